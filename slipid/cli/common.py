@@ -64,7 +64,7 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     return run
 
 
-def on_wheels(command: Callable[Words, int]) -> Callable[Words, None]:
+def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:
     """`guarded`, of a command that has nothing to say of a motor on a bench: it says so first.
 
     The config, or the folder of a result, is the first path among the arguments of a command.

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import DataFolder, Json, Out, OutFolder, Quiet, emit, on_wheels
-from slipid.support.files import Content
+from slipid.cli.common import DataFolder, Json, Out, OutFolder, Quiet, emit, for_robots
+from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ MOST_BEYOND = 0.05
 """Part of the rows in which wheels may be beyond the map."""
 
 
-@on_wheels
+@for_robots
 def floors(
     fitted: OutFolder,
     map: Annotated[

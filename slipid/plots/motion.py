@@ -12,9 +12,9 @@ from slipid.model.robot import Robot
 from slipid.plots import drawing
 from slipid.plots.measured_windows import MeasuredWindows, by_heading
 from slipid.predict import open_loop as replay
-from slipid.predict.floor_models import FloorModels
 from slipid.predict.kinematics import Encoder
-from slipid.predict.predictive import Contact
+from slipid.predict.predictive import ForceBalance
+from slipid.predict.slip_models import FloorModels
 
 ROWS = (
     ("slip", "slip: way lost [%]"),
@@ -98,7 +98,9 @@ def named(surface: str, load: str, groups: Sequence[tuple[str, str]]) -> str:
     return f"{surface}, load {load}" if several else surface
 
 
-def path_figure(model: Contact, data: Runs, order: Sequence[tuple[str, str]], title: str) -> Figure:
+def path_figure(
+    model: ForceBalance, data: Runs, order: Sequence[tuple[str, str]], title: str
+) -> Figure:
     """Some runs per floor and load, started at one point with the robot looking to the right.
 
     Args:
@@ -146,13 +148,15 @@ def _spread(data: Runs, runs: list[int]) -> list[int]:
     return [runs[k] for k in at]
 
 
-def _paths(model: Contact, data: Runs) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _paths(model: ForceBalance, data: Runs) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Measured, predicted and encoder path (edge, 2) of every run, from the origin, x ahead."""
     out: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = [None] * len(data)
     robot = model.robot
-    for w in replay.cuts(data, robot):
+    for w in replay.replay_windows(data, robot):
         tracks = model.tracks(w)
-        encoder = replay.follow(robot, w, FloorModels(Encoder()).increments(w, robot))
+        encoder = replay.tracks_from_increments(
+            robot, w, FloorModels(Encoder()).increments(w, robot)
+        )
         for n, k in enumerate(tracks.run):
             yaw = float(robot.camera.yaw(jnp.asarray(robot.session_index(w.session[n]))))
             first = tracks.measured[n, 0]

@@ -119,16 +119,19 @@ def wheel_curve(
     Source: `slipid.model.contact_law`.
     """
     frame, surface = robot.geometry.frame(), robot.surfaces.at(robot.surface_index(floor))
-    pull, slip_through = frame.pull[0], frame.slip_through[0]
+    drive_share, roller_share = frame.drive_share[0], frame.roller_share[0]
     rim = frame.radius * wheel_speed
-    along, roll = rim * pull * (1 - jnp.asarray(slip)), rim * (pull * sideways - slip_through)
+    along, roll = (
+        rim * drive_share * (1 - jnp.asarray(slip)),
+        rim * (drive_share * sideways - roller_share),
+    )
     relative = jnp.asarray(share * robot.geometry.wheels)
     surface, onset = law.sideways(law.at_load(surface, relative), frame.grip[0])
     grip = frame.grip[0] if frame.ordinary else None
-    forces = law.wheel_forces(along, roll, rim, pull, onset, surface, grip)
-    felt = forces.felt(pull, slip_through)
+    forces = law.wheel_forces(along, roll, rim, drive_share, onset, surface, grip)
+    motor_force = forces.motor_force(drive_share, roller_share)
     weight = robot.body.mass * GRAVITY * law.load_force(jnp.asarray(share), surface)
-    return np.asarray(frame.radius * weight * felt)
+    return np.asarray(frame.radius * weight * motor_force)
 
 
 def current_figure(seen: MeasuredWindows) -> Figure | None:

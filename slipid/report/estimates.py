@@ -12,10 +12,10 @@ from rich.text import Text
 
 from slipid.infer.bench.verdict import BenchFit
 from slipid.report.page import Page, percent, table, verdict
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 if TYPE_CHECKING:
-    from slipid.app.trust import Judgement
+    from slipid.app.trust import TrustReport
     from slipid.infer.posterior.diagnosis import Posterior
     from slipid.infer.result import Fit
     from slipid.infer.verdicts.estimates import Estimate
@@ -87,12 +87,12 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
     if fit.derived:
         page.table(estimates(fit.derived.values(), "\nknown as ratios, or not even so"))
     for profile in profiles:
-        page.line(f"profile: {profile.said}")
+        page.line(f"profile: {profile.sentence}")
     page.notes(fit.messages)
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
 
 
-def show_trust(page: Page, judged: "Judgement") -> None:
+def show_trust(page: Page, judged: "TrustReport") -> None:
     """Write how the fit predicts its own runs, open loop, and how far it may be trusted."""
     if judged.floors:
         made = table(("surface", "end / path", "encoders alone"))

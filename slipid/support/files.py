@@ -14,9 +14,6 @@ import numpy as np
 
 from slipid.support.errors import DataError
 
-Content = dict[str, Any]
-"""Content of a JSON or TOML file, or of a table in it: numbers, words, lists and tables by name."""
-
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file so that a reader, or a crash, finds the old one or the new one, never a part."""

@@ -12,7 +12,7 @@ import pytest
 from slipid.app import logs as packaged
 from slipid.app.config import read_config
 from slipid.app.logs import RECORDED, packaged_config, unpack
-from slipid.app.problem import read_job
+from slipid.app.problem import read_fit_task
 from slipid.cli import demo
 from slipid.cli.demo import PARTS, drive_anew
 from slipid.lab.testsite.config import plan
@@ -142,7 +142,9 @@ def test_the_demo_finds_the_motor_weighs_the_robot_and_beats_the_encoders(tmp_pa
     golden("demo_validation", list(of_validation(found)), rtol=1e-3, atol=1e-6)
     # the picture of the paths says what the table says
     config = read_config(tmp_path / "result" / "config.toml")
-    data = read_job(config, tmp_path / "recorded" / "unseen" / "logs", Reporter(quiet=True)).dataset
+    data = read_fit_task(
+        config, tmp_path / "recorded" / "unseen" / "logs", Reporter(quiet=True)
+    ).dataset
     order = [("firm", "as_built"), ("soft", "as_built"), ("soft", "moved")]
     drawn = path_figure(done.fit.contact, data, order, "unseen runs").axes
     for ax, floor in zip(drawn, ("firm", "soft", "soft@moved"), strict=False):

@@ -257,7 +257,7 @@ class Posterior:
         for tie in a.tied:
             span, root = np.asarray(tie.span), np.asarray(tie.root)
             rows = np.einsum("nma,anq->nmaq", span, root).reshape(-1, root.shape[0] * root.shape[2])
-            self.tied.append((np.asarray(tie.pieces), rows, np.asarray(tie.factor)))
+            self.tied.append((np.asarray(tie.segments), rows, np.asarray(tie.factor)))
 
     def __call__(self, x):
         return np.array([self.one(row) for row in x])
@@ -278,8 +278,8 @@ class Posterior:
         """Every number of the robot, in SI."""
         out = {k: v.copy() for k, v in self.start.items()}
         for e in self.space.free:
-            mine, d = z[self.space.place[e.path]], e.declaration
-            if d.tied:
+            mine, d = z[self.space.slices[e.path]], e.declaration
+            if d.constrained:
                 value = share_basis(len(mine) + 1) @ mine
                 value = np.exp(value) / np.exp(value).sum() if d.shares else value
             elif math.isinf(d.upper):

@@ -21,8 +21,9 @@ from slipid.camera.calibration.quality import Quality, judged
 from slipid.camera.calibration.report import floor_report, lens_report, scale_std, straight_report
 from slipid.camera.calibration.views import not_found, usable
 from slipid.camera.overhead import Lens, OverheadCamera, read_camera
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content, write_json
+from slipid.support.files import write_json
 
 
 @dataclass(frozen=True, eq=False)

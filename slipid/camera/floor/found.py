@@ -20,8 +20,8 @@ from slipid.camera.floor.proposal import Proposal
 from slipid.camera.floor.surfaces import Surfaces
 from slipid.camera.frames.still import is_picture
 from slipid.data.geojson_map import Patch, VectorMap
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 
 HARDLY, NOT = 5.0, 3.5
 """Surfaces whose looks differ by less are hardly told apart, or not at all [spreads].

@@ -9,7 +9,7 @@ from slipid.data.check.interpretation import Interpretation
 from slipid.data.check.joined import PoseConvention
 from slipid.data.check.mistakes import Candidate, Mistake
 from slipid.data.check.ratios import ScaleCause, ScaleRatios
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 Severity = Literal["wrong", "suspicious", "note"]
 """`wrong` must be corrected before a fit, `suspicious` needs a look, `note` could not be

@@ -16,7 +16,8 @@ from slipid.infer.fit_file import SCHEMA, number_json
 from slipid.infer.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
 from slipid.infer.verdicts.wording import VOLTAGE
-from slipid.support.files import Content, hash_of
+from slipid.support.content import Content
+from slipid.support.files import hash_of
 
 BINS = 8
 """Of about as many windows."""
@@ -247,7 +248,7 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
         ("motor.inductance", electrical, ROWS_ELECTRICAL, "L_a / R"),
         ("motor.rotor_inertia", mechanical, ROWS_MECHANICAL, "J R / C_e^2"),
     ):
-        if path in f.space.place and constant < least * rows:
+        if path in f.space.slices and constant < least * rows:
             about = f"about {_time(constant)}" if constant > 0.05 * rows else "far shorter"
             slow[path] = (
                 f"{path} is not identified at this rate: its time constant {name} is {about}, "
@@ -304,7 +305,7 @@ def _remarks(f: MotorFit) -> list[str]:
             f"residuals remember {f.remember:.2g} s: the intervals count {f.stretches:.0f} "
             "stretches of that length, not the rows"
         )
-    if "motor.rotor_inertia" in f.space.place:
+    if "motor.rotor_inertia" in f.space.slices:
         said.append("motor.rotor_inertia is that of the rotor with everything that turned with it")
     return said
 

@@ -7,14 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.deploy.deploy import ROBOT, robot_of
+from slipid.deploy.deploy import ROBOT, robot_of_force_balance
 from slipid.lab.benchmark import slipid_rows
 from slipid.lab.benchmark.scores import FoldScore
 from slipid.lab.benchmark.work import OF_FITS, BenchmarkOptions, data_of, problem_of
 from slipid.lab.trial import trial
-from slipid.robot.record import Sensors
+from slipid.robot.record import LogSensors
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
-from slipid.support.files import Content, read_json, write_json
+from slipid.support.content import Content
+from slipid.support.files import read_json, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -67,8 +68,10 @@ class RectangleTask:
         everybody = np.arange(len(data.logged))
         kept = Checkpoint(self.folder, key)
         own = slipid_rows.fit_slipid(data.job, problem_of(self.wish, SOURCE), everybody, kept)
-        sensors = Sensors(current_is_signed=data.logged.current_is_signed, voltage=True)
-        robot_of(own.contact, own.highest_speed, own.trend, sensors).save(self.folder / ROBOT)
+        sensors = LogSensors(current_is_signed=data.logged.current_is_signed, voltage=True)
+        robot_of_force_balance(own.contact, own.highest_speed, own.trend, sensors).save(
+            self.folder / ROBOT
+        )
 
     def drive(self, executor: Executor, report: Reporter) -> Content:
         """Drive all controllers on the virtual test site, or where MuJoCo is missing on the twin.
@@ -81,7 +84,7 @@ class RectangleTask:
         plant = "testsite" if find_spec("mujoco") is not None else "twin"
         asked = [name for name in CONTROLLERS if not self.wish.only or name in self.wish.only]
         try:
-            wish = trial.Wish(plant, controllers=tuple(asked), starts=STARTS)
+            wish = trial.TrialOptions(plant, controllers=tuple(asked), starts=STARTS)
             return trial.trial(self.folder, wish, executor, report).content
         except Exception as error:  # all else is written all the same
             return {"failed": FoldScore.of_error(error).absent}

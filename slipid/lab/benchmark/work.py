@@ -18,10 +18,10 @@ from slipid.lab.benchmark.sets import SOURCES, DataSet, LogSource, read_set
 from slipid.lab.benchmark.steps import RunBatch, run_batches
 from slipid.lab.benchmark.tuning import tuned
 from slipid.lab.systems.motion.features import common
-from slipid.predict.slip_model import Channel, Machine, PredictedRun, Run, SlipModel
+from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, SlipModel
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
-from slipid.support.files import Content
+from slipid.support.content import Content
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -143,7 +143,7 @@ def keys_of(piece: FoldTask) -> list[tuple[str, str]]:
     """
     wish, data, split = piece.wish, data_of(piece.wish, piece.source), split_of(piece)
     own = [slipid_rows.NAME] + ([OWN_MAP] if split.kind == "all" else [])
-    every = own + [method.name for method in rows(data.machine)]
+    every = own + [method.name for method in rows(data.spec)]
     wanted = [name for name in every if not wish.only or name in wish.only]
     several = len({base_of(f.floor) for f in data.facts}) > 1
     asked = [p for p in split.protocols if PROTOCOLS[p].told or (several and not wish.quick)]
@@ -226,31 +226,31 @@ def _row(scene: FoldData, protocol: str, name: str) -> FoldScore:
     try:
         if name in (slipid_rows.NAME, OWN_MAP):
             return _own(scene, asked, runs, name)
-        method = next(m for m in rows(scene.data.machine) if m.name == name)
-        if lacks := method.needs - channels_of(runs, scene.data.machine):
+        method = next(m for m in rows(scene.data.spec) if m.name == name)
+        if lacks := method.needs - channels_of(runs, scene.data.spec):
             return FoldScore.lacking(lacks)
         return _published(scene, asked, runs, method)
     except Exception as error:  # a row that fails must not stop the rest
         return FoldScore.of_error(error)
 
 
-def channels_of(runs: Sequence[Run], machine: Machine) -> frozenset[Channel]:
+def channels_of(runs: Sequence[Run], spec: RobotSpec) -> frozenset[Channel]:
     """What all these runs have beside encoders."""
-    twist: frozenset[Channel] = frozenset({"twist"} if machine.determines_twist else ())
+    twist: frozenset[Channel] = frozenset({"twist"} if spec.determines_twist else ())
     return common(runs) | twist
 
 
 def _published(
     scene: FoldData, asked: BenchmarkProtocol, runs: list[Run], method: SlipModel
 ) -> FoldScore:
-    machine = scene.data.machine
+    spec = scene.data.spec
     fitted = [run.with_floor(asked.told) for run in scene.fitted]
     began = time.perf_counter()
-    found = tuned(method, fitted, machine, asked.split)
+    found = tuned(method, fitted, spec, asked.split)
     chosen = time.perf_counter()
-    done = found.method.fit(fitted, machine)
+    done = found.method.fit(fitted, spec)
     ended = time.perf_counter()
-    said, each = _timed(lambda: done.predict([run.signals for run in runs], machine), runs)
+    said, each = _timed(lambda: done.predict([run.signals for run in runs], spec), runs)
     return FoldScore(
         runs=_judged(scene, runs, said),
         settings=found.settings,
@@ -279,8 +279,8 @@ def _own(scene: FoldData, asked: BenchmarkProtocol, runs: list[Run], name: str) 
     def predict() -> list[PredictedRun]:
         if drives:
             return slipid_rows.estimator_runs(own, scene.cuts, scene.judged, place)
-        machine = scene.data.machine
-        return [said for one in scene.cuts for said in slipid_rows.forecast(own, one, machine)]
+        spec = scene.data.spec
+        return [said for one in scene.cuts for said in slipid_rows.forecast(own, one, spec)]
 
     predict()  # compiles
     said, each = _timed(predict, runs)
@@ -296,8 +296,8 @@ def _own(scene: FoldData, asked: BenchmarkProtocol, runs: list[Run], name: str) 
 def _judged(
     scene: FoldData, runs: Sequence[Run], said: Sequence[PredictedRun]
 ) -> tuple[RunScore, ...]:
-    machine, over = scene.data.machine, scene.data.source.over
-    return tuple(scored(run, one, machine, over) for run, one in zip(runs, said, strict=True))
+    spec, over = scene.data.spec, scene.data.source.over
+    return tuple(scored(run, one, spec, over) for run, one in zip(runs, said, strict=True))
 
 
 def _timed(

@@ -62,7 +62,7 @@ class Meter(FloorClassifier):
     def candidates(self):
         return [replace(self, off=off) for off in self.tries] or (self,)
 
-    def fit(self, felts, machine):
+    def fit(self, felts, spec):
         labels = floors_of(felts)
         level = {
             name: float(np.mean([f.current.mean() for f in felts if f.floor == name]))
@@ -70,7 +70,7 @@ class Meter(FloorClassifier):
         }
         return replace(self, labels=labels, level=level)
 
-    def probability(self, felts, machine):
+    def probability(self, felts, spec):
         out = []
         for felt in felts:
             mean = np.cumsum(felt.current.mean(axis=1)) / np.arange(1, len(felt) + 1) + self.off
@@ -192,10 +192,10 @@ class Memory(Meter):
     def candidates(self):
         return [self, replace(self, right=True)]
 
-    def fit(self, felts, machine):
+    def fit(self, felts, spec):
         return replace(self, labels=floors_of(felts), known=frozenset(f.name for f in felts))
 
-    def probability(self, felts, machine):
+    def probability(self, felts, spec):
         seen = [f.name in self.known for f in felts]
         each = [np.array([0.9, 0.1]) if s else np.array([0.1, 0.9]) for s in seen]
         return [np.tile(p, (len(f), 1)) for p, f in zip(each, felts, strict=True)]
@@ -435,7 +435,7 @@ def test_slipid_says_what_it_lacks():
 class Broken(Meter):
     """Cannot be fitted."""
 
-    def fit(self, felts, machine):
+    def fit(self, felts, spec):
         raise ZeroDivisionError("no wheel")
 
 

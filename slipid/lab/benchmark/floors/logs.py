@@ -50,7 +50,7 @@ from slipid.lab.systems.floors.gaussian import GaussianClassifier
 from slipid.lab.systems.floors.interface import FloorClassifier, FloorSignals
 from slipid.model.geometry import skid_steer
 from slipid.model.robot import Robot, build
-from slipid.predict.slip_model import Machine, PredictedRun, Run
+from slipid.predict.slip_model import PredictedRun, RobotSpec, Run
 from slipid.support.errors import bad_data
 
 RADIUS = 0.165
@@ -197,7 +197,7 @@ def robotino_table(wish: BenchmarkOptions) -> ClassifierTable:
             parts.setdefault(NAME, []).append(done)
         for method in robotino_classifiers():
             if not wish.only or method.name in wish.only:
-                work = partial(_published, method, fitted, felts, data.machine, asked)
+                work = partial(_published, method, fitted, felts, data.spec, asked)
                 done = attempted(method.name, work)
                 parts.setdefault(method.name, []).append(done)
     return table_of(
@@ -266,16 +266,16 @@ def _published(
     method: FloorClassifier,
     fitted: list[FloorSignals],
     felts: list[FloorSignals],
-    machine: Machine,
+    spec: RobotSpec,
     asked: EvaluationSettings,
 ) -> ScoredClassifier:
     """A classifier fitted to some runs and asked of others, from their starts on."""
     starts = [felt.pieces(max(SECONDS))[0] for felt in felts]
-    found = tuned(method, fitted, machine, asked)
+    found = tuned(method, fitted, spec, asked)
     began = time.perf_counter()
-    done = found.method.fit(fitted, machine)
+    done = found.method.fit(fitted, spec)
     ended = time.perf_counter()
-    answers = answers_of(done, starts, machine, SECONDS)
+    answers = answers_of(done, starts, spec, SECONDS)
     row = ClassifierRow(
         method.name,
         settings=(found.settings,),

@@ -26,9 +26,10 @@ from slipid.lab.benchmark.work import OF_FITS, OF_ROWS, BenchmarkOptions, data_o
 from slipid.lab.systems.floors.cosine_energy import CosineEnergyClassifier, tree_rows
 from slipid.lab.systems.floors.gaussian import GaussianClassifier
 from slipid.lab.systems.floors.interface import FloorClassifier
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
-from slipid.support.files import Content, hash_of
+from slipid.support.content import Content
+from slipid.support.files import hash_of
 from slipid.support.jax_setup import setup_jax
 
 FOLDER = "borealtc"
@@ -55,12 +56,12 @@ def husky_table(data: Path, quick: bool = False, only: tuple[str, ...] = ()) -> 
         DataError: the folder's files cannot be read.
     """
     felts = read_floor_runs(data / FOLDER, RADIUS)
-    machine = Machine.of(husky().on(["any"]))
+    spec = RobotSpec.of(husky().on(["any"]))
     methods = [method for method in husky_classifiers() if not only or method.name in only]
     return classifier_table(
         methods,
         felts,
-        machine,
+        spec,
         ABOUT,
         EvaluationSettings.quick() if quick else EvaluationSettings(),
     )

@@ -25,7 +25,7 @@ from slipid.lab.benchmark.floors.result import (
 from slipid.lab.benchmark.scores import FoldScore
 from slipid.lab.benchmark.tuning import settings_of
 from slipid.lab.systems.floors.interface import Beliefs, FloorClassifier, FloorSignals
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 
 SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """After which classifiers are asked [s]."""
@@ -71,12 +71,12 @@ def folds_of(felts: Sequence[FloorSignals], count: int) -> Numbers:
 def answers_of(
     method: FloorClassifier,
     felts: Sequence[FloorSignals],
-    machine: Machine,
+    spec: RobotSpec,
     seconds: Sequence[float],
 ) -> list[Answer]:
     """What a fitted classifier says of the stretches of runs."""
     stretches = [part for felt in felts for part in felt.pieces(max(seconds))]
-    said = method.probability(stretches, machine)
+    said = method.probability(stretches, spec)
     return [
         answer
         for stretch, beliefs in zip(stretches, said, strict=True)
@@ -114,7 +114,7 @@ class TunedClassifier:
 def tuned(
     method: FloorClassifier,
     felts: Sequence[FloorSignals],
-    machine: Machine,
+    spec: RobotSpec,
     asked: EvaluationSettings,
 ) -> TunedClassifier:
     """The candidate that names the right floor most often in an inner cross-validation.
@@ -129,8 +129,8 @@ def tuned(
     for candidate in candidates:
         said: list[Answer] = []
         for k in range(asked.inner):
-            done = candidate.fit(_some(felts, fold != k), machine)
-            said += answers_of(done, _some(felts, fold == k), machine, asked.seconds)
+            done = candidate.fit(_some(felts, fold != k), spec)
+            said += answers_of(done, _some(felts, fold == k), spec, asked.seconds)
         each = [
             np.mean([a.said == a.floor for a in said if a.seconds == long])
             for long in sorted({a.seconds for a in said})
@@ -156,7 +156,7 @@ class ScoredClassifier:
 def judged(
     method: FloorClassifier,
     felts: Sequence[FloorSignals],
-    machine: Machine,
+    spec: RobotSpec,
     asked: EvaluationSettings,
 ) -> ScoredClassifier:
     """A classifier fitted and asked, fold by fold."""
@@ -166,11 +166,11 @@ def judged(
     for k in range(asked.judged):
         fitted = _some(felts, fold != k)
         left_out = [felt.pieces(asked.first_s)[0] for felt in _some(felts, fold == k)]
-        found = tuned(method, fitted, machine, asked)
+        found = tuned(method, fitted, spec, asked)
         began = time.perf_counter()
-        done = found.method.fit(fitted, machine)
+        done = found.method.fit(fitted, spec)
         ended = time.perf_counter()
-        answers += answers_of(done, left_out, machine, asked.seconds)
+        answers += answers_of(done, left_out, spec, asked.seconds)
         heard_s += time.perf_counter() - ended
         rows += sum(len(felt) for felt in left_out)
         settings.append(found.settings)
@@ -199,14 +199,14 @@ def attempted(name: str, work: Callable[[], ScoredClassifier]) -> ScoredClassifi
 def classifier_table(
     methods: Sequence[FloorClassifier],
     felts: Sequence[FloorSignals],
-    machine: Machine,
+    spec: RobotSpec,
     about: str,
     asked: EvaluationSettings = EvaluationSettings(),
     reference: str = "slipid",
 ) -> ClassifierTable:
     """All classifiers on the same runs; `reference` is the one that others are compared with."""
     done = {
-        method.name: attempted(method.name, partial(judged, method, felts, machine, asked))
+        method.name: attempted(method.name, partial(judged, method, felts, spec, asked))
         for method in methods
     }
     return table_of(done, felts, about, asked, reference)

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from slipid.deploy.deploy import given
+from slipid.deploy.deploy import given_numbers
 from slipid.lab.benchmark.floors.fitting import (
     MeteredMotor,
     currents_off,
@@ -39,7 +39,7 @@ from slipid.lab.benchmark.floors.fitting import (
 from slipid.lab.systems.floors.interface import Beliefs, FloorClassifier, FloorSignals, floors_of
 from slipid.model.contact_law import ContactSurface
 from slipid.model.robot import Robot
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, EstimatorState
 from slipid.robot.interface import Readings, Settings
@@ -66,7 +66,9 @@ def deployed(robot: Robot) -> DeployedRobot:
     )
     record = RobotRecord(
         wheels=Wheels(**{f.name: getattr(shape, f.name) for f in fields(Wheels)}),
-        parameters={path: n for path, n in given(robot).items() if not path.startswith("camera.")},
+        parameters={
+            path: n for path, n in given_numbers(robot).items() if not path.startswith("camera.")
+        },
         floors=tuple(
             FloorRecord(name=name, process=none, effect=none, current_std=1.0, seen=None)
             for name in robot.surfaces.labels
@@ -132,7 +134,7 @@ class SlipidFloorClassifier(FloorClassifier):
     settings: Settings = SETTINGS
     fitted: FittedFloors | None = field(default=None, repr=False)
 
-    def fit(self, felts: Sequence[FloorSignals], machine: Machine) -> "SlipidFloorClassifier":
+    def fit(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> "SlipidFloorClassifier":
         labels = floors_of(felts)
         seen = [self._heard(felt) for felt in felts]
         robot = self._on(labels)
@@ -140,10 +142,10 @@ class SlipidFloorClassifier(FloorClassifier):
             robot.motor, jnp.asarray(stiffness_of(seen)), jnp.asarray(scatter_of(seen))
         )
         robot = fitted_floors(replace(robot, motor=motor), seen)
-        std = _scatter(robot, seen, machine)
+        std = _scatter(robot, seen, spec)
         return replace(self, labels=labels, fitted=FittedFloors(robot.surfaces, motor, std))
 
-    def probability(self, felts: Sequence[FloorSignals], machine: Machine) -> list[Beliefs]:
+    def probability(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
             raise ValueError(f"{self.name} was not fitted")
         plain = deployed(self._on(self.labels))
@@ -153,7 +155,7 @@ class SlipidFloorClassifier(FloorClassifier):
         rows = -(-max(len(felt) for felt in felts) // 8) * 8
         for first in range(0, len(felts), TOGETHER):
             some = [self._heard(felt) for felt in felts[first : first + TOGETHER]]
-            beliefs = np.asarray(_driven(estimator, std, _FilterRows.of(some, rows, machine)))
+            beliefs = np.asarray(_driven(estimator, std, _FilterRows.of(some, rows, spec)))
             out += [beliefs[k, : len(felt)] for k, felt in enumerate(some)]
         return [row[:, :-1] / row[:, :-1].sum(axis=1, keepdims=True) for row in out]
 
@@ -179,15 +181,15 @@ class SlipidFloorClassifier(FloorClassifier):
         return replace(felt, current=np.maximum(np.abs(felt.current) - self.zero_a, 0.0))
 
 
-def kinds(felt: FloorSignals, machine: Machine) -> Int[np.ndarray, " row"]:
+def kinds(felt: FloorSignals, spec: RobotSpec) -> Int[np.ndarray, " row"]:
     """How a robot goes in each row: 0 straight, 1 in a bend, 2 on the spot."""
-    x, y, yaw = felt.rolling(machine).T
-    turn = machine.base_radius * np.abs(yaw)
+    x, y, yaw = felt.rolling(spec).T
+    turn = spec.base_radius * np.abs(yaw)
     return np.digitize(turn / np.maximum(np.hypot(x, y) + turn, 1e-9), BENDS)
 
 
 def _scatter(
-    robot: Robot, felts: Sequence[FloorSignals], machine: Machine
+    robot: Robot, felts: Sequence[FloorSignals], spec: RobotSpec
 ) -> Float[np.ndarray, "kind floor"]:
     """Std of currents about the model's on every floor, straight, in bends and on the spot [A]."""
     count = len(BENDS) + 1
@@ -199,7 +201,7 @@ def _scatter(
             take = take[:: max(1, len(take) // MOST_ROWS)]
             speed.append(felt.speed[take])
             current.append(felt.current[take])
-            kind.append(kinds(felt, machine)[take])
+            kind.append(kinds(felt, spec)[take])
         off = currents_off(robot, k, np.concatenate(speed), np.concatenate(current))
         squares, of_kind = (off**2).mean(axis=1), np.concatenate(kind)
         for n in range(count):
@@ -225,7 +227,7 @@ class _FilterRows(eqx.Module):
     kind: Int[Array, "*run row"]
 
     @classmethod
-    def of(cls, felts: Sequence[FloorSignals], rows: int, machine: Machine) -> "_FilterRows":
+    def of(cls, felts: Sequence[FloorSignals], rows: int, spec: RobotSpec) -> "_FilterRows":
         """Runs side by side, filled up to so many rows and to `TOGETHER` runs."""
         drives = felts[0].speed.shape[1]
         speed, current = np.zeros((2, TOGETHER, rows, drives))
@@ -237,7 +239,7 @@ class _FilterRows(eqx.Module):
             # a robot that stands feels nothing
             dt[k, :n] = np.where(felt.moves, felt.dt, 0.0)
             gyro[k, :n] = np.nan if felt.gyro is None else felt.gyro
-            kind[k, :n] = kinds(felt, machine)
+            kind[k, :n] = kinds(felt, spec)
         return cls(*(jnp.asarray(x) for x in (speed, current, gyro, dt, kind)))
 
 

@@ -78,7 +78,7 @@ from slipid.lab.systems.floors.interface import (
     floors_of,
     training_rows,
 )
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 
 if TYPE_CHECKING:
     from sklearn.ensemble import HistGradientBoostingClassifier
@@ -128,9 +128,9 @@ class CosineEnergyClassifier(FloorClassifier):
         both = (True, False)
         return [replace(self, losses=heat, logarithm=log) for heat in both for log in both]
 
-    def fit(self, felts: Sequence[FloorSignals], machine: Machine) -> "CosineEnergyClassifier":
+    def fit(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> "CosineEnergyClassifier":
         labels = floors_of(felts)
-        rows, floor = training_rows(felts, lambda felt: self._seen(felt, machine))
+        rows, floor = training_rows(felts, lambda felt: self._seen(felt, spec))
         known = np.isfinite(rows).all(axis=1)
         fitted = [self._series(rows[known & (floor == name)]) for name in labels]
         weight = np.stack([one.weight[0] for one in fitted])
@@ -140,12 +140,12 @@ class CosineEnergyClassifier(FloorClassifier):
             fitted=CosineSeries(weight, np.concatenate([one.std for one in fitted])),
         )
 
-    def probability(self, felts: Sequence[FloorSignals], machine: Machine) -> list[Beliefs]:
+    def probability(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
             raise ValueError(f"{self.name} was not fitted")
         out = []
         for felt in felts:
-            angle, energy = self._seen(felt, machine).T
+            angle, energy = self._seen(felt, spec).T
             expected = terms(angle, self.harmonics) @ self.fitted.weight.T
             z = (energy[:, None] - expected) / self.fitted.std
             log = -0.5 * z**2 - np.log(self.fitted.std)
@@ -165,18 +165,18 @@ class CosineEnergyClassifier(FloorClassifier):
         left = rows[:, 1] - a @ weight
         return CosineSeries(weight[None], np.array([max(float(left.std()), 1e-6)]))
 
-    def _seen(self, felt: FloorSignals, machine: Machine) -> Float[np.ndarray, "row 2"]:
+    def _seen(self, felt: FloorSignals, spec: RobotSpec) -> Float[np.ndarray, "row 2"]:
         """Direction of travel [rad] and energy coefficient of every row, NaN where it is slow."""
         window = TrailingWindow.of(felt.time, self.window_s)
-        x, y, yaw = (window.mean(column) for column in felt.rolling(machine).T)
-        turn = machine.base_radius * yaw
-        across = y if machine.determines_twist else turn
+        x, y, yaw = (window.mean(column) for column in felt.rolling(spec).T)
+        turn = spec.base_radius * yaw
+        across = y if spec.determines_twist else turn
         speed = np.sqrt(x**2 + y**2 + turn**2)
-        amps, shaft = np.abs(felt.current), np.abs(machine.gear_ratio * felt.speed)
-        heat = machine.resistance * self.losses * amps
-        power = ((heat + machine.back_emf * shaft) * amps).sum(axis=1)
+        amps, shaft = np.abs(felt.current), np.abs(spec.gear_ratio * felt.speed)
+        heat = spec.resistance * self.losses * amps
+        power = ((heat + spec.back_emf * shaft) * amps).sum(axis=1)
         moving = speed > SLOW
-        energy = window.mean(power) / (machine.mass * GRAVITY * np.where(moving, speed, np.nan))
+        energy = window.mean(power) / (spec.mass * GRAVITY * np.where(moving, speed, np.nan))
         energy = np.log(np.maximum(energy, 1e-9)) if self.logarithm else energy
         return np.stack([np.arctan2(across, x), energy], axis=1)
 
@@ -210,12 +210,12 @@ class TreeEnsemble:
     frequency: Float[np.ndarray, " floor"]
 
     def log_likelihood(
-        self, felts: Sequence[FloorSignals], machine: Machine
+        self, felts: Sequence[FloorSignals], spec: RobotSpec
     ) -> Float[np.ndarray, "row floor"]:
         """Of every floor in the rows of all runs, one after another, up to a factor per row."""
         from threadpoolctl import threadpool_limits
 
-        rows = np.concatenate([features(felt, machine, self.hearing) for felt in felts])
+        rows = np.concatenate([features(felt, spec, self.hearing) for felt in felts])
         with threadpool_limits(1):
             probability = self.trees.predict_proba(rows)
         return np.asarray(np.log(np.maximum(probability, LEAST)) - np.log(self.frequency))
@@ -256,17 +256,17 @@ class BoostedTreesClassifier(FloorClassifier):
         pairs = [(4, 20.0), (12, 20.0)]
         return [replace(self, leaves=leaves, memory_s=memory) for leaves, memory in pairs]
 
-    def fit(self, felts: Sequence[FloorSignals], machine: Machine) -> "BoostedTreesClassifier":
+    def fit(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> "BoostedTreesClassifier":
         heard = [self.hearing, DRIVING] if self.driving_off else [self.hearing]
-        fitted = tuple(self._ensemble(felts, machine, hearing) for hearing in heard)
+        fitted = tuple(self._ensemble(felts, spec, hearing) for hearing in heard)
         return replace(self, labels=floors_of(felts), fitted=fitted)
 
-    def probability(self, felts: Sequence[FloorSignals], machine: Machine) -> list[Beliefs]:
+    def probability(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if not self.fitted:
             raise ValueError(f"{self.name} was not fitted")
-        log = self.fitted[0].log_likelihood(felts, machine)
+        log = self.fitted[0].log_likelihood(felts, spec)
         for other in self.fitted[1:]:
-            log = log - other.log_likelihood(felts, machine)
+            log = log - other.log_likelihood(felts, spec)
         each = np.split(log, np.cumsum([len(felt) for felt in felts])[:-1])
         return [
             accumulated(mine, felt, self.apart_s, self.memory_s)
@@ -279,14 +279,14 @@ class BoostedTreesClassifier(FloorClassifier):
         return len(self.fitted) * self.trees * len(self.labels) * self.leaves
 
     def _ensemble(
-        self, felts: Sequence[FloorSignals], machine: Machine, hearing: FeatureChannels
+        self, felts: Sequence[FloorSignals], spec: RobotSpec, hearing: FeatureChannels
     ) -> TreeEnsemble:
         from sklearn.ensemble import HistGradientBoostingClassifier
         from threadpoolctl import threadpool_limits
 
         rows, floor = training_rows(
             felts,
-            lambda felt: features(felt, machine, hearing, piece_s=self.piece_s),
+            lambda felt: features(felt, spec, hearing, piece_s=self.piece_s),
             self.rows_s,
         )
         trees = HistGradientBoostingClassifier(

@@ -40,7 +40,7 @@ from slipid.lab.systems.floors.interface import (
     floors_of,
     training_rows,
 )
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 
 WINDOWS_S = (0.5, 1.0, 2.0)
 """Lengths of the windows [s]."""
@@ -61,7 +61,7 @@ class FeatureChannels:
 
 def features(
     felt: FloorSignals,
-    machine: Machine,
+    spec: RobotSpec,
     hearing: FeatureChannels = FeatureChannels(),
     windows_s: Sequence[float] = WINDOWS_S,
     piece_s: float = np.inf,
@@ -79,7 +79,7 @@ def features(
             amps, turned = np.abs(felt.current).sum(axis=1), np.abs(felt.speed).sum(axis=1)
             columns.append(window.mean(amps) / (window.mean(turned) + 0.1))
         if hearing.gyro and felt.gyro is not None:
-            turn = felt.rolling(machine)[:, 2]
+            turn = felt.rolling(spec)[:, 2]
             columns.append(window.mean(np.abs(felt.gyro)))
             columns += window.both(yaw_rate_shortfall(felt.gyro, turn))
         if hearing.vibration and felt.vibration is not None:
@@ -197,9 +197,9 @@ class GaussianClassifier(FloorClassifier):
     def candidates(self) -> Sequence["GaussianClassifier"]:
         return [replace(self, shared=shared) for shared in (0.0, 0.3, 1.0)]
 
-    def fit(self, felts: Sequence[FloorSignals], machine: Machine) -> "GaussianClassifier":
+    def fit(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> "GaussianClassifier":
         labels = floors_of(felts)
-        rows, floor = training_rows(felts, lambda felt: self._features(felt, machine, self.piece_s))
+        rows, floor = training_rows(felts, lambda felt: self._features(felt, spec, self.piece_s))
         middle, scale = np.nanmean(rows, axis=0), np.nanstd(rows, axis=0)
         comparable = np.nan_to_num((rows - middle) / np.maximum(scale, 1e-9), nan=0.0)
         groups = [comparable[floor == name] for name in labels]
@@ -216,13 +216,11 @@ class GaussianClassifier(FloorClassifier):
         )
         return replace(self, labels=labels, fitted=cloud)
 
-    def probability(self, felts: Sequence[FloorSignals], machine: Machine) -> list[Beliefs]:
+    def probability(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
             raise ValueError(f"{self.name} was not fitted")
         return [
-            accumulated(
-                self.fitted.log_likelihood(self._features(felt, machine)), felt, self.apart_s
-            )
+            accumulated(self.fitted.log_likelihood(self._features(felt, spec)), felt, self.apart_s)
             for felt in felts
         ]
 
@@ -234,7 +232,7 @@ class GaussianClassifier(FloorClassifier):
         return floors * (count + count * (count + 1) // 2)
 
     def _features(
-        self, felt: FloorSignals, machine: Machine, piece_s: float = np.inf
+        self, felt: FloorSignals, spec: RobotSpec, piece_s: float = np.inf
     ) -> Float[np.ndarray, "row feature"]:
         """Those of one window, without the time heard."""
-        return features(felt, machine, FeatureChannels(), (self.window_s,), piece_s)[:, 1:]
+        return features(felt, spec, FeatureChannels(), (self.window_s,), piece_s)[:, 1:]

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 
 Beliefs = Float[np.ndarray, "row floor"]
 """Probability of each floor after every row."""
@@ -82,9 +82,9 @@ class FloorSignals:
         edges = [*np.unique(self.began(seconds)), len(self)]
         return [self.part(int(a), int(b)) for a, b in pairwise(edges)]
 
-    def rolling(self, machine: Machine) -> Float[np.ndarray, "row 3"]:
+    def rolling(self, spec: RobotSpec) -> Float[np.ndarray, "row 3"]:
         """Body twist if nothing slips [m/s, m/s, rad/s]."""
-        return np.asarray(self.speed * machine.wheel_radius @ machine.back.T)
+        return np.asarray(self.speed * spec.wheel_radius @ spec.back.T)
 
 
 @dataclass(frozen=True)
@@ -104,11 +104,11 @@ class FloorClassifier(abc.ABC):
         return (self,)
 
     @abc.abstractmethod
-    def fit(self, felts: Sequence[FloorSignals], machine: Machine) -> Self:
+    def fit(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> Self:
         """The classifier fitted to runs whose floors it is told."""
 
     @abc.abstractmethod
-    def probability(self, felts: Sequence[FloorSignals], machine: Machine) -> list[Beliefs]:
+    def probability(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         """Probability of each floor after every row of runs, each heard from its first row on.
 
         What it says after a row depends on that row and those before it, on nothing later.

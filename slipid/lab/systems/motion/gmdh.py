@@ -46,7 +46,7 @@ from slipid.lab.systems.motion.features import (
     with_slip,
 )
 from slipid.lab.systems.motion.polynomial_network import Growth, PolynomialNetwork, grown
-from slipid.predict.slip_model import Channel, Machine, PredictedRun, Run, RunSignals, SlipModel
+from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, RunSignals, SlipModel
 
 KEPT = 20
 LEAST = 0.05
@@ -113,18 +113,18 @@ class GmdhOne(SlipModel):
     def candidates(self) -> Sequence["GmdhOne"]:
         return [replace(self, growth=growth) for growth in CANDIDATES]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "GmdhOne":
-        seen = SlipExamples.of(runs, machine)
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhOne":
+        seen = SlipExamples.of(runs, spec)
         in_a = first_half(seen.run, [run.floor for run in runs])
         networks = NetworkSet.grown(seen.inputs, seen.ratio, seen.weight, in_a, self.growth)
         return replace(self, channels=seen.channels, networks=networks)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.networks is None:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = SignalWindows.of(runs, machine)
-        ratio = self.networks.say(windows.inputs(machine, self.channels))
-        return with_slip(runs, windows, ratio, machine)
+        windows = SignalWindows.of(runs, spec)
+        ratio = self.networks.say(windows.inputs(spec, self.channels))
+        return with_slip(runs, windows, ratio, spec)
 
     @property
     def numbers(self) -> int:
@@ -154,8 +154,8 @@ class GmdhClass(SlipModel):
     def candidates(self) -> Sequence["GmdhClass"]:
         return [replace(self, growth=growth) for growth in CANDIDATES]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "GmdhClass":
-        seen = SlipExamples.of(runs, machine)
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhClass":
+        seen = SlipExamples.of(runs, spec)
         floor_of_run = [run.floor for run in runs]
         in_a = first_half(seen.run, floor_of_run)
         # a floor on which no wheel turned is none that was seen
@@ -175,18 +175,18 @@ class GmdhClass(SlipModel):
         loads = [frozenset(run.signals.load for run in runs if run.floor == name) for name in names]
         return replace(self, channels=seen.channels, floors=floors, loads=loads, telling=telling)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if not self.floors:
             raise ValueError(f"{self.name}: predict before fit")
-        windows, names = SignalWindows.of(runs, machine), list(self.floors)
-        inputs = windows.inputs(machine, self.channels)
+        windows, names = SignalWindows.of(runs, spec), list(self.floors)
+        inputs = windows.inputs(spec, self.channels)
         belief = self._belief(windows, inputs, runs)
         told = np.array([names.index(run.floor) if run.floor in names else -1 for run in runs])
         floor = np.where(told[windows.run] < 0, belief.argmax(axis=1), told[windows.run])
         ratio = np.zeros((len(inputs), 3))
         for number, networks in enumerate(self.floors.values()):
             ratio[floor == number] = networks.say(inputs[floor == number])
-        said = with_slip(runs, windows, ratio, machine)
+        said = with_slip(runs, windows, ratio, spec)
         return [
             replace(of_run, floors=dict(zip(names, belief_of_run.T, strict=True)))
             for of_run, belief_of_run in zip(said, at_steps(belief, windows, runs), strict=True)
