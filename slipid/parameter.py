@@ -63,14 +63,14 @@ class Declaration:
         return math.isinf(self.upper) and not math.isinf(self.lower)
 
     @property
-    def tied(self) -> bool:
+    def constrained(self) -> bool:
         """Whether its numbers have one coordinate less than there are of them."""
         return self.shares or self.deviation
 
     def to_search(self, value: Any) -> np.ndarray:
         """Search-space vector of an SI value (scalar or array)."""
         x = np.atleast_1d(np.asarray(value, float))
-        if self.tied:
+        if self.constrained:
             return np.asarray((np.log(x) if self.shares else x) @ share_basis(len(x)))
         if math.isinf(self.lower) and math.isinf(self.upper):
             return x
@@ -81,7 +81,7 @@ class Declaration:
 
     def to_si(self, z: Float[Numbers, "*some n"]) -> Float[Numbers, "*some m"]:
         """SI values of a search-space vector, or of many; numpy's for numpy's, uncompiled."""
-        if self.tied:
+        if self.constrained:
             x: Numbers = z @ share_basis(z.shape[-1] + 1).T
             return _softmax(x) if self.shares else x
         if math.isinf(self.lower) and math.isinf(self.upper):
@@ -200,7 +200,7 @@ class Entry:
     @property
     def coordinates(self) -> int:
         """How many search-space coordinates it takes when free."""
-        return self.size - 1 if self.declaration.tied else self.size
+        return self.size - 1 if self.declaration.constrained else self.size
 
 
 def entries(tree: Any, prefix: str = "", leaf: tuple[str, ...] = ()) -> Iterator[Entry]:

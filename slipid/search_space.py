@@ -72,7 +72,7 @@ class Space(eqx.Module):
         free, starts, means, spreads, pooled = [], [], [], [], []
         for entry in self.all:
             picked = [c for c in choices if fnmatch.fnmatchcase(entry.path, c.pattern)]
-            value, mean, spread, is_free = _settle(entry, entry.get(tree), picked)
+            value, mean, spread, is_free = _resolved(entry, entry.get(tree), picked)
             values[entry] = value
             if is_free:
                 free.append(entry)
@@ -81,7 +81,7 @@ class Space(eqx.Module):
                 spreads.append(spread)
                 found = entry.declaration.deviation and all(c.prior_std is None for c in picked)
                 pooled.append(np.full(entry.coordinates, found))
-        self.template = put(tree, values)
+        self.template = with_values(tree, values)
         self.free = tuple(free)
         self.start, self.prior_mean, self.prior_std = (
             np.concatenate([np.zeros(0), *parts]) for parts in (starts, means, spreads)
@@ -94,7 +94,7 @@ class Space(eqx.Module):
         return eqx.tree_at(lambda space: space.prior_std, self, prior_std)
 
     @property
-    def place(self) -> dict[str, slice]:
+    def slices(self) -> dict[str, slice]:
         """Where the coordinates of every free number are, by path."""
         ends = np.cumsum([0, *(e.coordinates for e in self.free)]).tolist()
         return {e.path: slice(a, b) for e, a, b in zip(self.free, ends, ends[1:], strict=False)}
@@ -125,8 +125,10 @@ class Space(eqx.Module):
 
     def tree(self, z: Float[Array, " free"] | Float[np.ndarray, " free"]) -> Any:
         """Tree of SI values at a search-space vector; jit-able."""
-        z, place = z if isinstance(z, jax.core.Tracer) else np.asarray(z, float), self.place
-        return put(self.template, {e: e.declaration.to_si(z[place[e.path]]) for e in self.free})
+        z, slices = z if isinstance(z, jax.core.Tracer) else np.asarray(z, float), self.slices
+        return with_values(
+            self.template, {e: e.declaration.to_si(z[slices[e.path]]) for e in self.free}
+        )
 
     def vector(self, tree: Any) -> np.ndarray:
         """Search-space vector of a tree's free numbers."""
@@ -134,12 +136,12 @@ class Space(eqx.Module):
         return np.concatenate([np.zeros(0), *parts])
 
 
-def put(tree: Any, values: Mapping[Entry, Any]) -> Any:
+def with_values(tree: Any, values: Mapping[Entry, Any]) -> Any:
     """The tree with these values [SI] at their places; compiles nothing where nothing is traced."""
     changed: dict[tuple[str, ...], tuple[Entry, Any]] = {}
     for entry, value in values.items():
         whole = changed[entry.leaf][1] if entry.leaf in changed else entry.whole(tree)
-        changed[entry.leaf] = entry, _placed(whole, entry.index, value)
+        changed[entry.leaf] = entry, _replaced(whole, entry.index, value)
     if not changed:
         return tree
     places, arrays = zip(*changed.values(), strict=True)
@@ -148,7 +150,7 @@ def put(tree: Any, values: Mapping[Entry, Any]) -> Any:
     )
 
 
-def _placed(whole: Any, index: int | None, value: Any) -> Any:
+def _replaced(whole: Any, index: int | None, value: Any) -> Any:
     """An array with a value in one of its rows, or in place of all of it."""
     shape = whole.shape if index is None else whole.shape[1:]
     if isinstance(whole, jax.core.Tracer) or isinstance(value, jax.core.Tracer):
@@ -162,24 +164,24 @@ def _placed(whole: Any, index: int | None, value: Any) -> Any:
     return out
 
 
-def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, Any, bool]:
+def _resolved(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, Any, bool]:
     """Value, prior mean and std in the search space, and whether it is free."""
     d = entry.declaration
     usual = np.full(entry.size, 1 / entry.size if d.shares else d.start)
     is_free, mean_si, std_si = d.free, None, None
     for c in picked:
         if c.fixed is not None:
-            value, is_free = _inside(entry, c.fixed), False
+            value, is_free = _checked_value(entry, c.fixed), False
         if c.start is not None:
-            value = _inside(entry, c.start)
+            value = _checked_value(entry, c.start)
         if c.prior_mean is not None or c.prior_std is not None:
-            mean_si = _inside(entry, usual if c.prior_mean is None else c.prior_mean)
-            std_si = _spread(entry, c.prior_std)
+            mean_si = _checked_value(entry, usual if c.prior_mean is None else c.prior_mean)
+            std_si = _checked_std(entry, c.prior_std)
             value = value if c.prior_mean is None or c.start is not None else mean_si
             is_free = True
         if c.free is not None:
             is_free = c.free
-    value = _inside(entry, value)
+    value = _checked_value(entry, value)
     mean = d.to_search(usual if mean_si is None else mean_si)
     if std_si is None:
         spread = np.full(entry.coordinates, d.spread)
@@ -196,7 +198,7 @@ def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, A
     return value, mean, spread, is_free
 
 
-def _spread(entry: Entry, std: Any) -> np.ndarray | None:
+def _checked_std(entry: Entry, std: Any) -> np.ndarray | None:
     """Std of a prior, checked; None where only its centre was given."""
     if std is None:
         return None
@@ -206,7 +208,7 @@ def _spread(entry: Entry, std: Any) -> np.ndarray | None:
     return x
 
 
-def _inside(entry: Entry, value: Any) -> np.ndarray:
+def _checked_value(entry: Entry, value: Any) -> np.ndarray:
     """Value as an array, checked; one number stands for all of a vector."""
     x, d = np.asarray(value, float), entry.declaration
     if x.size not in (1, entry.size):

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from slipid.app import logs as of_config
-from slipid.app.config import Config, Motor
+from slipid.app.config import BenchMotors, Config
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
 from slipid.data.reading.checks import MIN_ROWS
@@ -20,28 +20,28 @@ from slipid.data.reading.motor_layout import GivenColumns, motor_layout
 from slipid.data.reading.reader import read_logs
 from slipid.data.reading.table_format import format_of
 from slipid.data.runs import counted_once
-from slipid.infer.bench.doubts import refuse
 from slipid.infer.bench.fit import fit_motor
-from slipid.infer.bench.motor import Bench, BenchMotor, Record
+from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot
+from slipid.infer.bench.record_checks import check_records
 from slipid.infer.bench.verdict import BenchFit, bench_fit
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.files import Content, writable, write_bytes, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 
 @dataclass(frozen=True, eq=False)
-class BenchJob:
+class BenchTask:
     """Records of every motor by its label ("" of a single one), and what is wanted of its numbers.
 
     `skipped` and `taken` are lines for people; `units_said`: the unit of the current is not
     doubted, as it was named, or something was said of the resistance.
     """
 
-    records: Mapping[str, tuple[Record, ...]]
+    records: Mapping[str, tuple[BenchRecord, ...]]
     choices: Mapping[str, tuple[Choice, ...]]
     skipped: tuple[str, ...] = ()
     taken: tuple[str, ...] = ()
@@ -51,7 +51,7 @@ class BenchJob:
         """Refuse what cannot be, and fit the rest."""
         setup_jax(quiet=True)
         for label, records in self.records.items():
-            refuse(records, label, self.units_said)
+            check_records(records, label, self.units_said)
         fits = []
         for label, records in self.records.items():
             report.stage(f"fitting motor {label}".strip())
@@ -59,7 +59,7 @@ class BenchJob:
         return bench_fit(fits)
 
 
-def read_bench_job(config: Config, root: Path, report: Reporter) -> BenchJob:
+def read_bench_task(config: Config, root: Path, report: Reporter) -> BenchTask:
     """Every log of the motors that a config names; DataError where config or logs are wrong."""
     report.stage("reading logs")
     if not root.is_dir():
@@ -67,7 +67,7 @@ def read_bench_job(config: Config, root: Path, report: Reporter) -> BenchJob:
     found, skipped = of_config.files_of(config, config.content.logs, root)
     if not found:
         raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
-    parts: list[list[Record]] = []
+    parts: list[list[BenchRecord]] = []
     for section, paths in found:
         layout = of_config.layout_of(config, section)
         for path in paths:
@@ -78,7 +78,7 @@ def read_bench_job(config: Config, root: Path, report: Reporter) -> BenchJob:
     if len(counts) > 1:
         raise DataError(f"{config.path}: logs of {min(counts)} and of {max(counts)} motors")
     robot = config.content.robot
-    names = robot.names if isinstance(robot, Motor) else []
+    names = robot.names if isinstance(robot, BenchMotors) else []
     labels = _labels(names, counts.pop(), str(config.path))
     parts, left = _with_voltage(parts)
     records = {label: tuple(p[k] for p in parts) for k, label in enumerate(labels)}
@@ -89,12 +89,12 @@ def read_bench_job(config: Config, root: Path, report: Reporter) -> BenchJob:
     said = any(
         fnmatch.fnmatch("motor.resistance", c.pattern) for cs in choices.values() for c in cs
     )
-    return BenchJob(records, choices, lines, (), said)
+    return BenchTask(records, choices, lines, (), said)
 
 
-def read_one(
+def read_motor_log(
     path: Path, given: Mapping[str, GivenColumns], delimiter: str | None, signed: bool
-) -> BenchJob:
+) -> BenchTask:
     """Motors of a single file, with given columns, the others by their names."""
     layout = motor_layout(format_of(path, delimiter), given, signed)
     logs = counted_once(read_logs(path, layout, path.parent, None, "bench").logs)
@@ -107,10 +107,10 @@ def read_one(
         for channel, c in layout.channels.items()
     )
     said = "current" in given and given["current"].unit is not None
-    return BenchJob(records, dict.fromkeys(labels, ()), (), taken, said)
+    return BenchTask(records, dict.fromkeys(labels, ()), (), taken, said)
 
 
-def records_of(log: Log, layout: SensorLayout) -> list[Record]:
+def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
     """Record of each motor of a log, at its shaft."""
     if log.current is None:
         raise DataError(f"{log.name}: no current; expected a column of it for each motor")
@@ -126,7 +126,7 @@ def records_of(log: Log, layout: SensorLayout) -> list[Record]:
         # the halves of a window are independent only where every row is a reading of its own
         read = _read(log, k)
         out.append(
-            Record(
+            BenchRecord(
                 name=log.name,
                 sha256=log.sha256,
                 time=log.time[read],
@@ -161,7 +161,7 @@ def _labels(names: Sequence[str], motors: int, where: str) -> tuple[str, ...]:
     return tuple(names) or (("",) if motors == 1 else tuple(str(k + 1) for k in range(motors)))
 
 
-def _with_voltage(parts: list[list[Record]]) -> tuple[list[list[Record]], list[str]]:
+def _with_voltage(parts: list[list[BenchRecord]]) -> tuple[list[list[BenchRecord]], list[str]]:
     """Logs with a voltage, if there are any, and a line about the others."""
     have = [p for p in parts if p[0].voltage is not None]
     if not have or len(have) == len(parts):
@@ -171,13 +171,14 @@ def _with_voltage(parts: list[list[Record]]) -> tuple[list[list[Record]], list[s
 
 def _choices(config: Config, label: str) -> tuple[Choice, ...]:
     """What the config wants of a motor's numbers; DataError where it names none."""
-    paths = [e.path for e in entries(Bench(BenchMotor()))]
+    paths = [e.path for e in entries(BenchRoot(BenchMotor()))]
     choices = []
     for pattern, setting in config.content.parameters.items():
         plain, at, _ = pattern.partition("@")
         if not fnmatch.filter(paths, plain):
             raise DataError(
-                f"{config.path}: parameters.'{pattern}': no such parameter{near(plain, paths)}; "
+                f"{config.path}: parameters.'{pattern}': no such parameter"
+                f"{did_you_mean(plain, paths)}; "
                 f"expected one of {', '.join(paths)}"
             )
         if at and not fnmatch.fnmatchcase(label, pattern.partition("@")[2]):
@@ -185,7 +186,7 @@ def _choices(config: Config, label: str) -> tuple[Choice, ...]:
         gauss = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)
         choice = Choice(plain, setting.start, setting.fixed, setting.free, *gauss)
         try:
-            Space(Bench(BenchMotor()), [choice])
+            Space(BenchRoot(BenchMotor()), [choice])
         except ValueError as error:
             raise DataError(f"{config.path}: parameters.'{pattern}': {error}") from error
         choices.append(choice)
@@ -197,8 +198,8 @@ def identify_bench(
 ) -> tuple[BenchFit, tuple[str, ...]]:
     """Fit the motors of a config and write identified.json; names of the files."""
     began = time.monotonic()
-    job = read_bench_job(config, data, report)
-    fit = job.fit(report)
+    task = read_bench_task(config, data, report)
+    fit = task.fit(report)
     writable(out)
     content = fit.to_json()
     write_json(out / "identified.json", content)
@@ -211,8 +212,8 @@ def identify_bench(
         "data": {
             "folder": str(data),
             "hash": content["data"]["hash"],
-            "logs": {r.name: r.sha256 for rs in job.records.values() for r in rs},
-            "skipped": job.skipped,
+            "logs": {r.name: r.sha256 for rs in task.records.values() for r in rs},
+            "skipped": task.skipped,
         },
         "versions": versions(),
     }
@@ -227,14 +228,14 @@ def check_bench(
 
     A fit of a motor takes less than a second: its verdicts are given, and not its numbers.
     """
-    job = read_bench_job(config, data, report)
-    fit = job.fit(report)
+    task = read_bench_task(config, data, report)
+    fit = task.fit(report)
     content: Content = {
         "schema": "slipid.check/1",
         "drive": "motor",
         "logs": [
-            _seen(f"{r.name}@{label}" if label else r.name, r)
-            for label, rs in job.records.items()
+            _record_summary(f"{r.name}@{label}" if label else r.name, r)
+            for label, rs in task.records.items()
             for r in rs
         ],
         "parameters": {
@@ -242,14 +243,14 @@ def check_bench(
             for path, e in fit.parameters.items()
         },
         "messages": list(fit.messages),
-        "skipped": list(job.skipped),
+        "skipped": list(task.skipped),
     }
     if out is not None:
         write_json(out / "check.json", content)
     return fit, content
 
 
-def _seen(name: str, r: Record) -> Content:
+def _record_summary(name: str, r: BenchRecord) -> Content:
     """What one log holds of one motor."""
 
     def span(x: np.ndarray | None) -> list[float] | None:

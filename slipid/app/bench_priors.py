@@ -12,13 +12,13 @@ from slipid.support.errors import DataError
 from slipid.support.files import read_json
 
 SCHEMA = "slipid.identified/1"
-KEPT = "motor_bench.json"
+COPY_NAME = "motor_bench.json"
 """Copy of the file beside a robot's results."""
-GEAR = 0.3
+GEAR_STD = 0.3
 """Part of a friction that a gear may add to it, or take, as a std: a bench may have run without."""
-TAKEN = ("resistance", "back_emf", "brush_drop", "coulomb_friction", "viscous_friction")
+NAMES = ("resistance", "back_emf", "brush_drop", "coulomb_friction", "viscous_friction")
 """Zeros belong to the bench's meters; what has no part in a robot's fit is not asked for."""
-_WHAT = "what `slipid identify` of a motor, or `slipid motor --out`, wrote"
+_EXPECTED = "what `slipid identify` of a motor, or `slipid motor --out`, wrote"
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def bench_of(config: Config) -> BenchFile | None:
     if named is None:
         return None
     # a result keeps a copy, so that later commands need no other folder
-    kept = config.path.parent / KEPT
+    kept = config.path.parent / COPY_NAME
     path = kept if kept.is_file() else config.path.parent / named
     return BenchFile(path, _read(path, f"{config.path}: robot.motor"))
 
@@ -66,7 +66,7 @@ def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[
         return [], []
     path, told = bench.path, bench.numbers
     choices, left = [], []
-    for name in TAKEN:
+    for name in NAMES:
         sure = [t for t in told.get(name, []) if t.verdict == "identified"]
         if not sure:
             left.append(name)
@@ -74,7 +74,7 @@ def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[
         power = {"coulomb_friction": 1, "viscous_friction": 2}.get(name, 0)
         mean, std = _pooled(sure)
         if power and gear_ratio > 1:
-            std = float(np.hypot(std, GEAR * mean))
+            std = float(np.hypot(std, GEAR_STD * mean))
         times = gear_ratio**power
         choices.append(Choice(f"motor.{name}", prior_mean=times * mean, prior_std=times * std))
     lines = [f"motor from {path}: {', '.join(c.pattern for c in choices) or 'nothing'}"]
@@ -92,11 +92,11 @@ def _pooled(sure: list[BenchEstimate]) -> tuple[float, float]:
 
 def _read(path: Path, where: str) -> Mapping[str, list[BenchEstimate]]:
     """Numbers of a bench by name, one for each of its motors."""
-    content = read_json(path, _WHAT)
+    content = read_json(path, _EXPECTED)
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema != SCHEMA or content.get("drive") != "motor":
         found = "a robot's numbers" if schema == SCHEMA else f"schema {schema}"
-        raise DataError(f"{where}: {path}: {found}; expected {_WHAT}")
+        raise DataError(f"{where}: {path}: {found}; expected {_EXPECTED}")
     told: dict[str, list[BenchEstimate]] = {}
     try:
         for full, number in content["parameters"].items():
@@ -105,5 +105,5 @@ def _read(path: Path, where: str) -> Mapping[str, list[BenchEstimate]]:
                 known = float(number["value"]), float(number["std"]), str(number["verdict"])
                 told.setdefault(name, []).append(BenchEstimate(*known))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{where}: {path}: damaged ({error}); expected {_WHAT}") from error
+        raise DataError(f"{where}: {path}: damaged ({error}); expected {_EXPECTED}") from error
     return told

@@ -1,4 +1,4 @@
-"""What is wrong with the logs of a job or with its config, before anything is fitted.
+"""What is wrong with the logs of a task or with its config, before anything is fitted.
 
 What a set of logs holds and can tell before anything is fitted: what `slipid check` does.
 """
@@ -12,7 +12,7 @@ import numpy as np
 
 from slipid.app.config import read_config
 from slipid.app.logs import layout_of
-from slipid.app.problem import Job, Task, read_job
+from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task
 from slipid.data.align.clock import Clock
 from slipid.data.check.columns import Finding, worst_first, wrong
 from slipid.data.check.sanity import findings
@@ -22,7 +22,7 @@ from slipid.data.runs import Runs
 from slipid.fit.problem import CREEPS, Problem
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
-from slipid.infer.verdicts.unidentified import Flat, flat_directions, members, sentences
+from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
 from slipid.predict.agreement import scatter
 from slipid.support.errors import DataError
 from slipid.support.files import Content, write_json
@@ -33,12 +33,12 @@ _AT_MOTOR = ("wheel_ticks", "motor_angle", "motor_speed", "motor_speed_command")
 """Channels that the gear ratio of a layout turns into motion of the wheel."""
 
 
-def sanity(task: Task) -> tuple[Finding, ...]:
+def sanity(task: FitTask) -> tuple[Finding, ...]:
     """Findings about the runs of a task, and about the config where there is one; worst first."""
-    mass = task.config.content.wheels.mass_kg if isinstance(task, Job) else None
+    mass = task.config.content.wheels.mass_kg if isinstance(task, ConfigFitTask) else None
     said = [*_braking(task), *findings(task.dataset, task.robot.geometry, mass)]
-    if isinstance(task, Job):
-        said += [*_forgotten(task), *_two_gears(task)]
+    if isinstance(task, ConfigFitTask):
+        said += [*_missing_sizes(task), *_different_gears(task)]
     return worst_first(said)
 
 
@@ -52,7 +52,7 @@ def refuse_if_wrong(found: Sequence[Finding]) -> None:
         )
 
 
-def _braking(task: Task) -> Iterator[Finding]:
+def _braking(task: FitTask) -> Iterator[Finding]:
     """Magnitudes of currents beside voltages, of wheels that drag each other along in turns.
 
     On made runs of a skid-steer robot R then was off by ten of its stds, and called identified.
@@ -69,15 +69,15 @@ def _braking(task: Task) -> Iterator[Finding]:
         )
 
 
-def _forgotten(job: Job) -> Iterator[Finding]:
+def _missing_sizes(task: ConfigFitTask) -> Iterator[Finding]:
     """Numbers of the robot that torques scale with, and that were left at their defaults."""
-    logged = [n for n in ("current", "voltage") if getattr(job.dataset, n) is not None]
-    robot = job.config.content.wheels
+    logged = [n for n in ("current", "voltage") if getattr(task.dataset, n) is not None]
+    robot = task.config.content.wheels
     absent = ["mass_kg"] if robot.mass_kg is None else []
     absent += [] if "gear_ratio" in robot.model_fields_set else ["gear_ratio"]
     if not logged or not absent:
         return
-    taken = {"mass_kg": f"{float(job.robot.body.mass):g} kg", "gear_ratio": "1"}
+    taken = {"mass_kg": f"{float(task.robot.body.mass):g} kg", "gear_ratio": "1"}
     yield Finding(
         "forgotten",
         f"{' and '.join(f'{n} ({taken[n]} would be taken)' for n in absent)} left out of [robot], "
@@ -87,14 +87,14 @@ def _forgotten(job: Job) -> Iterator[Finding]:
     )
 
 
-def _two_gears(job: Job) -> Iterator[Finding]:
+def _different_gears(task: ConfigFitTask) -> Iterator[Finding]:
     """Gear ratios of the robot and of a layout that differ."""
-    robot = job.config.content.wheels
+    robot = task.config.content.wheels
     if "gear_ratio" not in robot.model_fields_set:
         return
     seen: set[str] = set()
-    for section in job.config.content.logs:
-        layout = layout_of(job.config, section)
+    for section in task.config.content.logs:
+        layout = layout_of(task.config, section)
         if section.format in seen or not _uses_gear(layout):
             continue
         seen.add(section.format)
@@ -120,7 +120,7 @@ _CHANNELS = (
 
 
 @dataclass(frozen=True)
-class Expected:
+class ExpectedEstimates:
     """What logs can be expected to tell of every number and ratio, by path.
 
     `messages` say what stays open and what would close it, one sentence each.
@@ -133,8 +133,8 @@ class Expected:
     def to_json(self) -> Content:
         """Its part of check.json."""
         return {
-            "parameters": {path: _before(e) for path, e in self.parameters.items()},
-            "derived": {path: _before(e) for path, e in self.derived.items()},
+            "parameters": {path: _expected_json(e) for path, e in self.parameters.items()},
+            "derived": {path: _expected_json(e) for path, e in self.derived.items()},
             "messages": list(self.messages),
         }
 
@@ -147,27 +147,27 @@ def check(
     That is the content of check.json, which is written to `out`, if that is wanted.
     """
     setup_jax(quiet=True)
-    job = read_job(read_config(config_path), data, report)
+    task = read_fit_task(read_config(config_path), data, report)
     report.stage("do logs and config go together?")
-    content = overview(job, job.skipped)
+    content = overview(task, task.skipped)
     report.stage("expected information")
-    content |= _expected_if_any(job).to_json()
+    content |= _expected_if_any(task).to_json()
     if out is not None:
         write_json(out / "check.json", content)
-    return job.dataset, content
+    return task.dataset, content
 
 
-def _expected_if_any(job: Task) -> Expected:
+def _expected_if_any(task: FitTask) -> ExpectedEstimates:
     """`expected`; nothing where what is wrong with the logs leaves no windows to fit."""
     try:
-        return expected(job, job.problem())
+        return expected(task, task.problem())
     except DataError as error:
-        return Expected({}, {}, (f"nothing can be expected of a fit: {error}",))
+        return ExpectedEstimates({}, {}, (f"nothing can be expected of a fit: {error}",))
 
 
-def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
+def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
     """Findings, runs by floor, load and session, channels, repairs, what was left out."""
-    data = job.dataset
+    data = task.dataset
     groups: dict[tuple[str, str, str], list[int]] = {}
     for k, log in enumerate(data.logs):
         groups.setdefault((log.surface or "unknown", log.load, data.session[k]), []).append(k)
@@ -175,7 +175,7 @@ def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
     notes = Counter(note for log in data.logs for note in log.notes)
     return {
         "schema": "slipid.check/1",
-        "findings": [finding.to_json() for finding in sanity(job)],
+        "findings": [finding.to_json() for finding in sanity(task)],
         "runs": len(data),
         "groups": [
             {
@@ -193,7 +193,7 @@ def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
         "clocks": {log.name: _clock(log.pose_clock) for log in data.logs if log.pose_clock},
         "notes": dict(notes.most_common()),
         "skipped": list(skipped),
-        "data": {"hash": job.data_hash, "logs": {log.name: log.sha256 for log in data.logs}},
+        "data": {"hash": task.data_hash, "logs": {log.name: log.sha256 for log in data.logs}},
     }
 
 
@@ -219,7 +219,7 @@ def _channels(logs: tuple[Log, ...]) -> list[str]:
     return said
 
 
-def expected(job: Task, problem: Problem) -> Expected:
+def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
     """Verdicts from the expected information, with noise as the runs scatter, if not typical.
 
     What floors are like is not known yet: of the start values and of every creep that a fit starts
@@ -231,23 +231,23 @@ def expected(job: Task, problem: Problem) -> Expected:
     creep = space.where(lambda e: e.quantity == "surface.creep")
     parameters: dict[str, Estimate] = {}
     ratios: dict[str, Estimate] = {}
-    open_: tuple[Flat, ...] = ()
+    open_: tuple[FlatDirection, ...] = ()
     most = -np.inf
     starts = (space.start, *(np.where(creep, np.log(c), space.start) for c in CREEPS))
     covariances = [problem.laplace(z, log_v, keep) for z in starts]
     # after them: what it compiles they have traced
     robot = space.tree(space.start)
-    validity = curves_of.validity(job.dataset, robot, problem.batch)
+    validity = curves_of.validity(task.dataset, robot, problem.batch)
     where = w.has_current, volt, validity, robot.geometry.determines_twist
     for covariance in covariances:
         flat = flat_directions(space, covariance, *where)
-        found = estimates(space, job.choices, space.start, covariance, volt, members(flat))
+        found = estimates(space, task.choices, space.start, covariance, volt, members(flat))
         _least(parameters, found)
         _least(ratios, derived(space, space.start, covariance, volt))
         left = float(np.linalg.slogdet(covariance)[1])
         if left > most:
             most, open_ = left, flat
-    return Expected(parameters, ratios, sentences(open_))
+    return ExpectedEstimates(parameters, ratios, sentences(open_))
 
 
 def _least(kept: dict[str, Estimate], found: Iterable[Estimate]) -> None:
@@ -261,6 +261,6 @@ def _least(kept: dict[str, Estimate], found: Iterable[Estimate]) -> None:
         kept[e.path] = max(kept.get(e.path, e), e, key=promise)
 
 
-def _before(e: Estimate) -> Content:
+def _expected_json(e: Estimate) -> Content:
     kept = {"unit": e.unit, "start": e.value, "expected_std": e.std}
     return kept | {"ratio": e.ratio, "verdict": e.verdict}

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.app.config import one_floor, read_config
+from slipid.app.config import read_config, single_floor_sections
 from slipid.app.logs import read_dataset
-from slipid.app.problem import Job, read_job
+from slipid.app.problem import ConfigFitTask, read_fit_task
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
 from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.infer.fit_file import load
 from slipid.infer.result import Fit
 from slipid.model.robot import Robot
@@ -45,9 +45,9 @@ def compare(
     """
     setup_jax(quiet=True)
     config = read_config(config_path)
-    job = read_job(config, data, report)
-    refuse_misordered(job.logs)
-    asked = {name: folds_of(job.dataset, name) for name in dict.fromkeys(questions)}
+    task = read_fit_task(config, data, report)
+    refuse_misordered(task.logs)
+    asked = {name: folds_of(task.dataset, name) for name in dict.fromkeys(questions)}
     for name in [name for name, fold in asked.items() if (fold < 0).all()]:
         report.line(f"skipped: {name}: no floor has runs in two of them")
         del asked[name]
@@ -56,10 +56,10 @@ def compare(
             f"{config.path}: no run can be left out; expected several headings or speeds"
         )
     report.stage("cutting windows")
-    problem = job.problem()
+    problem = task.problem()
     writable(out)
-    key = key_of(config.hash, job.data_hash, problem.space.names, problem.noise.names)
-    results, robot = _folds(job, problem, asked, Checkpoint(out / FOLDS, key), report)
+    key = key_of(config.hash, task.data_hash, problem.space.names, problem.noise.names)
+    results, robot = _folds(task, problem, asked, Checkpoint(out / FOLDS, key), report)
     surfaces = transfer(problem.windows, robot) if problem.windows.has_current else {}
     found: Content = {
         "schema": SCHEMA,
@@ -76,7 +76,7 @@ def compare(
             for name, some in results.items()
         },
         "surfaces": surfaces,
-        "data": {"hash": job.data_hash, "runs": len(job.dataset), "skipped": list(job.skipped)},
+        "data": {"hash": task.data_hash, "runs": len(task.dataset), "skipped": list(task.skipped)},
         "config": {"name": config.path.name, "sha256": config.hash},
         "versions": versions(),
         "runs": {name: _rows(some) for name, some in results.items()},
@@ -104,12 +104,16 @@ def _cost(folds: Sequence[Content]) -> Content:
 
 
 def _folds(
-    job: Job, problem: Problem, asked: Mapping[str, Fold], kept: Checkpoint, report: Reporter
+    task: ConfigFitTask,
+    problem: Problem,
+    asked: Mapping[str, Fold],
+    kept: Checkpoint,
+    report: Reporter,
 ) -> tuple[dict[str, list[Content]], Robot]:
     """Every fold of every question, and the robot fitted to all runs."""
-    wanted = job.settings
+    wanted = task.settings
 
-    def tell(state: State) -> None:
+    def tell(state: FitState) -> None:
         report.note(f"{state.stage}, round {state.round}")
 
     fit = partial(optimise, most_rounds=wanted.rounds, tolerance=wanted.tolerance, tell=tell)
@@ -120,7 +124,7 @@ def _folds(
         return {"z": z, "log_variance": log_variance, "covariance": optimum.covariance}
 
     def one(name: str, judged: np.ndarray) -> Content:
-        return judge(problem, job.choices, job.dataset, name, judged, fit).to_json()
+        return judge(problem, task.choices, task.dataset, name, judged, fit).to_json()
 
     work: dict[tuple[str, int], Callable[[], Content]] = {
         (name, k): partial(one, name, np.flatnonzero(fold == k))
@@ -138,7 +142,7 @@ def _folds(
 
 
 def finished(kept: Checkpoint, name: str, make: Callable[[], Content]) -> Content:
-    """A piece of work as its file has it; it is made where there is none of this very job."""
+    """A piece of work as its file has it; it is made where there is none of this very task."""
     found: Content | None = kept.load_json(name)
     if found is None:
         kept.save_json(name, make())
@@ -155,7 +159,7 @@ def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Valida
     setup_jax(quiet=True)
     fit = load(out)
     config = read_config(out / "config.toml")
-    sections = one_floor(config.content.validate_.logs or config.content.logs)
+    sections = single_floor_sections(config.content.validate_.logs or config.content.logs)
     report.stage("reading logs")
     dataset, skipped = read_dataset(config, sections, data, report)
     refuse_misordered(dataset.logs)

@@ -1,4 +1,4 @@
-"""The config of a job: what the TOML file may say, checked once, every mistake with its key.
+"""The config of a task: what the TOML file may say, checked once, every mistake with its key.
 
 Units stand in the names of the keys; everything is optional that has a default here. What a key
 means stands in the docstring of its section: `slipid reference` and `slipid new` print it.
@@ -21,7 +21,7 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 Numbers = Number | list[Number]
 
 
-class Wheeled(Section):
+class WheeledDrive(Section):
     """What every robot has.
 
     Attributes:
@@ -55,7 +55,7 @@ class Wheeled(Section):
         )
 
 
-class Omni(Wheeled):
+class OmniDrive(WheeledDrive):
     """Wheels on a circle, each driving 90 deg ahead of its azimuth.
 
     Attributes:
@@ -71,7 +71,7 @@ class Omni(Wheeled):
     roller_angle_deg: Number = 90.0
 
 
-class Box(Wheeled):
+class FourWheelDrive(WheeledDrive):
     """Four wheels, front left, front right, rear left, rear right: mecanum in X, or ordinary.
 
     Attributes:
@@ -84,7 +84,7 @@ class Box(Wheeled):
     half_width_m: Positive
 
 
-class Differential(Wheeled):
+class DifferentialDrive(WheeledDrive):
     """Two ordinary wheels on an axle, left and right, and casters.
 
     Attributes:
@@ -95,7 +95,7 @@ class Differential(Wheeled):
     track_m: Positive
 
 
-class General(Wheeled):
+class GeneralDrive(WheeledDrive):
     """Any wheels: centres, drive directions, roller angles.
 
     Attributes:
@@ -114,7 +114,7 @@ class General(Wheeled):
     roller_angles_deg: list[Number | Literal["none"]]
 
     @model_validator(mode="after")
-    def _one_per_wheel(self) -> "General":
+    def _one_per_wheel(self) -> "GeneralDrive":
         wheels = len(self.wheel_places_m)
         for key in ("drive_directions_deg", "roller_angles_deg"):
             if (count := len(getattr(self, key))) != wheels:
@@ -122,7 +122,7 @@ class General(Wheeled):
         return self
 
 
-class Motor(Section):
+class BenchMotors(Section):
     """No wheels: motors on a bench, logged at their shafts.
 
     Attributes:
@@ -133,10 +133,10 @@ class Motor(Section):
     names: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]] = Field(default_factory=list)
 
 
-Wheels = Omni | Box | Differential | General
+Wheels = OmniDrive | FourWheelDrive | DifferentialDrive | GeneralDrive
 
 
-class Logs(Section):
+class LogsSection(Section):
     """Log files of one kind, found by a glob below the data folder.
 
     Attributes:
@@ -162,7 +162,7 @@ class Logs(Section):
     min_rows: int = Field(default=2, ge=2)
 
     @model_validator(mode="after")
-    def _one_floor_or_many(self) -> "Logs":
+    def _one_floor_or_many(self) -> "LogsSection":
         if self.map is not None and self.surface != "folder":
             raise ValueError("surface and map at once; expected one of them")
         if self.session_name is not None and "session" in self.model_fields_set:
@@ -170,7 +170,7 @@ class Logs(Section):
         return self
 
 
-class Camera(Section):
+class CameraSection(Section):
     """The camera that saw the pose.
 
     Attributes:
@@ -193,7 +193,7 @@ class PriorSection(Section):
     std: Positive | list[Positive]
 
 
-class Setting(Section):
+class ParameterSection(Section):
     """What is wanted of the parameters that match a pattern.
 
     Attributes:
@@ -209,13 +209,13 @@ class Setting(Section):
     prior: PriorSection | None = None
 
     @model_validator(mode="after")
-    def _not_both(self) -> "Setting":
+    def _not_both(self) -> "ParameterSection":
         if self.fixed is not None and (self.prior is not None or self.free):
             raise ValueError("fixed and free or prior at once; expected one of them")
         return self
 
 
-class Weights(Section):
+class WeightsSection(Section):
     """What is known of the weight on the wheels in a load set-up.
 
     Either what scales show under each wheel, `kg`; or that it is `like` another set-up, with
@@ -236,7 +236,7 @@ class Weights(Section):
     place_m: tuple[Number, Number] | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> "Weights":
+    def _one_way(self) -> "WeightsSection":
         added = (self.like, self.mass_kg, self.place_m)
         if self.kg is None and None in added:
             raise ValueError("expected kg, or like, mass_kg and place_m")
@@ -276,7 +276,7 @@ class ValidateSection(Section):
         logs: sections as `[[logs]]`, for `slipid validate`.
     """
 
-    logs: list[Logs] = Field(default_factory=list)
+    logs: list[LogsSection] = Field(default_factory=list)
 
 
 class SelftestSection(Section):
@@ -301,7 +301,7 @@ class SelftestSection(Section):
     wanted: list[str] | None = None
 
 
-class Content(Section):
+class ConfigContent(Section):
     """The whole file.
 
     Attributes:
@@ -316,12 +316,12 @@ class Content(Section):
         validate: runs to predict instead of those that were fitted.
     """
 
-    robot: Annotated[Wheels | Motor, Field(discriminator="drive")]
+    robot: Annotated[Wheels | BenchMotors, Field(discriminator="drive")]
     layouts: dict[str, dict[str, object]] = Field(default_factory=dict)
-    logs: list[Logs] = Field(min_length=1)
-    camera: Camera = Camera()
-    parameters: dict[str, Setting] = Field(default_factory=dict)
-    weights: dict[str, Weights] = Field(default_factory=dict)
+    logs: list[LogsSection] = Field(min_length=1)
+    camera: CameraSection = CameraSection()
+    parameters: dict[str, ParameterSection] = Field(default_factory=dict)
+    weights: dict[str, WeightsSection] = Field(default_factory=dict)
     fit: FitSection = FitSection()
     selftest: SelftestSection = SelftestSection()
     validate_: ValidateSection = Field(default_factory=ValidateSection, alias="validate")
@@ -333,21 +333,21 @@ class Content(Section):
         Raises:
             ValueError: it is a motor on a bench.
         """
-        if isinstance(self.robot, Motor):
+        if isinstance(self.robot, BenchMotors):
             raise ValueError("drive = 'motor' has no wheels on a floor")
         return self.robot
 
     @model_validator(mode="after")
-    def _floors_one_by_one(self) -> "Content":
+    def _floors_one_by_one(self) -> "ConfigContent":
         for name, sections in (("logs", self.logs), ("validate.logs", self.validate_.logs)):
-            if sections and not one_floor(sections):
+            if sections and not single_floor_sections(sections):
                 raise ValueError(
                     f"{name}: every section has a map; expected one without, of runs on one floor"
                 )
         return self
 
 
-def one_floor(sections: Sequence[Logs]) -> list[Logs]:
+def single_floor_sections(sections: Sequence[LogsSection]) -> list[LogsSection]:
     """Sections whose runs keep to one floor each."""
     return [section for section in sections if section.map is None]
 
@@ -358,7 +358,7 @@ class Config:
 
     path: Path
     text: str
-    content: Content
+    content: ConfigContent
 
     @property
     def hash(self) -> str:
@@ -373,20 +373,20 @@ def read_config(path: Path) -> Config:
 
 def parsed(path: Path, text: str) -> Config:
     """Config from TOML text; DataError with every mistake on a line that begins with the path."""
-    return Config(path, text, checked(path, mapping_of(path, text), Content))
+    return Config(path, text, checked(path, mapping_of(path, text), ConfigContent))
 
 
 def geometry(robot: Wheels) -> Geometry:
     """Geometry of a `[robot]` section; ValueError where it cannot drive."""
     radius, gear = robot.wheel_radius_m, robot.gear_ratio
-    if isinstance(robot, Omni):
+    if isinstance(robot, OmniDrive):
         azimuths, base = robot.wheel_azimuths_deg, robot.base_radius_m
         shared = robot.drive_of(len(azimuths))
         return g.omni(azimuths, base, radius, gear, robot.roller_angle_deg, shared)
-    if isinstance(robot, Box):
+    if isinstance(robot, FourWheelDrive):
         make = g.mecanum if robot.drive == "mecanum" else g.skid_steer
         return make(robot.half_length_m, robot.half_width_m, radius, gear, robot.drive_of(4))
-    if isinstance(robot, Differential):
+    if isinstance(robot, DifferentialDrive):
         robot.drive_of(2)
         return g.differential(robot.track_m / 2, radius, gear)
     rollers = [None if a == "none" else float(a) for a in robot.roller_angles_deg]

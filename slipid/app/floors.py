@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.app.config import Logs, read_config
+from slipid.app.config import LogsSection, read_config
 from slipid.app.logs import read_dataset
 from slipid.data.log import Log
 from slipid.data.reading.reader import find_logs
@@ -24,7 +24,7 @@ SCHEMA = "slipid.floors/1"
 
 
 @dataclass(frozen=True, eq=False)
-class FloorsOfRun:
+class RunFloors:
     """A run with the floor under each wheel, in the rows in which a pose was read.
 
     Attributes:
@@ -45,7 +45,7 @@ class FloorsOfRun:
 
 def floors_under(
     out: Path, map_file: Path, data: Path, glob: str | None, report: Reporter
-) -> tuple[FloorLookup, list[FloorsOfRun]]:
+) -> tuple[FloorLookup, list[RunFloors]]:
     """Floors under the wheels in runs over a map, by the camera of a fit.
 
     Args:
@@ -64,7 +64,9 @@ def floors_under(
     sections = [section for section in named if section.map is not None]
     if glob is not None:
         find_logs(data, glob)
-        sections = [Logs(glob=glob, format=named[0].format, map=str(map_file), load=named[0].load)]
+        sections = [
+            LogsSection(glob=glob, format=named[0].format, map=str(map_file), load=named[0].load)
+        ]
     if not sections:
         raise DataError(
             f"{out / 'config.toml'}: no [[logs]] with a map; expected --logs GLOB for runs over it"
@@ -75,7 +77,7 @@ def floors_under(
         report.line(sentence)
     report.stage("looking up floors")
     sessions = zip(runs.logs, runs.session, strict=True)
-    found = [_of_run(fit.robot, lookup, log, session) for log, session in sessions]
+    found = [_run_floors(fit.robot, lookup, log, session) for log, session in sessions]
     if not any(run.inside.any() for run in found):
         x, y = np.concatenate([run.pose for run in found])[0, :2]
         raise DataError(
@@ -85,7 +87,7 @@ def floors_under(
     return lookup, found
 
 
-def _of_run(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> FloorsOfRun:
+def _run_floors(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> RunFloors:
     if log.pose is None or log.pose_fresh is None:
         raise DataError(f"{log.name}: no pose; expected poses in the frame of the map")
     rows = np.flatnonzero(log.pose_fresh)
@@ -95,7 +97,7 @@ def _of_run(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> Floors
         jnp.asarray(robot.geometry.place) * robot.geometry.base_radius - robot.camera.marker_place
     )
     found = lookup.under(pose, wheels)
-    return FloorsOfRun(
+    return RunFloors(
         log.name,
         log.time[rows],
         np.asarray(pose),
@@ -105,7 +107,7 @@ def _of_run(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> Floors
     )
 
 
-def write_floors(folder: Path, lookup: FloorLookup, runs: list[FloorsOfRun]) -> list[Path]:
+def write_floors(folder: Path, lookup: FloorLookup, runs: list[RunFloors]) -> list[Path]:
     """A CSV file for each run: time, pose, and of every wheel floor and distance to the border."""
     paths = []
     for run in runs:
@@ -130,7 +132,7 @@ def write_floors(folder: Path, lookup: FloorLookup, runs: list[FloorsOfRun]) -> 
     return paths
 
 
-def summary(lookup: FloorLookup, runs: list[FloorsOfRun]) -> Content:
+def summary(lookup: FloorLookup, runs: list[RunFloors]) -> Content:
     """How much of each run every floor was under every wheel."""
     return {
         "schema": SCHEMA,

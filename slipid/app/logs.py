@@ -7,19 +7,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from zipfile import ZipFile
 
-from slipid.app.config import Config, Logs
+from slipid.app.config import Config, LogsSection
 from slipid.data.log import Log
 from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.presets import PRESETS, declared_layout, preset
 from slipid.data.reading.reader import AnyLayout, find_logs, read_logs, session_of, without_beside
 from slipid.data.runs import Runs, collect, counted_once
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.files import write_bytes
 from slipid.support.progress import Reporter
 
 
 def read_dataset(
-    config: Config, sections: Sequence[Logs], root: Path, report: Reporter
+    config: Config, sections: Sequence[LogsSection], root: Path, report: Reporter
 ) -> tuple[Runs, list[str]]:
     """Runs of some log sections, and a line for each section without files."""
     if not root.is_dir():
@@ -59,10 +59,10 @@ def read_dataset(
 
 
 def files_of(
-    config: Config, sections: Sequence[Logs], root: Path
-) -> tuple[list[tuple[Logs, list[Path]]], list[str]]:
+    config: Config, sections: Sequence[LogsSection], root: Path
+) -> tuple[list[tuple[LogsSection, list[Path]]], list[str]]:
     """Files of every log section that has some, and a line for each that has none."""
-    found: list[tuple[Logs, list[Path]]] = []
+    found: list[tuple[LogsSection, list[Path]]] = []
     skipped: list[str] = []
     for section in sections:
         try:
@@ -75,7 +75,7 @@ def files_of(
     return own, skipped
 
 
-def layout_of(config: Config, section: Logs) -> AnyLayout:
+def layout_of(config: Config, section: LogsSection) -> AnyLayout:
     """Layout a log section names: one of the config's own, else a preset."""
     own = config.content.layouts
     if section.format in own:
@@ -88,7 +88,7 @@ def layout_of(config: Config, section: Logs) -> AnyLayout:
         return declared_layout({k: v for k, v in declared.items() if k != "kind"}, where)
     if section.format not in PRESETS:
         names = [*own, *PRESETS]
-        hint = near(section.format, names)
+        hint = did_you_mean(section.format, names)
         raise DataError(
             f"{config.path}: logs.format '{section.format}': no such layout{hint}; "
             f"expected one of {', '.join(names)}"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slipid.app.config import read_config
-from slipid.app.problem import Job, read_job
+from slipid.app.problem import ConfigFitTask, read_fit_task
 from slipid.infer.fit_file import load, write_identified
 from slipid.infer.posterior import sample as netcdf
 from slipid.infer.posterior.blocks import FORMAT, Plan
@@ -25,7 +25,7 @@ FOLDER = "sampling"
 
 
 @dataclass(frozen=True, eq=False)
-class Sampled:
+class SampleResult:
     """End of `sample`.
 
     Attributes:
@@ -38,7 +38,7 @@ class Sampled:
     written: tuple[str, ...]
 
 
-def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporter) -> Sampled:
+def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporter) -> SampleResult:
     """Sample around the fit in `out`: posterior.nc, sample.json, intervals in identified.json.
 
     A chain that was interrupted there goes on. The logs lie in `data`, by default where they were
@@ -47,12 +47,12 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     began = time.monotonic()
     setup_jax(quiet=True)
     fit = load(out)
-    _on_one_floor(fit)
-    folder = _where_the_logs_are(out, data)
-    job = read_job(read_config(out / "config.toml"), folder, report)
-    _same_logs(fit, job)
+    _refuse_mixed(fit)
+    folder = _log_folder(out, data)
+    task = read_fit_task(read_config(out / "config.toml"), folder, report)
+    _refuse_other_logs(fit, task)
     report.stage("compiling")
-    fit = replace(fit, problem=job.problem(fit.robot), data=job.dataset)
+    fit = replace(fit, problem=task.problem(fit.robot), data=task.dataset)
     # all that a chain depends on; how long it may become is not of it
     told = FORMAT, fit.data_hash, replace(plan, most=10**9), draws, sorted(fit.variance.items())
     kept = Checkpoint(out / FOLDER, key_of(*told, np.asarray(fit.z), np.asarray(fit.covariance)))
@@ -66,7 +66,7 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     if found.converged:
         kept.remove()
     written = ("posterior.nc", "sample.json", "identified.json")
-    return Sampled(found, about, written)
+    return SampleResult(found, about, written)
 
 
 def _summary(found: Posterior, plan: Plan, seconds: float) -> Content:
@@ -96,7 +96,7 @@ def _summary(found: Posterior, plan: Plan, seconds: float) -> Content:
     }
 
 
-def _where_the_logs_are(out: Path, data: Path | None) -> Path:
+def _log_folder(out: Path, data: Path | None) -> Path:
     """The data folder: as given, else where the fit found its logs, if they are still there."""
     if data is not None:
         return data
@@ -107,7 +107,7 @@ def _where_the_logs_are(out: Path, data: Path | None) -> Path:
     return folder
 
 
-def _on_one_floor(fit: Fit) -> None:
+def _refuse_mixed(fit: Fit) -> None:
     """Refuse a fit that learnt from runs over several floors: their likelihood is not sampled."""
     if fit.mixed is not None:
         raise DataError(
@@ -116,9 +116,9 @@ def _on_one_floor(fit: Fit) -> None:
         )
 
 
-def _same_logs(fit: Fit, job: Job) -> None:
+def _refuse_other_logs(fit: Fit, task: ConfigFitTask) -> None:
     """Refuse logs other than those that were fitted; names the first that differs."""
-    then, now = dict(fit.runs), {log.name: log.sha256 for log in job.dataset.logs}
+    then, now = dict(fit.runs), {log.name: log.sha256 for log in task.dataset.logs}
     for name in [*then, *now]:
         if then.get(name) != now.get(name):
             what = "is missing" if name not in now else "is new" if name not in then else "changed"

@@ -9,8 +9,8 @@ from slipid.data.runs import Runs
 from slipid.infer.result import Fit
 from slipid.infer.verdicts.disputed import EndPoints, Trust, verdict_of_trust
 from slipid.predict import open_loop as replay
-from slipid.predict.floor_models import FloorModels
 from slipid.predict.kinematics import Encoder
+from slipid.predict.slip_models import FloorModels
 from slipid.predict.validation import ScoredRun, add_scores
 from slipid.support.errors import DataError
 from slipid.support.files import Content
@@ -21,7 +21,7 @@ MOST_RUNS = 24
 
 
 @dataclass(frozen=True)
-class Judgement:
+class TrustReport:
     """A verdict and the errors it rests on.
 
     Attributes:
@@ -53,16 +53,16 @@ class Judgement:
         }
 
 
-def judgement(fit: Fit, data: Runs) -> Judgement:
+def trust_report(fit: Fit, data: Runs) -> TrustReport:
     """Verdict on a fit by the runs it was made of, replayed from their first pose on."""
     some = data.subset(_picked(data))
     runs: dict[int, ScoredRun] = {}
     try:
-        cuts = replay.cuts(some, fit.robot)
+        cuts = replay.replay_windows(some, fit.robot)
     except DataError:  # a fitted lag can be so long that a short run shows nothing
         cuts = []
     for w in cuts:
-        plain = replay.follow(fit.robot, w, ENCODER.increments(w, fit.robot))
+        plain = replay.tracks_from_increments(fit.robot, w, ENCODER.increments(w, fit.robot))
         for name, tracks in ((fit.contact.name, fit.contact.tracks(w)), (ENCODER.name, plain)):
             add_scores(runs, some, name, tracks, None)
     errors: dict[str, list[list[float]]] = {}
@@ -73,7 +73,7 @@ def judgement(fit: Fit, data: Runs) -> Judgement:
         name: EndPoints(*np.mean(each, axis=0).tolist()) for name, each in sorted(errors.items())
     }
     trust = verdict_of_trust(floors, fit.converged, fit.parameters.values())
-    return Judgement(trust, floors, len(runs))
+    return TrustReport(trust, floors, len(runs))
 
 
 def _picked(data: Runs) -> list[int]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 
 
 @cache
@@ -53,7 +53,7 @@ def marker_dictionary(name: str) -> Any:
     short = name.upper().removeprefix("DICT_")
     names = dictionary_names()
     if short not in names:
-        hint = near(short, names)
+        hint = did_you_mean(short, names)
         raise DataError(f"no marker dictionary '{name}'{hint}; expected one of {', '.join(names)}")
     aruco = opencv().aruco
     return aruco.getPredefinedDictionary(getattr(aruco, f"DICT_{short}"))

@@ -40,11 +40,11 @@ def benchmark(
     from slipid.lab.benchmark.benchmark import benchmark as run
     from slipid.lab.benchmark.plots import benchmark_pictures
     from slipid.lab.benchmark.report import show_benchmark, write_page
-    from slipid.lab.benchmark.work import Wish
+    from slipid.lab.benchmark.work import BenchmarkOptions
 
     only = () if rows is None else tuple(name.strip() for name in rows.split(",") if name.strip())
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
-        found = run(Wish(data, out, only, quick), executor, report)
+        found = run(BenchmarkOptions(data, out, only, quick), executor, report)
         report.stage("drawing")
         written = write_page(found, benchmark_pictures(found), out)
         report.line(f"in {out}: benchmark.json, {written.name}")

@@ -8,13 +8,13 @@ import typer
 
 from slipid.cli.common import Json, Quiet, emit, guarded
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.camera.calibration.board import Board
     from slipid.camera.calibration.calibrate import FloorFound, LensFound
     from slipid.report.page import Page
+    from slipid.support.files import Content
 
 SIZE_STD = 0.001
 """How well a printed board or a tape is known, relative."""
@@ -97,8 +97,8 @@ def calibrate(
                 "--metres-per-pixel, --lens-height and --turn are without any calibration; "
                 "expected a single picture beside them, and no board, camera, floor or points"
             )
-        return _straight(Path(words[0]), told, size_std, out, json)
-    _asked(words, camera, floor, points)
+        return _uncalibrated(Path(words[0]), told, size_std, out, json)
+    _refuse_combinations(words, camera, floor, points)
     with Reporter(quiet=quiet) as report:
         made = None
         if words or floor is not None:
@@ -107,10 +107,12 @@ def calibrate(
         lens = _lens(words, camera, made, k3)
         place = _floor(lens, made, floor, board_height, points, std)
         report.stage("writing")
-        return _written(lens, place, out, json)
+        return _write(lens, place, out, json)
 
 
-def _asked(words: list[str], camera: Path | None, floor: Path | None, points: Path | None) -> None:
+def _refuse_combinations(
+    words: list[str], camera: Path | None, floor: Path | None, points: Path | None
+) -> None:
     """Refuse options that do not go together."""
     if bool(words) == (camera is not None):
         raise DataError("expected either pictures of a board, or --camera FILE with a known lens")
@@ -169,7 +171,7 @@ def _floor(
     return floor_from_board(lens, board, floor, board_height, size_std)
 
 
-def _straight(
+def _uncalibrated(
     picture: Path,
     told: tuple[float | None, float | None, float | None],
     size_std: float | None,
@@ -189,7 +191,7 @@ def _straight(
     return 0
 
 
-def _written(lens: "LensFound", place: "FloorFound | None", out: Path, json: str | None) -> int:
+def _write(lens: "LensFound", place: "FloorFound | None", out: Path, json: str | None) -> int:
     """Write the camera and its pictures, and say what was found."""
     from slipid.camera.calibration.calibrate import save_lens
     from slipid.plots.calibration import coverage_picture, floor_picture
@@ -212,7 +214,7 @@ def _written(lens: "LensFound", place: "FloorFound | None", out: Path, json: str
     return 1 if report.get("poor") else 0
 
 
-def _show(page: "Page", report: Content, lens_too: bool = True) -> None:
+def _show(page: "Page", report: "Content", lens_too: bool = True) -> None:
     """Print what was found, and what is not as it should be."""
     from slipid.camera.calibration.report import described
 

@@ -5,19 +5,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import DataFolder, Json, Out, OutFolder, Quiet, emit, on_wheels
-from slipid.support.files import Content
+from slipid.cli.common import DataFolder, Json, Out, OutFolder, Quiet, emit, for_robots
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.report.page import Page
+    from slipid.support.files import Content
 
 
 MOST_BEYOND = 0.05
 """Part of the rows in which wheels may be beyond the map."""
 
 
-@on_wheels
+@for_robots
 def floors(
     fitted: OutFolder,
     map: Annotated[
@@ -49,7 +49,7 @@ def floors(
     return 0 if content["beyond_the_map"] <= MOST_BEYOND else 1
 
 
-def show(page: "Page", content: Content) -> None:
+def show(page: "Page", content: "Content") -> None:
     """Print how much of each run every floor was under every wheel."""
     from slipid.report.page import table
 

@@ -1,4 +1,4 @@
-"""Pieces of runs as windows, which a likelihood sums over."""
+"""Segments of runs as windows, which a likelihood sums over."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -18,16 +18,17 @@ PerWindow = Float[np.ndarray, "window wheel"]
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Pieces of K neighbouring windows; a short run is one piece, a long one is cut.
+    """Segments of K neighbouring windows; a short run is one segment, a long one is cut.
 
     Attributes:
-        run: number of the run that each piece is cut from (piece,).
-        surface, load, session: their names for each piece.
-        began: time in its run at which each piece begins [s] (piece,).
-        dt: length of each window [s] (piece, window).
-        turn: rotation of each wheel in the window [rad] (piece, window, wheel), at lag `lag`.
-        faster: wheel speed at its end less that at its start [rad/s]; d turn / d lag = -faster.
-        pose: pose at the edges of the windows (piece, window + 1, 3), as logged.
+        run: number of the run that each segment is cut from (segment,).
+        surface, load, session: their names for each segment.
+        start: time in its run at which each segment begins [s] (segment,).
+        dt: length of each window [s] (segment, window).
+        turn: rotation of each wheel in the window [rad] (segment, window, wheel), at lag `lag`.
+        speed_change: wheel speed at its end less that at its start [rad/s], so that
+            d turn / d lag = -speed_change.
+        pose: pose at the edges of the windows (segment, window + 1, 3), as logged.
         current: mean of the signed current or of its magnitude [A]; zeros where not logged.
         voltage: mean voltage [V]; zeros where not logged.
         current_var: variance of the mean current by the ammeter's own noise [A^2]; `UNREAD`, for
@@ -38,19 +39,19 @@ class Windows:
         lag: lag of the camera behind the encoders that was assumed [s].
     """
 
-    run: Int[np.ndarray, " piece"]
+    run: Int[np.ndarray, " segment"]
     surface: tuple[str, ...]
     load: tuple[str, ...]
     session: tuple[str, ...]
-    began: Float[np.ndarray, " piece"]
-    dt: Float[np.ndarray, "piece window"]
-    turn: Float[np.ndarray, "piece window wheel"]
-    faster: Float[np.ndarray, "piece window wheel"]
-    pose: Float[np.ndarray, "piece edge 3"]
-    current: Float[np.ndarray, "piece window wheel"]
-    voltage: Float[np.ndarray, "piece window wheel"]
-    current_var: Float[np.ndarray, "piece window wheel"]
-    voltage_var: Float[np.ndarray, "piece window wheel"]
+    start: Float[np.ndarray, " segment"]
+    dt: Float[np.ndarray, "segment window"]
+    turn: Float[np.ndarray, "segment window wheel"]
+    speed_change: Float[np.ndarray, "segment window wheel"]
+    pose: Float[np.ndarray, "segment edge 3"]
+    current: Float[np.ndarray, "segment window wheel"]
+    voltage: Float[np.ndarray, "segment window wheel"]
+    current_var: Float[np.ndarray, "segment window wheel"]
+    voltage_var: Float[np.ndarray, "segment window wheel"]
     has_current: bool
     has_voltage: bool
     current_is_signed: bool
@@ -59,8 +60,8 @@ class Windows:
     def __len__(self) -> int:
         return len(self.run)
 
-    def pieces(self, index: Int[np.ndarray, " some"]) -> "Windows":
-        """Some pieces, in the order given."""
+    def segments(self, index: Int[np.ndarray, " some"]) -> "Windows":
+        """Some segments, in the order given."""
         kept = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -72,27 +73,29 @@ class Windows:
 
     def at_lag(self, lag: float) -> "Windows":
         """The same windows at another lag of the camera, to first order [s]."""
-        return replace(self, turn=self.turn - (lag - self.lag) * self.faster, lag=lag)
+        return replace(self, turn=self.turn - (lag - self.lag) * self.speed_change, lag=lag)
 
 
 def windows(
-    data: Runs, wheel_radius: float, lag: float = 0.0, per_piece: int = 4, longest: float = 6.0
+    data: Runs, wheel_radius: float, lag: float = 0.0, per_segment: int = 4, longest: float = 6.0
 ) -> Windows:
-    """Cut every run from where it has moved `MOVED` into pieces of `per_piece` windows.
+    """Cut every run from where it has moved `MOVED` into segments of `per_segment` windows.
 
     Args:
         wheel_radius: radius of the wheels [m]; it only tells where motion starts.
         lag: lag of the camera behind the encoders [s].
-        longest: longest window [s]; a longer run makes more pieces.
+        longest: longest window [s]; a longer run makes more segments.
 
     Raises:
         DataError: a run whose wheels never move that far, or too short for its windows.
     """
-    each = [_edges(data, k, wheel_radius, lag, per_piece, longest) for k in range(len(data))]
-    run = [k for k, pieces in enumerate(each) for _ in pieces]
+    each = [_edges(data, k, wheel_radius, lag, per_segment, longest) for k in range(len(data))]
+    run = [k for k, segments in enumerate(each) for _ in segments]
     noise = ammeter_variance(data)
-    pieces = [_cut(data, k, edges, lag, noise[k]) for k, cuts in enumerate(each) for edges in cuts]
-    together = {name: np.stack([piece[name] for piece in pieces]) for name in pieces[0]}
+    segments = [
+        _cut(data, k, edges, lag, noise[k]) for k, cuts in enumerate(each) for edges in cuts
+    ]
+    together = {name: np.stack([segment[name] for segment in segments]) for name in segments[0]}
     logs = [data.logs[k] for k in run]
     return Windows(
         run=np.asarray(run),
@@ -146,9 +149,9 @@ def _ammeter(amps: Float[np.ndarray, " reading"], live: Bool[np.ndarray, " readi
 
 
 def _edges(
-    data: Runs, run: int, radius: float, lag: float, per_piece: int, longest: float
+    data: Runs, run: int, radius: float, lag: float, per_segment: int, longest: float
 ) -> list[np.ndarray]:
-    """Rows at the window edges of each piece of a run.
+    """Rows at the window edges of each segment of a run.
 
     Only rows with a new pose, and those whose pose shows a time at which the wheels were measured.
     """
@@ -156,14 +159,14 @@ def _edges(
     fresh = np.flatnonzero(data.fresh[data.rows(run)])
     shown = time[fresh] - lag
     fresh = fresh[(fresh >= first) & (shown >= time[0] - 1e-9) & (shown <= time[-1] + 1e-9)]
-    if len(fresh) < per_piece + 1:
+    if len(fresh) < per_segment + 1:
         raise DataError(
             f"{data.logs[run].name}: {len(fresh)} poses after the robot started; "
-            f"expected at least {per_piece + 1}"
+            f"expected at least {per_segment + 1}"
         )
     t = data.time[data.rows(run)][fresh]
-    pieces = max(1, int(np.ceil((t[-1] - t[0]) / (per_piece * longest) - 1e-9)))
-    count = min(pieces * per_piece, (len(fresh) - 1) // per_piece * per_piece)
+    segments = max(1, int(np.ceil((t[-1] - t[0]) / (per_segment * longest) - 1e-9)))
+    count = min(segments * per_segment, (len(fresh) - 1) // per_segment * per_segment)
     at = np.linspace(t[0], t[-1], count + 1)
     picked = np.searchsorted(t, at - 1e-12).clip(0, len(t) - 1)
     earlier = (picked - 1).clip(0)
@@ -171,13 +174,13 @@ def _edges(
     if (np.diff(picked) <= 0).any():
         picked = np.linspace(0, len(fresh) - 1, count + 1).round().astype(int)
     rows = fresh[picked]
-    return [rows[k : k + per_piece + 1] for k in range(0, count, per_piece)]
+    return [rows[k : k + per_segment + 1] for k in range(0, count, per_segment)]
 
 
 def _cut(
     data: Runs, run: int, edges: np.ndarray, lag: float, noise: Float[np.ndarray, " wheel"]
 ) -> dict[str, np.ndarray]:
-    """Windows between some rows of a run: the arrays of `Windows` for this piece, by name.
+    """Windows between some rows of a run: the arrays of `Windows` for this segment, by name.
 
     The noise is the variance of a single reading of each ammeter.
     """
@@ -202,10 +205,10 @@ def _cut(
         mean_voltage, count, missed = _mean(t, data.voltage[rows], live, fresh, at)
         unread = np.where(count > 0, missed, UNREAD)
     return {
-        "began": np.asarray(t[edges[0]]),
+        "start": np.asarray(t[edges[0]]),
         "dt": np.diff(t[edges]),
         "turn": np.diff(turned, axis=0),
-        "faster": np.diff(speed, axis=0),
+        "speed_change": np.diff(speed, axis=0),
         "pose": data.pose[rows][edges],
         "current": mean_current,
         "voltage": mean_voltage,

@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from slipid.robot.closed_loop import Pilot
+from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.controller import Controller, Correction, Gains, Law
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, Odometry
@@ -46,7 +46,7 @@ class ControllerRow:
         return self.correction == "none" or robot.wheels == PAPER_WHEELS
 
 
-OWN_ROWS: Mapping[str, ControllerRow] = {
+CONTROLLERS: Mapping[str, ControllerRow] = {
     "encoder": ControllerRow("encoder", "believes its encoders"),
     "slip_odometry": ControllerRow("curve", "odometry less slip over current (figure 5)"),
     "paper_print": ControllerRow("curve", "and torque correction as printed", "paper_print"),
@@ -64,13 +64,13 @@ OWN_ROWS: Mapping[str, ControllerRow] = {
 }
 
 
-def pilot_of(
+def control_loop_of(
     robot: DeployedRobot,
     row: ControllerRow,
     settings: Settings | None = None,
     forced: bool = False,
     floor: Floor | None = None,
-) -> Pilot[eqx.Module]:
+) -> ControlLoop[eqx.Module]:
     """Estimator and controller of a row; some rows have the gains tuned for the robot.
 
     Those are taken where they are better than gains set by hand, or forced. A map of the floors is
@@ -90,4 +90,4 @@ def pilot_of(
         estimator = Odometry(robot, settings, curve=row.observer == "curve")
         own = replace(own, preview=jnp.asarray(0.0))  # the paper's loop has none
     law = None if row.law is None else row.law(robot)
-    return Pilot(estimator, Controller(robot, own, correction=row.correction, law=law))
+    return ControlLoop(estimator, Controller(robot, own, correction=row.correction, law=law))

@@ -14,19 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.deploy.effects import told_by_load
-from slipid.deploy.record_of import plain, record_of
+from slipid.deploy.robot_record import effects_by_load, plain, robot_record
 from slipid.infer.posterior.diagnosis import Posterior
 from slipid.infer.result import Fit, draws
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.model.robot import Robot
 from slipid.parameter import entries
-from slipid.predict.predictive import Contact
-from slipid.robot.actuation import Habits
+from slipid.predict.predictive import ForceBalance
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.interface import MIXED
-from slipid.robot.record import Number, Sensors, Source
+from slipid.robot.interface import MIXED_FLOORS_PENALTY
+from slipid.robot.record import LogSensors, RecordedNumber, Source
 from slipid.robot.robot_file import typed
+from slipid.robot.twin import ActuatorModel
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import versions
 from slipid.support.errors import DataError
@@ -57,7 +56,7 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
         vectors, center = flat[rows], flat.mean(axis=0)
     else:
         fit, vectors, center = found, found.draws(DRAWS), found.z
-    record = record_of(
+    record = robot_record(
         _at(fit.robot, numbers),
         {path: _number(e) for path, e in numbers.items()},
         {name: float(v) ** 0.5 for name, v in fit.contact.forecast.items()},
@@ -65,14 +64,14 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
         max(max(v.wheel_speed) for v in fit.validity.values()),
         fit.current_trend,
         fit.validity,
-        told_by_load(fit.contact, center, vectors),
+        effects_by_load(fit.contact, center, vectors),
     )
     # one that has learnt from runs over several floors expects to drive on several
-    alike = record.alike if fit.mixed is None else MIXED
+    alike = record.alike if fit.mixed is None else MIXED_FLOORS_PENALTY
     about = replace(
         record,
         source=source,
-        sensors=Sensors(current_is_signed=fit.channels.signed, voltage=fit.channels.voltage),
+        sensors=LogSensors(current_is_signed=fit.channels.signed, voltage=fit.channels.voltage),
         alike=alike,
         messages=found.messages,
         data=fit.data_hash,
@@ -103,20 +102,20 @@ def read_robot(out: Path, load: str | None = None) -> DeployedRobot:
         raise DataError(
             f"{path}: not there; `slipid identify` writes it, so run it with --out {out}"
         )
-    return steered(path, DeployedRobot.load(path, load))
+    return require_steering(path, DeployedRobot.load(path, load))
 
 
-def steered(path: Path, robot: DeployedRobot) -> DeployedRobot:
+def require_steering(path: Path, robot: DeployedRobot) -> DeployedRobot:
     """The robot of a file; DataError where its wheels have no controller."""
     if not robot.steers:
         raise DataError(f"{path}: {NO_CONTROLLER}")
     return robot
 
 
-def habits_of(robot: DeployedRobot, gyro: bool) -> Habits:
+def actuator_model_of(robot: DeployedRobot, gyro: bool) -> ActuatorModel:
     """What the twin of a robot has: the sensors of its logs, and a gyro where it has one."""
     sensors = robot.record.sensors
-    return Habits(voltage=sensors.voltage, gyro=gyro, signed=sensors.current_is_signed)
+    return ActuatorModel(voltage=sensors.voltage, gyro=gyro, signed=sensors.current_is_signed)
 
 
 def _at(robot: Robot, numbers: Mapping[str, Estimate]) -> Robot:
@@ -125,17 +124,17 @@ def _at(robot: Robot, numbers: Mapping[str, Estimate]) -> Robot:
     return Space(robot, fixed).template
 
 
-def _number(e: Estimate) -> Number:
+def _number(e: Estimate) -> RecordedNumber:
     """As robot.json has it."""
-    kept = {f.name: getattr(e, f.name) for f in fields(Number)}
-    return typed(Number, json.loads(json.dumps(kept)), e.path)
+    kept = {f.name: getattr(e, f.name) for f in fields(RecordedNumber)}
+    return typed(RecordedNumber, json.loads(json.dumps(kept)), e.path)
 
 
-def robot_of(
-    contact: Contact,
+def robot_of_force_balance(
+    contact: ForceBalance,
     highest_speed: float,
     current_trend: tuple[float, float] = (0.0, 0.0),
-    sensors: Sensors | None = None,
+    sensors: LogSensors | None = None,
     load: str | None = None,
 ) -> DeployedRobot:
     """The robot of a fit as `slipid.deploy.deploy` has it, but for what a reader is told of it.
@@ -149,23 +148,23 @@ def robot_of(
         load: set-up it drives with, the first one by default.
     """
     several = draws(contact.z, contact.covariance, DRAWS, seed=0)
-    record = record_of(
+    record = robot_record(
         contact.robot,
-        given(contact.robot),
+        given_numbers(contact.robot),
         {name: float(np.sqrt(v)) for name, v in contact.forecast.items()},
         jax.vmap(contact.space.tree)(jnp.asarray(several)),
         highest_speed,
         current_trend,
         {},
-        told_by_load(contact, contact.z, several),
+        effects_by_load(contact, contact.z, several),
     )
-    return DeployedRobot.of(replace(record, sensors=sensors or Sensors()), load)
+    return DeployedRobot.of(replace(record, sensors=sensors or LogSensors()), load)
 
 
-def given(robot: Robot) -> Mapping[str, Number]:
+def given_numbers(robot: Robot) -> Mapping[str, RecordedNumber]:
     """The numbers of a robot as they were given, by path."""
     return {
-        e.path: Number(
+        e.path: RecordedNumber(
             value=plain(np.asarray(e.get(robot))),
             unit=e.declaration.unit,
             std=None,

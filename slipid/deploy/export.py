@@ -12,30 +12,37 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.floor_map import FloorMap, read_map
-from slipid.deploy.controllers import OWN_ROWS, ControllerRow, pilot_of
-from slipid.deploy.deploy import ROBOT, habits_of, read_robot, steered
+from slipid.deploy.controllers import CONTROLLERS, ControllerRow, control_loop_of
+from slipid.deploy.deploy import ROBOT, actuator_model_of, read_robot, require_steering
 from slipid.deploy.floors import floor_of
-from slipid.deploy.twin_run import REST_S, known_to_fit, path_of, site, starts, twin
+from slipid.deploy.twin_run import (
+    REST_S,
+    path_of,
+    require_known_surfaces,
+    starts,
+    twin_floor,
+    twin_plant,
+)
 from slipid.export.c99.folder import Recording, c_files
 from slipid.export.c99.lower import UnsupportedError
+from slipid.export.description import readme, warnings
 from slipid.export.folder import check_folder, check_writable, write_folder
-from slipid.export.header import readme, warnings
 from slipid.export.ros.folder import ros2_files
 from slipid.export.stablehlo import load_program, stablehlo_files
 from slipid.export.table import table_files
 from slipid.robot import trajectory
-from slipid.robot.closed_loop import PERIOD, Pilot, Plant, drive
+from slipid.robot.closed_loop import PERIOD, ControlLoop, Plant, run_closed_loop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import Measurement, Readings
 from slipid.robot.robot_file import robot_bytes
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.progress import Reporter
 
 FORMS = ("c", "ros2", "stablehlo", "table")
 
 
 @dataclass(frozen=True)
-class Wish:
+class ExportOptions:
     """What is to be exported.
 
     Attributes:
@@ -68,7 +75,7 @@ class Exported:
 
 
 @dataclass(frozen=True)
-class Place:
+class ExampleStart:
     """Where the example is driven.
 
     Attributes:
@@ -81,12 +88,12 @@ class Place:
     believed: tuple[float, float, float]
 
 
-def _place(robot: DeployedRobot, path: trajectory.Path, file: Path | None) -> Place:
+def _place(robot: DeployedRobot, path: trajectory.Path, file: Path | None) -> ExampleStart:
     """Patches of the robot's floors, or what a map shows; DataError if it shows other floors."""
-    floor = site(robot) if file is None else read_map(file)
-    known_to_fit(floor, robot, str(file))
+    floor = twin_floor(robot) if file is None else read_map(file)
+    require_known_surfaces(floor, robot, str(file))
     begin = starts(20, floor, path)[0]
-    return Place(floor, begin, (0.0, 0.0, 0.0) if file is None else begin)
+    return ExampleStart(floor, begin, (0.0, 0.0, 0.0) if file is None else begin)
 
 
 def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedRobot:
@@ -97,7 +104,11 @@ def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedR
     """
     is_file = source.suffix == ".json"
     path = source if is_file else source / ROBOT
-    robot = steered(path, DeployedRobot.load(path, load)) if is_file else read_robot(source, load)
+    robot = (
+        require_steering(path, DeployedRobot.load(path, load))
+        if is_file
+        else read_robot(source, load)
+    )
     try:
         return robot.on(*floors) if floors else robot
     except ValueError as error:
@@ -107,9 +118,9 @@ def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedR
 def export(
     robot: DeployedRobot,
     out: Path,
-    wish: Wish,
+    wish: ExportOptions,
     report: Reporter,
-    rows: Mapping[str, ControllerRow] = OWN_ROWS,
+    rows: Mapping[str, ControllerRow] = CONTROLLERS,
 ) -> Exported:
     """Write a robot in all wanted forms to a folder, with one of the controllers `rows`.
 
@@ -121,9 +132,11 @@ def export(
         raise DataError(f"no form; expected one or more of {', '.join(FORMS)}")
     for name in wish.forms:
         if name not in FORMS:
-            raise DataError(f"no form '{name}'{near(name, FORMS)}; expected {', '.join(FORMS)}")
+            raise DataError(
+                f"no form '{name}'{did_you_mean(name, FORMS)}; expected {', '.join(FORMS)}"
+            )
     if wish.controller not in rows:
-        close = near(wish.controller, rows)
+        close = did_you_mean(wish.controller, rows)
         choices = ", ".join(rows)
         raise DataError(f"no controller '{wish.controller}'{close}; expected one of {choices}")
     row = rows[wish.controller]
@@ -134,7 +147,7 @@ def export(
     check_writable(out)
     path = path_of(wish.path, wish.speed, robot)
     place = _place(robot, path, wish.map)
-    pilot = pilot_of(robot, row, floor=floor_of(place.floor, robot.labels))
+    pilot = control_loop_of(robot, row, floor=floor_of(place.floor, robot.labels))
     path = path.moved(place.believed).waiting(REST_S)
     content: dict[str, bytes] = {"robot.json": robot_bytes(robot.record)}
     forms = tuple(form for form in FORMS if form in wish.forms)
@@ -154,17 +167,19 @@ def export(
 def _form(
     form: str,
     robot: DeployedRobot,
-    pilot: Pilot[eqx.Module],
+    pilot: ControlLoop[eqx.Module],
     path: trajectory.Path,
-    wish: Wish,
-    place: Place,
+    wish: ExportOptions,
+    place: ExampleStart,
     gyro: bool,
 ) -> dict[str, bytes]:
     if form == "stablehlo":
         return stablehlo_files(pilot)
     if form == "c":
         try:
-            text = c_files(robot, pilot, path, recorded(robot, pilot, path, wish, place, gyro))
+            text = c_files(
+                robot, pilot, path, record_example(robot, pilot, path, wish, place, gyro)
+            )
         except UnsupportedError as error:
             raise DataError(f"controller {wish.controller}: {error}") from error
     else:
@@ -172,7 +187,7 @@ def _form(
     return {name: data.encode() for name, data in text.items()}
 
 
-class _Recorded:
+class _RecordingPlant:
     """A plant whose readings are kept."""
 
     def __init__(self, plant: Plant, wheels: int):
@@ -194,18 +209,18 @@ class _Recorded:
         return self.readings[-1]
 
 
-def recorded(
+def record_example(
     robot: DeployedRobot,
-    pilot: Pilot[eqx.Module],
+    pilot: ControlLoop[eqx.Module],
     path: trajectory.Path,
-    wish: Wish,
-    place: Place,
+    wish: ExportOptions,
+    place: ExampleStart,
     gyro: bool = False,
 ) -> Recording:
     """A run of a path, as it lies for the robot's start, on the twin."""
-    habits = habits_of(robot, gyro=gyro)
-    plant = _Recorded(twin(robot, place.floor, place.true, 0, habits), robot.wheels)
-    course = drive(pilot, path, plant, place.believed)
+    habits = actuator_model_of(robot, gyro=gyro)
+    plant = _RecordingPlant(twin_plant(robot, place.floor, place.true, 0, habits), robot.wheels)
+    course = run_closed_loop(pilot, path, plant, place.believed)
     given = [
         np.concatenate([[PERIOD], *(np.ravel(x) for x in jax.tree.leaves(reading))])
         for reading in plant.readings[: len(course.command)]

@@ -7,10 +7,9 @@ import numpy as np
 from slipid.data.floor_map import FloorMap, patchwork
 from slipid.deploy.floors import floor_of
 from slipid.robot import trajectory
-from slipid.robot.actuation import Habits
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.trajectory import Path
-from slipid.robot.twin import Twin, TwinPlant
+from slipid.robot.twin import ActuatorModel, Twin, TwinPlant
 from slipid.support.errors import DataError
 
 SITE_SEED, STARTS_SEED = 7, 2021
@@ -18,7 +17,7 @@ REST_S = 1.0
 """Time for which the robot stands before it drives: a gyro learns its zero [s]."""
 
 
-def site(robot: DeployedRobot) -> FloorMap:
+def twin_floor(robot: DeployedRobot) -> FloorMap:
     """Patches of about the robot's size, half of them of the floor on which it slips least.
 
     On the test site's firm, medium and soft floors encoders then travel 80 to 90 % of the first
@@ -54,7 +53,7 @@ def starts(count: int, floor: FloorMap, path: Path) -> list[tuple[float, float, 
     return out
 
 
-def known_to_fit(floor: FloorMap, robot: DeployedRobot, path: str) -> None:
+def require_known_surfaces(floor: FloorMap, robot: DeployedRobot, path: str) -> None:
     """Refuse a map, from this file, with a surface that the twin of a robot does not have."""
     if absent := [name for name in floor.surfaces if name not in robot.labels]:
         known = ", ".join(robot.labels)
@@ -78,12 +77,12 @@ def path_of(name: str, speed: float, robot: DeployedRobot) -> trajectory.Path:
     return trajectory.PATHS[name](speed)
 
 
-def twin(
+def twin_plant(
     robot: DeployedRobot,
     floor: FloorMap,
     start: tuple[float, float, float],
     seed: int,
-    habits: Habits,
+    habits: ActuatorModel,
 ) -> TwinPlant:
     """The identified model itself as a plant, see `slipid.robot.twin`."""
     made = Twin(robot, floor_of(floor, robot.labels), habits)

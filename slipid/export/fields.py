@@ -67,7 +67,7 @@ def kind_of(dtype: np.dtype) -> Kind:
     return "int" if np.issubdtype(dtype, np.integer) else "real"
 
 
-def described(kind: type) -> dict[str, str]:
+def attribute_docs(kind: type) -> dict[str, str]:
     """What a class's docstring says of every attribute.
 
     Several attributes may share a sentence, `place, turn: of its ... [m], [rad].`, or a line, apart
@@ -91,7 +91,7 @@ def described(kind: type) -> dict[str, str]:
 
 def _fields(tree: object, prefix: str, above: str, by: type | None = None) -> list[Field]:
     if is_dataclass(tree) and not isinstance(tree, type):
-        said = described(by or type(tree))
+        said = attribute_docs(by or type(tree))
         parts = []
         for field in fields(tree):
             if not field.metadata.get("static", False):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from slipid.robot.closed_loop import PERIOD, Pilot
+from slipid.robot.closed_loop import PERIOD, ControlLoop
 from slipid.robot.interface import Readings
 
 STEPS = 48
@@ -31,7 +31,7 @@ class Golden:
     command: Float[np.ndarray, "step wheel"]
 
 
-def golden(pilot: Pilot[eqx.Module]) -> Golden:
+def golden(pilot: ControlLoop[eqx.Module]) -> Golden:
     """A drive in which every sensor speaks up, and is silent, once."""
     run = jax.jit(lambda *given: _step(pilot, *given))
     begin = pilot.init()
@@ -44,14 +44,14 @@ def golden(pilot: Pilot[eqx.Module]) -> Golden:
 
 
 def _step(
-    pilot: Pilot[eqx.Module], state: tuple, z: Readings, reference: jax.Array, dt: jax.Array
+    pilot: ControlLoop[eqx.Module], state: tuple, z: Readings, reference: jax.Array, dt: jax.Array
 ) -> tuple:
     seen, said = pilot.estimator.step(state[0], z, dt)
     held, command = pilot.controller.step(state[1], reference, said, dt)
     return (seen, held), said, command
 
 
-def _drive(pilot: Pilot[eqx.Module]) -> Iterator[tuple[Readings, jax.Array, float]]:
+def _drive(pilot: ControlLoop[eqx.Module]) -> Iterator[tuple[Readings, jax.Array, float]]:
     """Readings, references and time steps: a late and a lost one, and wheels silent for long."""
     robot = pilot.controller.robot
     angle, count = np.zeros(robot.wheels), robot.wheels

@@ -21,7 +21,7 @@ from jaxtyping import Array
 
 from slipid.export.fields import Struct
 from slipid.export.golden import Golden, golden
-from slipid.robot.closed_loop import Pilot
+from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.interface import Measurement, Readings
 from slipid.robot.robot_file import typed
 from slipid.support.errors import DataError
@@ -89,7 +89,7 @@ class Program:
     batch: export.Exported
 
 
-def stablehlo_files(pilot: Pilot[eqx.Module]) -> dict[str, bytes]:
+def stablehlo_files(pilot: ControlLoop[eqx.Module]) -> dict[str, bytes]:
     """Content of the files by their names: the step of one robot and of many, and what goes in."""
     begin = pilot.init()
     state = begin.seen, begin.held
@@ -126,7 +126,7 @@ def stablehlo_files(pilot: Pilot[eqx.Module]) -> dict[str, bytes]:
     }
 
 
-def _signature(pilot: Pilot[eqx.Module]) -> Signature:
+def _signature(pilot: ControlLoop[eqx.Module]) -> Signature:
     begin = pilot.init()
     wheels = pilot.controller.robot.wheels
     nothing = Readings.nothing(wheels)

@@ -23,8 +23,8 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import brentq
 from scipy.stats import f as fisher
 
-from slipid.fit.shared import AXES, FloorShared
-from slipid.fit.variances import DEGREES, VARIANCE_SPREAD, Search, Square, Target
+from slipid.fit.shared_effects import AXES, SharedEffects
+from slipid.fit.variances import DEGREES, VARIANCE_SPREAD, Objective, Search, Square
 
 _STEPS, _SETTLED = 20, 1e-5
 """Most scoring steps in a turn, and a step of a log variance that counts as rest."""
@@ -38,7 +38,7 @@ _GRID = np.geomspace(0.1, 4.0, 60)
 """Stds of the load biases that are weighed, over the typical one."""
 
 
-class _Axis(NamedTuple):
+class _AxisEffects(NamedTuple):
     """The effects of the runs on a floor along one axis.
 
     Attributes:
@@ -49,7 +49,7 @@ class _Axis(NamedTuple):
     """
 
     number: int
-    pieces: Int[np.ndarray, " run"]
+    segments: Int[np.ndarray, " run"]
     left: Float[np.ndarray, " run"]
     fixed: Float[np.ndarray, "run run"]
     noise: Float[np.ndarray, " run"]
@@ -58,7 +58,7 @@ class _Axis(NamedTuple):
 
 
 def effect_variances(
-    target: Target,
+    objective: Objective,
     motion: tuple[Array, Array],
     weight: Array,
     covariance: Square,
@@ -72,14 +72,14 @@ def effect_variances(
         covariance: of the search vector.
     """
     out = np.array(log_v)
-    for axis in _axes(target, motion, weight, covariance, log_v):
-        typical = np.asarray(target.typical)[axis.numbers]
-        out[axis.numbers] = _scored(axis, out[axis.numbers], typical)
+    for axis in _axes(objective, motion, weight, covariance, log_v):
+        typical = np.asarray(objective.typical)[axis.numbers]
+        out[axis.numbers] = _scoring_steps(axis, out[axis.numbers], typical)
     return out
 
 
 def effect_information(
-    target: Target,
+    objective: Objective,
     motion: tuple[Array, Array],
     weight: Array,
     covariance: Square,
@@ -87,15 +87,15 @@ def effect_information(
 ) -> Float[np.ndarray, "variance variance"]:
     """Expected information of the same log variances, zero for the others."""
     out = np.zeros((len(log_v), len(log_v)))
-    for axis in _axes(target, motion, weight, covariance, log_v):
+    for axis in _axes(objective, motion, weight, covariance, log_v):
         v = np.exp(log_v)[axis.numbers]
-        inverse = np.linalg.inv(_whole(axis, v))
+        inverse = np.linalg.inv(_covariance(axis, v))
         grown = [k * (inverse @ b) for k, b in zip(v, axis.bases, strict=True)]
         out[np.ix_(axis.numbers, axis.numbers)] += _information(grown)
     return out
 
 
-class Courses(NamedTuple):
+class TravelDirections(NamedTuple):
     """Direction of travel of every piece [rad], nan on the spot, its way [m], and its set-up."""
 
     direction: Float[np.ndarray, " piece"]
@@ -104,12 +104,12 @@ class Courses(NamedTuple):
 
 
 def extrapolation(
-    target: Target,
+    objective: Objective,
     motion: tuple[Array, Array],
     keep: Float[np.ndarray, " piece"],
     covariance: Square,
     log_v: Float[np.ndarray, " variance"],
-    courses: Courses,
+    courses: TravelDirections,
 ) -> dict[str, float]:
     """By what variances are too small where nothing near was seen, by set-up of a piece.
 
@@ -124,13 +124,15 @@ def extrapolation(
     Sources: Sundararajan and Keerthi 2001, Neural Computation 13(5), eq. for leaving out; Bachoc
     2013, Computational Statistics and Data Analysis 66, on wrong models.
     """
-    axes = _axes(target, motion, jnp.asarray(keep), covariance, log_v)
-    left = _left_out(axes, log_v, courses.direction)
+    axes = _axes(objective, motion, jnp.asarray(keep), covariance, log_v)
+    left = _held_out_effects(axes, log_v, courses.direction)
     names = np.asarray(courses.setup)
-    return {name: _growth(left, courses.far, names == name) for name in dict.fromkeys(names)}
+    return {
+        name: _variance_growth(left, courses.far, names == name) for name in dict.fromkeys(names)
+    }
 
 
-class _LeftOut(NamedTuple):
+class _HeldOutEffects(NamedTuple):
     """Effects of pieces along, across and in yaw as others predict them; nan where none do.
 
     Attributes:
@@ -143,29 +145,29 @@ class _LeftOut(NamedTuple):
     own: Float[np.ndarray, "piece 3"]
 
 
-def _left_out(
-    axes: Iterable[_Axis],
+def _held_out_effects(
+    axes: Iterable[_AxisEffects],
     log_v: Float[np.ndarray, " variance"],
     direction: Float[np.ndarray, " piece"],
-) -> _LeftOut:
-    found = _LeftOut(*(np.full((len(direction), len(AXES)), np.nan) for _ in range(3)))
+) -> _HeldOutEffects:
+    found = _HeldOutEffects(*(np.full((len(direction), len(AXES)), np.nan) for _ in range(3)))
     for axis in axes:
         v = np.exp(log_v)[axis.numbers]
-        inverse, groups = np.linalg.inv(_whole(axis, v)), _sectors(direction[axis.pieces])
+        inverse, groups = np.linalg.inv(_covariance(axis, v)), _sectors(direction[axis.segments])
         if len(groups) < 3:
             continue
         white = inverse @ axis.left
         own = axis.noise + v[0] * np.diag(axis.bases[0])
         for mine in groups:
             spread = np.linalg.inv(inverse[np.ix_(mine, mine)])
-            at = axis.pieces[mine], axis.number
+            at = axis.segments[mine], axis.number
             found.gap[at], found.spread[at] = spread @ white[mine], np.diag(spread)
             found.own[at] = np.minimum(own[mine], np.diag(spread))
     return found
 
 
-def _growth(
-    left: _LeftOut, far: Float[np.ndarray, " piece"], mine: Bool[np.ndarray, " piece"]
+def _variance_growth(
+    left: _HeldOutEffects, far: Float[np.ndarray, " piece"], mine: Bool[np.ndarray, " piece"]
 ) -> float:
     """Of what a region of ends is made of beside own effects, to hold 90 % of those left out."""
     mine = mine & np.isfinite(left.gap).all(axis=1)
@@ -205,35 +207,35 @@ def _sectors(direction: Float[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]
 
 
 def _axes(
-    target: Target,
+    objective: Objective,
     motion: tuple[Array, Array],
     weight: Array,
     covariance: Square,
     log_v: Float[np.ndarray, " variance"],
-) -> Iterator[_Axis]:
-    space = target.space
+) -> Iterator[_AxisEffects]:
+    space = objective.space
     of_floor = space.where(lambda e: e.surface is not None)
     wide = np.where(of_floor[:, None] | of_floor, 0.0, covariance)
-    wide[of_floor, of_floor] = np.asarray(target.prior_std(log_v))[of_floor] ** 2
-    scale = np.asarray(target.blocks["motion"].covariance(jnp.asarray(log_v)))
+    wide[of_floor, of_floor] = np.asarray(objective.prior_std(log_v))[of_floor] ** 2
+    scale = np.asarray(objective.blocks["motion"].covariance(jnp.asarray(log_v)))
     gap, slope, counted = np.asarray(motion[0]), np.asarray(motion[1]), np.asarray(weight)
-    for floor in target.shared:
-        kept = counted[np.asarray(floor.pieces)] > 0
-        mine = np.asarray(floor.pieces)[kept]
+    for floor in objective.shared:
+        kept = counted[np.asarray(floor.segments)] > 0
+        mine = np.asarray(floor.segments)[kept]
         if len(mine) < 2:
             continue
         run, effect = np.exp(log_v)[np.asarray(floor.numbers)[0]], np.asarray(floor.effect)[kept]
-        left, noise, by = _left(gap[mine], slope[mine], scale[mine], effect, run)
+        left, noise, by = _remaining_effects(gap[mine], slope[mine], scale[mine], effect, run)
         for k in range(len(AXES)):
             alone = noise[:, k] / counted[mine]
             fixed = np.diag(alone) + by[:, k] @ wide @ by[:, k].T
-            pieces = _pieces(floor, k, kept, counted[mine])
-            numbers, bases = [n for n, _ in pieces], [c for _, c in pieces]
-            yield _Axis(k, mine, left[:, k], fixed, alone, numbers, bases)
+            segments = _variance_bases(floor, k, kept, counted[mine])
+            numbers, bases = [n for n, _ in segments], [c for _, c in segments]
+            yield _AxisEffects(k, mine, left[:, k], fixed, alone, numbers, bases)
 
 
-def _pieces(
-    floor: FloorShared, axis: int, kept: Bool[np.ndarray, " run"], weight: np.ndarray
+def _variance_bases(
+    floor: SharedEffects, axis: int, kept: Bool[np.ndarray, " run"], weight: np.ndarray
 ) -> list[tuple[int, np.ndarray]]:
     """Variance numbers, and what each makes of the covariance of the effects along an axis."""
     own, near, session = np.asarray(floor.numbers)[:, axis].tolist()
@@ -242,7 +244,7 @@ def _pieces(
     return [(number, matrix) for number, matrix in found if number >= 0]
 
 
-def _left(
+def _remaining_effects(
     gap: np.ndarray, slope: np.ndarray, scale: np.ndarray, effect: np.ndarray, run: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Effects left in each run (run, 3), their variance by camera and process, their slope."""
@@ -254,7 +256,7 @@ def _left(
     return left, np.diagonal(cov, axis1=1, axis2=2), take @ slope
 
 
-def _whole(axis: _Axis, v: np.ndarray) -> Float[np.ndarray, "run run"]:
+def _covariance(axis: _AxisEffects, v: np.ndarray) -> Float[np.ndarray, "run run"]:
     """Covariance of the effects at some variances."""
     return np.asarray(axis.fixed + sum(k * b for k, b in zip(v, axis.bases, strict=True)))
 
@@ -263,14 +265,14 @@ def _information(grown: list[np.ndarray]) -> np.ndarray:
     return np.array([[0.5 * np.sum(a * b.T) for b in grown] for a in grown])
 
 
-def _scored(axis: _Axis, log_v: np.ndarray, typical: np.ndarray) -> np.ndarray:
+def _scoring_steps(axis: _AxisEffects, log_v: np.ndarray, typical: np.ndarray) -> np.ndarray:
     """Log variances after Fisher scoring steps of the restricted likelihood.
 
     A step that makes it smaller is halved.
     """
 
     def loss(at: np.ndarray) -> float:
-        root = np.linalg.cholesky(_whole(axis, np.exp(at)))
+        root = np.linalg.cholesky(_covariance(axis, np.exp(at)))
         white = np.linalg.solve(root, axis.left)
         pull = (at - typical) / VARIANCE_SPREAD
         return float(np.log(np.diag(root)).sum() + 0.5 * white @ white + 0.5 * pull @ pull)
@@ -278,7 +280,7 @@ def _scored(axis: _Axis, log_v: np.ndarray, typical: np.ndarray) -> np.ndarray:
     before = loss(log_v)
     for _ in range(_STEPS):
         v = np.exp(log_v)
-        inverse = np.linalg.inv(_whole(axis, v))
+        inverse = np.linalg.inv(_covariance(axis, v))
         white = inverse @ axis.left
         grown = [k * (inverse @ b) for k, b in zip(v, axis.bases, strict=True)]
         told = [k * white @ b @ white for k, b in zip(v, axis.bases, strict=True)]
@@ -297,10 +299,10 @@ def _scored(axis: _Axis, log_v: np.ndarray, typical: np.ndarray) -> np.ndarray:
 
 
 def pooled(
-    precision: Square, z: Search, target: Target, log_v: Float[np.ndarray, " variance"]
+    precision: Square, z: Search, objective: Objective, log_v: Float[np.ndarray, " variance"]
 ) -> float:
     """Log of the mean variance of the load biases of floors; arguments as of `pooled_stds`."""
-    found = pooled_stds(precision, z, target, log_v)
+    found = pooled_stds(precision, z, objective, log_v)
     return float(np.log(found.weight @ found.std**2))
 
 
@@ -312,7 +314,7 @@ class PooledStds(NamedTuple):
 
 
 def pooled_stds(
-    precision: Square, z: Search, target: Target, log_v: Float[np.ndarray, " variance"]
+    precision: Square, z: Search, objective: Objective, log_v: Float[np.ndarray, " variance"]
 ) -> PooledStds:
     """Stds of the load biases with a half-normal prior, on a grid.
 
@@ -320,14 +322,14 @@ def pooled_stds(
 
     Source: Gelman 2006, Bayesian Analysis 1(3), on half-normal priors of group stds.
     """
-    at = np.flatnonzero(target.space.pooled)
-    now = np.exp(-log_v[target.pooled])
+    at = np.flatnonzero(objective.space.pooled)
+    now = np.exp(-log_v[objective.pooled])
     told = np.asarray(precision).copy()
     away = np.zeros(len(told))
-    away[at] = (z - target.space.prior_mean)[at]
+    away[at] = (z - objective.space.prior_mean)[at]
     pull = told @ away
     told[at, at] -= now
-    typical = np.exp(0.5 * float(target.typical[target.pooled]))
+    typical = np.exp(0.5 * float(objective.typical[objective.pooled]))
     log = []
     for part in _GRID:
         with_prior = told.copy()

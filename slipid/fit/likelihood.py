@@ -20,7 +20,7 @@ from slipid.model.robot import Robot
 Marker = Float[Array, "piece window 3"]
 """Increments of the marker [m, m, rad], or body twists [m/s, m/s, rad/s], of every window."""
 PerDrive = Float[Array, "piece window drive"]
-Felt = Float[Array, "piece window drive 2"]
+MotorForce = Float[Array, "piece window drive 2"]
 """What `model.robot.felt` says of the wheels of every drive."""
 PerChannel = Float[Array, "piece m"]
 """Window by window the drives of every piece, as residuals are."""
@@ -30,7 +30,7 @@ SMOOTH = 0.03
 FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
 """Variance added to every residual: rounding of the logs [m^2, A^2, V^2]."""
 
-_AS_THEY_ARE = ("dt", "turn", "faster", "pose", "current", "voltage", "current_var", "lag")
+_AS_THEY_ARE = ("dt", "turn", "speed_change", "pose", "current", "voltage", "current_var", "lag")
 
 
 def with_slope(of: Callable[[Array], Array], z: Array | np.ndarray) -> tuple[Array, Array]:
@@ -51,7 +51,7 @@ class Batch(eqx.Module):
     session: Int[Array, " piece"]
     dt: Float[Array, "piece window"]
     turn: PerDrive
-    faster: PerDrive
+    speed_change: PerDrive
     pose: Float[Array, "piece edge 3"]
     current: PerDrive
     voltage: PerDrive
@@ -104,12 +104,12 @@ class Predicted(eqx.Module):
 
     increment: Marker
     twist: Marker
-    felt: Felt
+    motor_force: MotorForce
 
 
 def wheel_speed(robot: Robot, b: Batch) -> PerDrive:
     """Mean wheel speed of every drive and window at the robot's camera lag [rad/s]."""
-    return (b.turn - (robot.camera.lag - b.lag) * b.faster) / b.dt[..., None]
+    return (b.turn - (robot.camera.lag - b.lag) * b.speed_change) / b.dt[..., None]
 
 
 def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
@@ -119,10 +119,10 @@ def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
     def window(w: Array, near: Array | None, surface: Array, load: Array) -> tuple[Array, Array]:
         w = shape.at_wheels(w)
         xi = model.twist(robot, frame, w, surface, load, near)
-        return xi, shape.at_drives(model.felt(robot, frame, xi, w, surface, load).T).T
+        return xi, shape.at_drives(model.motor_forces(robot, frame, xi, w, surface, load).T).T
 
-    twist, felt = each_window(window, b, wheel_speed(robot, b), near)
-    return Predicted(seen(robot, twist, b.dt, b.session), twist, felt)
+    twist, motor_force = each_window(window, b, wheel_speed(robot, b), near)
+    return Predicted(marker_increments(robot, twist, b.dt, b.session), twist, motor_force)
 
 
 def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | None = None) -> Any:
@@ -131,64 +131,66 @@ def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | No
     All windows are one axis meanwhile: two, one inside the other, take JAX half as long again to
     trace.
     """
-    pieces, windows = b.dt.shape
+    segments, windows = b.dt.shape
 
     def flat(x: Array) -> Array:
-        return x.reshape(pieces * windows, *x.shape[2:])
+        return x.reshape(segments * windows, *x.shape[2:])
 
-    def of_piece(x: Array) -> Array:
-        return jnp.repeat(x, windows, axis=0, total_repeat_length=pieces * windows)
+    def of_segment(x: Array) -> Array:
+        return jnp.repeat(x, windows, axis=0, total_repeat_length=segments * windows)
 
-    surface = flat(b.surface) if b.surface.ndim > 1 else of_piece(b.surface)
+    surface = flat(b.surface) if b.surface.ndim > 1 else of_segment(b.surface)
     at = None if near is None else flat(near)
     found = jax.vmap(of, (0, None if near is None else 0, 0, 0))(
-        flat(w), at, surface, of_piece(b.load)
+        flat(w), at, surface, of_segment(b.load)
     )
-    return jax.tree.map(lambda x: x.reshape(pieces, windows, *x.shape[1:]), found)
+    return jax.tree.map(lambda x: x.reshape(segments, windows, *x.shape[1:]), found)
 
 
-def seen(
+def marker_increments(
     robot: Robot, twist: Marker, dt: Float[Array, "piece window"], session: Int[Array, " piece"]
 ) -> Marker:
     """Marker increments of every window for given body twists."""
 
     def window(xi: Array, dt: Array, session: Array) -> Array:
-        return robot.camera.seen(se2.advance(xi, dt), session)
+        return robot.camera.marker_increment(se2.advance(xi, dt), session)
 
     return jax.vmap(jax.vmap(window, (0, 0, None)))(twist, dt, session)
 
 
-def predicted_current(robot: Robot, b: Batch, felt: Felt) -> PerDrive:
+def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDrive:
     """Motor current of every window [A] given what motors work against, or its size."""
     friction = robot.surfaces.friction[b.surface]  # of the wheels on average, as `felt` has it
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
     weight = friction * robot.body.mass * model.GRAVITY
-    torque = robot.geometry.wheel_radius * weight[..., None] * robot.motor.borne(felt)
+    torque = (
+        robot.geometry.wheel_radius * weight[..., None] * robot.motor.opposing_force(motor_force)
+    )
     amps = robot.motor.current(torque, wheel_speed(robot, b))
     if b.signed:
         return amps + robot.motor.current_offset
     return jnp.sqrt(amps**2 + SMOOTH**2) + robot.motor.current_offset
 
 
-def measured(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Marker:
+def measured_increments(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Marker:
     """Marker increments in the frame of each window's start, in corrected metres."""
 
-    def piece(edges: Float[Array, "edge 3"]) -> Float[Array, "window 3"]:
+    def segment(edges: Float[Array, "edge 3"]) -> Float[Array, "window 3"]:
         p = jax.vmap(robot.camera.corrected)(edges)
         c, s = jnp.cos(p[:-1, 2]), jnp.sin(p[:-1, 2])
         d = p[1:] - p[:-1]
         return jnp.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], d[:, 2]], axis=-1)
 
-    return jax.vmap(piece)(pose)
+    return jax.vmap(segment)(pose)
 
 
 def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "piece m"]:
     """Predicted less measured marker increments, a row per piece [m, m, rad]."""
-    return (p.increment - measured(robot, b.pose)).reshape(b.dt.shape[0], -1)
+    return (p.increment - measured_increments(robot, b.pose)).reshape(b.dt.shape[0], -1)
 
 
 def electric_residuals(
-    robot: Robot, b: Batch, felt: Felt, noise: ElectricNoise
+    robot: Robot, b: Batch, motor_force: MotorForce, noise: ElectricNoise
 ) -> dict[str, Array]:
     """Predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
 
@@ -197,13 +199,13 @@ def electric_residuals(
     """
     if not b.has_current:
         return {}
-    predicted = predicted_current(robot, b, felt)
+    predicted = predicted_current(robot, b, motor_force)
     out = {"current": _flat(predicted - b.current)}
     if b.has_voltage:
-        amps = predicted + _flow(b, noise)[0] * (b.current - predicted)
+        amps = predicted + _true_current_share(b, noise)[0] * (b.current - predicted)
         w = b.turn / b.dt[..., None]
         volts = robot.motor.voltage((amps - robot.motor.current_offset) * _direction(b), w)
-        out["voltage"] = _flat(volts - b.voltage) / spread(b, noise)
+        out["voltage"] = _flat(volts - b.voltage) / voltage_spread(b, noise)
     return out
 
 
@@ -216,7 +218,7 @@ def _direction(b: Batch) -> PerDrive:
     return jnp.ones_like(b.turn) if b.signed else jnp.tanh(b.turn / b.dt[..., None] / 0.2)
 
 
-def _flow(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDrive]:
+def _true_current_share(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDrive]:
     """Share k of the gap of a measured current that is true current, and what stays unknown of it.
 
     The true current is N(predicted, s^2) before it is measured with the noise sigma^2. Afterwards
@@ -237,7 +239,7 @@ def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, 
     camera = camera_log_jacobian(robot, b.pose)
     if not (b.has_current and b.has_voltage):
         return camera, jnp.zeros_like(camera)
-    return camera, -jnp.sum(jnp.log(spread(b, noise)), axis=1)
+    return camera, -jnp.sum(jnp.log(voltage_spread(b, noise)), axis=1)
 
 
 def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, " piece"]:
@@ -245,12 +247,12 @@ def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Flo
     return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
 
 
-def spread(b: Batch, noise: ElectricNoise) -> PerChannel:
+def voltage_spread(b: Batch, noise: ElectricNoise) -> PerChannel:
     """Std of the voltage residual over that of the voltage noise.
 
     The rest is of the true current that the ammeter and the model leave unknown, times R.
     """
-    unknown = (noise.resistance * _direction(b)) ** 2 * _flow(b, noise)[1]
+    unknown = (noise.resistance * _direction(b)) ** 2 * _true_current_share(b, noise)[1]
     return _flat(jnp.sqrt(1.0 + unknown / noise.voltage_std**2))
 
 

@@ -7,7 +7,7 @@ The residuals of a piece have the covariance
                          the run's own effect along, across and in yaw, per floor
 
 so the run effects are marginalised. Runs over several floors have variances of their own, as if
-they were driven on one more floor. What runs share with each other (`slipid.fit.shared`)
+they were driven on one more floor. What runs share with each other (`slipid.fit.shared_effects`)
 and how far floors differ from what is common to them have variances, too, beside these blocks. What
 is known beside them, as the ammeter's noise is, is added.
 """
@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from slipid.data.windows import Windows
-from slipid.fit.crossing import CURRENT, MOTION, Crossing
 from slipid.fit.likelihood import FLOOR, Batch, ElectricNoise, voltage_std
+from slipid.fit.multi_floor import MULTI_FLOOR_CURRENT, MULTI_FLOOR_MOTION, MultiFloorRuns
 from slipid.model.robot import Robot
 
 
@@ -37,7 +37,7 @@ class Components(eqx.Module):
     base: Float[Array, "piece component m m"]
     which: Int[Array, "piece component"]
     known: Float[Array, "piece m"]
-    pieces: Int[Array, " piece"]
+    segments: Int[Array, " piece"]
     count: Float[Array, " piece"]
 
     def covariance(
@@ -74,7 +74,7 @@ class Component:
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
+class NoiseModel:
     """Every variance component, and the matrices of each block of residuals."""
 
     components: tuple[Component, ...]
@@ -95,7 +95,7 @@ _MOTION = (
     ("yaw", "rad/sqrt(m)", 0.01),
 )
 _EFFECT = (("along", "m/m", 0.01), ("across", "m/m", 0.01), ("yaw", "rad/m", 0.03))
-_CROSSING = (
+_MULTI_FLOOR = (
     ("process.along", "m/sqrt(m)", 0.02),
     ("process.across", "m/sqrt(m)", 0.01),
     ("process.yaw", "rad/sqrt(m)", 0.05),
@@ -109,7 +109,7 @@ POOLED = "pooled.load_bias"
 """Name of the variance of the load biases of floors."""
 
 
-def noise(windows: Windows, robot: Robot, crossing: Crossing | None = None) -> Noise:
+def noise(windows: Windows, robot: Robot, multi_floor: MultiFloorRuns | None = None) -> NoiseModel:
     """Variance components for these windows, with distances and directions from the encoders.
 
     Pieces of runs over several floors are numbered after those of the windows.
@@ -122,15 +122,15 @@ def noise(windows: Windows, robot: Robot, crossing: Crossing | None = None) -> N
     for floor in floors:
         table += [Component("process", what, floor, u, v) for what, u, v in _MOTION]
         table += [Component("run", what, floor, u, v) for what, u, v in _EFFECT]
-    several = [floor for floor in floors if len(sessions_on(windows, floor)) > 1]
+    several_sessions = [floor for floor in floors if len(sessions_on(windows, floor)) > 1]
     for kind, part in SHARED.items():
-        for floor in several if kind == "session" else floors:
+        for floor in several_sessions if kind == "session" else floors:
             table += [Component(kind, what, floor, u, part * v) for what, u, v in _EFFECT]
     table.append(Component("pooled", "load_bias", None, "1", 0.05))
     on = _floors(windows, robot)
     blocks = {"motion": _motion_components(windows, robot, 2 + 6 * on)}
-    if crossing is not None:
-        table += _crossing_components(crossing, robot, len(windows), len(table), blocks)
+    if multi_floor is not None:
+        table += _multi_floor_components(multi_floor, robot, len(windows), len(table), blocks)
     if windows.has_current:
         start = len(table)
         for floor in floors:
@@ -142,7 +142,7 @@ def noise(windows: Windows, robot: Robot, crossing: Crossing | None = None) -> N
         unread = windows.voltage_var.reshape(n, -1)
         blocks["voltage"] = _components("voltage", base, np.full((n, 1), len(table)), unread)
         table.append(Component("voltage", "window", None, "V", 0.05))
-    return Noise(tuple(table), blocks)
+    return NoiseModel(tuple(table), blocks)
 
 
 def sessions_on(windows: Windows, floor: str) -> list[str]:
@@ -164,21 +164,29 @@ def electric_noise(
     return ElectricNoise(voltage_std(log_v[-1]), scatter + FLOOR["current"], resistance)
 
 
-def _crossing_components(
-    crossing: Crossing, robot: Robot, pieces: int, start: int, blocks: dict[str, Components]
+def _multi_floor_components(
+    multi_floor: MultiFloorRuns,
+    robot: Robot,
+    segments: int,
+    start: int,
+    blocks: dict[str, Components],
 ) -> list[Component]:
     """Variances of runs over several floors, whose covariance pieces go into the blocks.
 
     `pieces` is how many pieces come before theirs, `start` how many variances.
     """
-    w, none = crossing.windows, np.zeros((len(crossing.windows), 1), int)
-    table = [Component("crossing", what, None, unit, typical) for what, unit, typical in _CROSSING]
+    w, none = multi_floor.windows, np.zeros((len(multi_floor.windows), 1), int)
+    table = [
+        Component("crossing", what, None, unit, typical) for what, unit, typical in _MULTI_FLOOR
+    ]
     motion = _motion_components(w, robot, none + start)
-    blocks[MOTION] = _counted(motion, np.repeat(crossing.counts, 3, axis=1), pieces)
+    blocks[MULTI_FLOOR_MOTION] = _counted(
+        motion, np.repeat(multi_floor.counts, 3, axis=1), segments
+    )
     if w.has_current:
         current = _current_components(w, none + start + len(table))
-        live = np.repeat(crossing.counts, w.turn.shape[2], axis=1)
-        blocks[CURRENT] = _counted(current, live, pieces)
+        live = np.repeat(multi_floor.counts, w.turn.shape[2], axis=1)
+        blocks[MULTI_FLOOR_CURRENT] = _counted(current, live, segments)
         table += [Component("crossing", f"current.{k}", None, "A", 0.05) for k in ("window", "run")]
     return table
 
@@ -190,7 +198,7 @@ def _counted(of: Components, live: Bool[np.ndarray, "piece m"], first: int) -> C
         base=jnp.where(both, of.base, 0.0),
         which=of.which,
         known=jnp.where(live, of.known, 1.0),
-        pieces=of.pieces + first,
+        segments=of.segments + first,
         count=jnp.asarray(live.sum(axis=1), float),
     )
 
@@ -204,14 +212,16 @@ def _components(
         base=jnp.asarray(base),
         which=jnp.asarray(which),
         known=jnp.asarray(np.full((n, m), FLOOR[block]) + more),
-        pieces=jnp.arange(n),
+        segments=jnp.arange(n),
         count=jnp.full(n, float(m)),
     )
 
 
-def steps(windows: Windows | Batch, robot: Robot) -> Float[np.ndarray, "piece window 3"]:
+def encoder_increments(
+    windows: Windows | Batch, robot: Robot
+) -> Float[np.ndarray, "piece window 3"]:
     """Movement of the body in each window by the encoders, in its own frame [m, m, rad]."""
-    j = np.asarray(robot.geometry.least())
+    j = np.asarray(robot.geometry.pseudo_inverse())
     return np.asarray(windows.turn) * float(robot.geometry.wheel_radius) @ j.T
 
 
@@ -220,7 +230,7 @@ def travel(windows: Windows | Batch, robot: Robot) -> tuple[np.ndarray, np.ndarr
 
     Turning counts with the way of the wheels.
     """
-    step = steps(windows, robot)
+    step = encoder_increments(windows, robot)
     far = np.linalg.norm(step[..., :2], axis=-1)
     turned = np.abs(step[..., 2]) * float(robot.geometry.base_radius)
     way = step[..., :2] / np.maximum(far, 1e-9)[..., None]

@@ -14,9 +14,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.fit import likelihood as lk
-from slipid.fit.crossing import CURRENT, MOTION, Several
+from slipid.fit.multi_floor import MULTI_FLOOR_CURRENT, MULTI_FLOOR_MOTION, MultiFloorBatch
 from slipid.fit.noise import Components, electric_noise
-from slipid.fit.shared import FloorShared, Tie, freed_slopes, shared_slopes, shared_spread, ties
+from slipid.fit.shared_effects import (
+    EffectPosterior,
+    SharedEffects,
+    effect_covariances,
+    effect_posteriors,
+    marginal_slopes,
+    mean_effect_slopes,
+)
 from slipid.search_space import Space
 
 Vector = Array | np.ndarray
@@ -29,7 +36,7 @@ Blocks = dict[str, Array]
 """An array for every block of residuals: `motion`, `current`, `voltage`, those of `crossing`."""
 Noises = dict[str, Components]
 """Covariance pieces of every block."""
-MOTIONS = ("motion", MOTION)
+MOTION_BLOCKS = ("motion", MULTI_FLOOR_MOTION)
 """Blocks of residuals of the motion; the others are read given it."""
 DEGREES = 8.0
 """Degrees of freedom of the Student-t weight of a run."""
@@ -37,7 +44,7 @@ VARIANCE_SPREAD = 3.0
 """Std of the prior of every log variance."""
 
 
-class Target(eqx.Module):
+class Objective(eqx.Module):
     """What a fit maximises, as an argument of compiled functions.
 
     Attributes:
@@ -51,9 +58,9 @@ class Target(eqx.Module):
 
     space: Space
     batch: lk.Batch
-    several: Several | None
+    multi_floor: MultiFloorBatch | None
     blocks: dict[str, Components]
-    shared: tuple[FloorShared, ...]
+    shared: tuple[SharedEffects, ...]
     typical: Float[Array, " variance"]
     scored: Bool[np.ndarray, " variance"]
     pooled: int = eqx.field(static=True)
@@ -76,7 +83,7 @@ class Whitening(NamedTuple):
     loss: Array
 
 
-class ThroughVoltage(NamedTuple):
+class VoltageInformation(NamedTuple):
     """What voltages tell of variances, each (piece, m).
 
     Attributes:
@@ -96,14 +103,16 @@ class ThroughVoltage(NamedTuple):
 
 
 @eqx.filter_jit
-def through_voltage(target: Target, z: Vector, log_v: Vector, felt: Array) -> ThroughVoltage:
+def voltage_information(
+    objective: Objective, z: Vector, log_v: Vector, motor_force: Array
+) -> VoltageInformation:
     """What voltages tell of variances given the traction of every wheel's motor."""
-    robot, b = target.space.tree(z), target.batch
-    noise = electric_noise(target.blocks, log_v, robot.motor.resistance)
+    robot, b = objective.space.tree(z), objective.batch
+    noise = electric_noise(objective.blocks, log_v, robot.motor.resistance)
 
     def scaled(scatter: Array) -> tuple[Array, Array]:
         at = lk.ElectricNoise(noise.voltage_std, scatter, noise.resistance)
-        return lk.electric_residuals(robot, b, felt, at)["voltage"], lk.spread(b, at)
+        return lk.electric_residuals(robot, b, motor_force, at)["voltage"], lk.voltage_spread(b, at)
 
     # every residual depends on its own scatter only
     (r, spread), (more, wider) = jax.jvp(scaled, (noise.scatter,), (jnp.ones_like(noise.scatter),))
@@ -113,7 +122,7 @@ def through_voltage(target: Target, z: Vector, log_v: Vector, felt: Array) -> Th
     slope = -wider - weight * r * more / variance
     share = 1 / spread**2
     steeper = 0.5 * share * (2 * share - 1) * (weight * r**2 / variance - 1)
-    return ThroughVoltage(r, share, slope, moved + 2 * wider**2, steeper)
+    return VoltageInformation(r, share, slope, moved + 2 * wider**2, steeper)
 
 
 @eqx.filter_jit
@@ -122,7 +131,7 @@ def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> 
     roots, weights, loss = {}, {}, jnp.zeros(())
     for k, r in residual.items():
         inverse = inverse_root(noises[k].covariance(log_v))
-        m, kept = noises[k].count, jnp.asarray(keep)[noises[k].pieces]
+        m, kept = noises[k].count, jnp.asarray(keep)[noises[k].segments]
         q = jnp.sum(jnp.einsum("nij,nj->ni", inverse, r) ** 2, axis=-1)
         weights[k] = (DEGREES + m) / (DEGREES + q) * kept
         roots[k] = jnp.sqrt(weights[k])[:, None, None] * inverse
@@ -136,7 +145,7 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> B
     """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
     out = {}
     for k, jac in jacobian.items():
-        factor = jnp.asarray(keep)[noises[k].pieces] * expected(noises[k].count)
+        factor = jnp.asarray(keep)[noises[k].segments] * expected(noises[k].count)
         root = inverse_root(noises[k].covariance(log_v)) * jnp.sqrt(factor)[:, None, None]
         out[k] = jnp.einsum("nij,njp->nip", root, jac)
     return out
@@ -144,30 +153,36 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> B
 
 @eqx.filter_jit
 def precision(
-    target: Target, jacobian: Blocks, log_v: Vector, keep: Vector, alone: bool = False
+    objective: Objective, jacobian: Blocks, log_v: Vector, keep: Vector, alone: bool = False
 ) -> Array:
     """Expected information of the search vector, prior included (free, free).
 
     What runs share is marginalised; `alone` counts every run as if it shared nothing.
     """
-    prior = jnp.diag(1 / target.prior_std(log_v) ** 2)
+    prior = jnp.diag(1 / objective.prior_std(log_v) ** 2)
     total, of_motion = prior, prior
-    for k, half in whitened(target.blocks, jacobian, log_v, keep).items():
+    for k, half in whitened(objective.blocks, jacobian, log_v, keep).items():
         flat = half.reshape(-1, half.shape[-1])
         if k == "motion" and not alone:
-            tied = expected_ties(target, log_v, keep)
-            flat = freed_slopes(tied, half)
+            posteriors = expected_posteriors(objective, log_v, keep)
+            flat = marginal_slopes(posteriors, half)
         total += flat.T @ flat
-        of_motion += flat.T @ flat if k in MOTIONS else 0.0
-    return total if target.joint else _cut(total, of_motion, jnp.asarray(target.space.electric))
+        of_motion += flat.T @ flat if k in MOTION_BLOCKS else 0.0
+    return (
+        total if objective.joint else _cut(total, of_motion, jnp.asarray(objective.space.electric))
+    )
 
 
-def expected_ties(target: Target, log_v: Vector, keep: Vector) -> tuple[Tie, ...]:
+def expected_posteriors(
+    objective: Objective, log_v: Vector, keep: Vector
+) -> tuple[EffectPosterior, ...]:
     """What runs share, given residuals whitened by `whitened`."""
-    block = target.blocks["motion"]
+    block = objective.blocks["motion"]
     roots = inverse_root(block.covariance(jnp.asarray(log_v)))
-    factor = expected(block.count) * jnp.asarray(keep)[block.pieces]
-    return ties(target.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None])
+    factor = expected(block.count) * jnp.asarray(keep)[block.segments]
+    return effect_posteriors(
+        objective.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None]
+    )
 
 
 def expected(m: Array | float | int) -> Any:
@@ -182,12 +197,12 @@ def _cut(total: Array, of_motion: Array, e: Array) -> Array:
     marginalised in the first factor, as if currents told nothing of it. The fit's estimate of the
     motion does follow what currents tell of friction: its interval is rather too wide there.
     """
-    first = of_motion - _carried(of_motion, e)
+    first = of_motion - _schur_term(of_motion, e)
     motion = ~e[:, None] & ~e[None, :]
-    return jnp.where(motion, first + _carried(total, e), total)
+    return jnp.where(motion, first + _schur_term(total, e), total)
 
 
-def _carried(information: Array, e: Array) -> Array:
+def _schur_term(information: Array, e: Array) -> Array:
     """B^T A^-1 B for the block A of the coordinates e, and B between these and the others."""
     own = jnp.where(e[:, None] & e[None, :], information, jnp.diag(jnp.where(e, 0.0, 1.0)))
     cross = jnp.where(e[:, None] & ~e[None, :], information, 0.0)
@@ -195,36 +210,36 @@ def _carried(information: Array, e: Array) -> Array:
 
 
 @eqx.filter_jit
-def spread_of(target: Target, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
+def fitted_covariance(objective: Objective, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
     """Covariance of the residuals from fitted numbers and from what runs share (piece, m, m).
 
     The Jacobian is of the structural numbers; what runs share follows them.
     """
-    cov = jnp.linalg.inv(precision(target, jacobian, log_v, keep))
-    tied = expected_ties(target, log_v, keep)
-    half = whitened(target.blocks, jacobian, log_v, keep)["motion"]
-    followed = shared_slopes(tied, half)
+    cov = jnp.linalg.inv(precision(objective, jacobian, log_v, keep))
+    posteriors = expected_posteriors(objective, log_v, keep)
+    half = whitened(objective.blocks, jacobian, log_v, keep)["motion"]
+    followed = mean_effect_slopes(posteriors, half)
     motion = jacobian["motion"]
-    for of in target.shared:
-        off = jnp.einsum("nma,nap->nmp", of.effect, followed[of.pieces])
-        motion = motion.at[of.pieces].add(-off)
+    for of in objective.shared:
+        off = jnp.einsum("nma,nap->nmp", of.effect, followed[of.segments])
+        motion = motion.at[of.segments].add(-off)
     slopes = jacobian | {"motion": motion}
     spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in slopes.items()}
-    around = shared_spread(tied, len(motion))
-    for of in target.shared:
-        more = jnp.einsum("nma,nab,nlb->nml", of.effect, around[of.pieces], of.effect)
-        spread["motion"] = spread["motion"].at[of.pieces].add(more)
+    around = effect_covariances(posteriors, len(motion))
+    for of in objective.shared:
+        more = jnp.einsum("nma,nab,nlb->nml", of.effect, around[of.segments], of.effect)
+        spread["motion"] = spread["motion"].at[of.segments].add(more)
     return spread
 
 
 @eqx.filter_jit
-def scored(
-    target: Target,
+def scoring_step(
+    objective: Objective,
     residual: Blocks,
     spread: Blocks,
     log_v: Array,
     keep: Array,
-    voltage: ThroughVoltage | None,
+    voltage: VoltageInformation | None,
 ) -> Array:
     """One Fisher-scoring step of the restricted likelihood in the log variances of blocks.
 
@@ -232,15 +247,15 @@ def scored(
     covariance from what was fitted to them (piece, m, m); the degrees of freedom it stands for are
     not the variances' to have.
     """
-    _, weights, _ = whitening(target.blocks, residual, log_v, keep)
+    _, weights, _ = whitening(objective.blocks, residual, log_v, keep)
     score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])
     for k, r in residual.items():
-        noise, mine = target.blocks[k], _own(k, voltage)
+        noise, mine = objective.blocks[k], _own_share(k, voltage)
         root = inverse_root(noise.covariance(log_v))
         inverse = jnp.einsum("nji,njk->nik", root, root)
-        base, which = _shared(noise.base, mine), noise.which
+        base, which = _scaled_base(noise.base, mine), noise.which
         v = jnp.exp(log_v)[which]
-        vr, kept = jnp.einsum("nij,nj->ni", inverse, r), keep[noise.pieces]
+        vr, kept = jnp.einsum("nij,nj->ni", inverse, r), keep[noise.segments]
         fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
         trace = jnp.einsum("nij,ncij->nc", inverse, base)
         spent = jnp.einsum("nij,njk,nkl->nil", inverse, spread[k], inverse)
@@ -252,49 +267,57 @@ def scored(
         score = score.at[which].add(slope)
         if voltage is not None and k == "voltage":
             steeper = steeper.at[which].add((kept * jnp.sum(voltage.steeper, axis=1))[:, None])
-        if k in (MOTION, CURRENT) or (voltage is not None and k == "current"):
+        if k in (MULTI_FLOOR_MOTION, MULTI_FLOOR_CURRENT) or (
+            voltage is not None and k == "current"
+        ):
             # a logarithm that falls bends the more: its slope is in proportion to the variance
             steeper = steeper.at[which].add(-slope)
-    score -= (log_v - target.typical) / VARIANCE_SPREAD**2
-    info = information(target.blocks, log_v, keep, voltage)
+    score -= (log_v - objective.typical) / VARIANCE_SPREAD**2
+    info = information(objective.blocks, log_v, keep, voltage)
     info += jnp.diag(jnp.maximum(steeper, 0.0))
     step = jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
-    return log_v + jnp.where(target.scored, step, 0.0)
+    return log_v + jnp.where(objective.scored, step, 0.0)
 
 
 @eqx.filter_jit
 def information(
-    noises: Noises, log_v: Vector, keep: Vector, voltage: ThroughVoltage | None
+    noises: Noises, log_v: Vector, keep: Vector, voltage: VoltageInformation | None
 ) -> Array:
     """Expected information of the log variances, prior included (variance, variance)."""
     info = jnp.eye(log_v.shape[0]) / VARIANCE_SPREAD**2
     for k, noise in noises.items():
-        base, which = _shared(noise.base, _own(k, voltage)), noise.which
+        base, which = _scaled_base(noise.base, _own_share(k, voltage)), noise.which
         root = inverse_root(noise.covariance(log_v))
         vb = jnp.einsum("nji,njk,nckl->ncil", root, root, base)
         v = jnp.exp(log_v)[which]
         cross = 0.5 * jnp.einsum("ncij,ndji->ncd", vb, vb)
         cross *= v[:, :, None] * v[:, None, :]
-        kept = jnp.asarray(keep)[noise.pieces, None, None]
+        kept = jnp.asarray(keep)[noise.segments, None, None]
         info = info.at[which[:, :, None], which[:, None, :]].add(kept * cross)
-    return info if voltage is None else info + _through(noises["current"], log_v, keep, voltage)
+    return (
+        info
+        if voltage is None
+        else info + _scatter_information(noises["current"], log_v, keep, voltage)
+    )
 
 
-def _through(noise: Components, log_v: Vector, keep: Vector, voltage: ThroughVoltage) -> Array:
+def _scatter_information(
+    noise: Components, log_v: Vector, keep: Vector, voltage: VoltageInformation
+) -> Array:
     """Expected information of the log variances that voltages have of the scatter of currents."""
     grown = jnp.exp(log_v)[noise.which][..., None] * noise.single
-    kept = jnp.asarray(keep)[noise.pieces]
+    kept = jnp.asarray(keep)[noise.segments]
     cross = jnp.einsum("n,ni,nci,ndi->ncd", kept, voltage.information, grown, grown)
     info = jnp.zeros((log_v.shape[0],) * 2)
     return info.at[noise.which[:, :, None], noise.which[:, None, :]].add(cross)
 
 
-def _own(block: str, voltage: ThroughVoltage | None) -> Array | None:
+def _own_share(block: str, voltage: VoltageInformation | None) -> Array | None:
     """Part that the variances have in that of the residuals of a block, None for all."""
     return voltage.share if voltage is not None and block == "voltage" else None
 
 
-def _shared(base: Array, own: Array | None) -> Array:
+def _scaled_base(base: Array, own: Array | None) -> Array:
     """How the covariance of residuals grows with each variance, of which only a part is in them."""
     if own is None:
         return base

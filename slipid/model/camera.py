@@ -81,7 +81,7 @@ class Camera(eqx.Module):
         own = jnp.where(session >= 0, self.session_yaw[session], 0.0)
         return self.marker_yaw + own
 
-    def seen(
+    def marker_increment(
         self, increment: Float[Array, "3"], session: Int[Array, ""] | int
     ) -> Float[Array, "3"]:
         """Body-frame increment of the marker from the body's (x, y [m], yaw [rad])."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from slipid.model.contact_balance import Balance, Stance, stand, total
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Frame
+from slipid.model.geometry import WheelFrame
 from slipid.model.se2 import Columns, Planar, solve3
 
 _CHORD_STEPS = 30
@@ -41,7 +41,7 @@ class ContactProblem(eqx.Module):
     """
 
     rim: Float[Array, " wheel"]
-    frame: Frame
+    frame: WheelFrame
     surface: ContactSurface
     rest: Float[Array, " wheel"]
     start: Float[Array, "3"]
@@ -72,7 +72,7 @@ def _damped(balance: Balance, xi: Planar) -> Planar:
 
 @jax.custom_jvp
 @jax.jit
-def _root(problem: ContactProblem) -> Float[Array, "3"]:
+def _solve(problem: ContactProblem) -> Float[Array, "3"]:
     balance = problem.balance()
 
     def chord(xi: Array, _: None) -> tuple[Array, None]:
@@ -87,7 +87,7 @@ def _root(problem: ContactProblem) -> Float[Array, "3"]:
 
 @jax.custom_jvp
 @jax.jit
-def _root_near(problem: ContactProblem) -> Float[Array, "3"]:
+def _solve_near(problem: ContactProblem) -> Float[Array, "3"]:
     balance = problem.balance()
 
     def far(state: tuple[Array, Array, Array]) -> Array:
@@ -104,18 +104,20 @@ def _root_near(problem: ContactProblem) -> Float[Array, "3"]:
     return jnp.where(jnp.max(jnp.abs(step)) > _NEAR, jnp.nan, xi)
 
 
-One = tuple[ContactProblem]
+OneProblem = tuple[ContactProblem]
 
 
-def _implicit(root: Callable[[ContactProblem], Array]) -> Callable[[One, One], tuple[Array, Array]]:
+def _implicit_derivative(
+    root: Callable[[ContactProblem], Array],
+) -> Callable[[OneProblem, OneProblem], tuple[Array, Array]]:
     """Derivative of a root of the balance by what it depends on."""
 
-    def rule(primals: One, tangents: One) -> tuple[Array, Array]:
+    def rule(primals: OneProblem, tangents: OneProblem) -> tuple[Array, Array]:
         xi = root(*primals)
         return xi, moved(xi, primals, tangents)
 
     @jax.jit
-    def moved(xi: Array, primals: One, tangents: One) -> Array:
+    def moved(xi: Array, primals: OneProblem, tangents: OneProblem) -> Array:
         at = Planar(*xi)
         _, force = jax.jvp(lambda problem: problem.balance().force(at), primals, tangents)
         return -jnp.stack(solve3(primals[0].balance().jacobian(at), force))
@@ -123,20 +125,20 @@ def _implicit(root: Callable[[ContactProblem], Array]) -> Callable[[One, One], t
     return rule
 
 
-_root.defjvp(_implicit(_root))
-_root_near.defjvp(_implicit(_root_near))
+_solve.defjvp(_implicit_derivative(_solve))
+_solve_near.defjvp(_implicit_derivative(_solve_near))
 
 
-def guess(rim: Float[Array, " wheel"], frame: Frame) -> Float[Array, "3"]:
+def initial_twist(rim: Float[Array, " wheel"], frame: WheelFrame) -> Float[Array, "3"]:
     """Start of the root finder: the twist without slip, a little slower (least squares)."""
     j = frame.hold
     m = Columns(*(Planar(*column) for column in j.T @ j + 1e-6 * jnp.eye(3)))
-    return 0.8 * jnp.stack(solve3(m, Planar(*(j.T @ (rim * frame.pull)))))
+    return 0.8 * jnp.stack(solve3(m, Planar(*(j.T @ (rim * frame.drive_share)))))
 
 
 def equilibrium(
     rim: Float[Array, " wheel"],
-    frame: Frame,
+    frame: WheelFrame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
     near: Float[Array, "3"] | None = None,
@@ -153,26 +155,26 @@ def equilibrium(
 
     Source: the balance at the head of `slipid.model.contact_law`.
     """
-    start = jax.lax.stop_gradient(guess(rim, frame) if near is None else near)
+    start = jax.lax.stop_gradient(initial_twist(rim, frame) if near is None else near)
     problem = ContactProblem(rim, frame, surface, rest, start)
-    return _root(problem) if near is None else _root_near(problem)
+    return _solve(problem) if near is None else _solve_near(problem)
 
 
 def traction(
     xi: Float[Array, "3"],
     rim: Float[Array, " wheel"],
-    frame: Frame,
+    frame: WheelFrame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
 ) -> Float[Array, " wheel"]:
     """Traction along the drive of each wheel that its motor works against at a twist [mu m g]."""
-    return Balance(rim, stand(frame, surface, rest)).felt(Planar(*xi))
+    return Balance(rim, stand(frame, surface, rest)).motor_force(Planar(*xi))
 
 
-def rolled(
+def rolling_drag(
     xi: Float[Array, "3"],
     rim: Float[Array, " wheel"],
-    frame: Frame,
+    frame: WheelFrame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
 ) -> Float[Array, " wheel"]:
@@ -180,7 +182,7 @@ def rolled(
 
     The motor bears it, in units of `Motor.rolling_drag`, and the body does not feel it.
     """
-    return Balance(rim, stand(frame, surface, rest)).rolled(Planar(*xi))
+    return Balance(rim, stand(frame, surface, rest)).rolling_drag(Planar(*xi))
 
 
 def settle(
@@ -218,5 +220,5 @@ def settle(
     sound = jnp.isfinite(found.x + found.y + found.yaw)
     free = Planar(*(total(row[:, None] * rim) for row in plain))
     twist = jnp.stack(jax.tree.map(lambda x, p: jnp.where(sound, x, p), found, free))
-    felt = jnp.where(nearer, balance.felt(xi), balance.felt(near))
-    return twist, jnp.where(jnp.isfinite(felt), felt, 0.0)
+    motor_force = jnp.where(nearer, balance.motor_force(xi), balance.motor_force(near))
+    return twist, jnp.where(jnp.isfinite(motor_force), motor_force, 0.0)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from slipid.model import contact_law as law
 from slipid.model.contact_law import ContactSurface, WheelForces
-from slipid.model.geometry import Frame
+from slipid.model.geometry import WheelFrame
 from slipid.model.se2 import Columns, Planar, dot, solve3
 
 _LEAST_LOAD = 1e-3
@@ -34,7 +34,7 @@ class Stance(eqx.Module):
         sunk: drag of the rollers of each wheel under an even load.
     """
 
-    frame: Frame
+    frame: WheelFrame
     hold: Planar
     roll: Planar
     shift: Float[Array, "2 wheel *one"]
@@ -45,13 +45,13 @@ class Stance(eqx.Module):
     sunk: Float[Array, "wheel *batch"]
 
 
-def stand(frame: Frame, surface: ContactSurface, rest: Float[Array, " wheel"]) -> Stance:
+def stand(frame: WheelFrame, surface: ContactSurface, rest: Float[Array, " wheel"]) -> Stance:
     """A robot on one floor (leaves are numbers) or on one per wheel (wheel, *batch)."""
     floor, friction = replace(surface, friction=jnp.ones(())), surface.friction
     if jnp.ndim(friction) > 0:
         ones = (1,) * (jnp.ndim(friction) - 1)
         frame, rest = jax.tree.map(lambda a: a.reshape(*a.shape, *ones), (frame, rest))
-    rest = law.seen_load(rest, surface.load_bias)
+    rest = law.apparent_load(rest, surface.load_bias)
     if jnp.ndim(friction) > 0:
         friction = jnp.mean(surface.friction, axis=0)
         floor = replace(
@@ -141,18 +141,20 @@ class Balance(eqx.Module):
         x_yaw, y_yaw, turn = entry(0, 2), entry(1, 2), entry(2, 2)
         turn += law.scrub_moment(xi.yaw, on.floor.scrub).chord()
         m = Columns(Planar(xx, xy, x_yaw), Planar(xy, yy, y_yaw), Planar(x_yaw, y_yaw, turn))
-        drive = self._summed(pulls * self.rim * f.pull, rolls * self.rim * f.slip_through)
+        drive = self._summed(pulls * self.rim * f.drive_share, rolls * self.rim * f.roller_share)
         return solve3(m, drive)
 
-    def felt(self, xi: Planar) -> Float[Array, "wheel *batch"]:
+    def motor_force(self, xi: Planar) -> Float[Array, "wheel *batch"]:
         """Traction that each motor works against."""
         f = self.on.frame
-        return self.load(xi) * self.wheels(*self._speeds(xi)).felt(f.pull, f.slip_through)
+        return self.load(xi) * self.wheels(*self._speeds(xi)).motor_force(
+            f.drive_share, f.roller_share
+        )
 
-    def rolled(self, xi: Planar) -> Float[Array, "wheel *batch"]:
+    def rolling_drag(self, xi: Planar) -> Float[Array, "wheel *batch"]:
         """Drag of wheels that roll along their drive, if it is that of rollers; motors bear it."""
         _, roll = self._speeds(xi)
-        return self.on.sunk * law.rolled(self.rim, roll, self.on.frame.pull)
+        return self.on.sunk * law.rolling_fraction(self.rim, roll, self.on.frame.drive_share)
 
     def size(self, force: Planar) -> Float[Array, "*batch"]:
         """Square of a force, its moment over the base radius."""
@@ -170,13 +172,13 @@ class Balance(eqx.Module):
         """The law at speeds of the wheels."""
         f = self.on.frame
         grip = f.grip if f.ordinary else None
-        where = along, roll, self.rim, f.pull, self.on.drag_onset
+        where = along, roll, self.rim, f.drive_share, self.on.drag_onset
         return law.wheel_forces(*where, self.on.floor, grip)
 
     def _speeds(self, xi: Planar) -> tuple[Array, Array]:
         """Speeds of the wheels along their drive and along their rollers."""
         on = self.on
-        return dot(on.hold, xi), dot(on.roll, xi) - self.rim * on.frame.slip_through
+        return dot(on.hold, xi), dot(on.roll, xi) - self.rim * on.frame.roller_share
 
     def _summed(self, along: Array, roll: Array) -> Planar:
         """Force on the body of what wheels exert along their drive and along their rollers."""

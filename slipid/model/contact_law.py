@@ -205,14 +205,14 @@ class WheelForces(eqx.Module):
         """On the body, along the drive."""
         return self.traction.force() - self.resistance.force()
 
-    def felt(self, pull: Array, slip_through: Array) -> Array:
+    def motor_force(self, drive_share: Array, roller_share: Array) -> Array:
         """On the motor, for the wheel's `Frame.pull` and `Frame.slip_through`.
 
         Rolling resistance is counted as a force on the body that the motor does not feel; what the
         motor bears of it is in its own friction. Rollers at an angle (mecanum) pass on a part of
         what holds the wheel and a part of their drag.
         """
-        return self.traction.force() * pull - self.drag.force() * slip_through
+        return self.traction.force() * drive_share - self.drag.force() * roller_share
 
 
 def wheel_traction(
@@ -223,9 +223,9 @@ def wheel_traction(
     return Friction(slide, onset, floor.creep, 1.0, floor.slide_viscosity, beside)
 
 
-def rolled(rim: Array, roll: Array, pull: Array) -> Array:
+def rolling_fraction(rim: Array, roll: Array, drive_share: Array) -> Array:
     """Part of a wheel's motion that is along its drive, (r w / c) |r w / c|: how it drags there."""
-    along = rim * pull * jax.lax.rsqrt(rim**2 + roll**2 + 1e-12)
+    along = rim * drive_share * jax.lax.rsqrt(rim**2 + roll**2 + 1e-12)
     return along * jnp.abs(along)
 
 
@@ -244,7 +244,7 @@ def at_load(floor: ContactSurface, relative: Array) -> ContactSurface:
     )
 
 
-def seen_load(rest: Float[Array, "wheel *one"], bias: Array) -> Float[Array, "wheel *batch"]:
+def apparent_load(rest: Float[Array, "wheel *one"], bias: Array) -> Float[Array, "wheel *batch"]:
     """Load shares at rest as floors see them, for their load biases (wheel, *batch) or 0."""
     seen = rest * jnp.exp(bias)
     return seen / sum(seen[1:], start=seen[0])
@@ -269,7 +269,7 @@ def wheel_forces(
     along: Array,
     roll: Array,
     rim: Array,
-    pull: Array,
+    drive_share: Array,
     at_rest: Array,
     floor: ContactSurface,
     grip: Array | None = None,
@@ -284,7 +284,7 @@ def wheel_forces(
             sliding as a whole; None of one without.
     """
     active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
-    onset, slide = at_rest + floor.roller_creep * active, rim * pull - along
+    onset, slide = at_rest + floor.roller_creep * active, rim * drive_share - along
     ahead, beside = (None, None) if grip is None else (grip * slide, grip * roll)
     drag = floor.roller_creep, floor.roller_drag, floor.roller_viscosity
     return WheelForces(

@@ -97,9 +97,9 @@ class Geometry(eqx.Module):
         """What every drive has of all its wheels together, such as their torque."""
         return at_drives(self.drive_of, of_wheels)
 
-    def frame(self) -> "Frame":
+    def frame(self) -> "WheelFrame":
         """The wheels as rows of matrices, at the current radius, base and offsets."""
-        return _frame(
+        return _wheel_frame(
             jnp.asarray(self.place) * self.base_radius,
             jnp.asarray(self.drive_angle) + self.drive_offset,
             jnp.asarray(self.roller_angle),
@@ -147,13 +147,13 @@ class Geometry(eqx.Module):
         That of a drive with several wheels is their mean.
         """
         frame = self.frame()
-        of_wheels = frame.hold / frame.pull[:, None]
+        of_wheels = frame.hold / frame.drive_share[:, None]
         if not self.drive_of:
             return of_wheels
         share = np.eye(self.drives)[list(self.drive_of)]
         return jnp.asarray((share / share.sum(axis=0)).T) @ of_wheels
 
-    def least(self) -> Float[Array, "3 drive"]:
+    def pseudo_inverse(self) -> Float[Array, "3 drive"]:
         """J^+: the smallest body twist that comes nearest to rim speeds [m/s], of any drives.
 
         Wheels that all point ahead do not tell motion sideways: it is taken for none.
@@ -177,7 +177,7 @@ def at_drives(
     return of_wheels @ jnp.asarray(np.eye(len(set(drive_of)))[list(drive_of)])
 
 
-class Frame(eqx.Module):
+class WheelFrame(eqx.Module):
     """Wheel directions and levers as the force balance uses them.
 
     Attributes:
@@ -196,8 +196,8 @@ class Frame(eqx.Module):
 
     hold: Float[Array, "wheel 3"]
     roll: Float[Array, "wheel 3"]
-    pull: Float[Array, " wheel"]
-    slip_through: Float[Array, " wheel"]
+    drive_share: Float[Array, " wheel"]
+    roller_share: Float[Array, " wheel"]
     grip: Float[Array, " wheel"]
     shift: Float[Array, "wheel 2"]
     radius: Float[Array, ""]
@@ -206,7 +206,7 @@ class Frame(eqx.Module):
 
 
 @partial(jax.jit, static_argnames="grips")
-def _frame(
+def _wheel_frame(
     p: Float[Array, "wheel 2"],
     drive: Float[Array, " wheel"],
     roller: Float[Array, " wheel"],
@@ -214,7 +214,7 @@ def _frame(
     radius: Float[Array, ""],
     base: Float[Array, ""],
     grips: tuple[bool, ...],
-) -> Frame:
+) -> WheelFrame:
     free = drive - roller
     hold = free + 0.5 * math.pi
 
@@ -224,11 +224,11 @@ def _frame(
 
     # loads move when the contact patches do: N = N0 - shift @ (displacement), minimum change
     lever = jnp.concatenate([jnp.ones((1, len(p))), p.T], axis=0)
-    return Frame(
+    return WheelFrame(
         hold=row(hold),
         roll=row(free),
-        pull=larger * jnp.sin(roller),
-        slip_through=larger * jnp.cos(roller),
+        drive_share=larger * jnp.sin(roller),
+        roller_share=larger * jnp.cos(roller),
         grip=jnp.asarray(grips, dtype=float),
         shift=jnp.linalg.pinv(lever)[:, 1:],
         radius=radius,

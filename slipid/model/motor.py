@@ -72,9 +72,9 @@ class Motor(eqx.Module):
             + self.viscous_friction * wheel_speed
         )
 
-    def borne(self, felt: Float[Array, "*w 2"]) -> Float[Array, " *w"]:
+    def opposing_force(self, motor_force: Float[Array, "*w 2"]) -> Float[Array, " *w"]:
         """What a motor works against: traction, and drag along the drive (`robot.felt`)."""
-        return felt[..., 0] + self.rolling_drag * felt[..., 1]
+        return motor_force[..., 0] + self.rolling_drag * motor_force[..., 1]
 
     @property
     def gain(self) -> Array:

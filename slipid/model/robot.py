@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from slipid.model import contact, geometry
 from slipid.model.camera import Camera
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Frame, Geometry
+from slipid.model.geometry import Geometry, WheelFrame
 from slipid.model.motor import Motor
 from slipid.parameter import entries, parameter
 
@@ -169,7 +169,7 @@ def build(
 
 def twist(
     robot: Robot,
-    frame: Frame,
+    frame: WheelFrame,
     wheel_speed: Float[Array, " wheel"],
     surface: Array,
     load: Array,
@@ -183,9 +183,9 @@ def twist(
     return contact.equilibrium(frame.radius * wheel_speed, frame, floor, rest, near)
 
 
-def felt(
+def motor_forces(
     robot: Robot,
-    frame: Frame,
+    frame: WheelFrame,
     xi: Float[Array, "3"],
     wheel_speed: Float[Array, " wheel"],
     surface: Array,
@@ -198,12 +198,12 @@ def felt(
     """
     rim, floor = frame.radius * wheel_speed, robot.surfaces.at(surface)
     where = xi, rim, frame, floor, robot.body.load_share[load]
-    return jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
+    return jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
 
 
 def wheel_torque(
     robot: Robot,
-    frame: Frame,
+    frame: WheelFrame,
     xi: Float[Array, "3"],
     wheel_speed: Float[Array, " wheel"],
     surface: Array,
@@ -211,12 +211,12 @@ def wheel_torque(
 ) -> Float[Array, " wheel"]:
     """Torque of the traction of each wheel: r mu m g T [N m]."""
     force = jnp.mean(robot.surfaces.friction[surface]) * robot.body.mass * GRAVITY
-    return frame.radius * force * felt(robot, frame, xi, wheel_speed, surface, load)[..., 0]
+    return frame.radius * force * motor_forces(robot, frame, xi, wheel_speed, surface, load)[..., 0]
 
 
 def motor_current(
     robot: Robot,
-    frame: Frame,
+    frame: WheelFrame,
     xi: Float[Array, "3"],
     speed: Float[Array, " drive"],
     surface: Array,
@@ -228,5 +228,7 @@ def motor_current(
     """
     shape = robot.geometry
     force = jnp.mean(robot.surfaces.friction[surface]) * robot.body.mass * GRAVITY
-    borne = robot.motor.borne(felt(robot, frame, xi, shape.at_wheels(speed), surface, load))
-    return robot.motor.current(frame.radius * force * shape.at_drives(borne), speed)
+    opposing = robot.motor.opposing_force(
+        motor_forces(robot, frame, xi, shape.at_wheels(speed), surface, load)
+    )
+    return robot.motor.current(frame.radius * force * shape.at_drives(opposing), speed)

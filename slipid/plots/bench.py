@@ -18,9 +18,9 @@ from matplotlib.patheffects import withStroke
 
 from slipid.data.geojson_map import Patch, VectorMap, covered
 from slipid.infer.bench.fit import MotorFit
-from slipid.infer.bench.moments import Sums
+from slipid.infer.bench.moments import MomentSums
 from slipid.infer.bench.verdict import BenchFit
-from slipid.infer.bench.windows import Windows
+from slipid.infer.bench.windows import BenchWindows
 from slipid.plots.drawing import BLUE, INK, ORANGE, SHADE, figure, plain, save
 
 MOST = 4000
@@ -55,13 +55,13 @@ def bench_figure(fit: MotorFit) -> Figure:
     return made
 
 
-def _clock(w: Windows) -> np.ndarray:
+def _clock(w: BenchWindows) -> np.ndarray:
     """Time with the records one after the other [s]."""
     ends = [float(w.time[w.record == k].max(initial=0.0)) for k in range(int(w.record.max()) + 1)]
     return np.asarray(w.time + np.concatenate([[0.0], np.cumsum(ends)])[w.record])
 
 
-def _signals(axes: Axes, name: str, unit: str, w: Windows, s: Sums) -> None:
+def _signals(axes: Axes, name: str, unit: str, w: BenchWindows, s: MomentSums) -> None:
     plain(axes)
     clock, left = _clock(w), w.both.left
     fitted = left - (s.even.residual + s.odd.residual) / 2
@@ -73,7 +73,7 @@ def _signals(axes: Axes, name: str, unit: str, w: Windows, s: Sums) -> None:
     axes.legend(loc="upper right", fontsize=8, frameon=False, ncols=2)
 
 
-def _residuals(panels: list[Axes], unit: str, w: Windows, s: Sums) -> None:
+def _residuals(panels: list[Axes], unit: str, w: BenchWindows, s: MomentSums) -> None:
     """What is left, point by point, and its mean in bins."""
     clock, both = _clock(w), w.both
     good = np.flatnonzero(w.usable)

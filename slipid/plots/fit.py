@@ -18,8 +18,8 @@ from slipid.infer.result import Fit
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.plots import drawing
 from slipid.plots.drawing import figure, save, save_all, warned
+from slipid.plots.measured_windows import MeasuredWindows, measured_windows
 from slipid.plots.motion import heading_figure, path_figure
-from slipid.plots.seen import Seen, seen
 from slipid.plots.wheels import current_figure, curve_figure
 from slipid.predict.validation import Validation
 
@@ -133,7 +133,7 @@ PATHS = (
 )
 
 
-PICTURES: dict[str, Callable[[Fit, Runs, Seen], Figure | None]] = {
+PICTURES: dict[str, Callable[[Fit, Runs, MeasuredWindows], Figure | None]] = {
     "slip_by_heading": lambda fit, data, pieces: heading_figure(fit.robot, pieces),
     "paths": lambda fit, data, pieces: path_figure(
         fit.contact, data, pieces.groups, PATHS + "runs of the fit"
@@ -150,7 +150,7 @@ def identify_plots(fit: Fit, data: Runs, out: Path, warning: str | None = None) 
 
     What is said of a fit that is not to be used stands in the title of each.
     """
-    pieces = seen(fit.robot, data, fit.channels.windows)
+    pieces = measured_windows(fit.robot, data, fit.channels.windows)
     made = {name: draw(fit, data, pieces) for name, draw in PICTURES.items()}
     if warning is not None:
         for figure in filter(None, made.values()):
@@ -162,7 +162,7 @@ def picture(fit: Fit, data: Runs, name: str) -> Figure:
     """One picture by name; ValueError where there is none, or the runs have nothing for it."""
     if name not in PICTURES:
         raise ValueError(f"no picture '{name}'; there are {', '.join(PICTURES)}")
-    made = PICTURES[name](fit, data, seen(fit.robot, data, fit.channels.windows))
+    made = PICTURES[name](fit, data, measured_windows(fit.robot, data, fit.channels.windows))
     if made is None:
         raise ValueError(f"picture '{name}': the runs have nothing for it")
     return made

@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from slipid.data.runs import Runs
 from slipid.model.robot import Robot
 from slipid.plots import drawing
-from slipid.plots.seen import Seen, by_heading
+from slipid.plots.measured_windows import MeasuredWindows, by_heading
 from slipid.predict import open_loop as replay
-from slipid.predict.floor_models import FloorModels
 from slipid.predict.kinematics import Encoder
-from slipid.predict.predictive import Contact
+from slipid.predict.predictive import ForceBalance
+from slipid.predict.slip_models import FloorModels
 
 ROWS = (
     ("slip", "slip: way lost [%]"),
@@ -28,7 +28,7 @@ LEAST_OCTANTS = 5
 """Eighths of the circle in which a floor must have been driven for a picture by heading."""
 
 
-def heading_figure(robot: Robot, seen: Seen) -> Figure | None:
+def heading_figure(robot: Robot, seen: MeasuredWindows) -> Figure | None:
     """Slip and drift against the direction of travel, a column per floor and load set-up.
 
     None where no floor was driven straight in most directions.
@@ -58,7 +58,7 @@ def heading_figure(robot: Robot, seen: Seen) -> Figure | None:
     return made
 
 
-def _speeds(seen: Seen) -> list[float]:
+def _speeds(seen: MeasuredWindows) -> list[float]:
     """The speeds driven, at most `MOST_SPEEDS`, each a tenth away from the next."""
     found: list[float] = []
     values, counts = np.unique(seen.speed[seen.straight], return_counts=True)
@@ -68,7 +68,9 @@ def _speeds(seen: Seen) -> list[float]:
     return sorted(found[:MOST_SPEEDS])
 
 
-def _headings(robot: Robot, seen: Seen, g: int, speeds: list[float], axes: Sequence[Axes]) -> None:
+def _headings(
+    robot: Robot, seen: MeasuredWindows, g: int, speeds: list[float], axes: Sequence[Axes]
+) -> None:
     surface, load = seen.groups[g]
     mine = seen.straight & (seen.group == g)
     nearest = np.argmin(np.abs(seen.speed[:, None] - np.asarray(speeds)), axis=1)
@@ -96,7 +98,9 @@ def named(surface: str, load: str, groups: Sequence[tuple[str, str]]) -> str:
     return f"{surface}, load {load}" if several else surface
 
 
-def path_figure(model: Contact, data: Runs, order: Sequence[tuple[str, str]], title: str) -> Figure:
+def path_figure(
+    model: ForceBalance, data: Runs, order: Sequence[tuple[str, str]], title: str
+) -> Figure:
     """Some runs per floor and load, started at one point with the robot looking to the right.
 
     Args:
@@ -144,13 +148,15 @@ def _spread(data: Runs, runs: list[int]) -> list[int]:
     return [runs[k] for k in at]
 
 
-def _paths(model: Contact, data: Runs) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _paths(model: ForceBalance, data: Runs) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Measured, predicted and encoder path (edge, 2) of every run, from the origin, x ahead."""
     out: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = [None] * len(data)
     robot = model.robot
-    for w in replay.cuts(data, robot):
+    for w in replay.replay_windows(data, robot):
         tracks = model.tracks(w)
-        encoder = replay.follow(robot, w, FloorModels(Encoder()).increments(w, robot))
+        encoder = replay.tracks_from_increments(
+            robot, w, FloorModels(Encoder()).increments(w, robot)
+        )
         for n, k in enumerate(tracks.run):
             yaw = float(robot.camera.yaw(jnp.asarray(robot.session_index(w.session[n]))))
             first = tracks.measured[n, 0]

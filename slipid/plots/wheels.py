@@ -11,8 +11,8 @@ from slipid.infer.result import Fit
 from slipid.model import contact_law as law
 from slipid.model.robot import GRAVITY, Robot
 from slipid.plots import drawing
+from slipid.plots.measured_windows import MeasuredWindows
 from slipid.plots.motion import named
-from slipid.plots.seen import Seen
 
 DRIFTS = "#35B779"
 """Colour of a wheel that rolls sideways as fast as it turns, as in the colour scale of the dots."""
@@ -22,7 +22,7 @@ TURNS = 0.3
 """A wheel that turns slower than this part of the fastest one says little of its slip."""
 
 
-def curve_figure(fit: Fit, seen: Seen) -> Figure:
+def curve_figure(fit: Fit, seen: MeasuredWindows) -> Figure:
     """Slip over torque of every floor with its 90 % band, over what was seen of every wheel."""
     floors = list(dict.fromkeys(floor for floor, _ in seen.groups))
     measured = seen.amps is not None
@@ -46,7 +46,7 @@ def curve_figure(fit: Fit, seen: Seen) -> Figure:
     return made
 
 
-def _cloud(ax: Axes, robot: Robot, seen: Seen, floor: str) -> PathCollection | None:
+def _cloud(ax: Axes, robot: Robot, seen: MeasuredWindows, floor: str) -> PathCollection | None:
     """Measured slip of every driven wheel over its torque, scaled to an even load."""
     mine = np.array([seen.groups[g][0] == floor for g in seen.group])
     fastest = np.abs(seen.wheel_speed).max(axis=1, keepdims=True)
@@ -61,7 +61,7 @@ def _cloud(ax: Axes, robot: Robot, seen: Seen, floor: str) -> PathCollection | N
     return ax.scatter(x, y, 7, colour, lw=0, alpha=0.6, cmap="viridis_r", vmin=0.0, vmax=2.0)
 
 
-def driving_torque(robot: Robot, seen: Seen) -> np.ndarray:
+def driving_torque(robot: Robot, seen: MeasuredWindows) -> np.ndarray:
     """Torque along a wheel's turning [N m]: from the current, or predicted where none is logged.
 
     Wheels that share a drive share its torque.
@@ -119,19 +119,22 @@ def wheel_curve(
     Source: `slipid.model.contact_law`.
     """
     frame, surface = robot.geometry.frame(), robot.surfaces.at(robot.surface_index(floor))
-    pull, slip_through = frame.pull[0], frame.slip_through[0]
+    drive_share, roller_share = frame.drive_share[0], frame.roller_share[0]
     rim = frame.radius * wheel_speed
-    along, roll = rim * pull * (1 - jnp.asarray(slip)), rim * (pull * sideways - slip_through)
+    along, roll = (
+        rim * drive_share * (1 - jnp.asarray(slip)),
+        rim * (drive_share * sideways - roller_share),
+    )
     relative = jnp.asarray(share * robot.geometry.wheels)
     surface, onset = law.sideways(law.at_load(surface, relative), frame.grip[0])
     grip = frame.grip[0] if frame.ordinary else None
-    forces = law.wheel_forces(along, roll, rim, pull, onset, surface, grip)
-    felt = forces.felt(pull, slip_through)
+    forces = law.wheel_forces(along, roll, rim, drive_share, onset, surface, grip)
+    motor_force = forces.motor_force(drive_share, roller_share)
     weight = robot.body.mass * GRAVITY * law.load_force(jnp.asarray(share), surface)
-    return np.asarray(frame.radius * weight * felt)
+    return np.asarray(frame.radius * weight * motor_force)
 
 
-def current_figure(seen: Seen) -> Figure | None:
+def current_figure(seen: MeasuredWindows) -> Figure | None:
     """Measured current against predicted traction, a row per wheel, a column per floor and load."""
     if seen.amps is None:
         return None
@@ -163,7 +166,9 @@ def current_figure(seen: Seen) -> Figure | None:
     return made
 
 
-def _amps(ax: Axes, seen: Seen, mine: np.ndarray, wheel: int, top: float) -> PathCollection:
+def _amps(
+    ax: Axes, seen: MeasuredWindows, mine: np.ndarray, wheel: int, top: float
+) -> PathCollection:
     assert seen.amps is not None
     # a wheel at rest is held by its gear, which the motor model does not claim to know
     speed, fastest = seen.wheel_speed[:, wheel], np.abs(seen.wheel_speed).max(axis=1)

@@ -30,12 +30,12 @@ from slipid.data.runs import Runs
 from slipid.data.windows import Windows
 from slipid.fit.noise import travel
 from slipid.fit.problem import Problem
-from slipid.fit.shared import AXES
+from slipid.fit.shared_effects import AXES
 from slipid.fit.variances import Search, Square
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.predict.kinematics import fourier
-from slipid.predict.predictive import Predictive
+from slipid.predict.predictive import PredictiveModel
 from slipid.predict.score import chords, mean_error
 from slipid.predict.slip_model import body_twist, turned
 from slipid.search_space import Space
@@ -59,7 +59,9 @@ class FloorErrors:
     is_worse: bool
 
 
-def floor_errors(before: Predictive, after: Predictive, data: Runs) -> dict[str, FloorErrors]:
+def floor_errors(
+    before: PredictiveModel, after: PredictiveModel, data: Runs
+) -> dict[str, FloorErrors]:
     """Errors of runs on one floor each under two models, by floor.
 
     Both learnt from these runs, the second from others, too.
@@ -91,27 +93,27 @@ def compared(
 
 
 def end_errors(
-    model: Predictive, data: Runs
+    model: PredictiveModel, data: Runs
 ) -> tuple[Float[np.ndarray, " run"], Float[np.ndarray, " run"]]:
     """Distance of predicted from measured end, and how far each run went as the crow flies [m]."""
     error, far = np.zeros(len(data)), np.zeros(len(data))
-    for w in replay.cuts(data, model.robot):
+    for w in replay.replay_windows(data, model.robot):
         tracks, _ = model.ends(w)
         error[tracks.run] = np.linalg.norm(tracks.gap[:, :2], axis=1)
         far[tracks.run] = chords(tracks.measured)
     return error, far
 
 
-class Moved(NamedTuple):
+class LargestShift(NamedTuple):
     """The number that other runs moved most, and by how many of its standard errors before."""
 
     name: str
     sigma: float
 
 
-def most_moved(
+def largest_shift(
     space: Space, before: Search, covariance: Square, after: Search, settled: bool
-) -> Moved:
+) -> LargestShift:
     """Of the numbers that runs on one floor tell from motion; infinite where no rest was found.
 
     Runs that agree move a number by less than the standard error it had without them (Hausman
@@ -120,11 +122,11 @@ def most_moved(
     told = ~space.electric & ~space.where(lambda e: e.part == "camera")
     sigma = np.where(told, np.abs(after - before) / np.sqrt(np.diag(covariance)), 0.0)
     worst = int(np.argmax(sigma))
-    return Moved(space.names[worst], float(sigma[worst]) if settled else np.inf)
+    return LargestShift(space.names[worst], float(sigma[worst]) if settled else np.inf)
 
 
 def contradiction(
-    found: Mapping[str, FloorErrors], moved: Moved, by_map: float, as_if: Mapping[str, float]
+    found: Mapping[str, FloorErrors], moved: LargestShift, by_map: float, as_if: Mapping[str, float]
 ) -> str | None:
     """Why runs over several floors are not learnt from, None where they agree with the others.
 
@@ -172,7 +174,7 @@ def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
     """
     w, robot = problem.windows, problem.robot
     far, _ = travel(w, robot)
-    left = _left(w, robot, "camera.marker_place" in problem.space.place)
+    left = _unpredicted_motion(w, robot, "camera.marker_place" in problem.space.slices)
     variance = dict(zip(problem.noise.names, problem.noise.typical**2, strict=True))
     for floor in dict.fromkeys(w.surface):
         mine = np.asarray(w.surface) == floor
@@ -189,11 +191,13 @@ def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
     return np.log(list(variance.values()))
 
 
-def _left(w: Windows, robot: Robot, place_is_free: bool) -> Float[np.ndarray, "piece window 3"]:
+def _unpredicted_motion(
+    w: Windows, robot: Robot, place_is_free: bool
+) -> Float[np.ndarray, "piece window 3"]:
     """Motion along, across and in yaw that other runs do not predict [m, m, rad]."""
     shape = robot.geometry
-    back = np.asarray(shape.least()).T * float(shape.wheel_radius)
-    step, late = w.turn @ back, w.faster @ back
+    back = np.asarray(shape.pseudo_inverse()).T * float(shape.wheel_radius)
+    step, late = w.turn @ back, w.speed_change @ back
     moved = body_twist(w, robot) * w.dt[..., None]
     angle, series = np.arctan2(step[..., 1], step[..., 0]), fourier(step)
     for vector in (step, late, moved):

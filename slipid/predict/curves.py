@@ -17,11 +17,11 @@ from scipy import sparse
 from scipy.optimize import least_squares, linprog, lsq_linear
 
 from slipid.model.motor import REST
-from slipid.predict.slip_model import Machine, RunSignals, Twists
-from slipid.predict.steps import Steps, TrainingWindows, TwistModel, least
+from slipid.predict.slip_model import RobotSpec, RunSignals, Twists
+from slipid.predict.steps import Steps, TrainingWindows, TwistModel, scaled_least_squares
 
 Slips = Float[np.ndarray, "step drive"]
-Regressor = Callable[[RunSignals, Machine], Slips]
+Regressor = Callable[[RunSignals, RobotSpec], Slips]
 """What the slip of each wheel is a curve of, in every step."""
 Features = Callable[[np.ndarray], np.ndarray]
 """From the regressor (...,) to features (..., k); slip is their weighted sum."""
@@ -35,20 +35,20 @@ instead of whichever rounding prefers.
 """
 
 
-def current(signals: RunSignals, machine: Machine) -> Slips:
+def current(signals: RunSignals, spec: RobotSpec) -> Slips:
     """Current of every wheel along its motion [A]; zeros where none was logged."""
-    return np.zeros_like(signals.turn) if signals.current is None else signals.along(machine)
+    return np.zeros_like(signals.turn) if signals.current is None else signals.along(spec)
 
 
-def soft_torque(signals: RunSignals, machine: Machine) -> Slips:
+def soft_torque(signals: RunSignals, spec: RobotSpec) -> Slips:
     """Torque of every wheel [N m] as the motor's model has it; zeros where none was logged.
 
     The sign of a current fades as a wheel comes to rest, I = |I| w / sqrt(w^2 + w0^2), since an
     unsigned ammeter does not show it.
     """
-    shaft = np.abs(machine.gear_ratio * signals.speed)
-    amps = current(signals, machine) * shaft / np.sqrt(shaft**2 + REST**2)
-    return replace(signals, current=amps, current_is_signed=False).torque(machine, REST)
+    shaft = np.abs(spec.gear_ratio * signals.speed)
+    amps = current(signals, spec) * shaft / np.sqrt(shaft**2 + REST**2)
+    return replace(signals, current=amps, current_is_signed=False).torque(spec, REST)
 
 
 @dataclass(frozen=True)
@@ -56,17 +56,17 @@ class WheelSlip(TwistModel, abc.ABC):
     """A model that gives the slip of each wheel from what its own motor takes."""
 
     @abc.abstractmethod
-    def slip(self, steps: Steps, machine: Machine) -> Slips:
+    def slip(self, steps: Steps, spec: RobotSpec) -> Slips:
         """Slip of each drive [-] in every step."""
 
-    def twist(self, steps: Steps, machine: Machine) -> Twists:
-        rim = steps.signals.speed * machine.wheel_radius * (1.0 - self.slip(steps, machine))
-        return np.asarray(rim @ machine.back.T)
+    def twist(self, steps: Steps, spec: RobotSpec) -> Twists:
+        rim = steps.signals.speed * spec.wheel_radius * (1.0 - self.slip(steps, spec))
+        return np.asarray(rim @ spec.back.T)
 
 
 @final
 @dataclass(frozen=True)
-class Curve(WheelSlip):
+class CurveModel(WheelSlip):
     """Slip of each wheel as a function of its own current or torque, linear in coefficients.
 
         s_i = sum_k beta_k phi_k(x_i)
@@ -90,31 +90,31 @@ class Curve(WheelSlip):
     smoothing: float | None = None
     most: float = np.inf
 
-    def learn(self, w: TrainingWindows, machine: Machine) -> "Curve":
-        rim = w.steps.signals.speed * machine.wheel_radius
-        rows = w.rows(machine.back @ (rim[..., None] * self.regressors(w.steps, machine)), machine)
+    def learn(self, w: TrainingWindows, spec: RobotSpec) -> "CurveModel":
+        rim = w.steps.signals.speed * spec.wheel_radius
+        rows = w.rows(spec.back @ (rim[..., None] * self.regressors(w.steps, spec)), spec)
         a, b = rows.parts.reshape(-1, rows.parts.shape[-1]), rows.gap.ravel()
         if self.insensitive:
             return replace(self, coefficients=insensitive(a, b))
         if not self.monotone:
-            return replace(self, coefficients=least(a, b))
+            return replace(self, coefficients=scaled_least_squares(a, b))
         lower = np.where(np.arange(a.shape[1]) > 0, 0.0, -np.inf)
         ridge = RIDGE * np.diag(np.linalg.norm(a, axis=0))
         all_rows = np.concatenate([a, ridge]), np.concatenate([b, np.zeros(len(ridge))])
         return replace(self, coefficients=lsq_linear(*all_rows, (lower, np.inf), method="bvls").x)
 
-    def slip(self, steps: Steps, machine: Machine) -> Slips:
-        return np.clip(self.regressors(steps, machine) @ self.known, -self.most, self.most)
+    def slip(self, steps: Steps, spec: RobotSpec) -> Slips:
+        return np.clip(self.regressors(steps, spec) @ self.known, -self.most, self.most)
 
-    def regressors(self, steps: Steps, machine: Machine) -> Float[np.ndarray, "step drive k"]:
+    def regressors(self, steps: Steps, spec: RobotSpec) -> Float[np.ndarray, "step drive k"]:
         """What slip is linear in."""
-        x = self.regressor(steps.signals, machine)
+        x = self.regressor(steps.signals, spec)
         phi = self.features(x if self.smoothing is None else steps.smoothed(x, self.smoothing))
         if not self.per_wheel:
             return phi
         return np.einsum("sdk,de->sdek", phi, np.eye(phi.shape[1])).reshape(*phi.shape[:2], -1)
 
-    def stiffness(self, w: TrainingWindows, machine: Machine) -> Float[np.ndarray, "k k"]:
+    def stiffness(self, w: TrainingWindows, spec: RobotSpec) -> Float[np.ndarray, "k k"]:
         """A coefficient that rests on its bound does not move with the data."""
         held = self.monotone & (np.arange(self.numbers) > 0) & (self.known <= 0)
         return np.diag(held * HELD)
@@ -155,23 +155,23 @@ class Saturating(WheelSlip):
 
     name: str = "saturating"
 
-    def learn(self, w: TrainingWindows, machine: Machine) -> "Saturating":
-        scale = w.dt[:, None] * machine.size
+    def learn(self, w: TrainingWindows, spec: RobotSpec) -> "Saturating":
+        scale = w.dt[:, None] * spec.size
 
         def gap(shape: np.ndarray) -> np.ndarray:
-            found = w.means(replace(self, coefficients=shape).twist(w.steps, machine))
+            found = w.means(replace(self, coefficients=shape).twist(w.steps, spec))
             return np.asarray(((found - w.twist) * scale).ravel())
 
-        torque = soft_torque(w.steps.signals, machine)
+        torque = soft_torque(w.steps.signals, spec)
         top = float(np.log(max(torque.max(), 1e-3) * 1.5))
         # the cap makes several minima: with one-sided differences rounding decides between them
         starts = ([np.log(k), top] for k in (0.05, 0.3, 1.0))
         tries = [least_squares(gap, x, jac="3-point", max_nfev=200) for x in starts]
         return replace(self, coefficients=min(tries, key=lambda r: r.cost).x)
 
-    def slip(self, steps: Steps, machine: Machine) -> Slips:
+    def slip(self, steps: Steps, spec: RobotSpec) -> Slips:
         kappa, m_max = np.exp(self.known)
-        share = np.minimum(soft_torque(steps.signals, machine) / m_max, 0.98)
+        share = np.minimum(soft_torque(steps.signals, spec) / m_max, 0.98)
         return np.asarray(-kappa * np.log1p(-share))
 
 

@@ -13,13 +13,13 @@ from jaxtyping import Bool, Float, Int
 
 from slipid.data.runs import Runs
 from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, still_viscosities
+from slipid.fit.problem import Problem, fixed_viscosities
 from slipid.predict import open_loop as replay
-from slipid.predict.noisy import with_noise
-from slipid.predict.predictive import Predictive, contact_of
+from slipid.predict.fitted_slip_model import fit_with_noise
+from slipid.predict.predictive import PredictiveModel, force_balance_of
 from slipid.predict.score import setups
 from slipid.predict.slip_models import slip_models
-from slipid.predict.validation import ScoredRun, add_scores, told
+from slipid.predict.validation import ScoredRun, add_scores, plain_values
 from slipid.search_space import Choice, Space
 from slipid.support.errors import DataError
 from slipid.support.files import Content
@@ -28,7 +28,7 @@ Fold = Int[np.ndarray, " run"]
 
 
 @dataclass(frozen=True)
-class Facts:
+class FoldKey:
     """What folds go by: floor with load set-up, direction commanded [deg] and speed [m/s]."""
 
     floor: str
@@ -36,27 +36,27 @@ class Facts:
     speed: float
 
 
-def facts_of(data: Runs) -> list[Facts]:
+def fold_keys(data: Runs) -> list[FoldKey]:
     """Facts of all runs; directions and speeds are nan where they are not known."""
     where = setups([log.surface or "unknown" for log in data.logs], [log.load for log in data.logs])
     way = np.degrees(data.heading).tolist()
-    return [Facts(*one) for one in zip(where, way, data.speed.tolist(), strict=True)]
+    return [FoldKey(*one) for one in zip(where, way, data.speed.tolist(), strict=True)]
 
 
-def sectors(facts: Sequence[Facts]) -> Fold:
+def sectors(facts: Sequence[FoldKey]) -> Fold:
     """Fold of every run by the 60 deg its commanded heading lies in, -1 where it has none."""
     way, known = _headings(facts)
     return np.where(known, (np.floor((way % 360.0 + 1e-6) / 60.0) % 6).astype(int), -1)
 
 
-def random_headings(facts: Sequence[Facts]) -> Fold:
+def random_headings(facts: Sequence[FoldKey]) -> Fold:
     """One of six folds of every run by its heading, dealt every 5 deg, -1 where it has none."""
     dealt = np.random.default_rng(0).permutation(72) % 6
     way, known = _headings(facts)
     return np.where(known, dealt[np.round(way / 5.0).astype(int) % 72], -1)
 
 
-def speeds(facts: Sequence[Facts], most: int | None = None) -> Fold:
+def speeds(facts: Sequence[FoldKey], most: int | None = None) -> Fold:
     """Fold of every run by its commanded speed, -1 where its floor and load saw one fold only.
 
     Where there are more than twice `most` speeds, so many folds have equally many of them. Turns on
@@ -75,14 +75,16 @@ def speeds(facts: Sequence[Facts], most: int | None = None) -> Fold:
     return fold
 
 
-def _headings(facts: Sequence[Facts]) -> tuple[Float[np.ndarray, " run"], Bool[np.ndarray, " run"]]:
+def _headings(
+    facts: Sequence[FoldKey],
+) -> tuple[Float[np.ndarray, " run"], Bool[np.ndarray, " run"]]:
     """Commanded headings, zero where there is none [deg], and whether there is one."""
     way = np.array([f.heading_deg for f in facts], float)
     known = np.isfinite(way)
     return np.where(known, way, 0.0), known
 
 
-QUESTIONS: dict[str, Callable[[Sequence[Facts]], Fold]] = {
+QUESTIONS: dict[str, Callable[[Sequence[FoldKey]], Fold]] = {
     "sectors": sectors,
     "speeds": speeds,
     "random": random_headings,
@@ -96,7 +98,7 @@ def nested(data: Runs, question: str, judged: np.ndarray) -> Fold:
     A sector beside one that is judged would leave a wider gap than is asked about: it is -1, seen
     always, where two sectors or more are left.
     """
-    fold = QUESTIONS[question](facts_of(data))
+    fold = QUESTIONS[question](fold_keys(data))
     if question != "sectors":
         return fold
     left_out = np.unique(fold[judged])
@@ -122,7 +124,7 @@ def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
         )
     if parts is not None and parts < 2:
         raise ValueError(f"{parts} parts; expected 2 or more")
-    facts = facts_of(data)
+    facts = fold_keys(data)
     fold = QUESTIONS[question](facts)
     if parts is not None:
         fold = np.where(fold < 0, fold, fold % parts)
@@ -148,11 +150,11 @@ class FoldResult:
     reason: str
 
     def to_json(self) -> Content:
-        return asdict(self, dict_factory=told)
+        return asdict(self, dict_factory=plain_values)
 
 
 @dataclass(frozen=True, eq=False)
-class Learnt:
+class FoldModels:
     """Every model, the force balance first, fitted to some runs of a problem.
 
     Seconds are to fit, by model.
@@ -160,41 +162,43 @@ class Learnt:
 
     problem: Problem
     optimum: Optimum
-    models: tuple[Predictive, ...]
+    models: tuple[PredictiveModel, ...]
     seconds: dict[str, float]
 
 
-def learn(
+def fit_fold(
     problem: Problem,
     choices: Sequence[Choice],
     data: Runs,
     question: str,
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
-) -> Learnt:
+) -> FoldModels:
     """Every slip model fitted without some runs; arguments as of `judge`.
 
     Of the runs left out nothing is used but which they are.
     """
     fitted = np.setdiff1d(np.arange(len(data)), judged)
-    problem = of_some(problem, choices, data, fitted)
+    problem = problem_of_runs(problem, choices, data, fitted)
     keep = np.isin(problem.windows.run, fitted).astype(float)
     began = time.perf_counter()
     optimum = fit(problem, keep=keep)
-    contact = contact_of(problem, optimum.state, optimum.covariance, keep)
-    models: list[Predictive] = [contact]
+    contact = force_balance_of(problem, optimum.state, optimum.covariance, keep)
+    models: list[PredictiveModel] = [contact]
     seconds = {contact.name: time.perf_counter() - began}
     together, shape = nested(data, question, judged), problem.robot.geometry
     for model in slip_models(shape, problem.windows.has_current, together):
         began = time.perf_counter()
-        models.append(with_noise(model, contact, problem, keep))
+        models.append(fit_with_noise(model, contact, problem, keep))
         seconds[model.name] = time.perf_counter() - began
-    return Learnt(problem, optimum, tuple(models), seconds)
+    return FoldModels(problem, optimum, tuple(models), seconds)
 
 
-def of_some(problem: Problem, choices: Sequence[Choice], data: Runs, fitted: np.ndarray) -> Problem:
+def problem_of_runs(
+    problem: Problem, choices: Sequence[Choice], data: Runs, fitted: np.ndarray
+) -> Problem:
     """The problem of a fit to some of its runs: what those cannot tell is held."""
-    held = [*still_viscosities(data, fitted), *choices]
+    held = [*fixed_viscosities(data, fitted), *choices]
     if Space(problem.robot, held).names == problem.space.names:
         return problem
     return Problem(problem.windows, problem.robot, held)  # they saw a floor at one speed
@@ -214,12 +218,12 @@ def judge(
     left out for one of the `QUESTIONS`; a model that tunes itself does so for that question, on the
     other runs. `fit` is how the problem is fitted.
     """
-    learnt = learn(problem, choices, data, question, judged, fit)
+    learnt = fit_fold(problem, choices, data, question, judged, fit)
     problem, optimum = learnt.problem, learnt.optimum
     seconds = {name: {"fit": spent} for name, spent in learnt.seconds.items()}
     part = data.subset(judged)
     runs: dict[int, ScoredRun] = {}
-    cuts = replay.cuts(part, learnt.models[0].robot)
+    cuts = replay.replay_windows(part, learnt.models[0].robot)
     for model in learnt.models:
         began = time.perf_counter()
         for w in cuts:

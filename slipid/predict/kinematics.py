@@ -55,7 +55,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.model.geometry import Geometry
-from slipid.predict.slip_model import Channel, Machine, Twists, turned
+from slipid.predict.slip_model import Channel, RobotSpec, Twists, turned
 from slipid.predict.steps import Steps, TrainingWindows, TwistModel
 
 TERMS = {"effective_track": 3, "instantaneous_centres": 5, "full_linear": 6}
@@ -79,12 +79,12 @@ class Encoder(TwistModel):
     shape: Geometry | None = None
     lag: float | None = None
 
-    def learn(self, w: TrainingWindows, machine: Machine) -> "Encoder":
+    def learn(self, w: TrainingWindows, spec: RobotSpec) -> "Encoder":
         return self
 
-    def twist(self, steps: Steps, machine: Machine) -> Twists:
+    def twist(self, steps: Steps, spec: RobotSpec) -> Twists:
         at = steps if self.lag is None else steps.at_lag(self.lag)
-        return at.signals.rolling(machine if self.shape is None else machine.of_shape(self.shape))
+        return at.signals.rolling(spec if self.shape is None else spec.of_shape(self.shape))
 
 
 def nominal(shape: Geometry) -> Encoder:
@@ -106,28 +106,28 @@ class Corrected(TwistModel):
 
     shape: Geometry | None = None
 
-    def learn(self, w: TrainingWindows, machine: Machine) -> "Corrected":
+    def learn(self, w: TrainingWindows, spec: RobotSpec) -> "Corrected":
         from scipy.optimize import least_squares
 
         count, lag = TERMS[self.name], w.steps.lag
-        start = np.zeros(count + (w.steps.faster is not None))
+        start = np.zeros(count + (w.steps.speed_change is not None))
         start[:2], start[count:] = 1.0, lag
         low, high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
         low[count:], high[count:] = lag - LONGEST_LAG, lag + LONGEST_LAG
-        scale = w.dt[:, None] * machine.size
+        scale = w.dt[:, None] * spec.size
 
         def gap(numbers: np.ndarray) -> np.ndarray:
-            found = w.means(replace(self, coefficients=numbers).twist(w.steps, machine))
+            found = w.means(replace(self, coefficients=numbers).twist(w.steps, spec))
             return np.asarray(((found - w.twist) * scale).ravel())
 
         found = least_squares(gap, start, bounds=(low, high), x_scale="jac").x
         return replace(self, coefficients=found)
 
-    def twist(self, steps: Steps, machine: Machine) -> Twists:
+    def twist(self, steps: Steps, spec: RobotSpec) -> Twists:
         count, numbers = TERMS[self.name], self.known
         if len(numbers) > count:
             steps = steps.at_lag(float(numbers[count]))
-        own = machine if self.shape is None else machine.of_shape(self.shape)
+        own = spec if self.shape is None else spec.of_shape(self.shape)
         return corrected(steps.signals.rolling(own), numbers[:count])
 
 
@@ -167,29 +167,29 @@ class HeadingLookup(TwistModel):
     def candidates(self) -> Sequence["HeadingLookup"]:
         return [replace(self, ridge=ridge) for ridge in RIDGES]
 
-    def learn(self, w: TrainingWindows, machine: Machine) -> "HeadingLookup":
-        table = self._table(w, machine)
+    def learn(self, w: TrainingWindows, spec: RobotSpec) -> "HeadingLookup":
+        table = self._table(w, spec)
         ridge = table.best_weight() if self.ridge is None else self.ridge
         return replace(self, ridge=ridge, coefficients=table.solved(ridge))
 
-    def stiffness(self, w: TrainingWindows, machine: Machine) -> Float[np.ndarray, "k k"]:
+    def stiffness(self, w: TrainingWindows, spec: RobotSpec) -> Float[np.ndarray, "k k"]:
         """The ridge as a Gaussian prior: its penalty over the mean square of what is left."""
-        table = self._table(w, machine)
+        table = self._table(w, spec)
         left = np.mean((table.gap - table.phi @ self.known) ** 2, axis=0)
         weight = table.best_weight() if self.ridge is None else self.ridge
         return np.kron(table.penalty(weight), np.diag(1 / np.maximum(left, 1e-12)))
 
-    def twist(self, steps: Steps, machine: Machine) -> Twists:
-        rolling, series = steps.signals.rolling(machine), self.known
+    def twist(self, steps: Steps, spec: RobotSpec) -> Twists:
+        rolling, series = steps.signals.rolling(spec), self.known
         change = fourier(rolling) @ series
         change[:, :2] = turned(_direction(rolling), change[:, :2])
         return np.asarray(rolling + change)
 
-    def _table(self, w: TrainingWindows, machine: Machine) -> "_Table":
-        rolling = w.means(w.steps.signals.rolling(machine))
+    def _table(self, w: TrainingWindows, spec: RobotSpec) -> "_HeadingTable":
+        rolling = w.means(w.steps.signals.rolling(spec))
         gap = (w.twist - rolling) * w.dt[:, None]
         gap[:, :2] = turned(-_direction(rolling), gap[:, :2])
-        return _Table(fourier(rolling * w.dt[:, None]), gap, self._fold(w.run))
+        return _HeadingTable(fourier(rolling * w.dt[:, None]), gap, self._fold(w.run))
 
     def _fold(self, run: Int[np.ndarray, " window"]) -> Int[np.ndarray, " window"]:
         """Fold of every window, five of random runs where fewer than two are left out together."""
@@ -199,7 +199,7 @@ class HeadingLookup(TwistModel):
         return np.random.default_rng(0).integers(0, 5, run.max() + 1)[run]
 
 
-class _Table(NamedTuple):
+class _HeadingTable(NamedTuple):
     """Features (window, k), the gap they explain, and folds."""
 
     phi: np.ndarray

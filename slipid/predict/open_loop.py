@@ -17,10 +17,10 @@ from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
 from slipid.fit import likelihood as lk
 from slipid.fit.noise import travel
-from slipid.fit.sessions import by_axis
+from slipid.fit.session_effects import by_axis
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
-from slipid.predict.slip_model import sideways, turned
+from slipid.predict.slip_model import turned, turned_left
 from slipid.search_space import Space
 
 STEP = 0.5
@@ -44,7 +44,7 @@ class Tracks:
         return self.predicted[:, -1] - self.measured[:, -1]
 
 
-def cuts(data: Runs, robot: Robot) -> list[Windows]:
+def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
     """The runs, each as one piece of short steps, `TOGETHER` at a time.
 
     Numbers of steps are powers of two, so that few shapes are compiled.
@@ -70,9 +70,9 @@ def whole_runs(data: Runs, robot: Robot, steps: Sequence[int]) -> list[Windows]:
         runs = np.flatnonzero(np.asarray(steps) == count)
         for first in range(0, len(runs), TOGETHER):
             some = runs[first : first + TOGETHER]
-            w = windows(data.subset(some), radius, lag, per_piece=count, longest=np.inf)
+            w = windows(data.subset(some), radius, lag, per_segment=count, longest=np.inf)
             filled = np.minimum(np.arange(TOGETHER), len(w) - 1)
-            out.append(replace(w, run=some[w.run]).pieces(filled))
+            out.append(replace(w, run=some[w.run]).segments(filled))
     return out
 
 
@@ -99,14 +99,16 @@ def chain(start: Float[Array, "piece 3"], step: Float[Array, "piece window 3"]) 
     return jax.vmap(one)(start, step)
 
 
-def follow(robot: Robot, w: Windows, increment: Float[np.ndarray, "piece window 3"]) -> Tracks:
+def tracks_from_increments(
+    robot: Robot, w: Windows, increment: Float[np.ndarray, "piece window 3"]
+) -> Tracks:
     """Tracks of a model that gives marker increments."""
     pose = np.asarray(corrected(robot, jnp.asarray(w.pose)))
     path = np.asarray(chain(jnp.asarray(pose[:, 0]), jnp.asarray(increment)))
     return Tracks(w.run, path, pose)
 
 
-class Correction(eqx.Module):
+class IncrementCorrection(eqx.Module):
     """What is taken off predicted increments, and its slope by the search vector."""
 
     moved: Float[Array, "piece window 3"]
@@ -120,7 +122,7 @@ def end_jacobian(
     b: lk.Batch,
     start: Numbers,
     twist: Numbers | None = None,
-    corrected: Correction | None = None,
+    corrected: IncrementCorrection | None = None,
 ) -> Float[Array, "piece 2 free"]:
     """Slope of the ends by the search vector, from given start poses.
 
@@ -135,7 +137,9 @@ def end_jacobian(
             if corrected is not None:
                 step -= corrected.moved + corrected.by_number @ (x - jnp.asarray(z))
             return chain(start, step)[:, -1, :2]
-        return chain(start, lk.seen(robot, jnp.asarray(twist), b.dt, b.session))[:, -1, :2]
+        return chain(start, lk.marker_increments(robot, jnp.asarray(twist), b.dt, b.session))[
+            :, -1, :2
+        ]
 
     return jax.jacfwd(end)(z)
 
@@ -157,16 +161,16 @@ def end_covariance(
     far, u = travel(w, robot)
     p = tracks.predicted
     cov = of_parameters.copy()
-    lever = sideways(p[:, -1:, :2] - p[:, 1:, :2])  # what a turn at each step moves
+    lever = turned_left(p[:, -1:, :2] - p[:, 1:, :2])  # what a turn at each step moves
     way = p[:, :-1, 2]
-    along, across = turned(way, u), turned(way, sideways(u))
+    along, across = turned(way, u), turned(way, turned_left(u))
     process, run = (by_axis(variance, k, w) for k in ("process", "run"))
     axes = np.stack((along, across, lever))
     cov += np.einsum("na,nk,anki,ankj->nij", process, far, axes, axes)
     whole = np.einsum("nk,anki->nai", far, axes)
     effect = shared + run[:, :, None] * np.eye(len(axes))
     cov += np.einsum("nab,nai,nbj->nij", effect, whole, whole)
-    turn = sideways(p[:, -1, :2] - p[:, 0, :2])
+    turn = turned_left(p[:, -1, :2] - p[:, 0, :2])
     cov += variance["camera.heading"] * turn[:, :, None] * turn[:, None, :]
     cov += 2 * variance["camera.place"] * float(robot.camera.scale) ** 2 * np.eye(2)
     return cov

@@ -7,8 +7,8 @@ with scale
 
 V of its own camera, process and run variances, found by restricted likelihood from its own
 residuals; v what runs share, E what that moves; J the slope by its own numbers and the camera's, C
-their covariance. Simpler models have v of sessions (`slipid.fit.sessions`); the force
-balance has what its fit found of sessions and neighbours (`slipid.fit.shared`), and v
+their covariance. Simpler models have v of sessions (`slipid.fit.session_effects`); the force
+balance has what its fit found of sessions and neighbours (`slipid.fit.shared_effects`), and v
 grows where leaving out sectors asks for it. All models share the fitted camera;
 the numbers of a simpler model follow it.
 """
@@ -27,23 +27,29 @@ from scipy.special import gammaln
 
 from slipid.data.windows import Windows
 from slipid.fit import likelihood as lk
-from slipid.fit.hierarchy import Courses, extrapolation
+from slipid.fit.hierarchy import TravelDirections, extrapolation
 from slipid.fit.noise import SHARED, effects, travel
-from slipid.fit.problem import Problem, State
-from slipid.fit.sessions import Linear, by_axis, shared
-from slipid.fit.shared import AXES, Directions, FoundShared, Told, told_of
-from slipid.fit.variances import DEGREES, Search, Square, Vector, expected_ties, whitened
+from slipid.fit.problem import FitState, Problem
+from slipid.fit.session_effects import LinearModel, by_axis, with_session_effects
+from slipid.fit.shared_effects import (
+    AXES,
+    EffectForecast,
+    EffectTable,
+    TravelConditions,
+    forecast_effects,
+)
+from slipid.fit.variances import DEGREES, Search, Square, Vector, expected_posteriors, whitened
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.search_space import Space
 
 Gaps = Float[np.ndarray, "piece m"]
 Slopes = Float[np.ndarray, "piece m number"]
-Fitted = TypeVar("Fitted", bound="Predictive")
+Fitted = TypeVar("Fitted", bound="PredictiveModel")
 
 
 @dataclass(frozen=True, eq=False)
-class Predictive(abc.ABC):
+class PredictiveModel(abc.ABC):
     """A fitted model with noise of its own, seen by the camera of its robot.
 
     Variances are of every noise component by name, and of what sessions share, where they do. The
@@ -82,7 +88,9 @@ class Predictive(abc.ABC):
         noise = np.asarray(problem.covariance("motion", self.log_variance(problem)))
         e = effects(problem.windows, problem.robot)
         v = self.effect_covariance(problem.windows)
-        numbers = self.growth(problem.windows)[:, None, None] * around(slope, self.covariance)
+        numbers = self.growth(problem.windows)[:, None, None] * parameter_covariance(
+            slope, self.covariance
+        )
         return gap, noise + np.einsum("nma,nab,nlb->nml", e, v, e) + numbers
 
     def growth(self, w: Windows) -> Float[np.ndarray, " piece"]:
@@ -107,7 +115,7 @@ class Predictive(abc.ABC):
         keep: np.ndarray,
     ) -> Fitted:
         """The model with what runs of a session share in its variances and in its covariance."""
-        model = Linear(
+        model = LinearModel(
             *linear,
             covariance=self.covariance,
             wide=wide,
@@ -115,7 +123,7 @@ class Predictive(abc.ABC):
             effect=effects(problem.windows, problem.robot),
             run=by_axis(self.variance, "run", problem.windows),
         )
-        variance, covariance = shared(model, problem.windows, np.asarray(keep, float))
+        variance, covariance = with_session_effects(model, problem.windows, np.asarray(keep, float))
         return replace(self, variance={**self.variance, **variance}, covariance=covariance)
 
 
@@ -139,7 +147,7 @@ _camera_log_jacobian = jax.jit(lk.camera_log_jacobian)
 
 
 @dataclass(frozen=True, eq=False)
-class Contact(Predictive):
+class ForceBalance(PredictiveModel):
     """The force balance where a fit has left it, at the search vector z.
 
     Variances of numbers and of shared effects are too small for runs it has not seen, by the factor
@@ -148,7 +156,7 @@ class Contact(Predictive):
 
     space: Space
     z: Search
-    shared: Mapping[str, FoundShared]
+    shared: Mapping[str, EffectTable]
     extrapolation: Mapping[str, float]
 
     @property
@@ -167,12 +175,12 @@ class Contact(Predictive):
                 out[name] *= max(grown, default=1.0)
         return out
 
-    def told(self, w: Windows) -> Told:
+    def expected_effects(self, w: Windows) -> EffectForecast:
         """What neighbours among the fitted runs tell of runs."""
-        return told_of(self.shared, w, self.robot, self.space.size)
+        return forecast_effects(self.shared, w, self.robot, self.space.size)
 
     def effect_covariance(self, w: Windows) -> Float[np.ndarray, "piece 3 3"]:
-        shared = super().effect_covariance(w) + self.told(w).covariance
+        shared = super().effect_covariance(w) + self.expected_effects(w).covariance
         return self.growth(w)[:, None, None] * shared
 
     def growth(self, w: Windows) -> Float[np.ndarray, " piece"]:
@@ -194,16 +202,16 @@ class Contact(Predictive):
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
         electric = problem.electric(self.z, self.log_variance(problem))
         blocks, jac = problem.linear(self.z, electric)
-        told, e = self.told(problem.windows), effects(problem.windows, problem.robot)
+        told, e = self.expected_effects(problem.windows), effects(problem.windows, problem.robot)
         gap = np.asarray(blocks["motion"]) - np.einsum("nma,na->nm", e, told.mean)
         slope = np.asarray(jac["motion"]) - np.einsum("nma,nap->nmp", e, told.slope)
         return gap, slope
 
     def tracks(self, w: Windows) -> replay.Tracks:
         """Of whole runs, as the force balance and what neighbours tell have them."""
-        return self._tracks(w, self._moved(w, self.told(w)))
+        return self._tracks(w, self._moved(w, self.expected_effects(w)))
 
-    def _moved(self, w: Windows, told: Told) -> Float[np.ndarray, "piece window 3"]:
+    def _moved(self, w: Windows, told: EffectForecast) -> Float[np.ndarray, "piece window 3"]:
         """By what neighbours tell that the force balance moves too far."""
         moved = np.einsum("nma,na->nm", effects(w, self.robot), told.mean)
         return moved.reshape(*w.dt.shape, 3)
@@ -211,14 +219,14 @@ class Contact(Predictive):
     def _tracks(self, w: Windows, moved: Float[np.ndarray, "piece window 3"]) -> replay.Tracks:
         b = lk.batch(w, self.robot)
         increments = np.asarray(replay.contact_increments(self.robot, b)) - moved
-        return replay.follow(self.robot, w, increments)
+        return replay.tracks_from_increments(self.robot, w, increments)
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
-        b, told, e = lk.batch(w, self.robot), self.told(w), effects(w, self.robot)
+        b, told, e = lk.batch(w, self.robot), self.expected_effects(w), effects(w, self.robot)
         moved = self._moved(w, told)
         tracks = self._tracks(w, moved)
         by_number = np.einsum("nma,nap->nmp", e, told.slope).reshape(*moved.shape, -1)
-        more = replay.Correction(jnp.asarray(moved), jnp.asarray(by_number))
+        more = replay.IncrementCorrection(jnp.asarray(moved), jnp.asarray(by_number))
         start = tracks.predicted[:, 0]
         jac = np.asarray(replay.end_jacobian(self.space, self.z, b, start, corrected=more))
         own = np.einsum("nip,pq,njq->nij", jac, self.covariance, jac)
@@ -227,51 +235,51 @@ class Contact(Predictive):
         return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, own)
 
 
-def contact_of(
-    problem: Problem, state: State, covariance: Square, keep: Float[np.ndarray, " piece"]
-) -> Contact:
+def force_balance_of(
+    problem: Problem, state: FitState, covariance: Square, keep: Float[np.ndarray, " piece"]
+) -> ForceBalance:
     """The force balance at the end of a fit of the kept pieces, with what sessions share."""
     robot, variance = problem.space.tree(state.z), by_name(problem, state.log_variance)
     z, log_v = np.asarray(state.z), np.asarray(state.log_variance)
     blocks, jacobian = problem.linear(z, problem.electric(z, log_v))
     motion = blocks["motion"], jacobian["motion"]
     w = problem.windows
-    direction = Directions.of(w, problem.robot).direction
-    courses = Courses(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
-    grown = extrapolation(problem.target, motion, keep[: len(w)], covariance, log_v, courses)
-    return Contact(
+    direction = TravelConditions.of(w, problem.robot).direction
+    courses = TravelDirections(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
+    grown = extrapolation(problem.objective, motion, keep[: len(w)], covariance, log_v, courses)
+    return ForceBalance(
         robot,
         variance,
         np.asarray(covariance),
         problem.space,
         z,
-        shared=found_shared(problem, state, keep),
+        shared=effect_tables(problem, state, keep),
         extrapolation=grown,
     )
 
 
-def found_shared(
-    problem: Problem, state: State, keep: Float[np.ndarray, " piece"]
-) -> dict[str, FoundShared]:
+def effect_tables(
+    problem: Problem, state: FitState, keep: Float[np.ndarray, " piece"]
+) -> dict[str, EffectTable]:
     """What neighbouring runs on every floor share, by a fit of the kept pieces."""
     log_v, free = jnp.asarray(state.log_variance), problem.space.size
     residual, jacobian = problem.linear(state.z, problem.electric(state.z, log_v))
-    seen = problem.seen(residual, log_v, keep, state.shared(len(problem.windows)))
+    seen = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
     white = jnp.einsum("nij,nj->ni", seen.whitening.root["motion"], residual["motion"])
-    half = whitened(problem.target.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]
-    expected = expected_ties(problem.target, log_v, jnp.asarray(keep))
+    half = whitened(problem.objective.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]
+    expected = expected_posteriors(problem.objective, log_v, jnp.asarray(keep))
     std = np.exp(0.5 * np.asarray(log_v))
     out = {}
     for floor, of, tie, to in zip(
-        problem.robot.surfaces.labels, problem.target.shared, seen.tied, expected, strict=True
+        problem.robot.surfaces.labels, problem.objective.shared, seen.effects, expected, strict=True
     ):
         near = of.near.shape[-1]
         count = near + of.session.shape[1]
         inverse = np.linalg.inv(np.asarray(to.factor))
         covariance = (inverse.T @ inverse).reshape(3, count, 3, count)
         slope = jax.vmap(to.coefs, in_axes=-1, out_axes=-1)(half)
-        out[floor] = FoundShared(
-            paces=problem.paces[floor],
+        out[floor] = EffectTable(
+            speeds_and_loads=problem.speeds_and_loads[floor],
             std=std[np.asarray(of.numbers)[1]],
             coefs=np.asarray(tie.coefs(white)).reshape(3, count)[:, :near],
             by_number=np.asarray(slope).reshape(3, count, free)[:, :near],
@@ -280,7 +288,7 @@ def found_shared(
     return out
 
 
-def around(jac: Slopes, cov: np.ndarray) -> np.ndarray:
+def parameter_covariance(jac: Slopes, cov: np.ndarray) -> np.ndarray:
     """J C J^T of every piece, without the columns that are zero for it."""
     used = (jac != 0.0).any(axis=1)
     patterns, which = np.unique(used, axis=0, return_inverse=True)

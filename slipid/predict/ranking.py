@@ -39,7 +39,7 @@ Source: Sivula, Magnusson, Matamoros and Vehtari 2020, arXiv:2008.10296.
 
 
 @dataclass(frozen=True)
-class Ranked:
+class RankedModel:
     """A model on a floor: its score [nats per run], see `ranking`, and means over the runs.
 
     The difference is to the best, `se` over runs, `se_clustered` over sectors of headings as that
@@ -74,7 +74,7 @@ class Ranking:
     sentence: str
     band50: tuple[float, float]
     band90: tuple[float, float]
-    models: dict[str, Ranked]
+    models: dict[str, RankedModel]
 
 
 def ranking(runs: Sequence[ScoredRun]) -> dict[str, Ranking]:
@@ -106,13 +106,13 @@ def _floor(floor: str, runs: Sequence[ScoredRun]) -> Ranking:
 
 def _ranked(
     scores: Sequence[Score], behind: np.ndarray, is_best: bool, cluster: np.ndarray
-) -> Ranked:
+) -> RankedModel:
     """A model whose runs have these log densities less the best model's."""
     difference, se, clustered = mean_error(behind, cluster)
     far, _, far_se = mean_error(np.array([s.endpoint_error for s in scores]), cluster)
     level = np.array([s.level for s in scores], float)
     is_clear = abs(difference) >= SURE * clustered and abs(difference) * len(scores) >= SMALL
-    return Ranked(
+    return RankedModel(
         elpd=float(np.mean([s.log_density for s in scores if s.log_density is not None])),
         difference=difference,
         se=finite(se),
@@ -133,7 +133,7 @@ def _band(runs: int, share: float) -> tuple[float, float]:
     return low, high
 
 
-def _sentence(floor: str, best: str, models: Mapping[str, Ranked]) -> str:
+def _sentence(floor: str, best: str, models: Mapping[str, RankedModel]) -> str:
     order = sorted((m for m in models if m != best), key=lambda m: -models[m].difference)
     if not order:
         return f"{floor}: nothing to compare {_name(best)} with"
@@ -148,7 +148,7 @@ def _sentence(floor: str, best: str, models: Mapping[str, Ranked]) -> str:
     )
 
 
-def _apart(model: Ranked) -> str:
+def _apart(model: RankedModel) -> str:
     se = model.se_clustered
     return f"{-model.difference:.1f} +- {'?' if se is None else format(se, '.1f')}"
 
@@ -259,10 +259,10 @@ def errors_by_floor(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Co
         constant[name] = slip[mine] - slip[~mine].mean()
         own[name] = slip[mine] - line[mine] @ alone
     gaps = {"pooled": pooled, "constant": constant, "per_surface": own}
-    return {name: _left(gap) for name, gap in gaps.items()} | {"count": len(slip)}
+    return {name: _error_summary(gap) for name, gap in gaps.items()} | {"count": len(slip)}
 
 
-def _left(gaps: dict[str, np.ndarray]) -> Content:
+def _error_summary(gaps: dict[str, np.ndarray]) -> Content:
     each = {name: float(np.sqrt(np.mean(gap**2))) for name, gap in gaps.items()}
     rows = float(np.sqrt(np.mean(np.concatenate(list(gaps.values())) ** 2)))
     return {"rows": rows, "floors": float(np.mean(list(each.values()))), "each": each}

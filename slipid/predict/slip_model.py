@@ -17,23 +17,24 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.windows import Windows
-from slipid.fit.likelihood import measured, seen
+from slipid.fit.likelihood import marker_increments, measured_increments
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 
 Increments = Float[np.ndarray, "piece window 3"]
-_seen, _measured = jax.jit(seen), jax.jit(measured)
+_marker_increments = jax.jit(marker_increments)
+_measured_increments = jax.jit(measured_increments)
 
 
 def as_increments(twist: np.ndarray, w: Windows, robot: Robot) -> Increments:
     """Marker increments [m, m, rad] of body twists (piece, window, 3)."""
     session = jnp.asarray([robot.session_index(s) for s in w.session])
-    return np.asarray(_seen(robot, jnp.asarray(twist), jnp.asarray(w.dt), session))
+    return np.asarray(_marker_increments(robot, jnp.asarray(twist), jnp.asarray(w.dt), session))
 
 
 def body_twist(w: Windows, robot: Robot) -> np.ndarray:
     """Measured body twist of every window: yaw and place of the marker taken out, over dt."""
-    moved = np.asarray(_measured(robot, jnp.asarray(w.pose)))
+    moved = np.asarray(_measured_increments(robot, jnp.asarray(w.pose)))
     yaw = moved[..., 2]
     yaws = {s: float(robot.camera.yaw(robot.session_index(s))) for s in set(w.session)}
     psi = np.array([yaws[s] for s in w.session])[:, None]
@@ -51,7 +52,7 @@ def turned(angle: np.ndarray | float, v: np.ndarray) -> np.ndarray:
     return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], -1)
 
 
-def sideways(v: np.ndarray) -> np.ndarray:
+def turned_left(v: np.ndarray) -> np.ndarray:
     """Plane vectors (..., 2), each turned by a quarter to the left."""
     return np.stack([-v[..., 1], v[..., 0]], -1)
 
@@ -74,7 +75,7 @@ SHAFT_W0 = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Machine:
+class RobotSpec:
     """What is known of a robot before anything is fitted.
 
     A drive is a motor with all the wheels that it turns: one wheel, or a side of a skid steer.
@@ -100,10 +101,10 @@ class Machine:
     determines_twist: bool
 
     @classmethod
-    def of(cls, robot: Robot) -> "Machine":
+    def of(cls, robot: Robot) -> "RobotSpec":
         """Of a robot as its config has it."""
         shape, motor = robot.geometry, robot.motor
-        back = np.asarray(shape.least())
+        back = np.asarray(shape.pseudo_inverse())
         return cls(
             forward=np.linalg.pinv(back),
             back=back,
@@ -116,9 +117,9 @@ class Machine:
             determines_twist=bool(shape.determines_twist),
         )
 
-    def of_shape(self, shape: Geometry) -> "Machine":
+    def of_shape(self, shape: Geometry) -> "RobotSpec":
         """The same robot whose encoders are read with other sizes of its wheels and places."""
-        back = np.asarray(shape.least())
+        back = np.asarray(shape.pseudo_inverse())
         return replace(self, back=back, wheel_radius=float(shape.wheel_radius))
 
     @property
@@ -161,11 +162,11 @@ class RunSignals:
         """Wheel speed of each drive [rad/s]."""
         return self.turn / self.dt[:, None]
 
-    def rolling(self, machine: Machine) -> Twists:
+    def rolling(self, spec: RobotSpec) -> Twists:
         """Body twist if nothing slips: what encoders alone say."""
-        return np.asarray(self.speed * machine.wheel_radius @ machine.back.T)
+        return np.asarray(self.speed * spec.wheel_radius @ spec.back.T)
 
-    def along(self, machine: Machine) -> Float[np.ndarray, "step drive"]:
+    def along(self, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
         """Current along the wheel's motion [A]: positive where the motor drives.
 
         Of an unsigned ammeter it is the magnitude, as if the motor always drove.
@@ -178,23 +179,23 @@ class RunSignals:
         way = np.sign(self.speed)
         return np.asarray(self.current * way if self.current_is_signed else self.current)
 
-    def torque(self, machine: Machine, rest: float = SHAFT_W0) -> Float[np.ndarray, "step drive"]:
+    def torque(self, spec: RobotSpec, rest: float = SHAFT_W0) -> Float[np.ndarray, "step drive"]:
         """M = C_e I + R I^2 w / (w^2 + w0^2) [N m], w the shaft's speed and w0 that at `rest`.
 
         The 2021 paper's torque characterising variable M = U I / w, with U = C_e w + R I, regular
         at rest. Positive where the motor drives.
         """
-        amps, shaft = self.along(machine), np.abs(machine.gear_ratio * self.speed)
-        heat = machine.resistance * amps**2 * shaft / (shaft**2 + rest**2)
-        return np.asarray(machine.back_emf * amps + heat)
+        amps, shaft = self.along(spec), np.abs(spec.gear_ratio * self.speed)
+        heat = spec.resistance * amps**2 * shaft / (shaft**2 + rest**2)
+        return np.asarray(spec.back_emf * amps + heat)
 
-    def power(self, machine: Machine) -> Numbers:
+    def power(self, spec: RobotSpec) -> Numbers:
         """Electric power of all motors [W], by the currents and the motor's datasheet.
 
         P = sum_i (R I_i + C_e |w_i|) I_i
         """
-        amps, shaft = self.along(machine), np.abs(machine.gear_ratio * self.speed)
-        return np.asarray(((machine.resistance * amps + machine.back_emf * shaft) * amps).sum(1))
+        amps, shaft = self.along(spec), np.abs(spec.gear_ratio * self.speed)
+        return np.asarray(((spec.resistance * amps + spec.back_emf * shaft) * amps).sum(1))
 
     def windowed(self, seconds: float = WINDOW_S) -> "RunSignals":
         """The same run in longer steps: neighbours joined until they are about so long."""
@@ -297,11 +298,11 @@ class SlipModel(abc.ABC):
         return (self,)
 
     @abc.abstractmethod
-    def fit(self, runs: Sequence[Run], machine: Machine) -> Self:
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> Self:
         """The method fitted to runs."""
 
     @abc.abstractmethod
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         """Predictions of runs the model has not seen, from the signals alone."""
 
     @property
@@ -334,23 +335,23 @@ class ByFloor(SlipModel):
     def candidates(self) -> Sequence["ByFloor"]:
         return [replace(self, method=method) for method in self.method.candidates()]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "ByFloor":
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "ByFloor":
         groups: dict[str | None, list[Run]] = {}
         for run in runs:
             groups.setdefault(self.group_of(run.signals), []).append(run)
         order = sorted(groups, key=lambda name: -len(groups[name]))
         few = [name for name in order if len(groups[name]) < FEWEST] if len(order) > 1 else []
-        fitted = {n: self.method.fit(groups[n], machine) for n in order if n not in few}
+        fitted = {n: self.method.fit(groups[n], spec) for n in order if n not in few}
         if few:
-            fitted |= dict.fromkeys(few, self.method.fit(runs, machine))
+            fitted |= dict.fromkeys(few, self.method.fit(runs, spec))
         return replace(self, fitted=fitted)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         found: dict[int, PredictedRun] = {}
         groups = [self._fitted_group(run) for run in runs]
         for group in dict.fromkeys(groups):
             mine = [k for k, name in enumerate(groups) if name == group]
-            of_group = self.fitted[group].predict([runs[k] for k in mine], machine)
+            of_group = self.fitted[group].predict([runs[k] for k in mine], spec)
             found.update(zip(mine, of_group, strict=True))
         return [found[k] for k in range(len(runs))]
 
@@ -393,7 +394,7 @@ def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, 
     return np.column_stack([place, heading])
 
 
-def seen_from_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "edge 3"]:
+def relative_to_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "edge 3"]:
     """Poses as they are seen from the first of them."""
     moved = path - path[0]
     return np.column_stack([turned(-path[0, 2], moved[:, :2]), moved[:, 2]])

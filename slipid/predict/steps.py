@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 
 from slipid.predict.slip_model import (
     WINDOW_S,
-    Machine,
     PredictedRun,
+    RobotSpec,
     Run,
     RunSignals,
     SlipModel,
@@ -30,14 +30,14 @@ class Steps:
     Attributes:
         signals: all steps as if they were one run; its name and floor are those of the first.
         first: first step of each run.
-        faster: wheel speed at the end of each step less that at its start [rad/s], so that
-            d turn / d lag = -faster; None where the lag of the poses is settled.
+        speed_change: wheel speed at the end of each step less that at its start [rad/s], so that
+            d turn / d lag = -speed_change; None where the lag of the poses is settled.
         lag: lag of the poses behind the wheels that was assumed [s].
     """
 
     signals: RunSignals
     first: Int[np.ndarray, " run"]
-    faster: Float[np.ndarray, "step drive"] | None = None
+    speed_change: Float[np.ndarray, "step drive"] | None = None
     lag: float = 0.0
 
     @classmethod
@@ -64,9 +64,9 @@ class Steps:
 
     def at_lag(self, lag: float) -> "Steps":
         """The same steps at another lag, to first order [s]; as they are where it is settled."""
-        if self.faster is None:
+        if self.speed_change is None:
             return self
-        turn = self.signals.turn - (lag - self.lag) * self.faster
+        turn = self.signals.turn - (lag - self.lag) * self.speed_change
         return replace(self, signals=replace(self.signals, turn=turn), lag=lag)
 
     @property
@@ -166,18 +166,18 @@ class TrainingWindows:
         total = np.add.reduceat(values * self.steps.signals.dt.reshape(-1, *one), self.first)
         return np.asarray(total / self.dt.reshape(-1, *one))
 
-    def rows(self, parts: Float[np.ndarray, "step 3 k"], machine: Machine) -> "Rows":
+    def rows(self, parts: Float[np.ndarray, "step 3 k"], spec: RobotSpec) -> "SlipEquations":
         """What of the encoders' displacement is too much, as a sum of parts with weights.
 
         gap = (rolling - twist) dt = sum_k weight_k part_k dt, yaw times the base radius.
         """
-        gap = self.means(self.steps.signals.rolling(machine)) - self.twist
-        scale = self.dt[:, None] * machine.size
-        return Rows(self.means(parts) * scale[..., None], gap * scale)
+        gap = self.means(self.steps.signals.rolling(spec)) - self.twist
+        scale = self.dt[:, None] * spec.size
+        return SlipEquations(self.means(parts) * scale[..., None], gap * scale)
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class SlipEquations:
     """Equations that are linear in a method's coefficients, three for each window.
 
     Attributes:
@@ -189,7 +189,9 @@ class Rows:
     gap: Float[np.ndarray, "window 3"]
 
 
-def least(a: Float[np.ndarray, "row k"], b: Float[np.ndarray, " row"]) -> Float[np.ndarray, " k"]:
+def scaled_least_squares(
+    a: Float[np.ndarray, "row k"], b: Float[np.ndarray, " row"]
+) -> Float[np.ndarray, " k"]:
     """Least squares with columns of one length; of many solutions the shortest in those lengths."""
     size = np.linalg.norm(a, axis=0)
     # a column of nothing but rounding says nothing
@@ -212,23 +214,23 @@ class TwistModel(SlipModel, abc.ABC):
     coefficients: np.ndarray | None = field(default=None, kw_only=True)
 
     @abc.abstractmethod
-    def learn(self, w: TrainingWindows, machine: Machine) -> Self:
+    def learn(self, w: TrainingWindows, spec: RobotSpec) -> Self:
         """The model fitted to windows."""
 
     @abc.abstractmethod
-    def twist(self, steps: Steps, machine: Machine) -> Twists:
+    def twist(self, steps: Steps, spec: RobotSpec) -> Twists:
         """Body twist of every step [m/s, m/s, rad/s]."""
 
-    def stiffness(self, w: TrainingWindows, machine: Machine) -> Float[np.ndarray, "k k"]:
+    def stiffness(self, w: TrainingWindows, spec: RobotSpec) -> Float[np.ndarray, "k k"]:
         """Precision of the flat coefficients by what holds them besides the windows."""
         return np.zeros((self.numbers, self.numbers))
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "TwistModel":
-        return self.learn(TrainingWindows.of(runs), machine) if self.learns else self
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "TwistModel":
+        return self.learn(TrainingWindows.of(runs), spec) if self.learns else self
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         steps = Steps.of(runs)
-        return steps.predicted(self.twist(steps, machine))
+        return steps.predicted(self.twist(steps, spec))
 
     @property
     def numbers(self) -> int:

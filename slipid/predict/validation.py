@@ -10,9 +10,9 @@ from jaxtyping import Float
 from slipid.data.runs import Runs
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
-from slipid.predict.floor_models import FloorModels
-from slipid.predict.predictive import Contact
+from slipid.predict.predictive import ForceBalance
 from slipid.predict.score import Score, chords, lengths, scores, setups
+from slipid.predict.slip_models import FloorModels
 from slipid.support.errors import DataError
 from slipid.support.files import Content
 
@@ -43,7 +43,7 @@ class ScoredRun:
     session: str | None = None
 
     def to_json(self) -> Content:
-        return asdict(self, dict_factory=told)
+        return asdict(self, dict_factory=plain_values)
 
     @classmethod
     def of_json(cls, content: Content) -> "ScoredRun":
@@ -51,7 +51,7 @@ class ScoredRun:
         return cls(**{**content, "models": models})
 
 
-def told(values: Iterable[tuple[str, object]]) -> Content:
+def plain_values(values: Iterable[tuple[str, object]]) -> Content:
     """Plain values without what was not asked for."""
     return {k: v for k, v in values if v is not None or k not in ("session", "log_density")}
 
@@ -126,10 +126,10 @@ class Validation:
         return "\n".join(lines)
 
 
-def validation(fit: Contact, models: Sequence[FloorModels], data: Runs, new: int = 0) -> Validation:
+def validation(
+    fit: ForceBalance, models: Sequence[FloorModels], data: Runs, new: int = 0
+) -> Validation:
     """Prediction of runs of known floors by a fit, beside every slip model fitted on the same runs.
-
-    The fit has not seen `new` of the runs.
 
     The fit has not seen `new` of the runs.
 
@@ -142,10 +142,10 @@ def validation(fit: Contact, models: Sequence[FloorModels], data: Runs, new: int
     """
     _known(fit.robot, data)
     runs: dict[int, ScoredRun] = {}
-    for w in replay.cuts(data, fit.robot):
+    for w in replay.replay_windows(data, fit.robot):
         add_scores(runs, data, fit.name, *fit.ends(w))
         for model in models:
-            tracks = replay.follow(fit.robot, w, model.increments(w, fit.robot))
+            tracks = replay.tracks_from_increments(fit.robot, w, model.increments(w, fit.robot))
             add_scores(runs, data, model.name, tracks, None)
     return Validation(tuple(runs[k] for k in range(len(data))), new)
 

@@ -15,7 +15,7 @@ from slipid.report.page import Page, percent, table, verdict
 from slipid.support.files import Content
 
 if TYPE_CHECKING:
-    from slipid.app.trust import Judgement
+    from slipid.app.trust import TrustReport
     from slipid.infer.posterior.diagnosis import Posterior
     from slipid.infer.result import Fit
     from slipid.infer.verdicts.estimates import Estimate
@@ -87,12 +87,12 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
     if fit.derived:
         page.table(estimates(fit.derived.values(), "\nknown as ratios, or not even so"))
     for profile in profiles:
-        page.line(f"profile: {profile.said}")
+        page.line(f"profile: {profile.sentence}")
     page.notes(fit.messages)
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
 
 
-def show_trust(page: Page, judged: "Judgement") -> None:
+def show_trust(page: Page, judged: "TrustReport") -> None:
     """Write how the fit predicts its own runs, open loop, and how far it may be trusted."""
     if judged.floors:
         made = table(("surface", "end / path", "encoders alone"))
@@ -180,7 +180,7 @@ def show_validation(page: Page, found: Content) -> None:
 
 
 @dataclass(frozen=True)
-class Row:
+class TruthRow:
     """Truth against estimate of one number."""
 
     path: str
@@ -197,7 +197,7 @@ class Row:
         return self.interval[0] <= self.truth <= self.interval[1]
 
 
-def compared(fit: "Fit", truth: Content) -> list[Row]:
+def compared(fit: "Fit", truth: Content) -> list[TruthRow]:
     """Every number that was fitted beside its truth, as far as truth.json has one."""
     rows = []
     for e in fit.parameters.values():
@@ -207,7 +207,7 @@ def compared(fit: "Fit", truth: Content) -> list[Row]:
         truths = true if isinstance(true, list) else [true]
         for one, (label, value, interval) in zip(truths, rows_of(e), strict=True):
             low, high = interval or (value, value)
-            rows.append(Row(e.path, label, e.unit, float(one), value, (low, high), e.verdict))
+            rows.append(TruthRow(e.path, label, e.unit, float(one), value, (low, high), e.verdict))
     return rows
 
 

@@ -12,12 +12,12 @@ from jaxtyping import Array, Bool, Float
 from slipid.robot.controller import Controller, ControllerState
 from slipid.robot.interface import (
     AbstractEstimator,
-    Estimate,
     Measurement,
     Numbers,
     Pose,
     Readings,
     State,
+    StateEstimate,
 )
 from slipid.robot.trajectory import Path
 
@@ -27,7 +27,7 @@ LONGEST = 2.0
 """Times the path's own duration after which a run is given up."""
 
 
-class PilotState(eqx.Module, Generic[State]):
+class ControlLoopState(eqx.Module, Generic[State]):
     """What a pilot keeps: state of its estimator, of its controller, time of the path [s]."""
 
     seen: State
@@ -35,7 +35,7 @@ class PilotState(eqx.Module, Generic[State]):
     time: Float[Array, ""]
 
 
-class PilotOutput(eqx.Module):
+class ControlLoopOutput(eqx.Module):
     """What a pilot says after a step: wheel speeds [rad/s], an estimate, time of the path [s].
 
     `given_up` says that the robot was stuck and has stopped for good.
@@ -44,36 +44,38 @@ class PilotOutput(eqx.Module):
     """
 
     command: Float[Array, " wheel"]
-    estimate: Estimate
+    estimate: StateEstimate
     time: Float[Array, ""]
     given_up: Bool[Array, ""]
 
 
-class Pilot(eqx.Module, Generic[State]):
+class ControlLoop(eqx.Module, Generic[State]):
     """An estimator of any kind and a controller as one pure function."""
 
     estimator: AbstractEstimator[State]
     controller: Controller
 
-    def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> PilotState[State]:
+    def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> ControlLoopState[State]:
         """State of a robot at rest at a pose [m, m, rad], at the start of its path."""
         seen = self.estimator.init(jnp.asarray(pose, dtype=float))
-        return PilotState(seen, self.controller.init(), jnp.zeros(()))
+        return ControlLoopState(seen, self.controller.init(), jnp.zeros(()))
 
     def step(
         self,
         path: Path,
-        state: PilotState[State],
+        state: ControlLoopState[State],
         measurement: Measurement | Readings,
         dt: Float[Numbers, ""] | float,
-    ) -> tuple[PilotState[State], PilotOutput]:
+    ) -> tuple[ControlLoopState[State], ControlLoopOutput]:
         """Next state, and what is commanded and believed."""
         dt = jnp.asarray(dt, dtype=float)
         seen, estimate = self.estimator.step(state.seen, measurement, dt)
         here = jnp.where(jnp.isfinite(estimate.pose), estimate.pose, 1e3)
         time, reference = path.follow(state.time, here, dt, self.controller.gains.preview)
         held, command = self.controller.step(state.held, reference, estimate, dt)
-        return PilotState(seen, held, time), PilotOutput(command, estimate, time, held.given_up)
+        return ControlLoopState(seen, held, time), ControlLoopOutput(
+            command, estimate, time, held.given_up
+        )
 
 
 @runtime_checkable
@@ -95,7 +97,7 @@ class Plant(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class ClosedLoopRun:
     """One closed-loop run, a row per period.
 
     Attributes:
@@ -111,7 +113,7 @@ class Course:
     own: Float[np.ndarray, " step"]
     pose: Float[np.ndarray, "step 3"]
     command: Float[np.ndarray, "step wheel"]
-    estimate: Estimate
+    estimate: StateEstimate
     energy: Float[np.ndarray, " step"]
 
     @property
@@ -120,11 +122,13 @@ class Course:
         return np.asarray(self.estimate.pose)
 
 
-_step = eqx.filter_jit(Pilot.step)
+_step = eqx.filter_jit(ControlLoop.step)
 """The step with its numbers as arguments: compiled once for all pilots and starts alike."""
 
 
-def drive(pilot: Pilot[State], path: Path, plant: Plant, start: Pose) -> Course:
+def run_closed_loop(
+    pilot: ControlLoop[State], path: Path, plant: Plant, start: Pose
+) -> ClosedLoopRun:
     """Run a pilot on a plant at rest until its path is over.
 
     It also ends when the pilot gives up. The path is as it lies for the start, where the pilot
@@ -132,7 +136,7 @@ def drive(pilot: Pilot[State], path: Path, plant: Plant, start: Pose) -> Course:
     """
     wheels = pilot.controller.robot.wheels
     state, reading, dt = pilot.init(start), plant.reset().filled(wheels), jnp.asarray(PERIOD)
-    rows: list[tuple[float, float, tuple[float, float, float], PilotOutput]] = []
+    rows: list[tuple[float, float, tuple[float, float, float], ControlLoopOutput]] = []
     energy, own, begun = 0.0, 0.0, 0.0
     helpless, longest = False, LONGEST * path.duration + 10.0
     while own < path.duration - 1e-6 and begun < longest and not helpless:
@@ -143,10 +147,10 @@ def drive(pilot: Pilot[State], path: Path, plant: Plant, start: Pose) -> Course:
         energy += getattr(plant, "power", np.nan) * PERIOD
         begun += PERIOD
     time, spent, poses, said = zip(*rows, strict=True)
-    every: PilotOutput = jax.tree.map(lambda *x: np.stack([np.asarray(v) for v in x]), *said)
+    every: ControlLoopOutput = jax.tree.map(lambda *x: np.stack([np.asarray(v) for v in x]), *said)
     pose = np.array(poses)
     pose[:, 2] = np.unwrap(pose[:, 2])
-    return Course(
+    return ClosedLoopRun(
         path=path,
         time=np.array(time),
         own=np.asarray(every.time),
@@ -169,7 +173,7 @@ def _from_line(
 
 
 @dataclass(frozen=True)
-class Metrics:
+class PathMetrics:
     """What became of a path, from true poses.
 
     Attributes:
@@ -198,7 +202,7 @@ class Metrics:
     finished: bool
 
 
-def metrics(course: Course) -> Metrics:
+def path_metrics(course: ClosedLoopRun) -> PathMetrics:
     """What became of a path, from true poses."""
     p, path = course.pose, course.path
     corners = np.vstack([np.asarray(path.rows[0, :2]), np.asarray(path.corners)])
@@ -211,7 +215,7 @@ def metrics(course: Course) -> Metrics:
     left_mm = 1000 * float(path.left(course.own[-1]))
     wanted = float(path.rows[-1, 2])
     turned = np.degrees((p[-1, 2] - wanted + np.pi) % (2 * np.pi) - np.pi)
-    return Metrics(
+    return PathMetrics(
         along_track_mm=tuple((1000 * along).tolist()),
         sides_mm=tuple((1000 * sizes).tolist()),
         closure_mm=1000 * float(np.hypot(*(p[-1, :2] - corners[-1]))) + left_mm,

@@ -24,8 +24,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.parameter import parameter
-from slipid.robot.deployed import RobotArrays, recorded
-from slipid.robot.interface import UNTIMED_S, Estimate, Numbers, Scalar, as_arrays
+from slipid.robot.deployed import RobotArrays, with_record
+from slipid.robot.interface import UNTIMED_S, Numbers, Scalar, StateEstimate, as_arrays
 
 Correction = Literal["none", "torque", "paper_print", "paper_code"]
 Law = Callable[[Float[Array, "6"], Float[Array, "3"]], Float[Array, "3"]]
@@ -67,7 +67,7 @@ class Gains(eqx.Module):
         Raises:
             ValueError: the robot comes without its record.
         """
-        known = recorded(robot)
+        known = with_record(robot)
         tuned = known.record.gains
         if tuned is None or tuned.load != known.load_setup:
             return cls()
@@ -121,7 +121,7 @@ class ControllerState(eqx.Module):
         return self.tried > GIVES_UP_S
 
 
-def limited(
+def limit_command(
     wanted: Float[Array, " wheel"],
     before: Float[Array, " wheel"],
     current: Float[Array, " wheel"],
@@ -205,7 +205,7 @@ class Controller(eqx.Module):
         self,
         state: ControllerState,
         reference: Float[Array, "6"],
-        estimate: Estimate,
+        estimate: StateEstimate,
         dt: Float[Array, ""] | float,
     ) -> tuple[ControllerState, Float[Array, " wheel"]]:
         """Wheel speeds to command [rad/s].
@@ -237,7 +237,7 @@ class Controller(eqx.Module):
         before = jnp.where(old.begun, old.command, jnp.where(safe, e.wheel_speed, 0.0))
         wheels = jnp.where(safe, wheels, 0.0)
         since = jnp.where(safe, dt, jnp.maximum(dt, UNTIMED_S))
-        command = limited(wheels, before, e.current, self.robot, self.limits, since)
+        command = limit_command(wheels, before, e.current, self.robot, self.limits, since)
         free = safe & (jnp.max(jnp.abs(command - wheels)) < 0.05)  # the integral rests at a limit
         summed = jnp.clip(old.integral + k.integral * gap * dt, -LONGEST_I, LONGEST_I)
         new = ControllerState(
@@ -251,7 +251,7 @@ class Controller(eqx.Module):
         )
         return new, command
 
-    def _held(self, old: ControllerState, e: Estimate, dt: Array) -> tuple[Array, Array]:
+    def _held(self, old: ControllerState, e: StateEstimate, dt: Array) -> tuple[Array, Array]:
         """For how long the body has not gone where it should, and has tried to free itself [s].
 
         While it turns on the spot it is asked to go nowhere, which tells nothing of that.
@@ -279,7 +279,7 @@ class Controller(eqx.Module):
         turn = ref[5] + self.gains.yaw * jnp.sin(ref[2] - pose[2])
         return jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0], turn])
 
-    def _torque(self, wanted: Array, e: Estimate) -> Array:
+    def _torque(self, wanted: Array, e: StateEstimate) -> Array:
         """The 2021 paper's correction by the forces off the commanded direction [rad/s]."""
         if self.correction == "none":
             return jnp.zeros(self.robot.wheels)

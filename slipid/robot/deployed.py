@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Frame, Geometry, at_drives, at_wheels
+from slipid.model.geometry import Geometry, WheelFrame, at_drives, at_wheels
 from slipid.model.motor import Motor
-from slipid.robot.filter.effects import Told
+from slipid.robot.filter.effects import EffectTable
 from slipid.robot.record import LoadRecord, Numbers, RobotRecord
-from slipid.robot.robot_file import ANEW, check, read_robot, shape_of, write_robot
+from slipid.robot.robot_file import REWRITE_HINT, check_record, geometry_of, read_robot, write_robot
 from slipid.robot.unseen import with_unseen
 from slipid.support.errors import DataError
 
@@ -50,7 +50,7 @@ class RobotArrays(eqx.Module):
         unseen: for each floor, whether nobody drove on it.
     """
 
-    frame: Frame
+    frame: WheelFrame
     places: Float[Array, "wheel 2"]
     forward: Float[Array, "drive 3"]
     inverse: Float[Array, "3 drive"]
@@ -60,7 +60,7 @@ class RobotArrays(eqx.Module):
     mass: Float[Array, ""]
     process: Float[Array, "floor 3"]
     effect: Float[Array, "floor 3"]
-    told: Told
+    told: EffectTable
     friction_covariance: Float[Array, "floor floor"]
     current_std: Float[Array, " floor"]
     current_trend: Float[Array, "2"]
@@ -130,7 +130,7 @@ class DeployedRobot(RobotArrays):
         Else it has an estimator, but no controller: `slipid.robot.controller` asks for motion
         sideways as well.
         """
-        shape = shape_of(self.record)
+        shape = geometry_of(self.record)
         return not shape.drive_of and shape.determines_twist
 
     @classmethod
@@ -140,7 +140,7 @@ class DeployedRobot(RobotArrays):
         Raises:
             ValueError: no such load set-up, or a number that is missing or out of its bounds.
         """
-        check(record)
+        check_record(record)
         return _arrays(record, load, {path: n.value for path, n in record.parameters.items()})
 
     @classmethod
@@ -161,7 +161,7 @@ class DeployedRobot(RobotArrays):
         try:
             return cls.of(record, load)
         except ValueError as error:
-            raise DataError(f"{path}: {error}; {ANEW}") from error
+            raise DataError(f"{path}: {error}; {REWRITE_HINT}") from error
 
     def save(self, path: Path | str) -> None:
         """Write robot.json, with all load set-ups.
@@ -203,7 +203,7 @@ class DeployedRobot(RobotArrays):
         return DeployedRobot.of(with_unseen(self.record), self.load_setup)
 
 
-def recorded(robot: RobotArrays) -> DeployedRobot:
+def with_record(robot: RobotArrays) -> DeployedRobot:
     """The same robot, once it is sure that it has its record.
 
     Raises:
@@ -217,7 +217,7 @@ def recorded(robot: RobotArrays) -> DeployedRobot:
     return robot
 
 
-def drawn(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
+def posterior_robots(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
     """Robots that the posterior holds possible, stacked along a leading axis.
 
     What runs differ by stays in `DeployedRobot.effect`; the spread of the numbers is in the draws.
@@ -255,7 +255,7 @@ def _arrays(
         frame=geometry.frame(),
         places=jnp.asarray(geometry.place) * geometry.base_radius,
         forward=geometry.forward(),
-        inverse=geometry.least(),
+        inverse=geometry.pseudo_inverse(),
         motor=Motor(**of("motor", Motor), gear_ratio=_array(wheels.gear_ratio)),
         floors=ContactSurface(
             **{name: jnp.stack([row[name] for row in rows]) for name in rows[0]},
@@ -283,13 +283,13 @@ def _array(value: Numbers | Sequence[object]) -> Array:
     return jnp.asarray(value, dtype=float)
 
 
-def _told(load: LoadRecord, whole: Array) -> Told:
+def _told(load: LoadRecord, whole: Array) -> EffectTable:
     """What is told of effects, what is left over the whole std of every floor."""
     if load.told is None:
-        return Told.nothing(len(whole))
+        return EffectTable.nothing(len(whole))
     mean, left = _array(load.told.mean), _array(load.told.left)
     part = left / jnp.maximum(whole[:, None, None], 1e-12)
-    return Told(jnp.log(_array(load.told.speeds)), jnp.concatenate([mean, part], axis=-1))
+    return EffectTable(jnp.log(_array(load.told.speeds)), jnp.concatenate([mean, part], axis=-1))
 
 
 def _friction_covariance(record: RobotRecord) -> Array:

@@ -15,12 +15,19 @@ from jaxtyping import Array, Bool, Float
 from slipid.model.se2 import advance, compose
 from slipid.robot.deployed import RobotArrays
 from slipid.robot.filter.floor import Floor
-from slipid.robot.filter.floor_filter import FloorFilter, FloorState, Tick, length
+from slipid.robot.filter.floor_filter import FloorFilter, FloorState, TimeStep, length
 from slipid.robot.filter.hypotheses import hypotheses_of
-from slipid.robot.filter.pose_filter import PoseFilter, turned_axes
-from slipid.robot.filter.pose_fix import PoseState, placed
+from slipid.robot.filter.pose_filter import PoseFilter, axes_rotation
+from slipid.robot.filter.pose_fix import PoseState, apply_map
 from slipid.robot.filter.wheels import WheelState, read_currents, read_wheels, time_step
-from slipid.robot.interface import AbstractEstimator, Estimate, Pose, Readings, Settings, as_arrays
+from slipid.robot.interface import (
+    AbstractEstimator,
+    Pose,
+    Readings,
+    Settings,
+    StateEstimate,
+    as_arrays,
+)
 
 CURRENT_FROM = 0.4
 """Current from which the 2021 paper's deployed estimator counts slip [A]."""
@@ -47,7 +54,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
 
     Attributes:
         robot: the identified robot; its `labels` name the floors in the order of
-            `Estimate.surface_probability`.
+            `StateEstimate.surface_probability`.
         settings: by default as the robot's logs were.
         floor: map of the place, its surfaces by number in the robot's `labels`; None where there
             is none.
@@ -78,14 +85,14 @@ class Estimator(AbstractEstimator[EstimatorState]):
 
     def advance(
         self, state: EstimatorState, z: Readings, dt: Float[Array, ""]
-    ) -> tuple[EstimatorState, Estimate]:
+    ) -> tuple[EstimatorState, StateEstimate]:
         """One time step; see `AbstractEstimator.step`."""
         f, s, old = self.robot, self.settings, state
         dt = time_step(dt, s)
         wheels = read_wheels(f, s, old.wheels, z, dt)
         w = wheels.speed
         currents = read_currents(f, s, old.current, z, w, dt)
-        tick = Tick(
+        tick = TimeStep(
             dt=dt,
             moves=jnp.max(jnp.abs(f.frame.radius * w)) > s.still_m_s,
             acceleration=jnp.max(jnp.abs(w - old.wheels.speed)) / jnp.maximum(dt, 1e-3),
@@ -100,7 +107,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
             root, supports = by_pose.mapped(before, self.floor, hypotheses)
             mapped = jnp.mean(supports, axis=0)
             floors, motion = by_floor.step(old.floors, w, currents, turn, tick, mapped)
-            before, left = placed(before, root, supports, motion)
+            before, left = apply_map(before, root, supports, motion)
             supports = by_pose.mapped(before, self.floor, hypotheses)[1]
             floors = _corrected(floors, left, before, jnp.mean(supports, axis=0))
         place, twist, left = by_pose.step(before, motion, gyro, z, tick)
@@ -109,7 +116,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
         new = EstimatorState(wheels, currents.filtered, floors, place, stuck)
         unknown = floors.belief[-1]
         none = jnp.full((f.wheels, 1), unknown)
-        return new, Estimate(
+        return new, StateEstimate(
             pose=place.pose,
             twist=twist,
             slip=self._slip(w, twist),
@@ -129,7 +136,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
         rim = f.frame.radius * jnp.where(turns, w, 1.0)
         return jnp.where(turns, jnp.clip(1 - f.forward @ twist / rim, -2.0, 2.0), 0.0)
 
-    def _stuck(self, before: Array, w: Array, twist: Array, tick: Tick) -> Array:
+    def _stuck(self, before: Array, w: Array, twist: Array, tick: TimeStep) -> Array:
         """For how long the body has hardly moved while its wheels turn [s].
 
         Source: Ward and Iagnemma 2008, below a fifth of the wheels' speed.
@@ -148,7 +155,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
 
 def _corrected(floors: FloorState, left: Array, place: PoseState, expected: Array) -> FloorState:
     """Hypotheses once a map has corrected the pose, `left` in the world's axes."""
-    world = turned_axes(place.pose[2])
+    world = axes_rotation(place.pose[2])
     return replace(floors, apart=floors.apart @ (world.T @ left @ world).T, expected=expected)
 
 
@@ -193,7 +200,7 @@ class Odometry(AbstractEstimator[OdometryState]):
 
     def advance(
         self, state: OdometryState, z: Readings, dt: Float[Array, ""]
-    ) -> tuple[OdometryState, Estimate]:
+    ) -> tuple[OdometryState, StateEstimate]:
         """One time step; see `AbstractEstimator.step`. Neither gyro nor pose fixes are used."""
         f, s, old = self.robot, self.settings, state
         dt = time_step(dt, s)
@@ -210,7 +217,7 @@ class Odometry(AbstractEstimator[OdometryState]):
         twist = f.inverse @ (f.frame.radius * w * (1 - slip))
         pose = compose(old.pose, advance(twist, dt))
         unknown = jnp.zeros((f.wheels, len(f.labels) + 1)).at[:, -1].set(1.0)
-        return OdometryState(pose=pose, wheels=wheels, current=amps), Estimate(
+        return OdometryState(pose=pose, wheels=wheels, current=amps), StateEstimate(
             pose=pose,
             twist=twist,
             slip=slip,

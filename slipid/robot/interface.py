@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from slipid.robot.deployed import RobotArrays, recorded
+from slipid.robot.deployed import RobotArrays, with_record
 
 Numbers = Array | np.ndarray
 Pose = Float[Numbers, "3"] | tuple[float, float, float]
@@ -19,7 +19,7 @@ Pose = Float[Numbers, "3"] | tuple[float, float, float]
 Given = Numbers | Sequence[float] | float | None
 NO_FLOOR = "unknown"
 """Name of the floor under a wheel where no identified one explains what is measured."""
-MIXED = 1.0
+MIXED_FLOORS_PENALTY = 1.0
 """`Settings.alike` of a robot that is known to drive across the edges of floors."""
 UNTIMED_S = 0.01
 """What a step without a time counts as, until readings are stale and while the robot stops [s]."""
@@ -75,7 +75,7 @@ class Settings(eqx.Module):
         Raises:
             ValueError: it comes without its record.
         """
-        record = recorded(robot).record
+        record = with_record(robot).record
         return cls(current_is_signed=record.sensors.current_is_signed, alike=record.alike)
 
 
@@ -149,7 +149,7 @@ class Measurement(eqx.Module):
         return Readings(**given)
 
 
-class Estimate(eqx.Module):
+class StateEstimate(eqx.Module):
     """What an estimator believes after a step; runs have leading axes in front of every array.
 
     Attributes:
@@ -201,12 +201,14 @@ class AbstractEstimator(eqx.Module, Generic[State]):
         """State of a robot at rest at a pose [m, m, rad]."""
 
     @abstractmethod
-    def advance(self, state: State, z: Readings, dt: Float[Array, ""]) -> tuple[State, Estimate]:
+    def advance(
+        self, state: State, z: Readings, dt: Float[Array, ""]
+    ) -> tuple[State, StateEstimate]:
         """As `step`, from readings."""
 
     def step(
         self, state: State, measurement: Measurement | Readings, dt: Float[Numbers, ""] | float
-    ) -> tuple[State, Estimate]:
+    ) -> tuple[State, StateEstimate]:
         """State and estimate a time step later.
 
         Compiled at its first call; within a function that JAX transforms, it is part of that.
@@ -224,5 +226,5 @@ class AbstractEstimator(eqx.Module, Generic[State]):
 @eqx.filter_jit
 def _advanced(
     estimator: AbstractEstimator[State], state: State, z: Readings, dt: Array
-) -> tuple[State, Estimate]:
+) -> tuple[State, StateEstimate]:
     return estimator.advance(state, z, dt)

@@ -49,7 +49,7 @@ UNITS = {
 
 
 @dataclass(frozen=True)
-class Number:
+class RecordedNumber:
     """A fitted or fixed number of the robot [unit]; attributes as of identified.json.
 
     `std` and `interval90`, equal-tailed, are None where it was fixed; `source` is what they were
@@ -102,7 +102,7 @@ class FloorRecord:
 
 
 @dataclass(frozen=True)
-class ToldRecord:
+class EffectRecord:
     """What the fitted runs tell of effects, a table of floors, speeds and directions of travel.
 
     The directions are those of the body's motion relative to the body, evenly spaced from ahead
@@ -132,7 +132,7 @@ class LoadRecord:
 
     name: str
     spread: tuple[Axes, ...]
-    told: ToldRecord | None
+    told: EffectRecord | None
     highest_current: float
     wheel_curve: tuple[Pair, ...]
 
@@ -146,7 +146,7 @@ class LoadRecord:
 
 
 @dataclass(frozen=True)
-class Sensors:
+class LogSensors:
     """What the logs held, and so what the estimator counts on."""
 
     current_is_signed: bool = False
@@ -235,12 +235,12 @@ class RobotRecord:
 
     source: Source = "given"
     wheels: Wheels
-    parameters: Mapping[str, Number]
+    parameters: Mapping[str, RecordedNumber]
     floors: tuple[FloorRecord, ...]
     loads: tuple[LoadRecord, ...]
     current_trend: Pair
     highest_speed: float
-    sensors: Sensors = Sensors()
+    sensors: LogSensors = LogSensors()
     alike: float = 3.0
     messages: tuple[str, ...] = ()
     data: str | None = None

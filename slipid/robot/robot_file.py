@@ -23,7 +23,7 @@ import numpy as np
 from slipid.model.geometry import Geometry
 from slipid.model.robot import build
 from slipid.parameter import Declaration, Entry, entries
-from slipid.robot.record import UNITS, Numbers, RobotRecord, ToldRecord
+from slipid.robot.record import UNITS, EffectRecord, Numbers, RobotRecord
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_bytes
 
@@ -115,7 +115,7 @@ def _wrong(where: str, value: object, expected: str) -> ValueError:
 
 
 SCHEMA = "slipid.robot/6"
-ANEW = "copy it again, or write it anew with `slipid identify`"
+REWRITE_HINT = "copy it again, or write it anew with `slipid identify`"
 
 
 def write_robot(path: Path, record: RobotRecord) -> None:
@@ -138,17 +138,17 @@ def read_robot(path: Path) -> RobotRecord:
     now = checksum(content)
     content.pop("schema")
     if content.pop("units", None) != UNITS:
-        raise DataError(f"{path}: other units than {SCHEMA} has; {ANEW}")
+        raise DataError(f"{path}: other units than {SCHEMA} has; {REWRITE_HINT}")
     numbers = content.pop("numbers", None)
     try:
         record = typed(RobotRecord, content)
-        check(record)
+        check_record(record)
     except ValueError as error:
-        raise DataError(f"{path}: {error}; {ANEW}") from error
+        raise DataError(f"{path}: {error}; {REWRITE_HINT}") from error
     if said != now or numbers != record.numbers:
         raise DataError(
             f"{path}: the content does not match its checksum, so it was changed or damaged after "
-            f"it was written; {ANEW}"
+            f"it was written; {REWRITE_HINT}"
         )
     return record
 
@@ -163,7 +163,7 @@ def _content(path: Path) -> dict[str, object]:
         reason = error.strerror or str(error)
         raise DataError(f"{path}: {reason}; expected what `slipid identify` writes") from error
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: no valid JSON ({error}); {ANEW}") from error
+        raise DataError(f"{path}: no valid JSON ({error}); {REWRITE_HINT}") from error
     schema = content.get("schema") if isinstance(content, dict) else None
     if not (isinstance(schema, str) and re.fullmatch(r"slipid\.robot/[1-9][0-9]{0,8}", schema)):
         raise DataError(
@@ -172,7 +172,7 @@ def _content(path: Path) -> dict[str, object]:
         )
     if schema != SCHEMA:
         newer = int(schema.partition("/")[2]) > int(SCHEMA.partition("/")[2])
-        age, then = ("a newer", "update slipid") if newer else ("an older", ANEW)
+        age, then = ("a newer", "update slipid") if newer else ("an older", REWRITE_HINT)
         raise DataError(
             f"{path}: written by {age} slipid as {schema}, this one reads {SCHEMA}; {then}"
         )
@@ -201,14 +201,14 @@ def _text(value: object, indent: str = "") -> str:
     return json.dumps(value, allow_nan=False)
 
 
-def check(record: RobotRecord) -> None:
+def check_record(record: RobotRecord) -> None:
     """Refuse a record whose parts do not fit together by a ValueError that says which and how."""
     wheels = len(record.wheels.place)
     if not wheels:
         raise ValueError("wheels.place: no entries; expected one for every wheel")
     for name in ("drive_angle", "roller_angle", "grips"):
         _counted(f"wheels.{name}", getattr(record.wheels, name), wheels)
-    shape_of(record)  # which refuses wheels that cannot drive, and drives that turn none
+    geometry_of(record)  # which refuses wheels that cannot drive, and drives that turn none
     for kind, names in (("floors", record.labels), ("loads", [x.name for x in record.loads])):
         if not names or len(set(names)) < len(names):
             raise ValueError(f"{kind} {list(names)}; expected one or more, each once")
@@ -220,7 +220,7 @@ def check(record: RobotRecord) -> None:
     _numbers(record)
 
 
-def shape_of(record: RobotRecord) -> Geometry:
+def geometry_of(record: RobotRecord) -> Geometry:
     """The wheels, every number at its start."""
     plain = Geometry(**vars(record.wheels))
     return replace(
@@ -228,7 +228,7 @@ def shape_of(record: RobotRecord) -> Geometry:
     )
 
 
-def _told(where: str, told: ToldRecord, floors: int) -> None:
+def _told(where: str, told: EffectRecord, floors: int) -> None:
     """Refuse a table whose speeds do not rise, or whose rows are not as many as they should be."""
     speeds = told.speeds
     if not speeds or speeds[0] <= 0 or any(a >= b for a, b in pairwise(speeds)):
@@ -244,14 +244,14 @@ def _told(where: str, told: ToldRecord, floors: int) -> None:
         raise ValueError(f"{where}.left: a std below 0")
 
 
-def declared(record: RobotRecord) -> tuple[Entry, ...]:
+def declared_numbers(record: RobotRecord) -> tuple[Entry, ...]:
     """Every number that a robot of this shape has, in order; the camera is no part of it."""
-    robot = build(shape_of(record), record.labels, [load.name for load in record.loads])
+    robot = build(geometry_of(record), record.labels, [load.name for load in record.loads])
     return tuple(e for e in entries(robot) if e.part != "camera")
 
 
 def _numbers(record: RobotRecord) -> None:
-    known = {e.path: (e.declaration, e.size) for e in declared(record)}
+    known = {e.path: (e.declaration, e.size) for e in declared_numbers(record)}
     for path in known:
         if path not in record.parameters:
             raise ValueError(f"parameters['{path}'] is missing")

@@ -1,4 +1,6 @@
-"""The identified robot as a plant: what closed-loop runs are rehearsed on.
+"""How wheels follow their commands and what sensors are like: what no fit tells.
+
+The identified robot as a plant: what closed-loop runs are rehearsed on.
 
 Commands reach the wheels late, a slew and a lag after; wheels on several floors move the body as
 the contact says, and what the fit says the model misses is drawn anew for every run, effects as
@@ -15,7 +17,7 @@ Differentiate forwards (`jax.jvp`, `jax.jacfwd`): readings that are no numbers w
 backwards.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -26,12 +28,69 @@ from jaxtyping import Array, Float
 from slipid.model import contact
 from slipid.model.robot import GRAVITY
 from slipid.model.se2 import advance, compose
-from slipid.robot.actuation import RING, Habits
 from slipid.robot.closed_loop import PERIOD
 from slipid.robot.deployed import RobotArrays
-from slipid.robot.filter.effects import Course, direction, stays
+from slipid.robot.filter.effects import RolledMotion, effect_correlation, travel_direction
 from slipid.robot.filter.floor import Floor
 from slipid.robot.interface import Measurement, Pose, Readings
+
+RING = 6
+"""Commands that are kept: a delay may be up to `RING` - 1 periods."""
+
+
+@dataclass(frozen=True)
+class ActuatorModel:
+    """How wheels follow their commands and what sensors are like.
+
+    Attributes:
+        delay_s: from a command to the wheels [s].
+        slew: of the wheels [rad/s^2]; lag_s: of their speed control [s].
+        ticks: of an encoder per turn of the wheel.
+        ammeter_a: noise of a current [A]; drift_s: how long currents stay off the model's [s].
+        voltmeter_v: noise of a voltage [V]; voltage: whether it is measured.
+        gyro_noise, gyro_bias: of a yaw rate [rad/s]; gyro: whether it is measured.
+        signed: whether currents have signs.
+        substeps: of wheels and body in a control period.
+        smooth: encoders without ticks.
+    """
+
+    delay_s: float = 0.12
+    slew: float = 25.0
+    lag_s: float = 0.03
+    ticks: float = 32000.0
+    ammeter_a: float = 0.05
+    drift_s: float = 0.1
+    voltmeter_v: float = 0.05
+    voltage: bool = True
+    gyro_noise: float = 0.004
+    gyro_bias: float = 0.005
+    gyro: bool = False
+    signed: bool = False
+    substeps: int = 2
+    smooth: bool = False
+
+    @property
+    def substep(self) -> float:
+        """How long it takes [s]."""
+        return PERIOD / self.substeps
+
+    @property
+    def follow(self) -> float:
+        """Part of the gap to its set speed that a wheel makes up in a substep."""
+        return 1 - float(np.exp(-self.substep / max(self.lag_s, 1e-6)))
+
+    def held(self) -> Float[np.ndarray, "substep command"]:
+        """Share of each of the last commands, the newest first, in the mean over every substep.
+
+        Commands hold for a period and arrive so late; exact, and linear in the delay.
+        """
+        h = self.substep
+        begin = np.arange(self.substeps)[:, None] * h - self.delay_s
+        since = -np.arange(RING)[None, :] * PERIOD
+        both = np.minimum(begin + h, since + PERIOD) - np.maximum(begin, since)
+        share = np.clip(both, 0.0, None) / h
+        share[:, -1] += 1.0 - share.sum(axis=1)  # what is older counts as the oldest
+        return share
 
 
 class TwinState(eqx.Module):
@@ -72,7 +131,7 @@ class Twin(eqx.Module):
 
     robot: RobotArrays = eqx.field(converter=lambda robot: robot.arrays)
     floor: Floor
-    habits: Habits = eqx.field(static=True, default=Habits())
+    habits: ActuatorModel = eqx.field(static=True, default=ActuatorModel())
 
     def __check_init__(self) -> None:
         """Refuse a delay that the ring cannot hold."""
@@ -140,7 +199,7 @@ class Twin(eqx.Module):
         under = self.floor.under(pose, f.places)
         rim = f.frame.radius * w
         xi = contact.equilibrium(rim, f.frame, f.floors.at(under), f.rest)
-        course = Course.of(f.inverse @ rim, f.frame.base)
+        course = RolledMotion.of(f.inverse @ rim, f.frame.base)
         mean, part = f.told.at(course)
         missed, far, share = mean + part * f.effect * effect, course.speed * h, f.rest[:, None]
         off = far * jnp.sum(share * missed[under], axis=0)
@@ -153,8 +212,8 @@ class Twin(eqx.Module):
         far = (jnp.sqrt(xi[:2] @ xi[:2] + 1e-12) + f.frame.base * jnp.abs(xi[2])) * PERIOD
         under = self.floor.under(now.pose, f.places)
         left = jnp.all(under[:, None] != jnp.arange(len(f.labels)), axis=0)
-        way = direction(f.inverse @ (f.frame.radius * now.speed), f.frame.base)
-        toward, keep = stays(now.toward, way, left.astype(float), far)
+        way = travel_direction(f.inverse @ (f.frame.radius * now.speed), f.frame.base)
+        toward, keep = effect_correlation(now.toward, way, left.astype(float), far)
         fresh = jnp.sqrt(1 - keep**2 + 1e-15)[:, None] * noise.reshape(-1, 3)
         return keep[:, None] * now.effect + fresh, toward
 
@@ -164,13 +223,13 @@ class Twin(eqx.Module):
         under = self.floor.under(now.pose, f.places)
         floor = f.floors.at(under)
         where = xi, f.frame.radius * w, f.frame, floor, f.rest
-        felt = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
+        motor_force = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
         force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
         keep = float(np.exp(-PERIOD / self.habits.drift_s))
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
         drift = keep * now.drift + fresh
         moves = jnp.tanh(w / 0.2) ** 2  # a motor that stands draws nothing
-        model = f.motor.current(force * f.motor.borne(felt), w)
+        model = f.motor.current(force * f.motor.opposing_force(motor_force), w)
         free = (f.inverse @ (f.frame.radius * w))[:2]
         more = f.current_trend @ jnp.stack([1.0, jnp.sqrt(free @ free + 1e-24)])
         return model + moves * (jnp.sign(model) * more + now.offset + drift), drift

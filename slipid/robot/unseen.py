@@ -14,7 +14,7 @@ from itertools import product
 
 import numpy as np
 
-from slipid.robot.record import Axes, FloorRecord, LoadRecord, Number, Numbers, RobotRecord
+from slipid.robot.record import Axes, FloorRecord, LoadRecord, Numbers, RecordedNumber, RobotRecord
 
 SOFTNESS = (-2.0, -1.0, 0.0, 1.0, 2.0)
 """Log of the creep over that of the middle floor; its declared spread over floors is 1.5."""
@@ -65,10 +65,10 @@ def with_unseen(record: RobotRecord) -> RobotRecord:
     )
 
 
-def _middle(record: RobotRecord) -> dict[str, Number]:
+def _middle(record: RobotRecord) -> dict[str, RecordedNumber]:
     """Numbers of a floor in the middle of those that were driven on, geometric where positive."""
     first = f"surface.{record.labels[0]}."
-    middle_floor: dict[str, Number] = {}
+    middle_floor: dict[str, RecordedNumber] = {}
     for path, number in record.parameters.items():
         if not path.startswith(first):
             continue
@@ -77,7 +77,7 @@ def _middle(record: RobotRecord) -> dict[str, Number]:
         signed = quantity in _SIGNED
         middle = each.mean(axis=0) if signed else np.exp(np.log(each).mean(axis=0))
         value: Numbers = tuple(middle.tolist()) if middle.ndim else float(middle)
-        middle_floor[quantity] = Number(
+        middle_floor[quantity] = RecordedNumber(
             value=value,
             unit=number.unit,
             std=None,

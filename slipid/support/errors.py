@@ -33,7 +33,7 @@ def bad_data(
     return DataError(f"{where}: {found}; expected {expected}")
 
 
-def near(name: object, choices: Iterable[str]) -> str:
+def did_you_mean(name: object, choices: Iterable[str]) -> str:
     """`, did you mean this or that?` where some of the choices are spelled alike, else nothing."""
     found = get_close_matches(str(name), list(choices), n=2)
     return f", did you mean {' or '.join(found)}?" if found else ""

@@ -23,7 +23,7 @@ Result = TypeVar("Result")
 Words = ParamSpec("Words")
 
 
-class Here(Executor):
+class InProcess(Executor):
     """This process, which does the work as it is given."""
 
     def submit(

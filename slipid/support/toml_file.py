@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeVar, Union, get_args, get_origin, get
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.files import Content
 
 CLOSED = ConfigDict(extra="forbid")
@@ -64,7 +64,8 @@ def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) ->
     where = f"{path}: {_spelled(steps)}" if steps else str(path)
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         known = list(_annotations(_kinds_at(mapping, root, steps[:-1])[0]))
-        return f"{where}: no such key{near(steps[-1], known)}; expected one of {', '.join(known)}"
+        alike = did_you_mean(steps[-1], known)
+        return f"{where}: no such key{alike}; expected one of {', '.join(known)}"
     if kind in ("missing", "missing_argument"):
         return f"{where}: missing; expected a value for it"
     if kind == "union_tag_not_found":
@@ -74,7 +75,8 @@ def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) ->
     if kind == "union_tag_invalid":
         key, tag = context["discriminator"].strip("'"), context["tag"]
         choices = [known.strip(" '") for known in context["expected_tags"].split(",")]
-        return f"{where}.{key}: '{tag}'{near(tag, choices)}; expected one of {', '.join(choices)}"
+        alike = did_you_mean(tag, choices)
+        return f"{where}.{key}: '{tag}'{alike}; expected one of {', '.join(choices)}"
     if kind == "value_error":
         return f"{where}: {context['error']}"
     if kind == "literal_error":

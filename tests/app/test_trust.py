@@ -4,13 +4,13 @@ import json
 
 import pytest
 
-from slipid.app.trust import Judgement
+from slipid.app.trust import TrustReport
 from slipid.infer.verdicts.disputed import EndPoints, Trust
 from slipid.plots import drawing
 
 
 def judged(word):
-    return Judgement(Trust(word, ("it predicts worse",)), {"gray": EndPoints(0.4, 0.1)}, 12)
+    return TrustReport(Trust(word, ("it predicts worse",)), {"gray": EndPoints(0.4, 0.1)}, 12)
 
 
 def test_a_fit_that_is_not_to_be_trusted_says_so_in_its_pictures():

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.deploy.controllers import pilot_of
+from slipid.deploy.controllers import control_loop_of
 from slipid.export.c99.builder import Names
 from slipid.export.c99.code import Code, template
 from slipid.export.c99.function import Argument, function, traced
@@ -253,7 +253,7 @@ ALL = 99
 def test_many_floors(tmp_path, monkeypatch, floors, changes):
     monkeypatch.setattr(hypotheses, "CHANGES", changes)
     robot = known(mecanum(0.2, 0.15, 0.05, 20.0), [f"floor{k}" for k in range(floors)])
-    made = Code(robot, pilot_of(robot, ROWS["contact"]), PATH)
+    made = Code(robot, control_loop_of(robot, ROWS["contact"]), PATH)
     fleet = Fleet(made, tmp_path, FAST)
     drive = driven(made, robot, fleet, 400).write(tmp_path / "drive")
     took = timed(unfleeted(made, tmp_path / "alone"), drive, FAST)[0]

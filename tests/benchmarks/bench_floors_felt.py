@@ -15,14 +15,14 @@ from pathlib import Path
 
 import pytest
 
-from slipid.lab.benchmark.floors.part import FOLDER, felt_benchmark
+from slipid.lab.benchmark.floors.part import FOLDER, husky_table
 from tests.benchmarks.quick import QUICK
 
 
 def test_floors_that_are_felt(real_data: Path) -> None:
     if not (real_data / FOLDER).is_dir():
         pytest.skip(f"no logs of robots without a pose: {real_data / FOLDER} is no folder")
-    table = felt_benchmark(real_data, QUICK)
+    table = husky_table(real_data, QUICK)
     print(f"\n{table.about}: {table.runs} runs; chance {100 * table.chance:.0f} %")
     for row in table.rows:
         shown = [

@@ -126,13 +126,13 @@ def flawed(ground, flaw, seed):
 
 def driven(robot, row, path, steps=STEPS):
     """Closure [mm], cross-track rms [mm], whether it finished and whether it gave up, by start."""
-    from slipid.deploy.controllers import pilot_of
-    from slipid.deploy.deploy import habits_of
+    from slipid.deploy.controllers import control_loop_of
+    from slipid.deploy.deploy import actuator_model_of
     from slipid.deploy.floors import floor_of
-    from slipid.deploy.twin_run import site, starts
+    from slipid.deploy.twin_run import starts, twin_floor
     from slipid.lab.trial.controllers import ROWS as TRIAL
-    from slipid.lab.trial.plants import one_of
-    from slipid.robot.closed_loop import PERIOD, Course, Pilot, metrics
+    from slipid.lab.trial.plants import drawn_robot
+    from slipid.robot.closed_loop import PERIOD, ClosedLoopRun, ControlLoop, path_metrics
     from slipid.robot.filter.floor import Floor
     from slipid.robot.interface import Settings
     from tests.helpers.rolled_out import rollout
@@ -148,7 +148,7 @@ def driven(robot, row, path, steps=STEPS):
             share = jnp.where(jnp.all(there, axis=1), 1.0, 1e-9)
             return jnp.broadcast_to(share, (32, len(hypotheses)))
 
-    class ToldFloors(Pilot):
+    class ToldFloors(ControlLoop):
         """A pilot that learns from its fix which floors are under its wheels, and no more."""
 
         def step(self, path, state, measurement, dt):
@@ -156,24 +156,24 @@ def driven(robot, row, path, steps=STEPS):
             there = UnderWheels(known.cells, known.corner, known.cell, jnp.nan_to_num(at))
             pilot = eqx.tree_at(lambda p: p.estimator.floor, self, there)
             blind = replace(measurement, fix=jnp.full(3, jnp.nan))
-            return Pilot.step(pilot, path, state, blind, dt)
+            return ControlLoop.step(pilot, path, state, blind, dt)
 
-    ground = site(robot)
+    ground = twin_floor(robot)
     floor, seeds = floor_of(ground, robot.labels), range(SEED, SEED + STARTS)
     stack = partial(jax.tree.map, lambda *x: jnp.stack(x))
-    truths = stack(*[one_of(robot, seed) for seed in seeds])
+    truths = stack(*[drawn_robot(robot, seed) for seed in seeds])
     believed = stack(*[floor_of(flawed(ground, row.flaw, s), robot.labels) for s in seeds])
     places = starts(STARTS, ground, path)
     paths = [path.moved(place).waiting(1.0) for place in places]
     keys = jnp.stack([jax.random.key(seed) for seed in seeds])
-    habits = replace(habits_of(robot, gyro=row.gyro), smooth=row.smooth)
+    habits = replace(actuator_model_of(robot, gyro=row.gyro), smooth=row.smooth)
     std = jnp.array([row.place_std, row.heading_std])
 
     @eqx.filter_jit
     def all_of(*cases):
         def one(truth, path, place, key, there):
             known = truth if row.numbers else robot
-            pilot = pilot_of(known, TRIAL[row.name], Settings.of(robot), floor=there)
+            pilot = control_loop_of(known, TRIAL[row.name], Settings.of(robot), floor=there)
             if row.floors:
                 pilot = ToldFloors(pilot.estimator, pilot.controller)
             plant = TellingTwin(truth, floor, habits, fix_std=std)
@@ -187,7 +187,7 @@ def driven(robot, row, path, steps=STEPS):
         own = np.asarray(said.time[k])
         ended = np.flatnonzero((own >= path.duration - 1e-6) | np.asarray(said.given_up[k]))
         end = int(ended[0]) + 1 if len(ended) else steps
-        course = Course(
+        course = ClosedLoopRun(
             path=path,
             time=PERIOD * np.arange(end),
             own=own[:end],
@@ -196,7 +196,7 @@ def driven(robot, row, path, steps=STEPS):
             estimate=said.estimate,
             energy=np.full(end, np.nan),
         )
-        m = metrics(course)
+        m = path_metrics(course)
         helpless = bool(said.given_up[k, end - 1])
         out.append((m.closure_mm, m.cross_track_rmse_mm, m.finished, helpless))
     return np.array(out, float)

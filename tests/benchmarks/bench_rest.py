@@ -41,10 +41,10 @@ def shares(found):
 
 def ends(robot):
     """Whether each case came to this end, by name of the end."""
-    from slipid.deploy.controllers import pilot_of
-    from slipid.deploy.deploy import habits_of
+    from slipid.deploy.controllers import control_loop_of
+    from slipid.deploy.deploy import actuator_model_of
     from slipid.lab.trial.controllers import ROWS
-    from slipid.lab.trial.plants import one_of
+    from slipid.lab.trial.plants import drawn_robot
     from slipid.robot import trajectory
     from slipid.robot.closed_loop import PERIOD
     from slipid.robot.filter.floor import Floor
@@ -61,7 +61,9 @@ def ends(robot):
             return self.kept
 
     rng = np.random.default_rng(SEED)
-    truths = jax.tree.map(lambda *x: jnp.stack(x), *[one_of(robot, SEED + k) for k in range(CASES)])
+    truths = jax.tree.map(
+        lambda *x: jnp.stack(x), *[drawn_robot(robot, SEED + k) for k in range(CASES)]
+    )
     under = jnp.asarray(rng.integers(len(robot.labels), size=(CASES, robot.wheels)))
     gap, way = rng.uniform(0.05, 0.3, CASES), rng.uniform(-np.pi, np.pi, CASES)
     turn, heading = rng.uniform(-0.8, 0.8, CASES), rng.uniform(-np.pi, np.pi, CASES)
@@ -69,8 +71,8 @@ def ends(robot):
     keys = jax.random.split(jax.random.key(SEED), CASES)
     line = trajectory.waypoints([(0.0, 0.0), (0.4, 0.0)], speed=0.1)
     paths = [line.moved((0.0, 0.0, float(a))) for a in heading]
-    habits = habits_of(robot, gyro=False)
-    pilot = pilot_of(robot, ROWS["contact"], Settings.of(robot))
+    habits = actuator_model_of(robot, gyro=False)
+    pilot = control_loop_of(robot, ROWS["contact"], Settings.of(robot))
 
     @eqx.filter_jit
     def one(truth, kept, path, place, key):

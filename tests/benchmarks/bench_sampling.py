@@ -35,7 +35,7 @@ def problem_of(floor):
     """Likelihood of the runs on one floor."""
     from slipid.app.config import read_config
     from slipid.app.logs import read_dataset
-    from slipid.app.problem import job_of
+    from slipid.app.problem import fit_task
     from slipid.support.jax_setup import setup_jax
     from slipid.support.progress import Reporter
 
@@ -44,7 +44,7 @@ def problem_of(floor):
     logs = config.content.logs
     dataset, _ = read_dataset(config, logs, DATA, Reporter(quiet=True))
     mine = [k for k, log in enumerate(dataset.logs) if log.surface == floor][:: quick(1, 3)]
-    return job_of(config, dataset.subset(mine), [], Reporter(quiet=True)).problem()
+    return fit_task(config, dataset.subset(mine), [], Reporter(quiet=True)).problem()
 
 
 @pytest.fixture(scope="module")
@@ -81,18 +81,18 @@ def ess_of(chain):
 def by_slipid(density):
     """Chains (chain, draw, coordinate), seconds of sampling and of the warm-up, the last block."""
     from slipid.infer.posterior import ensemble as sampler
-    from slipid.infer.posterior.blocks import Plan, Record, Target
+    from slipid.infer.posterior.blocks import BlockStore, LogDensity, Plan
     from slipid.infer.posterior.coordinates import MOTION
     from slipid.infer.posterior.diagnosis import diagnose
 
     d = density
-    target = Target(d.terms, d.slope, d.coordinates.group, d.centre, d.covariance)
+    target = LogDensity(d.terms, d.slope, d.coordinates.group, d.centre, d.covariance)
     few = Plan(ensembles=2, walkers=16, block=10, warm_up=(2, 4, 6, 8), most=14)
     plan = quick(Plan(), few)
     x = np.repeat(d.centre[None], plan.walkers, axis=0)
     d.terms(x), d.slope(x)  # compiles
     times = [time.perf_counter()]
-    record = Record(keep=lambda part, block: times.append(time.perf_counter()))
+    record = BlockStore(keep=lambda part, block: times.append(time.perf_counter()))
     blocks = sampler.extended(target, plan, MOTION, record)
     warm = plan.warm_up[-1]
     chain = sampler.chain(blocks, plan)

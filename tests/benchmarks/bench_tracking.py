@@ -25,7 +25,7 @@ from slipid.camera.overhead import Lens, OverheadCamera
 from slipid.camera.tracking.track import summary
 from slipid.camera.tracking.tracking import LoneMarker, track
 from slipid.data.floor_map import uniform
-from slipid.lab.testsite.site import Camera, Site
+from slipid.lab.testsite.site import Site, SiteCamera
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK, quick
@@ -100,7 +100,7 @@ def test_speed(video, tmp_path):
 def test_accuracy_on_the_test_site(tmp_path, speed):
     from slipid.lab.testsite.studio import Studio, film
 
-    camera, site = Camera(), Site()
+    camera, site = SiteCamera(), Site()
     try:
         studio = Studio(site, "as_built", uniform(next(iter(site.grounds))), camera, seed=5)
     except DataError as error:

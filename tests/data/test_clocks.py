@@ -9,8 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from slipid.data.align.clock import SURE_STD, Clock, best_clock, clock_of_poses
-from slipid.data.align.motion_pair import MotionPair
-from slipid.data.align.regression import StepNoise
+from slipid.data.align.regression import MotionPair, StepNoise
 from slipid.data.reading.presets import declared_layout
 from slipid.data.reading.reader import read_logs, read_runs
 from slipid.support.errors import DataError

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from slipid.export.c99.code import Code
-from slipid.export.fields import described
+from slipid.export.fields import attribute_docs
 from slipid.robot.closed_loop import PERIOD
 from slipid.robot.interface import Measurement
 from slipid.robot.trajectory import rectangle
@@ -119,7 +119,7 @@ def test_every_field_has_a_unit():
 
 
 def test_a_docstring_says_what_each_attribute_is():
-    said = described(Measurement)
+    said = attribute_docs(Measurement)
     assert said["gyro"] == "yaw rate [rad/s]"
     assert said["fix_std"].startswith("of its place [m] and of its heading [rad]")
     assert set(said) == set(vars(Measurement()))
@@ -127,17 +127,17 @@ def test_a_docstring_says_what_each_attribute_is():
 
 @pytest.mark.slow
 def test_the_loop_closes_in_c_as_it_does_in_the_library(tmp_path):
-    from slipid.deploy.export import Place, Wish, recorded
-    from slipid.deploy.twin_run import site, starts
+    from slipid.deploy.export import ExampleStart, ExportOptions, record_example
+    from slipid.deploy.twin_run import starts, twin_floor
 
     made = code("contact")
     path = rectangle(length=0.4, width=0.2)
     loop = Code(made.robot, made.pilot, path)
     compiled = CompiledC(loop, tmp_path)
     robot = made.robot
-    floor = site(robot)
-    place = Place(floor, starts(20, floor, path)[0], (0.0, 0.0, 0.0))
-    kept = recorded(robot, made.pilot, path, Wish(), place)
+    floor = twin_floor(robot)
+    place = ExampleStart(floor, starts(20, floor, path)[0], (0.0, 0.0, 0.0))
+    kept = record_example(robot, made.pilot, path, ExportOptions(), place)
     compiled.begin((0.0, 0.0, 0.0))
     numbers = [f.size for f in loop.reading.fields]
     for row, command, time in zip(kept.given, kept.command, kept.time, strict=True):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.deploy.controllers import pilot_of
+from slipid.deploy.controllers import control_loop_of
 from slipid.export.stablehlo import FILES, SCHEMA, load_program, stablehlo_files
 from slipid.lab.trial.controllers import ROWS
 from slipid.robot.closed_loop import PERIOD
@@ -18,7 +18,7 @@ from slipid.robot.interface import Readings
 from slipid.support.errors import DataError
 from tests.helpers import small_twin
 
-PILOT = pilot_of(small_twin.deployed(1.0, 1.0, 0.3), ROWS["slip_odometry"])
+PILOT = control_loop_of(small_twin.deployed(1.0, 1.0, 0.3), ROWS["slip_odometry"])
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from slipid.robot.closed_loop import Pilot
+from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.interface import Readings
 from tests.helpers.compiled_c import CompiledC
 
@@ -68,7 +68,7 @@ class Batch:
 class Source:
     """Batches of steps by JAX, each of which goes on from the last."""
 
-    def __init__(self, pilot: Pilot, draw: Draw, robots: int, steps: int):
+    def __init__(self, pilot: ControlLoop, draw: Draw, robots: int, steps: int):
         wheels = pilot.controller.robot.wheels
         self._key, self._steps = jax.random.key(0), steps
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.robot.closed_loop import Pilot
+from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.interface import Pose, Readings, State
 from slipid.robot.trajectory import Path
 
@@ -88,7 +88,7 @@ class CompiledPilot(Generic[State]):
         call: the step.
     """
 
-    def __init__(self, pilot: Pilot[State], path: Path):
+    def __init__(self, pilot: ControlLoop[State], path: Path):
         """Prepare a pilot for a path as it lies for the start; the first call compiles."""
         self.pilot = pilot
         begin, nothing = pilot.init(), Readings.nothing(pilot.controller.robot.wheels)

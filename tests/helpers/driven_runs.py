@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.lab.systems.motion.ward_iagnemma_dynamics import Dynamics, Law
-from slipid.lab.systems.motion.ward_iagnemma_filter import Noise
+from slipid.lab.systems.motion.ward_iagnemma_dynamics import Dynamics, ForceLaw
+from slipid.lab.systems.motion.ward_iagnemma_filter import FilterNoise
 from slipid.predict.slip_model import Run
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
 MACHINES = pytest.mark.parametrize("machine", [ROBOTINO, HUSKY], ids=["omni", "skid"])
-FLOOR = Law(rise=15.0, rolling=0.15, turning=0.1, drag=3.0)
-TRUE = Noise(0.03, (0.003, 0.004, 0.002), 0.02, 0.03)
+FLOOR = ForceLaw(rise=15.0, rolling=0.15, turning=0.1, drag=3.0)
+TRUE = FilterNoise(0.03, (0.003, 0.004, 0.002), 0.02, 0.03)
 
 
-def held(rolling: np.ndarray, law: Law, machine=ROBOTINO, seconds: float = 20.0) -> np.ndarray:
+def held(rolling: np.ndarray, law: ForceLaw, machine=ROBOTINO, seconds: float = 20.0) -> np.ndarray:
     """Twist of a robot whose wheels have long turned as the rolling twist says."""
     dynamics = Dynamics.of(machine, law)
     q = np.atleast_2d(rolling) * machine.size
@@ -24,7 +24,7 @@ def held(rolling: np.ndarray, law: Law, machine=ROBOTINO, seconds: float = 20.0)
     return step.speeds / machine.size
 
 
-def driven(law: Law, seed: int, machine=ROBOTINO, **more) -> Run:
+def driven(law: ForceLaw, seed: int, machine=ROBOTINO, **more) -> Run:
     """A run of 4 s with two twists that the wheels keep, the body moving by the law."""
     rng = np.random.default_rng(seed)
     rolling = rng.uniform([-0.3, -0.3, -0.5], [0.3, 0.3, 0.5], (2, 3)) * [1, machine is ROBOTINO, 1]
@@ -49,7 +49,7 @@ def scattered(count: int, gyro: bool, noise: Noise = TRUE) -> list[Run]:
     return [made_run(rolling[k], twist[k], gyro=yaw[k] if gyro else None) for k in range(count)]
 
 
-def pulling(run: Run, law: Law, gain: float, offset: float, noise: float = 0.0) -> Run:
+def pulling(run: Run, law: ForceLaw, gain: float, offset: float, noise: float = 0.0) -> Run:
     """The run with currents of the traction, as a motor's constant and friction make of it."""
     dynamics = Dynamics.of(ROBOTINO, law)
     rim = run.signals.speed * ROBOTINO.wheel_radius

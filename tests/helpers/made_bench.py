@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.infer.bench.motor import Record
-from slipid.lab.testsite.motors import Drive, Motor, SpeedLoop
+from slipid.infer.bench.motor import BenchRecord
+from slipid.lab.testsite.robot_build import MotorBuild, SpeedLoop, WheelDrives
 
 FLYWHEEL, ROTOR = 1e-4, 7.1e-6
 STEPS = (0, 6, 0, -6, 12, 3, -12, -3, 0, 18, 9, -18, 8, -8, 0)
@@ -25,7 +25,7 @@ TRUTH = {
 }
 
 
-class OpenLoop(Drive):
+class OpenLoop(WheelDrives):
     """A drive that puts on the voltage it is asked for."""
 
     def _voltage(self, k: int, wanted: float, measured: float) -> float:
@@ -59,7 +59,9 @@ def driven(
 
     The drop of the brushes turns over the current `turn` [A].
     """
-    drive = OpenLoop(Motor(supply_v=48.0, supply_ohm=0.0, efficiency=1.0), SpeedLoop(), 1.0, 1, dt)
+    drive = OpenLoop(
+        MotorBuild(supply_v=48.0, supply_ohm=0.0, efficiency=1.0), SpeedLoop(), 1.0, 1, dt
+    )
     held = TRUTH["coulomb_friction"] * dt / inertia
     rows, speed = np.empty((round(seconds / dt), 4)), 0.0
     for k in range(len(rows)):
@@ -77,7 +79,7 @@ def logged(
     seed: int = 0,
     noise: tuple[float, float, float] = (0.05, 0.05, 1.0),
     quantum: tuple[float, float, float] = (0.02, 0.02, 1.0),
-) -> Record:
+) -> BenchRecord:
     """Rows at a rate, with noise, offsets and rounding of voltage, current and speed."""
     rng = np.random.default_rng(seed)
     step = round(1 / rate / (rows[1, 0] - rows[0, 0]))
@@ -86,7 +88,7 @@ def logged(
     seen = rows[:, 1:] + offset + np.array(noise) * rng.normal(size=(len(rows), 3))
     q = np.array(quantum)
     seen = np.where(q > 0, np.round(seen / np.where(q > 0, q, 1)) * q, seen)
-    return Record(
+    return BenchRecord(
         name="made",
         sha256="",
         time=rows[:, 0],
@@ -102,7 +104,7 @@ def truth(inertia: float, drop: float = 0.0) -> dict[str, float]:
     return {f"motor.{name}": value for name, value in known.items()}
 
 
-def write(record: Record, path: Path, header: str = "t,U,I,w") -> Path:
+def write(record: BenchRecord, path: Path, header: str = "t,U,I,w") -> Path:
     """The record as a CSV file in SI units."""
     table = np.stack([record.time, record.voltage, record.current, record.speed], axis=1)
     np.savetxt(path, table, delimiter=",", header=header, comments="", fmt="%.7g")

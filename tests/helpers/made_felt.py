@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slipid.lab.systems.floors.interface import Felt
+from slipid.lab.systems.floors.interface import FloorSignals
 
 HZ = 6.5
 
@@ -16,11 +16,11 @@ def made_felt(
     noise: float = 0.3,
     seed: int = 0,
     gyro: bool = True,
-) -> Felt:
+) -> FloorSignals:
     """A run whose motors draw `level` [A] and a little noise at wheel speeds (row, drive)."""
     rng = np.random.default_rng(seed)
     rows = len(speed)
-    return Felt(
+    return FloorSignals(
         name=name or f"{floor}/{seed}",
         floor=floor,
         time=np.arange(rows) / HZ,
@@ -36,7 +36,9 @@ def ahead(rows: int = 60, rate: float = 1.5, drives: int = 2) -> np.ndarray:
     return np.full((rows, drives), rate)
 
 
-def made_felts(levels: dict[str, float], runs: int = 4, rows: int = 60, **kw: float) -> list[Felt]:
+def made_felts(
+    levels: dict[str, float], runs: int = 4, rows: int = 60, **kw: float
+) -> list[FloorSignals]:
     """Runs straight ahead on floors that differ in what motors draw there [A]."""
     return [
         made_felt(floor, ahead(rows), level, seed=100 * n + k, name=f"{floor}/{k}", **kw)

@@ -6,15 +6,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.robot.closed_loop import PERIOD, Pilot, PilotOutput, PilotState
+from slipid.robot.closed_loop import PERIOD, ControlLoop, ControlLoopOutput, ControlLoopState
 from slipid.robot.interface import Pose, Readings, State
 from slipid.robot.trajectory import Path
 from slipid.robot.twin import Twin, TwinState
 
 
 def rollout(
-    pilot: Pilot[State], path: Path, twin: Twin, start: Pose, key: Array, steps: int
-) -> tuple[Float[Array, "step 3"], PilotOutput]:
+    pilot: ControlLoop[State], path: Path, twin: Twin, start: Pose, key: Array, steps: int
+) -> tuple[Float[Array, "step 3"], ControlLoopOutput]:
     """True poses [m, m, rad] and what the pilot says over a fixed number of steps.
 
     A path that is over is a rest at its end.
@@ -31,8 +31,10 @@ def rollout(
     reading = twin.first(state, noise[0])
 
     def step(
-        carry: tuple[TwinState, PilotState[State], Readings], drawn: Array
-    ) -> tuple[tuple[TwinState, PilotState[State], Readings], tuple[Array, PilotOutput]]:
+        carry: tuple[TwinState, ControlLoopState[State], Readings], drawn: Array
+    ) -> tuple[
+        tuple[TwinState, ControlLoopState[State], Readings], tuple[Array, ControlLoopOutput]
+    ]:
         before, held, reading = carry
         held, out = pilot.step(path, held, reading, PERIOD)
         state, reading = twin.step(before, out.command, drawn)

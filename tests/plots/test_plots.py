@@ -13,36 +13,44 @@ from matplotlib.image import imread
 from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.fit.optimise import Optimum
-from slipid.fit.problem import Problem, State
-from slipid.infer.design.planned_runs import Drive
+from slipid.fit.problem import FitState, Problem
+from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.result import Fit, summarise
-from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.lab.selftest.logs import (
+    SimulatedSensors,
+    heading_grid,
+    nominal_robot,
+    simulate_logs,
+    true_robot,
+)
 from slipid.model.geometry import differential, omni
 from slipid.plots import fit as plots
 from slipid.plots import fit as plots_robot
 from slipid.plots.compare import WORDS, ladder_figure
 from slipid.plots.drawing import figure, save
+from slipid.plots.measured_windows import by_heading, measured_windows
 from slipid.plots.motion import heading_figure
-from slipid.plots.seen import by_heading, seen
 from slipid.plots.wheels import current_figure, driving_torque, wheel_curve
 from slipid.predict.slip_models import slip_models
 from slipid.search_space import Choice
 
 pytestmark = pytest.mark.slow  # traces whole fits
 
-DRIVES = grid(setups=(("soft", "as_built"), ("firm", "as_built")), headings=8, turns=0)
-ROBOT = truth(DRIVES)
-QUIET = Sensors(std=dict.fromkeys(Sensors().std, 0.0), ripple=0.0, voltage_noise=0.0, wobble=0.0)
+DRIVES = heading_grid(setups=(("soft", "as_built"), ("firm", "as_built")), headings=8, turns=0)
+ROBOT = true_robot(DRIVES)
+QUIET = SimulatedSensors(
+    std=dict.fromkeys(SimulatedSensors().std, 0.0), ripple=0.0, voltage_noise=0.0, wobble=0.0
+)
 
 
 @functools.cache
 def data():
-    return collect(make_logs(ROBOT, DRIVES, 0, QUIET))
+    return collect(simulate_logs(ROBOT, DRIVES, 0, QUIET))
 
 
 @functools.cache
 def pieces():
-    return seen(ROBOT, data(), 4)
+    return measured_windows(ROBOT, data(), 4)
 
 
 @functools.cache
@@ -51,13 +59,13 @@ def fit() -> Fit:
     choices = [Choice("camera.scale", prior_mean=1.117, prior_std=0.002)]
     choices.append(Choice("camera.lag", prior_mean=0.056, prior_std=0.02))
     choices.append(Choice("robot.mass", fixed=12.0))
-    problem = Problem(windows(data(), 0.04, lag=0.056), blank(DRIVES), choices)
+    problem = Problem(windows(data(), 0.04, lag=0.056), nominal_robot(DRIVES), choices)
     z = problem.space.vector(ROBOT)
     log_v = 2 * np.log(problem.noise.typical)
     _, jacobian = problem.linear(jnp.asarray(z), problem.electric(z, log_v))
     keep = jnp.ones(len(problem.windows))
     info = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep))
-    state = State(z, log_v, 7, -1.5, 0.01, "joint")
+    state = FitState(z, log_v, 7, -1.5, 0.01, "joint")
     return summarise(
         problem, Optimum(state, np.linalg.inv(info), True, "settled", (0.0,)), data(), choices
     )
@@ -149,9 +157,11 @@ def test_without_currents_or_directions_those_pictures_are_left_out():
 
 
 def test_turning_pieces_have_no_direction():
-    drives = (Drive("soft", "as_built", 0.3, 0.2, turn=0.8),)
-    robot = truth(drives)
-    assert not seen(robot, collect(make_logs(robot, drives, 0, QUIET)), 4).straight.any()
+    drives = (PlannedRun("soft", "as_built", 0.3, 0.2, turn=0.8),)
+    robot = true_robot(drives)
+    assert not measured_windows(
+        robot, collect(simulate_logs(robot, drives, 0, QUIET)), 4
+    ).straight.any()
 
 
 def test_loads_are_written_at_their_wheels():

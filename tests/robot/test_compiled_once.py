@@ -10,7 +10,7 @@ import pytest
 
 from slipid.model.geometry import omni
 from slipid.model.robot import build
-from slipid.robot.closed_loop import Pilot, drive
+from slipid.robot.closed_loop import ControlLoop, run_closed_loop
 from slipid.robot.controller import Controller, Gains, Limits
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, Odometry
@@ -159,9 +159,9 @@ def test_another_robot_runs_a_closed_loop_without_compiling(robots):
     floor = small_twin.floor([[0, 1], [1, 0]])
 
     def course(robot: DeployedRobot, settings: Settings, limits: Limits) -> np.ndarray:
-        pilot = Pilot(Estimator(robot, settings), Controller(robot, Gains(), limits))
+        pilot = ControlLoop(Estimator(robot, settings), Controller(robot, Gains(), limits))
         plant = TwinPlant(Twin(robot, floor), (0.0, 0.0, 0.0), jax.random.key(0))
-        return drive(pilot, PATH, plant, (0.0, 0.0, 0.0)).command
+        return run_closed_loop(pilot, PATH, plant, (0.0, 0.0, 0.0)).command
 
     before = course(one, ONE, Limits())
     with compilations() as found:

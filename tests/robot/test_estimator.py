@@ -17,8 +17,8 @@ from slipid.model import contact
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.robot import closed_loop
-from slipid.robot.closed_loop import Pilot
-from slipid.robot.controller import LONGEST_I, Controller, Gains, Limits, limited
+from slipid.robot.closed_loop import ControlLoop
+from slipid.robot.controller import LONGEST_I, Controller, Gains, Limits, limit_command
 from slipid.robot.estimator import Estimator, Odometry
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import FloorFilter
@@ -63,10 +63,10 @@ def pilot(kind):
     deployed = robot()
     if kind == "curve":
         gains = Gains.at((2.0, 2.0, 0.2, 0.0, 0.15))
-        return Pilot(Odometry(deployed, curve=True), Controller(deployed, gains))
+        return ControlLoop(Odometry(deployed, curve=True), Controller(deployed, gains))
     gains = Gains.at((2.0, 2.0, 0.2, 0.3, 0.15))
     there = CHESS if kind == "mapped" else None
-    return Pilot(Estimator(deployed, floor=there), Controller(deployed, gains))
+    return ControlLoop(Estimator(deployed, floor=there), Controller(deployed, gains))
 
 
 @cache
@@ -240,7 +240,7 @@ def test_saturation_keeps_the_direction():
     for _ in range(50):
         wanted = rng.normal(size=3) * 30
         got = np.asarray(
-            limited(jnp.asarray(wanted), jnp.zeros(3), jnp.zeros(3), robot(), LIMITS, 0.5)
+            limit_command(jnp.asarray(wanted), jnp.zeros(3), jnp.zeros(3), robot(), LIMITS, 0.5)
         )
         np.testing.assert_allclose(np.cross(got, wanted), 0.0, atol=1e-9)
         assert got @ wanted > 0
@@ -250,7 +250,9 @@ def test_saturation_keeps_the_direction():
 def test_a_command_needs_no_more_than_the_supply_has_left(amps):
     f, limits = robot(), Limits(voltage=6.0, acceleration=1e4)
     wanted, motor = np.array([10.0, -9.0, 2.0]), f.motor
-    got = np.asarray(limited(jnp.asarray(wanted), jnp.zeros(3), jnp.asarray(amps), f, limits, DT))
+    got = np.asarray(
+        limit_command(jnp.asarray(wanted), jnp.zeros(3), jnp.asarray(amps), f, limits, DT)
+    )
     np.testing.assert_allclose(got / wanted, got[0] / wanted[0], rtol=1e-12)
     needs = np.abs(got) * float(motor.gear_ratio * motor.back_emf)
     left = 6.0 - float(motor.resistance) * np.abs(amps)
@@ -582,8 +584,8 @@ def test_a_robot_that_nothing_frees_gives_up_and_its_run_ends():
     )
     start, alone = (0.0, 0.0, 0.0), small_twin.floor([[0]])
     plant = TwinPlant(Twin(slick, alone), start, jax.random.key(0))
-    course = closed_loop.drive(
-        Pilot(Estimator(slick), Controller(slick, Gains())), PATH, plant, start
+    course = closed_loop.run_closed_loop(
+        ControlLoop(Estimator(slick), Controller(slick, Gains())), PATH, plant, start
     )
     assert 15.0 < course.time[-1] < 25.0
     assert course.own[-1] < 0.5 * PATH.duration

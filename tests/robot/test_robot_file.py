@@ -17,14 +17,14 @@ import jsonschema
 import numpy as np
 import pytest
 
-from slipid.deploy.deploy import given
-from slipid.deploy.record_of import record_of
+from slipid.deploy.deploy import given_numbers
+from slipid.deploy.robot_record import robot_record
 from slipid.model.geometry import omni
 from slipid.model.robot import Validity, build
 from slipid.parameter import entries
 from slipid.robot.controller import Gains
-from slipid.robot.deployed import DeployedRobot, drawn
-from slipid.robot.record import GainValues, ToldRecord
+from slipid.robot.deployed import DeployedRobot, posterior_robots
+from slipid.robot.record import EffectRecord, GainValues
 from slipid.support.errors import DataError
 from slipid.support.files import checksum
 from tests.helpers.known_robot import GAINS, USED, deploy_known
@@ -36,7 +36,7 @@ SEEN = Validity(
 ONE = (((0.01, -0.02, 1 / 3), (0.0, 0.1 + 0.2, 0.0)), ((0.0, 0.0, 0.0), (0.001, 0.0, -0.1)))
 """What is told of a floor at two speeds and in two directions."""
 LEFT = (((0.01, 0.02, 0.03), (0.03, 0.02, 0.01)), ((0.01, 0.01, 0.01), (0.02, 0.02, 0.0)))
-TOLD = ToldRecord((0.1, 0.3), (ONE, ONE[::-1]), (LEFT, LEFT[::-1]))
+TOLD = EffectRecord((0.1, 0.3), (ONE, ONE[::-1]), (LEFT, LEFT[::-1]))
 
 
 @pytest.fixture(scope="module")
@@ -64,13 +64,13 @@ def robot() -> DeployedRobot:
         several,
         (shaken, biases * jnp.arange(5)[:, None, None]),
     )
-    numbers = given(made)
+    numbers = given_numbers(made)
     share_path = "robot.load_share@own"
     pairs = tuple((x - 0.01, x + 0.01) for x in share[0].tolist())
     known = {"std": (0.01, 0.01, 0.01), "interval90": pairs, "verdict": "identified"}
     numbers[share_path] = replace(numbers[share_path], **known)
     std = {"process.firm.along": 0.003, "session.soft.yaw": 0.02}
-    record = record_of(
+    record = robot_record(
         made, numbers, std, several, 8.1, (0.01, -0.02), {"firm": SEEN}, {"moved": TOLD}
     )
     record = replace(record, messages=("say \u00e9 aloud",), versions={"jax": "0.1"})
@@ -127,7 +127,7 @@ def test_gains_are_those_of_the_load_set_up_they_were_tuned_for(path):
 
 
 def test_draws_are_robots_with_other_numbers(robot):
-    several = drawn(robot, (4, 0))
+    several = posterior_robots(robot, (4, 0))
     rows = robot.record.draws["surface.soft.friction"]
     np.testing.assert_array_equal(several.floors.friction[:, 1], [rows[4], rows[0]])
     biases = np.asarray(robot.floors.load_bias)

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from slipid.app.new.config_lines import ConfigLine, toml
+from slipid.app.new.draft import BagDraft, ConfigDraft, ConfigProposal, LogsDraft
 from slipid.app.new.file_channels import common_glob, floor_of, rank
-from slipid.app.new.robot import robot_from
+from slipid.app.new.guess import guess_robot
 from slipid.app.new.robot_questions import RobotAnswers, RobotOptions
-from slipid.app.new.sketch import BagSketch, ConfigProposal, LogsSketch, Sketch
-from slipid.app.reference.parameters import in_short, meanings
+from slipid.app.reference.keys import in_short, meanings
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.topics import Topic, topics_of
 from slipid.data.reading.column_names import meaning_of
@@ -19,7 +19,7 @@ SUFFIXES = (".bag", ".db3", ".mcap")
 _METADATA = "metadata.yaml"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_TURNS = ("wheel_ticks", "wheel_angle", "wheel_speed", "motor_speed")
+_WHEEL_CHANNELS = ("wheel_ticks", "wheel_angle", "wheel_speed", "motor_speed")
 _EFFORT = (
     "what is the effort: a current (A), a torque (motor_torque or wheel_torque, N*m), a voltage "
     "(V) or a duty (1)?"
@@ -31,7 +31,7 @@ _BY_NAME = ("current", "voltage", "duty")
 
 
 @dataclass(frozen=True)
-class _Served:
+class _TopicChannel:
     """A channel, or a group of them, that a topic holds; `wheels` where it has one per wheel.
 
     `field` and `unit` where the type of the messages does not tell them.
@@ -67,10 +67,12 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
     bag = bags[0]
     topics = topics_of(bag)
     joints, doubt = _joints(topics)
-    served = list(_first_of_each(topics, len(joints)))
-    wheels = next((one.wheels for name in _TURNS for one in served if one.channel == name), 0)
+    served = list(_best_topics(topics, len(joints)))
+    wheels = next(
+        (one.wheels for name in _WHEEL_CHANNELS for one in served if one.channel == name), 0
+    )
     served += _by_field_names(topics, served, wheels)
-    guessed = robot_from(options, wheels, ())
+    guessed = guess_robot(options, wheels, ())
     questions = [doubt] if doubt else []
     if not any(one.channel == "pose" for one in served):
         questions.append("no topic with a pose was found: a fit needs one")
@@ -80,19 +82,19 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
     root = path.parent if is_bag else path
     inside = [PurePosixPath(one.relative_to(root)) for one in bags]
     inside = [one for one in inside if len(one.parts) == len(inside[0].parts)]
-    layout = BagSketch(
+    layout = BagDraft(
         "mine",
-        _settings(guessed.robot, joints, served),
-        tuple(_lines(served)),
+        _layout_lines(guessed.robot, joints, served),
+        tuple(_topic_lines(served)),
         _unused(topics, served),
         tuple(questions),
     )
     floor = "on which floor was it driven? Or a topic or table tells: runs, in the layout"
     glob = common_glob(inside)
-    sketch = Sketch(
+    sketch = ConfigDraft(
         guessed.robot,
         (),
-        (LogsSketch(glob, "mine", floor_of(glob), question=floor),),
+        (LogsDraft(glob, "mine", floor_of(glob), question=floor),),
         carries=frozenset(one.channel for one in served if one.question != _EFFORT),
         above=(f"Proposed from {bag}.",),
         data=str(root),
@@ -121,7 +123,7 @@ def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
     return ordered, doubt
 
 
-def _first_of_each(topics: Sequence[Topic], joints: int) -> Iterator[_Served]:
+def _best_topics(topics: Sequence[Topic], joints: int) -> Iterator[_TopicChannel]:
     """The best topic for every channel: poses that are no odometry come before those that are."""
     order = sorted(topics, key=lambda t: (t.type == _ODOMETRY, t.type == _TRANSFORMS, t.name))
     taken: set[str] = set()
@@ -130,16 +132,16 @@ def _first_of_each(topics: Sequence[Topic], joints: int) -> Iterator[_Served]:
             if channel in taken or not topic.count:
                 continue
             taken.add(channel)
-            wheels = joints if topic.joints else _count(topic) if channel in PER_WHEEL else 0
-            yield _Served(channel, topic, wheels, _doubt(channel, topic))
+            wheels = joints if topic.joints else _array_length(topic) if channel in PER_WHEEL else 0
+            yield _TopicChannel(channel, topic, wheels, _pose_question(channel, topic))
         if any(f.path == "effort" and f.count for f in topic.fields) and "current" not in taken:
             taken.add("current")
-            yield _Served("current", topic, joints, _EFFORT)
+            yield _TopicChannel("current", topic, joints, _EFFORT)
 
 
 def _by_field_names(
-    topics: Sequence[Topic], served: Sequence[_Served], wheels: int
-) -> Iterator[_Served]:
+    topics: Sequence[Topic], served: Sequence[_TopicChannel], wheels: int
+) -> Iterator[_TopicChannel]:
     """Channels in messages of unknown types: numbers of every wheel in a field of that name."""
     taken = {one.channel for one in served}
     for topic in (one for one in topics if one.count and not one.serves and not one.joints):
@@ -152,15 +154,15 @@ def _by_field_names(
             taken.add(meaning.channel)
             unit = meaning.unit or CHANNELS[meaning.channel]
             ask = f"by the name of the field: is it that, in {unit}, in the order of the joints?"
-            yield _Served(meaning.channel, topic, wheels, ask, field.path, unit)
+            yield _TopicChannel(meaning.channel, topic, wheels, ask, field.path, unit)
 
 
-def _count(topic: Topic) -> int:
+def _array_length(topic: Topic) -> int:
     """How many wheels a message has numbers of."""
     return max((field.count for field in topic.fields if field.type.endswith("[]")), default=1)
 
 
-def _doubt(channel: str, topic: Topic) -> str:
+def _pose_question(channel: str, topic: Topic) -> str:
     if channel != "pose":
         return ""
     if topic.type == _ODOMETRY:
@@ -172,7 +174,7 @@ def _doubt(channel: str, topic: Topic) -> str:
     return ""
 
 
-def _lines(served: Sequence[_Served]) -> Iterator[ConfigLine]:
+def _topic_lines(served: Sequence[_TopicChannel]) -> Iterator[ConfigLine]:
     """A line for each channel."""
     for one in served:
         inside = f"topic = {toml(one.topic.name)}"
@@ -193,8 +195,8 @@ def _rate(topic: Topic) -> str:
     return f"{topic.type}, {(topic.count - 1) / (topic.last - topic.first):.3g} Hz"
 
 
-def _settings(
-    robot: RobotAnswers, joints: tuple[str, ...], served: Sequence[_Served]
+def _layout_lines(
+    robot: RobotAnswers, joints: tuple[str, ...], served: Sequence[_TopicChannel]
 ) -> tuple[ConfigLine, ...]:
     """Keys of the layout but for its topics."""
 
@@ -217,14 +219,14 @@ def _settings(
     return tuple(lines)
 
 
-def _unused(topics: Sequence[Topic], served: Sequence[_Served]) -> tuple[str, ...]:
+def _unused(topics: Sequence[Topic], served: Sequence[_TopicChannel]) -> tuple[str, ...]:
     """Other topics, with what their messages hold."""
     used = {one.topic.name for one in served}
     others = [topic for topic in topics if topic.name not in used and topic.count]
-    return tuple(f"Not used: {topic.name} ({topic.type}){_holds(topic)}" for topic in others)
+    return tuple(f"Not used: {topic.name} ({topic.type}){_field_list(topic)}" for topic in others)
 
 
-def _holds(topic: Topic) -> str:
+def _field_list(topic: Topic) -> str:
     if topic.problem:
         return f": {topic.problem}"
     paths = [field.path for field in topic.fields if not field.path.startswith("header")]

@@ -12,7 +12,7 @@ import numpy as np
 
 from slipid.model.geometry import Geometry
 
-ASKS = "# ? "
+QUESTION_MARK = "# ? "
 """What the line of an open question begins with."""
 _COLUMN = 38
 """Where comments begin, if the line leaves room."""
@@ -39,7 +39,7 @@ class ConfigLine:
 
     def text(self) -> str:
         """The line, below its question."""
-        asked = _asked(self.question)
+        asked = _question_lines(self.question)
         line = f"{'# ' if self.off else ''}{self.key} = {self.value}"
         if not self.comment:
             return asked + line
@@ -64,7 +64,7 @@ class ConfigBlock:
     def text(self) -> str:
         """Its part of the file."""
         out = [f"# {part}".rstrip() for text in self.above for part in wrapped(text, _WIDTH - 2)]
-        out += [_asked(question).rstrip("\n") for question in self.questions]
+        out += [_question_lines(question).rstrip("\n") for question in self.questions]
         out += [self.header] if self.header else []
         out += [line.text() for line in self.lines]
         out += [f"# {part}".rstrip() for text in self.below for part in wrapped(text, _WIDTH - 2)]
@@ -88,12 +88,12 @@ def toml(value: Value) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _asked(question: str) -> str:
-    """A question as comment lines, the first of which begins with `ASKS`."""
+def _question_lines(question: str) -> str:
+    """A question as comment lines, the first of which begins with `QUESTION_MARK`."""
     if not question:
         return ""
-    first, *others = wrapped(question, _WIDTH - len(ASKS))
-    return "".join([f"{ASKS}{first}\n", *(f"#   {part}\n" for part in others)])
+    first, *others = wrapped(question, _WIDTH - len(QUESTION_MARK))
+    return "".join([f"{QUESTION_MARK}{first}\n", *(f"#   {part}\n" for part in others)])
 
 
 def wrapped(text: str, width: int) -> list[str]:
@@ -114,7 +114,7 @@ def wrapped(text: str, width: int) -> list[str]:
     return out
 
 
-def all_asked(blocks: Iterable[ConfigBlock]) -> tuple[str, ...]:
+def all_questions(blocks: Iterable[ConfigBlock]) -> tuple[str, ...]:
     """Every open question of a config, in its order."""
     return tuple(question for block in blocks for question in block.asked)
 
@@ -129,12 +129,12 @@ on either side."""
 _MARGIN = 12
 """Columns beyond the wheels, for the axis to the left and the labels."""
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-LABEL = 3
+LABEL_WIDTH = 3
 """Characters of a wheel: its number, its arrow, the letter of a drive that it shares."""
 
 
 @dataclass(frozen=True)
-class _Wheel:
+class _DrawnWheel:
     """A wheel as it is drawn: row 0 is the middle, rows count down, columns to the right."""
 
     row: int
@@ -149,8 +149,12 @@ def drawing(robot: Geometry) -> str:
     its speed is positive, and a letter the motor that it shares with others.
     """
     lines = ["seen from above, arrows: the way of a positive wheel speed", ""]
-    lines += _picture(_placed(robot))
-    lines += ["", *(_said(robot, wheel) for wheel in range(robot.wheels)), *_shared(robot)]
+    lines += _picture(_grid_wheels(robot))
+    lines += [
+        "",
+        *(_wheel_line(robot, wheel) for wheel in range(robot.wheels)),
+        *_motor_lines(robot),
+    ]
     return "\n".join(line.rstrip() for line in lines)
 
 
@@ -160,7 +164,7 @@ def direction(degrees: float) -> str:
     return (*names, "ahead right")[round(degrees / 45) % 8]
 
 
-def _placed(robot: Geometry) -> list[_Wheel]:
+def _grid_wheels(robot: Geometry) -> list[_DrawnWheel]:
     """Wheels on a grid whose rows are twice as far apart as its columns, none on another."""
     place = np.asarray(robot.place) * float(robot.base_radius)
     # a character is about twice as high as it is wide
@@ -169,10 +173,10 @@ def _placed(robot: Geometry) -> list[_Wheel]:
     wheels = []
     for k, (x, y) in enumerate(place.tolist()):
         row, column = -round(x / step), -round(2 * y / step)
-        while any((row, column + d) in taken for d in range(-LABEL, LABEL + 1)):
+        while any((row, column + d) in taken for d in range(-LABEL_WIDTH, LABEL_WIDTH + 1)):
             row += 1
         taken.add((row, column))
-        wheels.append(_Wheel(row, column, _label(robot, k)))
+        wheels.append(_DrawnWheel(row, column, _label(robot, k)))
     return wheels
 
 
@@ -188,7 +192,7 @@ def _letter(robot: Geometry, wheel: int) -> str:
     return _LETTERS[robot.drive_of[wheel] % len(_LETTERS)]
 
 
-def _picture(wheels: list[_Wheel]) -> list[str]:
+def _picture(wheels: list[_DrawnWheel]) -> list[str]:
     top = min(-_LEAST, *(w.row for w in wheels)) - 1
     bottom = max(0, *(w.row for w in wheels))
     width = max(_COLUMNS, *(abs(w.column) for w in wheels)) + _MARGIN
@@ -212,7 +216,7 @@ def _picture(wheels: list[_Wheel]) -> list[str]:
     return [f"    {row[blank:]}" if row else "" for row in rows]
 
 
-def _said(robot: Geometry, wheel: int) -> str:
+def _wheel_line(robot: Geometry, wheel: int) -> str:
     """Where a wheel stands and what it does, in a line."""
     x, y = (float(robot.base_radius) * c for c in robot.place[wheel])
     degrees = math.degrees(robot.drive_angle[wheel]) % 360
@@ -241,7 +245,7 @@ def _corner(x: float, y: float) -> str:
     return f"{along} {'left' if y > far else 'right' if y < -far else ''}".strip()
 
 
-def _shared(robot: Geometry) -> list[str]:
+def _motor_lines(robot: Geometry) -> list[str]:
     """Which columns of the logs belong to which wheels, where they are not one for each."""
     if not robot.drive_of:
         return []

@@ -24,9 +24,9 @@ from slipid.support.errors import DataError
 _ORDER = ("fl", "fr", "ml", "mr", "rl", "rr", "l", "r")
 """Wheels as the drives count them."""
 _QUATERNION = ("x", "y", "z", "w")
-TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
+WHEEL_MOTION = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
 """Channels that tell how far the wheels turned, the best first."""
-_COUNTS = 50
+_LEAST_TICKS = 50
 """Whole numbers up to which a position is no count of ticks."""
 
 
@@ -76,7 +76,7 @@ class FileChannels:
     @property
     def turns(self) -> FileChannel | None:
         """The channel that tells how far the wheels turned."""
-        return self.first(*TURNS)
+        return self.first(*WHEEL_MOTION)
 
     @property
     def wheels(self) -> int:
@@ -90,7 +90,7 @@ class FileChannels:
         return bool(self.get("pose_x") and self.get("pose_y") and turned)
 
 
-def columns_of(numbers: TableNumbers) -> FileChannels:
+def channels_in(numbers: TableNumbers) -> FileChannels:
     """What the named columns of a file hold."""
     format, meanings = numbers.format, {}
     for at, name in enumerate(format.names):
@@ -106,10 +106,12 @@ def columns_of(numbers: TableNumbers) -> FileChannels:
             also.append(f"{format.names[at]} (as {format.names[there[one.label]]})")
         else:
             there[one.label] = at
-    found = [_found(numbers, meanings, name, places) for name, places in channels.items()]
-    found = _one_of_each(_told_apart(found))
-    notes = _odometry(numbers, meanings) + [f"not used, said twice: {', '.join(also)}"] * bool(also)
-    kept, dropped = _agreeing(found)
+    found = [_file_channel(numbers, meanings, name, places) for name, places in channels.items()]
+    found = _without_duplicates(_resolved(found))
+    notes = _odometry_note(numbers, meanings) + [f"not used, said twice: {', '.join(also)}"] * bool(
+        also
+    )
+    kept, dropped = _consistent(found)
     used = {at for one in kept for at in one.at}
     unused = [
         name for at, name in enumerate(format.names) if name and at in meanings and at not in used
@@ -117,7 +119,7 @@ def columns_of(numbers: TableNumbers) -> FileChannels:
     return FileChannels(tuple(kept), tuple(unused), tuple(notes + dropped))
 
 
-def _found(
+def _file_channel(
     numbers: TableNumbers, meanings: dict[int, ColumnMeaning], channel: str, places: dict[str, int]
 ) -> FileChannel:
     """A channel with its columns in order."""
@@ -142,38 +144,38 @@ def rank(label: str) -> tuple[int, int, str]:
     return (2, int(label) if label.isdecimal() else 0, label)
 
 
-def _told_apart(found: list[FileChannel]) -> list[FileChannel]:
+def _resolved(found: list[FileChannel]) -> list[FileChannel]:
     """Positions are ticks where they are whole numbers; v is a speed where no speed is logged."""
     speeds = {one.labels for one in found if one.channel.endswith("_speed")}
     out = []
     for one in found:
         kind, _, what = one.channel.rpartition("_")
         if what == "position":
-            ticks = one.unit in ("tick", "ticks") or (not one.unit and _counted(one.values))
+            ticks = one.unit in ("tick", "ticks") or (not one.unit and _is_ticks(one.values))
             one = replace(one, channel="wheel_ticks" if ticks else f"{kind}_angle")
         elif what == "v":
             volts = (
                 one.unit in ("V", "mV")
                 or one.labels in speeds
-                or (not one.unit and _always_far(one.values))
+                or (not one.unit and _stays_up(one.values))
             )
             one = replace(one, channel="voltage" if volts else f"{kind}_speed")
         out.append(one)
     return out
 
 
-def _counted(values: Float[np.ndarray, "row column"]) -> bool:
+def _is_ticks(values: Float[np.ndarray, "row column"]) -> bool:
     known = values[~np.isnan(values)]
-    return bool((known == np.round(known)).all() and np.abs(known).max(initial=0.0) > _COUNTS)
+    return bool((known == np.round(known)).all() and np.abs(known).max(initial=0.0) > _LEAST_TICKS)
 
 
-def _always_far(values: Float[np.ndarray, "row column"]) -> bool:
+def _stays_up(values: Float[np.ndarray, "row column"]) -> bool:
     """Whether numbers keep away from 0, as a battery's voltage does and a speed does not."""
     known = values[~np.isnan(values)]
     return bool(known.size) and float(known.min()) > 0.5 * float(known.max()) > 0.0
 
 
-def _one_of_each(found: list[FileChannel]) -> list[FileChannel]:
+def _without_duplicates(found: list[FileChannel]) -> list[FileChannel]:
     """The first of channels that turned out to be the same."""
     out: dict[str, FileChannel] = {}
     for one in found:
@@ -181,9 +183,9 @@ def _one_of_each(found: list[FileChannel]) -> list[FileChannel]:
     return list(out.values())
 
 
-def _agreeing(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
+def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
     """Channels that go together, and a line for each that is left out."""
-    turns = [one for name in TURNS for one in found if one.channel == name]
+    turns = [one for name in WHEEL_MOTION for one in found if one.channel == name]
     per_wheel = turns or [one for one in found if one.channel in PER_WHEEL]
     count = len(per_wheel[0].at) if per_wheel else 0
     labels = set(per_wheel[0].labels) if per_wheel else set()
@@ -191,7 +193,7 @@ def _agreeing(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
     for one in found:
         if one.channel == "pose_quaternion" and len(one.at) != 4:
             dropped.append(f"{len(one.at)} columns of a quaternion; expected x, y, z and w")
-        elif one.channel in PER_WHEEL and (len(one.at) != count or not _alike(labels, one)):
+        elif one.channel in PER_WHEEL and (len(one.at) != count or not _same_wheels(labels, one)):
             what = f"{len(one.at)} columns of {one.channel}"
             dropped.append(f"{what} are left out: {count} wheels have {per_wheel[0].channel}")
         else:
@@ -199,23 +201,23 @@ def _agreeing(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
     return kept, dropped
 
 
-def _alike(labels: set[str], one: FileChannel) -> bool:
+def _same_wheels(labels: set[str], one: FileChannel) -> bool:
     """Whether channels name the same wheels, or one names sides and the other numbers."""
     numbers = all(label.isdecimal() for label in labels)
     return set(one.labels) == labels or numbers != all(label.isdecimal() for label in one.labels)
 
 
-def _odometry(numbers: TableNumbers, meanings: dict[int, ColumnMeaning]) -> list[str]:
+def _odometry_note(numbers: TableNumbers, meanings: dict[int, ColumnMeaning]) -> list[str]:
     names = [numbers.format.names[at] for at, one in meanings.items() if one.channel == "odometry"]
     if not names:
         return []
     return [f"{', '.join(names)}: odometry is no pose of its own, wheels tell it already"]
 
 
-def without_names(numbers: TableNumbers) -> FileChannels:
+def unnamed_channels(numbers: TableNumbers) -> FileChannels:
     """What columns without names may hold: time, a pose and whole numbers as ticks."""
     values = numbers.values
-    whole = [k for k in range(values.shape[1]) if _counted(values[:, [k]])]
+    whole = [k for k in range(values.shape[1]) if _is_ticks(values[:, [k]])]
     time = next((k for k in range(values.shape[1]) if (np.diff(values[:, k]) > 0).all()), None)
     whole = [k for k in whole if k != time]
     others = [k for k in range(values.shape[1]) if k not in (*whole, time)]
@@ -248,21 +250,21 @@ def without(channels: FileChannels, names: frozenset[str]) -> FileChannels:
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".parquet")
 """Of files that may be logs."""
-_TELLING = 8
+_TELLING_COLUMNS = 8
 """Named columns from which nobody else will have the same by chance."""
-_TRIED = 3
+_FILES_TRIED = 3
 """Files that are read to see whether a preset fits."""
 
 
 @dataclass(frozen=True)
-class NoLog:
+class RejectedFile:
     """A file that might have been a log, and why it is none."""
 
     path: Path
     why: str
 
 
-def formats_below(folder: Path) -> tuple[list[TableFormat], list[NoLog]]:
+def formats_below(folder: Path) -> tuple[list[TableFormat], list[RejectedFile]]:
     """Every log in a folder and below, and the files that are none.
 
     Raises:
@@ -274,7 +276,7 @@ def formats_below(folder: Path) -> tuple[list[TableFormat], list[NoLog]]:
         try:
             found.append(format_of(path))
         except DataError as error:
-            not_logs.append(NoLog(path, str(error)))
+            not_logs.append(RejectedFile(path, str(error)))
     if not found:
         there = f"no log in {len(paths)} files" if paths else "no CSV or Parquet file below it"
         listed = "".join(f"\n{one.why}" for one in not_logs[:3])
@@ -283,7 +285,7 @@ def formats_below(folder: Path) -> tuple[list[TableFormat], list[NoLog]]:
 
 
 @dataclass(frozen=True)
-class Kind:
+class FileKind:
     """Files that are laid out alike, sorted by path."""
 
     formats: tuple[TableFormat, ...]
@@ -294,15 +296,15 @@ class Kind:
         return tuple(one.path for one in self.formats)
 
 
-def kinds_of(formats: Sequence[TableFormat]) -> list[Kind]:
+def file_kinds(formats: Sequence[TableFormat]) -> list[FileKind]:
     """Files by kind, the kind with most of them first."""
     groups: dict[TableFormat, list[TableFormat]] = {}
     for one in formats:
         groups.setdefault(one.signature, []).append(one)
-    return [Kind(tuple(g)) for g in sorted(groups.values(), key=len, reverse=True)]
+    return [FileKind(tuple(g)) for g in sorted(groups.values(), key=len, reverse=True)]
 
 
-def globs_of(root: Path, kind: Kind, others: Sequence[Path]) -> list[str]:
+def globs_of(root: Path, kind: FileKind, others: Sequence[Path]) -> list[str]:
     """Globs below a folder that find the files of a kind and none of the others.
 
     Folders two levels deep have one each: they tell sets of logs apart.
@@ -313,24 +315,24 @@ def globs_of(root: Path, kind: Kind, others: Sequence[Path]) -> list[str]:
     for path in map(PurePosixPath, mine):
         top = path.parts[0] if len(path.parts) > 2 else ""
         buckets.setdefault((top, len(path.parts)), []).append(path)
-    return [glob for paths in buckets.values() for glob in _narrow(paths, theirs)]
+    return [glob for paths in buckets.values() for glob in _narrow_globs(paths, theirs)]
 
 
-def _narrow(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> list[str]:
+def _narrow_globs(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> list[str]:
     """A glob for some files, narrower ones where it finds others."""
     glob = common_glob(paths)
-    if not any(_finds(glob, path) for path in theirs):
+    if not any(_glob_matches(glob, path) for path in theirs):
         return [glob]
     folders = {path.parent for path in paths}
     if len(folders) > 1:
         parts = [[p for p in paths if p.parent == folder] for folder in sorted(folders)]
-        return [one for part in parts for one in _narrow(part, theirs)]
+        return [one for part in parts for one in _narrow_globs(part, theirs)]
     return [path.as_posix() for path in paths]
 
 
 def common_glob(paths: Sequence[PurePosixPath]) -> str:
     """A glob that finds paths of the same depth: what they have in common, around stars."""
-    return "/".join(_part(parts) for parts in zip(*(p.parts for p in paths), strict=True))
+    return "/".join(_common_name(parts) for parts in zip(*(p.parts for p in paths), strict=True))
 
 
 def floor_of(glob: str) -> str:
@@ -339,14 +341,14 @@ def floor_of(glob: str) -> str:
     return first if len(others) > 1 and "*" not in first else "floor"
 
 
-def _finds(glob: str, path: PurePosixPath) -> bool:
+def _glob_matches(glob: str, path: PurePosixPath) -> bool:
     parts = glob.split("/")
     return len(parts) == len(path.parts) and all(
         fnmatchcase(name, part) for name, part in zip(path.parts, parts, strict=True)
     )
 
 
-def _part(names: tuple[str, ...]) -> str:
+def _common_name(names: tuple[str, ...]) -> str:
     """One name, or what several have in common around a star."""
     if len(set(names)) == 1:
         return names[0]
@@ -361,7 +363,7 @@ def _part(names: tuple[str, ...]) -> str:
     return f"{first[:alike].rstrip('0123456789')}*{end}"
 
 
-def pattern_beside(main: Kind, other: Kind) -> str | None:
+def pattern_beside(main: FileKind, other: FileKind) -> str | None:
     """Name of the file beside each of the main ones, as of `Layout.beside`; None if they have none.
 
     Either it is called the same in every folder, or after the main file.
@@ -382,13 +384,13 @@ def pattern_beside(main: Kind, other: Kind) -> str | None:
     return None
 
 
-def a_folder_each(kind: Kind) -> bool:
+def folder_per_run(kind: FileKind) -> bool:
     """Whether every file is alone of its kind in its folder: then the folder is a run."""
     return len(kind.paths) > 1 and len({path.parent for path in kind.paths}) == len(kind.paths)
 
 
 @dataclass(frozen=True)
-class Likely:
+class PresetMatches:
     """Presets that a kind of files can be read with.
 
     Attributes:
@@ -400,18 +402,18 @@ class Likely:
     perhaps: tuple[str, ...]
 
 
-def likely_presets(kind: Kind) -> Likely:
+def matching_presets(kind: FileKind) -> PresetMatches:
     """Presets that read the first files of a kind."""
     fits = [name for name, layout in PRESETS.items() if _matches(kind.formats[0], layout)]
     fits = [name for name in fits if _reads(kind, PRESETS[name])]
     fits.sort(key=lambda name: len(PRESETS[name].columns), reverse=True)
-    telling = [name for name in fits if PRESETS[name].names_row and _many(PRESETS[name])]
+    telling = [name for name in fits if PRESETS[name].names_row and _is_telling(PRESETS[name])]
     sure = telling[0] if telling else None
-    return Likely(sure, tuple(name for name in fits if name not in telling))
+    return PresetMatches(sure, tuple(name for name in fits if name not in telling))
 
 
-def _many(layout: Layout) -> bool:
-    return len(layout.columns) >= _TELLING
+def _is_telling(layout: Layout) -> bool:
+    return len(layout.columns) >= _TELLING_COLUMNS
 
 
 def _matches(format: TableFormat, layout: Layout) -> bool:
@@ -424,8 +426,8 @@ def _matches(format: TableFormat, layout: Layout) -> bool:
     return set(layout.columns) <= set(format.names)
 
 
-def _reads(kind: Kind, layout: Layout) -> bool:
-    for path in kind.paths[:_TRIED]:
+def _reads(kind: FileKind, layout: Layout) -> bool:
+    for path in kind.paths[:_FILES_TRIED]:
         try:
             refuse_misordered(read_logs(path, layout, path.parent, "floor", "as_built").logs)
         except DataError:

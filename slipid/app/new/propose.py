@@ -9,12 +9,12 @@ from slipid.app.logs import layout_of
 from slipid.app.new.bags import bags_in, propose_bags
 from slipid.app.new.config_lines import ConfigLine
 from slipid.app.new.config_text import new_config
-from slipid.app.new.file_channels import a_folder_each, floor_of, globs_of
-from slipid.app.new.robot import Group, SortedLogs, robot_from, sorted_logs
+from slipid.app.new.draft import ConfigDraft, ConfigProposal, LayoutDraft, LogsDraft
+from slipid.app.new.file_channels import floor_of, folder_per_run, globs_of
+from slipid.app.new.file_draft import file_draft, radius_hint
+from slipid.app.new.file_study import FileStudy, RunStudy
+from slipid.app.new.guess import RunFiles, SortedFiles, guess_robot, sort_files
 from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, robot_of
-from slipid.app.new.sketch import ConfigProposal, LayoutSketch, LogsSketch, Sketch
-from slipid.app.new.sketches import file_sketch, radius_hint
-from slipid.app.new.study import Known, Study
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
 from slipid.data.reading.bag.runs import PAUSE_S, parts_between_pauses
@@ -38,20 +38,20 @@ def propose(path: Path, options: RobotOptions) -> ConfigProposal:
         raise DataError(f"{path}: no such file or folder; expected a log, or a folder of logs")
     if bags := bags_in(path):
         proposed = propose_bags(bags, path, options)
-        return replace(proposed, sketch=_bags_tried(proposed.sketch, bags[0]))
-    found = sorted_logs(path)
+        return replace(proposed, sketch=_bags_checked(proposed.sketch, bags[0]))
+    found = sort_files(path)
     wheels = max((group.main.columns.wheels for group in found.groups), default=0)
     for _, name in found.presets:
         wheels = max(wheels, _wheels_of(PRESETS[name]))
     files = tuple(one for group in found.groups for one in group.all)
-    _no_bench(path, found, wheels, files)
-    guessed = robot_from(options, wheels, files)
-    robot = _as_presets_say(guessed.robot, found)
-    known = [_known(group, robot) for group in found.groups]
+    _refuse_bench(path, found, wheels, files)
+    guessed = guess_robot(options, wheels, files)
+    robot = _with_preset_gear(guessed.robot, found)
+    known = [_run_study(group, robot) for group in found.groups]
     logs = _logs(found)
     used = {one.format for one in logs if not one.off}
     presets = [PRESETS[name] for _, name in found.presets if name in used]
-    sketch = Sketch(
+    sketch = ConfigDraft(
         robot,
         tuple(
             _layout(group, one, k)
@@ -63,10 +63,12 @@ def propose(path: Path, options: RobotOptions) -> ConfigProposal:
         data=str(found.root),
         hints=(*guessed.hints, *(hint for one in known for hint in radius_hint(one))),
     )
-    return ConfigProposal(_tried(sketch, found, wheels), (*found.sentences, *found.hints))
+    return ConfigProposal(
+        _checked_by_reader(sketch, found, wheels), (*found.sentences, *found.hints)
+    )
 
 
-def _no_bench(path: Path, found: SortedLogs, wheels: int, files: Sequence[Study]) -> None:
+def _refuse_bench(path: Path, found: SortedFiles, wheels: int, files: Sequence[FileStudy]) -> None:
     """DataError where a log is of a motor on a bench, which another command is for."""
     if found.presets or wheels > 1 or not files or any(one.columns.has_pose for one in files):
         return
@@ -89,7 +91,7 @@ def _wheels_of(layout: Layout) -> int:
     return max((len(layout.channels[c].columns) for c in turns if c in layout.channels), default=0)
 
 
-def _as_presets_say(robot: RobotAnswers, found: SortedLogs) -> RobotAnswers:
+def _with_preset_gear(robot: RobotAnswers, found: SortedFiles) -> RobotAnswers:
     """The gear ratio that a published format has, unless an option gives another."""
     gears = {PRESETS[name].gear_ratio for _, name in found.presets}
     if len(gears) != 1 or "gear_ratio" not in robot.taken:
@@ -97,25 +99,25 @@ def _as_presets_say(robot: RobotAnswers, found: SortedLogs) -> RobotAnswers:
     return replace(robot, gear_ratio=gears.pop(), taken=robot.taken - {"gear_ratio"})
 
 
-def _known(group: Group, robot: RobotAnswers) -> Known:
-    others = tuple(Known(robot, other.main, other.all) for other in group.others)
-    return Known(robot, group.main, group.all, others)
+def _run_study(group: RunFiles, robot: RobotAnswers) -> RunStudy:
+    others = tuple(RunStudy(robot, other.main, other.all) for other in group.others)
+    return RunStudy(robot, group.main, group.all, others)
 
 
-def _layout(group: Group, known: Known, number: int) -> LayoutSketch:
-    file = file_sketch(group.main, known)
+def _layout(group: RunFiles, known: RunStudy, number: int) -> LayoutDraft:
+    file = file_draft(group.main, known)
     if not any(one.columns.has_pose for one in group.all):
         ask = "no pose was found (x, y, and a heading or a quaternion): a fit needs one"
         file = replace(file, questions=(*file.questions, ask))
-    beside = tuple(replace(file_sketch(one, known), pattern=name) for name, one in group.beside)
-    return LayoutSketch(_name(number), file, beside)
+    beside = tuple(replace(file_draft(one, known), pattern=name) for name, one in group.beside)
+    return LayoutDraft(_name(number), file, beside)
 
 
 def _name(number: int) -> str:
     return "mine" if number == 0 else f"mine{number + 1}"
 
 
-def _logs(found: SortedLogs) -> list[LogsSketch]:
+def _logs(found: SortedFiles) -> list[LogsDraft]:
     """A section for each glob; those of files that lack wheels or a pose are commented out."""
     named = [(kind, name) for kind, name in found.presets]
     named += [(group.kind, _name(k)) for k, group in enumerate(found.groups)]
@@ -127,17 +129,17 @@ def _logs(found: SortedLogs) -> list[LogsSketch]:
     out = []
     for kind, name in named:
         for glob in globs_of(found.root, kind, sorted(every - set(kind.paths))):
-            floors = glob.count("/") > 0 and not a_folder_each(kind)
+            floors = glob.count("/") > 0 and not folder_per_run(kind)
             off = name not in whole
             surface, ask = ("folder", "") if floors else (floor_of(glob), _FLOOR.format(glob))
             above = ("Without wheels or without a pose, so nothing to fit:",) if off else ()
-            out.append(LogsSketch(glob, name, surface, above, "" if off else ask, off))
+            out.append(LogsDraft(glob, name, surface, above, "" if off else ask, off))
     if all(one.off for one in out):  # a config has one section at least; the layout asks for a pose
         return [replace(one, off=False, above=()) for one in out]
     return sorted(out, key=lambda one: one.off)
 
 
-def _tried(sketch: Sketch, found: SortedLogs, wheels: int) -> Sketch:
+def _checked_by_reader(sketch: ConfigDraft, found: SortedFiles, wheels: int) -> ConfigDraft:
     """The sketch with what the reader says of the first file of each layout, if it refuses it."""
     drives = geometry(robot_of(sketch.robot)).drives
     layouts = []
@@ -145,19 +147,19 @@ def _tried(sketch: Sketch, found: SortedLogs, wheels: int) -> Sketch:
         questions = list(layout.file.questions)
         if wheels and drives != wheels:
             questions.append(f"[robot] has {drives} drives, but {wheels} have columns here: which?")
-        if problem := _tried_on(sketch, layout.name, group.kind.paths[0]).problem:
+        if problem := _read_first(sketch, layout.name, group.kind.paths[0]).problem:
             questions.append(f"the reader says: {problem}")
         layouts.append(replace(layout, file=replace(layout.file, questions=tuple(questions))))
     return replace(sketch, layouts=tuple(layouts))
 
 
-def _bags_tried(sketch: Sketch, first: Path) -> Sketch:
+def _bags_checked(sketch: ConfigDraft, first: Path) -> ConfigDraft:
     """The sketch with what the reader says of the first bag, if it refuses it.
 
     A bag that is one long drive with pauses is cut at them: its runs share a session.
     """
     (bag,) = sketch.bags
-    tried = _tried_on(sketch, bag.name, first)
+    tried = _read_first(sketch, bag.name, first)
     if tried.problem:
         questions = (*bag.questions, f"the reader says: {tried.problem}")
         return replace(sketch, bags=(replace(bag, questions=questions),))
@@ -171,23 +173,23 @@ def _bags_tried(sketch: Sketch, first: Path) -> Sketch:
 
 
 @dataclass(frozen=True)
-class _ReadAttempt:
+class _ReadResult:
     """What the reader made of a file: its runs, or why it refused it."""
 
     logs: tuple[Log, ...] = ()
     problem: str = ""
 
 
-def _tried_on(sketch: Sketch, name: str, path: Path) -> _ReadAttempt:
+def _read_first(sketch: ConfigDraft, name: str, path: Path) -> _ReadResult:
     """The first file of a layout as the reader reads it by the sketch."""
     try:
         config = parsed(Path("robot.toml"), new_config(sketch, "robot.toml").text)
         section = next((one for one in config.content.logs if one.format == name), None)
         if section is None:
-            return _ReadAttempt()
+            return _ReadResult()
         layout = layout_of(config, section)
         logs = read_logs(path, layout, path.parent, FLOOR, "as_built").logs
         refuse_misordered(logs)
-        return _ReadAttempt(tuple(logs))
+        return _ReadResult(tuple(logs))
     except DataError as error:
-        return _ReadAttempt(problem=str(error).splitlines()[0].replace("robot.toml ", ""))
+        return _ReadResult(problem=str(error).splitlines()[0].replace("robot.toml ", ""))

@@ -4,8 +4,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from slipid.app.config import Box, Differential, General, Omni, Wheels, geometry
-from slipid.support.errors import DataError, near
+from slipid.app.config import (
+    DifferentialDrive,
+    FourWheelDrive,
+    GeneralDrive,
+    OmniDrive,
+    Wheels,
+    geometry,
+)
+from slipid.support.errors import DataError, did_you_mean
 
 Asker = Callable[[str, str, str], str]
 """Asks people: what is asked, what stands there if they say nothing, and what was wrong with the
@@ -119,7 +126,7 @@ def rollers(text: str, known: RobotAnswers) -> tuple[float | None, ...]:
 
 
 @dataclass(frozen=True)
-class Question:
+class RobotQuestion:
     """One thing to know.
 
     Attributes:
@@ -145,66 +152,73 @@ def _drive(text: str, _: RobotAnswers) -> str:
     if word == "motor":
         raise ValueError("a motor on a bench needs no config; expected its log: slipid motor FILE")
     if word not in DRIVES:
-        raise ValueError(f"no such drive{near(word, DRIVES)}; expected one of {', '.join(DRIVES)}")
+        raise ValueError(
+            f"no such drive{did_you_mean(word, DRIVES)}; expected one of {', '.join(DRIVES)}"
+        )
     return word
 
 
-def _evenly(known: RobotAnswers) -> str:
+def _even_azimuths(known: RobotAnswers) -> str:
     """Azimuths of wheels evenly around, none straight ahead."""
     return ", ".join(f"{(k + 0.5) * 360 / known.wheels:g}" for k in range(known.wheels))
 
 
-def _each(text: str) -> Callable[[RobotAnswers], str]:
+def _per_wheel(text: str) -> Callable[[RobotAnswers], str]:
     return lambda known: ", ".join([text] * known.wheels)
 
 
-DRIVE = Question(
+DRIVE = RobotQuestion(
     "drive",
     "drive: omni (wheels with rollers, around the middle), mecanum (four, tilted rollers),\n"
     "  skid (four ordinary wheels), differential (two and casters), general (any wheels)",
     "omni",
     _drive,
 )
-_WHEELS = Question("wheels", "number of wheels", "3", count)
-_AZIMUTHS = Question(
+_WHEELS = RobotQuestion("wheels", "number of wheels", "3", count)
+_AZIMUTHS = RobotQuestion(
     "azimuths_deg",
     "where the wheels stand, counter-clockwise from ahead, in the order of your columns [deg]",
-    _evenly,
+    _even_azimuths,
     angles,
 )
-_BASE = Question("base_radius_m", "from the middle to the wheel centres [m]", "0.15", positive)
-_WHEELBASE = Question("wheelbase_m", "wheelbase, front to rear axle [m]", "0.3", positive)
-_TRACK = Question(
+_BASE = RobotQuestion("base_radius_m", "from the middle to the wheel centres [m]", "0.15", positive)
+_WHEELBASE = RobotQuestion("wheelbase_m", "wheelbase, front to rear axle [m]", "0.3", positive)
+_TRACK = RobotQuestion(
     "track_m", "track, between the middles of left and right wheels [m]", "0.3", positive
 )
-_SHARED = Question("shared", "does one motor turn both wheels of a side (yes or no)", "no", yes)
-_PLACES = Question(
+_SHARED = RobotQuestion(
+    "shared", "does one motor turn both wheels of a side (yes or no)", "no", yes
+)
+_PLACES = RobotQuestion(
     "places_m",
     "centres of the wheels, x ahead and y left: x, y; x, y; ... [m]",
     "0.2, 0.15; 0.2, -0.15; -0.2, 0",
     places,
 )
-_DIRECTIONS = Question(
-    "directions_deg", "directions in which the wheels roll, from ahead [deg]", _each("0"), angles
+_DIRECTIONS = RobotQuestion(
+    "directions_deg",
+    "directions in which the wheels roll, from ahead [deg]",
+    _per_wheel("0"),
+    angles,
 )
-_ROLLERS = Question(
+_ROLLERS = RobotQuestion(
     "rollers_deg",
     "angles of the rollers to them [deg], none without rollers",
-    _each("none"),
+    _per_wheel("none"),
     rollers,
 )
 COMMON = (
-    Question("wheel_radius_m", "wheel radius [m]", "0.05", positive),
-    Question("gear_ratio", "motor turns per wheel turn", "1", positive),
-    Question("mass_kg", "mass of the robot [kg]", "10", positive),
-    Question(
+    RobotQuestion("wheel_radius_m", "wheel radius [m]", "0.05", positive),
+    RobotQuestion("gear_ratio", "motor turns per wheel turn", "1", positive),
+    RobotQuestion("mass_kg", "mass of the robot [kg]", "10", positive),
+    RobotQuestion(
         "ticks_per_revolution",
         "encoder ticks per motor turn (0: no ticks are logged)",
         "1000",
         not_negative,
     ),
 )
-DRIVES: dict[str, tuple[Question, ...]] = {
+DRIVES: dict[str, tuple[RobotQuestion, ...]] = {
     "omni": (_WHEELS, _AZIMUTHS, _BASE),
     "mecanum": (_WHEELBASE, _TRACK, _SHARED),
     "skid": (_WHEELBASE, _TRACK, _SHARED),
@@ -225,14 +239,14 @@ def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> Robo
     Raises:
         DataError: an option is no answer to its question, or belongs to another drive.
     """
-    known = _answered(RobotAnswers(drive=drive), replace(DRIVE, default=drive), options, asker)
+    known = _with_question(RobotAnswers(drive=drive), replace(DRIVE, default=drive), options, asker)
     questions = (*DRIVES[known.drive], *COMMON)
-    _belongs(options, known.drive, questions)
+    _refuse_other_drives(options, known.drive, questions)
     for question in questions:
         if question is _WHEELS and options.azimuths_deg is not None and options.wheels is None:
             known = replace(known, wheels=len(options.azimuths_deg.replace(";", ",").split(",")))
             continue
-        known = _answered(known, question, options, asker)
+        known = _with_question(known, question, options, asker)
         if question is _PLACES:
             known = replace(known, wheels=len(known.places_m))
     if known.drive in ("mecanum", "skid"):
@@ -240,7 +254,9 @@ def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> Robo
     return replace(known, wheels=2) if known.drive == "differential" else known
 
 
-def _belongs(options: RobotOptions, drive: str, questions: tuple[Question, ...]) -> None:
+def _refuse_other_drives(
+    options: RobotOptions, drive: str, questions: tuple[RobotQuestion, ...]
+) -> None:
     """Refuse what this drive is not asked for: it would be lost without a word."""
     wanted = {"drive", *(question.about for question in questions)}
     for one in fields(options):
@@ -251,30 +267,30 @@ def _belongs(options: RobotOptions, drive: str, questions: tuple[Question, ...])
             )
 
 
-def _answered(
-    known: RobotAnswers, question: Question, options: RobotOptions, asker: Asker | None
+def _with_question(
+    known: RobotAnswers, question: RobotQuestion, options: RobotOptions, asker: Asker | None
 ) -> RobotAnswers:
     """What is known with the answer to one more question."""
     text = getattr(options, question.about)
     if text is not None:
         try:
-            return _with(known, question, text)
+            return _with_answer(known, question, text)
         except ValueError as error:
             raise DataError(f"{question.option} '{text}': {error}") from None
     default = question.default if isinstance(question.default, str) else question.default(known)
     if asker is None:
         known = replace(known, taken=known.taken | {question.about})
-        return _with(known, question, default)
+        return _with_answer(known, question, default)
     wrong = ""
     while True:
         text = asker(question.asks, default, wrong)
         try:
-            return _with(known, question, text)
+            return _with_answer(known, question, text)
         except ValueError as error:
             wrong = f"'{text}': {error}"
 
 
-def _with(known: RobotAnswers, question: Question, text: str) -> RobotAnswers:
+def _with_answer(known: RobotAnswers, question: RobotQuestion, text: str) -> RobotAnswers:
     """What is known with a text as the answer to a question; ValueError where it is none."""
     more: dict[str, Any] = {question.about: question.read(text, known)}
     return replace(known, **more)
@@ -289,27 +305,27 @@ def robot_of(known: RobotAnswers) -> Wheels:
         "mass_kg": known.mass_kg,
     }
     try:
-        robot = _model(known, sizes)
+        robot = _section(known, sizes)
         geometry(robot)
     except ValueError as error:
         raise DataError(f"drive {known.drive}: {error}") from None
     return robot
 
 
-def _model(known: RobotAnswers, sizes: dict[str, object]) -> Wheels:
+def _section(known: RobotAnswers, sizes: dict[str, object]) -> Wheels:
     if known.drive == "omni":
         azimuths = list(known.azimuths_deg)
         own = {"wheel_azimuths_deg": azimuths, "base_radius_m": known.base_radius_m}
-        return Omni.model_validate({**sizes, **own})
+        return OmniDrive.model_validate({**sizes, **own})
     if known.drive == "differential":
-        return Differential.model_validate({**sizes, "track_m": known.track_m})
+        return DifferentialDrive.model_validate({**sizes, "track_m": known.track_m})
     if known.drive == "general":
         rollers = ["none" if angle is None else angle for angle in known.rollers_deg]
         own = {
             "wheel_places_m": [list(place) for place in known.places_m],
             "drive_directions_deg": list(known.directions_deg),
         }
-        return General.model_validate({**sizes, **own, "roller_angles_deg": rollers})
+        return GeneralDrive.model_validate({**sizes, **own, "roller_angles_deg": rollers})
     half = {"half_length_m": known.wheelbase_m / 2, "half_width_m": known.track_m / 2}
     shared = {"drives": [[1, 3], [2, 4]]} if known.shared else {}
-    return Box.model_validate({**sizes, **half, **shared})
+    return FourWheelDrive.model_validate({**sizes, **half, **shared})

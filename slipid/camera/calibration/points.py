@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from slipid.support.errors import DataError, bad_data, near
+from slipid.support.errors import DataError, bad_data, did_you_mean
 
 COLUMNS = ("u", "v", "x", "y")
 LEAST_POINTS = 4
@@ -52,7 +52,7 @@ def read_points(path: Path, image_px: tuple[int, int]) -> FloorPoints:
     header, rows = _table(path)
     names = (*COLUMNS, "z") if "z" in header else COLUMNS
     if missing := [name for name in COLUMNS if name not in header]:
-        hint = near(missing[0], header)
+        hint = did_you_mean(missing[0], header)
         raise DataError(
             f"{path}: no column {', '.join(missing)}{hint}; the first line has {', '.join(header)}"
             "; expected u, v (pixels), x, y (metres) and perhaps z"

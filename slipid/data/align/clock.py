@@ -16,14 +16,15 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.align.motion_pair import MotionPair, PoseIncrements
 from slipid.data.align.regression import (
     LEAST_STEPS,
     Linearised,
+    MotionPair,
+    PoseIncrements,
     StepNoise,
     clear_best,
-    left_over,
     linearised,
+    unexplained,
 )
 
 COARSE, SEARCHED = 0.05, 0.1
@@ -110,7 +111,7 @@ def _searched(pair: MotionPair) -> float | None:
     if not high > low:
         return None
     offsets = np.arange(low, high + COARSE, COARSE)
-    left = left_over([pair], offsets, SEARCHED)
+    left = unexplained([pair], offsets, SEARCHED)
     best = clear_best(offsets, left)
     return None if best is None or not left[best] < MOST_LEFT else float(offsets[best])
 

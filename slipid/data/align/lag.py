@@ -5,8 +5,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from slipid.data.align.motion_pair import MotionPair
-from slipid.data.align.regression import clear_best, left_over
+from slipid.data.align.regression import MotionPair, clear_best, unexplained
 from slipid.data.runs import Runs
 
 LONGEST, SHARED = 8.0, 0.3
@@ -65,12 +64,12 @@ def _searched(data: Runs) -> PoseLag | None:
     usual = float(np.median([pair.time[-1] - pair.time[0] for pair in pairs]))
     most = round(min(LONGEST, (1.0 - SHARED) * usual) / COARSE)
     coarse = COARSE * np.arange(-most, most + 1)
-    left = left_over(pairs, -coarse, STEP)
+    left = unexplained(pairs, -coarse, STEP)
     best = clear_best(coarse, left)
     if best is None or best in (0, len(coarse) - 1):
         return None
     fine = coarse[best] + np.arange(-COARSE, COARSE + FINE / 2, FINE)
-    near = left_over(pairs, -np.append(fine, 0.0), STEP)
+    near = unexplained(pairs, -np.append(fine, 0.0), STEP)
     k = int(np.argmin(near[:-1]))
     return PoseLag(float(fine[k]), float(near[k]), float(near[-1]))
 

@@ -113,7 +113,7 @@ def gather(geometry: Geometry, at: StepEdges, moved: ChannelIncrements) -> Evide
             continue
         pose[convention] = found
         if moved.gyro is not None:
-            gyro[convention] = _alike(moved.gyro, body, found)
+            gyro[convention] = _correlation_with_gyro(moved.gyro, body, found)
     twist = None if moved.twist is None else products(moved.wheels, moved.twist, base, rounds=0)
     if twist is not None and not np.trace(twist.body) > 0:
         twist = None
@@ -121,7 +121,7 @@ def gather(geometry: Geometry, at: StepEdges, moved: ChannelIncrements) -> Evide
     return Evidence(rolling, base, pose, twist, _commanded(moved), alike)
 
 
-def _alike(gyro: np.ndarray, body: np.ndarray, found: Products) -> float:
+def _correlation_with_gyro(gyro: np.ndarray, body: np.ndarray, found: Products) -> float:
     """Covariance of gyro and heading over the product of their spreads; 0 where none turns."""
     turned = np.stack([gyro[found.known, 0], body[found.known, 2]])
     (own, both), (_, other) = (turned * found.weight) @ turned.T

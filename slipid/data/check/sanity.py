@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slipid.data.align.lag import PoseLag, pose_lag
-from slipid.data.check.causes import explained
 from slipid.data.check.columns import BROUGHT, SAME, Finding, exchanged, misordered, worst_first
 from slipid.data.check.electric import electric
 from slipid.data.check.interpretation import Evidence, Interpretation, gather, misfits, to_body
@@ -30,7 +29,7 @@ from slipid.data.check.joined import (
     usable,
 )
 from slipid.data.check.mistakes import mistakes
-from slipid.data.check.ratios import FORWARD, TURNS, ScaleRatios, ratios
+from slipid.data.check.ratios import FORWARD, TURNS, ScaleRatios, explained, ratios
 from slipid.data.check.single_runs import agreement, single_runs, standing
 from slipid.data.check.words import of_causes, of_mistake, of_ratios
 from slipid.data.runs import Runs

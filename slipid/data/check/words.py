@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 from math import isclose, pi
 
-from slipid.data.check.causes import Explained
 from slipid.data.check.columns import Finding
 from slipid.data.check.interpretation import Interpretation
 from slipid.data.check.joined import PoseConvention
 from slipid.data.check.mistakes import Candidate, Mistake
-from slipid.data.check.ratios import ScaleRatios
+from slipid.data.check.ratios import ScaleCause, ScaleRatios
 
 _OF_CONVENTION = {
     "heading_sign": "the heading of the poses turns the other way round than the body does",
@@ -139,7 +138,7 @@ def _convention(kind: str, convention: PoseConvention) -> Finding:
 
 
 def of_causes(
-    fitting: Sequence[Explained], single: bool, why: str, gear_ratio: float
+    fitting: Sequence[ScaleCause], single: bool, why: str, gear_ratio: float
 ) -> tuple[Finding, ...]:
     """Findings about factors: the likeliest with the others as ways out, or all of a pair.
 
@@ -176,7 +175,7 @@ def of_ratios(seen: ScaleRatios) -> str:
     return ", ".join(words[k].format(r.value) for k, r in seen.known.items() if not r.natural)
 
 
-def _factor(of: Explained, gear_ratio: float) -> Finding:
+def _factor(of: ScaleCause, gear_ratio: float) -> Finding:
     """The finding about a factor by which a channel is too large."""
     name, kind = of.name, _OF_CAUSE[of.name]
     size = of.factor if of.factor > 1 else 1 / of.factor

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from slipid.data.align.clock import Clock, best_clock
-from slipid.data.align.motion_pair import MotionPair
+from slipid.data.align.regression import MotionPair
 from slipid.data.log import Log
 from slipid.data.reading.checks import Unsteady
 from slipid.data.reading.layout import SensorLayout

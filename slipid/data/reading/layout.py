@@ -16,7 +16,7 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.units import converts, factor
-from slipid.support.errors import near
+from slipid.support.errors import did_you_mean
 from slipid.support.toml_file import CLOSED, Positive
 
 PER_WHEEL = {
@@ -193,4 +193,4 @@ class Layout(SensorLayout):
 def unknown(what: str, name: object, choices: Iterable[str]) -> str:
     """Message about a name that is none of the choices: the nearest of them, then all."""
     names = list(choices)
-    return f"no {what} '{name}'{near(name, names)}; expected one of {', '.join(names)}"
+    return f"no {what} '{name}'{did_you_mean(name, names)}; expected one of {', '.join(names)}"

@@ -8,7 +8,7 @@ from slipid.data.reading.column_names import ColumnMeaning, meaning_of, unit_in,
 from slipid.data.reading.layout import CHANNELS, Channel, Layout
 from slipid.data.reading.table_format import TableFormat
 from slipid.data.reading.units import converts
-from slipid.support.errors import DataError, bad_data, near
+from slipid.support.errors import DataError, bad_data, did_you_mean
 
 SHAFT = 10.0
 """Times by which a motor's shaft may turn faster than any wheel, whose speed the reader checks."""
@@ -58,7 +58,7 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
     for channel, one in given.items():
         for name in one.columns:
             if name not in names:
-                found = f"no column '{name}'{near(name, names)}"
+                found = f"no column '{name}'{did_you_mean(name, names)}"
                 raise bad_data(format.path, found, f"one of {', '.join(names)}")
         channels[channel] = _channel(channel, one.columns, format, one.unit)
     taken = {column for one in channels.values() for column in one.columns}

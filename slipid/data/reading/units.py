@@ -4,7 +4,7 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from slipid.support.errors import near
+from slipid.support.errors import did_you_mean
 
 if TYPE_CHECKING:
     import pint
@@ -67,7 +67,7 @@ def factor(unit: str, target: str) -> float:
     try:
         given = registry.parse_units(_ALIASES.get(unit.strip(), unit.strip()))
     except Exception as error:  # pint raises a dozen types, one of them tokenize's
-        known = f"{near(unit, KNOWN)} (known: {', '.join(KNOWN)})"
+        known = f"{did_you_mean(unit, KNOWN)} (known: {', '.join(KNOWN)})"
         raise ValueError(f"unknown unit '{unit}'{known}") from error
     if given.dimensionality != wanted.dimensionality:
         raise ValueError(f"unit '{unit}' cannot be converted to {target}")

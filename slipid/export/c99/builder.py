@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slipid.export.c99.ir import Array, At, Block, Cell, Memory, Nested, Statement, Variable
+from slipid.export.c99.ir import Array, At, Cell, CodeBlock, Memory, Nested, Statement, Variable
 from slipid.export.fields import DTYPES, Kind
 
 CALLS = ("r_atan2", "r_cos", "r_exp", "r_log", "r_pow", "r_rem", "r_sin", "r_floor")
@@ -49,8 +49,8 @@ class Builder:
 
     def __init__(self, names: Names, parent: Builder | None = None):
         self.names, self.parent = names, parent
-        self.turns: Block | None = None
-        self.blocks: list[Block] = []
+        self.turns: CodeBlock | None = None
+        self.blocks: list[CodeBlock] = []
         self.source = ""
         self.contiguous: dict[int, tuple[Array, Memory]] = {}
         self._known: dict[tuple[object, ...], Variable] = {}
@@ -97,11 +97,13 @@ class Builder:
             Statement(None, template, (cell,), memory, times, source=self.source)
         )
 
-    def append(self, lanes: int = 0, nested: Nested | None = None, calls: bool = False) -> Block:
+    def append(
+        self, lanes: int = 0, nested: Nested | None = None, calls: bool = False
+    ) -> CodeBlock:
         """A new block behind all others."""
-        return self.put(Block(self, 0, lanes, calls, nested=nested))
+        return self.put(CodeBlock(self, 0, lanes, calls, nested=nested))
 
-    def put(self, block: Block) -> Block:
+    def put(self, block: CodeBlock) -> CodeBlock:
         """A block behind all others."""
         block.place = len(self.blocks)
         self.blocks.append(block)
@@ -121,7 +123,7 @@ class Builder:
             return by_index or (home is not None and (home is self.turns or home.owner is self))
         return isinstance(cell, Variable) and cell.home.owner is self
 
-    def _place(self, cells: tuple[Cell, ...], lanes: int, calls: bool = False) -> Block:
+    def _place(self, cells: tuple[Cell, ...], lanes: int, calls: bool = False) -> CodeBlock:
         """The earliest block for a statement over so many lanes that uses these cells.
 
         Loops whose statements call functions are apart from those that a compiler can make of
@@ -143,7 +145,7 @@ class Builder:
             return 0
         return self._behind(cell.home, lanes == cell.lanes)
 
-    def _behind(self, home: Block | None, together: bool) -> int:
+    def _behind(self, home: CodeBlock | None, together: bool) -> int:
         if home is None or home.owner is not self:
             return 0  # it is filled before this builder's code begins
         return home.place + (0 if together else 1)

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from slipid.export.c99.builder import Names
 from slipid.export.c99.function import Argument, Function, function, traced
 from slipid.export.c99.text import TYPES, WIDTH, folded, table
+from slipid.export.description import header
 from slipid.export.fields import Struct
-from slipid.export.header import header
 from slipid.export.text import identifiers, listed, wrapped
-from slipid.robot.closed_loop import Pilot
+from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.interface import Measurement, Readings
@@ -36,7 +36,9 @@ class Code:
         functions: all that are generated.
     """
 
-    def __init__(self, robot: DeployedRobot, pilot: Pilot[eqx.Module], path: Path | None = None):
+    def __init__(
+        self, robot: DeployedRobot, pilot: ControlLoop[eqx.Module], path: Path | None = None
+    ):
         """Trace and lower all functions.
 
         Raises:
@@ -194,7 +196,7 @@ class Code:
         return filled("slipid.c", values)
 
 
-def about(pilot: Pilot[eqx.Module]) -> Iterator[str]:
+def about(pilot: ControlLoop[eqx.Module]) -> Iterator[str]:
     """Sentences on axes, wheels, sensors and floors for readers of the header."""
     robot = pilot.controller.robot
     yield (

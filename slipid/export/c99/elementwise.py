@@ -12,8 +12,8 @@ from slipid.export.c99.builder import Builder
 from slipid.export.c99.ir import (
     Array,
     Cell,
+    Constant,
     NoFormError,
-    Number,
     Value,
     Variable,
     cells_of,
@@ -139,9 +139,9 @@ def binary(name: str) -> Rule:
 
     def simpler(cells: tuple[Cell, ...]) -> Cell | None:
         a, b = cells
-        if isinstance(a, Number) and first is not None and a.value == first:
+        if isinstance(a, Constant) and first is not None and a.value == first:
             return b
-        if isinstance(b, Number) and second is not None and b.value == second:
+        if isinstance(b, Constant) and second is not None and b.value == second:
             return a
         return None
 
@@ -210,7 +210,7 @@ def select(builder: Builder, values: list[Value], params: Params, out: Shaped) -
         which, no, yes = cells
         if no == yes:
             return no
-        return (yes if which.value else no) if isinstance(which, Number) else None
+        return (yes if which.value else no) if isinstance(which, Constant) else None
 
     if len(values) != 3 or kind_of_value(values[0]) != "bool":
         raise NoFormError("more than two cases")

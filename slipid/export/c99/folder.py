@@ -13,10 +13,10 @@ from jaxtyping import Float
 
 from slipid.export.c99.code import Code, filled, template
 from slipid.export.c99.text import wrapped
+from slipid.export.description import facts, made_with, warned
 from slipid.export.fields import Struct
 from slipid.export.golden import golden
-from slipid.export.header import facts, made_with, warned
-from slipid.robot.closed_loop import Pilot
+from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.trajectory import Path
 
@@ -133,7 +133,7 @@ def _kib(numbers: int) -> str:
 
 def c_files(
     robot: DeployedRobot,
-    pilot: Pilot[eqx.Module],
+    pilot: ControlLoop[eqx.Module],
     path: Path,
     recording: Recording | None = None,
 ) -> dict[str, str]:

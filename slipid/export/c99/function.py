@@ -11,7 +11,7 @@ from slipid.export.c99.builder import Builder, Names
 from slipid.export.c99.ir import Array, Memory, Value, in_memory
 from slipid.export.c99.jaxpr import Traced
 from slipid.export.c99.lower import apart, lowered, store
-from slipid.export.c99.text import Body, folded
+from slipid.export.c99.text import FunctionBody, folded
 from slipid.export.fields import Field, Struct
 
 
@@ -129,7 +129,7 @@ def function(
     ]
     for memory, value in changed:
         store(builder, value, memory)
-    body = Body(builder)
+    body = FunctionBody(builder)
     unused = _unused(arguments, body.reads)
     lines = (*unused, *body.lines())
     return Function(name, about, tuple(arguments), lines, body.reads, body.scratch)

@@ -31,7 +31,7 @@ class NoFormError(Exception):
 
 
 @dataclass(frozen=True)
-class Number:
+class Constant:
     """A constant; 0 and -0 are two."""
 
     value: float | int | bool = field(compare=False)
@@ -59,7 +59,7 @@ class Memory:
     name: str
     kind: Kind
     size: int
-    home: Block | None = None
+    home: CodeBlock | None = None
     values: bytes = b""
     scalar: bool = False
     lanes: bool = False
@@ -93,7 +93,7 @@ class Variable:
     kind: Kind
     number: int
     lanes: int
-    home: Block
+    home: CodeBlock
     made_by: tuple[str, tuple[Cell, ...]] = ("", ())
 
     @property
@@ -102,7 +102,7 @@ class Variable:
         return Memory(f"m{self.number}", self.kind, self.lanes, self.home, lanes=True)
 
 
-Cell = Number | At | Variable
+Cell = Constant | At | Variable
 """A number, or one for every lane."""
 
 
@@ -130,7 +130,7 @@ class Statement:
 
 
 @dataclass(eq=False)
-class Block:
+class CodeBlock:
     """Statements that run one after the other, for every lane if `lanes` is not 0.
 
     Attributes:

@@ -17,8 +17,8 @@ from slipid.export.c99.elementwise import BINARY, UNARY, Rule, Shaped
 from slipid.export.c99.ir import (
     Array,
     At,
-    Block,
     Cell,
+    CodeBlock,
     Memory,
     Nested,
     NoFormError,
@@ -159,7 +159,7 @@ class _Lowering:
             out.append(in_memory(memory, pair[0].shape))
         return list(out)
 
-    def _memory(self, like: Value, block: Block) -> Memory:
+    def _memory(self, like: Value, block: CodeBlock) -> Memory:
         number = self._builder.names.number()
         return Memory(f"m{number}", kind_of_value(like), prod(like.shape), block)
 
@@ -171,7 +171,7 @@ class _Lowering:
             raise NoFormError("a loop that goes through an array")
         builder = self._builder
         body = Builder(builder.names, builder)
-        body.turns = Block(builder, 0, nested=Nested(None, scan.turns, [body]))
+        body.turns = CodeBlock(builder, 0, nested=Nested(None, scan.turns, [body]))
         begun = values[consts:]
         memories = [self._memory(value, body.turns) for value in begun]
         for value, memory in zip(begun, memories, strict=True):

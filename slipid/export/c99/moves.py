@@ -15,8 +15,8 @@ from slipid.export.c99.ir import (
     Array,
     At,
     Cell,
+    Constant,
     NoFormError,
-    Number,
     Value,
     Variable,
     cells_of,
@@ -145,7 +145,7 @@ def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     for at in np.ndindex(*shape):
         place = dict(zip(rest, at, strict=True))
         row = places[tuple(place[d] for d in batch if d != axis)]
-        starts: list[Cell] = [Number(0, "int")] * len(whole.shape)
+        starts: list[Cell] = [Constant(0, "int")] * len(whole.shape)
         for k, d in enumerate(numbers.start_index_map):
             starts[d] = row[k]
         base = _offset(builder, starts, whole, sizes, lanes)

@@ -17,8 +17,8 @@ from slipid.export.c99.ir import (
     At,
     Cell,
     Cells,
+    Constant,
     Memory,
-    Number,
     Value,
     Variable,
     cells_of,
@@ -99,7 +99,7 @@ class Sources:
     def _one(self, place: int) -> Cell:
         source, inner = self._source(place)
         if not isinstance(source, Array):
-            return Number(source.reshape(-1)[inner].item(), kind_of(source.dtype))
+            return Constant(source.reshape(-1)[inner].item(), kind_of(source.dtype))
         at = np.unravel_index(inner, source.shape)
         cell: Cell = source.cells[tuple(a for k, a in enumerate(at) if k != source.axis)]
         if not varies(cell):
@@ -121,8 +121,8 @@ class Sources:
         cells = [self.one(int(place)) for place in row]
         if all(cell == cells[0] for cell in cells):
             return cells[0]
-        if all(isinstance(cell, Number) for cell in cells):
-            values = np.array([cell.value for cell in cells if isinstance(cell, Number)])
+        if all(isinstance(cell, Constant) for cell in cells):
+            values = np.array([cell.value for cell in cells if isinstance(cell, Constant)])
             return At(self._builder.names.table(values, self.kind), 0, 1)
         places = _places(cells)
         if places is None and self._laned_source(row):
@@ -265,7 +265,7 @@ def along(builder: Builder, value: Value, shape: tuple[int, ...], axis: int | No
     if not isinstance(value, Array):
         value = np.broadcast_to(value, shape)
         if axis is None:
-            flat = [Number(x, kind_of(value.dtype)) for x in value.reshape(-1).tolist()]
+            flat = [Constant(x, kind_of(value.dtype)) for x in value.reshape(-1).tolist()]
             return cells_of(shape, flat)
         rows = np.moveaxis(value, axis, -1)
         cells = [_table(builder, row) for row in rows.reshape(-1, rows.shape[-1])]
@@ -282,5 +282,5 @@ def _table(builder: Builder, row: np.ndarray) -> Cell:
     """A row of constants."""
     kind = kind_of(row.dtype)
     if row.tobytes() == len(row) * row[:1].tobytes():
-        return Number(row[0].item(), kind)
+        return Constant(row[0].item(), kind)
     return At(builder.names.table(row, kind), 0, 1)

@@ -19,8 +19,8 @@ from slipid.export.c99.ir import (
     At,
     Cell,
     Cells,
+    Constant,
     NoFormError,
-    Number,
     Value,
     cells_of,
     kind_of_value,
@@ -182,15 +182,15 @@ def _dot_one(
     terms: list[str] = []
     cells: list[Cell] = []
     for a, b in zip(left, right, strict=True):
-        factors = [c for c in (a, b) if not (isinstance(c, Number) and c.value == 1)]
-        if any(isinstance(c, Number) and c.value == 0 for c in factors):
+        factors = [c for c in (a, b) if not (isinstance(c, Constant) and c.value == 1)]
+        if any(isinstance(c, Constant) and c.value == 0 for c in factors):
             continue
         if not factors:
-            factors = [Number(1.0, kind)]
+            factors = [Constant(1.0, kind)]
         terms.append(" * ".join(f"{{{len(cells) + k}}}" for k in range(len(factors))))
         cells.extend(factors)
     if not terms:
-        return Number(0.0, kind)
+        return Constant(0.0, kind)
     laned = lanes if any(varies(c) for c in cells) else 0
     if not summed:
         if terms == ["{0}"]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slipid.export.c99.builder import Builder
-from slipid.export.c99.ir import At, Block, Cell, Memory, Nested, Number, Statement, Variable
+from slipid.export.c99.ir import At, Cell, CodeBlock, Constant, Memory, Nested, Statement, Variable
 from slipid.export.fields import DTYPES, Kind
 
 
@@ -52,7 +52,7 @@ class Usage:
                 if self._needed(statement):
                     self._mark(statement, block)
 
-    def _mark(self, statement: Statement, block: Block) -> None:
+    def _mark(self, statement: Statement, block: CodeBlock) -> None:
         """Mark a statement that is needed, and what it uses."""
         self.live.add(id(statement))
         writes, target = statement.writes, statement.target
@@ -79,7 +79,7 @@ class Usage:
             return statement.always or (written is not None and written.name in self.read)
         return statement.target in self._used or statement.target.memory.name in self.read
 
-    def _uses(self, cell: Cell, block: Block) -> None:
+    def _uses(self, cell: Cell, block: CodeBlock) -> None:
         if isinstance(cell, Variable):
             self._used.add(cell)
             if cell.lanes and cell.home is not block:
@@ -174,7 +174,7 @@ def wrapped(words: Iterable[str], indent: str) -> list[str]:
     return [*lines, line.rstrip().rstrip(",")]
 
 
-class Body:
+class FunctionBody:
     """Text of the code of a builder, without what nothing uses.
 
     Attributes:
@@ -200,7 +200,7 @@ class Body:
             lines += self._nested(block, indent) if block.nested else self._block(block, indent)
         return lines
 
-    def _nested(self, block: Block, indent: str) -> list[str]:
+    def _nested(self, block: CodeBlock, indent: str) -> list[str]:
         nested = block.nested
         assert nested is not None
         bodies = [self._text(body, indent + "  ") for body in nested.bodies]
@@ -211,7 +211,7 @@ class Body:
         head = f"{indent}for (int32_t turn = 0; turn < {nested.times}; ++turn) {{"
         return [head, *bodies[0], f"{indent}}}"]
 
-    def _block(self, block: Block, indent: str) -> list[str]:
+    def _block(self, block: CodeBlock, indent: str) -> list[str]:
         live = [s for s in block.statements if id(s) in self._usage.live]
         if not block.lanes:
             return [line for s in live for line in self._statement(s, block, indent)]
@@ -228,7 +228,7 @@ class Body:
         head = f"{indent}for (int32_t l = 0; l < {block.lanes}; ++l) {{"
         return [*begun, head, *body, f"{indent}}}"]
 
-    def _statement(self, statement: Statement, block: Block, indent: str) -> list[str]:
+    def _statement(self, statement: Statement, block: CodeBlock, indent: str) -> list[str]:
         cells = [self._cell(cell, block) for cell in statement.cells]
         target = statement.target
         if target is None:
@@ -258,8 +258,8 @@ class Body:
         self._said = statement.source
         return [f"{indent}/* {statement.source} */"] if statement.source else []
 
-    def _cell(self, cell: Cell, block: Block) -> str:
-        if isinstance(cell, Number):
+    def _cell(self, cell: Cell, block: CodeBlock) -> str:
+        if isinstance(cell, Constant):
             return number(cell.value, cell.kind)
         if isinstance(cell, Variable):
             away = cell.lanes and cell.home is not block

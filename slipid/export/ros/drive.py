@@ -28,7 +28,7 @@ CORNERS = ("front_left", "front_right", "rear_right", "rear_left")
 
 
 @dataclass(frozen=True)
-class Controller:
+class ControllerPlugin:
     """A drive controller by the names that its users know.
 
     Attributes:
@@ -43,14 +43,14 @@ class Controller:
     twist: str
 
 
-OMNI = Controller(
+OMNI = ControllerPlugin(
     "omni_wheel_drive_controller",
     "omni_wheel_drive_controller/OmniWheelDriveController",
     "odom",
     "diagonal_covariance.pose",
     "diagonal_covariance.twist",
 )
-MECANUM = Controller(
+MECANUM = ControllerPlugin(
     "mecanum_drive_controller",
     "mecanum_drive_controller/MecanumDriveController",
     "odometry",
@@ -60,7 +60,7 @@ MECANUM = Controller(
 
 
 @dataclass(frozen=True)
-class Drive:
+class DriveController:
     """A controller with the numbers of a robot.
 
     Attributes:
@@ -70,14 +70,14 @@ class Drive:
             `MOST`.
     """
 
-    controller: Controller
+    controller: ControllerPlugin
     wheels: tuple[int, ...]
     turned: tuple[bool, ...]
     parameters: tuple[Parameter, ...]
     off: float
 
 
-def drive_of(robot: DeployedRobot) -> Drive | None:
+def drive_controller_of(robot: DeployedRobot) -> DriveController | None:
     """The controller for a robot; None where no controller has its kinematics."""
     made = _mecanum(robot) or _omni(robot)
     return made if made is not None and made.off <= MOST else None
@@ -89,7 +89,7 @@ def joint(wheel: int) -> str:
 
 
 @dataclass(frozen=True)
-class _Wheels:
+class _OrderedWheels:
     """The robot's wheels in a controller's order, rows of its kinematics with the signs there."""
 
     order: Int[np.ndarray, " wheel"]
@@ -99,7 +99,7 @@ class _Wheels:
     @classmethod
     def of(
         cls, robot: DeployedRobot, order: Int[np.ndarray, " wheel"], axis: int, sign: float
-    ) -> "_Wheels":
+    ) -> "_OrderedWheels":
         """With signs that give the entries of an axis of the twist this sign."""
         rows = np.asarray(robot.forward)[order]
         turned = rows[:, axis] * sign < 0
@@ -107,14 +107,14 @@ class _Wheels:
 
     def drive(
         self,
-        controller: Controller,
+        controller: ControllerPlugin,
         robot: DeployedRobot,
         own: Float[np.ndarray, "wheel 3"],
         parameters: tuple[Parameter, ...],
-    ) -> Drive:
+    ) -> DriveController:
         """The controller that has these rows as its own."""
         scale = np.array([1.0, 1.0, 1.0 / float(robot.frame.base)])
-        return Drive(
+        return DriveController(
             controller=controller,
             wheels=tuple(self.order.tolist()),
             turned=self.turned,
@@ -123,13 +123,13 @@ class _Wheels:
         )
 
 
-def _omni(robot: DeployedRobot) -> Drive | None:
+def _omni(robot: DeployedRobot) -> DriveController | None:
     """Wheels that stand evenly on a circle, the first one of the robot first."""
     places, count = np.asarray(robot.places), robot.wheels
     azimuth = np.arctan2(places[:, 1], places[:, 0])
     # the first wheel itself, and those a rounding error before it, count as at 0
     order = np.argsort(np.mod(azimuth - azimuth[0] + 1e-6, 2 * np.pi))
-    wheels = _Wheels.of(robot, order, axis=2, sign=-1.0)
+    wheels = _OrderedWheels.of(robot, order, axis=2, sign=-1.0)
     even = 2 * np.pi * np.arange(count) / count
     beyond = np.arctan2(wheels.rows[:, 0], -wheels.rows[:, 1]) - azimuth[0] - even
     offset = float(azimuth[0] + np.mean(np.mod(beyond + np.pi, 2 * np.pi) - np.pi))
@@ -144,7 +144,7 @@ def _omni(robot: DeployedRobot) -> Drive | None:
     return wheels.drive(OMNI, robot, own, parameters) if count >= 3 else None
 
 
-def _mecanum(robot: DeployedRobot) -> Drive | None:
+def _mecanum(robot: DeployedRobot) -> DriveController | None:
     """Four wheels, one at each corner about their middle."""
     places = np.asarray(robot.places)
     middle = places.mean(axis=0)
@@ -153,7 +153,7 @@ def _mecanum(robot: DeployedRobot) -> Drive | None:
         return None
     corners = ((True, True), (True, False), (False, False), (False, True))
     order = np.array([found[corner] for corner in corners])
-    wheels = _Wheels.of(robot, order, axis=0, sign=1.0)
+    wheels = _OrderedWheels.of(robot, order, axis=0, sign=1.0)
     rows = wheels.rows
     about = rows[:, 2] - (middle[0] * rows[:, 1] - middle[1] * rows[:, 0])
     turns, aside = np.array([-1.0, 1.0, 1.0, -1.0]), np.array([-1.0, 1.0, -1.0, 1.0])

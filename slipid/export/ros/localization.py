@@ -46,7 +46,7 @@ WAYS = 24
 
 
 @dataclass(frozen=True)
-class Errs:
+class OdometryErrors:
     """What odometry errs by on a floor, along, across and in yaw.
 
     Attributes:
@@ -65,7 +65,7 @@ class Errs:
         """What stays the same all the way of odometry that believes its encoders, per metre."""
         return _axes(np.hypot(self.effect, self.slip))
 
-    def without_slip(self) -> "Errs":
+    def without_slip(self) -> "OdometryErrors":
         """Of odometry that estimates slip, and so errs by what the contact model misses."""
         return replace(self, slip=(0.0, 0.0, 0.0))
 
@@ -87,17 +87,17 @@ class Errs:
         return _level(np.asarray(self.stays) ** 2 * distance * speed)
 
 
-def errs_of(robot: DeployedRobot) -> tuple[Errs, ...]:
+def odometry_errors(robot: DeployedRobot) -> tuple[OdometryErrors, ...]:
     """Errors of odometry on each floor, in the robot's order."""
     slip = np.asarray(_slip(robot.arrays, jnp.asarray(top_speed(robot))))
     process, effect = np.asarray(robot.process), np.asarray(robot.effect)
     return tuple(
-        Errs(name, _axes(process[k]), _axes(effect[k]), _axes(slip[k]))
+        OdometryErrors(name, _axes(process[k]), _axes(effect[k]), _axes(slip[k]))
         for k, name in enumerate(robot.labels)
     )
 
 
-def worst(errs: tuple[Errs, ...]) -> Errs:
+def worst(errs: tuple[OdometryErrors, ...]) -> OdometryErrors:
     """Errors on the floor on which the place is least known after `DISTANCE_M`."""
     return max(errs, key=lambda e: e.pose(DISTANCE_M)[0])
 
@@ -151,7 +151,7 @@ ACCELERATION = 0.01
 
 
 def filter_parameters(
-    robot: DeployedRobot, errs: Errs, odometry: str, whose: str
+    robot: DeployedRobot, errs: OdometryErrors, odometry: str, whose: str
 ) -> tuple[Parameter, ...]:
     """All parameters, for odometry on a topic that is of `whose` kind and errs like this."""
     about = (
@@ -174,7 +174,7 @@ def filter_parameters(
     )
 
 
-def process_noise(robot: DeployedRobot, errs: Errs) -> Parameter:
+def process_noise(robot: DeployedRobot, errs: OdometryErrors) -> Parameter:
     """Process noise on a floor, 15 x 15 as rows."""
     matrix, most = np.diag(_diagonal(robot, errs)), float(Limits().acceleration)
     about = (
@@ -188,8 +188,8 @@ def process_noise(robot: DeployedRobot, errs: Errs) -> Parameter:
     return Parameter("process_noise_covariance", entries, about, per_line=len(STATE))
 
 
-def _diagonal(robot: DeployedRobot, errs: Errs) -> Float[np.ndarray, " state"]:
-    """Per second: pose as `Errs.walk`, velocities as (a T)^2 per period T."""
+def _diagonal(robot: DeployedRobot, errs: OdometryErrors) -> Float[np.ndarray, " state"]:
+    """Per second: pose as `OdometryErrors.walk`, velocities as (a T)^2 per period T."""
     pose = errs.walk(top_speed(robot), DISTANCE_M)
     change = float(Limits().acceleration) * float(robot.frame.radius)
     speed, turn = change**2 * PERIOD_S, (change / float(robot.frame.base)) ** 2 * PERIOD_S

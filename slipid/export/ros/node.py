@@ -11,14 +11,14 @@ from dataclasses import asdict
 import numpy as np
 from jaxtyping import Array, Float
 
+from slipid.export.description import LIMITS, gains_origin, verdict_text
 from slipid.export.ros.yaml_text import Check, Parameter
-from slipid.export.rows import LIMITS, origin, said
 from slipid.export.text import identifiers, interval, listed
 from slipid.parameter import Declaration, Entry, entries
 from slipid.robot.controller import Gains, Limits
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.record import Number
-from slipid.robot.robot_file import declared
+from slipid.robot.record import RecordedNumber
+from slipid.robot.robot_file import declared_numbers
 
 NODE = "slipid"
 _ZERO = Check("gt_eq<>", (0.0,))
@@ -61,7 +61,7 @@ def _numbers(robot: DeployedRobot) -> Iterator[Parameter]:
             return f"{part}.{floors[e.surface]}.{last}"
         return quantity if e.load is None else f"{quantity}.{loads[e.load]}"
 
-    found = [(name(e), e) for e in declared(robot.record)]
+    found = [(name(e), e) for e in declared_numbers(robot.record)]
     order = {group: k for k, group in enumerate(dict.fromkeys(_group(n) for n, _ in found))}
     for called, e in sorted(found, key=lambda pair: order[_group(pair[0])]):
         number = robot.record.parameters[e.path]
@@ -72,13 +72,15 @@ def _group(name: str) -> str:
     return name.rpartition(".")[0]
 
 
-def _about(e: Entry, number: Number) -> str:
+def _about(e: Entry, number: RecordedNumber) -> str:
     d = e.declaration
     ends = number.interval90
     pairs = [] if ends is None else np.reshape(ends, (-1, 2)).tolist()
     each = "; ".join(interval((low, high)) for low, high in pairs)
     known = f", 90 % interval {each}" if each else ""
-    return f"{d.doc} {d.symbol} [{d.unit}]; {said(number.verdict)}, {number.provenance}{known}"
+    return (
+        f"{d.doc} {d.symbol} [{d.unit}]; {verdict_text(number.verdict)}, {number.provenance}{known}"
+    )
 
 
 def _checks(e: Entry) -> Iterator[Check]:
@@ -137,7 +139,7 @@ def _controls(robot: DeployedRobot) -> Iterator[Parameter]:
     for e in entries(gains):
         about = f"{e.declaration.doc} {e.declaration.symbol} [{e.declaration.unit}]"
         if e.path == "place":
-            about = f"{about}. {origin(robot)}"
+            about = f"{about}. {gains_origin(robot)}"
         yield Parameter(f"gains.{e.path}", float(e.get(gains)), about, (), read_only=False)
     for name, value in asdict(Limits()).items():
         checks = (Check("gt<>", (0.0,)),)

@@ -25,7 +25,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from slipid.infer.bench.moments import (
-    Sums,
+    MomentSums,
     cell_length,
     celled,
     grouped,
@@ -39,13 +39,13 @@ from slipid.infer.bench.motor import (
     AMPS,
     BRUSH_CURRENT,
     VOLTS,
-    Bench,
     BenchMotor,
-    Noise,
-    Record,
+    BenchRecord,
+    BenchRoot,
+    SensorNoise,
     noise_of,
 )
-from slipid.infer.bench.windows import Windows, electrical, mechanical
+from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
 from slipid.search_space import Choice, Space
 
 ROUNDS = 30
@@ -73,16 +73,16 @@ class MotorFit:
     """
 
     label: str
-    records: tuple[Record, ...]
+    records: tuple[BenchRecord, ...]
     space: Space
     choices: tuple[Choice, ...]
     z: Float[np.ndarray, " free"]
     covariance: Float[np.ndarray, "free free"]
-    volts: Windows | None
-    amps: Windows
-    volts_sums: Sums | None
-    amps_sums: Sums
-    noise: Noise
+    volts: BenchWindows | None
+    amps: BenchWindows
+    volts_sums: MomentSums | None
+    amps_sums: MomentSums
+    noise: SensorNoise
     remember: float
     stretches: float
     converged: bool
@@ -105,7 +105,7 @@ class MotorFit:
         return float(np.median([r.period for r in self.records]))
 
 
-class _Block(eqx.Module):
+class _EquationSums(eqx.Module):
     """Sums of one equation, nothing where it has no windows."""
 
     constant: Array
@@ -113,35 +113,35 @@ class _Block(eqx.Module):
     tangent: Array
 
     @staticmethod
-    def of(s: Sums | None, moments: int, columns: int) -> "_Block":
+    def of(s: MomentSums | None, moments: int, columns: int) -> "_EquationSums":
         if s is None:
-            return _Block(jnp.zeros(moments), *[jnp.zeros((moments, columns))] * 2)
-        return _Block(*map(jnp.asarray, (s.constant, s.slope, s.tangent)))
+            return _EquationSums(jnp.zeros(moments), *[jnp.zeros((moments, columns))] * 2)
+        return _EquationSums(*map(jnp.asarray, (s.constant, s.slope, s.tangent)))
 
 
-class _Held(eqx.Module):
+class _Objective(eqx.Module):
     """What the numbers are sought with: sums of both equations, S^-1/2, priors."""
 
     space: Space
-    volts: _Block
-    amps: _Block
+    volts: _EquationSums
+    amps: _EquationSums
     root: Array
 
-    def tangents(self) -> "_Held":
+    def tangents(self) -> "_Objective":
         """The same, whose slopes are what decides how sure the numbers are."""
         slopes = self.volts.tangent, self.amps.tangent
         return eqx.tree_at(lambda h: (h.volts.slope, h.amps.slope), self, slopes)
 
 
 def fit_motor(
-    records: Sequence[Record], choices: Sequence[Choice] = (), label: str = ""
+    records: Sequence[BenchRecord], choices: Sequence[Choice] = (), label: str = ""
 ) -> MotorFit:
     """Fit one motor to its records, of which all or none have voltages."""
     amps, volts = mechanical(records), electrical(records, 0.0)
     first = _first(volts, amps, all(r.signed for r in records))
     scaled = [*_scaled(records, float(first.resistance)), *choices]
-    space = Space(Bench(BenchMotor()), scaled)
-    z = space.vector(Bench(first))
+    space = Space(BenchRoot(BenchMotor()), scaled)
+    z = space.vector(BenchRoot(first))
     # what is not free, or has a start of the user's, keeps it
     z = np.where(_chosen(space, choices), space.start, z)
     zero, moved, rounds = 0.0, np.inf, 0
@@ -178,7 +178,7 @@ def fit_motor(
     )
 
 
-def _first(volts: Windows | None, amps: Windows, signed: bool) -> BenchMotor:
+def _first(volts: BenchWindows | None, amps: BenchWindows, signed: bool) -> BenchMotor:
     """Where the search starts: both equations by themselves, what is negative left at its start."""
     usual = BenchMotor()
     r, c, drop, slow, one = float(usual.resistance), float(usual.back_emf), 0.0, 0.0, 0.0
@@ -197,7 +197,7 @@ def _first(volts: Windows | None, amps: Windows, signed: bool) -> BenchMotor:
     )
 
 
-def _scaled(records: Sequence[Record], resistance: float) -> list[Choice]:
+def _scaled(records: Sequence[BenchRecord], resistance: float) -> list[Choice]:
     """Priors that go with the size of the motor: a time constant, and tenths of what was seen."""
     amps = 0.1 * max(float(np.abs(r.current).max()) for r in records)
     chosen = [Choice("motor.current_offset", prior_mean=0.0, prior_std=max(amps, 1e-6))]
@@ -216,7 +216,7 @@ def _chosen(space: Space, choices: Sequence[Choice]) -> np.ndarray:
 
 
 def _scatter(
-    volts: Windows | None, v: Sums | None, amps: Windows, a: Sums
+    volts: BenchWindows | None, v: MomentSums | None, amps: BenchWindows, a: MomentSums
 ) -> tuple[Float[np.ndarray, "moment moment"], float, float]:
     """Scatter of all moments; time that residuals remember [s], and how many such there are."""
     pairs = [(amps, a)] if volts is None or v is None else [(volts, v), (amps, a)]
@@ -231,7 +231,7 @@ def _scatter(
 
 
 def _solved(
-    space: Space, z: np.ndarray, v: Sums | None, a: Sums, s: np.ndarray
+    space: Space, z: np.ndarray, v: MomentSums | None, a: MomentSums, s: np.ndarray
 ) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"]]:
     """Optimum of the quasi-posterior with weights and scatter held, and its covariance."""
     std = np.sqrt(np.maximum(np.diag(s), 1e-300))
@@ -239,21 +239,21 @@ def _solved(
     root = np.linalg.inv(np.linalg.cholesky(s / std / std[:, None] + 1e-9 * np.eye(len(s)))) / std
     if v is None:
         root = np.concatenate([np.zeros((len(root), ASKED[0])), root], axis=1)
-    volts, amps = _Block.of(v, ASKED[0], len(VOLTS)), _Block.of(a, *a.slope.shape)
-    found, tangent = _searched(jnp.asarray(z), _Held(space, volts, amps, jnp.asarray(root)))
+    volts, amps = _EquationSums.of(v, ASKED[0], len(VOLTS)), _EquationSums.of(a, *a.slope.shape)
+    found, tangent = _searched(jnp.asarray(z), _Objective(space, volts, amps, jnp.asarray(root)))
     jacobian = np.asarray(tangent)
     return np.asarray(found), np.linalg.inv(jacobian.T @ jacobian)
 
 
 @eqx.filter_jit
-def _searched(z: Float[Array, " free"], held: _Held) -> tuple[Array, Array]:
+def _searched(z: Float[Array, " free"], held: _Objective) -> tuple[Array, Array]:
     """Optimum, and the Jacobian of the residuals there."""
     solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
     found = optx.least_squares(_residuals, solver, z, args=held, max_steps=200, throw=False)
     return found.value, jax.jacfwd(_residuals)(found.value, held.tangents())
 
 
-def _residuals(z: Float[Array, " free"], held: _Held) -> Float[Array, " residual"]:
+def _residuals(z: Float[Array, " free"], held: _Objective) -> Float[Array, " residual"]:
     """S^-1/2 g and what the prior says."""
     motor = held.space.tree(z).motor
     pairs = (held.volts, motor.volts()), (held.amps, motor.amps())

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from slipid.infer.bench.windows import Half, Windows
+from slipid.infer.bench.windows import BenchWindows, HalfSignals
 
 DEGREES = 4.0
 """Of freedom of Student's t."""
@@ -43,7 +43,7 @@ Square = Float[np.ndarray, "moment moment"]
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class HalfMoments:
     """Residuals of one half of the rows [V] or [A], their weights, and g of every window."""
 
     residual: Float[np.ndarray, " window"]
@@ -52,7 +52,7 @@ class Asked:
 
 
 @dataclass(frozen=True, eq=False)
-class Sums:
+class MomentSums:
     """h and G of an equation, and what they are made of.
 
     Attributes:
@@ -65,8 +65,8 @@ class Sums:
     constant: Moments
     slope: Float[np.ndarray, "moment column"]
     tangent: Float[np.ndarray, "moment column"]
-    even: Asked
-    odd: Asked
+    even: HalfMoments
+    odd: HalfMoments
     scale: float
 
     @property
@@ -79,7 +79,7 @@ class Sums:
         return (self.even.weight * self.even.residual + self.odd.weight * self.odd.residual) / 2
 
 
-def sums(w: Windows, coefficients: Float[np.ndarray, " column"], signals: int) -> Sums:
+def sums(w: BenchWindows, coefficients: Float[np.ndarray, " column"], signals: int) -> MomentSums:
     """Sums at some coefficients; the first so many signals are asked."""
     totals, halves = [], []
     for mine, other in ((w.even, w.odd), (w.odd, w.even)):
@@ -90,13 +90,13 @@ def sums(w: Windows, coefficients: Float[np.ndarray, " column"], signals: int) -
         z = other.signals[:, :signals] * (weight / 2)[:, None]
         bent = z * ((DEGREES - square) / (DEGREES + square))[:, None]
         totals.append((z.T @ mine.left, z.T @ mine.signals, bent.T @ mine.signals, scale / 2))
-        halves.append(Asked(residual, weight, z * residual[:, None]))
+        halves.append(HalfMoments(residual, weight, z * residual[:, None]))
     constant, slope, tangent, scale = (a + b for a, b in zip(*totals, strict=True))
     even, odd = halves
-    return Sums(constant, slope, tangent, even, odd, scale)
+    return MomentSums(constant, slope, tangent, even, odd, scale)
 
 
-def start(w: Windows, signals: int, columns: list[int], rounds: int = 12) -> np.ndarray:
+def start(w: BenchWindows, signals: int, columns: list[int], rounds: int = 12) -> np.ndarray:
     """Coefficients of some columns that make all moments vanish, 0 of the others."""
     found = np.zeros(w.even.signals.shape[1])
     weight = [w.usable.astype(float)] * 2
@@ -112,7 +112,7 @@ def start(w: Windows, signals: int, columns: list[int], rounds: int = 12) -> np.
     return found
 
 
-def _weights(half: Half, coefficients: np.ndarray, usable: np.ndarray) -> np.ndarray:
+def _weights(half: HalfSignals, coefficients: np.ndarray, usable: np.ndarray) -> np.ndarray:
     residual = half.left - half.signals @ coefficients
     return np.asarray(
         usable * (DEGREES + 1) / (DEGREES + (residual / _scale(residual[usable])) ** 2)
@@ -125,7 +125,7 @@ def _scale(residual: np.ndarray) -> float:
 
 
 def celled(
-    each: Float[np.ndarray, "window moment"], w: Windows, length: float
+    each: Float[np.ndarray, "window moment"], w: BenchWindows, length: float
 ) -> Float[np.ndarray, "cell moment"]:
     """Sums over cells of time of a given length [s], those of the next record behind."""
     place = np.floor(w.time / length).astype(int)
@@ -136,7 +136,7 @@ def celled(
     return total
 
 
-def cell_length(windows: Sequence[Windows]) -> float:
+def cell_length(windows: Sequence[BenchWindows]) -> float:
     """Length of cells that hold some windows each [s]."""
     strides = [float(np.median(np.diff(w.time))) for w in windows if len(w.time) > 1]
     return max(CELL_S, *(2 * s for s in strides))
@@ -180,7 +180,7 @@ def widened(s: Square, groups: Float[np.ndarray, "group moment"]) -> Square:
     return np.asarray(stretch * np.maximum(value / chance, 1.0) @ stretch.T)
 
 
-def grouped(s: Sums, w: Windows) -> Float[np.ndarray, "group moment"]:
+def grouped(s: MomentSums, w: BenchWindows) -> Float[np.ndarray, "group moment"]:
     """Sums over windows alike in speed, and among these in current: about as many in each group.
 
     A window is put where the half of its rows says that its residual is not of: its own noise would

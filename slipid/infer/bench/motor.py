@@ -70,14 +70,14 @@ class BenchMotor(eqx.Module):
         return jnp.append(torque / self.back_emf, self.current_offset)
 
 
-class Bench(eqx.Module):
+class BenchRoot(eqx.Module):
     """Root of the tree, so that the names begin with `motor`."""
 
     motor: BenchMotor
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Record:
+class BenchRecord:
     """One run of one motor.
 
     Attributes:
@@ -104,7 +104,7 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Noise:
+class SensorNoise:
     """Std of what changes from row to row, quantisation included: [V] or None, [A], [rad/s]."""
 
     voltage: float | None
@@ -112,10 +112,10 @@ class Noise:
     speed: float
 
 
-def noise_of(records: Sequence[Record]) -> Noise:
+def noise_of(records: Sequence[BenchRecord]) -> SensorNoise:
     """Noise of the sensors over all records of a motor."""
     volts = [r.voltage for r in records if r.voltage is not None]
-    return Noise(
+    return SensorNoise(
         noise(volts) if volts else None,
         noise([r.current for r in records]),
         noise([r.speed for r in records]),

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Int
 
 from slipid.infer.bench.fit import MotorFit
-from slipid.infer.bench.moments import Sums, cell_length, celled
-from slipid.infer.bench.windows import Windows
+from slipid.infer.bench.moments import MomentSums, cell_length, celled
+from slipid.infer.bench.windows import BenchWindows
 from slipid.infer.fit_file import SCHEMA, number_json
 from slipid.infer.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
-from slipid.infer.verdicts.unidentified import Flat, flat_directions, members, sentences
+from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
 from slipid.infer.verdicts.wording import VOLTAGE
 from slipid.support.files import Content, hash_of
 
@@ -60,7 +60,7 @@ def misfits(fit: MotorFit) -> tuple[Misfit, ...]:
     return tuple(m for m in found if m is not None)
 
 
-def _worst(fit: MotorFit, channel: str, unit: str, w: Windows, s: Sums) -> Misfit | None:
+def _worst(fit: MotorFit, channel: str, unit: str, w: BenchWindows, s: MomentSums) -> Misfit | None:
     """Largest mean of a bin, in its stds, over speed, current and time."""
     size = MATTERS * float(np.ptp(w.both.left))
     best: Misfit | None = None
@@ -83,8 +83,8 @@ def _worst(fit: MotorFit, channel: str, unit: str, w: Windows, s: Sums) -> Misfi
 
 def _mean(
     fit: MotorFit,
-    w: Windows,
-    s: Sums,
+    w: BenchWindows,
+    s: MomentSums,
     even: Int[np.ndarray, " some"],
     odd: Int[np.ndarray, " some"],
 ) -> tuple[float, float]:
@@ -220,7 +220,7 @@ def _labelled(path: str, label: str) -> str:
     return f"{path}@{label}" if label else path
 
 
-def _flat(f: MotorFit) -> tuple[Flat, ...]:
+def _flat(f: MotorFit) -> tuple[FlatDirection, ...]:
     """Directions that stay open, with what a bench can do about them."""
     found = flat_directions(f.space, f.covariance, has_current=True, has_voltage=f.has_voltage)
     return tuple(replace(one, remedy=_cure(one.paths, f.has_voltage)) for one in found)
@@ -247,7 +247,7 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
         ("motor.inductance", electrical, ROWS_ELECTRICAL, "L_a / R"),
         ("motor.rotor_inertia", mechanical, ROWS_MECHANICAL, "J R / C_e^2"),
     ):
-        if path in f.space.place and constant < least * rows:
+        if path in f.space.slices and constant < least * rows:
             about = f"about {_time(constant)}" if constant > 0.05 * rows else "far shorter"
             slow[path] = (
                 f"{path} is not identified at this rate: its time constant {name} is {about}, "
@@ -304,7 +304,7 @@ def _remarks(f: MotorFit) -> list[str]:
             f"residuals remember {f.remember:.2g} s: the intervals count {f.stretches:.0f} "
             "stretches of that length, not the rows"
         )
-    if "motor.rotor_inertia" in f.space.place:
+    if "motor.rotor_inertia" in f.space.slices:
         said.append("motor.rotor_inertia is that of the rotor with everything that turned with it")
     return said
 

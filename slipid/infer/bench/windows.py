@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.infer.bench.motor import BRUSH_CURRENT, REST, Record
+from slipid.infer.bench.motor import BRUSH_CURRENT, REST, BenchRecord
 
 ELECTRICAL_S, MECHANICAL_S = 3e-3, 1e-2
 """Half the length of a window, about a time constant of small motors: transients are seen [s]."""
@@ -42,7 +42,7 @@ BRAKES = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Half:
+class HalfSignals:
     """What the even, or the odd, rows say of every window: signals of an equation, and its left.
 
     With the means of speed [rad/s] and current [A].
@@ -55,7 +55,7 @@ class Half:
 
 
 @dataclass(frozen=True, eq=False)
-class Windows:
+class BenchWindows:
     """Windows of one equation, one after the other.
 
     Attributes:
@@ -65,20 +65,20 @@ class Windows:
         usable: False where the equation does not hold, at rest, or may not.
     """
 
-    even: Half
-    odd: Half
+    even: HalfSignals
+    odd: HalfSignals
     time: Float[np.ndarray, " window"]
     record: Int[np.ndarray, " window"]
     usable: Bool[np.ndarray, " window"]
 
     @property
-    def both(self) -> Half:
+    def both(self) -> HalfSignals:
         """Means of the two halves."""
         pairs = zip(vars(self.even).values(), vars(self.odd).values(), strict=True)
-        return Half(*((a + b) / 2 for a, b in pairs))
+        return HalfSignals(*((a + b) / 2 for a, b in pairs))
 
 
-def electrical(records: Sequence[Record], zero: float) -> Windows | None:
+def electrical(records: Sequence[BenchRecord], zero: float) -> BenchWindows | None:
     """Windows of the electrical equation [V], None without voltages.
 
     `zero` is what the ammeter shows without a current, for the signs of small ones [A].
@@ -87,41 +87,43 @@ def electrical(records: Sequence[Record], zero: float) -> Windows | None:
     for k, r in enumerate(records):
         if (measured := r.voltage) is None:
             return None
-        at = _Places(r, ELECTRICAL_S)
+        at = _WindowPlaces(r, ELECTRICAL_S)
 
-        def half(row: "_Half", r: Record = r, measured: np.ndarray = measured) -> Half:
+        def half(
+            row: "_HalfKernel", r: BenchRecord = r, measured: np.ndarray = measured
+        ) -> HalfSignals:
             current, speed = row.mean(r.current), row.mean(r.speed)
             along = np.ones(len(speed)) if r.signed else np.sign(row.longer(r.speed))
             sign = np.tanh((row.longer(r.current) - zero * along) / BRUSH_CURRENT)
             known = current, speed, sign, row.slope(r.current), np.ones(len(sign)), along
-            return Half(np.stack(known, 1), row.mean(measured), speed, current)
+            return HalfSignals(np.stack(known, 1), row.mean(measured), speed, current)
 
         parts.append(_cut(r, k, at, half))
     return _joined(parts)
 
 
-def mechanical(records: Sequence[Record]) -> Windows:
+def mechanical(records: Sequence[BenchRecord]) -> BenchWindows:
     """Windows of the mechanical equation [A]; at rest friction is a reaction, and unknown."""
     parts = []
     for k, r in enumerate(records):
-        at = _Places(r, MECHANICAL_S)
+        at = _WindowPlaces(r, MECHANICAL_S)
         rows = r.speed[at.middle[:, None] + np.arange(-at.half, at.half + 1)]
         moving = np.abs(rows.mean(axis=1)) > 2 * REST
         along = np.ones(len(rows)) if r.signed else np.sign(rows.mean(axis=1))
 
-        def half(row: "_Half", r: Record = r, along: np.ndarray = along) -> Half:
+        def half(row: "_HalfKernel", r: BenchRecord = r, along: np.ndarray = along) -> HalfSignals:
             current, speed = row.mean(r.current), row.mean(r.speed)
             known = row.slope(r.speed), np.tanh(speed / REST), speed, along
-            return Half(np.stack(known, 1), current, speed, current)
+            return HalfSignals(np.stack(known, 1), current, speed, current)
 
         parts.append(_cut(r, k, at, half, moving))
     return _joined(parts)
 
 
-class _Places:
+class _WindowPlaces:
     """Where windows of a record are: middles [row] and half the length [rows]."""
 
-    def __init__(self, r: Record, half_s: float):
+    def __init__(self, r: BenchRecord, half_s: float):
         half_s = max(half_s, min(ENOUGH * r.period, MECHANICAL_S))
         self.half = half = max(LEAST, 2 * round(half_s / r.period / 2))
         last = len(r.time) - half
@@ -130,10 +132,10 @@ class _Places:
         self.middle = middle[(span <= STRAY * 2 * half * r.period) & ~_jumps(r, half, middle)]
 
 
-class _Half:
+class _HalfKernel:
     """Kernel of every second row of the windows, which begins `first` rows inside them."""
 
-    def __init__(self, r: Record, at: _Places, first: int):
+    def __init__(self, r: BenchRecord, at: _WindowPlaces, first: int):
         self.at = at.middle[:, None] + np.arange(first - at.half, at.half - first + 1, 2)
         reach = WIDE * at.half
         wide = at.middle[:, None] + np.arange(first - reach, reach - first + 1, 2)
@@ -157,14 +159,14 @@ class _Half:
 
 
 def _cut(
-    r: Record,
+    r: BenchRecord,
     number: int,
-    at: _Places,
-    half: Callable[[_Half], Half],
+    at: _WindowPlaces,
+    half: Callable[[_HalfKernel], HalfSignals],
     usable: Bool[np.ndarray, " window"] | None = None,
-) -> Windows:
+) -> BenchWindows:
     """Windows of one record."""
-    even, odd = halves = _Half(r, at, 0), _Half(r, at, 1)
+    even, odd = halves = _HalfKernel(r, at, 0), _HalfKernel(r, at, 1)
     usable = np.ones(len(at.middle), bool) if usable is None else usable
     if not r.signed:
         # a magnitude was given the sign of the speed: wrong where the motor brakes
@@ -173,10 +175,12 @@ def _cut(
         spread = 1.4826 * np.median(np.abs(faster)) if len(faster) else 0.0
         usable = usable & (faster > -BRAKES * spread)
     time, count = r.time[at.middle] - r.time[0], np.full(len(at.middle), number)
-    return Windows(half(even), half(odd), time, count, usable)
+    return BenchWindows(half(even), half(odd), time, count, usable)
 
 
-def _jumps(r: Record, half: int, middle: Int[np.ndarray, " window"]) -> Bool[np.ndarray, " window"]:
+def _jumps(
+    r: BenchRecord, half: int, middle: Int[np.ndarray, " window"]
+) -> Bool[np.ndarray, " window"]:
     """Windows in which, or shortly before which, the voltage jumps between two rows."""
     if r.voltage is None:
         return np.zeros(len(middle), bool)
@@ -189,12 +193,14 @@ def _jumps(r: Record, half: int, middle: Int[np.ndarray, " window"]) -> Bool[np.
     return np.asarray(count[middle + half] > count[np.maximum(middle - half - rows, 0)])
 
 
-def _joined(parts: Sequence[Windows]) -> Windows:
+def _joined(parts: Sequence[BenchWindows]) -> BenchWindows:
     """Windows of several records, one after the other."""
 
-    def halves(found: Sequence[Half]) -> Half:
-        return Half(*map(np.concatenate, zip(*(vars(h).values() for h in found), strict=True)))
+    def halves(found: Sequence[HalfSignals]) -> HalfSignals:
+        return HalfSignals(
+            *map(np.concatenate, zip(*(vars(h).values() for h in found), strict=True))
+        )
 
     rest = ([getattr(p, name) for p in parts] for name in ("time", "record", "usable"))
     even, odd = halves([p.even for p in parts]), halves([p.odd for p in parts])
-    return Windows(even, odd, *map(np.concatenate, rest))
+    return BenchWindows(even, odd, *map(np.concatenate, rest))

@@ -1,15 +1,15 @@
-"""What a set of runs tells: information that adds up over runs, and which runs add most.
+"""Fisher information of sets of runs, and the choice of the runs that add most.
 
-Numbers of the motion m are informed by the motion residuals, electric numbers e by currents and
-voltages given the motion, as in the fit. With whitened Jacobians J of the motion and (E, C) of
+Motion residuals inform the numbers m of the motion; currents and voltages inform the electric
+numbers e given the motion, as in the fit. With whitened Jacobians J of the motion and (E, C) of
 currents and voltages by e and m,
 
     M = M0 + sum J^T J,   O = O0 + sum E^T E,   X = X0 + sum E^T C
     cov(m) = M^-1,   e = e(m) - L (m - m^),  L = O^-1 X,   cov(e) = O^-1 + L M^-1 L^T
 
-so M, O and X of different runs add. Where currents inform the motion, or there are none, all
-numbers count as m. A criterion is tr(G cov G^T) of a matrix G (Fedorov 1972; Atkinson, Donev and
-Tobias 2007, Optimum Experimental Designs, sections 10 and 12: c- and A-optimality, exchange).
+so M, O and X of different runs add. If currents inform the motion, or there are none, all numbers
+count as m. A criterion is tr(G cov G^T) of a matrix G (Fedorov 1972; Atkinson, Donev and Tobias
+2007, Optimum Experimental Designs, sections 10 and 12: c- and A-optimality, exchange).
 """
 
 from collections.abc import Sequence
@@ -21,38 +21,51 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 ENDLESS = 1e3
-"""Times that every candidate is driven where "endless" is meant: what is left then stays."""
+"""Repetitions of every candidate that stand for endless driving."""
 
 
-class Rows(NamedTuple):
-    """Whitened Jacobians of runs: J of the motion, E and C of currents (k is 0 without them)."""
+class RunJacobians(NamedTuple):
+    """Whitened Jacobians of runs.
+
+    Attributes:
+        motion: J of the motion residuals.
+        electric: E of currents and voltages by electric numbers (k is 0 without currents).
+        carried: C of currents and voltages by numbers of the motion.
+    """
 
     motion: Float[np.ndarray, "run m motion"]
     electric: Float[np.ndarray, "run k electric"]
     carried: Float[np.ndarray, "run k motion"]
 
-    def pick(self, index: Sequence[int] | np.ndarray) -> "Rows":
-        """Some runs, in the order given; a run may come several times."""
-        return Rows(*(part[np.asarray(index, int)] for part in self))
+    def pick(self, index: Sequence[int] | np.ndarray) -> "RunJacobians":
+        """Return some runs in the given order; a run may occur several times."""
+        return RunJacobians(*(part[np.asarray(index, int)] for part in self))
 
-    def joined(self, *others: "Rows") -> "Rows":
-        return Rows(*map(np.concatenate, zip(self, *others, strict=True)))
+    def joined(self, *others: "RunJacobians") -> "RunJacobians":
+        return RunJacobians(*map(np.concatenate, zip(self, *others, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
-class Knowledge:
-    """Information on all numbers, M, O and X, and which of them are electric."""
+class Information:
+    """Information on all numbers.
+
+    Attributes:
+        is_electric: mask of the electric numbers.
+        motion: M.
+        own: O.
+        cross: X.
+    """
 
     is_electric: Bool[np.ndarray, " free"]
     motion: Float[np.ndarray, "motion motion"]
     own: Float[np.ndarray, "electric electric"]
     cross: Float[np.ndarray, "electric motion"]
 
-    def plus(self, rows: Rows, times: float = 1.0) -> "Knowledge":
-        """After these runs as well, each so many times; -1 takes them away."""
-        # not -1: where a part has no numbers, numpy cannot tell how many rows it has
+    def plus(self, rows: RunJacobians, times: float = 1.0) -> "Information":
+        """Return the information with these runs added `times` times; -1 removes them."""
+        # reshape(-1, ...) would fail for a part without numbers
         j, e, c = (x.reshape(x.shape[0] * x.shape[1], x.shape[2]) for x in rows)
-        return Knowledge(
+        return Information(
             self.is_electric,
             self.motion + times * (j.T @ j),
             self.own + times * (e.T @ e),
@@ -61,7 +74,7 @@ class Knowledge:
 
     @cached_property
     def of_motion(self) -> Float[np.ndarray, "motion motion"]:
-        """Covariance of the motion's numbers."""
+        """Covariance of the numbers of the motion."""
         return _inverse(self.motion)
 
     @cached_property
@@ -80,12 +93,12 @@ class Knowledge:
         return float(np.einsum("ki,ij,kj->", goal, self.covariance, goal))
 
     def after_each(
-        self, rows: Rows, goal: Float[np.ndarray, "k free"]
+        self, rows: RunJacobians, goal: Float[np.ndarray, "k free"]
     ) -> Float[np.ndarray, " run"]:
-        """Criterion after one more run, for every candidate.
+        """Return the criterion after one more run, for every candidate.
 
-        By Woodbury's identity (M + J^T J)^-1 = M^-1 - W^T (1 + W J^T)^-1 W with W = J M^-1, so what
-        is inverted has the size of a run, not of all numbers.
+        By Woodbury's identity (M + J^T J)^-1 = M^-1 - W^T (1 + W J^T)^-1 W with W = J M^-1, the
+        inverted matrix has the size of a run, not of all numbers.
         """
         of_motion, of_electric = goal[:, ~self.is_electric], goal[:, self.is_electric]
         rest: np.ndarray | float = 0.0
@@ -104,26 +117,26 @@ class Knowledge:
         return np.asarray(before + rest - gain)
 
 
-def known(
+def information_of(
     covariance: Float[np.ndarray, "free free"], is_electric: Bool[np.ndarray, " free"]
-) -> Knowledge:
-    """Knowledge with this covariance."""
+) -> Information:
+    """Return the information with this covariance."""
     e, m = np.flatnonzero(is_electric), np.flatnonzero(~is_electric)
     of_motion = covariance[np.ix_(m, m)]
     motion = _inverse(of_motion)
     lean = -covariance[np.ix_(e, m)] @ motion
     own = _inverse(covariance[np.ix_(e, e)] - lean @ of_motion @ lean.T)
-    return Knowledge(np.asarray(is_electric, bool), motion, own, own @ lean)
+    return Information(np.asarray(is_electric, bool), motion, own, own @ lean)
 
 
-def path(
-    start: Knowledge,
-    rows: Rows,
+def criterion_path(
+    start: Information,
+    rows: RunJacobians,
     goal: np.ndarray,
     order: Sequence[int] | np.ndarray,
     at: Sequence[int] | None = None,
 ) -> list[float]:
-    """Criterion after so many runs of an order: before and after each, or at chosen numbers."""
+    """Return the criterion along an order of runs, before and after each or at chosen counts."""
     counts = range(len(order) + 1) if at is None else at
     found, now, done = [], start, 0
     for count in counts:
@@ -133,12 +146,14 @@ def path(
 
 
 def greedy(
-    start: Knowledge, rows: Rows, goal: np.ndarray, most: int, target: float = 0.0
+    start: Information, rows: RunJacobians, goal: np.ndarray, most: int, target: float = 0.0
 ) -> tuple[list[int], list[float]]:
-    """At most so many runs, each the one that lowers the criterion most; any may come again.
+    """Choose at most `most` runs, each the one that lowers the criterion most, with repetition.
 
-    It stops where the criterion has come down to the target. Returns the runs, and the criterion
-    before and after each.
+    The choice stops once the criterion has fallen to the target.
+
+    Returns:
+        the runs, and the criterion before and after each.
     """
     now, chosen, found = start, [], [start.criterion(goal)]
     while len(chosen) < most and found[-1] > target:
@@ -149,8 +164,10 @@ def greedy(
     return chosen, found
 
 
-def exchanged(start: Knowledge, rows: Rows, goal: np.ndarray, chosen: Sequence[int]) -> list[int]:
-    """The runs after each was once exchanged for the best in its place, the most useful first."""
+def exchanged(
+    start: Information, rows: RunJacobians, goal: np.ndarray, chosen: Sequence[int]
+) -> list[int]:
+    """Exchange each run once for the best one in its place; return the most useful first."""
     kept = list(chosen)
     for k in range(len(kept)):
         others = start.plus(rows.pick(kept[:k] + kept[k + 1 :]))
@@ -167,6 +184,6 @@ def exchanged(start: Knowledge, rows: Rows, goal: np.ndarray, chosen: Sequence[i
 
 
 def _inverse(a: np.ndarray) -> np.ndarray:
-    """Inverse of a symmetric positive matrix whose numbers differ widely in size."""
+    """Return the inverse of a symmetric positive matrix with entries of widely different size."""
     scale = 1 / np.sqrt(np.diag(a))
     return np.asarray(np.linalg.inv(a * scale[:, None] * scale) * scale[:, None] * scale)

@@ -6,7 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int, UInt32
 
-from slipid.infer.posterior.transport_map import Bend, Matrix, Stair, Transport, Warp, gaussian
+from slipid.infer.posterior.transport_map import (
+    Matrix,
+    Polynomials,
+    Stage,
+    Transport,
+    Warp,
+    gaussian,
+)
 
 FORMAT = 5
 """Version of the block files; bump it when their content or the way they are made changes."""
@@ -14,7 +21,7 @@ Chain = Float[np.ndarray, "ensemble step walker size"]
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class LogDensity:
     """A log density, and what is known of it beforehand.
 
     Terms of vectors (walker, size) are (walker, group + 1), the shared one last; the slope is that
@@ -38,7 +45,7 @@ class Target:
         """Map of the Gaussian near it."""
         return gaussian(self.centre, self.covariance, self.group)
 
-    def seen_by(self, map: Transport) -> "Target":
+    def seen_by(self, map: Transport) -> "LogDensity":
         """The same distribution in other coordinates; centre and covariance are left alone."""
         count = int(self.group.max()) + 1
         onto = np.eye(count + 1)[np.where(self.group < 0, count, self.group)]
@@ -88,7 +95,7 @@ class Plan:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class ChainBlock:
     """Some steps of all ensembles, and all that is needed to go on.
 
     Attributes:
@@ -110,19 +117,19 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Record:
+class BlockStore:
     """Where blocks of an earlier call are found and where new ones go.
 
     `done` gives the blocks of a part that are there already. `tell` is called with the part and the
     number of steps of a block that are done.
     """
 
-    done: Callable[[str], Sequence[Block]] = lambda part: ()
-    keep: Callable[[str, Block], None] = lambda part, block: None
+    done: Callable[[str], Sequence[ChainBlock]] = lambda part: ()
+    keep: Callable[[str, ChainBlock], None] = lambda part, block: None
     tell: Callable[[str, int], None] = lambda part, steps: None
 
 
-def packed(block: Block) -> dict[str, np.ndarray]:
+def packed(block: ChainBlock) -> dict[str, np.ndarray]:
     """Arrays of a block under their names in a file."""
     out = {
         "number": np.asarray(block.number),
@@ -142,15 +149,15 @@ def packed(block: Block) -> dict[str, np.ndarray]:
     return out
 
 
-def unpacked(arrays: Mapping[str, np.ndarray]) -> Block:
+def unpacked(arrays: Mapping[str, np.ndarray]) -> ChainBlock:
     """Block from the arrays that `packed` gave."""
     stairs = []
     while f"{len(stairs)}/own" in arrays:
         k = len(stairs)
         bend = {n: arrays[f"{k}/bend/{n}"] for n in _OF_BEND if f"{k}/bend/{n}" in arrays}
         fields = {n: arrays[f"{k}/{n}"] for n in _OF_STAIR}
-        stairs.append(Stair(**fields, bend=Bend(**bend) if bend else None))
-    return Block(
+        stairs.append(Stage(**fields, bend=Polynomials(**bend) if bend else None))
+    return ChainBlock(
         number=int(arrays["number"]),
         chain=arrays["chain"],
         log_prob=arrays["log_prob"],

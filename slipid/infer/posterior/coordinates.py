@@ -10,10 +10,10 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float, Int
 
 from slipid.fit import likelihood as lk
-from slipid.fit.problem import Problem, effects_of, twists
-from slipid.fit.shared import FloorShared, Tie
+from slipid.fit.problem import Problem, effects_given, twists
+from slipid.fit.shared_effects import EffectPosterior, SharedEffects
 from slipid.fit.variances import DEGREES, Blocks, Square, Vector, expected, inverse_root
-from slipid.infer.result import Fit, known
+from slipid.infer.result import Fit, required
 from slipid.model.robot import Robot
 
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
@@ -37,7 +37,7 @@ class Fitted:
     @classmethod
     def of(cls, fit: Fit) -> "Fitted":
         """The end of a fit, with the variances in the order of its problem."""
-        names = known(fit.problem).noise.names
+        names = required(fit.problem).noise.names
         return cls(fit.z, np.log([fit.variance[name] for name in names]), fit.covariance)
 
 
@@ -86,9 +86,9 @@ def effects_at(problem: Problem, residual: Blocks, log_v: Vector) -> Float[np.nd
     keep = np.ones(len(problem.windows))
     effect = np.zeros((len(keep), 3))
     for _ in range(_TURNS):
-        seen = problem.seen(residual, log_v, keep, effect)
+        seen = problem.weighed(residual, log_v, keep, effect)
         root = seen.whitening.root["motion"]
-        effect = np.asarray(effects_of(seen.tied, root, residual["motion"]))
+        effect = np.asarray(effects_given(seen.effects, root, residual["motion"]))
     return effect
 
 
@@ -112,8 +112,8 @@ class Anchor(eqx.Module):
     root: dict[str, Array]
     scale: dict[str, Array]
     log_det: dict[str, Array]
-    shared: tuple[FloorShared, ...]
-    tied: tuple[Tie, ...]
+    shared: tuple[SharedEffects, ...]
+    tied: tuple[EffectPosterior, ...]
     twist: Float[Array, "piece window 3"]
     twist_slope: Float[Array, "piece window 3 free"]
     electric: lk.ElectricNoise
@@ -130,7 +130,7 @@ class Anchor(eqx.Module):
         residual, _ = problem.linear(fitted.z, electric)
         effect = effects_at(problem, residual, log_v)
         part = {k: expected(r.shape[-1]) for k, r in residual.items()}
-        seen = problem.seen(residual, log_v, keep * part["motion"], effect)
+        seen = problem.weighed(residual, log_v, keep * part["motion"], effect)
         plain = {k: inverse_root(c.covariance(log_v)) for k, c in problem.noise.blocks.items()}
         diagonal = {k: jnp.diagonal(r, axis1=-2, axis2=-1) for k, r in plain.items()}
         twist, slope = twists(problem.space, problem.batch, fitted.z)
@@ -138,12 +138,12 @@ class Anchor(eqx.Module):
         return Anchor(
             batch=problem.batch,
             z=jnp.asarray(fitted.z),
-            prior_std=problem.target.prior_std(log_v),
+            prior_std=problem.objective.prior_std(log_v),
             root=plain,
             scale={k: jnp.sqrt(w * part[k] / part["motion"]) for k, w in weight.items()},
             log_det={k: -2 * jnp.sum(jnp.log(d), axis=-1) for k, d in diagonal.items()},
-            shared=problem.target.shared,
-            tied=seen.tied,
+            shared=problem.objective.shared,
+            tied=seen.effects,
             twist=twist,
             twist_slope=slope,
             electric=electric,

@@ -6,8 +6,8 @@ least squares,
 
     log p(x | data) = -1/2 |y(x)|^2 - 1/2 |(x - mean) / std|^2 + f log |d residuals / d data|
 
-with |y|^2 that of `slipid.fit.shared.freed`, and f what a Student t tells of its centre
-over what a Gaussian does, as it is in y. Floors share some coordinates and have the
+with |y|^2 that of `slipid.fit.shared_effects.marginal_residuals`, and f what a Student t tells of
+its centre over what a Gaussian does, as it is in y. Floors share some coordinates and have the
 others to themselves, so that the log posterior is a sum
 
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
@@ -34,7 +34,7 @@ from jaxtyping import Array, Float
 
 from slipid.fit import likelihood as lk
 from slipid.fit.problem import Problem
-from slipid.fit.shared import Tie, shared_effects
+from slipid.fit.shared_effects import EffectPosterior, mean_effects
 from slipid.fit.variances import Square, expected
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Coordinates, Fitted
 from slipid.model.robot import Robot
@@ -42,14 +42,14 @@ from slipid.model.robot import Robot
 Result = TypeVar("Result")
 
 
-class Held(NamedTuple):
+class HeldMotion(NamedTuple):
     """What the electric part holds of the motion of each walker: search vector and traction."""
 
     z: Float[Array, "*walker free"]
-    felt: Float[Array, "*walker piece window wheel 2"]
+    motor_force: Float[Array, "*walker piece window wheel 2"]
 
 
-class _Seen(NamedTuple):
+class _Residuals(NamedTuple):
     """Blocks of residuals (piece, m), and the robot they are of."""
 
     residuals: dict[str, Array]
@@ -89,7 +89,7 @@ class Density:
         return anchor.z.at[self.coordinates.structure].set(x)
 
     def of_all(
-        self, of: Callable[..., Result], x: np.ndarray | Array, held: Held | None = None
+        self, of: Callable[..., Result], x: np.ndarray | Array, held: HeldMotion | None = None
     ) -> Result:
         """A method of one vector for many, by the density of this form that compiles for all."""
         return self.mapped(of, (jnp.asarray(x), held))
@@ -108,7 +108,7 @@ class Density:
         return compiled(self.anchor, many)
 
     def terms(
-        self, x: Float[np.ndarray, "walker size"], held: Held | None = None
+        self, x: Float[np.ndarray, "walker size"], held: HeldMotion | None = None
     ) -> Float[np.ndarray, "walker term"]:
         """Terms of the log posterior of every walker: one per floor, then what floors share.
 
@@ -119,15 +119,15 @@ class Density:
         return out
 
     def slope(
-        self, x: Float[np.ndarray, "walker size"], held: Held | None = None
+        self, x: Float[np.ndarray, "walker size"], held: HeldMotion | None = None
     ) -> Float[np.ndarray, "walker size"]:
         """Derivative of the log posterior of every walker; the arguments are those of `terms`."""
         return np.array(self.of_all(Density._gradient, x, held))
 
-    def _gradient(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
+    def _gradient(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
         return jax.grad(lambda x: jnp.sum(self.sums(anchor, x, held)))(x)
 
-    def sums(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
+    def sums(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
         """Terms of one vector."""
         seen, count, b = self._residuals(anchor, x, held), len(self.floors), anchor.batch
         out = jnp.zeros(count + 1)
@@ -146,7 +146,7 @@ class Density:
         pull = (x - self.problem.space.prior_mean[at.structure]) / anchor.prior_std[at.structure]
         return out.at[np.where(at.group < 0, count, at.group)].add(-0.5 * pull**2)
 
-    def whitened(self, anchor: Anchor, x: Array, held: Held | None) -> Array:
+    def whitened(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
         """Whitened residuals of the electric part and of the prior, of one vector."""
         seen, at = self._residuals(anchor, x, held), self.coordinates.structure
         pull = (x - self.problem.space.prior_mean[at]) / anchor.prior_std[at]
@@ -158,7 +158,7 @@ class Density:
         """Log likelihood of every piece given what runs share, by block of residuals."""
         return self.of_all(Density._pieces, x)
 
-    def _pieces(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
+    def _pieces(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> dict[str, Array]:
         left, robot = self.left(anchor, x, held)
         out = {k: anchor.log_student(k, r) for k, r in left.items()}
         camera, spread = lk.log_jacobians(robot, anchor.batch, anchor.noise(robot))
@@ -172,48 +172,50 @@ class Density:
         """Blocks of residuals less what runs share, of many vectors (draw, piece, m)."""
         return self.of_all(Density._rest, x)
 
-    def _rest(self, anchor: Anchor, x: Array, held: Held | None) -> dict[str, Array]:
+    def _rest(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> dict[str, Array]:
         return self.left(anchor, x, held).residuals
 
-    def left(self, anchor: Anchor, x: Array, held: Held | None) -> _Seen:
+    def left(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> _Residuals:
         """Residuals less what runs share at its conditional mean, of one vector."""
         seen = self._residuals(anchor, x, held)
         if "motion" not in seen.residuals:
             return seen
         motion = seen.residuals["motion"]
-        effect = shared_effects(anchor.tied, anchor.white("motion", motion))
+        effect = mean_effects(anchor.tied, anchor.white("motion", motion))
         for of in anchor.shared:
-            off = jnp.einsum("nma,na->nm", of.effect, effect[of.pieces])
-            motion = motion.at[of.pieces].add(-off)
-        return _Seen(seen.residuals | {"motion": motion}, seen.robot)
+            off = jnp.einsum("nma,na->nm", of.effect, effect[of.segments])
+            motion = motion.at[of.segments].add(-off)
+        return _Residuals(seen.residuals | {"motion": motion}, seen.robot)
 
-    def _residuals(self, anchor: Anchor, x: Array, held: Held | None) -> _Seen:
+    def _residuals(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> _Residuals:
         b, at = anchor.batch, self.coordinates
         if self.part == ELECTRIC:
             assert held is not None, "what the electric part holds of the motion"
             robot = self.problem.space.tree(held.z.at[at.structure].set(x))
-            return _Seen(lk.electric_residuals(robot, b, held.felt, anchor.noise(robot)), robot)
+            return _Residuals(
+                lk.electric_residuals(robot, b, held.motor_force, anchor.noise(robot)), robot
+            )
         z = self.full(anchor, x)
         robot = self.problem.space.tree(z)
         p = anchor.predict(robot, z)
         out = {"motion": lk.motion_residual(robot, b, p)}
         if self.part == EVERYTHING:
-            out |= lk.electric_residuals(robot, b, p.felt, anchor.noise(robot))
+            out |= lk.electric_residuals(robot, b, p.motor_force, anchor.noise(robot))
         # or the root finder is computed again for every consumer
-        return _Seen(jax.lax.optimization_barrier(out), robot)
+        return _Residuals(jax.lax.optimization_barrier(out), robot)
 
-    def hold(self, x: Float[np.ndarray, "walker size"]) -> Held:
+    def hold(self, x: Float[np.ndarray, "walker size"]) -> HeldMotion:
         """What the electric part holds of walkers of the motion part."""
         return self.of_all(Density._held, x)
 
-    def _held(self, anchor: Anchor, x: Array, _: None) -> Held:
+    def _held(self, anchor: Anchor, x: Array, _: None) -> HeldMotion:
         z = self.full(anchor, x)
-        return Held(z, anchor.predict(self.problem.space.tree(z), z).felt)
+        return HeldMotion(z, anchor.predict(self.problem.space.tree(z), z).motor_force)
 
 
-def _explained(tie: Tie, white: Float[Array, "piece m"]) -> Array:
+def _explained(tie: EffectPosterior, white: Float[Array, "piece m"]) -> Array:
     """How much smaller |y|^2 is than that of whitened residuals, by shared effects of a floor."""
-    told = jnp.einsum("nma,nm->an", tie.span, white[tie.pieces])
+    told = jnp.einsum("nma,nm->an", tie.span, white[tie.segments])
     along = jnp.einsum("anq,an->aq", tie.root, told).ravel()
     return jnp.sum(solve_triangular(tie.factor, along, lower=True) ** 2)
 
@@ -271,7 +273,7 @@ def electric_given_motion(
 
 
 def _draw(
-    density: Density, anchor: Anchor, held: Held, start: Array, student: Array, chance: Array
+    density: Density, anchor: Anchor, held: HeldMotion, start: Array, student: Array, chance: Array
 ) -> tuple[Array, Array]:
     """The last of the proposals that were accepted, and which were."""
 

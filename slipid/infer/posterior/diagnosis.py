@@ -16,7 +16,7 @@ from jaxtyping import Float
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.fit_file import curves_json, identified_json, number_json
 from slipid.infer.posterior.blocks import Chain, Plan
-from slipid.infer.result import Fit, known
+from slipid.infer.result import Fit, required
 from slipid.infer.verdicts import estimates as verdicts
 from slipid.infer.verdicts.disputed import marked
 from slipid.infer.verdicts.unidentified import members
@@ -98,11 +98,11 @@ class Posterior:
             KeyError: no such number, or fixed; names those there are.
         """
         space = self.fit.space
-        if path not in space.place:
-            raise KeyError(f"no draws of '{path}'; there are {', '.join(space.place)}")
+        if path not in space.slices:
+            raise KeyError(f"no draws of '{path}'; there are {', '.join(space.slices)}")
         d = next(e.declaration for e in space.free if e.path == path)
-        found = jax.vmap(jax.vmap(d.to_si))(jnp.asarray(self.z[..., space.place[path]]))
-        return np.asarray(found if d.tied else found[..., 0])
+        found = jax.vmap(jax.vmap(d.to_si))(jnp.asarray(self.z[..., space.slices[path]]))
+        return np.asarray(found if d.constrained else found[..., 0])
 
     @cached_property
     def tree(self) -> "DataTree":
@@ -195,9 +195,9 @@ def estimates(
     geometric mean. Directions that the fit found open stay so.
     """
     flat, open_ = draws.reshape(-1, fit.space.size), members(fit.flat)
-    out, prior_std = dict(fit.parameters), fit.judged.prior_std
+    out, prior_std = dict(fit.parameters), fit.verdict_space.prior_std
     for e in fit.space.free:
-        at, d, old = fit.space.place[e.path], e.declaration, fit.parameters[e.path]
+        at, d, old = fit.space.slices[e.path], e.declaration, fit.parameters[e.path]
         z = flat[:, at]
         values = np.asarray(jax.vmap(d.to_si)(jnp.asarray(z)))
         low, high = np.quantile(values, [0.05, 0.95], axis=0)
@@ -207,7 +207,7 @@ def estimates(
         unsaid = e.path in verdicts.NEEDS_VOLTAGE and not fit.channels.voltage
         forced = old.verdict if unsaid or old.verdict == "at_bound" else None
         from_zero = verdicts.from_zero(d, z.std(axis=0))
-        verdict, provenance = verdicts.said(ratio, from_zero, forced, e.path in open_)
+        verdict, provenance = verdicts.verdict_of(ratio, from_zero, forced, e.path in open_)
         pull = (z.mean(axis=0) - fit.space.prior_mean[at]) / prior_std[at]
         out[e.path] = replace(
             old,
@@ -232,13 +232,13 @@ def identified(found: Posterior) -> Content:
     ratios = verdicts.derived(fit.space, flat.mean(axis=0), np.cov(flat.T), fit.channels.voltage)
     content["derived"] = {e.path: number_json(_drawn(e, fit, flat)) for e in ratios}
     some = flat[:: max(1, len(flat) // 400)]
-    curves = curves_of.curves(fit.space, flat.mean(axis=0), some, known(fit.problem).batch)
+    curves = curves_of.curves(fit.space, flat.mean(axis=0), some, required(fit.problem).batch)
     return content | {"curves": curves_json(curves), "messages": list(found.messages)}
 
 
 def _drawn(ratio: verdicts.Estimate, fit: Fit, flat: np.ndarray) -> verdicts.Estimate:
     """A quotient with the interval and the std of its draws."""
-    over, under = (fit.space.place[path] for path in ratio.path.rsplit("/", 1))
+    over, under = (fit.space.slices[path] for path in ratio.path.rsplit("/", 1))
     draws = np.exp(flat[:, over] - flat[:, under])
     low, high = np.quantile(draws, [0.05, 0.95]).tolist()
     std = float(draws.std())

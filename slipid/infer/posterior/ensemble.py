@@ -17,8 +17,8 @@ import numpy as np
 from emcee.state import State
 
 from slipid.infer.posterior import diagnosis
-from slipid.infer.posterior.blocks import Block, Chain, Plan, Record, Target
-from slipid.infer.posterior.proposals import WAY, Hamiltonian, families, moves
+from slipid.infer.posterior.blocks import BlockStore, Chain, ChainBlock, LogDensity, Plan
+from slipid.infer.posterior.proposals import QUARTER_TURN, Hamiltonian, families, moves
 from slipid.infer.posterior.transport_map import Transport, learnt
 
 RandomState = tuple[str, np.ndarray, int, int, float]
@@ -33,12 +33,12 @@ DRAWS_PER_EFFECTIVE = 20.0
 
 
 def extended(
-    target: Target,
+    target: LogDensity,
     plan: Plan,
     part: str,
-    record: Record,
-    done: Sequence[Block] | None = None,
-) -> list[Block]:
+    record: BlockStore,
+    done: Sequence[ChainBlock] | None = None,
+) -> list[ChainBlock]:
     """Blocks of a part until `diagnose` finds them good or the plan's most, each kept when made.
 
     Goes on from the blocks that are done, by default those of the record.
@@ -51,7 +51,7 @@ def extended(
     return blocks
 
 
-def _ended(blocks: list[Block], plan: Plan) -> bool:
+def _ended(blocks: list[ChainBlock], plan: Plan) -> bool:
     after = len(blocks) - plan.warm_up[-1]
     if len(blocks) >= plan.most:
         return True
@@ -61,12 +61,14 @@ def _ended(blocks: list[Block], plan: Plan) -> bool:
     return diagnosis.diagnose(chain(blocks, plan), plan).converged
 
 
-def chain(blocks: Sequence[Block], plan: Plan) -> Chain:
+def chain(blocks: Sequence[ChainBlock], plan: Plan) -> Chain:
     """Positions after the warm-up."""
     return np.concatenate([b.chain for b in blocks[plan.warm_up[-1] :]], axis=1)
 
 
-def _block(target: Target, plan: Plan, blocks: list[Block], tell: Callable[[int], None]) -> Block:
+def _block(
+    target: LogDensity, plan: Plan, blocks: list[ChainBlock], tell: Callable[[int], None]
+) -> ChainBlock:
     states, map, angle = _begin(target, plan, blocks)
     stop, told = threading.Event(), [0] * plan.ensembles
 
@@ -105,7 +107,7 @@ def _block(target: Target, plan: Plan, blocks: list[Block], tell: Callable[[int]
     ends = [f[2] for f in found]
     places = np.stack([f[0] for f in found])
     x, log = map.placed(places.reshape(-1, places.shape[-1]))
-    block = Block(
+    block = ChainBlock(
         number=len(blocks),
         chain=x.reshape(places.shape),
         log_prob=np.stack([f[1] for f in found]) - log.sum(axis=1).reshape(places.shape[:-1]),
@@ -122,7 +124,7 @@ def _block(target: Target, plan: Plan, blocks: list[Block], tell: Callable[[int]
 
 
 def _begin(
-    target: Target, plan: Plan, blocks: list[Block]
+    target: LogDensity, plan: Plan, blocks: list[ChainBlock]
 ) -> tuple[list[State], Transport, np.ndarray]:
     """State of every ensemble in mapped coordinates, the map, and the angle."""
     if not blocks:
@@ -137,7 +139,7 @@ def _begin(
     return states, last.map, last.angle
 
 
-def _start(target: Target, plan: Plan, ensemble: int) -> tuple[np.ndarray, RandomState]:
+def _start(target: LogDensity, plan: Plan, ensemble: int) -> tuple[np.ndarray, RandomState]:
     """Walkers spread wider than the fit's own uncertainty, at places with a density."""
     root = np.linalg.cholesky(target.covariance)
     wide = plan.spread * np.geomspace(0.25, 1.0, plan.walkers)[:, None]
@@ -159,14 +161,18 @@ def _start(target: Target, plan: Plan, ensemble: int) -> tuple[np.ndarray, Rando
 
 
 def _with_learnt(
-    block: Block, target: Target, plan: Plan, blocks: list[Block], turns: list[list[float]]
-) -> Block:
+    block: ChainBlock,
+    target: LogDensity,
+    plan: Plan,
+    blocks: list[ChainBlock],
+    turns: list[list[float]],
+) -> ChainBlock:
     """The block with what the warm-up has learnt for the next."""
     count = block.number + 1
     if count > plan.warm_up[-1]:
         return block
     more = np.array([np.mean(of) - ACCEPTED if of else 0.0 for of in turns])
-    block = replace(block, angle=np.clip(block.angle * np.exp(more), LEAST_ANGLE, WAY))
+    block = replace(block, angle=np.clip(block.angle * np.exp(more), LEAST_ANGLE, QUARTER_TURN))
     if count in plan.warm_up[:-1]:
         recent = [b.chain for b in [*blocks, block][count // 2 :]]
         draws = np.concatenate(recent, axis=1).reshape(-1, len(target.centre))

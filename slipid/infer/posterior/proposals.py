@@ -17,14 +17,14 @@ from jaxtyping import Float, Int
 from numpy.random import RandomState
 from scipy.special import gammaln
 
-from slipid.infer.posterior.blocks import Target
+from slipid.infer.posterior.blocks import LogDensity
 from slipid.infer.posterior.transport_map import Matrix
 
 STUDENT = 0.2
 """Part of independent draws that come from a Student t, so that no tail is left out."""
 DEGREES = 8.0
 """Degrees of freedom of that Student t."""
-WAY = 0.5 * np.pi
+QUARTER_TURN = 0.5 * np.pi
 """Length of a Hamiltonian move [rad]: a quarter turn leads to an independent draw of a Gaussian."""
 MOST_STEPS, SHORTEST = 12, 0.2
 """Steps of a Hamiltonian move at most, and the shortest over the longest that is made."""
@@ -49,7 +49,7 @@ class Family:
     groups: tuple[int, ...] | None
 
 
-def families(target: Target) -> list[Family]:
+def families(target: LogDensity) -> list[Family]:
     """Coordinates of all groups, and those that they share."""
     groups = tuple(int(g) for g in np.unique(target.group) if g >= 0)
     places = tuple(np.flatnonzero(target.group == g) for g in groups)
@@ -127,7 +127,7 @@ def _log_density(u: Matrix) -> Float[np.ndarray, " walker"]:
     return np.asarray(np.logaddexp(np.log(1 - STUDENT) - 0.5 * q, np.log(STUDENT) + of_t))
 
 
-class Differential(FamilyMove):
+class DifferentialEvolution(FamilyMove):
     """Differential evolution: differences of walkers that stand still, at times whole ones.
 
     Source: ter Braak 2006, Statistics and Computing 16; whole differences lead from mode to mode.
@@ -146,7 +146,7 @@ class Differential(FamilyMove):
         return old + scale[:, None] * (still[first] - still[second]) + jitter, np.zeros(count)
 
 
-class Along(FamilyMove):
+class CoordinateWalk(FamilyMove):
     """Random walk of x of one coordinate of each group, or of a shared one.
 
     Where data say no more than that a number is small, its logarithm may be anything: a plateau
@@ -154,7 +154,7 @@ class Along(FamilyMove):
     so that those of x follow as the map says, or else the others of x.
     """
 
-    def __init__(self, target: Target, groups: tuple[int, ...] | None):
+    def __init__(self, target: LogDensity, groups: tuple[int, ...] | None):
         assert target.map, "a target that is seen by a map"
         everything = np.arange(len(target.group))
         of_group = [np.flatnonzero(target.group == g) for g in groups or ()]
@@ -192,7 +192,7 @@ class Hamiltonian(FamilyMove):
     Source: Beskos et al. 2011, Stochastic Processes and their Applications 121, section 4.
     """
 
-    def __init__(self, target: Target, family: Family, angle: float):
+    def __init__(self, target: LogDensity, family: Family, angle: float):
         super().__init__(family)
         self.target, self.angle = target, angle
         self.accepted: list[float] = []
@@ -201,7 +201,7 @@ class Hamiltonian(FamilyMove):
         count, places = len(x), self.family.places
         # shorter steps, now and then, and more of them, for walkers where the density is steep
         h = self.angle * SHORTEST ** (random.uniform() ** 3)
-        steps = int(np.clip(random.uniform(0.7, 1.3) * WAY / h + 0.5, 1, MOST_STEPS))
+        steps = int(np.clip(random.uniform(0.7, 1.3) * QUARTER_TURN / h + 0.5, 1, MOST_STEPS))
         h *= random.uniform(0.8, 1.0, (count, 1))
         u, start, lost = x.copy(), np.zeros(x.shape), np.zeros(count, bool)
         own = np.concatenate(places)
@@ -239,7 +239,7 @@ def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
     return c * u + s * p, c * p - s * u
 
 
-def moves(target: Target, angles: Float[np.ndarray, " family"]) -> list[tuple[Move, float]]:
+def moves(target: LogDensity, angles: Float[np.ndarray, " family"]) -> list[tuple[Move, float]]:
     """Moves in the target's coordinates, and how often each is made.
 
     Angles are the steps of Hamiltonian moves of every family.
@@ -247,8 +247,8 @@ def moves(target: Target, angles: Float[np.ndarray, " family"]) -> list[tuple[Mo
     of_family = families(target)
     found: list[tuple[Move, float]] = []
     for family, angle in zip(of_family, angles, strict=True):
-        found.append((Along(target, family.groups), ALONG))
+        found.append((CoordinateWalk(target, family.groups), ALONG))
         found.append((Independence(family), INDEPENDENT / len(of_family)))
-        found.append((Differential(family), DIFFERENTIAL / len(of_family)))
+        found.append((DifferentialEvolution(family), DIFFERENTIAL / len(of_family)))
         found.append((Hamiltonian(target, family, float(angle)), HAMILTONIAN / len(of_family)))
     return found

@@ -26,11 +26,19 @@ from slipid.fit.hierarchy import effect_information, pooled_stds
 from slipid.fit.problem import Problem, linear
 from slipid.fit.variances import DEGREES, VARIANCE_SPREAD, information
 from slipid.infer.posterior import diagnosis, ensemble
-from slipid.infer.posterior.blocks import Block, Chain, Plan, Record, Target, packed, unpacked
+from slipid.infer.posterior.blocks import (
+    BlockStore,
+    Chain,
+    ChainBlock,
+    LogDensity,
+    Plan,
+    packed,
+    unpacked,
+)
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted, effects_at
 from slipid.infer.posterior.density import Density, electric_given_motion
 from slipid.infer.posterior.diagnosis import Posterior
-from slipid.infer.result import Fit, known
+from slipid.infer.result import Fit, required
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.files import write_bytes
@@ -51,8 +59,8 @@ def sampled(
     It goes on from the blocks that an earlier call has kept, and keeps new ones.
     """
 
-    def done(part: str) -> list[Block]:
-        blocks: list[Block] = []
+    def done(part: str) -> list[ChainBlock]:
+        blocks: list[ChainBlock] = []
         if kept is None:
             return blocks
         while (arrays := kept.load(f"{part}-{len(blocks):04d}")) is not None:
@@ -61,7 +69,7 @@ def sampled(
             report.line(f"going on from block {len(blocks)} ({part}) of {kept.folder}")
         return blocks
 
-    def keep(part: str, block: Block) -> None:
+    def keep(part: str, block: ChainBlock) -> None:
         if kept is not None:
             kept.save(f"{part}-{block.number:04d}", packed(block))
         _tell(block, plan, report)
@@ -69,10 +77,10 @@ def sampled(
     def steps(part: str, count: int) -> None:
         report.stage(f"sampling {part}")
 
-    return sample(fit, plan, draws, Record(done, keep, steps))
+    return sample(fit, plan, draws, BlockStore(done, keep, steps))
 
 
-def _tell(block: Block, plan: Plan, report: Reporter) -> None:
+def _tell(block: ChainBlock, plan: Plan, report: Reporter) -> None:
     """Progress of a chain; the time left is what it takes at most."""
     count = block.number + 1
     warm = "warm-up, " if count <= plan.warm_up[-1] else ""
@@ -84,15 +92,15 @@ def _tell(block: Block, plan: Plan, report: Reporter) -> None:
     report.advance(count, plan.most, what)
 
 
-def sample(fit: Fit, plan: Plan, draws: int = 400, record: Record | None = None) -> Posterior:
+def sample(fit: Fit, plan: Plan, draws: int = 400, record: BlockStore | None = None) -> Posterior:
     """Posterior around a fit, so many draws of each ensemble."""
-    problem, fitted = known(fit.problem), Fitted.of(fit)
-    assert problem.several is None, "runs on one floor each"
-    record = record or Record()
-    parts = (EVERYTHING,) if problem.target.joint else (MOTION, ELECTRIC)
+    problem, fitted = required(fit.problem), Fitted.of(fit)
+    assert problem.multi_floor is None, "runs on one floor each"
+    record = record or BlockStore()
+    parts = (EVERYTHING,) if problem.objective.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
     at = first.coordinates
-    target = Target(first.terms, first.slope, at.group, first.centre, first.covariance)
+    target = LogDensity(first.terms, first.slope, at.group, first.centre, first.covariance)
     blocks = ensemble.extended(target, plan, parts[0], record)
     chain = ensemble.chain(blocks, plan)
     found = diagnosis.diagnose(chain, plan)
@@ -127,7 +135,7 @@ def sample(fit: Fit, plan: Plan, draws: int = 400, record: Record | None = None)
 
 
 def thinned(
-    chain: Chain, blocks: Sequence[Block], draws: int
+    chain: Chain, blocks: Sequence[ChainBlock], draws: int
 ) -> tuple[Float[np.ndarray, "ensemble draw size"], Float[np.ndarray, "ensemble draw"]]:
     """Draws spread evenly over steps and walkers; some repeat where there are too few."""
     log_prob = np.concatenate([b.log_prob for b in blocks], axis=1)
@@ -147,22 +155,22 @@ def drawn_variances(
     """
     log_v, keep = fitted.log_variance, np.ones(len(problem.windows))
     electric = problem.electric(fitted.z, log_v)
-    residual, jacobian, felt = linear(problem.target, fitted.z, electric)
-    through = problem.through_voltage(fitted.z, log_v, felt)
+    residual, jacobian, motor_force = linear(problem.objective, fitted.z, electric)
+    through = problem.voltage_information(fitted.z, log_v, motor_force)
     effect = effects_at(problem, residual, log_v)
-    weight = problem.seen(residual, log_v, keep, effect).whitening.weight["motion"]
+    weight = problem.weighed(residual, log_v, keep, effect).whitening.weight["motion"]
     motion = residual["motion"], jacobian["motion"]
     told = np.array(information(problem.noise.blocks, log_v, keep, through))
-    of_blocks = np.asarray(problem.target.scored)
+    of_blocks = np.asarray(problem.objective.scored)
     told *= of_blocks[:, None] & of_blocks
-    told += effect_information(problem.target, motion, weight, fitted.covariance, log_v)
+    told += effect_information(problem.objective, motion, weight, fitted.covariance, log_v)
     told[np.diag_indices_from(told)] += np.where(of_blocks, 0.0, 1 / VARIANCE_SPREAD**2)
     root = np.linalg.cholesky(np.linalg.inv(told))
     rng = np.random.default_rng([seed, 1])
     out = log_v + rng.standard_normal((*shape, len(log_v))) @ root.T
     precision = np.linalg.inv(fitted.covariance)
-    pooled = pooled_stds(precision, fitted.z, problem.target, log_v)
-    out[..., problem.target.pooled] = 2 * np.log(rng.choice(pooled.std, shape, p=pooled.weight))
+    pooled = pooled_stds(precision, fitted.z, problem.objective, log_v)
+    out[..., problem.objective.pooled] = 2 * np.log(rng.choice(pooled.std, shape, p=pooled.weight))
     return np.asarray(out)
 
 
@@ -174,7 +182,7 @@ _AXES = ("x", "y", "yaw")
 
 def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
     """All groups of the file, with these attributes of the whole beside schema and data."""
-    fit, problem = found.fit, known(found.fit.problem)
+    fit, problem = found.fit, required(found.fit.problem)
     w, robot, runs = problem.windows, problem.robot, [name for name, _ in fit.runs]
     values, dims, units = _numbers(problem.space, found)
     noise, noise_dims = _noise(problem, found)
@@ -266,7 +274,9 @@ def _data(
     """
     w = problem.windows
     middle = problem.space.tree(jnp.asarray(found.z.mean(axis=(0, 1))))
-    measured = {"increment": np.asarray(jax.jit(lk.measured)(middle, problem.batch.pose))}
+    measured = {
+        "increment": np.asarray(jax.jit(lk.measured_increments)(middle, problem.batch.pose))
+    }
     dims = {"increment": ["piece", "window", "direction"]}
     gaps = {"increment": new["motion"]}
     if w.has_current:

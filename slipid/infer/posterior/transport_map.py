@@ -107,7 +107,7 @@ def _sinh_arcsinh(x: Vector) -> tuple[float, float, float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class Bend:
+class Polynomials:
     """Polynomials a (shift) and b (scale) of a group's coordinates.
 
     Factors are the columns whose product each monomial is, from (w, 1).
@@ -128,7 +128,7 @@ class Bend:
         return np.asarray((w - f @ self.shift.T) * np.exp(-f @ self.scale.T))
 
     @staticmethod
-    def none(size: int) -> "Bend":
+    def none(size: int) -> "Polynomials":
         """No bend, with all monomials that there can be."""
         one = size  # the column of ones
         factors = [(one, one, one)] + [(k, one, one) for k in range(size)]
@@ -136,13 +136,13 @@ class Bend:
         factors += [(*pair, one) for pair in combinations_with_replacement(squared, 2)]
         factors += [(k, k, k) for k in cubed]
         nothing = np.zeros((size, len(factors)))
-        return Bend(np.array(factors), nothing, nothing.copy())
+        return Polynomials(np.array(factors), nothing, nothing.copy())
 
     @staticmethod
-    def learnt(w: Matrix, effective: float) -> "Bend":
+    def learnt(w: Matrix, effective: float) -> "Polynomials":
         """Polynomials for draws that are worth so many independent ones."""
         size = w.shape[1]
-        bend = Bend.none(size)
+        bend = Polynomials.none(size)
         f = bend.monomials(w)
         reach = np.where(bend.factors >= size, -1, bend.factors).max(axis=1)
         for i in range(size):
@@ -192,7 +192,7 @@ MOST_DRAWS = 4000
 
 
 @dataclass(frozen=True, eq=False)
-class Stair:
+class Stage:
     """Some coordinates, by their places, after those they follow.
 
     Slope is the derivative of own ones by given ones, root the Cholesky factor of the
@@ -203,7 +203,7 @@ class Stair:
     given: Int[np.ndarray, " given"]
     slope: Float[np.ndarray, "given own"]
     root: Float[np.ndarray, "own own"]
-    bend: Bend | None
+    bend: Polynomials | None
 
     def left(self, about: Matrix) -> Matrix:
         """What others do not say of own coordinates, by the root.
@@ -222,7 +222,7 @@ class Transport:
     """
 
     mean: Vector
-    stairs: tuple[Stair, ...]
+    stairs: tuple[Stage, ...]
     last: Warp
 
     def forward(self, x: Matrix) -> Matrix:
@@ -244,14 +244,14 @@ class Transport:
         return np.array(_pulled(self._back, u, slope(self.placed(u)[0])))
 
     @cached_property
-    def _back(self) -> "Steps":
+    def _back(self) -> "InverseSteps":
         with jax.ensure_compile_time_eval():  # kept, so never a tracer's
             return _steps(self)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
-class Steps:
+class InverseSteps:
     """The way from u to x, a coordinate at a time, in arrays whose shapes nothing learnt changes.
 
     XLA compiles it once so, though stairs and monomials are others after every look at the draws.
@@ -273,7 +273,7 @@ class Steps:
     scale: Array
 
 
-def _steps(map: Transport) -> Steps:
+def _steps(map: Transport) -> InverseSteps:
     size = len(map.mean)
     slope, root = np.zeros((size, 2 * size + 1)), np.zeros(size)
     factors = np.full((size, MOST_MONOMIALS + 1, 3), 2 * size)
@@ -293,15 +293,15 @@ def _steps(map: Transport) -> Steps:
     order = np.concatenate([s.own for s in map.stairs])
     # on the device once, not in every call
     arrays = (map.mean, map.last, order, slope, root, factors, shift, scale)
-    return Steps(*jax.device_put(arrays))
+    return InverseSteps(*jax.device_put(arrays))
 
 
 _Step = tuple[Array, Array, Array, Array, Array, Array]
-"""A row of `Steps`: place, slope, root, factors, shift, scale."""
+"""A row of `InverseSteps`: place, slope, root, factors, shift, scale."""
 
 
 @jax.jit
-def _placed(map: Steps, u: Array) -> tuple[Array, Array]:
+def _placed(map: InverseSteps, u: Array) -> tuple[Array, Array]:
     rows, size = u.shape
     v = map.last.back(u)
 
@@ -321,7 +321,7 @@ def _placed(map: Steps, u: Array) -> tuple[Array, Array]:
 
 
 @jax.jit
-def _pulled(map: Steps, u: Array, slope: Array) -> Array:
+def _pulled(map: InverseSteps, u: Array, slope: Array) -> Array:
     (_, log), back = jax.vjp(lambda u: _placed(map, u), u)
     (out,) = back((slope, jnp.ones_like(log)))
     return jnp.asarray(out)
@@ -335,7 +335,7 @@ def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray) -> Transport:
     return Transport(mean, _stairs(covariance, group, covariance), Warp.none(len(mean)))
 
 
-def _stairs(covariance: Matrix, group: np.ndarray, at_mode: Matrix) -> tuple[Stair, ...]:
+def _stairs(covariance: Matrix, group: np.ndarray, at_mode: Matrix) -> tuple[Stage, ...]:
     """Stairs of a Gaussian, shared coordinates first, then group by group.
 
     Coordinates that are widest at the mode come first in a stair: a valley has its direction at the
@@ -348,8 +348,8 @@ def _stairs(covariance: Matrix, group: np.ndarray, at_mode: Matrix) -> tuple[Sta
             continue
         own = own[np.argsort(-np.diag(_given(at_mode, own, given)[1]))]
         slope, left = _given(covariance, own, given)
-        bend = Bend.none(len(own)) if g >= 0 else None
-        stairs.append(Stair(own, given, slope, np.linalg.cholesky(left), bend))
+        bend = Polynomials.none(len(own)) if g >= 0 else None
+        stairs.append(Stage(own, given, slope, np.linalg.cholesky(left), bend))
     return tuple(stairs)
 
 
@@ -370,7 +370,7 @@ def learnt(draws: Matrix, effective: float, covariance: Matrix, group: np.ndarra
     about, stairs = some - mean, []
     both = (effective * np.cov(about.T) + size * covariance) / (effective + size)
     for s in _stairs(both, group, covariance):
-        bend = Bend.learnt(s.left(about), effective) if s.bend else None
+        bend = Polynomials.learnt(s.left(about), effective) if s.bend else None
         stairs.append(replace(s, bend=bend))
     found = Transport(mean, tuple(stairs), Warp.none(size))
     return replace(found, last=Warp.learnt(found.forward(some)))

@@ -7,18 +7,18 @@ from dataclasses import asdict
 from itertools import zip_longest
 from typing import Protocol
 
-from slipid.lab.benchmark.floors.part import HuskyFloors, RobotinoFloors, felt_rows
-from slipid.lab.benchmark.judge import Row
-from slipid.lab.benchmark.own import NAME
+from slipid.lab.benchmark.floors.part import HuskyFloorTask, RobotinoFloorTask, husky_classifiers
 from slipid.lab.benchmark.protocols import PROTOCOLS, splits
-from slipid.lab.benchmark.rectangle import CONTROLLERS, Rectangle
+from slipid.lab.benchmark.rectangle import CONTROLLERS, RectangleTask
 from slipid.lab.benchmark.rows import ROWS
-from slipid.lab.benchmark.sets import SOURCES, there
+from slipid.lab.benchmark.scores import FoldScore
+from slipid.lab.benchmark.sets import SOURCES, is_available
+from slipid.lab.benchmark.slipid_rows import NAME
 from slipid.lab.benchmark.summary import RowSummary, summary
-from slipid.lab.benchmark.tuned import reading
-from slipid.lab.benchmark.work import OWN_MAP, QUICK_KIND, Piece, Wish, data_of
+from slipid.lab.benchmark.tuning import reading
+from slipid.lab.benchmark.work import OWN_MAP, QUICK_KIND, BenchmarkOptions, FoldTask, data_of
 from slipid.support.checkpoint import versions
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.executor import results
 from slipid.support.files import Content, writable, write_json
 from slipid.support.jax_setup import setup_jax
@@ -29,7 +29,7 @@ Tables = dict[str, dict[str, dict[str, RowSummary]]]
 """Summaries by data set, protocol and row."""
 
 
-class Part(Protocol):
+class BenchmarkTask(Protocol):
     """A part of the work, which keeps what it finds."""
 
     @property
@@ -42,7 +42,7 @@ class Part(Protocol):
         ...
 
 
-def benchmark(wish: Wish, executor: Executor, report: Reporter) -> Content:
+def benchmark(wish: BenchmarkOptions, executor: Executor, report: Reporter) -> Content:
     """Run every row on every data set that is there, and write benchmark.json.
 
     What is done is kept, and not done again; a row that fails is said, and stops no other.
@@ -53,7 +53,7 @@ def benchmark(wish: Wish, executor: Executor, report: Reporter) -> Content:
     began = time.monotonic()
     setup_jax(quiet=True)
     _known(wish)
-    sources = [source for source in SOURCES if there(source, wish.data)]
+    sources = [source for source in SOURCES if is_available(source, wish.data)]
     for source in SOURCES:
         if source not in sources:
             report.line(f"skipped: {source.name}: no folder {wish.data / source.folder}")
@@ -63,15 +63,15 @@ def benchmark(wish: Wish, executor: Executor, report: Reporter) -> Content:
     each = []
     for source in sources:
         try:
-            each.append(pieces_of(wish, source.name))
+            each.append(tasks_of(wish, source.name))
         except Exception as error:  # other data sets are there all the same
-            unread[source.name] = Row.of_error(error).absent
+            unread[source.name] = FoldScore.of_error(error).absent
             report.line(f"skipped: {source.name}: {unread[source.name]}")
     pieces = in_turn(each)
-    felt = [part for part in (HuskyFloors(wish), RobotinoFloors(wish)) if part.is_asked]
-    rectangle = Rectangle(wish)
+    felt = [part for part in (HuskyFloorTask(wish), RobotinoFloorTask(wish)) if part.is_asked]
+    rectangle = RectangleTask(wish)
     # the Robotino's floors come last: they take the fits that were made for its headings
-    parts: list[Part] = [*pieces, *felt]
+    parts: list[BenchmarkTask] = [*pieces, *felt]
     if not wish.quick and set(CONTROLLERS) & set(wish.only or CONTROLLERS):
         parts.insert(0, rectangle)
     report.stage(f"{len(parts)} parts")
@@ -96,7 +96,7 @@ def benchmark(wish: Wish, executor: Executor, report: Reporter) -> Content:
     return content
 
 
-def pieces_of(wish: Wish, name: str) -> list[Piece]:
+def tasks_of(wish: BenchmarkOptions, name: str) -> list[FoldTask]:
     """All folds that a source is split into."""
     data = data_of(wish, name)
     found = []
@@ -104,11 +104,11 @@ def pieces_of(wish: Wish, name: str) -> list[Piece]:
         if (wish.quick and kind != QUICK_KIND) or (kind == "all" and data.crossing is None):
             continue
         folds = splits(data.facts, kind)
-        found += [Piece(wish, name, kind, f.fold) for f in folds[: 1 if wish.quick else None]]
+        found += [FoldTask(wish, name, kind, f.fold) for f in folds[: 1 if wish.quick else None]]
     return found
 
 
-def in_turn(each: Sequence[Sequence[Piece]]) -> list[Piece]:
+def in_turn(each: Sequence[Sequence[FoldTask]]) -> list[FoldTask]:
     """Pieces of all sources by turns.
 
     What one process has compiled for a source lies in the cache when another comes to it.
@@ -116,28 +116,28 @@ def in_turn(each: Sequence[Sequence[Piece]]) -> list[Piece]:
     return [piece for row in zip_longest(*each) for piece in row if piece is not None]
 
 
-def work(part: Part) -> str:
+def work(part: BenchmarkTask) -> str:
     """Do a part."""
     return part.run()
 
 
-def _known(wish: Wish) -> None:
+def _known(wish: BenchmarkOptions) -> None:
     if not wish.data.is_dir():
         raise DataError(
             f"{wish.data}: no such folder; expected the folder of the data sets (--data)"
         )
-    classifiers = [method.name for method in felt_rows()]
+    classifiers = [method.name for method in husky_classifiers()]
     every = list(dict.fromkeys([NAME, OWN_MAP, *ROWS, *classifiers, *CONTROLLERS]))
     for name in wish.only:
         if name not in every:
             raise DataError(
-                f"no row '{name}'{near(name, every)}; expected some of {', '.join(every)}"
+                f"no row '{name}'{did_you_mean(name, every)}; expected some of {', '.join(every)}"
             )
 
 
-def tables_of(pieces: Sequence[Piece]) -> Tables:
+def tables_of(pieces: Sequence[FoldTask]) -> Tables:
     """Summaries of what was kept of all pieces."""
-    folds: dict[tuple[str, str], dict[str, list[Row]]] = {}
+    folds: dict[tuple[str, str], dict[str, list[FoldScore]]] = {}
     for piece in pieces:
         for (protocol, name), row in piece.rows().items():
             folds.setdefault((piece.source, protocol), {}).setdefault(name, []).append(row)
@@ -151,7 +151,9 @@ def tables_of(pieces: Sequence[Piece]) -> Tables:
     return tables
 
 
-def _set(wish: Wish, name: str, protocols: Mapping[str, Mapping[str, RowSummary]]) -> Content:
+def _set(
+    wish: BenchmarkOptions, name: str, protocols: Mapping[str, Mapping[str, RowSummary]]
+) -> Content:
     data = data_of(wish, name)
     return {
         "about": data.source.about,

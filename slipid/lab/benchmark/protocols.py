@@ -10,7 +10,7 @@ from jaxtyping import Int
 
 from slipid.data.runs import Runs
 from slipid.predict import folds as compared
-from slipid.predict.folds import Facts, speeds
+from slipid.predict.folds import FoldKey, speeds
 from slipid.predict.slip_model import Run
 
 FOLDS = 2
@@ -26,7 +26,7 @@ ALL = -1
 Labels = Int[np.ndarray, " run"]
 
 
-class Protocol(NamedTuple):
+class BenchmarkProtocol(NamedTuple):
     """A question.
 
     Attributes:
@@ -43,13 +43,15 @@ class Protocol(NamedTuple):
     strange: bool = False
 
 
-PROTOCOLS: dict[str, Protocol] = {
-    "known_floor": Protocol("headings", True, "new headings on a floor that is told"),
-    "unknown_floor": Protocol("headings", False, "new headings, the floor is not told"),
-    "sectors": Protocol("sectors", True, "left-out sectors of 60 degrees, the floor is told"),
-    "speeds": Protocol("speeds", True, "a left-out speed, the floor is told"),
-    "new_floor": Protocol("floors", False, "a floor that no method has seen", True),
-    "two_floors": Protocol("all", False, "runs from one floor to another, not told where"),
+PROTOCOLS: dict[str, BenchmarkProtocol] = {
+    "known_floor": BenchmarkProtocol("headings", True, "new headings on a floor that is told"),
+    "unknown_floor": BenchmarkProtocol("headings", False, "new headings, the floor is not told"),
+    "sectors": BenchmarkProtocol(
+        "sectors", True, "left-out sectors of 60 degrees, the floor is told"
+    ),
+    "speeds": BenchmarkProtocol("speeds", True, "a left-out speed, the floor is told"),
+    "new_floor": BenchmarkProtocol("floors", False, "a floor that no method has seen", True),
+    "two_floors": BenchmarkProtocol("all", False, "runs from one floor to another, not told where"),
 }
 
 
@@ -81,9 +83,9 @@ def base_of(floor: str) -> str:
     return floor.partition("@")[0]
 
 
-def facts_of(data: Runs, base_radius: float) -> list[Facts]:
+def facts_of(data: Runs, base_radius: float) -> list[FoldKey]:
     """Facts of all runs; a robot that cannot drive sideways has the direction (speed, turning)."""
-    out = compared.facts_of(data)
+    out = compared.fold_keys(data)
     for k, log in enumerate(data.logs):
         if log.wheels == 2 and np.isfinite(data.speed[k]) and log.twist_command is not None:
             ahead = float(np.median(log.twist_command[:, 0]))
@@ -93,12 +95,12 @@ def facts_of(data: Runs, base_radius: float) -> list[Facts]:
     return out
 
 
-def facts_of_run(run: Run) -> Facts:
+def facts_of_run(run: Run) -> FoldKey:
     """Facts of a run as methods are given it."""
-    return Facts(run.floor, float(np.degrees(run.heading)), run.speed)
+    return FoldKey(run.floor, float(np.degrees(run.heading)), run.speed)
 
 
-def headings(facts: Sequence[Facts]) -> Labels:
+def headings(facts: Sequence[FoldKey]) -> Labels:
     """Parts dealt at random by heading, so that one heading is in one part on every floor.
 
     Runs without a heading are dealt one by one.
@@ -110,18 +112,18 @@ def headings(facts: Sequence[Facts]) -> Labels:
     return np.random.default_rng(0).permutation(number.max() + 1)[number] % FOLDS
 
 
-def sectors(facts: Sequence[Facts]) -> Labels:
+def sectors(facts: Sequence[FoldKey]) -> Labels:
     """Parts of every other sector of directions; -1 of runs without a direction."""
     sector = compared.sectors(facts)
     return np.where(sector < 0, sector, sector % FOLDS)
 
 
-def floors(facts: Sequence[Facts]) -> Labels:
+def floors(facts: Sequence[FoldKey]) -> Labels:
     """Parts of one floor each."""
     return np.unique([base_of(f.floor) for f in facts], return_inverse=True)[1]
 
 
-KINDS: dict[str, Callable[[Sequence[Facts]], Labels]] = {
+KINDS: dict[str, Callable[[Sequence[FoldKey]], Labels]] = {
     "headings": headings,
     "sectors": sectors,
     "speeds": partial(speeds, most=SPEEDS),
@@ -129,7 +131,7 @@ KINDS: dict[str, Callable[[Sequence[Facts]], Labels]] = {
 }
 
 
-def splits(facts: Sequence[Facts], kind: str) -> list[Split]:
+def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
     """Folds of a kind; none where a part or what is left without it has too few runs.
 
     Runs of part -1 are always fitted. A floor that is left without a run is not judged.

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.deploy.deploy import ROBOT, robot_of
-from slipid.lab.benchmark import own as slipid_rows
-from slipid.lab.benchmark.judge import Row
-from slipid.lab.benchmark.work import OF_FITS, Wish, data_of, problem_of
+from slipid.deploy.deploy import ROBOT, robot_of_force_balance
+from slipid.lab.benchmark import slipid_rows
+from slipid.lab.benchmark.scores import FoldScore
+from slipid.lab.benchmark.work import OF_FITS, BenchmarkOptions, data_of, problem_of
 from slipid.lab.trial import trial
-from slipid.robot.record import Sensors
+from slipid.robot.record import LogSensors
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.files import Content, read_json, write_json
 from slipid.support.jax_setup import setup_jax
@@ -34,10 +34,10 @@ STARTS = 8
 
 
 @dataclass(frozen=True)
-class Rectangle:
+class RectangleTask:
     """The part of the work that identifies the robot which is then driven."""
 
-    wish: Wish
+    wish: BenchmarkOptions
     name: str = "rectangle"
 
     @property
@@ -52,7 +52,7 @@ class Rectangle:
         try:
             self._identify()
         except Exception as error:  # other parts are done all the same
-            write_json(self._failure, {"failed": Row.of_error(error).absent})
+            write_json(self._failure, {"failed": FoldScore.of_error(error).absent})
         return self.name
 
     @property
@@ -66,9 +66,11 @@ class Rectangle:
         key = key_of(data.job.config.hash, data.job.data_hash, code)
         everybody = np.arange(len(data.logged))
         kept = Checkpoint(self.folder, key)
-        own = slipid_rows.fit_own(data.job, problem_of(self.wish, SOURCE), everybody, kept)
-        sensors = Sensors(current_is_signed=data.logged.current_is_signed, voltage=True)
-        robot_of(own.contact, own.highest_speed, own.trend, sensors).save(self.folder / ROBOT)
+        own = slipid_rows.fit_slipid(data.job, problem_of(self.wish, SOURCE), everybody, kept)
+        sensors = LogSensors(current_is_signed=data.logged.current_is_signed, voltage=True)
+        robot_of_force_balance(own.contact, own.highest_speed, own.trend, sensors).save(
+            self.folder / ROBOT
+        )
 
     def drive(self, executor: Executor, report: Reporter) -> Content:
         """Drive all controllers on the virtual test site, or where MuJoCo is missing on the twin.
@@ -81,7 +83,7 @@ class Rectangle:
         plant = "testsite" if find_spec("mujoco") is not None else "twin"
         asked = [name for name in CONTROLLERS if not self.wish.only or name in self.wish.only]
         try:
-            wish = trial.Wish(plant, controllers=tuple(asked), starts=STARTS)
+            wish = trial.TrialOptions(plant, controllers=tuple(asked), starts=STARTS)
             return trial.trial(self.folder, wish, executor, report).content
         except Exception as error:  # all else is written all the same
-            return {"failed": Row.of_error(error).absent}
+            return {"failed": FoldScore.of_error(error).absent}

@@ -112,7 +112,7 @@ def absent(rows: Content) -> list[str]:
     return [f"{', '.join(names)}: {reason}" for reason, names in why.items()]
 
 
-class Other(NamedTuple):
+class ExtraTable(NamedTuple):
     """A part of benchmark.json that is one table, or why there is none."""
 
     title: str
@@ -121,19 +121,19 @@ class Other(NamedTuple):
     said: str = ""
 
 
-def others(found: Content) -> list[tuple[str, Other]]:
+def others(found: Content) -> list[tuple[str, ExtraTable]]:
     """Tables beside those of the data sets, by their names."""
-    parts: list[tuple[str, Content, Callable[[Content], Other]]]
+    parts: list[tuple[str, Content, Callable[[Content], ExtraTable]]]
     parts = [(name, one, felt) for name, one in found["floors"].items()]
     if found["rectangle"] is not None:
         parts.append(("rectangle", found["rectangle"], rectangle))
     return [
-        (name, Other("", (), [], f"failed: {one['failed']}") if "failed" in one else made(one))
+        (name, ExtraTable("", (), [], f"failed: {one['failed']}") if "failed" in one else made(one))
         for name, one, made in parts
     ]
 
 
-def rectangle(driven: Content) -> Other:
+def rectangle(driven: Content) -> ExtraTable:
     """Controllers of the trial, the least closure error first."""
     plant = {"testsite": "the virtual test site", "twin": "the identified model itself"}
     runs = min(row["runs"] for row in driven["summary"].values())
@@ -150,10 +150,10 @@ def rectangle(driven: Content) -> Other:
         closure = f"{row['closure_error_median']:.0f} [{low:.0f}, {high:.0f}]"
         finished, cross = f"{100 * row['finished_share']:.0f}", f"{row['cross_track_rmse']:.0f}"
         body.append((name, closure, said, finished, cross))
-    return Other(title, head, body)
+    return ExtraTable(title, head, body)
 
 
-def felt(found: Content) -> Other:
+def felt(found: Content) -> ExtraTable:
     """Classifiers: how often they are right, by the time heard; the best at the end first."""
     chance = f"always naming the commonest floor is right in {100 * found['chance']:.0f} %"
     title = f"{found['about']}; {found['runs']} runs; {chance}"
@@ -170,7 +170,7 @@ def felt(found: Content) -> Other:
         ]
         over = in_words("behind", row["after"][-1]["behind"])
         body.append((row["name"], *right, over, str(row["numbers"])))
-    return Other(title, head, body)
+    return ExtraTable(title, head, body)
 
 
 def picked(rows: Content) -> list[str]:

@@ -7,15 +7,15 @@ from typing import Literal
 
 import numpy as np
 
-from slipid.app.config import Config, Logs, one_floor, parsed
+from slipid.app.config import Config, LogsSection, parsed, single_floor_sections
 from slipid.app.logs import packaged_path, read_dataset, unpack
-from slipid.app.problem import Job, job_of
+from slipid.app.problem import ConfigFitTask, fit_task
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.runs import Runs, collect
 from slipid.lab.benchmark.protocols import facts_of
 from slipid.lab.benchmark.steps import POSES_PER_STEP
-from slipid.predict.folds import Facts
-from slipid.predict.slip_model import Machine
+from slipid.predict.folds import FoldKey
+from slipid.predict.slip_model import RobotSpec
 from slipid.search_space import Space
 from slipid.support.files import hash_of
 from slipid.support.progress import Reporter
@@ -26,7 +26,7 @@ Over = Literal["chord", "path"]
 
 
 @dataclass(frozen=True)
-class Currents:
+class CurrentColumns:
     """Columns of currents that a config leaves out of the fit, and methods hear all the same."""
 
     columns: tuple[str, ...]
@@ -34,7 +34,7 @@ class Currents:
 
 
 @dataclass(frozen=True)
-class Source:
+class LogSource:
     """One set of logs.
 
     Attributes:
@@ -43,7 +43,7 @@ class Source:
         config: name of the config that ships with slipid.
         kinds: of splits it is for, see `slipid.lab.benchmark.protocols`.
         over: what end-point errors are divided by.
-        poses_per_step: see `slipid.lab.benchmark.steps.cut`.
+        poses_per_step: see `slipid.lab.benchmark.steps.run_batches`.
         currents: columns that methods hear beside what the config reads.
         crossing: runs from one floor to another: their glob and the file of their map.
     """
@@ -55,12 +55,12 @@ class Source:
     kinds: tuple[str, ...]
     over: Over = "chord"
     poses_per_step: int = POSES_PER_STEP
-    currents: Currents | None = None
+    currents: CurrentColumns | None = None
     crossing: tuple[str, str] | None = None
 
 
 SOURCES = (
-    Source(
+    LogSource(
         name="robotino2022",
         about="Robotino on four floors, straight runs, unsigned currents",
         folder="robotino2022",
@@ -68,7 +68,7 @@ SOURCES = (
         kinds=("headings", "sectors", "speeds", "floors", "all"),
         crossing=("two_surfaces/*/*.csv", "maps/green_table.toml"),
     ),
-    Source(
+    LogSource(
         name="robotino2021",
         about="Robotino over the whole field of 2021, with a gyro, floors not named",
         folder="robotino2021",
@@ -77,25 +77,25 @@ SOURCES = (
         over="path",
         poses_per_step=1,
     ),
-    Source(
+    LogSource(
         name="warthog",
         about="skid-steer Warthog on grass and asphalt",
         folder="drive_skid",
         config="warthog.toml",
         kinds=("headings", "speeds", "floors"),
         over="path",
-        currents=Currents(("il", "ir"), signed=True),
+        currents=CurrentColumns(("il", "ir"), signed=True),
     ),
-    Source(
+    LogSource(
         name="husky",
         about="skid-steer Husky on wet grass",
         folder="drive_skid",
         config="husky.toml",
         kinds=("headings",),
         over="path",
-        currents=Currents(("il", "ir"), signed=False),
+        currents=CurrentColumns(("il", "ir"), signed=False),
     ),
-    Source(
+    LogSource(
         name="testsite",
         about="Robotino on the virtual test site (MuJoCo), two floors, two loads",
         folder="",
@@ -116,17 +116,17 @@ class DataSet:
         crossing: runs over several floors, where there are some; map: of these floors.
     """
 
-    source: Source
-    job: Job
+    source: LogSource
+    job: ConfigFitTask
     logged: Runs
-    facts: tuple[Facts, ...]
+    facts: tuple[FoldKey, ...]
     crossing: Runs | None = None
     map: FloorMap | None = None
 
     @property
-    def machine(self) -> Machine:
+    def spec(self) -> RobotSpec:
         """The robot as its config has it."""
-        return Machine.of(Space(self.job.robot, self.job.choices).template)
+        return RobotSpec.of(Space(self.job.robot, self.job.choices).template)
 
     def thinned(self, most: int) -> "DataSet":
         """At most so many runs, evenly taken from every floor and speed."""
@@ -153,12 +153,12 @@ class DataSet:
         return [f.floor for f in self.facts]
 
 
-def there(source: Source, data: Path) -> bool:
+def is_available(source: LogSource, data: Path) -> bool:
     """Whether a source's folder is there; the recorded runs always are."""
     return not source.folder or (data / source.folder).is_dir()
 
 
-def read_set(source: Source, data: Path, out: Path, report: Reporter) -> DataSet:
+def read_set(source: LogSource, data: Path, out: Path, report: Reporter) -> DataSet:
     """Read the runs of a source; what ships with slipid is unpacked below `out`.
 
     Raises:
@@ -167,7 +167,7 @@ def read_set(source: Source, data: Path, out: Path, report: Reporter) -> DataSet
     path = packaged_path(source.config)
     config = parsed(path, text_of(path))
     root = data / source.folder
-    sections: Sequence[Logs] = one_floor(config.content.logs)
+    sections: Sequence[LogsSection] = single_floor_sections(config.content.logs)
     if not source.folder:
         root = out / "recorded"
         if not (root / "unseen" / "truth" / "truth.json").is_file():
@@ -189,7 +189,7 @@ def read_set(source: Source, data: Path, out: Path, report: Reporter) -> DataSet
     return DataSet(source, job, logged, tuple(facts), crossing, floor)
 
 
-def _hearing(config: Config, currents: Currents | None) -> Config:
+def _hearing(config: Config, currents: CurrentColumns | None) -> Config:
     """The config, with columns of currents in its layouts."""
     if currents is None:
         return config
@@ -206,10 +206,10 @@ def _hearing(config: Config, currents: Currents | None) -> Config:
     return replace(config, content=config.content.model_copy(update={"layouts": layouts}))
 
 
-def _job(config: Config, logged: Runs, source: Source) -> Job:
+def _job(config: Config, logged: Runs, source: LogSource) -> ConfigFitTask:
     """What slipid fits of these runs: currents only where its config reads them."""
     fitted = logged
     if source.currents is not None:
         logs = [replace(log, current=None, current_fresh=None) for log in logged.logs]
         fitted = collect(logs, logged.session)
-    return job_of(config, fitted, (), Reporter(quiet=True))
+    return fit_task(config, fitted, (), Reporter(quiet=True))

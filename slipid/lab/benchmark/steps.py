@@ -19,7 +19,7 @@ POSES_PER_STEP = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Cut:
+class RunBatch:
     """Some runs in equally many steps.
 
     Attributes:
@@ -33,7 +33,7 @@ class Cut:
     windows: Windows
 
 
-def cut(data: Runs, robot: Robot, poses_per_step: int = POSES_PER_STEP) -> list[Cut]:
+def run_batches(data: Runs, robot: Robot, poses_per_step: int = POSES_PER_STEP) -> list[RunBatch]:
     """All runs in steps, from where the wheels have moved a centimetre to the last pose.
 
     The robot's camera says how true poses follow from logged ones, and how late they are. Nearly
@@ -50,13 +50,13 @@ def _steps(poses: float, poses_per_step: int) -> int:
     return 2 ** max(1, int(np.floor(np.log2(max(0.8 * poses / poses_per_step, 2.0)))))
 
 
-def _cut(data: Runs, robot: Robot, w: Windows) -> Cut:
+def _cut(data: Runs, robot: Robot, w: Windows) -> RunBatch:
     numbers = tuple(dict.fromkeys(w.run.tolist()))
     pose = body_poses(robot, w, np.asarray(replay.corrected(robot, jnp.asarray(w.pose))))
     runs = []
     for piece, k in enumerate(numbers):
         log = data.logs[k]
-        edges = w.began[piece] + np.concatenate([[0.0], np.cumsum(w.dt[piece])]) - w.lag
+        edges = w.start[piece] + np.concatenate([[0.0], np.cumsum(w.dt[piece])]) - w.lag
         signals = RunSignals(
             name=log.name,
             dt=w.dt[piece],
@@ -76,7 +76,7 @@ def _cut(data: Runs, robot: Robot, w: Windows) -> Cut:
             speed=float(data.speed[k]),
         )
         runs.append(run)
-    return Cut(numbers, tuple(runs), w)
+    return RunBatch(numbers, tuple(runs), w)
 
 
 def _mean(

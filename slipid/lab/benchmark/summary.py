@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.lab.benchmark.judge import Row, RunScore
+from slipid.lab.benchmark.scores import FoldScore, RunScore
 
 DRAWS = 1000
 """Of the bootstrap."""
@@ -17,7 +17,7 @@ FEW = 2
 Weights = Float[np.ndarray, "draw run"]
 
 
-class Number(NamedTuple):
+class MeanInterval(NamedTuple):
     """A mean and its 90 % interval by resampling."""
 
     value: float
@@ -41,19 +41,19 @@ class RowSummary:
         numbers, tune_s, fit_s, step_us: median over folds.
         settings: that were picked in each fold.
         unconverged: folds in which a fit in rounds did not come to rest.
-        absent: why there are no runs, see `Row`.
+        absent: why there are no runs, see `FoldScore`.
     """
 
-    endpoint_error: Number | None = None
-    floors: Mapping[str, Number] | None = None
-    behind: Number | None = None
-    length_error: Number | None = None
-    heading_error_deg: Number | None = None
-    twist_error: Number | None = None
-    coverage90: Number | None = None
-    slip_auc: Number | None = None
-    floor_accuracy: Number | None = None
-    energy_error: Number | None = None
+    endpoint_error: MeanInterval | None = None
+    floors: Mapping[str, MeanInterval] | None = None
+    behind: MeanInterval | None = None
+    length_error: MeanInterval | None = None
+    heading_error_deg: MeanInterval | None = None
+    twist_error: MeanInterval | None = None
+    coverage90: MeanInterval | None = None
+    slip_auc: MeanInterval | None = None
+    floor_accuracy: MeanInterval | None = None
+    energy_error: MeanInterval | None = None
     runs: int = 0
     numbers: int = 0
     tune_s: float = 0.0
@@ -65,7 +65,7 @@ class RowSummary:
     failed: bool = False
 
 
-def summary(folds: Mapping[str, Sequence[Row]], reference: str) -> dict[str, RowSummary]:
+def summary(folds: Mapping[str, Sequence[FoldScore]], reference: str) -> dict[str, RowSummary]:
     """Every row by its folds; the reference is the row that the others are compared with.
 
     A row that is absent in some fold is absent altogether: its runs would be others.
@@ -75,7 +75,7 @@ def summary(folds: Mapping[str, Sequence[Row]], reference: str) -> dict[str, Row
     out: dict[str, RowSummary] = {}
     first = next(iter(done.values()), [])
     if first:
-        weights = Resampled.of(first)
+        weights = Bootstrap.of(first)
         base = done.get(reference)
         for name, runs in done.items():
             assert [run.name for run in runs] == [run.name for run in first]
@@ -83,13 +83,13 @@ def summary(folds: Mapping[str, Sequence[Row]], reference: str) -> dict[str, Row
             out[name] = _summary(there[name], runs, rival, weights)
     for name, each in folds.items():
         if name not in out:
-            said = next((row for row in each if row.absent), Row(absent="no run"))
+            said = next((row for row in each if row.absent), FoldScore(absent="no run"))
             out[name] = RowSummary(absent=said.absent, failed=any(row.failed for row in each))
     return {name: out[name] for name in folds}
 
 
 @dataclass(frozen=True, eq=False)
-class Resampled:
+class Bootstrap:
     """Runs resampled with replacement, whole clusters of a floor at a time if there are enough.
 
     Attributes:
@@ -102,14 +102,14 @@ class Resampled:
     draws: Weights
 
     @classmethod
-    def of(cls, runs: Sequence[RunScore]) -> "Resampled":
+    def of(cls, runs: Sequence[RunScore]) -> "Bootstrap":
         """Runs by their clusters; a run whose cluster is negative is one by itself."""
         sector = np.array([run.cluster for run in runs])
         alone = -1 - np.arange(len(runs))
         return cls.by([run.floor for run in runs], np.where(sector < 0, alone, sector))
 
     @classmethod
-    def by(cls, floors: Sequence[str], cluster: np.ndarray) -> "Resampled":
+    def by(cls, floors: Sequence[str], cluster: np.ndarray) -> "Bootstrap":
         """Whatever is on these floors and in these clusters, one of each."""
         names = tuple(dict.fromkeys(floors))
         floor = np.array([names.index(name) for name in floors])
@@ -140,30 +140,33 @@ class Resampled:
         return np.where(total > 0, w @ x[mine] / np.maximum(total, 1e-12), np.nan)
 
 
-def number(draws: Float[np.ndarray, " draw"]) -> Number:
+def mean_interval(draws: Float[np.ndarray, " draw"]) -> MeanInterval:
     """The first draw, and the interval that the others span."""
     low, high = np.nanquantile(draws[1:], INTERVAL)
-    return Number(float(draws[0]), float(low), float(high))
+    return MeanInterval(float(draws[0]), float(low), float(high))
 
 
 def _summary(
-    rows: Sequence[Row], runs: Sequence[RunScore], rival: Sequence[RunScore] | None, by: Resampled
+    rows: Sequence[FoldScore],
+    runs: Sequence[RunScore],
+    rival: Sequence[RunScore] | None,
+    by: Bootstrap,
 ) -> RowSummary:
-    def mean(of: Callable[[RunScore], float | bool | None]) -> Number | None:
+    def mean(of: Callable[[RunScore], float | bool | None]) -> MeanInterval | None:
         x = np.array([np.nan if (v := of(run)) is None else float(v) for run in runs])
-        return number(by.mean(x)) if np.isfinite(x).any() else None
+        return mean_interval(by.mean(x)) if np.isfinite(x).any() else None
 
     error = np.array([run.endpoint_error for run in runs])
     behind = None
     if rival is not None:
-        behind = number(by.mean(error - np.array([run.endpoint_error for run in rival])))
+        behind = mean_interval(by.mean(error - np.array([run.endpoint_error for run in rival])))
 
     def median(name: str) -> float:
         return float(np.median([getattr(row, name) for row in rows]))
 
     return RowSummary(
-        endpoint_error=number(by.mean(error)),
-        floors={name: number(by.on(error, k)) for k, name in enumerate(by.names)},
+        endpoint_error=mean_interval(by.mean(error)),
+        floors={name: mean_interval(by.on(error, k)) for k, name in enumerate(by.names)},
         behind=behind,
         length_error=mean(lambda run: run.length_error),
         heading_error_deg=mean(lambda run: run.heading_error_deg),
@@ -182,7 +185,7 @@ def _summary(
     )
 
 
-def _auc(runs: Sequence[RunScore], by: Resampled) -> Number | None:
+def _auc(runs: Sequence[RunScore], by: Bootstrap) -> MeanInterval | None:
     """Area under the curve of slip detection over all windows, in a part of the draws."""
     score = np.concatenate([run.scores for run in runs])
     slips = np.concatenate([np.asarray(run.slips, bool) for run in runs])
@@ -190,7 +193,7 @@ def _auc(runs: Sequence[RunScore], by: Resampled) -> Number | None:
         return None
     of = np.repeat(np.arange(len(runs)), [len(run.scores) for run in runs])
     areas = [area(score, slips, w[of]) for w in by.draws[: DRAWS // 5 + 1]]
-    return number(np.array(areas))
+    return mean_interval(np.array(areas))
 
 
 def area(

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from slipid.data.log import Log
 from slipid.data.reading.reader import read_runs
-from slipid.lab.paper2021.result import COMMANDED_SIDES, Track, find_folder, regenerate
+from slipid.lab.paper2021.result import COMMANDED_SIDES, SquareTrack, find_folder, regenerate
 from slipid.lab.paper2021.table import FittedForm, MotorTable, deployed_slip
 from slipid.plots import drawing
 from slipid.support.files import write_json
@@ -122,7 +122,7 @@ def figure4(table: MotorTable) -> Figure:
     return made
 
 
-def figure7(tracks: tuple[Track, ...]) -> Figure:
+def figure7(tracks: tuple[SquareTrack, ...]) -> Figure:
     """Camera tracks around the commanded rectangle, with headings and how well they end."""
     made = drawing.figure(
         12.0, 5.7, "Figure 7: the same commanded rectangle, three ways to follow it"
@@ -136,7 +136,7 @@ def figure7(tracks: tuple[Track, ...]) -> Figure:
     return made
 
 
-def _draw_track(axes: Axes, track: Track) -> None:
+def _draw_track(axes: Axes, track: SquareTrack) -> None:
     colour = _TRACK[track.file.name]
     xy = _floor(track)
     long, short = COMMANDED_SIDES
@@ -170,7 +170,7 @@ def _draw_track(axes: Axes, track: Track) -> None:
     )
 
 
-def _floor(track: Track) -> np.ndarray:
+def _floor(track: SquareTrack) -> np.ndarray:
     """Positions from the start in right-handed axes [mm]: the camera's image has y down."""
     step = track.position - track.position[0]
     return np.stack([-step[:, 0], step[:, 1]], axis=1)

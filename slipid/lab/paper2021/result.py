@@ -51,7 +51,7 @@ COMMANDED_SIDES = (900.0, 400.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class SquareTrack:
     """One camera track, with the numbers a reader of figure 7 asks for.
 
     Args:
@@ -104,7 +104,7 @@ class Track:
         }
 
 
-def read_track(folder: Path, file: TrackFile) -> Track:
+def read_track(folder: Path, file: TrackFile) -> SquareTrack:
     """One track of figure 7; DataError where the file is broken or ends within its first side."""
     path = folder / "figure7" / f"square_{file.square}_camera.csv"
     table = read_columns(path, "robotino2021_camera")
@@ -112,7 +112,7 @@ def read_track(folder: Path, file: TrackFile) -> Track:
     if frames < file.side_frames:
         expected = f"at least the {file.side_frames} of the first side"
         raise bad_data(path, f"{frames} frames", expected)
-    return Track(
+    return SquareTrack(
         file=file,
         time=table["time_s"],
         position=np.stack([table["x_mm"], table["y_mm"]], axis=1),
@@ -136,7 +136,7 @@ class PaperResult:
 
     field: MotorTable
     motors: dict[int, MotorTable]
-    tracks: tuple[Track, ...]
+    tracks: tuple[SquareTrack, ...]
     transfer: Transfer | None
 
     def as_dict(self) -> dict[str, object]:

@@ -80,7 +80,7 @@ FIGURE_2 = Recipe(
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class SlipSamples:
     """Points of one motor: current [A], torque M [N m, motor] and slip [-], all (sample,)."""
 
     current: np.ndarray
@@ -91,13 +91,13 @@ class Samples:
         return len(self.slip)
 
 
-def pool(parts: Sequence[Samples]) -> Samples:
+def pool(parts: Sequence[SlipSamples]) -> SlipSamples:
     """All points of several sets of one motor, in order."""
     columns = zip(*((p.current, p.torque, p.slip) for p in parts), strict=True)
-    return Samples(*map(np.concatenate, columns))
+    return SlipSamples(*map(np.concatenate, columns))
 
 
-def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Samples:
+def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> SlipSamples:
     """Points of one motor that survive the recipe; the table is in the file's units."""
     effective = effective_speed(table, recipe)
     rpm = 2.0 * np.pi / 60.0
@@ -113,7 +113,7 @@ def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Sa
         torque = voltage * current / speed
         keep &= (current > recipe.min_current) & (slip > 0.0) & (slip <= 1.0)
         keep &= torque <= recipe.max_torque
-    return Samples(current=current[keep], torque=torque[keep], slip=slip[keep])
+    return SlipSamples(current=current[keep], torque=torque[keep], slip=slip[keep])
 
 
 def effective_speed(table: dict[str, np.ndarray], recipe: Recipe) -> np.ndarray:

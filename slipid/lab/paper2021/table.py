@@ -10,7 +10,7 @@ from slipid.lab.paper2021.samples import (
     FIGURES_3_AND_4,
     MOTORS,
     SURFACES,
-    Samples,
+    SlipSamples,
     needed,
     pool,
     read_columns,
@@ -85,13 +85,13 @@ class MotorTable:
         stored: the paper's stored model for these samples, not refitted; motor 1 only.
     """
 
-    samples: Samples
-    by_surface: dict[str, Samples]
+    samples: SlipSamples
+    by_surface: dict[str, SlipSamples]
     forms: dict[str, FittedForm]
     stored: FittedForm | None
 
 
-def fit_form(samples: Samples, name: str) -> FittedForm:
+def fit_form(samples: SlipSamples, name: str) -> FittedForm:
     """Least squares of one row of the table.
 
     Raises:
@@ -137,7 +137,7 @@ def field_table(folder: Path) -> MotorTable:
     return MotorTable(samples=samples, by_surface={}, forms=forms, stored=kept)
 
 
-def _stored(regressor: str, coefficients: tuple[float, ...], samples: Samples) -> FittedForm:
+def _stored(regressor: str, coefficients: tuple[float, ...], samples: SlipSamples) -> FittedForm:
     form = FittedForm(regressor, coefficients, first_power=0, rmse=0.0)
     return replace(form, rmse=_rms(samples.slip - form.slip(getattr(samples, regressor))))
 

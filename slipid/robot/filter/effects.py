@@ -3,8 +3,8 @@
 An effect is a motion along, across and in yaw per metre that wheels without slip would go. It
 belongs to a floor and to a direction of travel u, the unit vector of the twist without slip, yaw as
 rim speed. What the fitted runs tell of it, a mean and a std that is left, is a table over
-directions and speeds (`Told`). An effect e counts in stds left; it correlates less and less as the
-direction changes, and once the robot has left the floor:
+directions and speeds (`EffectTable`). An effect e counts in stds left; it correlates less and less
+as the direction changes, and once the robot has left the floor:
 
     k = exp(-(1 - a^2) |u - v|^2 / (2 TURN^2) - left far / AWAY),   a = exp(-far / SETTLES)
     e <- k e + sqrt(1 - k^2) noise,   v <- u + a (v - u)
@@ -31,7 +31,7 @@ TRAVELS = 0.2
 """Part of the rim speed from which a robot that turns travels in a direction, as in the fit."""
 
 
-class Course(eqx.Module):
+class RolledMotion(eqx.Module):
     """Where the wheels would take the body if none slipped: effects count along it.
 
     Attributes:
@@ -48,7 +48,7 @@ class Course(eqx.Module):
     travels: Bool[Array, ""]
 
     @classmethod
-    def of(cls, rolling: Float[Array, "3"], base: Float[Array, ""]) -> "Course":
+    def of(cls, rolling: Float[Array, "3"], base: Float[Array, ""]) -> "RolledMotion":
         """From the twist without slip and the base radius [m]."""
         straight = jnp.sqrt(rolling[:2] @ rolling[:2] + 1e-24)
         speed = straight + base * jnp.abs(rolling[2])
@@ -62,7 +62,7 @@ class Course(eqx.Module):
         )
 
 
-class Told(eqx.Module):
+class EffectTable(eqx.Module):
     """What the fitted runs tell of the effects of every floor, at evenly spaced directions.
 
     Attributes:
@@ -74,12 +74,12 @@ class Told(eqx.Module):
     table: Float[Array, "floor speed direction 6"]
 
     @classmethod
-    def nothing(cls, floors: int) -> "Told":
+    def nothing(cls, floors: int) -> "EffectTable":
         """Of effects of which nothing is known."""
         row = jnp.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
         return cls(jnp.zeros(1), jnp.broadcast_to(row, (floors, 1, 1, 6)))
 
-    def at(self, course: Course) -> tuple[Float[Array, "floor 3"], Float[Array, "floor 3"]]:
+    def at(self, course: RolledMotion) -> tuple[Float[Array, "floor 3"], Float[Array, "floor 3"]]:
         """Mean of the effects on every floor, and the part of their std that is left.
 
         Linear between the table's directions and speeds; what is told fades beyond its speeds.
@@ -106,13 +106,13 @@ class Told(eqx.Module):
         return jnp.stack([low, low + 1]), jnp.stack([1 - part, part]), log_speed - within
 
 
-def direction(rolling: Float[Array, "3"], base: Float[Array, ""]) -> Float[Array, "3"]:
+def travel_direction(rolling: Float[Array, "3"], base: Float[Array, ""]) -> Float[Array, "3"]:
     """Of travel, from the twist without slip and the base radius [m]."""
     rim = rolling.at[2].multiply(base)
     return rim / jnp.sqrt(rim @ rim + 1e-12)
 
 
-def stays(
+def effect_correlation(
     before: Float[Array, "3"],
     now: Float[Array, "3"],
     left: Float[Array, " floor"],

@@ -8,7 +8,7 @@ hypothesis c, one floor under each wheel:
     prior_c = mean_s W_sc
 
 What the currents and the gyro of a step say of the hypotheses, p_c before and p_c' after it, says
-how likely each pose is, beside how likely it was (`slipid.robot.filter.pose_fix.placed`):
+how likely each pose is, beside how likely it was (`slipid.robot.filter.pose_fix.apply_map`):
 
     P(x_s) ~ (sum_c p_c' W_sc / prior_c  /  sum_c p_c W_sc / prior_c)^(1/4)
 

@@ -27,16 +27,16 @@ from slipid.model.contact_balance import Balance, stand
 from slipid.model.robot import GRAVITY
 from slipid.model.se2 import Planar, advance, compose, solve3
 from slipid.robot.deployed import RobotArrays
-from slipid.robot.filter.effects import Course
+from slipid.robot.filter.effects import RolledMotion
 from slipid.robot.filter.hypotheses import hypotheses_of
-from slipid.robot.filter.wheels import Currents
+from slipid.robot.filter.wheels import MotorCurrents
 from slipid.robot.interface import Settings
 
-HASTE = 30.0
+INERTIA_ACCELERATION = 30.0
 """Wheel acceleration from which inertia, which the equilibrium lacks, hides floors [rad/s^2]."""
 
 
-class Tick(eqx.Module):
+class TimeStep(eqx.Module):
     """One time step [s], as `slipid.robot.filter.wheels.time_step` counts it.
 
     Attributes:
@@ -65,7 +65,7 @@ class FloorState(eqx.Module):
     apart: Float[Array, "hypothesis 3"]
 
 
-class Motion(eqx.Module):
+class BodyMotion(eqx.Module):
     """What the hypotheses together say of the body's motion.
 
     Attributes:
@@ -83,7 +83,7 @@ class Motion(eqx.Module):
     twist: Float[Array, "3"]
     scatter: Float[Array, "3 3"]
     rolling: Float[Array, "3"]
-    course: Course
+    course: RolledMotion
     left: Float[Array, "floor 3"]
     by_friction: Float[Array, "3 floor"]
     known: Float[Array, " hypothesis"]
@@ -125,11 +125,11 @@ class FloorFilter(eqx.Module):
         self,
         old: FloorState,
         w: Array,
-        currents: Currents,
+        currents: MotorCurrents,
         turn: Array,
-        tick: Tick,
+        tick: TimeStep,
         mapped: Float[Array, " hypothesis"] | None = None,
-    ) -> tuple[FloorState, Motion]:
+    ) -> tuple[FloorState, BodyMotion]:
         """Beliefs a time step later, and the motion they say.
 
         Args:
@@ -141,13 +141,13 @@ class FloorFilter(eqx.Module):
         settled, predicted = self.solve(old.twist, w)
         f = self.robot
         rolling = f.inverse @ (f.frame.radius * w)
-        course = Course.of(rolling, f.frame.base)
+        course = RolledMotion.of(rolling, f.frame.base)
         mean, part = f.told.at(course)
-        xi = settled + told_of(f, course.speed * mean @ course.axes.T)
+        xi = settled + effects_by_hypothesis(f, course.speed * mean @ course.axes.T)
         told, none = self._evidence(xi, predicted, currents, w, turn)
         # what the equilibrium does not know, inertia, weighs little while wheels speed up
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)
-        weight = weight / (1 + (tick.acceleration / HASTE) ** 2)
+        weight = weight / (1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2)
         prior, apart = self._mixed(old, xi, tick, mapped)
         log = jnp.log(jnp.maximum(prior, 1e-12)) + weight * jnp.append(told, none)
         belief = jax.nn.softmax(log)
@@ -156,7 +156,7 @@ class FloorFilter(eqx.Module):
         before = prior[:-1] / jnp.maximum(jnp.sum(prior[:-1]), 1e-12)
         apart, jump = self._moved(apart, known, xi, turn, tick)
         under = self._marginal(known)
-        motion = Motion(
+        motion = BodyMotion(
             twist=middle,
             scatter=(xi - middle).T @ (known[:, None] * (xi - middle)),
             rolling=rolling,
@@ -187,9 +187,9 @@ class FloorFilter(eqx.Module):
         on = stand(f.frame, f.floors.at(hypotheses_of(f).under.T), f.rest)
         rim = f.frame.radius * f.at_wheels(w)
         twist, pull = settle(near.T, rim, on, f.by_wheels)
-        drag = Balance(rim[:, None], on).rolled(Planar(*twist))
-        borne = f.motor.borne(jnp.stack([pull, drag], axis=-1))
-        force = on.friction * f.mass * GRAVITY * borne
+        drag = Balance(rim[:, None], on).rolling_drag(Planar(*twist))
+        opposing = f.motor.opposing_force(jnp.stack([pull, drag], axis=-1))
+        force = on.friction * f.mass * GRAVITY * opposing
         torque = f.at_drives((force * f.frame.radius).T)
         amps = f.motor.current(torque, jnp.broadcast_to(w, torque.shape))
         more = f.current_trend @ jnp.stack([1.0, length((f.inverse @ (f.frame.radius * w))[:2])])
@@ -219,7 +219,7 @@ class FloorFilter(eqx.Module):
         return -jnp.nan_to_num(jnp.clip(jnp.stack(slope), -most, most))
 
     def _evidence(
-        self, xi: Array, predicted: Array, currents: Currents, w: Array, turn: Array
+        self, xi: Array, predicted: Array, currents: MotorCurrents, w: Array, turn: Array
     ) -> tuple[Array, Array]:
         """Log likelihood of what is measured under every hypothesis, and under none of them.
 
@@ -227,16 +227,16 @@ class FloorFilter(eqx.Module):
         of single precision.
         """
         f, s = self.robot, self.settings
-        amps, told_of = currents.filtered, currents.told
+        amps, effects_by_hypothesis = currents.filtered, currents.told
         var = f.on_average(f.current_std[hypotheses_of(f).under] ** 2)
         size = jnp.sqrt(predicted**2 + 0.03**2)
-        gap = jnp.where(told_of == 2, predicted - amps, size - jnp.abs(amps))
+        gap = jnp.where(effects_by_hypothesis == 2, predicted - amps, size - jnp.abs(amps))
         var = var + (currents.variance + self._stiction(w)) + self._of_friction(predicted)
         yaw = jnp.mean(f.effect[:, 2]) * jnp.maximum(length(xi[:, :2]), 0.02)
         gyro_gap, gyro_var = xi[:, 2] - turn, s.gyro_std**2 + yaw**2
         gap = jnp.concatenate([gap, gyro_gap[:, None]], axis=1)
         var = jnp.concatenate([var, gyro_var[:, None]], axis=1)
-        heard = jnp.append(told_of > 0, jnp.isfinite(turn))
+        heard = jnp.append(effects_by_hypothesis > 0, jnp.isfinite(turn))
         worst = (s.unknown_std + 1.0) ** 2
         score = jnp.sum(jnp.where(heard, jnp.minimum(gap**2 / var, worst), 0.0), axis=1)
         # a logarithm of a product costs a robot's computer less than several
@@ -259,7 +259,7 @@ class FloorFilter(eqx.Module):
         return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / motor.gain) ** 2 / 3
 
     def _mixed(
-        self, old: FloorState, xi: Array, tick: Tick, mapped: Array | None
+        self, old: FloorState, xi: Array, tick: TimeStep, mapped: Array | None
     ) -> tuple[Array, Array]:
         """Probabilities and ways once wheels may have come to other floors."""
         known, unknown = jnp.maximum(old.belief[:-1], 1e-12), old.belief[-1]
@@ -304,7 +304,7 @@ class FloorFilter(eqx.Module):
         return p.at[whole].set((1 - leaves) * mine + to.T @ mine)
 
     def _moved(
-        self, apart: Array, known: Array, xi: Array, turn: Array, tick: Tick
+        self, apart: Array, known: Array, xi: Array, turn: Array, tick: TimeStep
     ) -> tuple[Array, Array]:
         """Poses of the hypotheses seen from their mean after the step; its way beyond the twist.
 
@@ -323,7 +323,9 @@ class FloorFilter(eqx.Module):
         return jnp.einsum("c,cwf->wf", known, hypotheses_of(self.robot).on.astype(float))
 
 
-def told_of(robot: RobotArrays, of_floor: Float[Array, "floor 3"]) -> Float[Array, "hypothesis 3"]:
+def effects_by_hypothesis(
+    robot: RobotArrays, of_floor: Float[Array, "floor 3"]
+) -> Float[Array, "hypothesis 3"]:
     """What is told of the body under every hypothesis: of all wheels on one floor, no more."""
     ways = hypotheses_of(robot)
     return jnp.zeros((len(ways), 3)).at[ways.uniform].set(of_floor)

@@ -20,17 +20,24 @@ from jaxtyping import Array, Bool, Float, Int
 
 from slipid.model.se2 import advance, compose
 from slipid.robot.deployed import RobotArrays
-from slipid.robot.filter.effects import direction, stays
+from slipid.robot.filter.effects import effect_correlation, travel_direction
 from slipid.robot.filter.floor import Floor
-from slipid.robot.filter.floor_filter import HASTE, Motion, Tick, length
-from slipid.robot.filter.pose_fix import HISTORY, PoseState, fixed, handed_over, nearest, recounted
+from slipid.robot.filter.floor_filter import INERTIA_ACCELERATION, BodyMotion, TimeStep, length
+from slipid.robot.filter.pose_fix import (
+    HISTORY,
+    PoseState,
+    apply_fix,
+    history_after_jump,
+    nearest,
+    rebased,
+)
 from slipid.robot.interface import Readings, Settings
 
-CREEPS = 0.05
+CREEP_SPEED = 0.05
 """Speed up to which no fit has seen how a robot turns [m/s]."""
 
 
-class _Way(eqx.Module):
+class _StepMotion(eqx.Module):
     """Where the body goes in a step, and what pushes it off.
 
     Attributes:
@@ -80,11 +87,11 @@ class PoseFilter(eqx.Module):
         self, now: PoseState, floor: Floor, hypotheses: Int[np.ndarray, "hypothesis wheel"]
     ) -> tuple[Float[Array, "3 3"], Float[Array, "sample hypothesis"]]:
         """Root of the pose's covariance, and what a map supports at poses drawn from it."""
-        root, floors = root_of(now.covariance[:3, :3]), len(self.robot.labels)
+        root, floors = cholesky_root(now.covariance[:3, :3]), len(self.robot.labels)
         return root, floor.supports(now.pose, root, self.robot.places, hypotheses, floors)
 
     def step(
-        self, old: PoseState, motion: Motion, gyro: Array, z: Readings, tick: Tick
+        self, old: PoseState, motion: BodyMotion, gyro: Array, z: Readings, tick: TimeStep
     ) -> tuple[PoseState, Float[Array, "3"], Float[Array, "3 3"]]:
         """Pose a time step later, and the twist that took it there.
 
@@ -104,25 +111,25 @@ class PoseFilter(eqx.Module):
         twist = free.at[2].set(self._turned(old, free[2], gyro))
         pose = compose(old.pose, advance(twist, dt) + motion.jump)
         still = jnp.where(tick.moves, 0.0, jnp.minimum(old.still + dt, 1e3))
-        old = replace(old, history=handed_over(old, motion, self.robot.frame.base))
+        old = replace(old, history=history_after_jump(old, motion, self.robot.frame.base))
         new = replace(self._grow(old, pose, way, tick), still=still)
         new = self._rest(self._turns(new, way, gyro, free[2], tick), gyro)
         begun, ended = jnp.concatenate([jnp.zeros(1), new.pose, free[2:]]), new.far[None]
         entry = jnp.concatenate([begun, new.noise.reshape(-1), ended])
         history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
-        new, left = fixed(recounted(replace(new, history=history)), z)
-        world = turned_axes(new.pose[2])
+        new, left = apply_fix(rebased(replace(new, history=history)), z)
+        world = axes_rotation(new.pose[2])
         return new, twist, world.T @ left @ world
 
-    def _way(self, motion: Motion, gyro: Array) -> _Way:
+    def _way(self, motion: BodyMotion, gyro: Array) -> _StepMotion:
         share = self.robot.rest @ motion.under
         speed, axes = motion.course.speed, motion.course.axes
         std = speed * share[:, None] * motion.left
         by_effect = (std[:, :, None] * axes.T).reshape(-1, 3).T
         # by the way, so that a robot that stands has none
         per_metre = motion.scatter / jnp.maximum(speed**2, 1e-12)
-        doubt = speed * axes @ root_of(axes.T @ per_metre @ axes)
-        return _Way(
+        doubt = speed * axes @ cholesky_root(axes.T @ per_metre @ axes)
+        return _StepMotion(
             speed=speed,
             axes=axes,
             slope=jnp.concatenate([by_effect, motion.by_friction, doubt], axis=1),
@@ -130,14 +137,14 @@ class PoseFilter(eqx.Module):
             by_gyro=jnp.isfinite(gyro),
         )
 
-    def _forgotten(self, old: PoseState, motion: Motion, tick: Tick) -> PoseState:
+    def _forgotten(self, old: PoseState, motion: BodyMotion, tick: TimeStep) -> PoseState:
         """With effects as far as they stay the same over the step, their variance as it was."""
         f = self.robot
         speed = length(motion.twist[:2]) + f.frame.base * jnp.abs(motion.twist[2])
         far = speed * tick.dt  # what is truly left behind
         left = jnp.prod(1 - motion.under, axis=0)
-        now = direction(motion.rolling, f.frame.base)
-        toward, keep = stays(old.toward, now, left, far)
+        now = travel_direction(motion.rolling, f.frame.base)
+        toward, keep = effect_correlation(old.toward, now, left, far)
         toward = jnp.where(far > 0, toward, old.toward)
         doubt = jnp.exp(-far / self.settings.doubt_m)
         parts = [jnp.repeat(keep, 3), jnp.ones(len(left)), jnp.full(3, doubt), jnp.ones(1)]
@@ -166,7 +173,9 @@ class PoseFilter(eqx.Module):
             return free  # code that is exported for one robot goes without the search
         return jnp.where(delay == 0.0, free, nearest(now.history, delay)[4])
 
-    def _turns(self, now: PoseState, way: _Way, gyro: Array, free: Array, tick: Tick) -> PoseState:
+    def _turns(
+        self, now: PoseState, way: _StepMotion, gyro: Array, free: Array, tick: TimeStep
+    ) -> PoseState:
         """Compare a gyro with the contact model while the robot moves.
 
         The gyro reads the model's yaw rate, what pushes it off, and its own bias, so that it tells
@@ -181,14 +190,16 @@ class PoseFilter(eqx.Module):
         """
         dt, cov = jnp.maximum(tick.dt, 1e-3), now.covariance
         look = jnp.concatenate([jnp.zeros(3), way.slope[2], jnp.ones(1)])
-        told = (way.speed > CREEPS) & jnp.isfinite(gyro) & (tick.dt > 0)
+        told = (way.speed > CREEP_SPEED) & jnp.isfinite(gyro) & (tick.dt > 0)
         gap = jnp.where(told, gyro - now.nuisance[-1] - self._then(now, free), 0.0)
         walk = (way.share @ self.robot.process[:, 2] ** 2) * way.speed / dt
-        noise = (self.settings.gyro_std**2 + walk) * (1 + (tick.acceleration / HASTE) ** 2)
+        noise = (self.settings.gyro_std**2 + walk) * (
+            1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2
+        )
         var = look @ cov @ look + noise
         var = var * jnp.maximum(gap**2 / (9.0 * var), 1.0)
         learns = told * jnp.zeros(len(cov)).at[jnp.array([2, -1])].set(1.0)
-        return _learnt(now, look, gap, var, learns)
+        return _scalar_update(now, look, gap, var, learns)
 
     def _rest(self, now: PoseState, gyro: Array) -> PoseState:
         """Learn the gyro's bias while the robot rests.
@@ -201,12 +212,12 @@ class PoseFilter(eqx.Module):
         var = cov[-1, -1] + self.settings.gyro_std**2
         rests = jnp.isfinite(gyro) & (now.still > 0.3) & (gap**2 < 9.0 * var)
         look, learns = jnp.zeros(len(cov)).at[-1].set(1.0), jnp.broadcast_to(rests, len(cov))
-        return _learnt(now, look, jnp.where(rests, gap, 0.0), var, learns.astype(float))
+        return _scalar_update(now, look, jnp.where(rests, gap, 0.0), var, learns.astype(float))
 
-    def _grow(self, old: PoseState, pose: Array, way: _Way, tick: Tick) -> PoseState:
+    def _grow(self, old: PoseState, pose: Array, way: _StepMotion, tick: TimeStep) -> PoseState:
         """At the pose after the step, with the covariance and what came into it."""
         f, s, dt = self.robot, self.settings, tick.dt
-        world = turned_axes(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))
+        world = axes_rotation(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))
         gone = pose[:2] - old.pose[:2]
         # yaw comes from the gyro, not from the floor
         keep = jnp.where(way.by_gyro, jnp.array([1.0, 1.0, 0.0]), jnp.ones(3))
@@ -232,7 +243,7 @@ class PoseFilter(eqx.Module):
         )
 
 
-def _learnt(
+def _scalar_update(
     now: PoseState, look: Array, gap: Array, var: Array, learns: Float[Array, " unknown"]
 ) -> PoseState:
     """Corrected by a reading that differs by `gap` from `look` times what is unknown.
@@ -256,13 +267,13 @@ def _learnt(
     )
 
 
-def turned_axes(heading: Float[Array, ""]) -> Float[Array, "3 3"]:
+def axes_rotation(heading: Float[Array, ""]) -> Float[Array, "3 3"]:
     """Turns a covariance of a body's motion from its axes to the world's."""
     c, s = jnp.cos(heading), jnp.sin(heading)
     return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def root_of(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+def cholesky_root(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """Lower triangular root of a covariance of ways per metre or of poses.
 
     It has 0.1 mm/m, or 0.1 mm and 0.1 mrad, more, so that there is one.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from slipid.robot.filter.floor import SPREAD
-from slipid.robot.filter.floor_filter import Motion
+from slipid.robot.filter.floor_filter import BodyMotion
 from slipid.robot.interface import Readings
 
 HISTORY = 48
@@ -47,7 +47,7 @@ class PoseState(eqx.Module):
     history: Float[Array, "entry 15"]
 
 
-def fixed(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3"]]:
+def apply_fix(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3"]]:
     """Corrected by a pose fix of some time ago, if there is one, and what it leaves of a gap."""
     age = jnp.where(jnp.isfinite(z.fix_age) & (z.fix_age >= 0), z.fix_age, 0.0)
     has = (
@@ -102,11 +102,11 @@ def _corrected(
     return pose + change[:3], now.nuisance + change[3:], cov, history, left
 
 
-def placed(
+def apply_map(
     now: PoseState,
     root: Float[Array, "3 3"],
     supports: Float[Array, "sample hypothesis"],
-    motion: Motion,
+    motion: BodyMotion,
 ) -> tuple[PoseState, Float[Array, "3 3"]]:
     """Corrected by what is believed of the floors, where a map has them elsewhere.
 
@@ -138,7 +138,9 @@ def placed(
     return new, root @ scatter @ root.T @ _inverse(whole)
 
 
-def handed_over(old: PoseState, motion: Motion, base: Float[Array, ""]) -> Float[Array, "entry 15"]:
+def history_after_jump(
+    old: PoseState, motion: BodyMotion, base: Float[Array, ""]
+) -> Float[Array, "entry 15"]:
     """The history once news of the floors has moved the pose: what it knows of before moves too.
 
     The ways of what was and of what is believed went apart until now, at the rate at which the two
@@ -197,7 +199,7 @@ def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Arra
     return jnp.where(jnp.isfinite(most), part / jnp.maximum(most, 1.0), 0.0)
 
 
-def recounted(now: PoseState) -> PoseState:
+def rebased(now: PoseState) -> PoseState:
     """With noise and way counted from the oldest entry of the history.
 
     They, and ages instead of times, stay small however long a robot drives: 32 bits hold them.

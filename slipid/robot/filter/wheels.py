@@ -31,7 +31,7 @@ class WheelState(eqx.Module):
         )
 
 
-class Currents(eqx.Module):
+class MotorCurrents(eqx.Module):
     """What is known of the motor currents.
 
     Attributes:
@@ -78,7 +78,7 @@ def read_wheels(
 
 def read_currents(
     robot: RobotArrays, settings: Settings, old: Array, z: Readings, w: Array, dt: Array
-) -> Currents:
+) -> MotorCurrents:
     """Currents from ammeters and, through the motor's equation, from voltmeters.
 
     `old` are the filtered ones before the step [A], `w` wheel speeds [rad/s].
@@ -97,7 +97,7 @@ def read_currents(
     heard = known | volts
     a = 1 - jnp.exp(-dt / s.filter_s)
     # with a voltage the sign is known; without, and unsigned, only the size
-    return Currents(
+    return MotorCurrents(
         filtered=jnp.where(heard, old + a * (now - old), old),
         told=jnp.where(heard, jnp.where(volts | s.current_is_signed, 2, 1), 0),
         variance=share**2 * var_i + (1 - share) ** 2 * var_u,

@@ -7,8 +7,7 @@ from math import pi
 
 import pytest
 
-from slipid.data.check.causes import explained
-from slipid.data.check.ratios import ScaleRatio, ScaleRatios
+from slipid.data.check.ratios import ScaleRatio, ScaleRatios, explained
 from slipid.data.check.sanity import findings
 from tests.helpers.mistakes import MISTAKES
 from tests.helpers.plain_robot import DRIVES, Drive, as_runs, drive

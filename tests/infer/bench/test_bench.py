@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.infer.bench.doubts import refuse
 from slipid.infer.bench.fit import fit_motor
-from slipid.infer.bench.motor import Bench, BenchMotor, noise
+from slipid.infer.bench.motor import BenchMotor, BenchRoot, noise
+from slipid.infer.bench.record_checks import check_records
 from slipid.infer.bench.verdict import BenchFit, bench_fit, misfits
 from slipid.infer.bench.windows import electrical, mechanical
 from slipid.search_space import Choice, Space
@@ -32,7 +32,7 @@ def record(rows):
 
 
 def fitted(*records, choices=()) -> BenchFit:
-    refuse(records, "")
+    check_records(records, "")
     return bench_fit([fit_motor(records, choices)])
 
 
@@ -150,7 +150,7 @@ def test_time_does_not_run_backwards(record):
 
 
 def test_derivatives_are_those_of_finite_differences():
-    space = Space(Bench(BenchMotor()))
+    space = Space(BenchRoot(BenchMotor()))
     z = jnp.asarray(space.start) + 0.1
 
     def coefficients(z):
@@ -240,5 +240,5 @@ def test_what_is_fixed_stays(record):
 )
 def test_a_wrong_log_is_refused_with_a_next_step(record, change, said):
     with pytest.raises(DataError, match=said) as error:
-        refuse([replace(record, **change(record))], "")
+        check_records([replace(record, **change(record))], "")
     assert "expected" in str(error.value)

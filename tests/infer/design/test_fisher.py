@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 from slipid.fit import noise as of_noise
 from slipid.fit.problem import Problem
 from slipid.infer.design import fisher as info
-from slipid.infer.design.planned_runs import Drive, candidates, steady_windows
+from slipid.infer.design.planned_runs import PlannedRun, candidates, steady_windows
 from slipid.infer.design.planner import Planner, parameter_goal
 from slipid.infer.result import Channels
 from slipid.search_space import Choice
@@ -27,10 +27,10 @@ CHOICES = [
     Choice("camera.scale", prior_mean=1.1, prior_std=0.01),
 ]
 DRIVES = [
-    Drive(*SETUP, 0.3, 0.2),
-    Drive(*SETUP, 2.0, 0.1, 0.4),
-    Drive("firm", "moved", 0.0, 0.0, -0.5),
-    Drive("firm", "as_built", 4.0, 0.3, 0.0, 1.2),
+    PlannedRun(*SETUP, 0.3, 0.2),
+    PlannedRun(*SETUP, 2.0, 0.1, 0.4),
+    PlannedRun("firm", "moved", 0.0, 0.0, -0.5),
+    PlannedRun("firm", "as_built", 4.0, 0.3, 0.0, 1.2),
 ]
 
 
@@ -69,7 +69,7 @@ def rows(current, voltage):
 def start(current, voltage):
     """The prior alone."""
     this = planner(current, voltage)
-    return info.known(np.diag(this.space.prior_std**2), this.is_electric)
+    return info.information_of(np.diag(this.space.prior_std**2), this.is_electric)
 
 
 CASES = [
@@ -83,7 +83,7 @@ CASES = [
 def test_is_what_the_likelihood_says_of_the_same_windows(current, voltage):
     """Of one run and of several: information of different runs adds, whatever the channels."""
     this = planner(current, voltage)
-    problem = Problem(windows(DRIVES, current, voltage), robot(), CHOICES).apart()
+    problem = Problem(windows(DRIVES, current, voltage), robot(), CHOICES).without_shared_effects()
     log_v = log_variance(problem)
     blocks, jacobian = problem.linear(jnp.asarray(this.z), problem.electric(this.z, log_v))
     assert all(np.abs(r).max() < 1e-9 for r in blocks.values())  # logged as predicted
@@ -105,7 +105,7 @@ def test_runs_of_a_session_cannot_average_away_what_they_share():
     this = Planner(robot(), CHOICES, {**plain.variance, **shared}, Channels(False))
     runs = [0, 1, 2, 3, 2, 2]
     w = windows([DRIVES[k] for k in runs], False, False)
-    problem = Problem(w, robot(), CHOICES).apart()
+    problem = Problem(w, robot(), CHOICES).without_shared_effects()
     log_v = log_variance(problem)
     _, jacobian = problem.linear(jnp.asarray(this.z), problem.electric(this.z, log_v))
     j = np.asarray(jacobian["motion"]).reshape(-1, this.space.size)
@@ -123,7 +123,7 @@ def test_runs_of_a_session_cannot_average_away_what_they_share():
     np.testing.assert_allclose(weight - prior, factor * gauss, rtol=1e-6, atol=1e-6 * gauss.max())
     whole = block_diag(*blocks) / factor + effect * list(shared.values()) @ effect.T
     expected = np.linalg.inv(prior + j.T @ np.linalg.solve(whole, j))
-    known = info.known(
+    known = info.information_of(
         block_diag(np.diag(this.space.prior_std**2), np.eye(this.effects)), this.is_electric
     )
     n, std = this.space.size, this.space.prior_std
@@ -136,7 +136,7 @@ def test_runs_of_a_session_cannot_average_away_what_they_share():
 @pytest.mark.slow
 def test_known_undoes_covariance():
     now = start(False, False).plus(rows(False, False))
-    again = info.known(now.covariance, now.is_electric)
+    again = info.information_of(now.covariance, now.is_electric)
     np.testing.assert_allclose(again.covariance, now.covariance, rtol=1e-8, atol=1e-12)
 
 
@@ -149,13 +149,13 @@ def made_up(seed, electric=3, count=25):
     free, m = 9, 4
     root = rng.normal(size=(free, free))
     is_electric = np.arange(free) >= free - electric
-    rows = info.Rows(
+    rows = info.RunJacobians(
         rng.normal(size=(count, m, free - electric)),
         rng.normal(size=(count, m, electric)),
         rng.normal(size=(count, m, free - electric)),
     )
     goal = rng.normal(size=(2, free))
-    return info.known(np.linalg.inv(root @ root.T + np.eye(free)), is_electric), rows, goal
+    return info.information_of(np.linalg.inv(root @ root.T + np.eye(free)), is_electric), rows, goal
 
 
 @pytest.mark.parametrize("electric", [0, 3])
@@ -176,11 +176,13 @@ def test_a_criterion_of_the_motion_never_rises(seed):
     chosen, found = info.greedy(now, rows, goal, 8)
     assert (np.diff(found) < 0).all()
     order = np.random.default_rng(seed).permutation(len(rows.motion))
-    path = info.path(now, rows, goal, order)
+    path = info.criterion_path(now, rows, goal, order)
     assert (np.diff(path) < 0).all()
-    assert info.path(now, rows, goal, order, [3, 10]) == pytest.approx([path[3], path[10]])
+    assert info.criterion_path(now, rows, goal, order, [3, 10]) == pytest.approx(
+        [path[3], path[10]]
+    )
     better = info.exchanged(now, rows, goal, chosen)
-    ends = info.path(now, rows, goal, better)
+    ends = info.criterion_path(now, rows, goal, better)
     assert len(better) == 8
     assert ends[-1] <= found[-1] * (1 + 1e-12)
     assert (np.diff(ends) < 0).all()
@@ -205,7 +207,7 @@ def test_a_long_run_is_worth_less_than_two_and_a_second_one_its_share():
     np.testing.assert_allclose(twice, 2 * once, rtol=1e-12, atol=1e-12 * np.abs(once).max())
     shares = parameter_goal(this, "robot.load_share@as_built").rows
     after = [
-        info.Knowledge(prior.is_electric, prior.motion + x, prior.own, prior.cross)
+        info.Information(prior.is_electric, prior.motion + x, prior.own, prior.cross)
         for x in (once, twice, far)
     ]
     std = [np.sqrt(k.criterion(shares)) for k in after]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slipid.infer.posterior import sample as posterior
-from slipid.infer.posterior.blocks import Plan, Record
+from slipid.infer.posterior.blocks import BlockStore, Plan
 from slipid.infer.posterior.coordinates import MOTION
 from tests.helpers import calibration
 from tests.helpers.kept import kept
@@ -47,7 +47,7 @@ def test_it_goes_on_from_any_block_as_if_it_had_not_ended(whole, count):
     """Electric numbers and variances too, though they are drawn after the last block."""
     fit, plan, blocks, found = whole
     again = posterior.sample(
-        fit, plan, draws=10, record=Record(done=lambda part: blocks[part][:count])
+        fit, plan, draws=10, record=BlockStore(done=lambda part: blocks[part][:count])
     )
     np.testing.assert_array_equal(again.z, found.z)
     np.testing.assert_array_equal(again.log_variance, found.log_variance)
@@ -60,7 +60,9 @@ def test_electric_numbers_are_drawn_anew_for_a_longer_chain(whole):
     fit, plan, blocks, found = whole
     longer = replace(plan, most=plan.most + 1)
     anew = posterior.sample(fit, longer, draws=10)
-    again = posterior.sample(fit, longer, draws=10, record=Record(done=lambda part: blocks[part]))
+    again = posterior.sample(
+        fit, longer, draws=10, record=BlockStore(done=lambda part: blocks[part])
+    )
     np.testing.assert_array_equal(again.z, anew.z)
     electric = fit.space.electric
     assert (again.z[..., electric] != found.z[..., electric]).any()
@@ -75,7 +77,7 @@ def test_electric_draws_that_never_moved_are_not_believed(whole, monkeypatch):
         "diagnose",
         lambda chain, plan: replace(diagnose(chain, plan), converged=True),
     )
-    record = Record(done=lambda part: blocks[part])
+    record = BlockStore(done=lambda part: blocks[part])
     assert posterior.sample(fit, plan, draws=10, record=record).converged
     drawn = posterior.electric_given_motion
     monkeypatch.setattr(
@@ -96,7 +98,7 @@ def whole():
         fit,
         plan,
         draws=10,
-        record=Record(keep=lambda part, block: blocks[part].append(block)),
+        record=BlockStore(keep=lambda part, block: blocks[part].append(block)),
     )
     assert {part: len(made) for part, made in blocks.items()} == {MOTION: 4}
     return fit, plan, blocks, found

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slipid.infer.posterior import sample as posterior
-from slipid.infer.posterior.blocks import Plan, Record
+from slipid.infer.posterior.blocks import BlockStore, Plan
 from tests.helpers import calibration
 
 PLAN = Plan(ensembles=2, walkers=6, block=4, warm_up=(1, 2), most=3)
@@ -21,7 +21,7 @@ def test_a_short_chain(golden):
         fit,
         PLAN,
         draws=10,
-        record=Record(keep=lambda part, block: blocks.append((part, block))),
+        record=BlockStore(keep=lambda part, block: blocks.append((part, block))),
     )
     rows = []
     for part, block in blocks:

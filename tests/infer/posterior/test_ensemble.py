@@ -9,13 +9,13 @@ import pytest
 from arviz_stats.base import array_stats
 from emcee.model import Model
 
-from slipid.infer.posterior.blocks import Plan, Record, Target, packed, unpacked
+from slipid.infer.posterior.blocks import BlockStore, LogDensity, Plan, packed, unpacked
 from slipid.infer.posterior.diagnosis import autocorrelation_time, diagnose
 from slipid.infer.posterior.ensemble import chain as positions
 from slipid.infer.posterior.ensemble import extended
 from slipid.infer.posterior.proposals import (
-    Along,
-    Differential,
+    CoordinateWalk,
+    DifferentialEvolution,
     Hamiltonian,
     Independence,
     families,
@@ -32,7 +32,7 @@ def known(terms, group, centre, covariance):
         ends = [terms(x + s).sum(axis=1) - terms(x - s).sum(axis=1) for s in step]
         return np.stack(ends, axis=1) / 2e-5
 
-    return Target(terms, slope, group, centre, covariance)
+    return LogDensity(terms, slope, group, centre, covariance)
 
 
 def gaussian():
@@ -127,7 +127,7 @@ def plateau():
 
 def run(target, plan, done=()):
     """Blocks up to the plan's end."""
-    return extended(target, plan, "part", Record(), done)
+    return extended(target, plan, "part", BlockStore(), done)
 
 
 def sampled(target, plan=PLAN):
@@ -238,7 +238,7 @@ def made_gaussian(map, group):
         return -0.5 * u**2 @ onto
 
     centre, covariance = np.zeros(len(group)), np.eye(len(group))
-    return Target(terms, np.negative, group, centre, covariance, map=map)
+    return LogDensity(terms, np.negative, group, centre, covariance, map=map)
 
 
 def model_of(target):
@@ -286,7 +286,7 @@ def two_widths():
         each = -0.5 * precision * x**2
         return np.stack([each[:, group == g].sum(axis=1) for g in (0, 1, -1)], axis=1)
 
-    target = Target(terms, lambda x: -precision * x, group, np.zeros(5), np.eye(5))
+    target = LogDensity(terms, lambda x: -precision * x, group, np.zeros(5), np.eye(5))
     return target.seen_by(target.laplace()), precision
 
 
@@ -328,7 +328,7 @@ def test_walking_along_a_coordinate_keeps_the_distribution(bent, groups):
     model, u = model_of(target), np.random.RandomState(1).standard_normal((4000, 9))
     _, state = state_of(target, u)
     moved = 0.0
-    move = Along(target, groups)
+    move = CoordinateWalk(target, groups)
     for _ in range(8):
         state, took = move.propose(model, state)
         moved += took.mean() / 8
@@ -342,7 +342,7 @@ def test_walking_along_a_coordinate_keeps_the_distribution(bent, groups):
 def test_whole_differences_lead_from_mode_to_mode():
     target, _, _ = two_modes()
     (family,) = families(target)
-    move, random = Differential(family), np.random.RandomState(0)
+    move, random = DifferentialEvolution(family), np.random.RandomState(0)
     still = np.concatenate([np.full((20, 2), -4.0), np.full((20, 2), 4.0)])
     x = np.full((4000, 2), -4.0)
     new, factor = move.proposed(x, still, random)

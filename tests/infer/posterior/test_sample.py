@@ -12,7 +12,7 @@ from scipy.stats import norm
 from slipid.fit.hierarchy import effect_information
 from slipid.fit.noise import POOLED
 from slipid.fit.problem import Problem
-from slipid.infer.posterior.blocks import Block
+from slipid.infer.posterior.blocks import ChainBlock
 from slipid.infer.posterior.coordinates import Fitted, effects_at
 from slipid.infer.posterior.sample import drawn_variances, thinned
 from slipid.infer.posterior.transport_map import gaussian
@@ -65,9 +65,9 @@ def test_variances_are_drawn_from_the_gaussian_of_their_information(problem):
     single = np.array([n.startswith(("camera", "process", "current")) for n in names])
     residual, jacobian = problem.linear(end.z, problem.electric(end.z, log_v))
     effect = effects_at(problem, residual, log_v)
-    weight = problem.seen(residual, log_v, np.ones(24), effect).whitening.weight["motion"]
+    weight = problem.weighed(residual, log_v, np.ones(24), effect).whitening.weight["motion"]
     motion = residual["motion"], jacobian["motion"]
-    of_effects = effect_information(problem.target, motion, weight, end.covariance, log_v)
+    of_effects = effect_information(problem.objective, motion, weight, end.covariance, log_v)
     of_effects += np.eye(len(log_v)) / 9
     told = np.where(single[:, None] & single, by_definition(problem, log_v), 0.0)
     told += np.where(~single[:, None] & ~single, of_effects, 0.0)
@@ -105,14 +105,14 @@ def test_runs_that_err_alike_are_no_outliers_to_variances(problem, monkeypatch):
 def test_how_far_floors_differ_is_drawn_by_how_likely_it_is(problem):
     """Load biases that are known by themselves, with a half-normal prior of their common std."""
     end, at = fitted(problem), problem.space.pooled
-    now, typical = np.exp(0.5 * end.log_variance[problem.target.pooled]), 0.05
+    now, typical = np.exp(0.5 * end.log_variance[problem.objective.pooled]), 0.05
     sure = 0.02**-2  # what data alone tell of each
     seen = np.array([0.06, -0.09, 0.12, -0.05])
     covariance = np.diag(np.where(at, 1 / (sure + now**-2), 0.01))
     z = end.z.copy()
     z[at] = seen * sure / (sure + now**-2)
     draws = drawn_variances(problem, Fitted(z, end.log_variance, covariance), SHAPE, 0)
-    std = np.exp(0.5 * draws[..., problem.target.pooled]).ravel()
+    std = np.exp(0.5 * draws[..., problem.objective.pooled]).ravel()
 
     def density(s, power=0):
         spread = np.sqrt(s**2 + 1 / sure)
@@ -123,7 +123,7 @@ def test_how_far_floors_differ_is_drawn_by_how_likely_it_is(problem):
     # the grid's steps are 6 %
     assert std.mean() == pytest.approx(mean, rel=0.01)
     assert std.std() == pytest.approx(np.sqrt(square - mean**2), rel=0.03)
-    others = drawn_variances(problem, end, (1, 2000), 0)[..., problem.target.pooled]
+    others = drawn_variances(problem, end, (1, 2000), 0)[..., problem.objective.pooled]
     assert np.exp(0.5 * others).mean() < 0.6 * mean  # biases of zero tell that floors are alike
 
 
@@ -132,7 +132,7 @@ def test_thinned_draws_are_spread_over_steps_and_walkers_and_keep_their_log_dens
     random = np.zeros((2, 624), np.uint32), np.zeros((2, 3))
     map = gaussian(np.zeros(1), np.eye(1), np.zeros(1, int))
     blocks = [
-        Block(k, part, 0.5 * part[..., 0], random, np.zeros(2), map, np.array([0.1]))
+        ChainBlock(k, part, 0.5 * part[..., 0], random, np.zeros(2), map, np.array([0.1]))
         for k, part in enumerate(np.split(chain, 3, axis=1))
     ]
     x, log_prob = thinned(chain, blocks, 40)

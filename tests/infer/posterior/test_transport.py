@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slipid.infer.posterior.blocks import Block, packed, unpacked
+from slipid.infer.posterior.blocks import ChainBlock, packed, unpacked
 from slipid.infer.posterior.transport_map import Warp, _placed, learnt
 
 
@@ -57,7 +57,7 @@ def test_a_map_is_kept_whole(bent, tmp_path):
     map, _ = bent
     chain, log_prob = np.zeros((1, 2, 3, 9)), np.zeros((1, 2, 3))
     random = np.zeros((1, 624), np.uint32), np.zeros((1, 3))
-    block = Block(7, chain, log_prob, random, np.zeros(1), map, np.array([0.3]))
+    block = ChainBlock(7, chain, log_prob, random, np.zeros(1), map, np.array([0.3]))
     np.savez(tmp_path / "block.npz", **packed(block))
     with np.load(tmp_path / "block.npz", allow_pickle=False) as kept:
         again = unpacked(dict(kept))

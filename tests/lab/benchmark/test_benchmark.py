@@ -9,12 +9,20 @@ from typer.testing import CliRunner
 
 from slipid.cli.main import app
 from slipid.lab.benchmark import work as benchmark_work
-from slipid.lab.benchmark.benchmark import benchmark, pieces_of
-from slipid.lab.benchmark.judge import Row
-from slipid.lab.benchmark.rectangle import Rectangle
-from slipid.lab.benchmark.work import QUICK_RUNS, Piece, Wish, data_of, keys_of, source_of, split_of
+from slipid.lab.benchmark.benchmark import benchmark, tasks_of
+from slipid.lab.benchmark.rectangle import RectangleTask
+from slipid.lab.benchmark.scores import FoldScore
+from slipid.lab.benchmark.work import (
+    QUICK_RUNS,
+    BenchmarkOptions,
+    FoldTask,
+    data_of,
+    keys_of,
+    source_of,
+    split_of,
+)
 from slipid.support.errors import DataError
-from slipid.support.executor import Here
+from slipid.support.executor import InProcess
 from slipid.support.progress import Reporter
 
 
@@ -52,7 +60,12 @@ def test_one_command_makes_a_table_and_goes_on_from_what_was_kept(tmp_path, monk
     assert {name for name in after if after[name] != before[name]} == {"known_floor_encoder.json"}
 
     # in this process, where a row can be broken; the fit is kept
-    piece = Piece(Wish(data, out, ("encoder", "paper_code"), quick=True), "testsite", "headings", 0)
+    piece = FoldTask(
+        BenchmarkOptions(data, out, ("encoder", "paper_code"), quick=True),
+        "testsite",
+        "headings",
+        0,
+    )
     next(out.rglob("known_floor_encoder.json")).unlink()
 
     def broken(*_: object) -> list:
@@ -61,24 +74,26 @@ def test_one_command_makes_a_table_and_goes_on_from_what_was_kept(tmp_path, monk
     monkeypatch.setattr("slipid.predict.kinematics.Encoder.predict", broken)
     assert piece.run() == "testsite/headings_0"
     left = {name: row for (_, name), row in piece.rows().items()}
-    assert left["encoder"] == Row(absent="ZeroDivisionError: a wheel of size 0", failed=True)
+    assert left["encoder"] == FoldScore(absent="ZeroDivisionError: a wheel of size 0", failed=True)
     assert len(left["paper_code"].runs) == len(split_of(piece).judged)
 
 
 def test_every_part_of_every_kind_is_asked_or_one_of_headings_if_it_has_to_be_quick(tmp_path):
     (tmp_path / "x").mkdir()
-    wish = Wish(tmp_path / "x", tmp_path / "out")
+    wish = BenchmarkOptions(tmp_path / "x", tmp_path / "out")
     kinds = ("headings", "sectors", "speeds", "floors")
     every = [f"testsite/{kind}_{fold}" for kind in kinds for fold in (0, 1)]
-    assert [piece.name for piece in pieces_of(wish, "testsite")] == every
-    quick = pieces_of(replace(wish, quick=True), "testsite")
+    assert [piece.name for piece in tasks_of(wish, "testsite")] == every
+    quick = tasks_of(replace(wish, quick=True), "testsite")
     assert [piece.name for piece in quick] == ["testsite/headings_0"]
     assert {protocol for protocol, _ in keys_of(quick[0])} == {"known_floor"}
 
 
 def test_where_there_is_one_floor_nobody_is_asked_which_it_is(tmp_path, monkeypatch):
     (tmp_path / "x").mkdir()
-    piece = Piece(Wish(tmp_path / "x", tmp_path / "out", ("encoder",)), "testsite", "headings", 0)
+    piece = FoldTask(
+        BenchmarkOptions(tmp_path / "x", tmp_path / "out", ("encoder",)), "testsite", "headings", 0
+    )
     assert keys_of(piece) == [("known_floor", "encoder"), ("unknown_floor", "encoder")]
     data = data_of(piece.wish, "testsite")
     alone = replace(data, facts=tuple(replace(f, floor="firm") for f in data.facts))
@@ -88,7 +103,7 @@ def test_where_there_is_one_floor_nobody_is_asked_which_it_is(tmp_path, monkeypa
 
 def test_other_runs_over_several_floors_are_other_work_but_no_other_fit(tmp_path, monkeypatch):
     (tmp_path / "x").mkdir()
-    piece = Piece(Wish(tmp_path / "x", tmp_path / "out"), "testsite", "headings", 0)
+    piece = FoldTask(BenchmarkOptions(tmp_path / "x", tmp_path / "out"), "testsite", "headings", 0)
     data = data_of(piece.wish, "testsite")
     rows, fit = (benchmark_work.kept_of(piece, fit=fit).key for fit in (False, True))
     more = replace(data, crossing=data.logged.subset([0]))
@@ -99,11 +114,11 @@ def test_other_runs_over_several_floors_are_other_work_but_no_other_fit(tmp_path
 
 def test_quick_work_does_not_overwrite_what_was_kept(tmp_path):
     (tmp_path / "x").mkdir()
-    wish = Wish(tmp_path / "x", tmp_path / "out", ("encoder",))
+    wish = BenchmarkOptions(tmp_path / "x", tmp_path / "out", ("encoder",))
     few = data_of(wish, "testsite").thinned(QUICK_RUNS)
     assert len(few.logged) < len(data_of(wish, "testsite").logged)
     whole, quick = (
-        Piece(replace(wish, quick=quick), "testsite", "headings", 0) for quick in (False, True)
+        FoldTask(replace(wish, quick=quick), "testsite", "headings", 0) for quick in (False, True)
     )
     assert whole.name == quick.name
     folders = {
@@ -114,7 +129,11 @@ def test_quick_work_does_not_overwrite_what_was_kept(tmp_path):
 
 def test_an_unknown_row_is_named_with_the_choices(tmp_path):
     with pytest.raises(DataError, match=r"no row 'encodr'.*did you mean.*encoder"):
-        benchmark(Wish(tmp_path, tmp_path / "out", ("encodr",)), Here(), Reporter(quiet=True))
+        benchmark(
+            BenchmarkOptions(tmp_path, tmp_path / "out", ("encodr",)),
+            InProcess(),
+            Reporter(quiet=True),
+        )
 
 
 def test_a_missing_folder_is_named(tmp_path):
@@ -126,7 +145,9 @@ def test_a_missing_folder_is_named(tmp_path):
 
 def test_a_split_that_cannot_be_read_fails_alone(tmp_path, monkeypatch):
     (tmp_path / "x").mkdir()
-    piece = Piece(Wish(tmp_path / "x", tmp_path / "out", ("encoder",)), "testsite", "headings", 0)
+    piece = FoldTask(
+        BenchmarkOptions(tmp_path / "x", tmp_path / "out", ("encoder",)), "testsite", "headings", 0
+    )
 
     def broken(_: object) -> None:
         raise OSError("disk on fire")
@@ -140,7 +161,9 @@ def test_a_split_that_cannot_be_read_fails_alone(tmp_path, monkeypatch):
 
     # what failed is tried again
     monkeypatch.setattr(benchmark_work, "_scene", lambda piece: None)
-    monkeypatch.setattr(benchmark_work, "_row", lambda scene, protocol, name: Row.lacking(["gyro"]))
+    monkeypatch.setattr(
+        benchmark_work, "_row", lambda scene, protocol, name: FoldScore.lacking(["gyro"])
+    )
     piece.run()
     assert {row.absent for row in piece.rows().values()} == {"needs a gyro"}
 
@@ -151,7 +174,9 @@ def test_a_data_set_that_cannot_be_read_stops_no_other(tmp_path, monkeypatch):
     (folder / "run.csv").write_text("this is no log")
     monkeypatch.setattr("slipid.lab.benchmark.benchmark.SOURCES", [source_of("robotino2022")])
     found = benchmark(
-        Wish(tmp_path / "data", tmp_path / "out", ("quann_slip",)), Here(), Reporter(quiet=True)
+        BenchmarkOptions(tmp_path / "data", tmp_path / "out", ("quann_slip",)),
+        InProcess(),
+        Reporter(quiet=True),
     )
     assert list(found["unread"]) == ["robotino2022"]
     assert found["sets"] == {}
@@ -160,11 +185,11 @@ def test_a_data_set_that_cannot_be_read_stops_no_other(tmp_path, monkeypatch):
 
 def test_a_robot_that_cannot_be_identified_drives_no_rectangle(tmp_path, monkeypatch):
     (tmp_path / "x").mkdir()
-    rectangle = Rectangle(Wish(tmp_path / "x", tmp_path / "out"))
+    rectangle = RectangleTask(BenchmarkOptions(tmp_path / "x", tmp_path / "out"))
 
     def broken(*_: object) -> None:
         raise OSError("disk on fire")
 
     monkeypatch.setattr("slipid.lab.benchmark.rectangle.data_of", broken)
     assert rectangle.run() == "rectangle"
-    assert rectangle.drive(Here(), Reporter(quiet=True)) == {"failed": "OSError: disk on fire"}
+    assert rectangle.drive(InProcess(), Reporter(quiet=True)) == {"failed": "OSError: disk on fire"}

@@ -7,7 +7,7 @@ import pytest
 
 from slipid.app.logs import packaged_path
 from slipid.lab.benchmark.protocols import KINDS, PROTOCOLS
-from slipid.lab.benchmark.sets import SOURCES, read_set, there
+from slipid.lab.benchmark.sets import SOURCES, is_available, read_set
 from slipid.support.progress import Reporter
 
 QUIET = Reporter(quiet=True)
@@ -27,9 +27,9 @@ def test_every_source_has_a_config_and_kinds_that_there_are():
 
 
 def test_what_is_absent_is_absent(tmp_path):
-    assert [one.name for one in SOURCES if there(one, tmp_path)] == ["testsite"]
+    assert [one.name for one in SOURCES if is_available(one, tmp_path)] == ["testsite"]
     (tmp_path / "drive_skid").mkdir()
-    assert there(source("husky"), tmp_path)
+    assert is_available(source("husky"), tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def testsite(tmp_path_factory):
 def test_recorded_runs_need_no_data_folder(testsite):
     assert len(testsite.logged) == len(testsite.job.dataset) == 120
     assert set(testsite.setups) == {"firm", "soft", "soft@moved"}
-    assert testsite.machine.determines_twist
+    assert testsite.spec.determines_twist
     assert {fact.floor for fact in testsite.facts} == {"firm", "soft", "soft@moved"}
 
 
@@ -60,7 +60,7 @@ def test_currents_are_heard_where_the_fit_does_without(real_data, tmp_path):
         assert data.logged.current_is_signed is signed
         assert data.job.dataset.current is None
         assert [log.name for log in data.logged.logs] == [log.name for log in data.job.dataset.logs]
-        assert not data.machine.determines_twist
+        assert not data.spec.determines_twist
 
 
 @pytest.mark.slow

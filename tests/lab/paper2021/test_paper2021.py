@@ -13,7 +13,7 @@ from slipid.data.log import Log
 from slipid.lab.paper2021 import plots as paper_plots
 from slipid.lab.paper2021.result import (
     TRACK_FILES,
-    Track,
+    SquareTrack,
     TrackFile,
     find_folder,
     read_track,
@@ -22,7 +22,7 @@ from slipid.lab.paper2021.result import (
 from slipid.lab.paper2021.samples import (
     FIGURES_3_AND_4,
     SURFACES,
-    Samples,
+    SlipSamples,
     curve_points,
     effective_speed,
     leave_one_surface_out,
@@ -135,7 +135,7 @@ def test_forms_recover_their_coefficients(rng):
     }
     expected = [(3.2,), (0.1, 2.0), (0.05, 4.0, -5.0), (0.08, 0.5), (0.4,)]
     for (name, slip), coefficients in zip(truth.items(), expected, strict=True):
-        form = fit_form(Samples(I, M, slip), name)
+        form = fit_form(SlipSamples(I, M, slip), name)
         np.testing.assert_allclose(form.coefficients, coefficients, rtol=1e-9)
         assert form.rmse < 1e-12
         np.testing.assert_allclose(form.slip(M if "M" in name else I), slip, rtol=1e-9)
@@ -144,7 +144,7 @@ def test_forms_recover_their_coefficients(rng):
 def test_line_through_the_origin_does_not_bend_to_an_offset(rng):
     M = rng.uniform(0.02, 0.4, 400)
     slip = 0.3 + 0.0 * M
-    form = fit_form(Samples(M, M, slip), "linear in M")
+    form = fit_form(SlipSamples(M, M, slip), "linear in M")
     slope = (M @ slip) / (M @ M)
     assert form.coefficients == pytest.approx((slope,), rel=1e-12)
     assert form.rmse == pytest.approx(np.sqrt(np.mean((slip - slope * M) ** 2)), rel=1e-12)
@@ -152,7 +152,7 @@ def test_line_through_the_origin_does_not_bend_to_an_offset(rng):
 
 
 def test_too_few_samples_are_refused():
-    empty = Samples(np.zeros(1), np.zeros(1), np.zeros(1))
+    empty = SlipSamples(np.zeros(1), np.zeros(1), np.zeros(1))
     with pytest.raises(ValueError, match="1 samples cannot fix 2 coefficients"):
         fit_form(empty, "affine in M")
 
@@ -223,7 +223,7 @@ def test_track_numbers_of_a_made_square():
     file = TrackFile("made", "made", "made", 4, 4, 1.0)
     position = np.array([[10.0, 0], [13, 4], [10, 8], [10, 20], [110, 20], [110, 0], [40, 40]])
     heading = np.array([350.0, 355, 360, 365, 370, 372, 375])
-    track = Track(file=file, time=np.arange(7.0), position=position, heading=heading)
+    track = SquareTrack(file=file, time=np.arange(7.0), position=position, heading=heading)
     assert track.path_length == pytest.approx(5 + 5 + 12)
     assert track.displacement == pytest.approx(20.0)
     assert track.closure == pytest.approx(50.0)

@@ -8,7 +8,7 @@ from slipid.data.reading.bag.layout import EFFORT, TopicChannel
 from slipid.data.reading.bag.shape import FieldPick, JointPick, Pick, steps_of
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL
 from slipid.data.reading.units import converts, factor
-from slipid.support.errors import near
+from slipid.support.errors import did_you_mean
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 _ODOMETRY = "nav_msgs/msg/Odometry"
@@ -135,7 +135,7 @@ def _joint_meaning(channel: str, spec: TopicChannel, joints: tuple[str, ...]) ->
     """Of a channel that is an array of JointState."""
     array = spec.fields[0] if spec.fields else _array_of(channel)
     if array not in _JOINT_ARRAYS or len(spec.fields) > 1:
-        found = f"no array '{array}' in {JOINT_STATE}{near(array, _JOINT_ARRAYS)}"
+        found = f"no array '{array}' in {JOINT_STATE}{did_you_mean(array, _JOINT_ARRAYS)}"
         raise Unfit(found, f"one of {', '.join(_JOINT_ARRAYS)}")
     unit = spec.unit or _JOINT_ARRAYS[array]
     if unit is None:
@@ -171,7 +171,9 @@ def _check_number(path: str, message: Message) -> None:
     found = message.paths.get(plain)
     if found is None:
         known = list(message.paths)
-        raise Unfit(f"no field '{path}' in {message.name}{near(plain, known)}", _listed(message))
+        raise Unfit(
+            f"no field '{path}' in {message.name}{did_you_mean(plain, known)}", _listed(message)
+        )
     if found.startswith("text"):
         raise Unfit(f"field '{path}' of {message.name} is a text", "a field with numbers")
 

@@ -24,7 +24,7 @@ from slipid.data.reading.bag.shape import (
 )
 from slipid.data.reading.bag.streams import topic_error
 from slipid.data.reading.bag.transforms import STATIC, Link, chain_of
-from slipid.support.errors import DataError, bad_data, near
+from slipid.support.errors import DataError, bad_data, did_you_mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ def message_of(bag: OpenBag, layout: BagLayout, name: str, channel: str) -> Mess
     """Type of a topic's messages; DataError where the topic is missing or empty."""
     topic = bag.topics.get(name)
     if topic is None:
-        found = f"no topic '{name}' for {channel}{near(name, bag.topics)}"
+        found = f"no topic '{name}' for {channel}{did_you_mean(name, bag.topics)}"
         raise bad_data(bag.path, found, _one_of(bag, layout, channel))
     if not topic.count:
         found = f"no message in the topic, which holds {channel}"

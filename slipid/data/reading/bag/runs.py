@@ -16,7 +16,7 @@ from slipid.data.reading.bag.plan import message_of
 from slipid.data.reading.bag.shape import STAMPS, MessageShape, shape_of, steps_of
 from slipid.data.reading.bag.streams import topic_error
 from slipid.data.reading.signal import Signal
-from slipid.support.errors import bad_data, near
+from slipid.support.errors import bad_data, did_you_mean
 
 STILL = 0.02
 """A wheel that turned by less [rad], or is turning slower [rad/s], stands still."""
@@ -186,7 +186,7 @@ def by_table(path: Path, rule: RunRule, zero: float) -> list[RunSpan]:
     names = reader.fieldnames or []
     for name in names:
         if name not in COLUMNS:
-            found = f"column '{name}'{near(name, COLUMNS)}"
+            found = f"column '{name}'{did_you_mean(name, COLUMNS)}"
             raise bad_data(file, found, f"columns of {', '.join(COLUMNS)}", row=1)
     if missing := [name for name in COLUMNS[:2] if name not in names]:
         raise bad_data(file, f"no column '{missing[0]}'", "the columns start and end", row=1)
@@ -252,7 +252,7 @@ def _marks(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[_Mark]:
     for path in (rule.field, rule.surface, rule.load):
         plain = ".".join(step.name for step in steps_of(path)) if path else None
         if plain is not None and plain not in message.paths:
-            found = f"no field '{path}' in {message.name}{near(path, message.paths)}"
+            found = f"no field '{path}' in {message.name}{did_you_mean(path, message.paths)}"
             raise topic_error(bag.path, name, found, f"one of {', '.join(message.paths)}")
     marks = []
     for number, raw in enumerate(bag.messages((name,)), start=1):

@@ -18,7 +18,7 @@ from slipid.data.reading.bag.transforms import STATIC, Moving, composed, heading
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL
 from slipid.data.reading.signal import Signal, SignalSource
 from slipid.data.reading.units import factor
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 
 APART_NOTED = 0.5
 """Difference between two clocks that is worth a note [s]."""
@@ -273,7 +273,7 @@ def _check_joints(plan: ChannelPlan, streams: Sequence[Stream]) -> None:
     there = list(dict.fromkeys(name for pick in picks for name in pick.names))
     for j, joint in enumerate(picks[0].joints):
         if joint not in there:
-            found = f"no joint '{joint}'{near(joint, there)}"
+            found = f"no joint '{joint}'{did_you_mean(joint, there)}"
             raise streams[0].error(found, f"one of the names that are there: {listed(there)}")
         if all(stream.absent[:, j].all() for stream in streams):
             found = f"{picks[0].array} of joint '{joint}' is empty in every message"

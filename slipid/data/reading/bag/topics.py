@@ -87,10 +87,10 @@ def topics_of(path: Path, definitions: Path | None = None) -> tuple[Topic, ...]:
         DataError: it is no bag, or is damaged.
     """
     with open_bag(path) as bag:
-        return tuple(_looked_into(bag, stored, definitions) for stored in bag.topics.values())
+        return tuple(_described(bag, stored, definitions) for stored in bag.topics.values())
 
 
-def _looked_into(bag: OpenBag, stored: StoredTopic, definitions: Path | None) -> Topic:
+def _described(bag: OpenBag, stored: StoredTopic, definitions: Path | None) -> Topic:
     """What is known of one topic."""
     raws = list(islice(bag.messages((stored.name,)), _LOOKED_AT)) if stored.count else []
     if not raws:

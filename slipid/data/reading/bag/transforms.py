@@ -11,7 +11,7 @@ from slipid.data.reading.bag.meanings import listed
 from slipid.data.reading.bag.opened import OpenBag
 from slipid.data.reading.bag.shape import Edge, Located, MessageShape, edges_of
 from slipid.data.reading.bag.streams import TopicStreams, topic_error
-from slipid.support.errors import near
+from slipid.support.errors import did_you_mean
 
 STATIC = "_static"
 """End of the topic's name beside `/tf` that holds transforms which never change."""
@@ -140,7 +140,10 @@ def chain_of(
     where = ", ".join(messages)
     for name in (frame, child):
         if name not in frames:
-            found, expected = f"no frame '{name}'{near(name, frames)}", f"one of {listed(frames)}"
+            found, expected = (
+                f"no frame '{name}'{did_you_mean(name, frames)}",
+                f"one of {listed(frames)}",
+            )
             raise topic_error(bag.path, where, found, expected)
     found = f"no transforms lead from '{frame}' to '{child}'"
     pairs = listed(f"{parent} -> {name}" for name, parent in sorted(seen.parent.items()))

@@ -34,7 +34,7 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 from scipy.optimize import least_squares
 
-from slipid.lab.systems.floors.interface import Felt
+from slipid.lab.systems.floors.interface import FloorSignals
 from slipid.model.motor import Motor
 from slipid.model.robot import Robot, motor_current, twist
 
@@ -72,7 +72,7 @@ class Cells:
     rows: Float[np.ndarray, " cell"]
 
     @classmethod
-    def of(cls, felt: Felt) -> "Cells":
+    def of(cls, felt: FloorSignals) -> "Cells":
         """Cells of one run, of rows in which it moves."""
         take = felt.moves & np.isfinite(felt.current).all(axis=1)
         speed, amps = felt.speed[take], felt.current[take]
@@ -97,7 +97,7 @@ class Cells:
         )
 
     @classmethod
-    def joined(cls, felts: Sequence[Felt]) -> "Cells":
+    def joined(cls, felts: Sequence[FloorSignals]) -> "Cells":
         """Cells of several runs."""
         each = [cls.of(felt) for felt in felts]
         names = ("speed", "current", "gyro", "weight", "std", "rows")
@@ -116,7 +116,7 @@ class Cells:
         return Cells(*(filled(getattr(self, name)) for name in names))
 
 
-def scatter_of(felts: Sequence[Felt]) -> float:
+def scatter_of(felts: Sequence[FloorSignals]) -> float:
     """Std of currents while wheel speeds are the same [A]."""
     cells = Cells.joined(felts)
     several = cells.rows >= 5
@@ -126,7 +126,7 @@ def scatter_of(felts: Sequence[Felt]) -> float:
     )
 
 
-def stiffness_of(felts: Sequence[Felt]) -> Float[np.ndarray, " drive"]:
+def stiffness_of(felts: Sequence[FloorSignals]) -> Float[np.ndarray, " drive"]:
     """Current that each drive takes more than the mean of all, going straight, median of runs [A].
 
     Zero of robots whose drives have nothing in common, three omni wheels say.
@@ -141,11 +141,11 @@ def stiffness_of(felts: Sequence[Felt]) -> Float[np.ndarray, " drive"]:
     return np.median(found, axis=0) if found else np.zeros(felts[0].speed.shape[1])
 
 
-def fitted_floors(robot: Robot, felts: Sequence[Felt]) -> Robot:
+def fitted_floors(robot: Robot, felts: Sequence[FloorSignals]) -> Robot:
     """The robot with numbers of all its floors, each by the runs on it."""
     for number, floor in enumerate(robot.surfaces.labels):
         cells = Cells.joined([felt for felt in felts if felt.floor == floor]).thinned(CELLS)
-        left = _Left(robot, number, cells)
+        left = _FloorMisfit(robot, number, cells)
         logs = least_squares(left.gaps, START, left.slope, loss="soft_l1", max_nfev=30).x
         robot = on_floor(robot, jnp.asarray(number), jnp.asarray(logs))
     return robot
@@ -171,7 +171,7 @@ def currents_off(
         every = Cells(
             w, amps, np.zeros(CELLS), np.ones((CELLS, 2)), np.ones_like(w), np.ones(CELLS)
         )
-        gaps = _Left(robot, number, every).gaps(logs)[: CELLS * drives]
+        gaps = _FloorMisfit(robot, number, every).gaps(logs)[: CELLS * drives]
         found.append(CURRENT_A * gaps.reshape(CELLS, drives)[:rows])
     return np.concatenate(found)
 
@@ -198,7 +198,7 @@ def shown(
     return jax.vmap(one)(speed)
 
 
-class _Left:
+class _FloorMisfit:
     """What numbers of a floor leave of currents and turning, with its derivative."""
 
     def __init__(self, robot: Robot, number: int, cells: Cells):

@@ -25,26 +25,32 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.lab.benchmark.floors.protocol import (
-    Asked,
+    EvaluationSettings,
     ScoredClassifier,
+    answers_after,
     answers_of,
-    asked_after,
     attempted,
     table_of,
     tuned,
 )
-from slipid.lab.benchmark.floors.result import Answer, FeltRow, FeltTable
-from slipid.lab.benchmark.own import NAME, Own, Place, estimated, fit_own
+from slipid.lab.benchmark.floors.result import Answer, ClassifierRow, ClassifierTable
 from slipid.lab.benchmark.protocols import Split, base_of, splits
 from slipid.lab.benchmark.sets import DataSet
-from slipid.lab.benchmark.steps import Cut, cut
-from slipid.lab.benchmark.work import Piece, Wish, data_of, kept_of, problem_of
-from slipid.lab.systems.floors.cosine_energy import CosineEnergy, tree_rows
-from slipid.lab.systems.floors.gaussian import Gaussian
-from slipid.lab.systems.floors.interface import Felt, FloorMethod
+from slipid.lab.benchmark.slipid_rows import (
+    NAME,
+    FloorKnowledge,
+    SlipidFit,
+    estimator_runs,
+    fit_slipid,
+)
+from slipid.lab.benchmark.steps import RunBatch, run_batches
+from slipid.lab.benchmark.work import BenchmarkOptions, FoldTask, data_of, kept_of, problem_of
+from slipid.lab.systems.floors.cosine_energy import CosineEnergyClassifier, tree_rows
+from slipid.lab.systems.floors.gaussian import GaussianClassifier
+from slipid.lab.systems.floors.interface import FloorClassifier, FloorSignals
 from slipid.model.geometry import skid_steer
 from slipid.model.robot import Robot, build
-from slipid.predict.slip_model import Machine, PredictedRun, Run
+from slipid.predict.slip_model import PredictedRun, RobotSpec, Run
 from slipid.support.errors import bad_data
 
 RADIUS = 0.165
@@ -80,7 +86,7 @@ FEWEST = 3
 """Rows that a run has at least."""
 
 
-def read_felt(root: Path, wheel_radius: float) -> list[Felt]:
+def read_floor_runs(root: Path, wheel_radius: float) -> list[FloorSignals]:
     """Runs of a skid-steer robot below a folder, one folder per floor, as `borealtc` has them.
 
     A file is one run, or several where rows are more than `LONGEST_S` apart.
@@ -98,11 +104,11 @@ def read_felt(root: Path, wheel_radius: float) -> list[Felt]:
     return [run for path in files for run in _runs(path, wheel_radius)]
 
 
-def _runs(path: Path, wheel_radius: float) -> list[Felt]:
+def _runs(path: Path, wheel_radius: float) -> list[FloorSignals]:
     """Runs of one file."""
     rows = _rows(path)
     column = dict(zip(COLUMNS, rows.T, strict=True))
-    whole = Felt(
+    whole = FloorSignals(
         name=f"{path.parent.name}/{path.stem}",
         floor=path.parent.name.lower(),
         time=column["time"],
@@ -160,38 +166,38 @@ SECONDS = (0.5, 1.0, 2.0, 4.0)
 ABOUT = "Robotino on four floors, straight runs: wheel speeds and sizes of currents"
 
 
-def robotino_rows() -> list[FloorMethod]:
+def robotino_classifiers() -> list[FloorClassifier]:
     """Classifiers beside slipid; without a gyro and an accelerometer there is no vibration row."""
     trees = [row for row in tree_rows() if not row.hearing.vibration]
-    return [CosineEnergy(), Gaussian(), *trees]
+    return [CosineEnergyClassifier(), GaussianClassifier(), *trees]
 
 
-def robotino_felt(wish: Wish) -> FeltTable:
+def robotino_table(wish: BenchmarkOptions) -> ClassifierTable:
     """The table of all classifiers on the Robotino's runs, or of those that are wished for.
 
     A fit of slipid that is kept of the same runs is not done again.
     """
     data = data_of(wish, SOURCE)
     found = splits(data.facts, KIND)[: 1 if wish.quick else None]
-    asked = Asked(seconds=SECONDS, inner=1 if wish.quick else 2)
+    asked = EvaluationSettings(seconds=SECONDS, inner=1 if wish.quick else 2)
     parts: dict[str, list[ScoredClassifier]] = {}
-    judged: list[Felt] = []
+    judged: list[FloorSignals] = []
     for split in found:
-        own = fit_own(
+        own = fit_slipid(
             data.job,
             problem_of(wish, SOURCE),
             split.fitted,
-            kept_of(Piece(wish, SOURCE, KIND, split.fold), fit=True),
+            kept_of(FoldTask(wish, SOURCE, KIND, split.fold), fit=True),
         )
         fitted, cuts = _fitted(data, split, own), _judged(data, split, own)
-        felts = [felt_of(run) for one in cuts for run in one.runs]
+        felts = [floor_signals(run) for one in cuts for run in one.runs]
         judged += felts
         if not wish.only or NAME in wish.only:
             done = attempted(NAME, partial(_own, own, cuts, data, split, felts))
             parts.setdefault(NAME, []).append(done)
-        for method in robotino_rows():
+        for method in robotino_classifiers():
             if not wish.only or method.name in wish.only:
-                work = partial(_published, method, fitted, felts, data.machine, asked)
+                work = partial(_published, method, fitted, felts, data.spec, asked)
                 done = attempted(method.name, work)
                 parts.setdefault(method.name, []).append(done)
     return table_of(
@@ -199,7 +205,7 @@ def robotino_felt(wish: Wish) -> FeltTable:
     )
 
 
-def felt_of(run: Run) -> Felt:
+def floor_signals(run: Run) -> FloorSignals:
     """A run as classifiers hear it, without its pose.
 
     Raises:
@@ -208,7 +214,7 @@ def felt_of(run: Run) -> Felt:
     heard = run.signals
     if heard.current is None:
         raise ValueError(f"{heard.name}: no current; floors are felt by it")
-    return Felt(
+    return FloorSignals(
         name=heard.name,
         floor=base_of(run.floor),
         time=np.cumsum(heard.dt),
@@ -218,29 +224,33 @@ def felt_of(run: Run) -> Felt:
     )
 
 
-def _fitted(data: DataSet, split: Split, own: Own) -> list[Felt]:
-    cuts = cut(data.logged.subset(split.fitted), own.contact.robot, data.source.poses_per_step)
+def _fitted(data: DataSet, split: Split, own: SlipidFit) -> list[FloorSignals]:
+    cuts = run_batches(
+        data.logged.subset(split.fitted), own.contact.robot, data.source.poses_per_step
+    )
     runs = {k: run for one in cuts for k, run in zip(one.numbers, one.runs, strict=True)}
-    return [felt_of(runs[k]) for k in sorted(runs)]
+    return [floor_signals(runs[k]) for k in sorted(runs)]
 
 
-def _judged(data: DataSet, split: Split, own: Own) -> list[Cut]:
-    return cut(data.logged.subset(split.judged), own.contact.robot, data.source.poses_per_step)
+def _judged(data: DataSet, split: Split, own: SlipidFit) -> list[RunBatch]:
+    return run_batches(
+        data.logged.subset(split.judged), own.contact.robot, data.source.poses_per_step
+    )
 
 
 def _own(
-    own: Own, cuts: list[Cut], data: DataSet, split: Split, felts: list[Felt]
+    own: SlipidFit, cuts: list[RunBatch], data: DataSet, split: Split, felts: list[FloorSignals]
 ) -> ScoredClassifier:
     """What the estimator says of the runs that were left out."""
     began = time.perf_counter()
-    said = estimated(own, cuts, data.logged.subset(split.judged), Place())
+    said = estimator_runs(own, cuts, data.logged.subset(split.judged), FloorKnowledge())
     took = time.perf_counter() - began
     answers: list[Answer] = []
     for felt, one in zip(felts, said, strict=True):
         labels, beliefs = beliefs_of(one)
-        answers += asked_after(felt, beliefs, labels, SECONDS)
+        answers += answers_after(felt, beliefs, labels, SECONDS)
     rows = sum(len(felt) for felt in felts)
-    row = FeltRow(NAME, numbers=own.numbers, fit_s=own.seconds, row_us=1e6 * took / rows)
+    row = ClassifierRow(NAME, numbers=own.numbers, fit_s=own.seconds, row_us=1e6 * took / rows)
     return ScoredClassifier(row, tuple(answers))
 
 
@@ -253,16 +263,20 @@ def beliefs_of(said: PredictedRun) -> tuple[tuple[str, ...], np.ndarray]:
 
 
 def _published(
-    method: FloorMethod, fitted: list[Felt], felts: list[Felt], machine: Machine, asked: Asked
+    method: FloorClassifier,
+    fitted: list[FloorSignals],
+    felts: list[FloorSignals],
+    spec: RobotSpec,
+    asked: EvaluationSettings,
 ) -> ScoredClassifier:
     """A classifier fitted to some runs and asked of others, from their starts on."""
     starts = [felt.pieces(max(SECONDS))[0] for felt in felts]
-    found = tuned(method, fitted, machine, asked)
+    found = tuned(method, fitted, spec, asked)
     began = time.perf_counter()
-    done = found.method.fit(fitted, machine)
+    done = found.method.fit(fitted, spec)
     ended = time.perf_counter()
-    answers = answers_of(done, starts, machine, SECONDS)
-    row = FeltRow(
+    answers = answers_of(done, starts, spec, SECONDS)
+    row = ClassifierRow(
         method.name,
         settings=(found.settings,),
         numbers=done.numbers,

@@ -13,20 +13,20 @@ from slipid.lab.benchmark.floors.logs import (
     SOURCE,
     ZERO_A,
     husky,
-    read_felt,
-    robotino_felt,
-    robotino_rows,
+    read_floor_runs,
+    robotino_classifiers,
+    robotino_table,
 )
-from slipid.lab.benchmark.floors.protocol import Asked, felt_table
-from slipid.lab.benchmark.floors.result import FeltTable
-from slipid.lab.benchmark.floors.slipid_row import SlipidFloors
-from slipid.lab.benchmark.judge import Row
-from slipid.lab.benchmark.own import NAME
-from slipid.lab.benchmark.work import OF_FITS, OF_ROWS, Wish, data_of
-from slipid.lab.systems.floors.cosine_energy import CosineEnergy, tree_rows
-from slipid.lab.systems.floors.gaussian import Gaussian
-from slipid.lab.systems.floors.interface import FloorMethod
-from slipid.predict.slip_model import Machine
+from slipid.lab.benchmark.floors.protocol import EvaluationSettings, classifier_table
+from slipid.lab.benchmark.floors.result import ClassifierTable
+from slipid.lab.benchmark.floors.slipid_row import SlipidFloorClassifier
+from slipid.lab.benchmark.scores import FoldScore
+from slipid.lab.benchmark.slipid_rows import NAME
+from slipid.lab.benchmark.work import OF_FITS, OF_ROWS, BenchmarkOptions, data_of
+from slipid.lab.systems.floors.cosine_energy import CosineEnergyClassifier, tree_rows
+from slipid.lab.systems.floors.gaussian import GaussianClassifier
+from slipid.lab.systems.floors.interface import FloorClassifier
+from slipid.predict.slip_model import RobotSpec
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.files import Content, hash_of
 from slipid.support.jax_setup import setup_jax
@@ -37,13 +37,13 @@ ABOUT = (
 )
 
 
-def felt_rows() -> list[FloorMethod]:
+def husky_classifiers() -> list[FloorClassifier]:
     """All classifiers, slipid first, unfitted."""
-    own = SlipidFloors(robot=husky(), zero_a=ZERO_A)
-    return [own, CosineEnergy(), Gaussian(), *tree_rows()]
+    own = SlipidFloorClassifier(robot=husky(), zero_a=ZERO_A)
+    return [own, CosineEnergyClassifier(), GaussianClassifier(), *tree_rows()]
 
 
-def felt_benchmark(data: Path, quick: bool = False, only: tuple[str, ...] = ()) -> FeltTable:
+def husky_table(data: Path, quick: bool = False, only: tuple[str, ...] = ()) -> ClassifierTable:
     """The table of all classifiers, or of those that are named.
 
     Args:
@@ -54,17 +54,23 @@ def felt_benchmark(data: Path, quick: bool = False, only: tuple[str, ...] = ()) 
     Raises:
         DataError: the folder's files cannot be read.
     """
-    felts = read_felt(data / FOLDER, RADIUS)
-    machine = Machine.of(husky().on(["any"]))
-    methods = [method for method in felt_rows() if not only or method.name in only]
-    return felt_table(methods, felts, machine, ABOUT, Asked.quick() if quick else Asked())
+    felts = read_floor_runs(data / FOLDER, RADIUS)
+    spec = RobotSpec.of(husky().on(["any"]))
+    methods = [method for method in husky_classifiers() if not only or method.name in only]
+    return classifier_table(
+        methods,
+        felts,
+        spec,
+        ABOUT,
+        EvaluationSettings.quick() if quick else EvaluationSettings(),
+    )
 
 
 @dataclass(frozen=True)
-class FeltPart(abc.ABC):
+class FloorTask(abc.ABC):
     """A table of classifiers that is made once, and kept."""
 
-    wish: Wish
+    wish: BenchmarkOptions
 
     @property
     @abc.abstractmethod
@@ -86,7 +92,7 @@ class FeltPart(abc.ABC):
         """Hash of its logs."""
 
     @abc.abstractmethod
-    def make(self) -> FeltTable:
+    def make(self) -> ClassifierTable:
         """Fit and judge the classifiers that are wished for."""
 
     @property
@@ -111,7 +117,7 @@ class FeltPart(abc.ABC):
             try:
                 kept.save_json(self.name, self.make().to_json())
             except Exception as error:  # other parts are done all the same
-                kept.save_json(self.name, {"failed": Row.of_error(error).absent})
+                kept.save_json(self.name, {"failed": FoldScore.of_error(error).absent})
         return self.name
 
     def table(self) -> Content:
@@ -120,7 +126,7 @@ class FeltPart(abc.ABC):
         return found
 
 
-class HuskyFloors(FeltPart):
+class HuskyFloorTask(FloorTask):
     """Five floors that a Husky felt, without a pose."""
 
     name = "husky_floors"
@@ -128,18 +134,18 @@ class HuskyFloors(FeltPart):
 
     @property
     def rows(self) -> Sequence[str]:
-        return [method.name for method in felt_rows()]
+        return [method.name for method in husky_classifiers()]
 
     def logs(self) -> str:
         root = self.wish.data / FOLDER
         files = sorted(root.glob("*/*.csv"))
         return hash_of((str(f.relative_to(root)), f.read_text(errors="replace")) for f in files)
 
-    def make(self) -> FeltTable:
-        return felt_benchmark(self.wish.data, self.wish.quick, self.wish.only)
+    def make(self) -> ClassifierTable:
+        return husky_table(self.wish.data, self.wish.quick, self.wish.only)
 
 
-class RobotinoFloors(FeltPart):
+class RobotinoFloorTask(FloorTask):
     """Four floors that a Robotino felt; slipid is its fit to the runs with poses."""
 
     name = "robotino_floors"
@@ -147,10 +153,10 @@ class RobotinoFloors(FeltPart):
 
     @property
     def rows(self) -> Sequence[str]:
-        return [NAME, *(method.name for method in robotino_rows())]
+        return [NAME, *(method.name for method in robotino_classifiers())]
 
     def logs(self) -> str:
         return data_of(self.wish, SOURCE).job.data_hash
 
-    def make(self) -> FeltTable:
-        return robotino_felt(self.wish)
+    def make(self) -> ClassifierTable:
+        return robotino_table(self.wish)

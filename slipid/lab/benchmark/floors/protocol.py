@@ -15,11 +15,17 @@ from functools import partial
 import numpy as np
 from jaxtyping import Int
 
-from slipid.lab.benchmark.floors.result import Answer, FeltRow, FeltTable, after_seconds, confused
-from slipid.lab.benchmark.judge import Row
-from slipid.lab.benchmark.tuned import settings_of
-from slipid.lab.systems.floors.interface import Beliefs, Felt, FloorMethod
-from slipid.predict.slip_model import Machine
+from slipid.lab.benchmark.floors.result import (
+    Answer,
+    ClassifierRow,
+    ClassifierTable,
+    after_seconds,
+    confusion,
+)
+from slipid.lab.benchmark.scores import FoldScore
+from slipid.lab.benchmark.tuning import settings_of
+from slipid.lab.systems.floors.interface import Beliefs, FloorClassifier, FloorSignals
+from slipid.predict.slip_model import RobotSpec
 
 SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """After which classifiers are asked [s]."""
@@ -29,7 +35,7 @@ Numbers = Int[np.ndarray, " run"]
 
 
 @dataclass(frozen=True)
-class Asked:
+class EvaluationSettings:
     """How classifiers are judged.
 
     Attributes:
@@ -46,12 +52,12 @@ class Asked:
     first_s: float = np.inf
 
     @classmethod
-    def quick(cls) -> "Asked":
+    def quick(cls) -> "EvaluationSettings":
         """One fold, the first minute of its runs and short times, settings as they are."""
         return cls(seconds=QUICK_SECONDS, judged=1, inner=1, first_s=60.0)
 
 
-def folds_of(felts: Sequence[Felt], count: int) -> Numbers:
+def folds_of(felts: Sequence[FloorSignals], count: int) -> Numbers:
     """Fold of every run: on each floor the first is in the first, the second in the second, .."""
     seen: dict[str, int] = {}
     fold = []
@@ -63,20 +69,23 @@ def folds_of(felts: Sequence[Felt], count: int) -> Numbers:
 
 
 def answers_of(
-    method: FloorMethod, felts: Sequence[Felt], machine: Machine, seconds: Sequence[float]
+    method: FloorClassifier,
+    felts: Sequence[FloorSignals],
+    spec: RobotSpec,
+    seconds: Sequence[float],
 ) -> list[Answer]:
     """What a fitted classifier says of the stretches of runs."""
     stretches = [part for felt in felts for part in felt.pieces(max(seconds))]
-    said = method.probability(stretches, machine)
+    said = method.probability(stretches, spec)
     return [
         answer
         for stretch, beliefs in zip(stretches, said, strict=True)
-        for answer in asked_after(stretch, beliefs, method.labels, seconds)
+        for answer in answers_after(stretch, beliefs, method.labels, seconds)
     ]
 
 
-def asked_after(
-    stretch: Felt, beliefs: Beliefs, labels: Sequence[str], seconds: Sequence[float]
+def answers_after(
+    stretch: FloorSignals, beliefs: Beliefs, labels: Sequence[str], seconds: Sequence[float]
 ) -> list[Answer]:
     """What beliefs say after each of the times that count, see the head of this file."""
     heard, step = np.cumsum(stretch.dt), float(np.median(stretch.dt))
@@ -94,29 +103,34 @@ def asked_after(
 
 
 @dataclass(frozen=True)
-class Tuned:
+class TunedClassifier:
     """A method with settings, in words, that did best; how long that took [s]."""
 
-    method: FloorMethod
+    method: FloorClassifier
     settings: str
     seconds: float
 
 
-def tuned(method: FloorMethod, felts: Sequence[Felt], machine: Machine, asked: Asked) -> Tuned:
+def tuned(
+    method: FloorClassifier,
+    felts: Sequence[FloorSignals],
+    spec: RobotSpec,
+    asked: EvaluationSettings,
+) -> TunedClassifier:
     """The candidate that names the right floor most often in an inner cross-validation.
 
     By the mean over all times that are asked; the first of those that are as good.
     """
     began, candidates = time.perf_counter(), list(method.candidates())
     if len(candidates) == 1 or asked.inner < 2:
-        return Tuned(method, "", 0.0)
+        return TunedClassifier(method, "", 0.0)
     fold = folds_of(felts, asked.inner)
     right = []
     for candidate in candidates:
         said: list[Answer] = []
         for k in range(asked.inner):
-            done = candidate.fit(_some(felts, fold != k), machine)
-            said += answers_of(done, _some(felts, fold == k), machine, asked.seconds)
+            done = candidate.fit(_some(felts, fold != k), spec)
+            said += answers_of(done, _some(felts, fold == k), spec, asked.seconds)
         each = [
             np.mean([a.said == a.floor for a in said if a.seconds == long])
             for long in sorted({a.seconds for a in said})
@@ -124,10 +138,10 @@ def tuned(method: FloorMethod, felts: Sequence[Felt], machine: Machine, asked: A
         right.append(float(np.mean(each)))
     best = candidates[int(np.argmax(right))]
     words = settings_of(best, candidates)
-    return Tuned(best, words, time.perf_counter() - began)
+    return TunedClassifier(best, words, time.perf_counter() - began)
 
 
-def _some(felts: Sequence[Felt], take: np.ndarray) -> list[Felt]:
+def _some(felts: Sequence[FloorSignals], take: np.ndarray) -> list[FloorSignals]:
     return [felt for felt, t in zip(felts, take, strict=True) if t]
 
 
@@ -135,12 +149,15 @@ def _some(felts: Sequence[Felt], take: np.ndarray) -> list[Felt]:
 class ScoredClassifier:
     """A classifier in all folds: its row but for what is compared, and its answers."""
 
-    row: FeltRow
+    row: ClassifierRow
     answers: tuple[Answer, ...]
 
 
 def judged(
-    method: FloorMethod, felts: Sequence[Felt], machine: Machine, asked: Asked
+    method: FloorClassifier,
+    felts: Sequence[FloorSignals],
+    spec: RobotSpec,
+    asked: EvaluationSettings,
 ) -> ScoredClassifier:
     """A classifier fitted and asked, fold by fold."""
     fold = folds_of(felts, asked.folds)
@@ -149,18 +166,18 @@ def judged(
     for k in range(asked.judged):
         fitted = _some(felts, fold != k)
         left_out = [felt.pieces(asked.first_s)[0] for felt in _some(felts, fold == k)]
-        found = tuned(method, fitted, machine, asked)
+        found = tuned(method, fitted, spec, asked)
         began = time.perf_counter()
-        done = found.method.fit(fitted, machine)
+        done = found.method.fit(fitted, spec)
         ended = time.perf_counter()
-        answers += answers_of(done, left_out, machine, asked.seconds)
+        answers += answers_of(done, left_out, spec, asked.seconds)
         heard_s += time.perf_counter() - ended
         rows += sum(len(felt) for felt in left_out)
         settings.append(found.settings)
         numbers.append(done.numbers)
         fit_s.append(ended - began)
         tune_s.append(found.seconds)
-    row = FeltRow(
+    row = ClassifierRow(
         name=method.name,
         settings=tuple(settings),
         numbers=int(np.median(numbers)),
@@ -176,20 +193,20 @@ def attempted(name: str, work: Callable[[], ScoredClassifier]) -> ScoredClassifi
     try:
         return work()
     except Exception as error:  # other rows are judged all the same
-        return ScoredClassifier(FeltRow(name, absent=Row.of_error(error).absent), ())
+        return ScoredClassifier(ClassifierRow(name, absent=FoldScore.of_error(error).absent), ())
 
 
-def felt_table(
-    methods: Sequence[FloorMethod],
-    felts: Sequence[Felt],
-    machine: Machine,
+def classifier_table(
+    methods: Sequence[FloorClassifier],
+    felts: Sequence[FloorSignals],
+    spec: RobotSpec,
     about: str,
-    asked: Asked = Asked(),
+    asked: EvaluationSettings = EvaluationSettings(),
     reference: str = "slipid",
-) -> FeltTable:
+) -> ClassifierTable:
     """All classifiers on the same runs; `reference` is the one that others are compared with."""
     done = {
-        method.name: attempted(method.name, partial(judged, method, felts, machine, asked))
+        method.name: attempted(method.name, partial(judged, method, felts, spec, asked))
         for method in methods
     }
     return table_of(done, felts, about, asked, reference)
@@ -197,11 +214,11 @@ def felt_table(
 
 def table_of(
     done: dict[str, ScoredClassifier],
-    felts: Sequence[Felt],
+    felts: Sequence[FloorSignals],
     about: str,
-    asked: Asked,
+    asked: EvaluationSettings,
     reference: str,
-) -> FeltTable:
+) -> ClassifierTable:
     """Rows put together."""
     rival = (done[reference].answers or None) if reference in done else None
     longest, rows = max(asked.seconds), []
@@ -211,11 +228,11 @@ def table_of(
             continue
         other = None if name == reference else rival
         after = after_seconds(one.answers, other)
-        rows.append(replace(one.row, after=after, said=confused(one.answers, longest)))
+        rows.append(replace(one.row, after=after, said=confusion(one.answers, longest)))
     first = next((one.answers for one in done.values() if one.answers), ())
     if not first:
         raise ValueError("; ".join(f"{name}: {one.row.absent}" for name, one in done.items()))
     floor = [a.floor for a in first if a.seconds == min(asked.seconds)]
     chance = max(floor.count(name) for name in set(floor)) / len(floor)
     names = tuple(sorted({felt.floor for felt in felts}))
-    return FeltTable(about, len({felt.name for felt in felts}), names, chance, tuple(rows))
+    return ClassifierTable(about, len({felt.name for felt in felts}), names, chance, tuple(rows))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from slipid.lab.benchmark.summary import Number, Resampled, number
+from slipid.lab.benchmark.summary import Bootstrap, MeanInterval, mean_interval
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,15 @@ class AfterSeconds:
 
     seconds: float
     stretches: int
-    accuracy: Number
-    balanced: Number
-    behind: Number | None
+    accuracy: MeanInterval
+    balanced: MeanInterval
+    behind: MeanInterval | None
     by_floor: Mapping[str, float]
     log_score: float
 
 
 @dataclass(frozen=True)
-class FeltRow:
+class ClassifierRow:
     """A classifier.
 
     Attributes:
@@ -77,7 +77,7 @@ class FeltRow:
 
 
 @dataclass(frozen=True)
-class FeltTable:
+class ClassifierTable:
     """All classifiers on one set of runs.
 
     Attributes:
@@ -91,7 +91,7 @@ class FeltTable:
     runs: int
     floors: tuple[str, ...]
     chance: float
-    rows: tuple[FeltRow, ...]
+    rows: tuple[ClassifierRow, ...]
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
@@ -117,24 +117,24 @@ def _after(
     right = np.array([a.said == a.floor for a in answers], dtype=float)
     # whole runs are drawn anew, floor by floor
     run = np.unique([a.run for a in answers], return_inverse=True)[1]
-    by = Resampled.by([a.floor for a in answers], run)
+    by = Bootstrap.by([a.floor for a in answers], run)
     behind = None
     if rival is not None:
         assert [(a.run, a.floor) for a in rival] == [(a.run, a.floor) for a in answers]
         theirs = np.array([a.said == a.floor for a in rival], dtype=float)
-        behind = number(by.over_all(right - theirs))
+        behind = mean_interval(by.over_all(right - theirs))
     return AfterSeconds(
         seconds=seconds,
         stretches=len(answers),
-        accuracy=number(by.over_all(right)),
-        balanced=number(by.mean(right)),
+        accuracy=mean_interval(by.over_all(right)),
+        balanced=mean_interval(by.mean(right)),
         behind=behind,
         by_floor={name: float(by.on(right, k)[0]) for k, name in enumerate(by.names)},
         log_score=float(np.mean(np.log(np.maximum([a.probability for a in answers], 1e-6)))),
     )
 
 
-def confused(answers: Sequence[Answer], seconds: float) -> dict[str, dict[str, float]]:
+def confusion(answers: Sequence[Answer], seconds: float) -> dict[str, dict[str, float]]:
     """On each floor, how often each was named after so long [%]."""
     mine = [a for a in answers if a.seconds == seconds]
     names = sorted({a.floor for a in mine} | {a.said for a in mine})

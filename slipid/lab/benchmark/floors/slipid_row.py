@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from slipid.deploy.deploy import given
+from slipid.deploy.deploy import given_numbers
 from slipid.lab.benchmark.floors.fitting import (
     MeteredMotor,
     currents_off,
@@ -36,10 +36,10 @@ from slipid.lab.benchmark.floors.fitting import (
     scatter_of,
     stiffness_of,
 )
-from slipid.lab.systems.floors.interface import Beliefs, Felt, FloorMethod, floors_of
+from slipid.lab.systems.floors.interface import Beliefs, FloorClassifier, FloorSignals, floors_of
 from slipid.model.contact_law import ContactSurface
 from slipid.model.robot import Robot
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, EstimatorState
 from slipid.robot.interface import Readings, Settings
@@ -66,7 +66,9 @@ def deployed(robot: Robot) -> DeployedRobot:
     )
     record = RobotRecord(
         wheels=Wheels(**{f.name: getattr(shape, f.name) for f in fields(Wheels)}),
-        parameters={path: n for path, n in given(robot).items() if not path.startswith("camera.")},
+        parameters={
+            path: n for path, n in given_numbers(robot).items() if not path.startswith("camera.")
+        },
         floors=tuple(
             FloorRecord(name=name, process=none, effect=none, current_std=1.0, seen=None)
             for name in robot.surfaces.labels
@@ -102,7 +104,7 @@ others (`filter_s`); `gyro_std` is about what the fits leave of the yaw rate."""
 
 
 @dataclass(frozen=True, eq=False)
-class Learnt:
+class FittedFloors:
     """What is known of floors.
 
     Attributes:
@@ -116,7 +118,7 @@ class Learnt:
 
 
 @dataclass(frozen=True)
-class SlipidFloors(FloorMethod):
+class SlipidFloorClassifier(FloorClassifier):
     """slipid's floor filter.
 
     Attributes:
@@ -130,9 +132,9 @@ class SlipidFloors(FloorMethod):
     robot: Robot | None = None
     zero_a: float = 0.0
     settings: Settings = SETTINGS
-    fitted: Learnt | None = field(default=None, repr=False)
+    fitted: FittedFloors | None = field(default=None, repr=False)
 
-    def fit(self, felts: Sequence[Felt], machine: Machine) -> "SlipidFloors":
+    def fit(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> "SlipidFloorClassifier":
         labels = floors_of(felts)
         seen = [self._heard(felt) for felt in felts]
         robot = self._on(labels)
@@ -140,10 +142,10 @@ class SlipidFloors(FloorMethod):
             robot.motor, jnp.asarray(stiffness_of(seen)), jnp.asarray(scatter_of(seen))
         )
         robot = fitted_floors(replace(robot, motor=motor), seen)
-        std = _scatter(robot, seen, machine)
-        return replace(self, labels=labels, fitted=Learnt(robot.surfaces, motor, std))
+        std = _scatter(robot, seen, spec)
+        return replace(self, labels=labels, fitted=FittedFloors(robot.surfaces, motor, std))
 
-    def probability(self, felts: Sequence[Felt], machine: Machine) -> list[Beliefs]:
+    def probability(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
             raise ValueError(f"{self.name} was not fitted")
         plain = deployed(self._on(self.labels))
@@ -153,7 +155,7 @@ class SlipidFloors(FloorMethod):
         rows = -(-max(len(felt) for felt in felts) // 8) * 8
         for first in range(0, len(felts), TOGETHER):
             some = [self._heard(felt) for felt in felts[first : first + TOGETHER]]
-            beliefs = np.asarray(_driven(estimator, std, _Rows.of(some, rows, machine)))
+            beliefs = np.asarray(_driven(estimator, std, _FilterRows.of(some, rows, spec)))
             out += [beliefs[k, : len(felt)] for k, felt in enumerate(some)]
         return [row[:, :-1] / row[:, :-1].sum(axis=1, keepdims=True) for row in out]
 
@@ -174,20 +176,20 @@ class SlipidFloors(FloorMethod):
         surfaces = replace(robot.surfaces, lead=none, drag_exponent=none + 1.0)
         return replace(robot, surfaces=surfaces)
 
-    def _heard(self, felt: Felt) -> Felt:
+    def _heard(self, felt: FloorSignals) -> FloorSignals:
         """The run with currents over the zero of the ammeters, and nothing below it."""
         return replace(felt, current=np.maximum(np.abs(felt.current) - self.zero_a, 0.0))
 
 
-def kinds(felt: Felt, machine: Machine) -> Int[np.ndarray, " row"]:
+def kinds(felt: FloorSignals, spec: RobotSpec) -> Int[np.ndarray, " row"]:
     """How a robot goes in each row: 0 straight, 1 in a bend, 2 on the spot."""
-    x, y, yaw = felt.rolling(machine).T
-    turn = machine.base_radius * np.abs(yaw)
+    x, y, yaw = felt.rolling(spec).T
+    turn = spec.base_radius * np.abs(yaw)
     return np.digitize(turn / np.maximum(np.hypot(x, y) + turn, 1e-9), BENDS)
 
 
 def _scatter(
-    robot: Robot, felts: Sequence[Felt], machine: Machine
+    robot: Robot, felts: Sequence[FloorSignals], spec: RobotSpec
 ) -> Float[np.ndarray, "kind floor"]:
     """Std of currents about the model's on every floor, straight, in bends and on the spot [A]."""
     count = len(BENDS) + 1
@@ -199,7 +201,7 @@ def _scatter(
             take = take[:: max(1, len(take) // MOST_ROWS)]
             speed.append(felt.speed[take])
             current.append(felt.current[take])
-            kind.append(kinds(felt, machine)[take])
+            kind.append(kinds(felt, spec)[take])
         off = currents_off(robot, k, np.concatenate(speed), np.concatenate(current))
         squares, of_kind = (off**2).mean(axis=1), np.concatenate(kind)
         for n in range(count):
@@ -209,11 +211,11 @@ def _scatter(
     return std
 
 
-class _Rows(eqx.Module):
+class _FilterRows(eqx.Module):
     """What the filter hears, run by run and row by row.
 
     Attributes:
-        speed, current, gyro: as of `Felt`.
+        speed, current, gyro: as of `FloorSignals`.
         dt: how long each row stands for [s]; 0 of rows that a run is filled up with.
         kind: how the robot goes, see `kinds`.
     """
@@ -225,7 +227,7 @@ class _Rows(eqx.Module):
     kind: Int[Array, "*run row"]
 
     @classmethod
-    def of(cls, felts: Sequence[Felt], rows: int, machine: Machine) -> "_Rows":
+    def of(cls, felts: Sequence[FloorSignals], rows: int, spec: RobotSpec) -> "_FilterRows":
         """Runs side by side, filled up to so many rows and to `TOGETHER` runs."""
         drives = felts[0].speed.shape[1]
         speed, current = np.zeros((2, TOGETHER, rows, drives))
@@ -237,24 +239,24 @@ class _Rows(eqx.Module):
             # a robot that stands feels nothing
             dt[k, :n] = np.where(felt.moves, felt.dt, 0.0)
             gyro[k, :n] = np.nan if felt.gyro is None else felt.gyro
-            kind[k, :n] = kinds(felt, machine)
+            kind[k, :n] = kinds(felt, spec)
         return cls(*(jnp.asarray(x) for x in (speed, current, gyro, dt, kind)))
 
 
 @eqx.filter_jit
 def _driven(
-    estimator: Estimator, std: Float[Array, "kind floor"], runs: _Rows
+    estimator: Estimator, std: Float[Array, "kind floor"], runs: _FilterRows
 ) -> Float[Array, "run row floor_or_none"]:
     """Probability of every floor, and of none, under the robot after every row."""
     nothing = Readings.nothing(estimator.robot.drives)
 
-    def step(state: EstimatorState, row: _Rows) -> tuple[EstimatorState, Array]:
+    def step(state: EstimatorState, row: _FilterRows) -> tuple[EstimatorState, Array]:
         now = Estimator(replace(estimator.robot, current_std=std[row.kind]), estimator.settings)
         z = replace(nothing, wheel_speed=row.speed, current=row.current, gyro=row.gyro)
         state, seen = now.advance(state, z, row.dt)
         return state, seen.surface_probability.mean(axis=0)
 
-    def one(run: _Rows) -> Array:
+    def one(run: _FilterRows) -> Array:
         state = estimator.init()
         state = replace(
             state,

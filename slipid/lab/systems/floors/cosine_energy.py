@@ -69,16 +69,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from slipid.lab.systems.floors.gaussian import Hearing, Window, features
+from slipid.lab.systems.floors.gaussian import FeatureChannels, TrailingWindow, features
 from slipid.lab.systems.floors.interface import (
     Beliefs,
-    Felt,
-    FloorMethod,
+    FloorClassifier,
+    FloorSignals,
     accumulated,
     floors_of,
-    rows_of,
+    training_rows,
 )
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 
 if TYPE_CHECKING:
     from sklearn.ensemble import HistGradientBoostingClassifier
@@ -90,7 +90,7 @@ SLOW = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Series:
+class CosineSeries:
     """A cosine series of each floor.
 
     Attributes:
@@ -103,7 +103,7 @@ class Series:
 
 
 @dataclass(frozen=True)
-class CosineEnergy(FloorMethod):
+class CosineEnergyClassifier(FloorClassifier):
     """Energy coefficient as a cosine series in the direction of travel, and a Gaussian about it.
 
     Attributes:
@@ -122,30 +122,30 @@ class CosineEnergy(FloorMethod):
     window_s: float = 0.5
     apart_s: float = 0.5
     memory_s: float = 20.0
-    fitted: Series | None = field(default=None, repr=False)
+    fitted: CosineSeries | None = field(default=None, repr=False)
 
-    def candidates(self) -> Sequence["CosineEnergy"]:
+    def candidates(self) -> Sequence["CosineEnergyClassifier"]:
         both = (True, False)
         return [replace(self, losses=heat, logarithm=log) for heat in both for log in both]
 
-    def fit(self, felts: Sequence[Felt], machine: Machine) -> "CosineEnergy":
+    def fit(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> "CosineEnergyClassifier":
         labels = floors_of(felts)
-        rows, floor = rows_of(felts, lambda felt: self._seen(felt, machine))
+        rows, floor = training_rows(felts, lambda felt: self._seen(felt, spec))
         known = np.isfinite(rows).all(axis=1)
         fitted = [self._series(rows[known & (floor == name)]) for name in labels]
         weight = np.stack([one.weight[0] for one in fitted])
         return replace(
             self,
             labels=labels,
-            fitted=Series(weight, np.concatenate([one.std for one in fitted])),
+            fitted=CosineSeries(weight, np.concatenate([one.std for one in fitted])),
         )
 
-    def probability(self, felts: Sequence[Felt], machine: Machine) -> list[Beliefs]:
+    def probability(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
             raise ValueError(f"{self.name} was not fitted")
         out = []
         for felt in felts:
-            angle, energy = self._seen(felt, machine).T
+            angle, energy = self._seen(felt, spec).T
             expected = terms(angle, self.harmonics) @ self.fitted.weight.T
             z = (energy[:, None] - expected) / self.fitted.std
             log = -0.5 * z**2 - np.log(self.fitted.std)
@@ -156,27 +156,27 @@ class CosineEnergy(FloorMethod):
     def numbers(self) -> int:
         return 0 if self.fitted is None else self.fitted.weight.size + self.fitted.std.size
 
-    def _series(self, rows: Float[np.ndarray, "row 2"]) -> Series:
+    def _series(self, rows: Float[np.ndarray, "row 2"]) -> CosineSeries:
         """The series of one floor by its directions and coefficients."""
         a = terms(rows[:, 0], self.harmonics)
         ridge = self.ridge * np.eye(a.shape[1])
         ridge[0, 0] = 0.0
         weight = np.linalg.solve(a.T @ a + ridge + 1e-9 * np.eye(len(ridge)), a.T @ rows[:, 1])
         left = rows[:, 1] - a @ weight
-        return Series(weight[None], np.array([max(float(left.std()), 1e-6)]))
+        return CosineSeries(weight[None], np.array([max(float(left.std()), 1e-6)]))
 
-    def _seen(self, felt: Felt, machine: Machine) -> Float[np.ndarray, "row 2"]:
+    def _seen(self, felt: FloorSignals, spec: RobotSpec) -> Float[np.ndarray, "row 2"]:
         """Direction of travel [rad] and energy coefficient of every row, NaN where it is slow."""
-        window = Window.of(felt.time, self.window_s)
-        x, y, yaw = (window.mean(column) for column in felt.rolling(machine).T)
-        turn = machine.base_radius * yaw
-        across = y if machine.determines_twist else turn
+        window = TrailingWindow.of(felt.time, self.window_s)
+        x, y, yaw = (window.mean(column) for column in felt.rolling(spec).T)
+        turn = spec.base_radius * yaw
+        across = y if spec.determines_twist else turn
         speed = np.sqrt(x**2 + y**2 + turn**2)
-        amps, shaft = np.abs(felt.current), np.abs(machine.gear_ratio * felt.speed)
-        heat = machine.resistance * self.losses * amps
-        power = ((heat + machine.back_emf * shaft) * amps).sum(axis=1)
+        amps, shaft = np.abs(felt.current), np.abs(spec.gear_ratio * felt.speed)
+        heat = spec.resistance * self.losses * amps
+        power = ((heat + spec.back_emf * shaft) * amps).sum(axis=1)
         moving = speed > SLOW
-        energy = window.mean(power) / (machine.mass * GRAVITY * np.where(moving, speed, np.nan))
+        energy = window.mean(power) / (spec.mass * GRAVITY * np.where(moving, speed, np.nan))
         energy = np.log(np.maximum(energy, 1e-9)) if self.logarithm else energy
         return np.stack([np.arctan2(across, x), energy], axis=1)
 
@@ -189,14 +189,14 @@ def terms(angle: Float[np.ndarray, " row"], harmonics: int) -> Float[np.ndarray,
 
 LEAST = 1e-4
 """Probability that no floor goes below after one row."""
-EVERYTHING = Hearing()
+EVERYTHING = FeatureChannels()
 """What slipid hears too."""
-DRIVING = Hearing(current=False, gyro=False)
+DRIVING = FeatureChannels(current=False, gyro=False)
 """Wheel speeds alone."""
 
 
 @dataclass(frozen=True, eq=False)
-class Ensemble:
+class TreeEnsemble:
     """Trees that were fitted to some channels.
 
     Attributes:
@@ -205,24 +205,24 @@ class Ensemble:
         frequency: of each floor among the rows it was fitted to.
     """
 
-    hearing: Hearing
+    hearing: FeatureChannels
     trees: "HistGradientBoostingClassifier"
     frequency: Float[np.ndarray, " floor"]
 
     def log_likelihood(
-        self, felts: Sequence[Felt], machine: Machine
+        self, felts: Sequence[FloorSignals], spec: RobotSpec
     ) -> Float[np.ndarray, "row floor"]:
         """Of every floor in the rows of all runs, one after another, up to a factor per row."""
         from threadpoolctl import threadpool_limits
 
-        rows = np.concatenate([features(felt, machine, self.hearing) for felt in felts])
+        rows = np.concatenate([features(felt, spec, self.hearing) for felt in felts])
         with threadpool_limits(1):
             probability = self.trees.predict_proba(rows)
         return np.asarray(np.log(np.maximum(probability, LEAST)) - np.log(self.frequency))
 
 
 @dataclass(frozen=True)
-class BoostedTrees(FloorMethod):
+class BoostedTreesClassifier(FloorClassifier):
     """Gradient-boosted trees on windows, their log probabilities added up.
 
     Attributes:
@@ -238,7 +238,7 @@ class BoostedTrees(FloorMethod):
     """
 
     name: str = "boosted_trees"
-    hearing: Hearing = EVERYTHING
+    hearing: FeatureChannels = EVERYTHING
     driving_off: bool = False
     leaves: int = 4
     trees: int = 60
@@ -248,25 +248,25 @@ class BoostedTrees(FloorMethod):
     rows_s: float = 0.4
     piece_s: float = 8.0
     tuned: bool = True
-    fitted: tuple[Ensemble, ...] = field(default=(), repr=False)
+    fitted: tuple[TreeEnsemble, ...] = field(default=(), repr=False)
 
-    def candidates(self) -> Sequence["BoostedTrees"]:
+    def candidates(self) -> Sequence["BoostedTreesClassifier"]:
         if not self.tuned:
             return (self,)
         pairs = [(4, 20.0), (12, 20.0)]
         return [replace(self, leaves=leaves, memory_s=memory) for leaves, memory in pairs]
 
-    def fit(self, felts: Sequence[Felt], machine: Machine) -> "BoostedTrees":
+    def fit(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> "BoostedTreesClassifier":
         heard = [self.hearing, DRIVING] if self.driving_off else [self.hearing]
-        fitted = tuple(self._ensemble(felts, machine, hearing) for hearing in heard)
+        fitted = tuple(self._ensemble(felts, spec, hearing) for hearing in heard)
         return replace(self, labels=floors_of(felts), fitted=fitted)
 
-    def probability(self, felts: Sequence[Felt], machine: Machine) -> list[Beliefs]:
+    def probability(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if not self.fitted:
             raise ValueError(f"{self.name} was not fitted")
-        log = self.fitted[0].log_likelihood(felts, machine)
+        log = self.fitted[0].log_likelihood(felts, spec)
         for other in self.fitted[1:]:
-            log = log - other.log_likelihood(felts, machine)
+            log = log - other.log_likelihood(felts, spec)
         each = np.split(log, np.cumsum([len(felt) for felt in felts])[:-1])
         return [
             accumulated(mine, felt, self.apart_s, self.memory_s)
@@ -278,13 +278,15 @@ class BoostedTrees(FloorMethod):
         """Leaves of all trees at most."""
         return len(self.fitted) * self.trees * len(self.labels) * self.leaves
 
-    def _ensemble(self, felts: Sequence[Felt], machine: Machine, hearing: Hearing) -> Ensemble:
+    def _ensemble(
+        self, felts: Sequence[FloorSignals], spec: RobotSpec, hearing: FeatureChannels
+    ) -> TreeEnsemble:
         from sklearn.ensemble import HistGradientBoostingClassifier
         from threadpoolctl import threadpool_limits
 
-        rows, floor = rows_of(
+        rows, floor = training_rows(
             felts,
-            lambda felt: features(felt, machine, hearing, piece_s=self.piece_s),
+            lambda felt: features(felt, spec, hearing, piece_s=self.piece_s),
             self.rows_s,
         )
         trees = HistGradientBoostingClassifier(
@@ -300,16 +302,16 @@ class BoostedTrees(FloorMethod):
         with threadpool_limits(1):
             trees.fit(rows, floor)
         frequency = np.array([np.mean(floor == name) for name in floors_of(felts)])
-        return Ensemble(hearing, trees, frequency)
+        return TreeEnsemble(hearing, trees, frequency)
 
 
-def tree_rows() -> list[BoostedTrees]:
+def tree_rows() -> list[BoostedTreesClassifier]:
     """The row, and those that tell what it owes to the driving and what vibration would add."""
-    row = BoostedTrees()
+    row = BoostedTreesClassifier()
     beside = replace(row, tuned=False)
     return [
         row,
         replace(beside, name="boosted_trees_felt", driving_off=True),
         replace(beside, name="boosted_trees_driving", hearing=DRIVING),
-        replace(beside, name="boosted_trees_vibration", hearing=Hearing(vibration=True)),
+        replace(beside, name="boosted_trees_vibration", hearing=FeatureChannels(vibration=True)),
     ]

@@ -34,20 +34,20 @@ from jaxtyping import Float, Int
 
 from slipid.lab.systems.floors.interface import (
     Beliefs,
-    Felt,
-    FloorMethod,
+    FloorClassifier,
+    FloorSignals,
     accumulated,
     floors_of,
-    rows_of,
+    training_rows,
 )
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 
 WINDOWS_S = (0.5, 1.0, 2.0)
 """Lengths of the windows [s]."""
 
 
 @dataclass(frozen=True)
-class Hearing:
+class FeatureChannels:
     """Which channels features are made of; wheel speeds always.
 
     Attributes:
@@ -60,9 +60,9 @@ class Hearing:
 
 
 def features(
-    felt: Felt,
-    machine: Machine,
-    hearing: Hearing = Hearing(),
+    felt: FloorSignals,
+    spec: RobotSpec,
+    hearing: FeatureChannels = FeatureChannels(),
     windows_s: Sequence[float] = WINDOWS_S,
     piece_s: float = np.inf,
 ) -> Float[np.ndarray, "row feature"]:
@@ -73,28 +73,28 @@ def features(
     began = felt.began(piece_s)
     columns = [np.minimum(felt.time - felt.time[began], max(windows_s))]
     for seconds in windows_s:
-        window = Window.of(felt.time, seconds, began)
+        window = TrailingWindow.of(felt.time, seconds, began)
         columns += [column for x in _moving(felt, hearing) for column in window.both(x)]
         if hearing.current:
             amps, turned = np.abs(felt.current).sum(axis=1), np.abs(felt.speed).sum(axis=1)
             columns.append(window.mean(amps) / (window.mean(turned) + 0.1))
         if hearing.gyro and felt.gyro is not None:
-            turn = felt.rolling(machine)[:, 2]
+            turn = felt.rolling(spec)[:, 2]
             columns.append(window.mean(np.abs(felt.gyro)))
-            columns += window.both(short_of(felt.gyro, turn))
+            columns += window.both(yaw_rate_shortfall(felt.gyro, turn))
         if hearing.vibration and felt.vibration is not None:
             columns += window.both(felt.vibration)
     return np.stack(columns, axis=1)
 
 
-def short_of(
+def yaw_rate_shortfall(
     gyro: Float[np.ndarray, " row"], turn: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, " row"]:
     """How much a gyro's yaw rate falls short of the encoders', whichever way they turn [rad/s]."""
     return np.asarray(np.where(turn < 0, gyro - turn, turn - gyro))
 
 
-def _moving(felt: Felt, hearing: Hearing) -> list[np.ndarray]:
+def _moving(felt: FloorSignals, hearing: FeatureChannels) -> list[np.ndarray]:
     """Channels of which means and stds are features, one array each."""
     drives = range(felt.speed.shape[1])
     amps = [np.abs(felt.current[:, k]) for k in drives] if hearing.current else []
@@ -102,7 +102,7 @@ def _moving(felt: Felt, hearing: Hearing) -> list[np.ndarray]:
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
+class TrailingWindow:
     """For every row, those rows of the last so many seconds.
 
     Attributes:
@@ -117,7 +117,7 @@ class Window:
         time: Float[np.ndarray, " row"],
         seconds: float,
         began: Int[np.ndarray, " row"] | None = None,
-    ) -> "Window":
+    ) -> "TrailingWindow":
         """Windows of a length at rows of these times [s], none of them from before `began`."""
         first = np.searchsorted(time, time - seconds + 1e-6)
         return cls(first if began is None else np.maximum(first, began))
@@ -144,7 +144,7 @@ class Window:
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class FloorGaussians:
     """A Gaussian of every floor.
 
     Attributes:
@@ -175,7 +175,7 @@ class Cloud:
 
 
 @dataclass(frozen=True)
-class Gaussian(FloorMethod):
+class GaussianClassifier(FloorClassifier):
     """A Gaussian per floor, the likelihood of windows added up.
 
     Attributes:
@@ -192,14 +192,14 @@ class Gaussian(FloorMethod):
     window_s: float = 1.0
     apart_s: float = 1.0
     piece_s: float = 8.0
-    fitted: Cloud | None = field(default=None, repr=False)
+    fitted: FloorGaussians | None = field(default=None, repr=False)
 
-    def candidates(self) -> Sequence["Gaussian"]:
+    def candidates(self) -> Sequence["GaussianClassifier"]:
         return [replace(self, shared=shared) for shared in (0.0, 0.3, 1.0)]
 
-    def fit(self, felts: Sequence[Felt], machine: Machine) -> "Gaussian":
+    def fit(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> "GaussianClassifier":
         labels = floors_of(felts)
-        rows, floor = rows_of(felts, lambda felt: self._features(felt, machine, self.piece_s))
+        rows, floor = training_rows(felts, lambda felt: self._features(felt, spec, self.piece_s))
         middle, scale = np.nanmean(rows, axis=0), np.nanstd(rows, axis=0)
         comparable = np.nan_to_num((rows - middle) / np.maximum(scale, 1e-9), nan=0.0)
         groups = [comparable[floor == name] for name in labels]
@@ -207,7 +207,7 @@ class Gaussian(FloorMethod):
         own = np.stack([np.cov(group.T, bias=True) for group in groups])
         covariance = (1 - self.shared) * own + self.shared * own.mean(axis=0)
         factor = np.linalg.cholesky(covariance + self.ridge * np.eye(len(middle)))
-        cloud = Cloud(
+        cloud = FloorGaussians(
             middle=middle,
             scale=np.maximum(scale, 1e-9),
             mean=mean,
@@ -216,13 +216,11 @@ class Gaussian(FloorMethod):
         )
         return replace(self, labels=labels, fitted=cloud)
 
-    def probability(self, felts: Sequence[Felt], machine: Machine) -> list[Beliefs]:
+    def probability(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
             raise ValueError(f"{self.name} was not fitted")
         return [
-            accumulated(
-                self.fitted.log_likelihood(self._features(felt, machine)), felt, self.apart_s
-            )
+            accumulated(self.fitted.log_likelihood(self._features(felt, spec)), felt, self.apart_s)
             for felt in felts
         ]
 
@@ -234,7 +232,7 @@ class Gaussian(FloorMethod):
         return floors * (count + count * (count + 1) // 2)
 
     def _features(
-        self, felt: Felt, machine: Machine, piece_s: float = np.inf
+        self, felt: FloorSignals, spec: RobotSpec, piece_s: float = np.inf
     ) -> Float[np.ndarray, "row feature"]:
         """Those of one window, without the time heard."""
-        return features(felt, machine, Hearing(), (self.window_s,), piece_s)[:, 1:]
+        return features(felt, spec, FeatureChannels(), (self.window_s,), piece_s)[:, 1:]

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 
 Beliefs = Float[np.ndarray, "row floor"]
 """Probability of each floor after every row."""
@@ -22,7 +22,7 @@ STILL = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Felt:
+class FloorSignals:
     """What a robot feels of a floor, row by row, without a pose.
 
     Attributes:
@@ -59,7 +59,7 @@ class Felt:
         """Rows in which a wheel turns; a robot that stands feels no floor."""
         return np.asarray(np.abs(self.speed).max(axis=1) > STILL)
 
-    def part(self, first: int, last: int) -> "Felt":
+    def part(self, first: int, last: int) -> "FloorSignals":
         """The rows from `first` up to, and without, `last`."""
         rows = slice(first, last)
         return replace(
@@ -77,18 +77,18 @@ class Felt:
         number = np.floor(start / seconds + 1e-6)
         return np.searchsorted(number, number)
 
-    def pieces(self, seconds: float) -> list["Felt"]:
+    def pieces(self, seconds: float) -> list["FloorSignals"]:
         """The run cut into parts of this length one after another, the last of them shorter."""
         edges = [*np.unique(self.began(seconds)), len(self)]
         return [self.part(int(a), int(b)) for a, b in pairwise(edges)]
 
-    def rolling(self, machine: Machine) -> Float[np.ndarray, "row 3"]:
+    def rolling(self, spec: RobotSpec) -> Float[np.ndarray, "row 3"]:
         """Body twist if nothing slips [m/s, m/s, rad/s]."""
-        return np.asarray(self.speed * machine.wheel_radius @ machine.back.T)
+        return np.asarray(self.speed * spec.wheel_radius @ spec.back.T)
 
 
 @dataclass(frozen=True)
-class FloorMethod(abc.ABC):
+class FloorClassifier(abc.ABC):
     """A classifier of floors, before or after it is fitted.
 
     Attributes:
@@ -99,16 +99,16 @@ class FloorMethod(abc.ABC):
     name: str
     labels: tuple[str, ...] = ()
 
-    def candidates(self) -> Sequence["FloorMethod"]:
+    def candidates(self) -> Sequence["FloorClassifier"]:
         """Itself with other settings, at most `TRIES`, from which cross-validation picks one."""
         return (self,)
 
     @abc.abstractmethod
-    def fit(self, felts: Sequence[Felt], machine: Machine) -> Self:
+    def fit(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> Self:
         """The classifier fitted to runs whose floors it is told."""
 
     @abc.abstractmethod
-    def probability(self, felts: Sequence[Felt], machine: Machine) -> list[Beliefs]:
+    def probability(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         """Probability of each floor after every row of runs, each heard from its first row on.
 
         What it says after a row depends on that row and those before it, on nothing later.
@@ -120,14 +120,14 @@ class FloorMethod(abc.ABC):
         """How many numbers were fitted."""
 
 
-def floors_of(felts: Sequence[Felt]) -> tuple[str, ...]:
+def floors_of(felts: Sequence[FloorSignals]) -> tuple[str, ...]:
     """Names of the floors that runs were driven on, sorted."""
     return tuple(sorted({felt.floor for felt in felts}))
 
 
-def rows_of(
-    felts: Sequence[Felt],
-    features: Callable[[Felt], Float[np.ndarray, "row feature"]],
+def training_rows(
+    felts: Sequence[FloorSignals],
+    features: Callable[[FloorSignals], Float[np.ndarray, "row feature"]],
     every_s: float = 0.0,
 ) -> tuple[Float[np.ndarray, "row feature"], np.ndarray]:
     """Features to train on and the floor of each row, of rows in which the robot moves.
@@ -145,7 +145,7 @@ def rows_of(
 
 def accumulated(
     log_likelihood: Float[np.ndarray, "row floor"],
-    felt: Felt,
+    felt: FloorSignals,
     apart_s: float,
     memory_s: float = np.inf,
 ) -> Beliefs:

@@ -33,8 +33,8 @@ from jaxtyping import Bool, Float, Int
 from slipid.predict.slip_model import (
     WINDOW_S,
     Channel,
-    Machine,
     PredictedRun,
+    RobotSpec,
     Run,
     RunSignals,
     Twists,
@@ -58,7 +58,7 @@ class Regressor(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Windows:
+class SignalWindows:
     """Windows of several runs, one run after the other.
 
     Attributes:
@@ -74,15 +74,15 @@ class Windows:
     run: Int[np.ndarray, " window"]
 
     @classmethod
-    def of(cls, runs: Sequence[RunSignals], machine: Machine) -> "Windows":
+    def of(cls, runs: Sequence[RunSignals], spec: RobotSpec) -> "SignalWindows":
         """Of runs in their own steps."""
-        return cls.joined([run.windowed() for run in runs], machine)
+        return cls.joined([run.windowed() for run in runs], spec)
 
     @classmethod
-    def joined(cls, joined: Sequence[RunSignals], machine: Machine) -> "Windows":
+    def joined(cls, joined: Sequence[RunSignals], spec: RobotSpec) -> "SignalWindows":
         """Of runs whose steps are windows already."""
-        rolling = _stacked([run.rolling(machine) for run in joined])
-        size = np.sqrt(((rolling * machine.size) ** 2).sum(axis=1))
+        rolling = _stacked([run.rolling(spec) for run in joined])
+        size = np.sqrt(((rolling * spec.size) ** 2).sum(axis=1))
         return cls(joined, rolling, size, np.repeat(np.arange(len(joined)), [*map(len, joined)]))
 
     @property
@@ -90,9 +90,9 @@ class Windows:
         """Whether the wheels turn fast enough to tell anything."""
         return self.size >= REST
 
-    def direction(self, machine: Machine) -> Float[np.ndarray, "window 3"]:
+    def direction(self, spec: RobotSpec) -> Float[np.ndarray, "window 3"]:
         """Rolling twist over its size: ahead, to the left, turning."""
-        return np.asarray(self.rolling * machine.size / self.size.clip(min=REST)[:, None])
+        return np.asarray(self.rolling * spec.size / self.size.clip(min=REST)[:, None])
 
     def speed(self) -> Float[np.ndarray, "window drive"]:
         """Wheel speed of each drive [rad/s]."""
@@ -102,13 +102,13 @@ class Windows:
         """Magnitude of each drive's current [A]."""
         return np.abs(_stacked([_logged(run.current, run, "current") for run in self.signals]))
 
-    def inputs(self, machine: Machine, channels: frozenset[Channel]) -> Inputs:
+    def inputs(self, spec: RobotSpec, channels: frozenset[Channel]) -> Inputs:
         """All inputs, with those of the channels named.
 
         Raises:
             ValueError: a run lacks one of the channels.
         """
-        direction = self.direction(machine)
+        direction = self.direction(spec)
         x, y = direction[:, 0], direction[:, 1]
         columns = [self.rolling, self.speed(), direction, np.stack([x * x - y * y, 2 * x * y], 1)]
         if "current" in channels:
@@ -117,13 +117,13 @@ class Windows:
             columns.append(_stacked([_logged(run.command, run, "command") for run in self.signals]))
         if "gyro" in channels:
             gyro = _stacked([_logged(run.gyro, run, "gyro")[:, None] for run in self.signals])[:, 0]
-            slip = (gyro - self.rolling[:, 2]) * machine.base_radius / self.size.clip(min=REST)
+            slip = (gyro - self.rolling[:, 2]) * spec.base_radius / self.size.clip(min=REST)
             columns.append(np.stack([gyro, slip], axis=1))
         return np.concatenate(columns, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
-class Lessons:
+class SlipExamples:
     """Windows in which wheels turned, with the slip that the pose shows in them.
 
     Attributes:
@@ -133,7 +133,7 @@ class Lessons:
         run: number of the run that each window is of.
     """
 
-    windows: Windows
+    windows: SignalWindows
     channels: frozenset[Channel]
     inputs: Inputs
     ratio: Ratios
@@ -141,14 +141,14 @@ class Lessons:
     run: Int[np.ndarray, " window"]
 
     @classmethod
-    def of(cls, runs: Sequence[Run], machine: Machine) -> "Lessons":
+    def of(cls, runs: Sequence[Run], spec: RobotSpec) -> "SlipExamples":
         """Of runs with poses.
 
         Raises:
             ValueError: the wheels turn in no window of them.
         """
         joined, channels = [run.windowed() for run in runs], common(runs)
-        windows = Windows.joined([run.signals for run in joined], machine)
+        windows = SignalWindows.joined([run.signals for run in joined], spec)
         moves = windows.moves
         if not moves.any():
             raise ValueError("no window of the runs has turning wheels; nothing to learn from")
@@ -157,8 +157,8 @@ class Lessons:
         return cls(
             windows=windows,
             channels=channels,
-            inputs=windows.inputs(machine, channels)[moves],
-            ratio=slip * machine.size / size[:, None],
+            inputs=windows.inputs(spec, channels)[moves],
+            ratio=slip * spec.size / size[:, None],
             weight=weight_of(size),
             run=windows.run[moves],
         )
@@ -206,21 +206,21 @@ def weight_of(size: Float[np.ndarray, " window"]) -> Float[np.ndarray, " window"
 
 
 def with_slip(
-    runs: Sequence[RunSignals], windows: Windows, ratio: Ratios, machine: Machine
+    runs: Sequence[RunSignals], windows: SignalWindows, ratio: Ratios, spec: RobotSpec
 ) -> list[PredictedRun]:
     """Paths of runs at their own steps: the encoders', with the slip that is said of each window.
 
     A window's slip velocity holds for all of its steps.
     """
-    slip = at_steps(ratio * windows.size[:, None] / machine.size, windows, runs)
+    slip = at_steps(ratio * windows.size[:, None] / spec.size, windows, runs)
     return [
-        PredictedRun(path_of(run.rolling(machine) + of_run, run.dt))
+        PredictedRun(path_of(run.rolling(spec) + of_run, run.dt))
         for run, of_run in zip(runs, slip, strict=True)
     ]
 
 
 def at_steps(
-    values: Float[np.ndarray, "window value"], windows: Windows, runs: Sequence[RunSignals]
+    values: Float[np.ndarray, "window value"], windows: SignalWindows, runs: Sequence[RunSignals]
 ) -> list[Float[np.ndarray, "_ value"]]:
     """The values of each window, at every step that lies in it; an array for each run."""
     ends = np.searchsorted(windows.run, np.arange(len(runs) + 1))

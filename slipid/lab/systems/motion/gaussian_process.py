@@ -32,7 +32,7 @@ NOISES = (1e-4, 2.0)
 
 
 @runtime_checkable
-class Regressor(Protocol):
+class ProcessRegressor(Protocol):
     """What is used of scikit-learn's Gaussian process."""
 
     def predict(
@@ -59,7 +59,7 @@ class Kernel:
         """How many of them are fitted."""
         return 2 + (len(self.lengths) if self.free else 0)
 
-    def tuned(self, rows: "Rows") -> "Kernel":
+    def tuned(self, rows: "ProcessRows") -> "Kernel":
         """The kernel that makes a sample of the rows most likely, found from this one."""
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.gaussian_process import GaussianProcessRegressor
@@ -80,26 +80,26 @@ class Kernel:
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class ProcessRows:
     """Inputs and outputs of which a process is made, and how much each row counts."""
 
     x: Float[np.ndarray, "row input"]
     y: Float[np.ndarray, "row output"]
     weight: Float[np.ndarray, " row"]
 
-    def only(self, mine: Bool[np.ndarray, " row"]) -> "Rows":
-        return Rows(self.x[mine], self.y[mine], self.weight[mine])
+    def only(self, mine: Bool[np.ndarray, " row"]) -> "ProcessRows":
+        return ProcessRows(self.x[mine], self.y[mine], self.weight[mine])
 
-    def drawn(self, most: int) -> "Rows":
+    def drawn(self, most: int) -> "ProcessRows":
         """So many rows at most, drawn in proportion to how much they count."""
         share, rng = self.weight / self.weight.sum(), np.random.default_rng(SEED)
         count = min(most, int(np.count_nonzero(share)))
         some = rng.choice(len(share), count, replace=False, p=share)
-        return Rows(self.x[some], self.y[some], self.weight[some])
+        return ProcessRows(self.x[some], self.y[some], self.weight[some])
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class ProcessPrediction:
     """Mean and standard deviation of a new measurement, its noise included."""
 
     mean: Float[np.ndarray, "row output"]
@@ -107,7 +107,7 @@ class Prediction:
 
 
 @dataclass(frozen=True, eq=False)
-class Process:
+class GaussianProcess:
     """A process that knows a sample of rows.
 
     Attributes:
@@ -117,11 +117,11 @@ class Process:
     """
 
     kernel: Kernel
-    known: Rows
-    regressor: Regressor
+    known: ProcessRows
+    regressor: ProcessRegressor
 
     @classmethod
-    def of(cls, rows: Rows, kernel: Kernel) -> "Process":
+    def of(cls, rows: ProcessRows, kernel: Kernel) -> "GaussianProcess":
         from sklearn.gaussian_process import GaussianProcessRegressor
         from threadpoolctl import threadpool_limits
 
@@ -131,10 +131,10 @@ class Process:
             regressor.fit(known.x, known.y)
         return cls(kernel, known, regressor)
 
-    def predict(self, x: Float[np.ndarray, "row input"]) -> Prediction:
+    def predict(self, x: Float[np.ndarray, "row input"]) -> ProcessPrediction:
         mean, std = self.regressor.predict(x, return_std=True)
         outputs = self.known.y.shape[1]
-        return Prediction(mean.reshape(-1, outputs), std.reshape(-1, outputs))
+        return ProcessPrediction(mean.reshape(-1, outputs), std.reshape(-1, outputs))
 
     @property
     def numbers(self) -> int:

@@ -37,9 +37,16 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.lab.systems.motion.features import Inputs, Lessons, Scale, Windows, at_steps, with_slip
+from slipid.lab.systems.motion.features import (
+    Inputs,
+    Scale,
+    SignalWindows,
+    SlipExamples,
+    at_steps,
+    with_slip,
+)
 from slipid.lab.systems.motion.polynomial_network import Growth, PolynomialNetwork, grown
-from slipid.predict.slip_model import Channel, Machine, PredictedRun, Run, RunSignals, SlipModel
+from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, RunSignals, SlipModel
 
 KEPT = 20
 LEAST = 0.05
@@ -56,7 +63,7 @@ SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
-class Networks:
+class NetworkSet:
     """A network for each of several outputs, with the scales of inputs and outputs."""
 
     inputs: Scale
@@ -71,7 +78,7 @@ class Networks:
         weight: Float[np.ndarray, " window"],
         in_a: Bool[np.ndarray, " window"],
         growth: Growth,
-    ) -> "Networks":
+    ) -> "NetworkSet":
         inputs, outputs = Scale.of(x), Scale.of(y)
         seen, said = inputs.scaled(x), outputs.scaled(y)
         each = [grown(seen, column, weight, in_a, growth) for column in said.T]
@@ -101,23 +108,23 @@ class GmdhOne(SlipModel):
     name: str = "gmdh_one"
     growth: Growth = CANDIDATES[0]
     channels: frozenset[Channel] = frozenset()
-    networks: Networks | None = None
+    networks: NetworkSet | None = None
 
     def candidates(self) -> Sequence["GmdhOne"]:
         return [replace(self, growth=growth) for growth in CANDIDATES]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "GmdhOne":
-        seen = Lessons.of(runs, machine)
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhOne":
+        seen = SlipExamples.of(runs, spec)
         in_a = first_half(seen.run, [run.floor for run in runs])
-        networks = Networks.grown(seen.inputs, seen.ratio, seen.weight, in_a, self.growth)
+        networks = NetworkSet.grown(seen.inputs, seen.ratio, seen.weight, in_a, self.growth)
         return replace(self, channels=seen.channels, networks=networks)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.networks is None:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = Windows.of(runs, machine)
-        ratio = self.networks.say(windows.inputs(machine, self.channels))
-        return with_slip(runs, windows, ratio, machine)
+        windows = SignalWindows.of(runs, spec)
+        ratio = self.networks.say(windows.inputs(spec, self.channels))
+        return with_slip(runs, windows, ratio, spec)
 
     @property
     def numbers(self) -> int:
@@ -140,15 +147,15 @@ class GmdhClass(SlipModel):
     name: str = "gmdh_class"
     growth: Growth = CANDIDATES[0]
     channels: frozenset[Channel] = frozenset()
-    floors: Mapping[str, Networks] = field(default_factory=dict)
+    floors: Mapping[str, NetworkSet] = field(default_factory=dict)
     loads: Sequence[frozenset[str | None]] = ()
-    telling: Networks | None = None
+    telling: NetworkSet | None = None
 
     def candidates(self) -> Sequence["GmdhClass"]:
         return [replace(self, growth=growth) for growth in CANDIDATES]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "GmdhClass":
-        seen = Lessons.of(runs, machine)
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhClass":
+        seen = SlipExamples.of(runs, spec)
         floor_of_run = [run.floor for run in runs]
         in_a = first_half(seen.run, floor_of_run)
         # a floor on which no wheel turned is none that was seen
@@ -156,7 +163,7 @@ class GmdhClass(SlipModel):
         names = [name for name in dict.fromkeys(floor_of_run) if name in named]
         on = np.stack([named == name for name in names], axis=1)
         floors = {
-            name: Networks.grown(
+            name: NetworkSet.grown(
                 seen.inputs[mine], seen.ratio[mine], seen.weight[mine], in_a[mine], self.growth
             )
             for name, mine in zip(names, on.T, strict=True)
@@ -164,29 +171,29 @@ class GmdhClass(SlipModel):
         telling = None
         if len(names) > 1:
             alike = (on / on.sum(axis=0)).sum(axis=1)
-            telling = Networks.grown(seen.inputs, on.astype(float), alike, in_a, self.growth)
+            telling = NetworkSet.grown(seen.inputs, on.astype(float), alike, in_a, self.growth)
         loads = [frozenset(run.signals.load for run in runs if run.floor == name) for name in names]
         return replace(self, channels=seen.channels, floors=floors, loads=loads, telling=telling)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if not self.floors:
             raise ValueError(f"{self.name}: predict before fit")
-        windows, names = Windows.of(runs, machine), list(self.floors)
-        inputs = windows.inputs(machine, self.channels)
+        windows, names = SignalWindows.of(runs, spec), list(self.floors)
+        inputs = windows.inputs(spec, self.channels)
         belief = self._belief(windows, inputs, runs)
         told = np.array([names.index(run.floor) if run.floor in names else -1 for run in runs])
         floor = np.where(told[windows.run] < 0, belief.argmax(axis=1), told[windows.run])
         ratio = np.zeros((len(inputs), 3))
         for number, networks in enumerate(self.floors.values()):
             ratio[floor == number] = networks.say(inputs[floor == number])
-        said = with_slip(runs, windows, ratio, machine)
+        said = with_slip(runs, windows, ratio, spec)
         return [
             replace(of_run, floors=dict(zip(names, belief_of_run.T, strict=True)))
             for of_run, belief_of_run in zip(said, at_steps(belief, windows, runs), strict=True)
         ]
 
     def _belief(
-        self, windows: Windows, inputs: Inputs, runs: Sequence[RunSignals]
+        self, windows: SignalWindows, inputs: Inputs, runs: Sequence[RunSignals]
     ) -> Float[np.ndarray, "window floor"]:
         """Probability of each floor by all of a run that was heard up to each window.
 

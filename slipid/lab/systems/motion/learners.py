@@ -15,7 +15,7 @@ Liberties:
       before all trees are there.
     - Windows are drawn with a chance in proportion to how much they count, and then count alike.
 
-Source: Friedman 2001, Greedy function approximation: a gradient boosting machine, Annals of
+Source: Friedman 2001, Greedy function approximation: a gradient boosting spec, Annals of
 Statistics 29(5); the binning of Ke and others 2017, LightGBM, NeurIPS, as scikit-learn has it.
 
 A small neural network over all that the robot measures.
@@ -47,8 +47,14 @@ from typing import final
 
 import numpy as np
 
-from slipid.lab.systems.motion.features import Lessons, Regressor, Scale, Windows, with_slip
-from slipid.predict.slip_model import Channel, Machine, PredictedRun, Run, RunSignals, SlipModel
+from slipid.lab.systems.motion.features import (
+    Regressor,
+    Scale,
+    SignalWindows,
+    SlipExamples,
+    with_slip,
+)
+from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, RunSignals, SlipModel
 
 FEWEST = 20
 """Windows in a leaf at least."""
@@ -93,11 +99,11 @@ class BoostedTrees(SlipModel):
     def candidates(self) -> Sequence["BoostedTrees"]:
         return [replace(self, boosting=boosting) for boosting in CANDIDATES]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "BoostedTrees":
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "BoostedTrees":
         from sklearn.ensemble import HistGradientBoostingRegressor
         from threadpoolctl import threadpool_limits
 
-        seen, how = Lessons.of(runs, machine), self.boosting
+        seen, how = SlipExamples.of(runs, spec), self.boosting
         # scikit-learn takes ten times as long for bins of weighted inputs
         chance = np.random.default_rng(SEED).uniform(size=len(seen.weight))
         kept = chance <= seen.weight / seen.weight.max()
@@ -116,16 +122,16 @@ class BoostedTrees(SlipModel):
             )
         return replace(self, channels=seen.channels, each=each, windows=int(kept.sum()))
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         from threadpoolctl import threadpool_limits
 
         if not self.each:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = Windows.of(runs, machine)
-        inputs = windows.inputs(machine, self.channels)
+        windows = SignalWindows.of(runs, spec)
+        inputs = windows.inputs(spec, self.channels)
         with threadpool_limits(1):
             ratio = np.stack([trees.predict(inputs) for trees in self.each], axis=1)
-        return with_slip(runs, windows, ratio, machine)
+        return with_slip(runs, windows, ratio, spec)
 
     @property
     def numbers(self) -> int:
@@ -144,14 +150,19 @@ NETWORK_SEED = 0
 
 
 @dataclass(frozen=True)
-class Shape:
+class NetworkShape:
     """Sizes of the hidden layers, and how much large weights cost."""
 
     hidden: tuple[int, ...]
     alpha: float
 
 
-NETWORK_CANDIDATES = (Shape((32,), 1e-3), Shape((16,), 1e-1), Shape((16,), 1.0), Shape((32,), 1.0))
+NETWORK_CANDIDATES = (
+    NetworkShape((32,), 1e-3),
+    NetworkShape((16,), 1e-1),
+    NetworkShape((16,), 1.0),
+    NetworkShape((32,), 1.0),
+)
 
 
 @final
@@ -167,7 +178,7 @@ class NeuralNetwork(SlipModel):
     """
 
     name: str = "neural_network"
-    shape: Shape = NETWORK_CANDIDATES[0]
+    shape: NetworkShape = NETWORK_CANDIDATES[0]
     channels: frozenset[Channel] = frozenset()
     inputs: Scale | None = None
     outputs: Scale | None = None
@@ -176,12 +187,12 @@ class NeuralNetwork(SlipModel):
     def candidates(self) -> Sequence["NeuralNetwork"]:
         return [replace(self, shape=shape) for shape in NETWORK_CANDIDATES]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "NeuralNetwork":
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "NeuralNetwork":
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.neural_network import MLPRegressor
         from threadpoolctl import threadpool_limits
 
-        seen = Lessons.of(runs, machine)
+        seen = SlipExamples.of(runs, spec)
         inputs, outputs = Scale.of(seen.inputs), Scale.of(seen.ratio)
         network = MLPRegressor(
             hidden_layer_sizes=self.shape.hidden,
@@ -201,14 +212,14 @@ class NeuralNetwork(SlipModel):
             self, channels=seen.channels, inputs=inputs, outputs=outputs, network=network
         )
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.network is None or self.inputs is None or self.outputs is None:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = Windows.of(runs, machine)
-        inputs = self.inputs.scaled(windows.inputs(machine, self.channels))
+        windows = SignalWindows.of(runs, spec)
+        inputs = self.inputs.scaled(windows.inputs(spec, self.channels))
         ratio = self.outputs.back(self.network.predict(inputs))
         ratio = ratio.clip(self.outputs.low, self.outputs.high)
-        return with_slip(runs, windows, ratio, machine)
+        return with_slip(runs, windows, ratio, spec)
 
     @property
     def numbers(self) -> int:

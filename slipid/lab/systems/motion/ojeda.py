@@ -49,15 +49,15 @@ from jaxtyping import Bool, Float
 
 from slipid.predict.slip_model import (
     Channel,
-    Machine,
     PredictedRun,
+    RobotSpec,
     Run,
     RunSignals,
     SlipModel,
     Twists,
-    seen_from_start,
+    relative_to_start,
 )
-from slipid.predict.steps import Steps, TrainingWindows, least
+from slipid.predict.steps import Steps, TrainingWindows, scaled_least_squares
 
 Line = Float[np.ndarray, "2"]
 """k0 [m/s] and k1 [m/s/A]."""
@@ -72,7 +72,7 @@ PRIOR = 1e6
 
 
 @dataclass(frozen=True)
-class Hard:
+class HardFloor:
     """Mean and std over time of the wheels' mean smoothed current on the hard floor [A]."""
 
     mean: float
@@ -84,7 +84,7 @@ class Hard:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class FlaggedSteps:
     """What is computed of some runs before the two numbers come in.
 
     Attributes:
@@ -103,11 +103,11 @@ class Scene:
         way = np.sign(self.rim) * self.flagged[:, None]
         return np.stack([way, way * (self.current - middle)], axis=-1)
 
-    def twist(self, line: Float[np.ndarray, "*step 2"], machine: Machine) -> Twists:
+    def twist(self, line: Float[np.ndarray, "*step 2"], spec: RobotSpec) -> Twists:
         """Corrected body twist of every step by k0 and k1, one pair or one in each step."""
         less = self.flagged[:, None] * (line[..., :1] + line[..., 1:] * self.current)
         rim = np.sign(self.rim) * np.maximum(np.abs(self.rim) - less, 0.0)
-        return np.asarray(rim @ machine.back.T)
+        return np.asarray(rim @ spec.back.T)
 
 
 @final
@@ -125,64 +125,64 @@ class Ojeda(SlipModel):
     tuning: Tuning = "continuous"
     needs: frozenset[Channel] = field(default=frozenset({"current"}), kw_only=True)
     time_constant: float = 0.3
-    hard: Hard | None = None
+    hard: HardFloor | None = None
     lines: Mapping[str | None, Float[np.ndarray, "2"]] = field(default_factory=dict)
 
     def candidates(self) -> Sequence["Ojeda"]:
         return [replace(self, time_constant=seconds) for seconds in (0.3, 1.0)]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "Ojeda":
-        hard = self._hard(hard_runs(runs, machine), machine)
-        lines: dict[str | None, Line] = {None: self._line(runs, hard, machine)}
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "Ojeda":
+        hard = self._hard(hard_runs(runs, spec), spec)
+        lines: dict[str | None, Line] = {None: self._line(runs, hard, spec)}
         floors = list(dict.fromkeys(run.floor for run in runs))
         for floor in floors if len(floors) > 1 else ():
-            lines[floor] = self._line([run for run in runs if run.floor == floor], hard, machine)
+            lines[floor] = self._line([run for run in runs if run.floor == floor], hard, spec)
         return replace(self, hard=hard, lines=lines)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.hard is None:
             raise ValueError(f"{self.name}: not fitted")
-        scene = self._scene(runs, self.hard, machine)
+        scene = self._scene(runs, self.hard, spec)
         line = np.stack([self.lines.get(run.floor, self.lines[None]) for run in runs])
-        twist = scene.twist(np.repeat(line, scene.steps.length, axis=0), machine)
+        twist = scene.twist(np.repeat(line, scene.steps.length, axis=0), spec)
         return scene.steps.predicted(twist, self.hard.sigmas(scene.current))
 
     @property
     def numbers(self) -> int:
         return 2 * len(self.lines) + 2 * (self.hard is not None)
 
-    def _hard(self, runs: Sequence[Run], machine: Machine) -> Hard:
+    def _hard(self, runs: Sequence[Run], spec: RobotSpec) -> HardFloor:
         steps = Steps.of([run.signals for run in runs])
-        current = steps.smoothed(steps.signals.along(machine), self.time_constant).mean(axis=1)
-        moves = np.abs(steps.signals.speed).mean(axis=1) * machine.wheel_radius > MOVING
+        current = steps.smoothed(steps.signals.along(spec), self.time_constant).mean(axis=1)
+        moves = np.abs(steps.signals.speed).mean(axis=1) * spec.wheel_radius > MOVING
         seen = current[moves] if moves.any() else current
-        return Hard(float(seen.mean()), max(float(seen.std()), 1e-6))
+        return HardFloor(float(seen.mean()), max(float(seen.std()), 1e-6))
 
-    def _scene(self, runs: Sequence[RunSignals], hard: Hard, machine: Machine) -> Scene:
+    def _scene(self, runs: Sequence[RunSignals], hard: HardFloor, spec: RobotSpec) -> FlaggedSteps:
         steps = Steps.of(runs)
-        rim = steps.signals.speed * machine.wheel_radius
-        current = steps.smoothed(steps.signals.along(machine), self.time_constant)
-        return Scene(steps, rim, current, hard.sigmas(current) > SIGMAS)
+        rim = steps.signals.speed * spec.wheel_radius
+        current = steps.smoothed(steps.signals.along(spec), self.time_constant)
+        return FlaggedSteps(steps, rim, current, hard.sigmas(current) > SIGMAS)
 
-    def _line(self, runs: Sequence[Run], hard: Hard, machine: Machine) -> Line:
+    def _line(self, runs: Sequence[Run], hard: HardFloor, spec: RobotSpec) -> Line:
         """k0 [m/s] and k1 [m/s/A] of some runs; zero where no slip was flagged."""
-        scene = self._scene([run.signals for run in runs], hard, machine)
+        scene = self._scene([run.signals for run in runs], hard, spec)
         if not scene.flagged.any():
             return np.zeros(2)
         if self.tuning == "sporadic":
-            return sporadic(scene, runs, machine)
+            return sporadic(scene, runs, spec)
         w = TrainingWindows.of(runs)
         if self.tuning == "continuous":
-            return continuous(scene, w, machine)
-        return by_gyro(scene, w, hard.mean, machine)
+            return continuous(scene, w, spec)
+        return by_gyro(scene, w, hard.mean, spec)
 
 
-def hard_runs(runs: Sequence[Run], machine: Machine) -> list[Run]:
+def hard_runs(runs: Sequence[Run], spec: RobotSpec) -> list[Run]:
     """Those on the floor where encoders err least; of one floor, the quarter that errs least."""
     steps = Steps.of([run.signals for run in runs])
-    rolling = steps.signals.rolling(machine)
-    gap = np.linalg.norm((steps.ends(rolling) - true_ends(runs)) * machine.size, axis=1)
-    way = np.linalg.norm(rolling * machine.size, axis=1) * steps.signals.dt
+    rolling = steps.signals.rolling(spec)
+    gap = np.linalg.norm((steps.ends(rolling) - true_ends(runs)) * spec.size, axis=1)
+    way = np.linalg.norm(rolling * spec.size, axis=1) * steps.signals.dt
     error = gap / np.maximum(np.add.reduceat(way, steps.first), 1e-9)
     floors = np.array([run.floor for run in runs])
     names = list(dict.fromkeys(floors.tolist()))
@@ -195,12 +195,12 @@ def hard_runs(runs: Sequence[Run], machine: Machine) -> list[Run]:
 
 def true_ends(runs: Sequence[Run]) -> Float[np.ndarray, "run 3"]:
     """Pose at each run's end, seen from its start [m, m, rad]."""
-    return np.stack([seen_from_start(run.pose)[-1] for run in runs])
+    return np.stack([relative_to_start(run.pose)[-1] for run in runs])
 
 
-def continuous(scene: Scene, w: TrainingWindows, machine: Machine) -> Line:
+def continuous(scene: FlaggedSteps, w: TrainingWindows, spec: RobotSpec) -> Line:
     """By the pose at all times; only windows with slip flagged count."""
-    rows = w.rows(machine.back @ scene.features(), machine)
+    rows = w.rows(spec.back @ scene.features(), spec)
     told = rows.parts.any(axis=(1, 2))
     return forgetful(rows.parts[told], rows.gap[told], FORGETTING, PRIOR)
 
@@ -223,26 +223,26 @@ def forgetful(
     return np.linalg.solve(a.T @ a + prior, a.T @ b)
 
 
-def sporadic(scene: Scene, runs: Sequence[Run], machine: Machine) -> Line:
+def sporadic(scene: FlaggedSteps, runs: Sequence[Run], spec: RobotSpec) -> Line:
     """By the place at the end of each run."""
     from scipy.optimize import least_squares
 
     place = true_ends(runs)[:, :2]
 
     def gap(line: np.ndarray) -> np.ndarray:
-        return np.asarray((scene.steps.ends(scene.twist(line, machine))[:, :2] - place).ravel())
+        return np.asarray((scene.steps.ends(scene.twist(line, spec))[:, :2] - place).ravel())
 
     return np.asarray(least_squares(gap, np.zeros(2), x_scale="jac").x)
 
 
-def by_gyro(scene: Scene, w: TrainingWindows, middle: float, machine: Machine) -> Line:
+def by_gyro(scene: FlaggedSteps, w: TrainingWindows, middle: float, spec: RobotSpec) -> Line:
     """By the yaw rate alone; the middle is the hard floor's mean current [A]."""
     heard = scene.steps.signals
     if heard.gyro is None:
         raise ValueError(f"{heard.name}: no gyro; this method needs one")
-    parts = w.means(machine.back[2] @ scene.features(middle)) * w.dt[:, None]
-    gap = w.means(heard.rolling(machine)[:, 2] - heard.gyro) * w.dt
-    offset, gain = least(parts, gap)
+    parts = w.means(spec.back[2] @ scene.features(middle)) * w.dt[:, None]
+    gap = w.means(heard.rolling(spec)[:, 2] - heard.gyro) * w.dt
+    offset, gain = scaled_least_squares(parts, gap)
     return np.array([offset - gain * middle, gain])
 
 

@@ -109,7 +109,7 @@ def grown(
     errors: list[float] = []
     halves = (in_a, ~in_a) if 0 < in_a.sum() < len(in_a) else (np.ones_like(in_a),) * 2
     while len(layers) < growth.layers and x.shape[1] > 1 and (not errors or errors[-1] > NOTHING):
-        half_a, half_b = (Sums.of(x[half], y[half], weight[half]) for half in halves)
+        half_a, half_b = (PairMoments.of(x[half], y[half], weight[half]) for half in halves)
         neurons = half_a.solved(growth.ridge)
         error = half_b.errors(neurons.weight)
         best = np.argsort(error, kind="stable")[: growth.kept]
@@ -134,7 +134,7 @@ def pruned(layers: Sequence[Layer]) -> list[Layer]:
 
 
 @dataclass(frozen=True, eq=False)
-class Sums:
+class PairMoments:
     """Means over some rows, from which neurons of all pairs of inputs are solved and judged.
 
     Attributes:
@@ -155,7 +155,7 @@ class Sums:
         x: Float[np.ndarray, "row input"],
         y: Float[np.ndarray, " row"],
         weight: Float[np.ndarray, " row"],
-    ) -> "Sums":
+    ) -> "PairMoments":
         weight = weight / weight.sum()
         pair = np.triu_indices(x.shape[1], 1)
         a, b = (POWERS[:, k, None] + POWERS[None, :, k] for k in (0, 1))

@@ -58,13 +58,20 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, Int
 
-from slipid.lab.systems.motion.features import Inputs, Lessons, Scale, Windows, at_steps, with_slip
-from slipid.lab.systems.motion.gaussian_process import Kernel, Process, Rows
+from slipid.lab.systems.motion.features import (
+    Inputs,
+    Scale,
+    SignalWindows,
+    SlipExamples,
+    at_steps,
+    with_slip,
+)
+from slipid.lab.systems.motion.gaussian_process import GaussianProcess, Kernel, ProcessRows
 from slipid.predict.slip_model import (
     Aim,
     Channel,
-    Machine,
     PredictedRun,
+    RobotSpec,
     Run,
     RunSignals,
     SlipModel,
@@ -94,31 +101,31 @@ class QuannEnergy(SlipModel):
     length: float = 0.2
     law: Float[np.ndarray, "4"] | None = None
     fastest: Float[np.ndarray, "2"] | None = None
-    process: Process | None = None
+    process: GaussianProcess | None = None
 
     def candidates(self) -> Sequence["QuannEnergy"]:
         return [replace(self, length=length) for length in (0.1, 0.2, 0.5)]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "QuannEnergy":
-        windows = Windows.of([run.signals for run in runs], machine)
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "QuannEnergy":
+        windows = SignalWindows.of([run.signals for run in runs], spec)
         way, motion = rate(windows.rolling), motions(windows.rolling)
-        energy = np.concatenate([run.power(machine) for run in windows.signals]) / way
+        energy = np.concatenate([run.power(spec) for run in windows.signals]) / way
         terms = law_terms(motion)
         law = np.linalg.lstsq(terms * way[:, None], energy * way, rcond=1e-6)[0]
         left = (energy - terms @ law)[:, None]
-        rows = Rows(places(windows, machine), left, way**2)
+        rows = ProcessRows(places(windows, spec), left, way**2)
         kernel = Kernel((self.length,), free=False).tuned(rows)
-        process = Process.of(rows, kernel)
+        process = GaussianProcess.of(rows, kernel)
         return replace(self, law=law, fastest=motion.max(axis=0), process=process)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.process is None or self.law is None or self.fastest is None:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = Windows.of(runs, machine)
-        left = self.process.predict(places(windows, machine)).mean
+        windows = SignalWindows.of(runs, spec)
+        left = self.process.predict(places(windows, spec)).mean
         motion = np.minimum(motions(windows.rolling), self.fastest)
         energy = law_terms(motion) @ self.law + left[:, 0]
-        rolling = [run.rolling(machine) for run in runs]
+        rolling = [run.rolling(spec) for run in runs]
         of_steps = at_steps(energy[:, None], windows, runs)
         return [
             PredictedRun(path_of(twist, run.dt), power=energy_of_run[:, 0] * rate(twist))
@@ -146,9 +153,9 @@ def law_terms(motion: Float[np.ndarray, "row 2"]) -> Float[np.ndarray, "row 4"]:
     return np.stack([np.ones_like(speed), speed, speed**2, turning], axis=1)
 
 
-def places(windows: Windows, machine: Machine) -> Float[np.ndarray, "window 2"]:
+def places(windows: SignalWindows, spec: RobotSpec) -> Float[np.ndarray, "window 2"]:
     """Place in the middle of each window by the encoders, seen from the run's start [m]."""
-    paths = [path_of(run.rolling(machine), run.dt)[:, :2] for run in windows.signals]
+    paths = [path_of(run.rolling(spec), run.dt)[:, :2] for run in windows.signals]
     return np.concatenate([0.5 * (path[1:] + path[:-1]) for path in paths])
 
 
@@ -177,37 +184,37 @@ class QuannSlip(SlipModel):
     needs: frozenset[Channel] = field(default=frozenset({"current"}), kw_only=True)
     anisotropic: bool = True
     scale: Scale | None = None
-    process: Process | None = None
+    process: GaussianProcess | None = None
     inflation: float = 1.0
 
     def candidates(self) -> Sequence["QuannSlip"]:
         return [replace(self, anisotropic=each) for each in (True, False)]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "QuannSlip":
-        lessons = Lessons.of(runs, machine)
-        inputs = slip_inputs(lessons.windows, machine)[lessons.windows.moves]
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "QuannSlip":
+        lessons = SlipExamples.of(runs, spec)
+        inputs = slip_inputs(lessons.windows, spec)[lessons.windows.moves]
         scale = Scale.of(inputs)
-        rows = Rows(scale.scaled(inputs), lessons.ratio, lessons.weight)
+        rows = ProcessRows(scale.scaled(inputs), lessons.ratio, lessons.weight)
         lengths = (START,) * (inputs.shape[1] if self.anisotropic else 1)
         kernel = Kernel(lengths, free=True).tuned(rows)
         squares = []
         for part in parts(np.unique(lessons.run)):
             mine = np.isin(lessons.run, part)
             # of a single run there are no others
-            others = Process.of(rows if mine.all() else rows.only(~mine), kernel)
+            others = GaussianProcess.of(rows if mine.all() else rows.only(~mine), kernel)
             known = replace(self, scale=scale, process=others, inflation=1.0)
-            squares.append(end_squares(known, [runs[k] for k in part], machine))
+            squares.append(end_squares(known, [runs[k] for k in part], spec))
         inflation = float(np.concatenate(squares).mean())
-        whole = Process.of(rows, kernel)
+        whole = GaussianProcess.of(rows, kernel)
         return replace(self, scale=scale, process=whole, inflation=inflation)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.process is None or self.scale is None:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = Windows.of(runs, machine)
-        slip = self.process.predict(self.scale.scaled(slip_inputs(windows, machine)))
-        said = with_slip(runs, windows, slip.mean, machine)
-        std = at_steps(slip.std * windows.size[:, None] / machine.size, windows, runs)
+        windows = SignalWindows.of(runs, spec)
+        slip = self.process.predict(self.scale.scaled(slip_inputs(windows, spec)))
+        said = with_slip(runs, windows, slip.mean, spec)
+        std = at_steps(slip.std * windows.size[:, None] / spec.size, windows, runs)
         return [
             replace(of_run, end_covariance=self.inflation * spread + CAMERA**2 * np.eye(2))
             for of_run, run, of_step in zip(said, runs, std, strict=True)
@@ -219,9 +226,9 @@ class QuannSlip(SlipModel):
         return 0 if self.process is None else 1 + self.process.numbers
 
 
-def slip_inputs(windows: Windows, machine: Machine) -> Inputs:
+def slip_inputs(windows: SignalWindows, spec: RobotSpec) -> Inputs:
     """|I| and |w| of each drive, and the direction of travel."""
-    columns = [windows.amperes(), np.abs(windows.speed()), windows.direction(machine)]
+    columns = [windows.amperes(), np.abs(windows.speed()), windows.direction(spec)]
     return np.concatenate(columns, axis=1)
 
 
@@ -246,10 +253,10 @@ def end_spread(
 
 
 def end_squares(
-    fitted: QuannSlip, runs: Sequence[Run], machine: Machine
+    fitted: QuannSlip, runs: Sequence[Run], spec: RobotSpec
 ) -> Float[np.ndarray, " run"]:
     """Square of the error at the end of each run, in units of its covariance, per dimension."""
-    said = fitted.predict([run.signals for run in runs], machine)
+    said = fitted.predict([run.signals for run in runs], spec)
     error = np.stack(
         [
             (of_run.path - path_of(run.twist, run.signals.dt))[-1, :2]

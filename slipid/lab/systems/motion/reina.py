@@ -47,12 +47,18 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from slipid.lab.systems.motion.reina_indicators import Example, Indicators, Limits, Signals, Sugeno
+from slipid.lab.systems.motion.reina_indicators import (
+    Indicators,
+    LabelledRun,
+    SlipThresholds,
+    SmoothedSignals,
+    Sugeno,
+)
 from slipid.predict.slip_model import (
     Channel,
-    Machine,
     Numbers,
     PredictedRun,
+    RobotSpec,
     Run,
     RunSignals,
     SlipModel,
@@ -76,29 +82,29 @@ class _Detector(SlipModel):
     needs: frozenset[Channel] = field(default=_CURRENT, kw_only=True)
     smoothing: float = 0.3
     quantile: float = 0.95
-    limits: Limits = field(default_factory=Limits)
+    limits: SlipThresholds = field(default_factory=SlipThresholds)
     slip: float = 0.0
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "_Detector":
-        examples = [Example.of(run, machine, self.smoothing) for run in runs]
-        limited = replace(self, limits=Limits.of(examples, self.quantile))
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "_Detector":
+        examples = [LabelledRun.of(run, spec, self.smoothing) for run in runs]
+        limited = replace(self, limits=SlipThresholds.of(examples, self.quantile))
         trained = limited._trained(examples)
         return replace(trained, slip=trained._mean_slip(examples))
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         said = []
         for heard in runs:
-            score = self.score(Signals.of(heard, machine, self.smoothing))
+            score = self.score(SmoothedSignals.of(heard, spec, self.smoothing))
             kept = 1.0 - self.slip * (score >= self._flagged)
-            path = path_of(heard.rolling(machine) * kept[:, None], heard.dt)
+            path = path_of(heard.rolling(spec) * kept[:, None], heard.dt)
             said.append(PredictedRun(path, slipping=score))
         return said
 
-    def score(self, signals: Signals) -> Numbers:
+    def score(self, signals: SmoothedSignals) -> Numbers:
         """How sure it is that the robot slips in each step; 0 where it stands."""
         return np.where(signals.moving, self._answer(Indicators.of(signals, self.limits)), 0.0)
 
-    def _mean_slip(self, examples: Sequence[Example]) -> float:
+    def _mean_slip(self, examples: Sequence[LabelledRun]) -> float:
         """Slip of the flagged parts of windows that explains their twists best."""
         against = square = 0.0
         for example in examples:
@@ -109,7 +115,7 @@ class _Detector(SlipModel):
             square += float(share**2 @ example.square)
         return against / square if square > 0.0 else 0.0
 
-    def _trained(self, examples: Sequence[Example]) -> "_Detector":
+    def _trained(self, examples: Sequence[LabelledRun]) -> "_Detector":
         """Itself, with what it learns beside the thresholds."""
         return self
 
@@ -172,7 +178,7 @@ class ReinaFuzzy(_Detector):
     def _flagged(self) -> float:
         return 0.5
 
-    def _trained(self, examples: Sequence[Example]) -> "ReinaFuzzy":
+    def _trained(self, examples: Sequence[LabelledRun]) -> "ReinaFuzzy":
         signals = [example.signals for example in examples]
         inputs = np.concatenate([self._inputs(Indicators.of(s, self.limits)) for s in signals])
         slips = np.concatenate([example.slips for example in examples])

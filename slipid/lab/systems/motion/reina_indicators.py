@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.predict.slip_model import WINDOW_S, Machine, Numbers, Run, RunSignals, groups
+from slipid.predict.slip_model import WINDOW_S, Numbers, RobotSpec, Run, RunSignals, groups
 
 _PULL = 1.0
 """How many samples the answer of a logical OR counts as, in every rule."""
@@ -83,7 +83,7 @@ _DRIVING = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Signals:
+class SmoothedSignals:
     """What the indicators are made of, smoothed, in every step of a run.
 
     Attributes:
@@ -101,19 +101,19 @@ class Signals:
     moving: Bool[np.ndarray, " step"]
 
     @classmethod
-    def of(cls, heard: RunSignals, machine: Machine, seconds: float) -> "Signals":
+    def of(cls, heard: RunSignals, spec: RobotSpec, seconds: float) -> "SmoothedSignals":
         """Of a run, smoothed over so long."""
         mean = smoothing(heard.dt, seconds)
-        speed, amps = mean @ heard.speed, mean @ heard.along(machine)
-        rim = machine.wheel_radius * speed
+        speed, amps = mean @ heard.speed, mean @ heard.along(spec)
+        rim = spec.wheel_radius * speed
         fastest = np.abs(rim).max(axis=1, keepdims=True)
         drives = np.abs(rim) >= _DRIVING * fastest
         turning = None
         if heard.gyro is not None:
-            turning = np.abs(mean @ (heard.rolling(machine)[:, 2] - heard.gyro))
+            turning = np.abs(mean @ (heard.rolling(spec)[:, 2] - heard.gyro))
         change = np.diff(speed, axis=0, prepend=speed[:1]) / heard.dt[:, None]
         return cls(
-            deviation=_deviation(rim, mean, heard, machine),
+            deviation=_deviation(rim, mean, heard, spec),
             change=np.abs(change).max(axis=1),
             turning=turning,
             amps=np.where(drives, amps, np.inf).min(axis=1),
@@ -122,7 +122,7 @@ class Signals:
 
 
 @dataclass(frozen=True)
-class Limits:
+class SlipThresholds:
     """What signals are without slip.
 
     Attributes:
@@ -137,7 +137,7 @@ class Limits:
     highest: float = 1.0
 
     @classmethod
-    def of(cls, examples: "Sequence[Example]", quantile: float) -> "Limits":
+    def of(cls, examples: "Sequence[LabelledRun]", quantile: float) -> "SlipThresholds":
         """By quantiles of the steps that do not slip."""
         signals = [example.signals for example in examples]
         slips = np.concatenate([example.slips for example in examples])
@@ -169,7 +169,7 @@ class Indicators:
     gyro: Numbers | None
 
     @classmethod
-    def of(cls, signals: Signals, limits: Limits) -> "Indicators":
+    def of(cls, signals: SmoothedSignals, limits: SlipThresholds) -> "Indicators":
         """Of a run's signals."""
         turning = signals.turning if np.isfinite(limits.turning) else None
         return cls(
@@ -180,7 +180,7 @@ class Indicators:
 
 
 @dataclass(frozen=True, eq=False)
-class Example:
+class LabelledRun:
     """A training run: its signals, and how much it slipped in each window.
 
     Attributes:
@@ -191,23 +191,23 @@ class Example:
         square: what they say, times itself [m^2/s^2].
     """
 
-    signals: Signals
+    signals: SmoothedSignals
     first: np.ndarray
     slips: Numbers
     against: Float[np.ndarray, " window"]
     square: Float[np.ndarray, " window"]
 
     @classmethod
-    def of(cls, run: Run, machine: Machine, seconds: float) -> "Example":
+    def of(cls, run: Run, spec: RobotSpec, seconds: float) -> "LabelledRun":
         """Of a run whose signals are smoothed over so long."""
         joined = run.windowed()
-        rolling = joined.signals.rolling(machine) * machine.size
-        slip = rolling - joined.twist * machine.size
+        rolling = joined.signals.rolling(spec) * spec.size
+        slip = rolling - joined.twist * spec.size
         size = np.linalg.norm(rolling, axis=1)
         slips = np.where(size > _REST, np.linalg.norm(slip, axis=1) > SLIPS * size, np.nan)
         first = groups(run.signals.dt, WINDOW_S)
         return cls(
-            signals=Signals.of(run.signals, machine, seconds),
+            signals=SmoothedSignals.of(run.signals, spec, seconds),
             first=first,
             slips=np.repeat(slips, np.diff(first, append=len(run.signals))),
             against=(slip * rolling).sum(axis=1),
@@ -227,11 +227,11 @@ def _deviation(
     rim: Float[np.ndarray, "step drive"],
     mean: Float[np.ndarray, "step step"],
     heard: RunSignals,
-    machine: Machine,
+    spec: RobotSpec,
 ) -> Numbers:
     """Largest relative deviation of a wheel from the shape of the commanded twist."""
-    forward = machine.forward.T
-    shape = mean @ (heard.rolling(machine) @ forward)
+    forward = spec.forward.T
+    shape = mean @ (heard.rolling(spec) @ forward)
     if heard.command is not None:
         commanded = mean @ (heard.command @ forward)
         asked = np.abs(commanded).max(axis=1, keepdims=True) > _REST

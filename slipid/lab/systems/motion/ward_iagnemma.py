@@ -72,14 +72,14 @@ from slipid.lab.systems.motion.ward_iagnemma_dynamics import (
     REST,
     Drives,
     Dynamics,
+    DynamicsStep,
     Each,
-    Law,
-    Padded,
+    ForceLaw,
+    PaddedRuns,
     Speeds,
-    Step,
 )
-from slipid.lab.systems.motion.ward_iagnemma_filter import Filter, Noise
-from slipid.predict.slip_model import Machine, PredictedRun, Run, RunSignals, SlipModel, path_of
+from slipid.lab.systems.motion.ward_iagnemma_filter import FilterNoise, SlipFilter
+from slipid.predict.slip_model import PredictedRun, RobotSpec, Run, RunSignals, SlipModel, path_of
 
 _STEADY = 10.0
 """Time after which speeds are taken for steady [s]."""
@@ -100,13 +100,13 @@ _MEDIAN_OF_SQUARES = 0.4549
 
 
 @dataclass(frozen=True, eq=False)
-class Windows:
+class PosedWindows:
     """Windows of training runs.
 
     Attributes:
         run: number of the run of each.
         rolling, true: q if nothing slipped, and by the pose [m/s].
-        rim, pull: as of `Padded`.
+        rim, pull: as of `PaddedRuns`.
         gyro: less the true yaw rate [rad/s]; nan where there is none.
         dt: [s].
     """
@@ -120,35 +120,35 @@ class Windows:
     dt: Each
 
     @classmethod
-    def of(cls, runs: Sequence[Run], machine: Machine) -> "Windows":
+    def of(cls, runs: Sequence[Run], spec: RobotSpec) -> "PosedWindows":
         """Of at most `_FIT_RUNS` runs, drawn with a fixed seed."""
         drawn = np.random.default_rng(0).permutation(len(runs))[:_FIT_RUNS]
         joined = [runs[k].windowed() for k in np.sort(drawn)]
-        padded = Padded.of([run.signals for run in joined], machine)
+        padded = PaddedRuns.of([run.signals for run in joined], spec)
         run, step = np.nonzero(padded.dt > 0.0)
-        true = np.concatenate([run.twist * machine.size for run in joined])
+        true = np.concatenate([run.twist * spec.size for run in joined])
         return cls(
             run=run,
             rolling=padded.rolling[run, step],
             true=true,
             rim=padded.rim[run, step],
             pull=padded.pull[run, step],
-            gyro=padded.gyro[run, step] - true[:, 2] / machine.base_radius,
+            gyro=padded.gyro[run, step] - true[:, 2] / spec.base_radius,
             dt=padded.dt[run, step],
         )
 
-    def thinned(self, most: int) -> "Windows":
+    def thinned(self, most: int) -> "PosedWindows":
         """At most so many of them, evenly spaced."""
         every = slice(None, None, -(-len(self.dt) // most))
         return replace(self, **{f.name: getattr(self, f.name)[every] for f in fields(self)})
 
-    def steady(self, dynamics: Dynamics) -> Step:
+    def steady(self, dynamics: Dynamics) -> DynamicsStep:
         """Every window as if it had always driven like that."""
         rolling = np.full(len(self.dt), dynamics.law.rolling)
         return dynamics.step(self.rolling, rolling, self.rim, np.full(len(self.dt), _STEADY))
 
 
-def fitted_law(windows: Windows, machine: Machine, with_drag: bool) -> Law:
+def fitted_law(windows: PosedWindows, spec: RobotSpec, with_drag: bool) -> ForceLaw:
     """The law whose speeds come nearest to the true ones, relative to those of the wheels."""
     from scipy.optimize import least_squares
 
@@ -158,11 +158,11 @@ def fitted_law(windows: Windows, machine: Machine, with_drag: bool) -> Law:
     some = windows.thinned(_FIT_WINDOWS)
     size = np.maximum(np.linalg.norm(some.rolling, axis=1), REST)[:, None]
 
-    def law(logs: np.ndarray) -> Law:
-        return Law(**dict(zip(names, np.exp(logs).tolist(), strict=True)))
+    def law(logs: np.ndarray) -> ForceLaw:
+        return ForceLaw(**dict(zip(names, np.exp(logs).tolist(), strict=True)))
 
     def left(logs: np.ndarray) -> np.ndarray:
-        gap = (some.steady(Dynamics.of(machine, law(logs))).speeds - some.true) / size
+        gap = (some.steady(Dynamics.of(spec, law(logs))).speeds - some.true) / size
         return np.append(gap.ravel(), _PRIOR * np.sqrt(len(gap)) * (logs - middle))
 
     starts = [middle + np.log([*times, 1.0, 1.0][: len(names)]) for times in _GRID]
@@ -180,7 +180,7 @@ def fitted_law(windows: Windows, machine: Machine, with_drag: bool) -> Law:
     return law(found.x)
 
 
-def fitted_noise(windows: Windows, dynamics: Dynamics, mass: float) -> Noise:
+def fitted_noise(windows: PosedWindows, dynamics: Dynamics, mass: float) -> FilterNoise:
     """What the law leaves in the windows."""
     step = windows.steady(dynamics)
     gap = windows.true - step.speeds
@@ -192,7 +192,7 @@ def fitted_noise(windows: Windows, dynamics: Dynamics, mass: float) -> Noise:
     density = np.median(ends**2 / np.add.reduceat(windows.dt, at)[:, None], axis=0)
     drift = np.maximum(np.sqrt(density / _MEDIAN_OF_SQUARES), 1e-4)
     noise = replace(
-        Noise(),
+        FilterNoise(),
         rolling=max(float(np.sqrt(np.median(shift**2) / _MEDIAN_OF_SQUARES)), 1e-5),
         drift=(float(drift[0]), float(drift[1]), float(drift[2])),
     )
@@ -201,7 +201,7 @@ def fitted_noise(windows: Windows, dynamics: Dynamics, mass: float) -> Noise:
     return with_currents(with_gyro(noise, windows), windows, force)
 
 
-def with_gyro(noise: Noise, windows: Windows) -> Noise:
+def with_gyro(noise: FilterNoise, windows: PosedWindows) -> FilterNoise:
     """Noise and bias of the gyro, where there is one."""
     told = np.isfinite(windows.gyro)
     if not told.any():
@@ -213,7 +213,7 @@ def with_gyro(noise: Noise, windows: Windows) -> Noise:
     return replace(noise, gyro=max(scatter, 1e-5), bias=max(bias, 1e-5))
 
 
-def with_currents(noise: Noise, windows: Windows, force: Drives) -> Noise:
+def with_currents(noise: FilterNoise, windows: PosedWindows, force: Drives) -> FilterNoise:
     """Scale, offset and noise of the forces by currents, where there are any."""
     told = np.isfinite(windows.pull)
     if not told.any():
@@ -244,8 +244,8 @@ class WardIagnemma(SlipModel):
     name: str = "ward_iagnemma"
     with_drag: bool = True
     wander: float = 0.0
-    law: Law = field(default_factory=Law)
-    noise: Noise = field(default_factory=Noise)
+    law: ForceLaw = field(default_factory=ForceLaw)
+    noise: FilterNoise = field(default_factory=FilterNoise)
 
     @classmethod
     def with_current(cls) -> "WardIagnemma":
@@ -255,33 +255,33 @@ class WardIagnemma(SlipModel):
     def candidates(self) -> Sequence["WardIagnemma"]:
         return [replace(self, with_drag=d, wander=w) for d in (False, True) for w in (0.0, 0.5)]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "WardIagnemma":
-        windows = Windows.of(runs, machine)
-        law = fitted_law(windows, machine, self.with_drag)
-        noise = fitted_noise(windows, Dynamics.of(machine, law), machine.mass)
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "WardIagnemma":
+        windows = PosedWindows.of(runs, spec)
+        law = fitted_law(windows, spec, self.with_drag)
+        noise = fitted_noise(windows, Dynamics.of(spec, law), spec.mass)
         return replace(self, law=law, noise=noise)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
-        padded = Padded.of(runs, machine)
-        tracked = self.filter(machine).track(padded)
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
+        padded = PaddedRuns.of(runs, spec)
+        tracked = self.filter(spec).track(padded)
         size, fastest = (np.linalg.norm(q, axis=2) for q in (tracked.speeds, padded.rolling))
         kept = np.where(fastest > REST, size / np.where(fastest > REST, fastest, 1.0), 1.0)
         slipping = np.clip(1.0 - kept, 0.0, 1.0)
         return [
             PredictedRun(
-                path_of(tracked.speeds[k, : len(run)] / machine.size, run.dt),
+                path_of(tracked.speeds[k, : len(run)] / spec.size, run.dt),
                 end_covariance=tracked.covariance[k, :2, :2],
                 slipping=slipping[k, : len(run)],
             )
             for k, run in enumerate(runs)
         ]
 
-    def filter(self, machine: Machine) -> Filter:
+    def filter(self, spec: RobotSpec) -> SlipFilter:
         """The filter as fitted, for a robot."""
-        return Filter(
-            dynamics=Dynamics.of(machine, self.law),
+        return SlipFilter(
+            dynamics=Dynamics.of(spec, self.law),
             noise=self.noise,
-            mass=machine.mass,
+            mass=spec.mass,
             hears_current="current" in self.needs,
             wander=self.wander * self.noise.rolling,
         )

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.predict.slip_model import Machine, RunSignals
+from slipid.predict.slip_model import RobotSpec, RunSignals
 
 Drives = Float[np.ndarray, "run drive"]
 Speeds = Float[np.ndarray, "run 3"]
@@ -34,7 +34,7 @@ _SOLVED = 1e-7
 
 
 @dataclass(frozen=True)
-class Law:
+class ForceLaw:
     """Forces between wheels and floor, as shares of the weight.
 
     Attributes:
@@ -55,7 +55,7 @@ class Law:
 
 
 @dataclass(frozen=True, eq=False)
-class Push:
+class Acceleration:
     """Accelerations [m/s^2], and their derivatives by the speeds [1/s] and by rho [m/s^2]."""
 
     rate: Speeds
@@ -64,7 +64,7 @@ class Push:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class DynamicsStep:
     """Speeds after a step of the dynamics, and their derivatives by those before and by rho."""
 
     speeds: Speeds
@@ -73,7 +73,7 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
-class Nearer:
+class NewtonIterate:
     """Speeds nearer to the solution of a step, and whether they solve it."""
 
     speeds: Speeds
@@ -91,17 +91,17 @@ class Dynamics:
         base_radius: L [m].
     """
 
-    law: Law
+    law: ForceLaw
     rims: Float[np.ndarray, "drive 3"]
     turning: Float[np.ndarray, "3"]
     base_radius: float
 
     @classmethod
-    def of(cls, machine: Machine, law: Law) -> "Dynamics":
+    def of(cls, spec: RobotSpec, law: ForceLaw) -> "Dynamics":
         """Of a robot."""
-        turning = np.array([0.0, 0.0 if machine.determines_twist else 1.0, 1.0])
-        rims = np.asarray(machine.forward / machine.size, dtype=float)
-        return cls(law, rims, turning, float(machine.base_radius))
+        turning = np.array([0.0, 0.0 if spec.determines_twist else 1.0, 1.0])
+        rims = np.asarray(spec.forward / spec.size, dtype=float)
+        return cls(law, rims, turning, float(spec.base_radius))
 
     def traction(self, slide: Drives) -> Drives:
         """Traction of each drive over the robot's mass [m/s^2], by sliding speeds [m/s]."""
@@ -115,7 +115,7 @@ class Dynamics:
         rising = law.rise * np.exp(-law.rise * np.abs(slide))
         return np.asarray(load * (law.grip * rising + law.viscous))
 
-    def push(self, q: Speeds, rolling: Each, rim: Drives, secant: bool = False) -> Push:
+    def push(self, q: Speeds, rolling: Each, rim: Drives, secant: bool = False) -> Acceleration:
         """Accelerations at speeds q; with `secant`, slopes of the chords to where no force acts."""
         law, slide = self.law, rim - q @ self.rims.T
         traction, stiff = self.traction(slide), self.stiffness(slide)
@@ -146,9 +146,9 @@ class Dynamics:
         if not secant:
             slope[:, 0, 2] += q[:, 1] / self.base_radius
             slope[:, 1, 2] -= q[:, 0] / self.base_radius
-        return Push(rate, slope, -GRAVITY * straight * (along + law.drag * q))
+        return Acceleration(rate, slope, -GRAVITY * straight * (along + law.drag * q))
 
-    def step(self, speeds: Speeds, rolling: Each, rim: Drives, dt: Each) -> Step:
+    def step(self, speeds: Speeds, rolling: Each, rim: Drives, dt: Each) -> DynamicsStep:
         """Backward Euler: q' = q + dt a(q'), by Newton's method, run by run until it is solved."""
         solution, todo = speeds.copy(), np.arange(len(speeds))
         for _ in range(_MOST_STEPS):
@@ -158,9 +158,13 @@ class Dynamics:
                 break
         at, wait = self.push(solution, rolling, rim), dt[:, None]
         inverse = np.linalg.inv(np.eye(3) - wait[..., None] * at.slope)
-        return Step(solution, inverse, (inverse @ (wait * at.by_rolling)[..., None])[..., 0])
+        return DynamicsStep(
+            solution, inverse, (inverse @ (wait * at.by_rolling)[..., None])[..., 0]
+        )
 
-    def _nearer(self, q: Speeds, start: Speeds, rolling: Each, rim: Drives, dt: Each) -> "Nearer":
+    def _nearer(
+        self, q: Speeds, start: Speeds, rolling: Each, rim: Drives, dt: Each
+    ) -> "NewtonIterate":
         """One step of Newton's method from q.
 
         Traction and resistance flatten out, so that the step may overshoot. Where it does not come
@@ -177,7 +181,7 @@ class Dynamics:
         if worse.any():
             secants = self.push(q, rolling, rim, secant=True).slope
             trial = np.where(worse[:, None], q - solved(wait, secants, left), trial)
-        return Nearer(trial, done)
+        return NewtonIterate(trial, done)
 
 
 def solved(
@@ -192,7 +196,7 @@ _DRIVING = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Padded:
+class PaddedRuns:
     """Runs side by side, padded to the same number of steps with steps of no time.
 
     Attributes:
@@ -210,9 +214,9 @@ class Padded:
     pull: Float[np.ndarray, "run step drive"]
 
     @classmethod
-    def of(cls, runs: Sequence[RunSignals], machine: Machine) -> "Padded":
+    def of(cls, runs: Sequence[RunSignals], spec: RobotSpec) -> "PaddedRuns":
         """Of runs of any lengths."""
-        shape, drives = (len(runs), max(len(run) for run in runs)), len(machine.forward)
+        shape, drives = (len(runs), max(len(run) for run in runs)), len(spec.forward)
         padded = cls(
             dt=np.zeros(shape),
             rim=np.zeros((*shape, drives)),
@@ -223,18 +227,18 @@ class Padded:
         for k, run in enumerate(runs):
             steps = slice(len(run))
             padded.dt[k, steps] = run.dt
-            padded.rim[k, steps] = run.speed * machine.wheel_radius
-            padded.rolling[k, steps] = run.rolling(machine) * machine.size
+            padded.rim[k, steps] = run.speed * spec.wheel_radius
+            padded.rolling[k, steps] = run.rolling(spec) * spec.size
             padded.gyro[k, steps] = np.nan if run.gyro is None else run.gyro
-            padded.pull[k, steps] = pulls(run, machine)
+            padded.pull[k, steps] = motor_forces(run, spec)
         return padded
 
 
-def pulls(run: RunSignals, machine: Machine) -> Float[np.ndarray, "step drive"]:
+def motor_forces(run: RunSignals, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
     """Force n C_e I / r along each drive's motion [N]; nan where it tells nothing."""
-    rim = np.abs(run.speed * machine.wheel_radius)
+    rim = np.abs(run.speed * spec.wheel_radius)
     if run.current is None:
         return np.full(rim.shape, np.nan)
     drives = (rim >= _DRIVING * rim.max(axis=1, keepdims=True)) & (rim > REST)
-    scale = machine.gear_ratio * machine.back_emf / machine.wheel_radius
-    return np.where(drives, scale * run.along(machine), np.nan)
+    scale = spec.gear_ratio * spec.back_emf / spec.wheel_radius
+    return np.where(drives, scale * run.along(spec), np.nan)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from slipid.lab.systems.motion.ward_iagnemma_dynamics import Drives, Dynamics, Each, Padded
+from slipid.lab.systems.motion.ward_iagnemma_dynamics import Drives, Dynamics, Each, PaddedRuns
 from slipid.predict.slip_model import WINDOW_S
 
 Spread = Float[np.ndarray, "run 8 8"]
@@ -18,7 +18,7 @@ Row = Float[np.ndarray, "run 8"]
 
 
 @dataclass(frozen=True)
-class Noise:
+class FilterNoise:
     """What the law leaves.
 
     Attributes:
@@ -40,7 +40,7 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class FilterState:
     """Mean and covariance of q (3), rho, the gyro's bias, and the error of the pose (3).
 
     The pose rides along without being corrected: its error is that of a path of filtered twists.
@@ -50,11 +50,13 @@ class State:
     mean: Float[np.ndarray, "run 5"]
     spread: Spread
 
-    def moved(self, mean: Float[np.ndarray, "run 5"], by: Spread) -> "State":
+    def moved(self, mean: Float[np.ndarray, "run 5"], by: Spread) -> "FilterState":
         """At another mean, the covariance carried along by the derivatives."""
-        return State(mean, by @ self.spread @ by.transpose(0, 2, 1))
+        return FilterState(mean, by @ self.spread @ by.transpose(0, 2, 1))
 
-    def corrected(self, row: Row, news: Each, variance: Each, of: slice = slice(5)) -> "State":
+    def corrected(
+        self, row: Row, news: Each, variance: Each, of: slice = slice(5)
+    ) -> "FilterState":
         """By a measurement with these derivatives; nan news is none.
 
         Joseph's form, right for any gain: P - K h P - P h' K' + K s K' with s = h P h' + variance.
@@ -69,11 +71,11 @@ class State:
         gain[:, of.stop :] = 0.0
         less = gain[:, :, None] * (shared - 0.5 * size * gain)[:, None, :]
         mean = self.mean + gain[:, :5] * np.where(heard, news, 0.0)[:, None]
-        return State(mean, self.spread - less - less.transpose(0, 2, 1))
+        return FilterState(mean, self.spread - less - less.transpose(0, 2, 1))
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
+class FilteredRuns:
     """What the filter says of padded runs: q in every step, and the covariance of the last pose."""
 
     speeds: Float[np.ndarray, "run step 3"]
@@ -81,7 +83,7 @@ class Tracked:
 
 
 @dataclass(frozen=True, eq=False)
-class Filter:
+class SlipFilter:
     """The extended Kalman filter.
 
     Attributes:
@@ -92,18 +94,18 @@ class Filter:
     """
 
     dynamics: Dynamics
-    noise: Noise
+    noise: FilterNoise
     mass: float
     hears_current: bool
     wander: float
 
-    def track(self, runs: Padded) -> Tracked:
+    def track(self, runs: PaddedRuns) -> FilteredRuns:
         """All runs at once."""
         count, steps = runs.dt.shape
         rolling = np.full((count, 1), self.dynamics.law.rolling)
         mean = np.concatenate([runs.rolling[:, 0], rolling, np.zeros((count, 1))], axis=1)
         variances = [0.0, 0.0, 0.0, self.noise.rolling**2, self.noise.bias**2, 0.0, 0.0, 0.0]
-        state = State(mean, np.tile(np.diag(variances), (count, 1, 1)))
+        state = FilterState(mean, np.tile(np.diag(variances), (count, 1, 1)))
         heading, speeds = np.zeros(count), np.zeros((count, steps, 3))
         for k in range(steps):
             dt = runs.dt[:, k]
@@ -112,9 +114,9 @@ class Filter:
             turn = state.mean[:, 2] / self.dynamics.base_radius * dt
             state = self._travelled(state, heading + 0.5 * turn, dt)
             heading = heading + turn
-        return Tracked(speeds, state.spread[:, 5:, 5:])
+        return FilteredRuns(speeds, state.spread[:, 5:, 5:])
 
-    def _driven(self, state: State, rim: Drives, dt: Each) -> State:
+    def _driven(self, state: FilterState, rim: Drives, dt: Each) -> FilterState:
         """A step of the dynamics, and what drifts meanwhile."""
         step = self.dynamics.step(state.mean[:, :3], state.mean[:, 3], rim, dt)
         by = np.tile(np.eye(8), (len(dt), 1, 1))
@@ -126,7 +128,7 @@ class Filter:
         after.spread[:, 3, 3] += self.wander**2 * dt
         return after
 
-    def _heard(self, state: State, runs: Padded, k: int) -> State:
+    def _heard(self, state: FilterState, runs: PaddedRuns, k: int) -> FilterState:
         """The gyro and the currents of a step taken in."""
         longer = WINDOW_S / np.where(runs.dt[:, k] > 0.0, runs.dt[:, k], WINDOW_S)
         radius = self.dynamics.base_radius
@@ -146,7 +148,7 @@ class Filter:
             state = state.corrected(row, pull - told, self.noise.force**2 * longer, slice(3, 4))
         return state
 
-    def _bounded(self, state: State) -> State:
+    def _bounded(self, state: FilterState) -> FilterState:
         """The weak constraint on rho."""
         law, straight = self.dynamics.law, 1.0 - self.dynamics.turning
         speed = np.linalg.norm(state.mean[:, :3] * straight, axis=1)
@@ -157,7 +159,7 @@ class Filter:
         variance = np.full(len(rolling), (0.1 * self.noise.rolling) ** 2)
         return state.corrected(row, np.where(beyond == 0.0, np.nan, beyond), variance)
 
-    def _travelled(self, state: State, heading: Each, dt: Each) -> State:
+    def _travelled(self, state: FilterState, heading: Each, dt: Each) -> FilterState:
         """A step added to the error of the pose; the heading is that in its middle."""
         radius = self.dynamics.base_radius
         turning = np.stack([np.cos(heading), np.sin(heading)], axis=1)

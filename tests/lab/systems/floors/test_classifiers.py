@@ -13,13 +13,13 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 from slipid.lab.systems.floors.cosine_energy import (
     DRIVING,
     GRAVITY,
-    BoostedTrees,
-    CosineEnergy,
+    BoostedTreesClassifier,
+    CosineEnergyClassifier,
     terms,
     tree_rows,
 )
-from slipid.lab.systems.floors.gaussian import Gaussian, Hearing, features
-from slipid.lab.systems.floors.interface import rows_of
+from slipid.lab.systems.floors.gaussian import FeatureChannels, GaussianClassifier, features
+from slipid.lab.systems.floors.interface import training_rows
 from tests.helpers.made_felt import HZ, ahead, made_felt, made_felts
 from tests.helpers.made_runs import HUSKY, ROBOTINO
 
@@ -37,19 +37,19 @@ def mixed_felts(seed: int = 0):
 
 def training(method, felts):
     """Features and floors as a method trains on them."""
-    if isinstance(method, Gaussian):
-        return rows_of(felts, lambda f: method._features(f, HUSKY, method.piece_s))
+    if isinstance(method, GaussianClassifier):
+        return training_rows(felts, lambda f: method._features(f, HUSKY, method.piece_s))
 
     def take(f):
         return features(f, HUSKY, method.hearing, piece_s=method.piece_s)
 
-    return rows_of(felts, take, method.rows_s)
+    return training_rows(felts, take, method.rows_s)
 
 
 @pytest.mark.parametrize("shared", [0.0, 1.0])
 def test_a_gaussian_is_discriminant_analysis(shared):
     felts = mixed_felts()
-    method = Gaussian(shared=shared, ridge=1e-9, apart_s=1 / HZ)
+    method = GaussianClassifier(shared=shared, ridge=1e-9, apart_s=1 / HZ)
     done = method.fit(felts, HUSKY)
     rows, floor = training(method, felts)
     log = done.fitted.log_likelihood(rows)
@@ -69,7 +69,7 @@ def test_a_gaussian_is_discriminant_analysis(shared):
 def test_a_shared_part_lies_between():
     felts, found = mixed_felts(), []
     for shared in (0.0, 0.5, 1.0):
-        method = Gaussian(shared=shared)
+        method = GaussianClassifier(shared=shared)
         root = method.fit(felts, HUSKY).fitted.root
         found.append(np.linalg.inv(root) @ np.linalg.inv(root).transpose(0, 2, 1))
     assert np.allclose(found[1], 0.5 * (found[0] + found[2]))
@@ -77,7 +77,7 @@ def test_a_shared_part_lies_between():
 
 def test_trees_are_those_of_the_library():
     felts = mixed_felts()
-    method = BoostedTrees(trees=15, apart_s=1 / HZ, memory_s=np.inf)
+    method = BoostedTreesClassifier(trees=15, apart_s=1 / HZ, memory_s=np.inf)
     done = method.fit(felts, HUSKY)
     rows, floor = training(method, felts)
     oracle = HistGradientBoostingClassifier(
@@ -100,7 +100,7 @@ def test_how_often_a_floor_was_driven_is_no_evidence():
     """Ten times as many runs on one of two floors that feel alike do not make it more probable."""
     many = [made_felt("grass", ahead(), 2.0, seed=k) for k in range(20)]
     few = [made_felt("snow", ahead(), 2.0, seed=100 + k) for k in range(2)]
-    done = BoostedTrees(trees=10).fit([*many, *few], HUSKY)
+    done = BoostedTreesClassifier(trees=10).fit([*many, *few], HUSKY)
     unseen = [made_felt("grass", ahead(13), 2.0, seed=200 + k) for k in range(30)]
     mean = np.mean([b[3] for b in done.probability(unseen, HUSKY)], axis=0)
     assert mean[0] < 0.65
@@ -134,9 +134,9 @@ def test_rows_of_trees_hear_what_their_names_say():
         "boosted_trees_driving",
         "boosted_trees_vibration",
     ]
-    assert plain.hearing == off.hearing == Hearing(True, True, False)
-    assert driving.hearing == DRIVING == Hearing(False, False, False)
-    assert vibration.hearing == Hearing(True, True, True)
+    assert plain.hearing == off.hearing == FeatureChannels(True, True, False)
+    assert driving.hearing == DRIVING == FeatureChannels(False, False, False)
+    assert vibration.hearing == FeatureChannels(True, True, True)
     assert off.driving_off
     assert not plain.driving_off
 
@@ -159,7 +159,7 @@ def circle_felt(weight: np.ndarray, floor: str, seed: int = 0, noise: float = 0.
 
 def test_a_series_is_the_one_that_data_were_made_from():
     weight = np.array([0.5, 0.1, -0.05, 0.0, 0.08])
-    method = CosineEnergy(harmonics=2, ridge=0.0)
+    method = CosineEnergyClassifier(harmonics=2, ridge=0.0)
     done = method.fit([circle_felt(weight, "gray")], ROBOTINO)
     assert np.allclose(done.fitted.weight[0], weight, atol=1e-9)
     noisy = method.fit([circle_felt(weight, "gray", noise=0.05)], ROBOTINO)
@@ -170,7 +170,9 @@ def test_a_series_is_the_one_that_data_were_made_from():
 def test_a_ridge_pulls_waves_towards_nothing_and_not_the_mean():
     weight = np.array([0.5, 0.1, 0.0, 0.0, 0.0])
     rows = 72
-    done = CosineEnergy(harmonics=2, ridge=rows / 2).fit([circle_felt(weight, "gray")], ROBOTINO)
+    done = CosineEnergyClassifier(harmonics=2, ridge=rows / 2).fit(
+        [circle_felt(weight, "gray")], ROBOTINO
+    )
     assert np.allclose(done.fitted.weight[0], [0.5, 0.05, 0, 0, 0], atol=2e-3)
 
 
@@ -180,7 +182,7 @@ def test_the_likelihood_is_that_of_normal_coefficients():
         circle_felt(w, name, seed=k, noise=0.05 * (k + 1))
         for k, (name, w) in enumerate(weights.items())
     ]
-    method = CosineEnergy(harmonics=2, ridge=0.0, apart_s=10.0, memory_s=np.inf)
+    method = CosineEnergyClassifier(harmonics=2, ridge=0.0, apart_s=10.0, memory_s=np.inf)
     done = method.fit(felts, ROBOTINO)
     assert done.fitted.std[1] > 1.5 * done.fitted.std[0]
     one = felts[0].part(0, 2)
@@ -194,12 +196,12 @@ def test_the_likelihood_is_that_of_normal_coefficients():
 
 def test_a_logarithm_of_the_coefficient_may_be_modelled():
     felt = circle_felt(np.array([0.5, 0.1, 0, 0, 0]), "gray")
-    plain, log = (CosineEnergy(logarithm=x)._seen(felt, ROBOTINO) for x in (False, True))
+    plain, log = (CosineEnergyClassifier(logarithm=x)._seen(felt, ROBOTINO) for x in (False, True))
     assert np.allclose(np.log(plain[:, 1]), log[:, 1])
 
 
 def test_the_direction_of_a_skid_steer_is_that_of_going_and_turning():
-    method = CosineEnergy()
+    method = CosineEnergyClassifier()
     for wheels, expected in [([1, 1], 0), ([-1, -1], np.pi), ([-1, 1], np.pi / 2)]:
         felt = made_felt("grass", np.tile(np.array(wheels, float), (5, 1)), 1.0)
         angle = method._seen(felt, HUSKY)[-1, 0]
@@ -208,11 +210,11 @@ def test_the_direction_of_a_skid_steer_is_that_of_going_and_turning():
 
 def test_a_robot_that_stands_has_no_coefficient():
     felt = made_felt("grass", np.zeros((4, 2)), 1.0)
-    assert np.isnan(CosineEnergy()._seen(felt, HUSKY)[:, 1]).all()
+    assert np.isnan(CosineEnergyClassifier()._seen(felt, HUSKY)[:, 1]).all()
 
 
 def test_candidates_of_the_series_are_with_and_without_heat_and_logarithm():
-    pairs = {(c.losses, c.logarithm) for c in CosineEnergy().candidates()}
+    pairs = {(c.losses, c.logarithm) for c in CosineEnergyClassifier().candidates()}
     assert pairs == {(True, True), (True, False), (False, True), (False, False)}
 
 
@@ -220,13 +222,15 @@ def test_without_heat_a_coefficient_does_not_depend_on_how_fast_all_wheels_turn(
     slow = made_felt("grass", ahead(5, rate=1.0), 2.0)
     fast = replace(slow, speed=3 * slow.speed)
     for losses, same in ((True, False), (False, True)):
-        one, other = (CosineEnergy(losses=losses)._seen(f, HUSKY)[:, 1] for f in (slow, fast))
+        one, other = (
+            CosineEnergyClassifier(losses=losses)._seen(f, HUSKY)[:, 1] for f in (slow, fast)
+        )
         assert np.allclose(one, other) == same
 
 
 def test_a_gaussian_treats_what_was_not_heard_as_the_mean():
     felts = made_felts({"grass": 2.0, "snow": 4.0})
-    done = Gaussian().fit(felts, HUSKY)
+    done = GaussianClassifier().fit(felts, HUSKY)
     deaf = replace(felts[0], gyro=np.full(60, np.nan))
     assert np.isfinite(done.probability([deaf], HUSKY)[0]).all()
     assert done.probability([deaf], HUSKY)[0][-1, 0] > 0.9

@@ -5,9 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.lab.systems.floors.cosine_energy import BoostedTrees, CosineEnergy
-from slipid.lab.systems.floors.gaussian import Gaussian, Hearing, Window, features
-from slipid.lab.systems.floors.interface import accumulated, rows_of
+from slipid.lab.systems.floors.cosine_energy import BoostedTreesClassifier, CosineEnergyClassifier
+from slipid.lab.systems.floors.gaussian import (
+    FeatureChannels,
+    GaussianClassifier,
+    TrailingWindow,
+    features,
+)
+from slipid.lab.systems.floors.interface import accumulated, training_rows
 from tests.helpers.made_felt import HZ, ahead, made_felt, made_felts
 from tests.helpers.made_runs import HUSKY
 
@@ -64,7 +69,7 @@ def test_windows_hold_the_last_seconds_and_nothing_else():
     rng = np.random.default_rng(0)
     x = 100 + rng.normal(size=30)
     time = np.cumsum(rng.uniform(0.1, 0.2, 30))
-    mean, std = Window.of(time, 0.5).both(x)
+    mean, std = TrailingWindow.of(time, 0.5).both(x)
     for t in range(30):
         mine = x[: t + 1][time[: t + 1] > time[t] - 0.5 + 1e-6]
         assert mean[t] == pytest.approx(mine.mean())
@@ -72,12 +77,12 @@ def test_windows_hold_the_last_seconds_and_nothing_else():
 
 
 def test_a_window_of_half_a_second_holds_two_rows_a_quarter_apart():
-    assert Window.of(0.25 * np.arange(5), 0.5).first.tolist() == [0, 0, 1, 2, 3]
+    assert TrailingWindow.of(0.25 * np.arange(5), 0.5).first.tolist() == [0, 0, 1, 2, 3]
 
 
 def test_windows_leave_out_what_was_not_heard():
     x = np.array([np.nan, 1.0, np.nan, 3.0])
-    mean, std = Window.of(np.arange(4.0), 10.0).both(x)
+    mean, std = TrailingWindow.of(np.arange(4.0), 10.0).both(x)
     assert np.isnan(mean[0])
     assert mean[1:].tolist() == [1.0, 1.0, 2.0]
     assert std[3] == pytest.approx(1.0)
@@ -86,13 +91,13 @@ def test_windows_leave_out_what_was_not_heard():
 def test_features_are_of_the_channels_that_are_asked_for():
     felt = made_felt("grass", ahead(20), 2.0)
     other = replace(felt, current=felt.current + 1.0)
-    driving = Hearing(current=False, gyro=False)
+    driving = FeatureChannels(current=False, gyro=False)
     same = features(felt, HUSKY, driving), features(other, HUSKY, driving)
     assert np.array_equal(*same)
     assert not np.array_equal(features(felt, HUSKY), features(other, HUSKY))
     shaken = replace(felt, vibration=2 * felt.vibration)
     assert np.array_equal(features(felt, HUSKY), features(shaken, HUSKY))
-    vibration = Hearing(vibration=True)
+    vibration = FeatureChannels(vibration=True)
     assert not np.array_equal(features(felt, HUSKY, vibration), features(shaken, HUSKY, vibration))
 
 
@@ -114,7 +119,7 @@ def test_features_of_a_run_heard_anew_are_those_of_its_pieces():
 def test_rows_to_train_on_are_apart_and_move():
     felt = made_felt("grass", ahead(52), 2.0)
     still = replace(felt, speed=np.where(np.arange(52)[:, None] < 26, 0.0, felt.speed))
-    rows, floor = rows_of([felt, still], lambda f: f.time[:, None], every_s=0.3)
+    rows, floor = training_rows([felt, still], lambda f: f.time[:, None], every_s=0.3)
     assert (floor == "grass").all()
     assert len(rows) == 26 + 13
     assert np.diff(rows[:26, 0]) == pytest.approx(2 / HZ)
@@ -123,8 +128,13 @@ def test_rows_to_train_on_are_apart_and_move():
 
 @pytest.mark.parametrize(
     "method",
-    [Gaussian(), CosineEnergy(), BoostedTrees(trees=5), BoostedTrees(trees=5, driving_off=True)],
-    ids=lambda m: f"{m.name}{len(m.fitted)}" if isinstance(m, BoostedTrees) else m.name,
+    [
+        GaussianClassifier(),
+        CosineEnergyClassifier(),
+        BoostedTreesClassifier(trees=5),
+        BoostedTreesClassifier(trees=5, driving_off=True),
+    ],
+    ids=lambda m: f"{m.name}{len(m.fitted)}" if isinstance(m, BoostedTreesClassifier) else m.name,
 )
 def test_what_is_heard_later_changes_no_belief(method):
     felts = made_felts({"grass": 2.0, "snow": 4.0})
@@ -142,7 +152,9 @@ def test_what_is_heard_later_changes_no_belief(method):
     assert np.allclose(before.sum(axis=1), 1.0)
 
 
-@pytest.mark.parametrize("method", [Gaussian(), CosineEnergy(), BoostedTrees(trees=20)])
+@pytest.mark.parametrize(
+    "method", [GaussianClassifier(), CosineEnergyClassifier(), BoostedTreesClassifier(trees=20)]
+)
 def test_floors_that_differ_in_what_motors_draw_are_told(method):
     levels = {"grass": 2.0, "ice": 1.0, "snow": 4.0}
     done = method.fit(made_felts(levels), HUSKY)
@@ -155,14 +167,18 @@ def test_floors_that_differ_in_what_motors_draw_are_told(method):
     assert done.numbers > 0
 
 
-@pytest.mark.parametrize("method", [Gaussian(), CosineEnergy(), BoostedTrees()])
+@pytest.mark.parametrize(
+    "method", [GaussianClassifier(), CosineEnergyClassifier(), BoostedTreesClassifier()]
+)
 def test_what_was_not_fitted_says_so(method):
     with pytest.raises(ValueError, match="not fitted"):
         method.probability([made_felt("grass", ahead(), 2.0)], HUSKY)
     assert method.numbers == 0
 
 
-@pytest.mark.parametrize("method", [Gaussian(), CosineEnergy(), BoostedTrees()])
+@pytest.mark.parametrize(
+    "method", [GaussianClassifier(), CosineEnergyClassifier(), BoostedTreesClassifier()]
+)
 def test_candidates_are_few_and_differ(method):
     assert 1 < len(method.candidates()) <= 4
     assert len(set(map(repr, method.candidates()))) == len(method.candidates())
@@ -173,6 +189,6 @@ def test_runs_without_a_gyro_are_heard_all_the_same():
         made_felt(floor, ahead(), level, seed=k, gyro=False)
         for k, (floor, level) in enumerate([("grass", 2.0), ("snow", 4.0)] * 3)
     ]
-    for method in (Gaussian(), CosineEnergy(), BoostedTrees(trees=5)):
+    for method in (GaussianClassifier(), CosineEnergyClassifier(), BoostedTreesClassifier(trees=5)):
         beliefs = method.fit(felts, HUSKY).probability(felts[:2], HUSKY)
         assert [int(b[-1].argmax()) for b in beliefs] == [0, 1]

@@ -11,7 +11,7 @@ from slipid.lab.systems.motion.gmdh import (
     MEMORY,
     GmdhClass,
     GmdhOne,
-    Networks,
+    NetworkSet,
     first_half,
     remembered,
 )
@@ -19,8 +19,8 @@ from slipid.lab.systems.motion.polynomial_network import (
     GAIN,
     Growth,
     Layer,
+    PairMoments,
     PolynomialNetwork,
-    Sums,
     grown,
     pruned,
 )
@@ -42,7 +42,7 @@ def rows(seed=0, n=80, inputs=4):
 
 def test_neurons_of_all_pairs_are_weighted_ridge_regressions():
     x, y, weight = rows()
-    layer = Sums.of(x, y, weight).solved(0.3)
+    layer = PairMoments.of(x, y, weight).solved(0.3)
     assert layer.inputs.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
     for (a, b), found in zip(layer.inputs, layer.weight, strict=True):
         root = np.sqrt(weight / weight.sum())[:, None]
@@ -54,10 +54,11 @@ def test_neurons_of_all_pairs_are_weighted_ridge_regressions():
 
 def test_errors_of_neurons_are_those_of_what_they_say():
     x, y, weight = rows()
-    layer = Sums.of(*rows(1)).solved(0.01)
+    layer = PairMoments.of(*rows(1)).solved(0.01)
     square = (layer.output(x) - y[:, None]) ** 2
     assert np.allclose(
-        Sums.of(x, y, weight).errors(layer.weight), np.average(square, axis=0, weights=weight)
+        PairMoments.of(x, y, weight).errors(layer.weight),
+        np.average(square, axis=0, weights=weight),
     )
 
 
@@ -101,11 +102,11 @@ def test_growing_ends_where_the_unseen_half_gains_nothing():
     # the next layer of all that was kept is no better
     kept = x
     for _ in network.layers:
-        half_a, half_b = (Sums.of(kept[h], y[h], weight[h]) for h in (in_a, ~in_a))
+        half_a, half_b = (PairMoments.of(kept[h], y[h], weight[h]) for h in (in_a, ~in_a))
         layer = half_a.solved(growth.ridge)
         best = np.argsort(half_b.errors(layer.weight))[:4]
         kept = layer.only(best).output(kept)
-    half_a, half_b = (Sums.of(kept[h], y[h], weight[h]) for h in (in_a, ~in_a))
+    half_a, half_b = (PairMoments.of(kept[h], y[h], weight[h]) for h in (in_a, ~in_a))
     following = half_b.errors(half_a.solved(growth.ridge).weight).min()
     assert following >= (1 - GAIN) * errors[-1]
 
@@ -155,7 +156,7 @@ def test_older_evidence_fades_and_no_run_remembers_another():
 def test_networks_say_nothing_beyond_what_they_were_taught():
     x = np.random.default_rng(0).uniform([-1, -1, -3], [1, 1, 1], (100, 3))
     y = np.stack([x[:, 0] * x[:, 1], x[:, 2] ** 2], axis=1)
-    networks = Networks.grown(x, y, np.ones(100), np.arange(100) % 2 == 0, EXACT)
+    networks = NetworkSet.grown(x, y, np.ones(100), np.arange(100) % 2 == 0, EXACT)
     assert np.allclose(networks.say(x), y)
     far = networks.say(np.full((1, 3), 50.0))
     # the corner where both are largest was not seen, nor squares beyond one on this side

@@ -6,15 +6,21 @@ import numpy as np
 import pytest
 
 from slipid.lab.systems.motion.features import (
-    Lessons,
     Scale,
-    Windows,
+    SignalWindows,
+    SlipExamples,
     at_steps,
     common,
     weight_of,
     with_slip,
 )
-from slipid.lab.systems.motion.learners import PASSES, BoostedTrees, Boosting, NeuralNetwork, Shape
+from slipid.lab.systems.motion.learners import (
+    PASSES,
+    BoostedTrees,
+    Boosting,
+    NetworkShape,
+    NeuralNetwork,
+)
 from slipid.predict.slip_model import ByFloor, Run, path_of
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
@@ -32,7 +38,7 @@ def test_inputs_of_a_window_are_those_of_its_motion():
     amps = np.tile([-1.0, 2.0, 3.0], (40, 1))
     rolling = straight(0.4) * [0.8, 0.8, 1.0] + np.array([0.0, 0.0, 0.96])
     run = made_run(rolling, current=amps, gyro=np.full(40, 0.3))
-    windows = Windows.of([run.signals], ROBOTINO)
+    windows = SignalWindows.of([run.signals], ROBOTINO)
     inputs = windows.inputs(ROBOTINO, common([run]))
     # 0.16 m/s ahead and 0.12 m/s of turning make a size of 0.2 m/s
     twist = [0.16 * np.cos(0.4), 0.16 * np.sin(0.4), 0.96]
@@ -47,7 +53,7 @@ def test_inputs_of_a_window_are_those_of_its_motion():
 
 def test_a_robot_that_turns_on_the_spot_has_a_size_and_a_direction():
     run = made_run(np.tile([0.0, 0.0, -0.8], (20, 1)))
-    windows = Windows.of([run.signals], ROBOTINO)
+    windows = SignalWindows.of([run.signals], ROBOTINO)
     assert np.allclose(windows.size, 0.1)
     assert np.allclose(windows.direction(ROBOTINO), [0.0, 0.0, -1.0])
 
@@ -57,7 +63,7 @@ def test_channels_that_one_run_lacks_are_left_out():
     lacking = replace(whole, signals=replace(whole.signals, gyro=None))
     assert common([whole]) == {"current", "gyro", "command"}
     assert common([whole, lacking]) == {"current", "command"}
-    windows = Windows.of([lacking.signals], ROBOTINO)
+    windows = SignalWindows.of([lacking.signals], ROBOTINO)
     with pytest.raises(ValueError, match="no gyro"):
         windows.inputs(ROBOTINO, common([whole]))
 
@@ -66,7 +72,7 @@ def test_slip_ratios_are_those_that_were_made_at_any_speed():
     ratio = [-0.3, 0.1, 0.25]
     runs = [slipping(0.5, ratio, speed) for speed in (0.1, 0.4)]
     runs.append(made_run(np.zeros((40, 3)), np.full((40, 3), 0.01)))
-    lessons = Lessons.of(runs, ROBOTINO)
+    lessons = SlipExamples.of(runs, ROBOTINO)
     # not one of a robot at rest
     assert lessons.run.tolist() == [0] * 8 + [1] * 8
     assert np.allclose(lessons.ratio, ratio)
@@ -74,7 +80,7 @@ def test_slip_ratios_are_those_that_were_made_at_any_speed():
 
 def test_nothing_is_learned_of_robots_at_rest():
     with pytest.raises(ValueError, match="nothing to learn"):
-        Lessons.of([made_run(np.zeros((40, 3)))], ROBOTINO)
+        SlipExamples.of([made_run(np.zeros((40, 3)))], ROBOTINO)
 
 
 def test_weights_rise_with_the_square_and_then_are_level():
@@ -87,7 +93,7 @@ def test_weights_rise_with_the_square_and_then_are_level():
 def test_a_path_with_the_slip_that_was_made_is_the_true_one():
     runs = [slipping(0.5, [-0.3, 0.1, 0.25]), slipping(2.0, [0.2, 0.0, -0.1], steps=23)]
     heard = [run.signals for run in runs]
-    windows = Windows.of(heard, ROBOTINO)
+    windows = SignalWindows.of(heard, ROBOTINO)
     ratio = np.array([[-0.3, 0.1, 0.25], [0.2, 0.0, -0.1]])[windows.run]
     for said, run in zip(with_slip(heard, windows, ratio, ROBOTINO), runs, strict=True):
         assert np.allclose(said.path, path_of(run.twist, run.signals.dt))
@@ -95,7 +101,9 @@ def test_a_path_with_the_slip_that_was_made_is_the_true_one():
 
 def test_values_of_windows_are_those_of_their_steps():
     runs = [made_run(straight(0.0, steps=steps)).signals for steps in (10, 7)]
-    first, second = at_steps(np.array([[1.0], [2.0], [3.0]]), Windows.of(runs, ROBOTINO), runs)
+    first, second = at_steps(
+        np.array([[1.0], [2.0], [3.0]]), SignalWindows.of(runs, ROBOTINO), runs
+    )
     assert first[:, 0].tolist() == [1.0] * 5 + [2.0] * 5
     assert second[:, 0].tolist() == [3.0] * 7
 
@@ -151,7 +159,9 @@ def test_a_neural_network_learns_how_slip_turns_with_the_direction():
 
 
 def test_the_numbers_of_a_network_are_its_weights():
-    method = NeuralNetwork(shape=Shape((5, 4), 0.1)).fit([slipping(0.0, [0.1, 0.0, 0.0])], ROBOTINO)
+    method = NeuralNetwork(shape=NetworkShape((5, 4), 0.1)).fit(
+        [slipping(0.0, [0.1, 0.0, 0.0])], ROBOTINO
+    )
     parts = (*method.network.coefs_, *method.network.intercepts_)
     assert method.numbers == sum(part.size for part in parts)
     assert NeuralNetwork().numbers == 0
@@ -176,7 +186,7 @@ def test_a_network_says_nothing_beyond_what_it_was_taught():
 def test_learned_slip_of_a_skid_steer_without_currents_is_that_of_each_floor(method):
     twist = np.tile([0.5, 0.0, 0.4], (60, 1))
     runs = [
-        made_run(twist, twist * [1.0 - loss, 1.0, 0.5], machine=HUSKY, floor=floor)
+        made_run(twist, twist * [1.0 - loss, 1.0, 0.5], spec=HUSKY, floor=floor)
         for floor, loss in (("ice", 0.5), ("grass", 0.1))
         for _ in range(5)
     ]

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.lab.systems.motion.features import Windows
-from slipid.lab.systems.motion.gaussian_process import KEPT, Kernel, Process, Rows
+from slipid.lab.systems.motion.features import SignalWindows
+from slipid.lab.systems.motion.gaussian_process import KEPT, GaussianProcess, Kernel, ProcessRows
 from slipid.lab.systems.motion.quann import (
     PARTS,
     QuannEnergy,
@@ -29,17 +29,17 @@ def matern(a, b, kernel):
     return kernel.variance * (1 + np.sqrt(3) * d) * np.exp(-np.sqrt(3) * d)
 
 
-def rows(n=60, seed=0) -> Rows:
+def rows(n=60, seed=0) -> ProcessRows:
     rng = np.random.default_rng(seed)
     x = rng.uniform(-2, 2, (n, 2))
     y = np.stack([np.sin(2 * x[:, 0]), 5.0 + 3.0 * np.cos(x[:, 1])], axis=1)
-    return Rows(x, y + rng.normal(0.0, 0.1, y.shape), np.ones(n))
+    return ProcessRows(x, y + rng.normal(0.0, 0.1, y.shape), np.ones(n))
 
 
 def test_a_posterior_is_that_of_the_closed_form():
     known = rows()
     new = np.random.default_rng(1).uniform(-3, 3, (7, 2))
-    said = Process.of(known, KERNEL).predict(new)
+    said = GaussianProcess.of(known, KERNEL).predict(new)
     mean, std = known.y.mean(axis=0), known.y.std(axis=0)
     gram = matern(known.x, known.x, KERNEL) + 0.05 * np.eye(60)
     across = matern(new, known.x, KERNEL)
@@ -125,7 +125,7 @@ def test_slip_is_learned_from_currents_and_direction():
 
 def test_inputs_of_slip_are_magnitudes_and_a_direction():
     run = slipping(2.0, 3)
-    windows = Windows.of([run.signals], ROBOTINO)
+    windows = SignalWindows.of([run.signals], ROBOTINO)
     row = slip_inputs(windows, ROBOTINO)[0]
     assert np.allclose(row[:3], np.abs(run.signals.current[0]))
     assert np.allclose(row[3:6], np.abs(run.signals.speed[0]))
@@ -153,7 +153,7 @@ def test_a_covariance_is_that_of_the_slip_in_metres_and_radians():
     method = QuannSlip().fit(runs, ROBOTINO)
     new = slipping(1.0, 77).signals
     (said,) = method.predict([new], ROBOTINO)
-    inputs = slip_inputs(Windows.of([new], ROBOTINO), ROBOTINO)
+    inputs = slip_inputs(SignalWindows.of([new], ROBOTINO), ROBOTINO)
     std = method.process.predict(method.scale.scaled(inputs)).std[0] * 0.2 / SIZES
     spread = end_spread(said.path, np.tile(std, (40, 1)), new.dt)
     assert np.allclose(said.end_covariance, method.inflation * spread + 1e-6 * np.eye(2))
@@ -228,7 +228,7 @@ def test_a_law_leaves_the_least_squares_of_power():
     factors = np.random.default_rng(6).uniform(0.5, 1.5, 40)
     runs = [drawing(moving(seed), factor) for seed, factor in enumerate(factors)]
     method = QuannEnergy().fit(runs, ROBOTINO)
-    windows = Windows.of([run.signals for run in runs], ROBOTINO)
+    windows = SignalWindows.of([run.signals for run in runs], ROBOTINO)
     power = np.concatenate([run.power(ROBOTINO) for run in windows.signals])
     speed = np.hypot(windows.rolling[:, 0], windows.rolling[:, 1])
     terms = np.stack([speed**0, speed, speed**2, np.abs(windows.rolling[:, 2])], axis=1)
@@ -238,7 +238,7 @@ def test_a_law_leaves_the_least_squares_of_power():
 
 def test_places_are_in_the_middle_of_windows_and_seen_from_the_start():
     runs = [made_run(straight(0.0)).signals, made_run(straight(np.pi / 2)).signals]
-    found = places(Windows.of(runs, ROBOTINO), ROBOTINO)
+    found = places(SignalWindows.of(runs, ROBOTINO), ROBOTINO)
     assert np.allclose(found[:2], [[0.05, 0.0], [0.15, 0.0]])
     assert np.allclose(found[8:10], [[0.0, 0.05], [0.0, 0.15]])
 

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from slipid.lab.systems.motion.reina import ReinaDeterministic
-from slipid.lab.systems.motion.reina_indicators import Indicators, Limits, Signals, smoothing
+from slipid.lab.systems.motion.reina_indicators import (
+    Indicators,
+    SlipThresholds,
+    SmoothedSignals,
+    smoothing,
+)
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 from tests.helpers.patchy_runs import patchy, slipping
 
@@ -29,12 +34,12 @@ def test_smoothing_of_uneven_steps_weighs_them_by_their_length():
 
 
 def test_a_wheel_off_the_commanded_shape_is_told_by_the_encoder_indicator():
-    run = made_run(np.tile([1.0, 0.0, 0.0], (20, 1)), current=np.ones((20, 2)), machine=HUSKY)
+    run = made_run(np.tile([1.0, 0.0, 0.0], (20, 1)), current=np.ones((20, 2)), spec=HUSKY)
     heard = replace(run.signals, turn=run.signals.turn * [1.0, 1.4])
-    signals = Signals.of(heard, HUSKY, 0.3)
+    signals = SmoothedSignals.of(heard, HUSKY, 0.3)
     # of two wheels, the median ratio is in their middle
     assert signals.deviation == pytest.approx(np.full(20, 0.2 / 1.2), rel=1e-5)
-    uncommanded = Signals.of(replace(heard, command=None), HUSKY, 0.3)
+    uncommanded = SmoothedSignals.of(replace(heard, command=None), HUSKY, 0.3)
     assert uncommanded.deviation == pytest.approx(np.zeros(20), abs=1e-6)
 
 
@@ -43,29 +48,33 @@ def test_a_slow_wheel_counts_in_units_of_the_fastest():
     rim = run.signals.speed * ROBOTINO.wheel_radius + [0.0, 0.01, 0.0]
     heard = replace(run.signals, turn=rim / ROBOTINO.wheel_radius * 0.1)
     fastest = 0.2 * np.cos(np.pi / 6)
-    deviation = Signals.of(heard, ROBOTINO, 0.3).deviation
+    deviation = SmoothedSignals.of(heard, ROBOTINO, 0.3).deviation
     assert deviation == pytest.approx(np.full(20, 0.01 / (0.3 * fastest)), rel=1e-4)
 
 
 def test_accelerations_are_those_of_the_fastest_changing_wheel():
     rolling = np.outer(np.linspace(0.0, 1.9, 20), [0.1, 0.0, 0.0])
-    change = Signals.of(made_run(rolling, current=np.ones((20, 3))).signals, ROBOTINO, 1e-3).change
+    change = SmoothedSignals.of(
+        made_run(rolling, current=np.ones((20, 3))).signals, ROBOTINO, 1e-3
+    ).change
     assert change[1:] == pytest.approx(np.full(19, np.cos(np.pi / 6) / 0.04 * 0.1), rel=1e-4)
 
 
 def test_the_smallest_current_is_that_of_the_wheels_that_drive():
     current = np.tile([0.6, 0.1, 0.7], (20, 1))
-    ahead = Signals.of(made_run(straight(0.0, 0.2, 20), current=current).signals, ROBOTINO, 0.3)
+    ahead = SmoothedSignals.of(
+        made_run(straight(0.0, 0.2, 20), current=current).signals, ROBOTINO, 0.3
+    )
     assert ahead.amps == pytest.approx(np.full(20, 0.6))
     turning = np.tile([0.0, 0.0, 1.0], (20, 1))
-    around = Signals.of(made_run(turning, current=current).signals, ROBOTINO, 0.3)
+    around = SmoothedSignals.of(made_run(turning, current=current).signals, ROBOTINO, 0.3)
     assert around.amps == pytest.approx(np.full(20, 0.1))
 
 
 def test_indicators_are_signals_over_their_limits():
     run = patchy(0, gyro=True)
-    signals = Signals.of(run.signals, ROBOTINO, 1e-3)
-    limits = Limits(change=2.0, turning=0.06, usual=0.4, highest=0.8)
+    signals = SmoothedSignals.of(run.signals, ROBOTINO, 1e-3)
+    limits = SlipThresholds(change=2.0, turning=0.06, usual=0.4, highest=0.8)
     told = Indicators.of(signals, limits)
     assert run.signals.current is not None
     fastest = np.abs(run.signals.speed).max(axis=1, keepdims=True)
@@ -85,7 +94,7 @@ def test_limits_are_quantiles_of_the_steps_that_do_not_slip():
     runs = [patchy(k, gyro=True) for k in range(6)]
     limits = ReinaDeterministic(quantile=0.9).fit(runs, ROBOTINO).limits
     firm = ~np.concatenate([slipping(run) for run in runs])
-    signals = [Signals.of(run.signals, ROBOTINO, 0.3) for run in runs]
+    signals = [SmoothedSignals.of(run.signals, ROBOTINO, 0.3) for run in runs]
     amps = np.concatenate([s.amps for s in signals])[firm]
     assert limits.usual == pytest.approx(np.median(amps))
     assert limits.highest == pytest.approx(np.quantile(amps, 0.9))

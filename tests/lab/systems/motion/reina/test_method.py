@@ -7,7 +7,12 @@ import pytest
 from sklearn.metrics import roc_auc_score
 
 from slipid.lab.systems.motion.reina import ReinaDeterministic, ReinaFuzzy
-from slipid.lab.systems.motion.reina_indicators import Indicators, Limits, Signals, Sugeno
+from slipid.lab.systems.motion.reina_indicators import (
+    Indicators,
+    SlipThresholds,
+    SmoothedSignals,
+    Sugeno,
+)
 from slipid.predict.slip_model import TRIES, ByFloor, groups, path_of
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 from tests.helpers.patchy_runs import LOST, patchy, slipping
@@ -16,7 +21,7 @@ BOTH = [ReinaDeterministic(), ReinaFuzzy()]
 
 
 def test_slip_is_flagged_by_the_gyro_or_by_all_currents_but_not_by_the_encoders():
-    method = ReinaDeterministic(limits=Limits(0.01, 0.05, 0.4, 0.8), slip=0.5)
+    method = ReinaDeterministic(limits=SlipThresholds(0.01, 0.05, 0.4, 0.8), slip=0.5)
     encoder = np.array([5.0, 5.0, 5.0, 0.0])
     current, gyro = np.array([0.2, 1.1, 0.2, 0.2]), np.array([0.3, 0.3, 1.2, 0.3])
     assert (method._answer(Indicators(encoder, current, gyro)) >= 1.0).tolist() == [
@@ -54,7 +59,7 @@ def test_without_other_signs_the_area_is_that_of_the_currents_themselves():
     said = method.predict([run.signals for run in steady], ROBOTINO)
     score = np.concatenate([one.slipping for one in said if one.slipping is not None])
     truth = np.concatenate([slipping(run) for run in steady])
-    amps = np.concatenate([Signals.of(r.signals, ROBOTINO, 1e-3).amps for r in steady])
+    amps = np.concatenate([SmoothedSignals.of(r.signals, ROBOTINO, 1e-3).amps for r in steady])
     raised = np.maximum(amps - method.limits.usual, 0.0)
     assert 0.6 < roc_auc_score(truth, score) < 0.97
     assert roc_auc_score(truth, score.round(6)) == pytest.approx(
@@ -151,7 +156,7 @@ def test_skid_steer_and_floors(method):
         slow = rolling * [0.7, 1.0, 0.5]
         amps = np.full((40, 2), 4.0) + 0.1 * np.random.default_rng(k).normal(size=(40, 2))
         gyro = slow[:, 2]
-        runs.append(made_run(rolling, slow, machine=HUSKY, current=amps, gyro=gyro, floor="grass"))
+        runs.append(made_run(rolling, slow, spec=HUSKY, current=amps, gyro=gyro, floor="grass"))
     fitted = ByFloor.of(method).fit(runs, HUSKY)
     said = fitted.predict([run.signals for run in runs], HUSKY)
     assert np.isfinite(np.concatenate([one.path for one in said])).all()
@@ -185,7 +190,7 @@ def test_windows_that_slip_are_those_of_more_than_a_fifth_with_turning_in_metres
 @pytest.mark.parametrize(("answer", "kept"), [(0.55, 0.7), (0.45, 1.0)])
 def test_fuzzy_answers_flag_slip_from_one_half_on(answer, kept):
     method = ReinaFuzzy(
-        rules=Sugeno(2, np.full(4, answer)), slip=0.3, limits=Limits(turning=np.inf)
+        rules=Sugeno(2, np.full(4, answer)), slip=0.3, limits=SlipThresholds(turning=np.inf)
     )
     run = patchy(3)
     said = method.predict([run.signals], ROBOTINO)[0]

@@ -7,14 +7,14 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import check_grad
 
-from slipid.lab.systems.motion.ward_iagnemma_dynamics import GRAVITY, REST, Dynamics, Law
+from slipid.lab.systems.motion.ward_iagnemma_dynamics import GRAVITY, REST, Dynamics, ForceLaw
 from tests.helpers.driven_runs import FLOOR, MACHINES, held
 from tests.helpers.made_runs import HUSKY, ROBOTINO
 
 
 def test_at_constant_speed_traction_equals_resistance():
     """Ahead on two drives: C1 (1 - exp(-A u)) = rho v / sqrt(v^2 + v_s^2), solved for u."""
-    law = Law(rise=12.0, viscous=0.0, rolling=0.25)
+    law = ForceLaw(rise=12.0, viscous=0.0, rolling=0.25)
     v = held(np.array([0.5, 0.0, 0.0]), law, HUSKY, 1e6)[0]
     u = -np.log(1.0 - law.rolling * v[0] / np.hypot(v[0], REST) / law.grip) / law.rise
     assert v[0] == pytest.approx(0.5 - u, rel=1e-5)
@@ -23,7 +23,7 @@ def test_at_constant_speed_traction_equals_resistance():
 
 def test_an_omni_robot_between_two_wheels_slides_by_what_both_must_pull():
     """Along x two of three wheels pull, at 30 deg: 2 (N T) cos 30 = rho m g, and N = m g / 3."""
-    law = Law(rise=12.0, viscous=0.0, rolling=0.25, turning=0.3)
+    law = ForceLaw(rise=12.0, viscous=0.0, rolling=0.25, turning=0.3)
     v = held(np.array([0.5, 0.0, 0.0]), law, seconds=1e6)[0]
     share = law.rolling * v[0] / np.hypot(v[0], REST) * np.sqrt(3.0) / law.grip
     u = -np.log(1.0 - share) / law.rise
@@ -32,7 +32,7 @@ def test_an_omni_robot_between_two_wheels_slides_by_what_both_must_pull():
 
 def test_viscous_forces_alone_share_speeds_by_their_slopes():
     """C2 u = rho c v along, and rollers leave the other speeds alike."""
-    law = Law(grip=0.0, viscous=0.3, rolling=1e-9, turning=0.0, drag=0.2e9)
+    law = ForceLaw(grip=0.0, viscous=0.3, rolling=1e-9, turning=0.0, drag=0.2e9)
     v = held(np.array([0.2, -0.1, 0.0]), law, seconds=1e6)[0]
     # J^T J = 1.5 on three wheels with N = m g / 3: half of all wheels' slope
     kept = 0.5 * 0.3 / (0.5 * 0.3 + 0.2)
@@ -40,9 +40,9 @@ def test_viscous_forces_alone_share_speeds_by_their_slopes():
 
 
 @MACHINES
-def test_small_steps_follow_the_differential_equation(machine):
+def test_small_steps_follow_the_differential_equation(spec):
     law = replace(FLOOR, viscous=0.3)
-    dynamics = Dynamics.of(machine, law)
+    dynamics = Dynamics.of(spec, law)
     rim, rho = np.array([[0.4, 0.1, -0.2]]) @ dynamics.rims.T, np.array([law.rolling])
 
     def rate(_time, q):
@@ -51,11 +51,11 @@ def test_small_steps_follow_the_differential_equation(machine):
         pull = law.grip * np.sign(slide) * (1 - np.exp(-law.rise * np.abs(slide)))
         force = dynamics.rims.T @ (load * (pull + law.viscous * slide))
         x, y, turn = q
-        p = np.array([x, y, 0.0]) if machine is ROBOTINO else np.array([x, 0.0, 0.0])
+        p = np.array([x, y, 0.0]) if spec is ROBOTINO else np.array([x, 0.0, 0.0])
         t = q - p
         force -= GRAVITY * law.rolling * p * (1 / np.sqrt(p @ p + REST**2) + law.drag)
         force -= GRAVITY * law.turning * t / np.sqrt(t @ t + REST**2)
-        yaw = turn / machine.base_radius
+        yaw = turn / spec.base_radius
         return force * [1, 1, 2] + np.array([yaw * y, -yaw * x, 0.0])
 
     start = np.array([0.05, -0.1, 0.2])
@@ -71,16 +71,16 @@ def test_small_steps_follow_the_differential_equation(machine):
 
 
 @MACHINES
-def test_a_step_solves_its_equation_however_stiff(machine):
+def test_a_step_solves_its_equation_however_stiff(spec):
     rng = np.random.default_rng(0)
     for _ in range(10):
-        law = Law(
+        law = ForceLaw(
             grip=np.exp(rng.uniform(-3, 0.5)),
             rise=np.exp(rng.uniform(0, 5)),
             rolling=np.exp(rng.uniform(-7, -0.5)),
             turning=np.exp(rng.uniform(-7, -0.5)),
         )
-        dynamics = Dynamics.of(machine, law)
+        dynamics = Dynamics.of(spec, law)
         q, rolling = rng.normal(size=(2, 20, 3)) * 0.3
         rim, rho, dt = rolling @ dynamics.rims.T, np.full(20, law.rolling), np.full(20, 0.2)
         after = dynamics.step(q, rho, rim, dt).speeds
@@ -89,11 +89,11 @@ def test_a_step_solves_its_equation_however_stiff(machine):
 
 
 @MACHINES
-def test_the_derivatives_of_a_step(machine):
+def test_the_derivatives_of_a_step(spec):
     rng = np.random.default_rng(1)
     for _ in range(2):
         q, rolling = rng.normal(size=(2, 1, 3)) * 0.2
-        dynamics = Dynamics.of(machine, FLOOR)
+        dynamics = Dynamics.of(spec, FLOOR)
         rim, dt = rolling @ dynamics.rims.T, np.array([0.15])
 
         def after(x, axis, dynamics=dynamics, rim=rim, dt=dt):

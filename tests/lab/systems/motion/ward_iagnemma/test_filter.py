@@ -5,8 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.lab.systems.motion.ward_iagnemma_dynamics import GRAVITY, Dynamics, Law, Padded, pulls
-from slipid.lab.systems.motion.ward_iagnemma_filter import Filter, Noise, State
+from slipid.lab.systems.motion.ward_iagnemma_dynamics import (
+    GRAVITY,
+    Dynamics,
+    ForceLaw,
+    PaddedRuns,
+    motor_forces,
+)
+from slipid.lab.systems.motion.ward_iagnemma_filter import FilterNoise, FilterState, SlipFilter
 from slipid.predict.slip_model import path_of
 from tests.helpers.driven_runs import FLOOR
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
@@ -15,13 +21,13 @@ from tests.helpers.made_runs import ROBOTINO, made_run, straight
 def test_linear_traction_makes_it_the_linear_kalman_filter():
     """Turning on the spot without resistance, by the textbook: yaw rate, bias, and yaw."""
     rng = np.random.default_rng(2)
-    law = Law(grip=0.0, viscous=0.2, rolling=0.0, turning=0.0)
-    noise = Noise(rolling=0.0, drift=(0.0, 0.0, 0.004), gyro=0.03, bias=0.05)
+    law = ForceLaw(grip=0.0, viscous=0.2, rolling=0.0, turning=0.0)
+    noise = FilterNoise(rolling=0.0, drift=(0.0, 0.0, 0.004), gyro=0.03, bias=0.05)
     wheels, gyro, dt, radius = rng.normal(size=40), rng.normal(size=40), 0.1, 0.125
     rolling = np.outer(wheels, [0.0, 0.0, 1.0])
     heard = made_run(rolling, gyro=gyro, dt=dt).signals
-    own = Filter(Dynamics.of(ROBOTINO, law), noise, 10.0, hears_current=False, wander=0.0)
-    tracked = own.track(Padded.of([heard], ROBOTINO))
+    own = SlipFilter(Dynamics.of(ROBOTINO, law), noise, 10.0, hears_current=False, wander=0.0)
+    tracked = own.track(PaddedRuns.of([heard], ROBOTINO))
 
     # 2 (N / m) C2 u of three wheels, the 2 by the inertia m L^2 / 2
     slope = 2 * GRAVITY * 0.2
@@ -49,7 +55,7 @@ def test_a_measurement_is_that_of_the_textbook_but_for_the_pose():
     root, row = rng.normal(size=(8, 8)), rng.normal(size=8)
     row[5:] = 0.0
     spread, mean = root @ root.T, rng.normal(size=5)
-    state = State(mean[None], spread[None])
+    state = FilterState(mean[None], spread[None])
     after = state.corrected(row[None], np.array([0.7]), np.array([0.3]))
     gain = spread @ row / (row @ spread @ row + 0.3)
     assert after.mean[0] == pytest.approx(mean + 0.7 * gain[:5])
@@ -61,7 +67,7 @@ def test_a_measurement_is_that_of_the_textbook_but_for_the_pose():
     assert after.spread[0] == pytest.approx(joseph)
     one = state.corrected(row[None], np.array([0.7]), np.array([0.3]), slice(3, 4))
     assert one.mean[0] == pytest.approx(mean + 0.7 * gain[:5] * [0, 0, 0, 1, 0])
-    two = State(np.tile(mean, (2, 1)), np.tile(spread, (2, 1, 1)))
+    two = FilterState(np.tile(mean, (2, 1)), np.tile(spread, (2, 1, 1)))
     for news, variance in ((np.nan, 0.3), (0.7, np.nan)):
         heard = two.corrected(
             np.tile(row, (2, 1)), np.array([0.7, news]), np.array([0.3, variance])
@@ -71,30 +77,30 @@ def test_a_measurement_is_that_of_the_textbook_but_for_the_pose():
 
 
 def test_resistance_that_pushes_or_exceeds_traction_is_pulled_back():
-    law, noise = Law(drag=2.0), Noise(rolling=0.1)
-    own = Filter(Dynamics.of(ROBOTINO, law), noise, 10.0, hears_current=False, wander=0.0)
+    law, noise = ForceLaw(drag=2.0), FilterNoise(rolling=0.1)
+    own = SlipFilter(Dynamics.of(ROBOTINO, law), noise, 10.0, hears_current=False, wander=0.0)
     mean = np.array([[0.3, 0.4, 9.0, rho, 0.0] for rho in (-0.2, 0.1, 0.8)])
     spread = np.tile(np.diag([0.0, 0, 0, 0.01, 0, 0, 0, 0]), (3, 1, 1))
-    after = own._bounded(State(mean, spread)).mean[:, 3]
+    after = own._bounded(FilterState(mean, spread)).mean[:, 3]
     # a hundredth of the prior's variance: a hundred parts of the bound in a hundred and one
     assert after == pytest.approx([-0.2 / 101, 0.1, 0.3 + (0.8 - 0.3) / 101])
 
 
 def test_the_force_of_a_current_is_that_of_gear_motor_and_wheel():
     heard = made_run(straight(0.0), current=np.tile([0.5, 0.2, 0.7], (40, 1))).signals
-    force = pulls(heard, ROBOTINO)[0]
+    force = motor_forces(heard, ROBOTINO)[0]
     assert force[[0, 2]] == pytest.approx(np.array([0.5, 0.7]) * 16 * 0.05 / 0.04)
     assert np.isnan(force[1])
-    assert np.isnan(pulls(replace(heard, current=None), ROBOTINO)).all()
+    assert np.isnan(motor_forces(replace(heard, current=None), ROBOTINO)).all()
 
 
 def test_the_spread_of_the_end_is_that_of_paths_with_other_twists():
     """Turning fast: by differences of the end with noise in the twist of each of two steps."""
-    noise = Noise(rolling=0.0, drift=(0.01, 0.02, 0.03))
+    noise = FilterNoise(rolling=0.0, drift=(0.01, 0.02, 0.03))
     heard = made_run(np.tile([0.3, -0.2, 2.0], (2, 1)), dt=0.2).signals
     dynamics = Dynamics.of(ROBOTINO, FLOOR)
-    own = Filter(dynamics, noise, 10.0, hears_current=False, wander=0.0)
-    runs = Padded.of([heard], ROBOTINO)
+    own = SlipFilter(dynamics, noise, 10.0, hears_current=False, wander=0.0)
+    runs = PaddedRuns.of([heard], ROBOTINO)
 
     def end(shaken):
         q, twist = runs.rolling[:, 0], np.zeros((2, 3))

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.lab.systems.motion.ward_iagnemma import WardIagnemma, Windows
-from slipid.lab.systems.motion.ward_iagnemma_dynamics import pulls
+from slipid.lab.systems.motion.ward_iagnemma import PosedWindows, WardIagnemma
+from slipid.lab.systems.motion.ward_iagnemma_dynamics import motor_forces
 from tests.helpers.driven_runs import FLOOR, TRUE, driven, pulling, scattered
 from tests.helpers.made_runs import ROBOTINO
 
@@ -51,12 +51,12 @@ def test_the_noise_of_currents_is_that_of_the_means_of_runs():
         run = pulling(driven(FLOOR, k), FLOOR, 1.0, rng.normal())
         runs.append(run)
     noise = WardIagnemma.with_current().fit(runs, ROBOTINO).noise
-    counts = [np.isfinite(pulls(run.signals.windowed(), ROBOTINO)).sum() for run in runs]
+    counts = [np.isfinite(motor_forces(run.signals.windowed(), ROBOTINO)).sum() for run in runs]
     assert noise.force == pytest.approx(np.sqrt(np.mean(counts) / 3), rel=0.35)
 
 
 def test_windows_are_drawn_from_few_runs_and_thinned_evenly():
-    windows = Windows.of([driven(FLOOR, k) for k in range(45)], ROBOTINO)
+    windows = PosedWindows.of([driven(FLOOR, k) for k in range(45)], ROBOTINO)
     assert len(np.unique(windows.run)) == 40
     assert len(windows.dt) == 40 * 8
     assert windows.thinned(100).run.tolist() == windows.run[::4].tolist()

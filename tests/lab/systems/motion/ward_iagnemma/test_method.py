@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import chi2
 
 from slipid.lab.systems.motion.ward_iagnemma import WardIagnemma
-from slipid.lab.systems.motion.ward_iagnemma_dynamics import Law
-from slipid.lab.systems.motion.ward_iagnemma_filter import Noise
+from slipid.lab.systems.motion.ward_iagnemma_dynamics import ForceLaw
+from slipid.lab.systems.motion.ward_iagnemma_filter import FilterNoise
 from slipid.predict.slip_model import TRIES, ByFloor, body_increments
 from tests.helpers.driven_runs import FLOOR, MACHINES, TRUE, driven, pulling, scattered
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
@@ -26,24 +26,24 @@ def test_a_robot_that_stands_keeps_standing():
 
 def test_wheels_that_spin_on_the_spot_are_told():
     run = made_run(straight(0.0), current=np.ones((40, 3)))
-    stuck = WardIagnemma(law=Law(rolling=2.0), noise=Noise(rolling=1e-6))
-    rolls = WardIagnemma(law=Law(rise=200.0, rolling=1e-3), noise=Noise(rolling=1e-6))
+    stuck = WardIagnemma(law=ForceLaw(rolling=2.0), noise=FilterNoise(rolling=1e-6))
+    rolls = WardIagnemma(law=ForceLaw(rise=200.0, rolling=1e-3), noise=FilterNoise(rolling=1e-6))
     assert (stuck.predict([run.signals], ROBOTINO)[0].slipping[3:] > 0.8).all()
     assert (rolls.predict([run.signals], ROBOTINO)[0].slipping < 0.05).all()
 
 
 @pytest.mark.slow
 @MACHINES
-def test_what_was_driven_by_the_law_is_foretold(machine):
-    runs = [driven(FLOOR, k, machine) for k in range(14)]
-    fitted = WardIagnemma().fit(runs[:10], machine)
-    foretold = fitted.predict([run.signals for run in runs[10:]], machine)
+def test_what_was_driven_by_the_law_is_foretold(spec):
+    runs = [driven(FLOOR, k, spec) for k in range(14)]
+    fitted = WardIagnemma().fit(runs[:10], spec)
+    foretold = fitted.predict([run.signals for run in runs[10:]], spec)
     # after the wheels change, the robot's mass needs some steps to follow
     settled = np.r_[10:20, 30:40]
     for run, said in zip(runs[10:], foretold, strict=True):
         twist = body_increments(said.path) / run.signals.dt[:, None]
-        off = np.abs((twist - run.twist) * machine.size)[settled]
-        slip = np.abs((run.signals.rolling(machine) - run.twist) * machine.size)[settled]
+        off = np.abs((twist - run.twist) * spec.size)[settled]
+        slip = np.abs((run.signals.rolling(spec) - run.twist) * spec.size)[settled]
         assert off.max() < 0.05 * slip.max()
 
 
@@ -64,7 +64,7 @@ def test_nine_ends_of_ten_lie_in_their_regions(gyro):
 
 @pytest.mark.slow
 def test_the_gyro_makes_the_end_surer():
-    noise = Noise(0.03, (0.003, 0.004, 0.02), 0.001, 0.001)
+    noise = FilterNoise(0.03, (0.003, 0.004, 0.02), 0.001, 0.001)
     method = WardIagnemma(law=FLOOR, noise=noise)
     for run in scattered(3, True):
         sure, unsure = method.predict([run.signals, replace(run.signals, gyro=None)], ROBOTINO)
@@ -73,7 +73,7 @@ def test_the_gyro_makes_the_end_surer():
 
 def test_currents_tell_runs_that_resist_more():
     heavier = replace(FLOOR, rolling=0.25)
-    noise = Noise(rolling=0.05, drift=(1e-3, 1e-3, 1e-3), force=0.5)
+    noise = FilterNoise(rolling=0.05, drift=(1e-3, 1e-3, 1e-3), force=0.5)
     run = pulling(driven(heavier, 5), FLOOR, 1.0, 0.0)
     method = replace(WardIagnemma.with_current(), law=FLOOR, noise=noise)
     deaf = replace(method, needs=frozenset())
@@ -93,7 +93,7 @@ def test_runs_do_not_tell_on_those_beside_them():
 
 def test_rho_that_wanders_makes_the_end_less_sure():
     heard = made_run(straight(0.2)).signals
-    noise = Noise(0.02, (1e-4, 1e-4, 1e-4))
+    noise = FilterNoise(0.02, (1e-4, 1e-4, 1e-4))
     spread = [
         np.trace(
             WardIagnemma(law=FLOOR, noise=noise, wander=w)

@@ -6,29 +6,35 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from slipid.api.runs import made_runs
+from slipid.api.runs import simulate_runs
 from slipid.fit.variances import DEGREES
-from slipid.lab.benchmark import own as slipid_rows
-from slipid.lab.benchmark.own import Own, Place, estimated, replay, told
-from slipid.lab.benchmark.steps import cut
-from slipid.predict.slip_model import Machine, PredictedRun
+from slipid.lab.benchmark import slipid_rows
+from slipid.lab.benchmark.slipid_rows import (
+    FloorKnowledge,
+    SlipidFit,
+    estimator_runs,
+    forecast,
+    replay,
+)
+from slipid.lab.benchmark.steps import run_batches
+from slipid.predict.slip_model import PredictedRun, RobotSpec
 from slipid.robot.estimator import Estimator
-from slipid.robot.interface import MIXED, Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from tests.helpers.small_twin import deployed
 
 
 @pytest.fixture(scope="module")
 def made():
-    return made_runs(("firm", "soft"), headings=3, turns=0, seed=3)
+    return simulate_runs(("firm", "soft"), headings=3, turns=0, seed=3)
 
 
-def own_of(made, current=True) -> Own:
+def own_of(made, current=True) -> SlipidFit:
     """The robot that drove the runs, as if it had been fitted to them."""
 
     def ends(w):
         return SimpleNamespace(predicted=w.pose), np.tile(np.diag([4.0, 1.0]), (len(w), 1, 1))
 
-    own = object.__new__(Own)
+    own = object.__new__(SlipidFit)
     dataset = SimpleNamespace(current=np.ones(1) if current else None)
     stub = {
         "contact": SimpleNamespace(ends=ends, robot=made.robot),
@@ -42,9 +48,9 @@ def own_of(made, current=True) -> Own:
 
 
 def test_where_the_floor_is_told_the_region_is_that_of_a_student_t(made):
-    one = cut(made.runs, made.robot)[0]
-    machine = Machine.of(made.robot)
-    said = told(own_of(made, current=False), one, machine)
+    one = run_batches(made.runs, made.robot)[0]
+    spec = RobotSpec.of(made.robot)
+    said = forecast(own_of(made, current=False), one, spec)
     assert len(said) == len(one.runs)
     for run in said:
         assert run.end_covariance is not None
@@ -70,40 +76,40 @@ def driven(made, monkeypatch):
 
 def labels(place, made, driven, current=True):
     """Floors of each estimator that is driven for some runs."""
-    cuts = cut(made.runs, made.robot)
-    said = estimated(own_of(made, current), cuts, made.runs, place)
+    cuts = run_batches(made.runs, made.robot)
+    said = estimator_runs(own_of(made, current), cuts, made.runs, place)
     assert len(said) == len(made.runs)
     return [estimator.robot.labels for estimator, _ in driven]
 
 
 def test_an_estimator_has_the_floors_that_it_may_meet(made, driven):
-    assert labels(Place(), made, driven) == [("firm", "soft")]
+    assert labels(FloorKnowledge(), made, driven) == [("firm", "soft")]
     driven.clear()
-    assert sorted(labels(Place(told=True), made, driven)) == [("firm",), ("soft",)]
+    assert sorted(labels(FloorKnowledge(told=True), made, driven)) == [("firm",), ("soft",)]
     for estimator, heard in driven:
         assert {one.name for one in heard} == {
             log.name for log in made.runs.logs if log.surface == estimator.robot.labels[0]
         }
     driven.clear()
-    (found,) = labels(Place(strange=True), made, driven)
+    (found,) = labels(FloorKnowledge(strange=True), made, driven)
     assert found[:2] == ("firm", "soft")
     assert "unseen_1" in found
 
 
 def test_only_a_robot_that_may_stand_on_several_floors_looks_for_them(made, driven):
-    labels(Place(), made, driven)
-    assert driven[0][0].settings.alike != MIXED
+    labels(FloorKnowledge(), made, driven)
+    assert driven[0][0].settings.alike != MIXED_FLOORS_PENALTY
     cuts = [
         replace(one, runs=tuple(replace(run, floor="unknown") for run in one.runs))
-        for one in cut(made.runs, made.robot)
+        for one in run_batches(made.runs, made.robot)
     ]
-    estimated(own_of(made), cuts, made.runs, Place())
-    assert driven[1][0].settings.alike == MIXED
+    estimator_runs(own_of(made), cuts, made.runs, FloorKnowledge())
+    assert driven[1][0].settings.alike == MIXED_FLOORS_PENALTY
 
 
 def test_an_estimator_hears_currents_only_if_it_was_fitted_to_some(made, driven):
-    labels(Place(), made, driven, current=True)
-    labels(Place(), made, driven, current=False)
+    labels(FloorKnowledge(), made, driven, current=True)
+    labels(FloorKnowledge(), made, driven, current=False)
     (_, with_currents), (_, without) = driven
     assert all(one.current is not None for one in with_currents)
     assert all(one.current is None for one in without)
@@ -113,7 +119,7 @@ def test_an_estimator_hears_currents_only_if_it_was_fitted_to_some(made, driven)
 def test_what_is_not_on_a_floor_of_the_robot_is_unknown(made, monkeypatch):
     monkeypatch.setattr(slipid_rows, "TOGETHER", 1)
     robot = deployed().with_unseen()
-    heard = cut(made.runs, made.robot)[0].runs[0].signals
+    heard = run_batches(made.runs, made.robot)[0].runs[0].signals
     (said,) = replay(Estimator(robot, Settings.of(robot)), [heard], np.zeros((1, 3)))
     assert said.floors is not None
     assert list(said.floors) == ["firm", "soft", "unknown"]

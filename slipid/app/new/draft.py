@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 from slipid.app.new.config_lines import ConfigLine, toml
 from slipid.app.new.robot_questions import RobotAnswers
-from slipid.app.reference.parameters import in_short
+from slipid.app.reference.keys import in_short
 from slipid.data.reading.layout import Layout
 
-_NAMES = "the column names and units below are examples: write those of your files"
+_EXAMPLE_NAMES = "the column names and units below are examples: write those of your files"
 _LABELS = {
     (4, False): ("fl", "fr", "rl", "rr"),
     (4, True): ("left", "right"),
@@ -17,7 +17,7 @@ _LABELS = {
 
 
 @dataclass(frozen=True)
-class ChannelSketch:
+class ChannelDraft:
     """A channel of a layout: columns and unit as of `Channel`, the rest as of `Line`."""
 
     channel: str
@@ -36,7 +36,7 @@ class ChannelSketch:
 
 
 @dataclass(frozen=True)
-class FileSketch:
+class FileDraft:
     """One kind of file.
 
     Attributes:
@@ -48,7 +48,7 @@ class FileSketch:
         pattern: name of a file that lies beside a run's own, as of `Layout.beside`; empty for that.
     """
 
-    channels: tuple[ChannelSketch, ...]
+    channels: tuple[ChannelDraft, ...]
     delimiter: str = ","
     names_row: int = 1
     units_row: int = 0
@@ -63,29 +63,29 @@ class FileSketch:
         if not self.delimiter:
             return self.settings
         rows = ("names_row", "units_row") if self.units_row else ("names_row",)
-        lines = [setting("delimiter", self.delimiter)]
-        lines += [setting(key, getattr(self, key)) for key in (*rows, "first_data_row")]
+        lines = [layout_line("delimiter", self.delimiter)]
+        lines += [layout_line(key, getattr(self, key)) for key in (*rows, "first_data_row")]
         return (*lines, *self.settings)
 
 
 @dataclass(frozen=True)
-class LayoutSketch:
+class LayoutDraft:
     """A layout of the config's own; `examples`: whether other ways to log are shown below it."""
 
     name: str
-    file: FileSketch
-    beside: tuple[FileSketch, ...] = ()
+    file: FileDraft
+    beside: tuple[FileDraft, ...] = ()
     examples: bool = False
 
     @property
-    def channels(self) -> Iterator[ChannelSketch]:
+    def channels(self) -> Iterator[ChannelDraft]:
         """Every channel that counts, of all its files."""
         for file in (self.file, *self.beside):
             yield from (channel for channel in file.channels if not channel.off)
 
 
 @dataclass(frozen=True)
-class BagSketch:
+class BagDraft:
     """A layout of bags: its keys, a line for each topic that counts, and what they hold."""
 
     name: str
@@ -96,7 +96,7 @@ class BagSketch:
 
 
 @dataclass(frozen=True)
-class LogsSketch:
+class LogsDraft:
     """A section of logs; attributes as of `Logs`, and what is said or asked of it.
 
     A session of "" is not written: the default holds.
@@ -112,7 +112,7 @@ class LogsSketch:
 
 
 @dataclass(frozen=True)
-class Hint:
+class RobotHint:
     """What to ask of a key of `[robot]` that nobody answered, instead of the usual words."""
 
     key: str
@@ -120,7 +120,7 @@ class Hint:
 
 
 @dataclass(frozen=True)
-class Sketch:
+class ConfigDraft:
     """A whole config.
 
     Attributes:
@@ -134,13 +134,13 @@ class Sketch:
     """
 
     robot: RobotAnswers
-    layouts: tuple[LayoutSketch, ...]
-    logs: tuple[LogsSketch, ...]
+    layouts: tuple[LayoutDraft, ...]
+    logs: tuple[LogsDraft, ...]
     carries: frozenset[str] = frozenset()
     above: tuple[str, ...] = ()
     data: str = "DIR"
-    hints: tuple[Hint, ...] = ()
-    bags: tuple[BagSketch, ...] = ()
+    hints: tuple[RobotHint, ...] = ()
+    bags: tuple[BagDraft, ...] = ()
 
     @property
     def channels(self) -> frozenset[str]:
@@ -153,37 +153,39 @@ class Sketch:
 class ConfigProposal:
     """A config to be, and what was found in the logs, in sentences."""
 
-    sketch: Sketch
+    sketch: ConfigDraft
     sentences: tuple[str, ...]
 
 
-def setting(key: str, value: object, question: str = "", comment: str = "") -> ConfigLine:
+def layout_line(key: str, value: object, question: str = "", comment: str = "") -> ConfigLine:
     """A key of a layout with what it means."""
     return ConfigLine(key, toml(value), comment or in_short(Layout, key), question)
 
 
-def blank(known: RobotAnswers) -> Sketch:
+def template_draft(known: RobotAnswers) -> ConfigDraft:
     """Everything that this robot may log, in one file for each run."""
-    layout = LayoutSketch(
-        "mine", FileSketch(_channels(known), settings=_settings(known)), examples=True
+    layout = LayoutDraft(
+        "mine", FileDraft(_channels(known), settings=_settings(known)), examples=True
     )
-    return Sketch(known, (layout,), (LogsSketch("*/*.csv", "mine"),))
+    return ConfigDraft(known, (layout,), (LogsDraft("*/*.csv", "mine"),))
 
 
 def _settings(known: RobotAnswers) -> tuple[ConfigLine, ...]:
-    gear = setting("gear_ratio", known.gear_ratio, comment="as above")
-    signed = setting("current_is_signed", True, comment="false where only magnitudes are logged")
+    gear = layout_line("gear_ratio", known.gear_ratio, comment="as above")
+    signed = layout_line(
+        "current_is_signed", True, comment="false where only magnitudes are logged"
+    )
     if not known.ticks_per_revolution:
         return (gear, signed)
     question = ""
     if "ticks_per_revolution" in known.taken:
         question = "taken by default: look it up, of the motor shaft with all edges"
-    ticks = setting("ticks_per_revolution", known.ticks_per_revolution, question)
-    increments = setting("ticks_are_increments", False)
+    ticks = layout_line("ticks_per_revolution", known.ticks_per_revolution, question)
+    increments = layout_line("ticks_are_increments", False)
     return (ticks, increments, gear, signed)
 
 
-def _channels(known: RobotAnswers) -> tuple[ChannelSketch, ...]:
+def _channels(known: RobotAnswers) -> tuple[ChannelDraft, ...]:
     labels = _LABELS.get((known.wheels, known.shared))
     if labels is None or known.drive in ("omni", "general"):
         labels = tuple(str(k + 1) for k in range(known.wheels))
@@ -192,22 +194,22 @@ def _channels(known: RobotAnswers) -> tuple[ChannelSketch, ...]:
         return tuple(f"{name}_{label}" for label in labels)
 
     ticks = bool(known.ticks_per_revolution)
-    turns = ChannelSketch("wheel_ticks", each("ticks"), "tick", "or wheel_angle, motor_angle")
-    speed = ChannelSketch("wheel_speed", each("speed"), "rad/s", "or motor_speed, before the gear")
+    turns = ChannelDraft("wheel_ticks", each("ticks"), "tick", "or wheel_angle, motor_angle")
+    speed = ChannelDraft("wheel_speed", each("speed"), "rad/s", "or motor_speed, before the gear")
     sideways = known.drive in ("omni", "mecanum", "general")
     twist = [("twist_command_x", "command_x", "m/s"), ("twist_command_y", "command_y", "m/s")]
     twist = twist if sideways else twist[:1]
     commands = [
-        ChannelSketch(*(channel, (column,), unit))
+        ChannelDraft(*(channel, (column,), unit))
         for channel, column, unit in (*twist, ("twist_command_yaw", "command_yaw", "rad/s"))
     ]
     return (
-        ChannelSketch("time", ("time",), "s", question=_NAMES),
+        ChannelDraft("time", ("time",), "s", question=_EXAMPLE_NAMES),
         turns if ticks else speed,
-        ChannelSketch("current", each("current"), "A"),
-        ChannelSketch("voltage", each("voltage"), "V", "at the motors, not the battery's"),
-        ChannelSketch("pose_x", ("x",), "m", "at the rate of its sensor; empty cells between"),
-        ChannelSketch("pose_y", ("y",), "m"),
-        ChannelSketch("pose_heading", ("heading",), "rad"),
+        ChannelDraft("current", each("current"), "A"),
+        ChannelDraft("voltage", each("voltage"), "V", "at the motors, not the battery's"),
+        ChannelDraft("pose_x", ("x",), "m", "at the rate of its sensor; empty cells between"),
+        ChannelDraft("pose_y", ("y",), "m"),
+        ChannelDraft("pose_heading", ("heading",), "rad"),
         *commands,
     )

@@ -12,24 +12,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.app.problem import Job
+from slipid.app.problem import ConfigFitTask
 from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
-from slipid.deploy.deploy import robot_of
+from slipid.deploy.deploy import robot_of_force_balance
 from slipid.deploy.floors import floor_of
 from slipid.fit import likelihood as lk
 from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.fit.variances import DEGREES
 from slipid.infer.slip_curves import current_trend
-from slipid.lab.benchmark.steps import Cut, body_poses
-from slipid.predict.folds import of_some
-from slipid.predict.predictive import Contact, contact_of
-from slipid.predict.slip_model import Machine, PredictedRun, RunSignals, seen_from_start
+from slipid.lab.benchmark.steps import RunBatch, body_poses
+from slipid.predict.folds import problem_of_runs
+from slipid.predict.predictive import ForceBalance, force_balance_of
+from slipid.predict.slip_model import PredictedRun, RobotSpec, RunSignals, relative_to_start
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
-from slipid.robot.interface import MIXED, NO_FLOOR, Readings, Settings
-from slipid.robot.record import Sensors
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, NO_FLOOR, Readings, Settings
+from slipid.robot.record import LogSensors
 from slipid.support.checkpoint import Checkpoint
 
 NAME = "slipid"
@@ -44,7 +44,7 @@ LONGEST_S = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Own:
+class SlipidFit:
     """slipid fitted to some runs of a data set.
 
     Attributes:
@@ -56,8 +56,8 @@ class Own:
         seconds: that the fit took; converged: whether it did.
     """
 
-    contact: Contact
-    job: Job
+    contact: ForceBalance
+    job: ConfigFitTask
     seen: tuple[int, ...]
     highest_speed: float
     trend: tuple[float, float]
@@ -73,16 +73,20 @@ class Own:
     def deployed(self) -> DeployedRobot:
         """The robot as it is deployed, on all floors of the data set."""
         signed = self.job.dataset.current_is_signed
-        return robot_of(self.contact, self.highest_speed, self.trend, Sensors(signed))
+        return robot_of_force_balance(
+            self.contact, self.highest_speed, self.trend, LogSensors(signed)
+        )
 
 
-def fit_own(job: Job, problem: Problem, fitted: np.ndarray, kept: Checkpoint) -> Own:
+def fit_slipid(
+    job: ConfigFitTask, problem: Problem, fitted: np.ndarray, kept: Checkpoint
+) -> SlipidFit:
     """The force balance fitted to some runs of a job.
 
     What was kept of this very fit is not done again. Fits of one `job.problem()` share what was
     compiled for it.
     """
-    problem = of_some(problem, job.choices, job.dataset, fitted)
+    problem = problem_of_runs(problem, job.choices, job.dataset, fitted)
     keep = np.isin(problem.windows.run, fitted).astype(float)
     if (found := kept.load("fit")) is None:
         began = time.perf_counter()
@@ -97,34 +101,34 @@ def fit_own(job: Job, problem: Problem, fitted: np.ndarray, kept: Checkpoint) ->
         found = kept.load("fit")
         assert found is not None
     covariance, seconds, converged = (found.pop(k) for k in ("covariance", "seconds", "converged"))
-    contact = contact_of(problem, State.of(found), covariance, keep)
+    contact = force_balance_of(problem, FitState.of(found), covariance, keep)
     speed, trend = _seen(problem, contact, keep)
     seen = {job.dataset.logs[k].surface for k in fitted.tolist()}
     rows = tuple(k for k, name in enumerate(contact.robot.surfaces.labels) if name in seen)
-    return Own(contact, job, rows, speed, trend, float(seconds), bool(converged))
+    return SlipidFit(contact, job, rows, speed, trend, float(seconds), bool(converged))
 
 
 def _seen(
-    problem: Problem, contact: Contact, keep: Float[np.ndarray, " piece"]
+    problem: Problem, contact: ForceBalance, keep: Float[np.ndarray, " piece"]
 ) -> tuple[float, tuple[float, float]]:
     """Highest wheel speed [rad/s] and trend of currents in the pieces that count."""
-    w = problem.windows.pieces(np.flatnonzero(keep > 0))
+    w = problem.windows.segments(np.flatnonzero(keep > 0))
     speed = float(np.abs(w.turn / w.dt[..., None]).max())
     if not w.has_current:
         return speed, (0.0, 0.0)
     return speed, current_trend(contact.robot, lk.batch(w, contact.robot))
 
 
-def told(own: Own, cut: Cut, machine: Machine) -> list[PredictedRun]:
+def forecast(own: SlipidFit, cut: RunBatch, spec: RobotSpec) -> list[PredictedRun]:
     """What the force balance says of runs whose floors it is told, with the electric power."""
     w = cut.windows
     tracks, cov = own.contact.ends(w)
     robot = own.contact.robot
     paths = body_poses(robot, w, tracks.predicted)
-    power = _power(own, w, machine) if own.job.dataset.current is not None else None
+    power = _power(own, w, spec) if own.job.dataset.current is not None else None
     return [
         PredictedRun(
-            path=seen_from_start(paths[k]),
+            path=relative_to_start(paths[k]),
             end_covariance=turned_covariance(cov[k], -float(paths[k, 0, 2])),
             freedom=DEGREES,
             power=None if power is None else power[k],
@@ -133,22 +137,22 @@ def told(own: Own, cut: Cut, machine: Machine) -> list[PredictedRun]:
     ]
 
 
-def _power(own: Own, w: Any, machine: Machine) -> np.ndarray:
+def _power(own: SlipidFit, w: Any, spec: RobotSpec) -> np.ndarray:
     """Electric power of all motors by the currents that the force balance predicts [W]."""
     robot = own.contact.robot
     b = lk.batch(w, robot)
     amps = np.abs(np.asarray(_currents(robot, b)))
-    shaft = np.abs(machine.gear_ratio * w.turn / w.dt[..., None])
-    return np.asarray(((machine.resistance * amps + machine.back_emf * shaft) * amps).sum(-1))
+    shaft = np.abs(spec.gear_ratio * w.turn / w.dt[..., None])
+    return np.asarray(((spec.resistance * amps + spec.back_emf * shaft) * amps).sum(-1))
 
 
 @jax.jit
 def _currents(robot: Any, b: lk.Batch) -> Array:
-    return lk.predicted_current(robot, b, lk.predict(robot, b).felt)
+    return lk.predicted_current(robot, b, lk.predict(robot, b).motor_force)
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class FloorKnowledge:
     """What an estimator knows of where it drives.
 
     Attributes:
@@ -162,7 +166,9 @@ class Place:
     map: FloorMap | None = None
 
 
-def estimated(own: Own, cuts: Sequence[Cut], data: Runs, place: Place) -> list[PredictedRun]:
+def estimator_runs(
+    own: SlipidFit, cuts: Sequence[RunBatch], data: Runs, place: FloorKnowledge
+) -> list[PredictedRun]:
     """What the estimator says of runs, in the order of the cuts, which are of these data.
 
     It hears currents only if it was fitted to some.
@@ -184,7 +190,9 @@ def estimated(own: Own, cuts: Sequence[Cut], data: Runs, place: Place) -> list[P
     return [out[n] for n in range(len(runs))]
 
 
-def _estimator(own: Own, load: str, only: str | None, place: Place, several: bool) -> Estimator:
+def _estimator(
+    own: SlipidFit, load: str, only: str | None, place: FloorKnowledge, several: bool
+) -> Estimator:
     """The estimator of a fit, for all floors that were fitted, or only one."""
     whole = own.deployed
     # a floor that nobody has seen has no numbers
@@ -194,7 +202,7 @@ def _estimator(own: Own, load: str, only: str | None, place: Place, several: boo
         robot = robot.with_unseen()
     settings = Settings.of(robot)
     if several or place.map is not None:
-        settings = replace(settings, alike=MIXED)
+        settings = replace(settings, alike=MIXED_FLOORS_PENALTY)
     known = None if place.map is None else floor_of(place.map, robot.labels)
     return Estimator(robot, settings, known)
 
@@ -205,7 +213,7 @@ def _starts(runs: Sequence[Any], mine: Sequence[int], floor: FloorMap | None) ->
     return np.stack([runs[n][0].pose[0] for n in mine])
 
 
-class _Rows(eqx.Module):
+class _ReplayRows(eqx.Module):
     """What an estimator hears, row by row of every run; NaN where there is nothing."""
 
     angle: Float[Array, "run row drive"]
@@ -216,18 +224,18 @@ class _Rows(eqx.Module):
 
 @eqx.filter_jit
 def _driven(
-    estimator: Estimator, start: Float[Array, "run 3"], rows: _Rows
+    estimator: Estimator, start: Float[Array, "run 3"], rows: _ReplayRows
 ) -> tuple[Array, Array, Array]:
     """Poses, covariances of the place and probabilities of floors under the robot, row by row."""
     nothing = Readings.nothing(estimator.robot.drives)
 
-    def step(state: Any, row: _Rows) -> Any:
+    def step(state: Any, row: _ReplayRows) -> Any:
         z = replace(nothing, wheel_angle=row.angle, current=row.current, gyro=row.gyro)
         state, seen = estimator.step(state, z, row.dt)
         floors = jnp.mean(seen.surface_probability, axis=0)
         return state, (seen.pose, seen.covariance[:2, :2], floors)
 
-    def one(pose: Array, of_run: _Rows) -> Any:
+    def one(pose: Array, of_run: _ReplayRows) -> Any:
         return jax.lax.scan(step, estimator.init(pose), of_run)[1]
 
     return jax.vmap(one)(start, rows)
@@ -264,14 +272,14 @@ def replay(
                 current[n, rows] = np.repeat(run.current, part, axis=0)
             if run.gyro is not None:
                 gyro[n, rows] = np.repeat(run.gyro, part)
-        heard = _Rows(*(jnp.asarray(x) for x in (angle, current, gyro, dt)))
+        heard = _ReplayRows(*(jnp.asarray(x) for x in (angle, current, gyro, dt)))
         pose, cov, floors = (np.asarray(x) for x in _driven(estimator, jnp.asarray(begin), heard))
         for n, k in enumerate(some):
             ends = np.cumsum(parts[k])
             path = np.concatenate([begin[n][None], pose[n, ends]])
             under = {estimator.robot.labels[row]: floors[n, ends, row] for row in known}
             said = PredictedRun(
-                path=seen_from_start(path),
+                path=relative_to_start(path),
                 end_covariance=turned_covariance(cov[n, ends[-1]], -float(begin[n, 2])),
                 floors=under | {NO_FLOOR: 1.0 - sum(under.values())},
             )

@@ -1,4 +1,16 @@
-"""The record of a robot: its numbers as they are, and what the model makes of them once for all."""
+"""The record of a robot: its numbers as they are, and what the model makes of them once for all.
+
+What the fitted runs tell of the effects of floors, as the table that robot.json has.
+
+The motion per metre along, across and in yaw, of wheels that would not slip, is predicted to be
+
+    contact(z) - told(z),   told(z) = mean + slope (z - z_fit)
+
+as forecasts have it (`slipid.fit.shared_effects`). The mean of the table is what that is beyond
+the contact model with the robot's numbers; what is left is the covariance of the effects given the
+numbers, grown as forecasts are, and the scatter of this very sum over draws of the numbers: where
+runs were near, another number is made up for by another effect.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
@@ -11,25 +23,27 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.fit.noise import SHARED
-from slipid.fit.shared import AXES
+from slipid.fit.shared_effects import AXES, SpeedAndLoad, TravelConditions
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Frame, at_drives, at_wheels
+from slipid.model.geometry import WheelFrame, at_drives, at_wheels
 from slipid.model.motor import Motor
 from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.parameter import entries
+from slipid.predict.predictive import ForceBalance
 from slipid.robot import record
+from slipid.robot.record import Axes, EffectRecord
 
 
-def record_of(
+def robot_record(
     robot: Robot,
-    numbers: Mapping[str, record.Number],
+    numbers: Mapping[str, record.RecordedNumber],
     std: Mapping[str, float],
     draws: Robot,
     highest_speed: float,
     current_trend: record.Pair,
     seen: Mapping[str, Validity],
-    told: Mapping[str, record.ToldRecord] | None = None,
+    told: Mapping[str, record.EffectRecord] | None = None,
 ) -> record.RobotRecord:
     """The record of a robot, but for what is known of where its numbers come from.
 
@@ -101,14 +115,14 @@ def _axes(row: Sequence[float] | np.ndarray) -> record.Axes:
 
 
 def _load(
-    robot: Robot, name: str, top: float, draws: Robot, told: record.ToldRecord | None
+    robot: Robot, name: str, top: float, draws: Robot, told: record.EffectRecord | None
 ) -> record.LoadRecord:
     """What depends on how the robot is loaded."""
     shape, k = robot.geometry, jnp.asarray(robot.load_index(name))
     frame, ways = shape.frame(), directions(36)
     if not shape.determines_twist:
         ways = jnp.concatenate([ways, _turns(frame)])
-    wheels, rest = _Wheels.of(robot), robot.body.load_share[k]
+    wheels, rest = _WheelArrays.of(robot), robot.body.load_share[k]
     floors, motor, mass = robot.surfaces, robot.motor, robot.body.mass
     speed, amps, slip = _circle(wheels, floors, rest, motor, mass, jnp.asarray(top), ways)
     curve = np.asarray(_wheel_curve(speed, amps, slip))
@@ -127,20 +141,20 @@ def directions(count: int) -> Float[Array, "way 3"]:
     return jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
 
 
-def _turns(frame: Frame) -> Float[Array, "way 3"]:
+def _turns(frame: WheelFrame) -> Float[Array, "way 3"]:
     """Twists on the spot, to the left and to the right, with a rim speed of 1 m/s or so."""
     return jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / frame.base
 
 
-class _Wheels(eqx.Module):
+class _WheelArrays(eqx.Module):
     """The wheels as arrays, wherever they are: what is compiled for some serves all as many."""
 
-    frame: Frame
+    frame: WheelFrame
     forward: Float[Array, "*draw drive 3"]
     drive_of: tuple[int, ...] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, robot: Robot) -> "_Wheels":
+    def of(cls, robot: Robot) -> "_WheelArrays":
         shape = robot.geometry
         return cls(shape.frame(), shape.forward(), shape.drive_of)
 
@@ -151,7 +165,7 @@ class _Wheels(eqx.Module):
 
 @eqx.filter_jit
 def _circle(
-    wheels: _Wheels,
+    wheels: _WheelArrays,
     surfaces: ContactSurface,
     rest: Float[Array, " wheel"],
     motor: Motor,
@@ -170,8 +184,10 @@ def _circle(
         xi = contact.equilibrium(rim, frame, floor, rest)
         force = floor.friction * mass * GRAVITY * frame.radius
         where = xi, rim, frame, floor, rest
-        felt = jnp.stack([contact.traction(*where), contact.rolled(*where)], axis=-1)
-        amps = motor.current(at_drives(wheels.drive_of, force * motor.borne(felt)), w)
+        motor_force = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
+        amps = motor.current(
+            at_drives(wheels.drive_of, force * motor.opposing_force(motor_force)), w
+        )
         lost = turned - wheels.forward @ xi
         return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
 
@@ -196,7 +212,9 @@ def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
     return jax.vmap(wheel, 1)(*flat)
 
 
-def _spread(robot: Robot, frame: Frame, draws: Robot, load: Array) -> Float[np.ndarray, "floor 3"]:
+def _spread(
+    robot: Robot, frame: WheelFrame, draws: Robot, load: Array
+) -> Float[np.ndarray, "floor 3"]:
     """Std over posterior draws of the motion per metre, a row per floor (along, across, yaw).
 
     On average over all directions; of wheels that do not drive sideways the largest, turns on the
@@ -222,12 +240,12 @@ def moved_per_metre(
     For ways to move at 1 m/s, of robots that are stacked.
     """
     rest = draws.body.load_share[:, load]
-    return _moved(jax.vmap(_Wheels.of)(draws), draws.surfaces, rest, speed, way)
+    return _moved(jax.vmap(_WheelArrays.of)(draws), draws.surfaces, rest, speed, way)
 
 
 @eqx.filter_jit
 def _moved(
-    wheels: _Wheels,
+    wheels: _WheelArrays,
     surfaces: ContactSurface,
     rest: Float[Array, "draw wheel"],
     speed: Array,
@@ -235,7 +253,7 @@ def _moved(
 ) -> Array:
     """As `moved_per_metre`."""
 
-    def one(wheels: _Wheels, surfaces: ContactSurface, rest: Array) -> Array:
+    def one(wheels: _WheelArrays, surfaces: ContactSurface, rest: Array) -> Array:
         rim, frame = wheels.rim(speed * way @ wheels.forward.T), wheels.frame
         xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
             surfaces
@@ -245,3 +263,73 @@ def _moved(
         return jnp.stack([along, across, xi[..., 2]], axis=-1) / speed
 
     return jax.vmap(one)(wheels, surfaces, rest)
+
+
+DIRECTIONS = 72
+"""Of the table; half of the kernel's length apart."""
+_Grid = Float[np.ndarray, "floor speed direction 3"]
+
+
+def effects_by_load(
+    contact: ForceBalance, center: Float[np.ndarray, " free"], draws: Float[np.ndarray, "draw free"]
+) -> dict[str, EffectRecord]:
+    """What is told of effects by load set-up; nothing where no runs share any.
+
+    Args:
+        contact: the fit as a model that forecasts.
+        center: search vector of the deployed numbers; draws: of their posterior.
+    """
+    paces = [pace for found in contact.shared.values() for pace in found.speeds_and_loads]
+    if not paces:
+        return {}
+    speeds = sorted({pace.log_speed for pace in paces})
+    return {
+        load: _table(contact, center, draws, load, np.array(speeds))
+        for load in contact.robot.body.loads
+    }
+
+
+def _table(
+    contact: ForceBalance, center: np.ndarray, draws: np.ndarray, load: str, log_speed: np.ndarray
+) -> EffectRecord:
+    count, labels = len(log_speed), contact.robot.surfaces.labels
+    angle = np.linspace(0.0, 2 * np.pi, DIRECTIONS, endpoint=False)
+    paces = tuple(SpeedAndLoad(float(s), load) for s in log_speed for _ in angle)
+    way = TravelConditions(np.tile(angle, count), paces, contact.robot.geometry.mirror())
+    robots = jax.vmap(contact.space.tree)(jnp.asarray(draws))
+    k = jnp.asarray(contact.robot.load_index(load))
+    moved = [moved_per_metre(robots, k, jnp.exp(s), directions(DIRECTIONS)) for s in log_speed]
+    predicted = np.concatenate([np.asarray(x) for x in moved], axis=2)  # speeds in turn
+    shape = (len(labels), count, DIRECTIONS, len(AXES))
+    mean, left = np.zeros(shape), np.zeros(shape)
+    for n, floor in enumerate(labels):
+        found = contact.shared[floor]
+        told = found.forecast(way)
+        grown = contact.extrapolation.get(f"{floor}@{load}", 1.0)
+        given = np.diagonal(told.covariance, axis1=1, axis2=2) + _of(contact, "session", floor)
+        off = predicted[:, n] - np.einsum("nap,kp->kna", told.slope, draws - center)
+        at = told.mean + told.slope @ (center - contact.z)
+        mean[n] = -at.reshape(shape[1:])
+        left[n] = np.sqrt(
+            _of(contact, "run", floor) + grown * (given + spread_of(off) ** 2)
+        ).reshape(shape[1:])
+    speeds = tuple(_short(np.exp(s)) for s in log_speed)
+    return EffectRecord(speeds, _rows(mean), _rows(left))
+
+
+def _of(contact: ForceBalance, kind: str, floor: str) -> Float[np.ndarray, "3"]:
+    """Variances of what a run has of its own, or of what a session shares, by axis."""
+    return np.array([contact.variance.get(f"{kind}.{floor}.{axis}", 0.0) for axis in AXES])
+
+
+def _rows(grid: _Grid) -> tuple[tuple[tuple[Axes, ...], ...], ...]:
+    def axes(row: np.ndarray) -> Axes:
+        along, across, yaw = (_short(x) for x in row)
+        return along, across, yaw
+
+    return tuple(tuple(tuple(axes(a) for a in d) for d in s) for s in grid)
+
+
+def _short(value: float) -> float:
+    """To four digits: the table is long, and known no better."""
+    return float(f"{value:.4g}")

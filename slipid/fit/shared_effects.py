@@ -32,7 +32,7 @@ from jaxtyping import Array, Float, Int
 from scipy.special import ive
 
 from slipid.data.windows import Windows
-from slipid.fit.noise import Noise, effects, sessions_on, steps, travel
+from slipid.fit.noise import NoiseModel, effects, encoder_increments, sessions_on, travel
 from slipid.model.robot import Robot
 
 AXES = ("along", "across", "yaw")
@@ -51,47 +51,49 @@ _SPEED = 0.25
 
 
 @dataclass(frozen=True)
-class Pace:
+class SpeedAndLoad:
     """A speed, as the rounded logarithm of m/s, and a load set-up, driven on a floor."""
 
     log_speed: float
     load: str
 
-    def near(self, other: "Pace") -> float:
+    def near(self, other: "SpeedAndLoad") -> float:
         """Correlation of effects in the same direction."""
         apart = (self.log_speed - other.log_speed) / SPEED_LENGTH
         return float(np.exp(-0.5 * apart**2) * (1.0 if self.load == other.load else OTHER_LOAD))
 
 
 @dataclass(frozen=True, eq=False)
-class Directions:
+class TravelConditions:
     """Direction of travel of every piece relative to the body [rad], and its pace.
 
     The direction is nan where a robot turns on the spot; `mirror` is the axis of `Geometry.mirror`.
     """
 
     direction: Float[np.ndarray, " piece"]
-    pace: tuple[Pace, ...]
+    speed_and_load: tuple[SpeedAndLoad, ...]
     mirror: float | None
 
     @staticmethod
-    def of(w: Windows, robot: Robot) -> "Directions":
+    def of(w: Windows, robot: Robot) -> "TravelConditions":
         """As the encoders have it."""
         far = travel(w, robot)[0]
-        moved = steps(w, robot)[..., :2].sum(axis=1)
+        moved = encoder_increments(w, robot)[..., :2].sum(axis=1)
         straight = np.hypot(*moved.T)
         moves = straight > 0.2 * far.sum(axis=1)
         speed = np.log(np.maximum(straight / w.dt.sum(axis=1), 1e-3))
         rounded = np.round(speed / _SPEED) * _SPEED
-        return Directions(
+        return TravelConditions(
             np.where(moves, np.arctan2(moved[:, 1], moved[:, 0]), np.nan),
-            tuple(Pace(float(s), load) for s, load in zip(rounded, w.load, strict=True)),
+            tuple(SpeedAndLoad(float(s), load) for s, load in zip(rounded, w.load, strict=True)),
             robot.geometry.mirror(),
         )
 
-    def of_pieces(self, mine: Int[np.ndarray, " some"]) -> "Directions":
+    def subset(self, mine: Int[np.ndarray, " some"]) -> "TravelConditions":
         """Those of some pieces."""
-        return Directions(self.direction[mine], tuple(self.pace[k] for k in mine), self.mirror)
+        return TravelConditions(
+            self.direction[mine], tuple(self.speed_and_load[k] for k in mine), self.mirror
+        )
 
     def around(self) -> Float[np.ndarray, "3 piece harmonic"]:
         """Root of the kernel over directions, along, across and in yaw; zero on the spot."""
@@ -111,23 +113,30 @@ class Directions:
         ]
         return np.stack(root) * np.isfinite(self.direction)[:, None]
 
-    def basis(self, paces: tuple[Pace, ...]) -> Float[np.ndarray, "3 piece coef"]:
+    def basis(
+        self, speeds_and_loads: tuple[SpeedAndLoad, ...]
+    ) -> Float[np.ndarray, "3 piece coef"]:
         """Root of the kernel: effects of unit coefs, from paces that were seen.
 
         Its rows are as long as those of `around`, less where the pace is another.
         """
-        if not paces:
-            return np.zeros((len(AXES), len(self.pace), 0))
-        seen = np.array([[a.near(b) for b in paces] for a in paces])
-        root = np.linalg.cholesky(seen + 1e-9 * np.eye(len(paces)))
-        met = {pace: np.array([pace.near(b) for b in paces]) for pace in set(self.pace)}
-        share = {pace: np.linalg.solve(root, row) for pace, row in met.items()}
-        of_pace = np.array([share[pace] for pace in self.pace]).reshape(-1, len(paces))
+        if not speeds_and_loads:
+            return np.zeros((len(AXES), len(self.speed_and_load), 0))
+        seen = np.array([[a.near(b) for b in speeds_and_loads] for a in speeds_and_loads])
+        root = np.linalg.cholesky(seen + 1e-9 * np.eye(len(speeds_and_loads)))
+        met = {
+            speed_and_load: np.array([speed_and_load.near(b) for b in speeds_and_loads])
+            for speed_and_load in set(self.speed_and_load)
+        }
+        share = {speed_and_load: np.linalg.solve(root, row) for speed_and_load, row in met.items()}
+        of_pace = np.array(
+            [share[speed_and_load] for speed_and_load in self.speed_and_load]
+        ).reshape(-1, len(speeds_and_loads))
         whole = np.einsum("pc,apd->apcd", of_pace, self.around())
-        return np.asarray(whole.reshape(len(AXES), len(self.pace), -1))
+        return np.asarray(whole.reshape(len(AXES), len(self.speed_and_load), -1))
 
 
-class FloorShared(eqx.Module):
+class SharedEffects(eqx.Module):
     """What the runs on a floor share, as arrays.
 
     Attributes:
@@ -137,7 +146,7 @@ class FloorShared(eqx.Module):
         numbers: of the variances of own, neighbours' and session's effects, -1 where there is none.
     """
 
-    pieces: Int[Array, " run"]
+    segments: Int[Array, " run"]
     effect: Float[Array, "run m 3"]
     near: Float[Array, "3 run condition"]
     session: Float[Array, "run session"]
@@ -150,18 +159,20 @@ class FloorShared(eqx.Module):
         return jnp.concatenate(parts, axis=-1)
 
 
-Paces = dict[str, tuple[Pace, ...]]
+SpeedsAndLoads = dict[str, tuple[SpeedAndLoad, ...]]
 """Those that each floor was driven at."""
 
 
-def shared_of(w: Windows, robot: Robot, noise: Noise) -> tuple[tuple[FloorShared, ...], Paces]:
+def effects_by_floor(
+    w: Windows, robot: Robot, noise: NoiseModel
+) -> tuple[tuple[SharedEffects, ...], SpeedsAndLoads]:
     """What runs share on every floor, and the paces it was driven at."""
-    every, moved, place = Directions.of(w, robot), effects(w, robot), noise.names.index
-    floors, found, paces = np.asarray(w.surface), [], {}
+    conditions, moved, place = TravelConditions.of(w, robot), effects(w, robot), noise.names.index
+    floors, found, speeds_and_loads = np.asarray(w.surface), [], {}
     for floor in robot.surfaces.labels:
         mine = np.flatnonzero(floors == floor)
-        here = every.of_pieces(mine)
-        paces[floor] = tuple(dict.fromkeys(here.pace))
+        here = conditions.subset(mine)
+        speeds_and_loads[floor] = tuple(dict.fromkeys(here.speed_and_load))
         names = sessions_on(w, floor)
         session = np.array([w.session[k] for k in mine])[:, None] == np.asarray(names)
         kinds = [
@@ -169,18 +180,18 @@ def shared_of(w: Windows, robot: Robot, noise: Noise) -> tuple[tuple[FloorShared
         ]
         number = [[place(n) if n in noise.names else -1 for n in row] for row in kinds]
         found.append(
-            FloorShared(
-                pieces=jnp.asarray(mine),
+            SharedEffects(
+                segments=jnp.asarray(mine),
                 effect=jnp.asarray(moved[mine]),
-                near=jnp.asarray(here.basis(paces[floor])),
+                near=jnp.asarray(here.basis(speeds_and_loads[floor])),
                 session=jnp.asarray(session[:, : len(names) if len(names) > 1 else 0], float),
                 numbers=jnp.asarray(number),
             )
         )
-    return tuple(found), paces
+    return tuple(found), speeds_and_loads
 
 
-class Tie(eqx.Module):
+class EffectPosterior(eqx.Module):
     """Shared effects of a floor given whitened residuals of its runs.
 
     Attributes:
@@ -188,14 +199,14 @@ class Tie(eqx.Module):
         root: S; factor: Cholesky factor of C.
     """
 
-    pieces: Int[Array, " run"]
+    segments: Int[Array, " run"]
     span: Float[Array, "run m 3"]
     root: Float[Array, "3 run coef"]
     factor: Float[Array, "coefs coefs"]
 
     def coefs(self, white: Float[Array, "piece m"]) -> Float[Array, " coefs"]:
         """Conditional mean u^ of the coefs given whitened residuals of all pieces."""
-        told = jnp.einsum("nma,nm->an", self.span, white[self.pieces])
+        told = jnp.einsum("nma,nm->an", self.span, white[self.segments])
         return cho_solve((self.factor, True), jnp.einsum("anq,an->aq", self.root, told).ravel())
 
     def effects(self, coefs: Float[Array, " coefs"]) -> Float[Array, "run 3"]:
@@ -204,76 +215,82 @@ class Tie(eqx.Module):
 
 
 @eqx.filter_jit
-def ties(
-    shared: tuple[FloorShared, ...],
+def effect_posteriors(
+    shared: tuple[SharedEffects, ...],
     log_v: Float[Array, " variance"],
     white: Float[Array, "piece m m"],
-) -> tuple[Tie, ...]:
+) -> tuple[EffectPosterior, ...]:
     """Shared effects of every floor for given whitening roots of all pieces."""
 
-    def tie(of: FloorShared) -> Tie:
-        span = jnp.einsum("nij,nja->nia", white[of.pieces], of.effect)
+    def tie(of: SharedEffects) -> EffectPosterior:
+        span = jnp.einsum("nij,nja->nia", white[of.segments], of.effect)
         gram = jnp.einsum("nia,nib->abn", span, span)
         root = of.root(log_v)
         weighed = jnp.einsum("abn,bnk->abnk", gram, root)
         size = root.shape[0] * root.shape[2]
         inner = jnp.einsum("anq,abnk->aqbk", root, weighed).reshape(size, size)
-        return Tie(of.pieces, span, root, jnp.linalg.cholesky(jnp.eye(size) + inner))
+        return EffectPosterior(of.segments, span, root, jnp.linalg.cholesky(jnp.eye(size) + inner))
 
     return tuple(tie(of) for of in shared)
 
 
-def freed(tied: tuple[Tie, ...], white: Float[Array, "piece m"]) -> Float[Array, " rows"]:
+def marginal_residuals(
+    posteriors: tuple[EffectPosterior, ...], white: Float[Array, "piece m"]
+) -> Float[Array, " rows"]:
     """Whitened residuals less shared effects at their conditional mean, and the coefs' own.
 
     Its square is the quadratic form of the marginal likelihood.
     """
-    coefs = [tie.coefs(white) for tie in tied]
-    for tie, u in zip(tied, coefs, strict=True):
+    coefs = [tie.coefs(white) for tie in posteriors]
+    for tie, u in zip(posteriors, coefs, strict=True):
         moved = jnp.einsum("nma,na->nm", tie.span, tie.effects(u))
-        white = white.at[tie.pieces].add(-moved)
+        white = white.at[tie.segments].add(-moved)
     return jnp.concatenate([white.ravel(), *coefs])
 
 
 @eqx.filter_jit
-def shared_effects(
-    tied: tuple[Tie, ...], white: Float[Array, "piece m"]
+def mean_effects(
+    posteriors: tuple[EffectPosterior, ...], white: Float[Array, "piece m"]
 ) -> Float[Array, "piece 3"]:
     """Conditional mean of the effects that runs share, for every piece."""
     out = jnp.zeros((len(white), len(AXES)))
-    for tie in tied:
-        out = out.at[tie.pieces].set(tie.effects(tie.coefs(white)))
+    for tie in posteriors:
+        out = out.at[tie.segments].set(tie.effects(tie.coefs(white)))
     return out
 
 
 @eqx.filter_jit
-def shared_spread(tied: tuple[Tie, ...], count: int) -> Float[Array, "piece 3 3"]:
+def effect_covariances(
+    posteriors: tuple[EffectPosterior, ...], count: int
+) -> Float[Array, "piece 3 3"]:
     """Covariance of the shared effects of every piece, given the numbers of the model."""
     out = jnp.zeros((count, len(AXES), len(AXES)))
-    for tie in tied:
+    for tie in posteriors:
         axes, runs, _ = tie.root.shape
         rows = jnp.einsum("ab,anq->nabq", jnp.eye(axes), tie.root).reshape(runs * axes, -1)
         half = jax.scipy.linalg.solve_triangular(tie.factor, rows.T, lower=True)
         half = half.reshape(-1, runs, axes)
-        out = out.at[tie.pieces].set(jnp.einsum("kna,knb->nab", half, half))
+        out = out.at[tie.segments].set(jnp.einsum("kna,knb->nab", half, half))
     return out
 
 
-def freed_slopes(
-    tied: tuple[Tie, ...], white: Float[Array, "piece m free"]
+def marginal_slopes(
+    posteriors: tuple[EffectPosterior, ...], white: Float[Array, "piece m free"]
 ) -> Float[Array, "rows free"]:
-    """`freed` of every column."""
-    return jax.vmap(lambda column: freed(tied, column), in_axes=-1, out_axes=-1)(white)
+    """`marginal_residuals` of every column."""
+    return jax.vmap(lambda column: marginal_residuals(posteriors, column), in_axes=-1, out_axes=-1)(
+        white
+    )
 
 
-def shared_slopes(
-    tied: tuple[Tie, ...], white: Float[Array, "piece m free"]
+def mean_effect_slopes(
+    posteriors: tuple[EffectPosterior, ...], white: Float[Array, "piece m free"]
 ) -> Float[Array, "piece 3 free"]:
-    """`shared_effects` of every column."""
-    return jax.vmap(lambda column: shared_effects(tied, column), in_axes=-1, out_axes=-1)(white)
+    """`mean_effects` of every column."""
+    return jax.vmap(lambda column: mean_effects(posteriors, column), in_axes=-1, out_axes=-1)(white)
 
 
-class Told(NamedTuple):
+class EffectForecast(NamedTuple):
     """What shared effects add to the motion of pieces: mean, slope by numbers, and covariance."""
 
     mean: Float[np.ndarray, "piece 3"]
@@ -282,7 +299,7 @@ class Told(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class FoundShared:
+class EffectTable:
     """What neighbouring runs on a floor were found to share.
 
     Attributes:
@@ -292,38 +309,40 @@ class FoundShared:
         covariance: of the coefs given the numbers.
     """
 
-    paces: tuple[Pace, ...]
+    speeds_and_loads: tuple[SpeedAndLoad, ...]
     std: Float[np.ndarray, "3"]
     coefs: Float[np.ndarray, "3 coef"]
     by_number: Float[np.ndarray, "3 coef free"]
     covariance: Float[np.ndarray, "3 coef 3 coef"]
 
-    def told(self, way: Directions) -> Told:
+    def forecast(self, way: TravelConditions) -> EffectForecast:
         """Of new runs on this floor."""
-        basis, around = way.basis(self.paces), way.around()
+        basis, around = way.basis(self.speeds_and_loads), way.around()
         of = self.std[:, None, None] * basis
         whole = np.where(np.isfinite(way.direction), (around**2).sum(axis=-1), 1.0)
         rest = (self.std[:, None] ** 2 * np.maximum(whole - (basis**2).sum(axis=-1), 0.0)).T
         known = np.einsum("anq,aqbr->nabr", of, self.covariance)
-        return Told(
+        return EffectForecast(
             np.einsum("anq,aq->na", of, self.coefs),
             np.einsum("anq,aqp->nap", of, self.by_number),
             np.einsum("nabr,bnr->nab", known, of) + rest[:, :, None] * np.eye(len(AXES)),
         )
 
 
-def told_of(found: Mapping[str, FoundShared], w: Windows, robot: Robot, free: int) -> Told:
+def forecast_effects(
+    found: Mapping[str, EffectTable], w: Windows, robot: Robot, free: int
+) -> EffectForecast:
     """What neighbours tell of runs, on every floor; nothing where no floor was found to share."""
     n, axes = len(w), len(AXES)
-    out = Told(np.zeros((n, axes)), np.zeros((n, axes, free)), np.zeros((n, axes, axes)))
+    out = EffectForecast(np.zeros((n, axes)), np.zeros((n, axes, free)), np.zeros((n, axes, axes)))
     if not found:
         return out
-    every, floors = Directions.of(w, robot), np.asarray(w.surface)
+    conditions, floors = TravelConditions.of(w, robot), np.asarray(w.surface)
     for floor, one in found.items():
         mine = np.flatnonzero(floors == floor)
         if not len(mine):
             continue
-        here = every.of_pieces(mine)
-        for whole, part in zip(out, one.told(here), strict=True):
+        here = conditions.subset(mine)
+        for whole, part in zip(out, one.forecast(here), strict=True):
             whole[mine] = part
     return out

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
 from slipid.data.windows import Windows
-from slipid.fit.shared import AXES
+from slipid.fit.shared_effects import AXES
 from slipid.fit.variances import DEGREES
 
 SPREAD = 3.0
@@ -32,7 +32,7 @@ TURNS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
+class LinearModel:
     """A fitted model made linear at its fit, on all pieces of a problem.
 
     Gap is predicted less measured; `wide` the covariance of the numbers as they were before a
@@ -49,8 +49,8 @@ class Linear:
     run: Float[np.ndarray, "piece 3"]
 
 
-def shared(
-    model: Linear, w: Windows, keep: Float[np.ndarray, " piece"]
+def with_session_effects(
+    model: LinearModel, w: Windows, keep: Float[np.ndarray, " piece"]
 ) -> tuple[dict[str, float], Float[np.ndarray, "number number"]]:
     """Variances `session.<floor>.<axis>`, and the covariance of the numbers with them.
 
@@ -63,16 +63,16 @@ def shared(
     pulls = weighted * (_weights(model, np.zeros_like(model.run)) * keep)[:, None, None]
     of_session = by_axis(variance, "session", w)
     meat = np.zeros_like(model.covariance)
-    of_piece = pairs(w)
-    for pair in dict.fromkeys(of_piece):
-        mine = np.array([other == pair for other in of_piece]) & (keep > 0)
+    of_segment = floors_and_sessions(w)
+    for pair in dict.fromkeys(of_segment):
+        mine = np.array([other == pair for other in of_segment]) & (keep > 0)
         if mine.any():
             u = pulls[mine].sum(axis=0)
             meat += u.T @ (of_session[mine][0][:, None] * u)
     return variance, model.covariance + model.covariance @ meat @ model.covariance
 
 
-def pairs(w: Windows) -> list[tuple[str, str]]:
+def floors_and_sessions(w: Windows) -> list[tuple[str, str]]:
     """Floor and session of every piece; what is shared is shared by these."""
     return list(zip(w.surface, w.session, strict=True))
 
@@ -82,9 +82,11 @@ def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.nd
     return np.array([[variance.get(f"{kind}.{f}.{axis}", 0.0) for axis in AXES] for f in w.surface])
 
 
-def _variances(model: Linear, w: Windows, keep: np.ndarray, weight: np.ndarray) -> dict[str, float]:
+def _variances(
+    model: LinearModel, w: Windows, keep: np.ndarray, weight: np.ndarray
+) -> dict[str, float]:
     session, floor = np.asarray(w.session), np.asarray(w.surface)
-    left, noise, slope = _left(model)
+    left, noise, slope = _remaining_effects(model)
     variance: dict[str, float] = {}
     for name in dict.fromkeys(floor[keep > 0].tolist()):
         mine = (floor == name) & (keep > 0)
@@ -100,7 +102,7 @@ def _variances(model: Linear, w: Windows, keep: np.ndarray, weight: np.ndarray) 
     return variance
 
 
-def _weights(model: Linear, more: np.ndarray) -> np.ndarray:
+def _weights(model: LinearModel, more: np.ndarray) -> np.ndarray:
     """Student-t weight of every piece, given the variances of effects beyond its scale."""
     e = model.effect
     scale = model.scale + np.einsum("nma,na,nla->nml", e, more, e)
@@ -109,7 +111,7 @@ def _weights(model: Linear, more: np.ndarray) -> np.ndarray:
     return np.asarray((DEGREES + m) / (DEGREES + q))
 
 
-def _left(model: Linear) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _remaining_effects(model: LinearModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Effects left in each run (piece, 3), their variance by camera and process, their slope."""
     e = model.effect
     plain = model.scale - np.einsum("nma,na,nla->nml", e, model.run, e)

@@ -11,16 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from slipid.fit.crossing import Crossing, Errors, Several, errors, residuals_at
+from slipid.fit.multi_floor import (
+    MultiFloorBatch,
+    MultiFloorRuns,
+    WindowErrors,
+    residuals_at,
+    window_errors,
+)
 from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 
 _ROUNDS = 6
 """Most rounds of the fits to half of the runs, which only judge."""
 
 
 @dataclass(frozen=True, eq=False)
-class Across:
+class MultiFloorFit:
     """A fit of runs on one floor and on several together.
 
     Attributes:
@@ -34,35 +40,42 @@ class Across:
 
     problem: Problem
     optimum: Optimum
-    before: Errors
-    after: Errors | None
-    learnt: Errors
-    as_if: Mapping[str, Errors]
+    before: WindowErrors
+    after: WindowErrors | None
+    learnt: WindowErrors
+    as_if: Mapping[str, WindowErrors]
 
 
-def across(
+def fit_multi_floor(
     problem: Problem,
     optimum: Optimum,
-    several: Crossing,
-    tell: Callable[[State], None],
+    multi_floor: MultiFloorRuns,
+    tell: Callable[[FitState], None],
     most_rounds: int = 30,
     tolerance: float = 0.02,
-) -> Across:
+) -> MultiFloorFit:
     """Goes on from the optimum of a problem with runs over several floors.
 
     `tell` is called after every round of the fit to all runs; the limits are those of `optimise`.
     """
-    whole = problem.crossed(several)
-    start = replace(whole.restated(optimum.state, problem), round=0)
-    on_one, number = len(problem.windows), np.unique(several.windows.run, return_inverse=True)[1]
+    whole = problem.with_multi_floor(multi_floor)
+    start = replace(whole.carried_over(optimum.state, problem), round=0)
+    on_one, number = (
+        len(problem.windows),
+        np.unique(multi_floor.windows.run, return_inverse=True)[1],
+    )
     odd = number % 2 == 1
-    target, every = whole.target, np.ones(len(odd))
-    assert target.several is not None, "runs over several floors"
+    objective, every = whole.objective, np.ones(len(odd))
+    assert objective.multi_floor is not None, "runs over several floors"
 
-    def off(several: Several, *judged: tuple[State, Float[np.ndarray, " run"]]) -> Errors:
+    def off(
+        multi_floor: MultiFloorBatch, *judged: tuple[FitState, Float[np.ndarray, " run"]]
+    ) -> WindowErrors:
         """Errors, each run by the state that judges it with weight 1 and the others with 0."""
-        found = [(residuals_at(target.space, several, jnp.asarray(s.z)), w) for s, w in judged]
-        return errors(several, found)
+        found = [
+            (residuals_at(objective.space, multi_floor, jnp.asarray(s.z)), w) for s, w in judged
+        ]
+        return window_errors(multi_floor, found)
 
     learnt = optimise(whole, start=start, tell=tell, most_rounds=most_rounds, tolerance=tolerance)
     after = None
@@ -72,16 +85,16 @@ def across(
             keep = np.concatenate([np.ones(on_one), ~half])
             other = optimise(whole, keep=keep, start=start, most_rounds=_ROUNDS)
             parts.append((other.state, half.astype(float)))
-        after = off(target.several, *parts)
+        after = off(objective.multi_floor, *parts)
     end = (learnt.state, every)
-    return Across(
+    return MultiFloorFit(
         problem=whole,
         optimum=learnt,
-        before=off(target.several, (start, every)),
+        before=off(objective.multi_floor, (start, every)),
         after=after,
-        learnt=off(target.several, end),
+        learnt=off(objective.multi_floor, end),
         as_if={
-            floor: off(target.several.as_if_on(k), end)
+            floor: off(objective.multi_floor.as_if_on(k), end)
             for k, floor in enumerate(whole.robot.surfaces.labels)
         },
     )

@@ -35,12 +35,13 @@ MOST_ACCELERATION = 0.6
 MOST_WINDOWS = 40
 """Most windows in a piece, for which windows are made longer; a run that has still more of them
 makes several pieces, as if it were several runs."""
-MOTION, CURRENT = "crossing.motion", "crossing.current"
+MULTI_FLOOR_MOTION = "crossing.motion"
+MULTI_FLOOR_CURRENT = "crossing.current"
 """Names of their blocks of residuals."""
 
 
 @dataclass(frozen=True, eq=False)
-class Crossing:
+class MultiFloorRuns:
     """Runs over several floors, a piece per run; runs are (name, sha256).
 
     The floor is that under each wheel in the middle of each window, by number in the robot's stack.
@@ -53,7 +54,7 @@ class Crossing:
     runs: tuple[tuple[str, str], ...]
 
 
-def crossing(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Crossing:
+def multi_floor_runs(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> MultiFloorRuns:
     """Pieces of runs whose poses are in the frame of a map, for every map its runs.
 
     Where wheels stand is read through the camera of the fitted robot, which knows every surface of
@@ -76,18 +77,18 @@ def crossing(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Crossing:
     at, there = _padded(rows)
     w = _joined([c.windows for c in cut], run)
     whole = replace(
-        w.pieces(at[:, 0]),
+        w.segments(at[:, 0]),
         pose=np.concatenate([w.pose[at[:, :1], 0], w.pose[at, 1]], axis=1),
         **{name: getattr(w, name)[at, 0] for name in _PER_WINDOW},
     )
     names = tuple(name for c in cut for name in c.runs)
-    return Crossing(whole, floor[at, 0], counts[at, 0] & there, names)
+    return MultiFloorRuns(whole, floor[at, 0], counts[at, 0] & there, names)
 
 
-_PER_WINDOW = ("dt", "turn", "faster", "current", "voltage", "current_var", "voltage_var")
+_PER_WINDOW = ("dt", "turn", "speed_change", "current", "voltage", "current_var", "voltage_var")
 
 
-def _windows_on(data: Runs, floor: FloorMap, robot: Robot) -> Crossing:
+def _windows_on(data: Runs, floor: FloorMap, robot: Robot) -> MultiFloorRuns:
     """The same of one map, each window a piece of its own."""
     radius = float(robot.geometry.wheel_radius)
     w = _short(data, radius, float(robot.camera.lag))
@@ -100,7 +101,7 @@ def _windows_on(data: Runs, floor: FloorMap, robot: Robot) -> Crossing:
             "wheels turn evenly and each keeps to its floor; expected larger patches or slower runs"
         )
     names = tuple((log.name, log.sha256) for log in data.logs)
-    return Crossing(w, under[:, 1:2], counts[:, None], names)
+    return MultiFloorRuns(w, under[:, 1:2], counts[:, None], names)
 
 
 def _short(data: Runs, radius: float, lag: float) -> Windows:
@@ -109,7 +110,7 @@ def _short(data: Runs, radius: float, lag: float) -> Windows:
     for k in range(len(data)):
         t = data.time[data.rows(k)]
         length = np.clip((t[-1] - t[0]) / MOST_WINDOWS, SHORTEST, LONGEST)
-        each.append(windows(data.subset([k]), radius, lag, per_piece=1, longest=float(length)))
+        each.append(windows(data.subset([k]), radius, lag, per_segment=1, longest=float(length)))
     return _joined(each, np.repeat(np.arange(len(each)), [len(w) for w in each]))
 
 
@@ -153,13 +154,13 @@ def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "piece time whee
 
 def _steady(w: Windows, radius: float) -> Bool[np.ndarray, " piece"]:
     """Windows in which wheels turn, about evenly, and no camera frames are missing."""
-    rim, jump = radius * w.turn[:, 0] / w.dt, radius * w.faster[:, 0] / w.dt
+    rim, jump = radius * w.turn[:, 0] / w.dt, radius * w.speed_change[:, 0] / w.dt
     moves = np.abs(rim).max(axis=1) >= LEAST_SPEED
     even = np.abs(jump).max(axis=1) <= MOST_ACCELERATION
     return np.asarray(moves & even & (w.dt[:, 0] < 2 * LONGEST))
 
 
-class Several(eqx.Module):
+class MultiFloorBatch(eqx.Module):
     """Runs over several floors as arrays for compiled functions.
 
     Counts are 1 for windows that count, else 0.
@@ -169,11 +170,11 @@ class Several(eqx.Module):
     counts: Float[Array, "piece window"]
 
     @staticmethod
-    def of(crossing: Crossing, robot: Robot) -> "Several":
-        b = lk.batch(crossing.windows, robot, crossing.floor)
-        return Several(b, jnp.asarray(crossing.counts, float))
+    def of(multi_floor_runs: MultiFloorRuns, robot: Robot) -> "MultiFloorBatch":
+        b = lk.batch(multi_floor_runs.windows, robot, multi_floor_runs.floor)
+        return MultiFloorBatch(b, jnp.asarray(multi_floor_runs.counts, float))
 
-    def as_if_on(self, floor: int) -> "Several":
+    def as_if_on(self, floor: int) -> "MultiFloorBatch":
         """The same runs as if all wheels had stood on one floor all the while."""
         alone = jnp.full_like(self.batch.surface, floor)
         return replace(self, batch=replace(self.batch, surface=alone))
@@ -182,10 +183,10 @@ class Several(eqx.Module):
         """Predicted less measured motion and, where they are logged, currents."""
         b = self.batch
         gap = lk.motion_residual(robot, b, p)
-        out = {MOTION: gap * jnp.repeat(self.counts, 3, axis=1)}
+        out = {MULTI_FLOOR_MOTION: gap * jnp.repeat(self.counts, 3, axis=1)}
         if b.has_current:
-            amps = lk.predicted_current(robot, b, p.felt) - b.current
-            out[CURRENT] = (amps * self.counts[..., None]).reshape(len(gap), -1)
+            amps = lk.predicted_current(robot, b, p.motor_force) - b.current
+            out[MULTI_FLOOR_CURRENT] = (amps * self.counts[..., None]).reshape(len(gap), -1)
         return out
 
     def log_jacobian(self, robot: Robot) -> Float[Array, " piece"]:
@@ -195,13 +196,13 @@ class Several(eqx.Module):
 
 
 @eqx.filter_jit
-def residuals_at(space: Space, several: Several, z: Array) -> dict[str, Array]:
+def residuals_at(space: Space, multi_floor: MultiFloorBatch, z: Array) -> dict[str, Array]:
     """Residuals of runs over several floors at a search vector."""
     robot = space.tree(z)
-    return several.residuals(robot, lk.predict(robot, several.batch))
+    return multi_floor.residuals(robot, lk.predict(robot, multi_floor.batch))
 
 
-class Errors(NamedTuple):
+class WindowErrors(NamedTuple):
     """Root mean square errors of windows: `speed` [m/s], `yaw_rate` [rad/s], `current` [A].
 
     The current is None where it was not logged.
@@ -212,23 +213,24 @@ class Errors(NamedTuple):
     current: float | None
 
 
-def errors(
-    several: Several, judged: Sequence[tuple[dict[str, Array], Float[np.ndarray, " piece"]]]
-) -> Errors:
+def window_errors(
+    multi_floor: MultiFloorBatch,
+    judged: Sequence[tuple[dict[str, Array], Float[np.ndarray, " piece"]]],
+) -> WindowErrors:
     """Of residuals by block, each with the weight of every piece in it, 1 or 0."""
-    counts, dt = np.asarray(several.counts), np.asarray(several.batch.dt)
+    counts, dt = np.asarray(multi_floor.counts), np.asarray(multi_floor.batch.dt)
     motion, current, total = np.zeros(3), 0.0, 0.0
     for residual, weight in judged:
         count = counts * weight[:, None]
-        rate = np.asarray(residual[MOTION]).reshape(*dt.shape, 3) / dt[..., None]
+        rate = np.asarray(residual[MULTI_FLOOR_MOTION]).reshape(*dt.shape, 3) / dt[..., None]
         motion += (count[..., None] * rate**2).sum(axis=(0, 1))
         total += count.sum()
-        if CURRENT in residual:
-            amps = np.asarray(residual[CURRENT]).reshape(*dt.shape, -1)
+        if MULTI_FLOOR_CURRENT in residual:
+            amps = np.asarray(residual[MULTI_FLOOR_CURRENT]).reshape(*dt.shape, -1)
             current += (count * (amps**2).mean(axis=2)).sum()
     x, y, yaw = motion / total
-    has_current = several.batch.has_current
-    return Errors(
+    has_current = multi_floor.batch.has_current
+    return WindowErrors(
         speed=float(np.sqrt(x + y)),
         yaw_rate=float(np.sqrt(yaw)),
         current=float(np.sqrt(current / total)) if has_current else None,

@@ -22,7 +22,7 @@ _TURNED, _NEAR_TURN = 0.5, 5.0
 
 
 @dataclass(frozen=True)
-class Unit:
+class UnitGuess:
     """A unit, and what was assumed to tell it; `doubt` is for people to answer."""
 
     unit: str
@@ -30,37 +30,37 @@ class Unit:
     doubt: str = ""
 
 
-def time_unit(values: Float[np.ndarray, " row"]) -> Unit:
+def time_unit(values: Float[np.ndarray, " row"]) -> UnitGuess:
     """Unit of time, from stamps since 1970 or else from the steps."""
     first = float(np.nanmin(np.abs(values)))
     for unit, per in _CLOCKS.items():
         if _SECONDS[0] < first / per < _SECONDS[1]:
-            return Unit(unit, f"counts from 1970, in {unit}")
+            return UnitGuess(unit, f"counts from 1970, in {unit}")
     steps = np.abs(np.diff(values[~np.isnan(values)]))
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
     fits = [unit for unit, per in _CLOCKS.items() if _STEPS[0] <= usual / per <= _STEPS[1]]
     if len(fits) == 1:
-        return Unit(fits[0], f"steps of {usual:.4g}")
+        return UnitGuess(fits[0], f"steps of {usual:.4g}")
     if not fits:
-        return Unit("s", doubt=f"in which unit are steps of {usual:.4g}?")
+        return UnitGuess("s", doubt=f"in which unit are steps of {usual:.4g}?")
     if fits[0] == "s" and usual < 1.0 and (steps != np.round(steps)).any():
-        return Unit("s", f"steps of {usual:.4g}")
-    return Unit(fits[0], doubt=f"steps of {usual:.4g}: in {' or '.join(fits)}?")
+        return UnitGuess("s", f"steps of {usual:.4g}")
+    return UnitGuess(fits[0], doubt=f"steps of {usual:.4g}: in {' or '.join(fits)}?")
 
 
-def place_unit(
+def position_unit(
     time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]
-) -> Unit:
+) -> UnitGuess:
     """Unit of a place, from the speed that it would be [time in s]."""
     speed, size = speed_of(time, x, y), float(np.nanmax(np.abs([x, y])))
     if speed < FAST and size < 200:
-        return Unit("m", f"at most {speed:.2g} m/s")
+        return UnitGuess("m", f"at most {speed:.2g} m/s")
     whole = x[~np.isnan(x)]
     if float(np.nanmin([x, y])) >= 0 and size < 4100 and (whole == np.round(whole)).all():
-        return Unit("mm", doubt="millimetres, or pixels (then give metres_per_pixel)?")
+        return UnitGuess("mm", doubt="millimetres, or pixels (then give metres_per_pixel)?")
     if speed < 1e3 * FAST:
-        return Unit("mm", f"at most {speed:.4g} mm/s")
-    return Unit("m", doubt=f"in which unit? It moves by {speed:.3g} of them a second")
+        return UnitGuess("mm", f"at most {speed:.4g} mm/s")
+    return UnitGuess("m", doubt=f"in which unit? It moves by {speed:.3g} of them a second")
 
 
 def speed_of(
@@ -80,7 +80,7 @@ def speed_of(
     return float(np.quantile(speeds, 0.9)) if len(speeds) else 0.0
 
 
-def heading_unit(values: Float[np.ndarray, " row"], turned: float = 0.0) -> Unit:
+def heading_unit(values: Float[np.ndarray, " row"], turned: float = 0.0) -> UnitGuess:
     """Unit of a heading, from its jumps at a full turn, else from its size.
 
     Args:
@@ -89,23 +89,25 @@ def heading_unit(values: Float[np.ndarray, " row"], turned: float = 0.0) -> Unit
     known = values[~np.isnan(values)]
     jump, most = float(np.abs(np.diff(known)).max(initial=0.0)), float(np.abs(known).max(initial=0))
     if 330 < jump <= 361:
-        return Unit("deg", "jumps by 360")
+        return UnitGuess("deg", "jumps by 360")
     if 5.8 < jump <= 6.2832 + 1e-3:
-        return Unit("rad", "jumps by 2 pi")
+        return UnitGuess("rad", "jumps by 2 pi")
     if turned > _TURNED:
         times = float(np.ptp(known)) / turned
         for unit, expected in (("rad", 1.0), ("deg", 180.0 / np.pi)):
             if expected / _NEAR_TURN < times < expected * _NEAR_TURN:
-                return Unit(unit, f"turns {times:.2g} times as far as the turn rate says")
+                return UnitGuess(unit, f"turns {times:.2g} times as far as the turn rate says")
     if most <= 6.2832 + 1e-3:
         doubt = "radians or degrees? It never turns far" if most < 0.5 else ""
-        return Unit("rad", f"up to {most:.3g}", doubt)
+        return UnitGuess("rad", f"up to {most:.3g}", doubt)
     if most <= 361 and most > 50:
-        return Unit("deg", f"up to {most:.3g}")
-    return Unit("rad" if most < 30 else "deg", doubt=f"radians or degrees? It reaches {most:.4g}")
+        return UnitGuess("deg", f"up to {most:.3g}")
+    return UnitGuess(
+        "rad" if most < 30 else "deg", doubt=f"radians or degrees? It reaches {most:.4g}"
+    )
 
 
-def speed_unit(ratio: float | None, radius: float | None) -> Unit:
+def speed_unit(ratio: float | None, radius: float | None) -> UnitGuess:
     """Unit of wheel speeds, from the way of the pose, if there is one, and a radius, if it is said.
 
     Args:
@@ -114,50 +116,50 @@ def speed_unit(ratio: float | None, radius: float | None) -> Unit:
     """
     options = "rad/s, rpm or deg/s; or m/s at the rim: then divide by the radius with scale"
     if ratio is None:
-        return Unit("rad/s", doubt=f"in which unit: {options}?")
+        return UnitGuess("rad/s", doubt=f"in which unit: {options}?")
     if radius is not None:
         units = {unit: ratio / factor(unit, "rad/s") for unit in ("rad/s", "rpm", "deg/s", "rev/s")}
         best = min(units, key=lambda unit: abs(np.log(units[unit] / radius)))
         apart = abs(np.log(units[best] / radius))
         if apart < 0.7 and apart < abs(np.log(ratio)):
-            return Unit(best, "as fast as the pose")
+            return UnitGuess(best, "as fast as the pose")
     elif RADII[0] <= ratio <= RADII[1]:
-        return Unit("rad/s", f"as fast as the pose with wheels of about {ratio:.2g} m")
+        return UnitGuess("rad/s", f"as fast as the pose with wheels of about {ratio:.2g} m")
     if 0.7 < ratio < 1.5:
         doubt = "as fast as the pose itself, hence m/s at the rim: put scale = 1 / wheel radius"
-        return Unit("rad/s", doubt=doubt)
+        return UnitGuess("rad/s", doubt=doubt)
     if RADII[0] <= ratio / factor("rpm", "rad/s") <= RADII[1]:
-        return Unit("rpm", doubt="rpm, or deg/s? With rad/s wheels would be too small")
-    return Unit("rad/s", doubt=f"in which unit: {options}?")
+        return UnitGuess("rpm", doubt="rpm, or deg/s? With rad/s wheels would be too small")
+    return UnitGuess("rad/s", doubt=f"in which unit: {options}?")
 
 
-def angle_unit(ratio: float | None, radius: float | None) -> Unit:
+def angle_unit(ratio: float | None, radius: float | None) -> UnitGuess:
     """Unit of wheel angles; arguments as of `speed_unit`."""
     if ratio is None:
-        return Unit("rad", doubt="radians, degrees, turns or ticks?")
+        return UnitGuess("rad", doubt="radians, degrees, turns or ticks?")
     low, high = RADII if radius is None else (radius / 2, radius * 2)
     for unit in ("rad", "deg", "rev"):
         if low <= ratio / factor(unit, "rad") <= high:
-            return Unit(unit, "turns as far as the pose goes")
-    return Unit("rad", doubt="radians, degrees, turns or ticks? The pose goes another way")
+            return UnitGuess(unit, "turns as far as the pose goes")
+    return UnitGuess("rad", doubt="radians, degrees, turns or ticks? The pose goes another way")
 
 
-def plain_unit(channel: str) -> Unit:
+def usual_unit(channel: str) -> UnitGuess:
     """Unit of what is logged in SI but for rare cases."""
-    return Unit({"wheel_ticks": "tick"}.get(channel, CHANNELS[channel]))
+    return UnitGuess({"wheel_ticks": "tick"}.get(channel, CHANNELS[channel]))
 
 
-def current_unit(most: float) -> Unit:
+def current_unit(most: float) -> UnitGuess:
     """Unit of currents from their largest."""
     if most > 120:
-        return Unit("mA", f"up to {most:.4g}")
-    return Unit("A", f"up to {most:.3g}")
+        return UnitGuess("mA", f"up to {most:.4g}")
+    return UnitGuess("A", f"up to {most:.3g}")
 
 
-def duty_unit(most: float) -> Unit:
+def duty_unit(most: float) -> UnitGuess:
     """Unit of duty cycles from their largest."""
     if most <= 1.05:
-        return Unit("1", f"up to {most:.3g}")
+        return UnitGuess("1", f"up to {most:.3g}")
     if most <= 105:
-        return Unit("percent", f"up to {most:.3g}")
-    return Unit("1", doubt=f"it reaches {most:.4g}: give scale, 1 over what stands for full")
+        return UnitGuess("percent", f"up to {most:.3g}")
+    return UnitGuess("1", doubt=f"it reaches {most:.4g}: give scale, 1 over what stands for full")

@@ -15,13 +15,13 @@ from slipid.lab.benchmark.sets import Over
 from slipid.predict.score import chords, clusters, lengths, scores
 from slipid.predict.slip_model import (
     WINDOW_S,
-    Machine,
     PredictedRun,
+    RobotSpec,
     Run,
     body_increments,
     groups,
     path_of,
-    seen_from_start,
+    relative_to_start,
 )
 from slipid.support.files import Content
 
@@ -66,13 +66,13 @@ class RunScore:
         return asdict(self)
 
 
-def scored(run: Run, said: PredictedRun, machine: Machine, over: Over) -> RunScore:
+def scored(run: Run, said: PredictedRun, spec: RobotSpec, over: Over) -> RunScore:
     """Score of a prediction of a run."""
-    true = seen_from_start(run.pose)
+    true = relative_to_start(run.pose)
     cov = None if said.end_covariance is None else said.end_covariance[None]
     (end,) = scores(said.path[None], true[None], cov, said.freedom)
     first = groups(run.signals.dt, WINDOW_S)
-    off, slip, slips = _windows(run, said, machine, first)
+    off, slip, slips = _windows(run, said, spec, first)
     return RunScore(
         name=run.signals.name,
         floor=run.floor,
@@ -85,7 +85,7 @@ def scored(run: Run, said: PredictedRun, machine: Machine, over: Over) -> RunSco
         scores=[float(f"{x:.4g}") for x in slip.tolist()],
         slips=slips.tolist(),
         floor_right=_floor_right(run, said),
-        energy_error=_energy_error(run, said, machine),
+        energy_error=_energy_error(run, said, spec),
     )
 
 
@@ -95,16 +95,16 @@ def _length(path: Float[np.ndarray, "edge 3"], over: Over) -> float:
 
 
 def _windows(
-    run: Run, said: PredictedRun, machine: Machine, first: np.ndarray
+    run: Run, said: PredictedRun, spec: RobotSpec, first: np.ndarray
 ) -> tuple[float, Float[np.ndarray, " window"], Bool[np.ndarray, " window"]]:
     """Rms twist error [m/s]; how sure the method is of slip, and where there was any."""
     edges = np.append(first, len(run.signals))
     dt = np.diff(np.concatenate([[0.0], np.cumsum(run.signals.dt)])[edges])[:, None]
-    true = body_increments(run.pose[edges]) / dt * machine.size
-    told = body_increments(said.path[edges]) / dt * machine.size
+    true = body_increments(run.pose[edges]) / dt * spec.size
+    told = body_increments(said.path[edges]) / dt * spec.size
     # joined as the paths are, so that a method that says what encoders say sees no slip at all
-    by_wheels = path_of(run.signals.rolling(machine), run.signals.dt)
-    rolling = body_increments(by_wheels[edges]) / dt * machine.size
+    by_wheels = path_of(run.signals.rolling(spec), run.signals.dt)
+    rolling = body_increments(by_wheels[edges]) / dt * spec.size
     size = np.linalg.norm(rolling, axis=1)
     moves = size > STANDS
     most = np.maximum(size, STANDS)
@@ -129,15 +129,15 @@ def _floor_right(run: Run, said: PredictedRun) -> float | None:
     return float((right * run.signals.dt).sum() / run.signals.dt.sum())
 
 
-def _energy_error(run: Run, said: PredictedRun, machine: Machine) -> float | None:
+def _energy_error(run: Run, said: PredictedRun, spec: RobotSpec) -> float | None:
     if said.power is None or run.signals.current is None:
         return None
-    spent = float((run.signals.power(machine) * run.signals.dt).sum())
+    spent = float((run.signals.power(spec) * run.signals.dt).sum())
     return abs(float((said.power * run.signals.dt).sum()) / max(spent, 1e-9) - 1)
 
 
 @dataclass(frozen=True)
-class Row:
+class FoldScore:
     """A method in one fold of one protocol.
 
     Attributes:
@@ -166,17 +166,17 @@ class Row:
         return asdict(self)
 
     @classmethod
-    def of_json(cls, content: dict[str, Any]) -> "Row":
+    def of_json(cls, content: dict[str, Any]) -> "FoldScore":
         return cls(**{**content, "runs": tuple(RunScore(**run) for run in content["runs"])})
 
     @classmethod
-    def lacking(cls, channels: Iterable[str]) -> "Row":
+    def lacking(cls, channels: Iterable[str]) -> "FoldScore":
         """Of a method that needs what was not logged."""
         words = {"twist": "wheels that drive sideways", "command": "a commanded twist"}
         named = [words.get(name, f"a {name}") for name in sorted(channels)]
         return cls(absent=f"needs {' and '.join(named)}")
 
     @classmethod
-    def of_error(cls, error: Exception) -> "Row":
+    def of_error(cls, error: Exception) -> "FoldScore":
         """Of a method that ended in an error."""
         return cls(absent=f"{type(error).__name__}: {error}".splitlines()[0][:300], failed=True)

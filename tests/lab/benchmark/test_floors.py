@@ -25,24 +25,24 @@ from slipid.lab.benchmark.floors.logs import (
     ZERO_A,
     _joined,
     beliefs_of,
-    felt_of,
+    floor_signals,
     husky,
-    read_felt,
-    robotino_rows,
+    read_floor_runs,
+    robotino_classifiers,
 )
-from slipid.lab.benchmark.floors.part import HuskyFloors, RobotinoFloors, felt_rows
+from slipid.lab.benchmark.floors.part import HuskyFloorTask, RobotinoFloorTask, husky_classifiers
 from slipid.lab.benchmark.floors.protocol import (
-    Asked,
+    EvaluationSettings,
     ScoredClassifier,
     answers_of,
-    felt_table,
+    classifier_table,
     folds_of,
     tuned,
 )
-from slipid.lab.benchmark.floors.result import Answer, FeltRow, after_seconds, confused
-from slipid.lab.benchmark.floors.slipid_row import SlipidFloors, kinds
-from slipid.lab.benchmark.work import Wish
-from slipid.lab.systems.floors.interface import FloorMethod, floors_of
+from slipid.lab.benchmark.floors.result import Answer, ClassifierRow, after_seconds, confusion
+from slipid.lab.benchmark.floors.slipid_row import SlipidFloorClassifier, kinds
+from slipid.lab.benchmark.work import BenchmarkOptions
+from slipid.lab.systems.floors.interface import FloorClassifier, floors_of
 from slipid.predict.slip_model import PredictedRun
 from slipid.support.errors import DataError
 from slipid.support.files import json_text
@@ -51,7 +51,7 @@ from tests.helpers.made_runs import HUSKY, made_run, straight
 
 
 @dataclass(frozen=True)
-class Meter(FloorMethod):
+class Meter(FloorClassifier):
     """Takes the floor whose mean current is nearest, and is wrong where it is told to be."""
 
     name: str = "meter"
@@ -62,7 +62,7 @@ class Meter(FloorMethod):
     def candidates(self):
         return [replace(self, off=off) for off in self.tries] or (self,)
 
-    def fit(self, felts, machine):
+    def fit(self, felts, spec):
         labels = floors_of(felts)
         level = {
             name: float(np.mean([f.current.mean() for f in felts if f.floor == name]))
@@ -70,7 +70,7 @@ class Meter(FloorMethod):
         }
         return replace(self, labels=labels, level=level)
 
-    def probability(self, felts, machine):
+    def probability(self, felts, spec):
         out = []
         for felt in felts:
             mean = np.cumsum(felt.current.mean(axis=1)) / np.arange(1, len(felt) + 1) + self.off
@@ -99,7 +99,7 @@ def row(t, **other):
 def test_a_file_is_a_run_and_a_gap_makes_two(tmp_path):
     written(tmp_path / "ICE" / "00.csv", [row(t) for t in (0, 0.15, 0.3, 1.0, 1.15, 1.3, 1.45)])
     written(tmp_path / "SNOW" / "00.csv", [row(0), row(0.15, gyro_z=""), row(0.3)])
-    ice, more, snow = read_felt(tmp_path, 0.165)
+    ice, more, snow = read_floor_runs(tmp_path, 0.165)
     assert [len(r) for r in (ice, more, snow)] == [3, 4, 3]
     assert (ice.name, ice.floor, snow.floor) == ("ICE/00", "ice", "snow")
     assert ice.speed[0] == pytest.approx([2.0, 1.0])
@@ -123,16 +123,16 @@ def test_a_file_is_a_run_and_a_gap_makes_two(tmp_path):
 def test_a_bad_file_is_named_with_its_row(tmp_path, rows, said):
     written(tmp_path / "ICE" / "00.csv", rows)
     with pytest.raises(DataError, match=r"00\.csv") as error:
-        read_felt(tmp_path, 0.165)
+        read_floor_runs(tmp_path, 0.165)
     assert said in str(error.value)
 
 
 def test_a_missing_column_and_a_missing_folder_are_named(tmp_path):
     with pytest.raises(DataError, match=r"no file FLOOR/RUN\.csv"):
-        read_felt(tmp_path, 0.165)
+        read_floor_runs(tmp_path, 0.165)
     written(tmp_path / "ICE" / "00.csv", ["0,1"], "time,curL")
     with pytest.raises(DataError, match="column 'curR': no such column"):
-        read_felt(tmp_path, 0.165)
+        read_floor_runs(tmp_path, 0.165)
 
 
 def test_every_run_is_left_out_once_and_floors_are_in_every_fold():
@@ -173,10 +173,12 @@ def test_a_stretch_of_a_robot_that_stands_is_not_asked():
 
 def test_settings_are_picked_by_runs_that_the_candidate_was_not_fitted_to():
     felts = made_felts({"grass": 2.0, "snow": 4.0})
-    found = tuned(Meter(tries=(9.0, 0.0, 5.0)), felts, HUSKY, Asked(seconds=(1.0,)))
+    found = tuned(Meter(tries=(9.0, 0.0, 5.0)), felts, HUSKY, EvaluationSettings(seconds=(1.0,)))
     assert found.method.off == 0.0
     assert found.settings == "off = 0.0"
-    assert tuned(Meter(tries=(9.0, 0.0)), felts, HUSKY, Asked(inner=1)).method.tries == (9.0, 0.0)
+    assert tuned(
+        Meter(tries=(9.0, 0.0)), felts, HUSKY, EvaluationSettings(inner=1)
+    ).method.tries == (9.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -190,10 +192,10 @@ class Memory(Meter):
     def candidates(self):
         return [self, replace(self, right=True)]
 
-    def fit(self, felts, machine):
+    def fit(self, felts, spec):
         return replace(self, labels=floors_of(felts), known=frozenset(f.name for f in felts))
 
-    def probability(self, felts, machine):
+    def probability(self, felts, spec):
         seen = [f.name in self.known for f in felts]
         each = [np.array([0.9, 0.1]) if s else np.array([0.1, 0.9]) for s in seen]
         return [np.tile(p, (len(f), 1)) for p, f in zip(each, felts, strict=True)]
@@ -202,7 +204,9 @@ class Memory(Meter):
 @pytest.mark.parametrize("judged", [1, 3])
 def test_nobody_is_asked_of_runs_that_it_was_fitted_to(judged):
     felts = made_felts({"grass": 2.0, "snow": 4.0}, runs=6)
-    table = felt_table([Memory()], felts, HUSKY, "made", Asked((1.0,), 3, judged), "memory")
+    table = classifier_table(
+        [Memory()], felts, HUSKY, "made", EvaluationSettings((1.0,), 3, judged), "memory"
+    )
     assert table.rows[0].said["grass"] == {"grass": 0.0, "snow": 100.0}
     assert len(table.rows[0].settings) == judged
 
@@ -244,7 +248,7 @@ def test_stretches_of_one_run_are_no_independent_witnesses():
 
 def test_what_was_named_on_each_floor_in_percent():
     said = [answer("a", 1), answer("a", 0), answer("b", 1, floor="snow")]
-    assert confused(said, 1.0) == {
+    assert confusion(said, 1.0) == {
         "grass": {"grass": 50.0, "other": 50.0, "snow": 0.0},
         "snow": {"grass": 0.0, "other": 0.0, "snow": 100.0},
     }
@@ -253,7 +257,9 @@ def test_what_was_named_on_each_floor_in_percent():
 def test_a_table_compares_all_rows_with_the_reference():
     felts = made_felts({"grass": 2.0, "snow": 4.0}, runs=5)
     good, bad = Meter(name="good"), Meter(name="bad", off=1.5)
-    table = felt_table([good, bad], felts, HUSKY, "made", Asked(seconds=(1.0, 4.0)), "good")
+    table = classifier_table(
+        [good, bad], felts, HUSKY, "made", EvaluationSettings(seconds=(1.0, 4.0)), "good"
+    )
     first, second = table.rows
     assert first.after[0].accuracy.value == 1.0
     assert first.after[0].behind is None
@@ -268,14 +274,18 @@ def test_a_table_compares_all_rows_with_the_reference():
 
 def test_a_quick_table_is_of_one_fold_and_of_the_first_minute():
     felts = made_felts({"grass": 2.0, "snow": 4.0}, runs=5, rows=600)
-    after = felt_table([Meter()], felts, HUSKY, "made", Asked.quick(), "meter").rows[0].after
+    after = (
+        classifier_table([Meter()], felts, HUSKY, "made", EvaluationSettings.quick(), "meter")
+        .rows[0]
+        .after
+    )
     assert [a.seconds for a in after] == [0.5, 1.0, 2.0]
     # of each floor one run, of which a minute is 30 stretches
     assert [a.stretches for a in after] == [60, 60, 60]
 
 
 def test_rows_have_names_of_their_own_and_slipid_is_first():
-    names = [method.name for method in felt_rows()]
+    names = [method.name for method in husky_classifiers()]
     assert names[0] == "slipid"
     assert len(set(names)) == len(names)
 
@@ -392,7 +402,7 @@ def test_frictions_are_found_by_currents_and_turning(slippery):
 
 @pytest.mark.slow
 def test_slipid_tells_floors_that_differ_in_friction_only_and_looks_at_nothing_later(slippery):
-    method = SlipidFloors(robot=husky(), zero_a=ZERO_A).fit(driven(slippery), HUSKY)
+    method = SlipidFloorClassifier(robot=husky(), zero_a=ZERO_A).fit(driven(slippery), HUSKY)
     assert method.labels == ("grass", "ice", "snow")
     assert np.asarray(method.fitted.motor.stiffness) == pytest.approx([-0.5, 0.5], abs=0.2)
     judged = driven(slippery, runs=3, seed=1)
@@ -417,29 +427,33 @@ def test_slipid_tells_floors_that_differ_in_friction_only_and_looks_at_nothing_l
 
 def test_slipid_says_what_it_lacks():
     with pytest.raises(ValueError, match="not fitted"):
-        SlipidFloors(robot=husky()).probability(made_felts({"grass": 2.0}), HUSKY)
+        SlipidFloorClassifier(robot=husky()).probability(made_felts({"grass": 2.0}), HUSKY)
     with pytest.raises(ValueError, match="which robot"):
-        SlipidFloors().fit(made_felts({"grass": 2.0}), HUSKY)
+        SlipidFloorClassifier().fit(made_felts({"grass": 2.0}), HUSKY)
 
 
 class Broken(Meter):
     """Cannot be fitted."""
 
-    def fit(self, felts, machine):
+    def fit(self, felts, spec):
         raise ZeroDivisionError("no wheel")
 
 
 def test_a_classifier_that_fails_has_an_empty_row_beside_the_others():
     felts = made_felts({"grass": 2.0, "snow": 4.0})
     methods = [Broken(name="broken"), Meter()]
-    table = felt_table(methods, felts, HUSKY, "made", Asked(seconds=(1.0,)), "broken")
+    table = classifier_table(
+        methods, felts, HUSKY, "made", EvaluationSettings(seconds=(1.0,)), "broken"
+    )
     lost, there = table.rows
     assert (lost.name, lost.absent) == ("broken", "ZeroDivisionError: no wheel")
     assert lost.after == ()
     assert there.after[0].accuracy.value > 0.5
     assert there.after[0].behind is None
     with pytest.raises(ValueError, match="no wheel"):
-        felt_table(methods[:1], felts, HUSKY, "made", Asked(seconds=(1.0,)), "broken")
+        classifier_table(
+            methods[:1], felts, HUSKY, "made", EvaluationSettings(seconds=(1.0,)), "broken"
+        )
 
 
 def in_the_air(root: Path) -> tuple[float, float, float]:
@@ -474,13 +488,13 @@ def test_a_free_wheel_draws_what_was_measured(real_data):
 def test_a_robotino_run_is_heard_without_its_pose():
     amps = np.tile([-0.5, 1.0, 2.0], (40, 1))
     run = made_run(straight(0.3), current=amps, signed=True, floor="gray@moved")
-    felt = felt_of(run)
+    felt = floor_signals(run)
     assert (felt.floor, felt.name) == ("gray", run.signals.name)
     assert felt.dt.sum() == pytest.approx(4.0)
     assert np.array_equal(felt.speed, run.signals.speed)
     assert felt.current[0].tolist() == [0.5, 1.0, 2.0]
     with pytest.raises(ValueError, match="no current"):
-        felt_of(made_run(straight(0.3)))
+        floor_signals(made_run(straight(0.3)))
 
 
 def test_what_the_estimator_calls_unknown_is_left_out_of_the_comparison():
@@ -491,21 +505,21 @@ def test_what_the_estimator_calls_unknown_is_left_out_of_the_comparison():
 
 
 def test_a_classifier_that_fails_in_one_fold_has_an_empty_row():
-    lost = ScoredClassifier(FeltRow("trees", absent="ValueError: no leaf"), ())
-    there = ScoredClassifier(FeltRow("trees", numbers=4), (answer("a", 1),))
+    lost = ScoredClassifier(ClassifierRow("trees", absent="ValueError: no leaf"), ())
+    there = ScoredClassifier(ClassifierRow("trees", numbers=4), (answer("a", 1),))
     assert _joined([there, lost]) == lost
     assert _joined([there, there]) == ScoredClassifier(there.row, there.answers * 2)
 
 
 def test_rows_on_the_robotino_hear_no_vibration():
-    names = [method.name for method in robotino_rows()]
+    names = [method.name for method in robotino_classifiers()]
     assert "boosted_trees_vibration" not in names
     assert {"belyaev_kushnarev", "gaussian", "boosted_trees"} <= set(names)
 
 
 @pytest.mark.nightly
 def test_slipid_is_ahead_of_all_classifiers_on_the_robotino(real_data, tmp_path):
-    part = RobotinoFloors(Wish(real_data, tmp_path, quick=True))
+    part = RobotinoFloorTask(BenchmarkOptions(real_data, tmp_path, quick=True))
     if not part.is_asked:
         pytest.skip(f"no logs of the Robotino in {real_data}")
     assert part.run() == "robotino_floors"
@@ -516,17 +530,17 @@ def test_slipid_is_ahead_of_all_classifiers_on_the_robotino(real_data, tmp_path)
 
 
 def test_a_table_is_made_where_its_logs_are_and_a_row_is_wished_for(tmp_path):
-    assert not HuskyFloors(Wish(tmp_path, tmp_path)).is_asked
+    assert not HuskyFloorTask(BenchmarkOptions(tmp_path, tmp_path)).is_asked
     (tmp_path / "borealtc").mkdir()
-    assert HuskyFloors(Wish(tmp_path, tmp_path)).is_asked
-    assert HuskyFloors(Wish(tmp_path, tmp_path, ("gaussian",))).is_asked
-    assert not HuskyFloors(Wish(tmp_path, tmp_path, ("encoder",))).is_asked
-    assert not RobotinoFloors(Wish(tmp_path, tmp_path)).is_asked
+    assert HuskyFloorTask(BenchmarkOptions(tmp_path, tmp_path)).is_asked
+    assert HuskyFloorTask(BenchmarkOptions(tmp_path, tmp_path, ("gaussian",))).is_asked
+    assert not HuskyFloorTask(BenchmarkOptions(tmp_path, tmp_path, ("encoder",))).is_asked
+    assert not RobotinoFloorTask(BenchmarkOptions(tmp_path, tmp_path)).is_asked
 
 
 def test_a_table_that_fails_is_kept_with_its_reason_until_the_logs_change(tmp_path):
     (tmp_path / "borealtc").mkdir()
-    part = HuskyFloors(Wish(tmp_path, tmp_path / "out"))
+    part = HuskyFloorTask(BenchmarkOptions(tmp_path, tmp_path / "out"))
     assert part.run() == "husky_floors"
     assert "no file FLOOR/RUN.csv" in part.table()["failed"]
     written(tmp_path / "borealtc" / "ICE" / "00.csv", ["0,1,1,1,1,0,0"])
@@ -537,16 +551,18 @@ def test_a_table_that_fails_is_kept_with_its_reason_until_the_logs_change(tmp_pa
 
 def test_a_table_in_which_a_classifier_failed_is_made_again(tmp_path, monkeypatch):
     (tmp_path / "borealtc").mkdir()
-    part = HuskyFloors(Wish(tmp_path, tmp_path / "out"))
+    part = HuskyFloorTask(BenchmarkOptions(tmp_path, tmp_path / "out"))
     felts = made_felts({"grass": 2.0, "snow": 4.0})
     methods = [Broken(name="trees"), Meter()]
     made = []
 
     def make(_):
         made.append(len(made))
-        return felt_table(methods, felts, HUSKY, "made", Asked(seconds=(1.0,)), "meter")
+        return classifier_table(
+            methods, felts, HUSKY, "made", EvaluationSettings(seconds=(1.0,)), "meter"
+        )
 
-    monkeypatch.setattr(HuskyFloors, "make", make)
+    monkeypatch.setattr(HuskyFloorTask, "make", make)
     part.run()
     assert part.table()["rows"][0]["absent"] == "ZeroDivisionError: no wheel"
     methods[0] = Meter(name="trees")

@@ -7,15 +7,15 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from slipid.app.new.file_channels import FileChannel, FileChannels, columns_of, without_names
-from slipid.app.new.magnitudes import Unit, place_unit, speed_of, time_unit
+from slipid.app.new.file_channels import FileChannel, FileChannels, channels_in, unnamed_channels
 from slipid.app.new.robot_questions import RobotAnswers
+from slipid.app.new.units import UnitGuess, position_unit, speed_of, time_unit
 from slipid.data.reading.table_format import TableFormat, TableNumbers, numbers_of
 from slipid.data.reading.units import factor
 from slipid.data.wheel_signals import refresh_period
 
-METRES = Unit("m")
-_AHEAD = 2
+METRES = UnitGuess("m")
+_ALIGNED_DRIVES = 2
 """Drives up to which all wheels point ahead."""
 _SPARSE = 0.02
 """Share of empty cells from which a channel is said to be slower than the rows."""
@@ -25,7 +25,7 @@ ANGLES = ("wheel_angle", "motor_angle")
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
+class FileStudy:
     """A file of one kind.
 
     Attributes:
@@ -38,7 +38,7 @@ class Study:
     numbers: TableNumbers
     columns: FileChannels
     time: Float[np.ndarray, " row"]
-    clock: Unit | None
+    clock: UnitGuess | None
 
     @property
     def format(self) -> TableFormat:
@@ -53,19 +53,19 @@ class Study:
         return float(np.median(steps)) if len(steps) else 1.0
 
 
-def study(format: TableFormat) -> Study:
+def study_file(format: TableFormat) -> FileStudy:
     """A file looked into; DataError where its numbers cannot be read."""
     numbers = numbers_of(format)
-    columns = columns_of(numbers) if any(format.names) else without_names(numbers)
+    columns = channels_in(numbers) if any(format.names) else unnamed_channels(numbers)
     found = columns.get("time")
     if found is None:
-        return Study(numbers, columns, np.arange(len(numbers.values), dtype=float), None)
+        return FileStudy(numbers, columns, np.arange(len(numbers.values), dtype=float), None)
     values = found.values[:, 0]
-    clock = Unit(found.unit) if found.unit else time_unit(values)
-    return Study(numbers, columns, values * factor(clock.unit, "s"), clock)
+    clock = UnitGuess(found.unit) if found.unit else time_unit(values)
+    return FileStudy(numbers, columns, values * factor(clock.unit, "s"), clock)
 
 
-def rate(one: Study, found: FileChannel) -> str:
+def reading_rate(one: FileStudy, found: FileChannel) -> str:
     """How often a channel is read, in words: by empty cells, by repeats, else by rows."""
     values, time = found.values[:, 0], one.time
     there = ~np.isnan(values) & ~np.isnan(time)
@@ -75,14 +75,14 @@ def rate(one: Study, found: FileChannel) -> str:
     steps = np.diff(time)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
     empty = 1.0 - float(there.mean())
-    often = f"{_hertz(usual)}, empty in between" if empty > _SPARSE else _hertz(usual)
+    often = f"{_rate_text(usual)}, empty in between" if empty > _SPARSE else _rate_text(usual)
     period = refresh_period([(time, values)])
     if period is not None and period > 1.5 * usual:
-        return f"{often}; read anew {_hertz(period)}"
+        return f"{often}; read anew {_rate_text(period)}"
     return often
 
 
-def _hertz(period: float) -> str:
+def _rate_text(period: float) -> str:
     return f"{1.0 / period:.3g} Hz" if period > 0 else ""
 
 
@@ -98,14 +98,14 @@ class PoseMotion:
     """
 
     speed: float | None = None
-    place: Unit = METRES
+    place: UnitGuess = METRES
     time: Float[np.ndarray, " pose"] | None = None
     x: Float[np.ndarray, " pose"] | None = None
     y: Float[np.ndarray, " pose"] | None = None
     steps: Float[np.ndarray, " pose"] | None = None
 
 
-def motion(one: Study | None) -> PoseMotion:
+def pose_motion(one: FileStudy | None) -> PoseMotion:
     """How the robot moves by the pose in a file; nothing where it has none."""
     if one is None or not one.columns.has_pose:
         return PoseMotion()
@@ -114,11 +114,11 @@ def motion(one: Study | None) -> PoseMotion:
     assert y is not None
     px, py = x.values[:, 0], y.values[:, 0]
     if x.unit:
-        place = Unit(x.unit)
+        place = UnitGuess(x.unit)
     elif one.clock is None:
-        place = Unit("m", doubt="in which unit?")
+        place = UnitGuess("m", doubt="in which unit?")
     else:
-        place = place_unit(one.time, px, py)
+        place = position_unit(one.time, px, py)
     if place.unit in ("pixel", "pixels", "pix", "px") or one.clock is None:
         return PoseMotion(place=place)
     scale = factor(place.unit, "m")
@@ -128,7 +128,7 @@ def motion(one: Study | None) -> PoseMotion:
     return PoseMotion(speed_of(time, px, py), place, time, px, py, steps)
 
 
-def increments(found: FileChannel, one: Study, moved: PoseMotion) -> bool | None:
+def ticks_are_increments(found: FileChannel, one: FileStudy, moved: PoseMotion) -> bool | None:
     """Whether ticks are those since the last row and not a sum; None where nothing tells.
 
     The way of the pose goes along with the ticks of each row, or with their changes.
@@ -141,7 +141,7 @@ def increments(found: FileChannel, one: Study, moved: PoseMotion) -> bool | None
     if moved.time is not None and moved.steps is not None and len(moved.time) > 20:
         way = np.interp(one.time, moved.time, np.cumsum(moved.steps))
         width = max(1, len(way) // 60)
-        sums = [_in_parts(row, width) for row in (of_rows, of_changes, np.abs(np.diff(way)))]
+        sums = [_block_sums(row, width) for row in (of_rows, of_changes, np.abs(np.diff(way)))]
         if all(float(np.std(part)) > 0 for part in sums):
             rows, changes = (float(np.corrcoef(part, sums[2])[0, 1]) for part in sums[:2])
             if abs(rows - changes) > 0.15:
@@ -153,13 +153,13 @@ def increments(found: FileChannel, one: Study, moved: PoseMotion) -> bool | None
     return False if most > 60 * usual else None
 
 
-def _in_parts(values: Float[np.ndarray, " row"], width: int) -> Float[np.ndarray, " part"]:
+def _block_sums(values: Float[np.ndarray, " row"], width: int) -> Float[np.ndarray, " part"]:
     """Sums over stretches of so many rows: one row alone is noise."""
     count = len(values) // width
     return values[: count * width].reshape(count, width).sum(axis=1)
 
 
-def over_wheels(one: Study, speed: FileChannel, moved: PoseMotion) -> float | None:
+def pose_over_wheel_speed(one: FileStudy, speed: FileChannel, moved: PoseMotion) -> float | None:
     """Speed of the pose over that of the wheels, of seconds in which they turn; None without both.
 
     It is the radius of wheels that all point ahead, if their speeds are in rad/s, and near it
@@ -168,7 +168,7 @@ def over_wheels(one: Study, speed: FileChannel, moved: PoseMotion) -> float | No
     if moved.time is None or moved.x is None or moved.y is None or one.clock is None:
         return None
     # two wheels point ahead: their mean has the sign of the way; of others the sizes are as good
-    ahead = speed.values.shape[1] <= _AHEAD
+    ahead = speed.values.shape[1] <= _ALIGNED_DRIVES
     rows = speed.values.mean(axis=1) if ahead else np.sqrt((speed.values**2).mean(axis=1))
     there = ~(np.isnan(rows) | np.isnan(one.time))
     time, rows = one.time[there], rows[there]
@@ -188,16 +188,16 @@ def over_wheels(one: Study, speed: FileChannel, moved: PoseMotion) -> float | No
     return ratio if ratio > 0 else None
 
 
-def signed(current: FileChannel, speed: FileChannel | None) -> bool | None:
+def has_sign(current: FileChannel, speed: FileChannel | None) -> bool | None:
     """Whether currents have a sign; None where nothing drove backwards and nothing tells."""
     values = current.values[~np.isnan(current.values)]
     most = float(np.abs(values).max(initial=0.0))
     if float(values.min(initial=0.0)) < -0.02 * most:
         return True
-    return False if driven_backwards(current, speed) else None
+    return False if has_magnitudes(current, speed) else None
 
 
-def driven_backwards(current: FileChannel, speed: FileChannel | None) -> bool:
+def has_magnitudes(current: FileChannel, speed: FileChannel | None) -> bool:
     """Whether currents are positive where wheels drive backwards, as magnitudes are.
 
     Two files with rows of their own do not tell.
@@ -210,7 +210,7 @@ def driven_backwards(current: FileChannel, speed: FileChannel | None) -> bool:
     return float(strong.mean()) > max(0.01, 3 * float(least.mean()))
 
 
-def of_battery(voltages: Sequence[FileChannel], speed: FileChannel | None) -> bool:
+def is_battery_voltage(voltages: Sequence[FileChannel], speed: FileChannel | None) -> bool:
     """Whether the voltage of some runs stays up whatever the wheels do, as a battery's does.
 
     Every run is measured by what is high in it: batteries of other robots, or other charges, are
@@ -225,13 +225,13 @@ def of_battery(voltages: Sequence[FileChannel], speed: FileChannel | None) -> bo
     return stays_up and (speed is None or float(np.nanstd(speed.values)) > 0.0)
 
 
-def pose_study(studies: tuple[Study, ...]) -> Study | None:
+def file_with_pose(studies: tuple[FileStudy, ...]) -> FileStudy | None:
     """The file that has the pose."""
     return next((one for one in studies if one.columns.has_pose), None)
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class RunStudy:
     """What files of a run tell of each other.
 
     Attributes:
@@ -241,14 +241,14 @@ class Known:
     """
 
     robot: RobotAnswers
-    main: Study
-    all: tuple[Study, ...]
-    others: tuple["Known", ...] = ()
+    main: FileStudy
+    all: tuple[FileStudy, ...]
+    others: tuple["RunStudy", ...] = ()
 
     @cached_property
     def moved(self) -> PoseMotion:
         """Motion by the pose."""
-        return motion(pose_study(self.all))
+        return pose_motion(file_with_pose(self.all))
 
     def find(self, *channels: str) -> FileChannel | None:
         """The first of some channels, in any of the files."""
@@ -256,12 +256,12 @@ class Known:
         return next((one for one in found if one is not None), None)
 
     @property
-    def runs(self) -> tuple["Known", ...]:
+    def runs(self) -> tuple["RunStudy", ...]:
         """This run, and the others."""
         return (self, *self.others)
 
     @cached_property
-    def over_wheels(self) -> float | None:
+    def pose_over_wheel_speed(self) -> float | None:
         """Speed of the pose over that of the wheels, the middle one of all runs."""
         found = []
         for run in self.runs:
@@ -270,15 +270,15 @@ class Known:
             if speed is None and angle is not None and run.main.clock is not None:
                 rates = np.gradient(angle.values, run.main.time, axis=0)
                 speed = replace(angle, values=rates)
-            ratio = None if speed is None else over_wheels(run.main, speed, run.moved)
+            ratio = None if speed is None else pose_over_wheel_speed(run.main, speed, run.moved)
             found += [ratio] if ratio is not None else []
         return float(np.median(found)) if found else None
 
     @property
-    def signed(self) -> bool | None:
+    def has_sign(self) -> bool | None:
         """Whether currents have a sign in any of the runs; None where none tells."""
         signs = [
-            signed(current, run.find(*SPEEDS))
+            has_sign(current, run.find(*SPEEDS))
             for run in self.runs
             if (current := run.find(*CURRENTS)) is not None
         ]
@@ -289,7 +289,7 @@ class Known:
         """Whether currents are what the battery gives: positive both ways, negative at times."""
         currents = [(run.find(*CURRENTS), run.find(*SPEEDS)) for run in self.runs]
         known = [(current, speed) for current, speed in currents if current is not None]
-        both_ways = any(driven_backwards(current, speed) for current, speed in known)
+        both_ways = any(has_magnitudes(current, speed) for current, speed in known)
         return both_ways and any(np.nanmin(current.values) < 0.0 for current, _ in known)
 
     @property

@@ -24,7 +24,7 @@ TURNING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class MeasuredWindows:
     """Pieces of a few seconds; angles in the body frame, everything a mean over the piece.
 
     What is of a wheel is of all wheels of a drive: their mean, of loads and torques the sum.
@@ -66,15 +66,15 @@ class Seen:
     unsigned: bool
 
 
-def seen(robot: Robot, data: Runs, per_piece: int) -> Seen:
-    """Pieces of at most `per_piece` windows of 1.5 s, beside what the robot predicts."""
+def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWindows:
+    """Return segments of at most `per_segment` windows of 1.5 s, beside what the robot predicts."""
     radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
-    w = windows(data, radius, lag, per_piece=per_piece, longest=1.5)
+    w = windows(data, radius, lag, per_segment=per_segment, longest=1.5)
     b, dt = lk.batch(w, robot), w.dt[..., None]
     shape = robot.geometry
-    torque = np.asarray(shape.at_drives(curves.seen(robot, b)[1]))
+    torque = np.asarray(shape.at_drives(curves.wheel_states(robot, b)[1]))
     amps, dragged = (np.asarray(x) for x in _borne(robot, b))
-    inverse, frame = np.asarray(shape.least()) * radius, shape.frame()
+    inverse, frame = np.asarray(shape.pseudo_inverse()) * radius, shape.frame()
     free = (w.turn @ inverse.T).sum(axis=1)
     far = np.linalg.norm((w.turn @ inverse.T)[..., :2], axis=-1).sum(axis=1)
     true = (body_twist(w, robot) * dt).sum(axis=1)
@@ -99,7 +99,7 @@ def seen(robot: Robot, data: Runs, per_piece: int) -> Seen:
     lost = {name: float(np.median(slip[floor == name])) for name in w.surface}
     groups = tuple(sorted(set(pairs), key=lambda pair: (lost[pair[0]], *pair)))
     wanted = data.speed[w.run]
-    return Seen(
+    return MeasuredWindows(
         group=np.array([groups.index(p) for p in pairs]),
         groups=groups,
         speed=np.round(np.where(np.isfinite(wanted), wanted, far / time), 2),
@@ -110,7 +110,7 @@ def seen(robot: Robot, data: Runs, per_piece: int) -> Seen:
         yaw=np.degrees(true[:, 2] - free[:, 2]) / np.maximum(ahead, 1e-9),
         wheel_speed=whole(lk.wheel_speed(robot, b)),
         wheel_slip=1.0 - (true @ np.asarray(shape.forward()).T) / safe,
-        sideways=mean(np.abs(true @ (frame.roll / frame.pull[:, None]).T)) / np.abs(safe),
+        sideways=mean(np.abs(true @ (frame.roll / frame.drive_share[:, None]).T)) / np.abs(safe),
         share=np.asarray(shape.at_drives(robot.body.load_share))[np.asarray(b.load)],
         amps=whole(w.current) if w.has_current else None,
         amps_model=whole(amps),
@@ -144,11 +144,11 @@ def by_heading(
 @jax.jit
 def _borne(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
     """Predicted currents [A], and torques of the drag along the drive [N m]."""
-    felt = lk.predict(robot, b).felt
+    motor_force = lk.predict(robot, b).motor_force
     force = robot.surfaces.friction[b.surface] * robot.body.mass * model.GRAVITY
-    drag = robot.motor.rolling_drag * felt[..., 1]
+    drag = robot.motor.rolling_drag * motor_force[..., 1]
     torque = robot.geometry.wheel_radius * force[:, None, None] * drag
-    return lk.predicted_current(robot, b, felt), torque
+    return lk.predicted_current(robot, b, motor_force), torque
 
 
 @jax.jit

@@ -8,18 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
+from slipid.app.new.draft import RobotHint
 from slipid.app.new.file_channels import (
     SUFFIXES,
-    Kind,
+    FileKind,
+    file_kinds,
     formats_below,
-    kinds_of,
-    likely_presets,
+    matching_presets,
     pattern_beside,
     without,
 )
+from slipid.app.new.file_study import FileStudy, file_with_pose, study_file
 from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, ask
-from slipid.app.new.sketch import Hint
-from slipid.app.new.study import Study, pose_study, study
 from slipid.data.reading.table_format import format_of
 from slipid.data.reading.units import factor
 from slipid.data.wheel_signals import body_steps
@@ -30,16 +30,16 @@ _SIDEWAYS = 0.3
 
 
 @dataclass(frozen=True)
-class GuessedRobot:
+class RobotGuess:
     """A robot, with what is to be asked of it in words that fit the logs."""
 
     robot: RobotAnswers
-    hints: tuple[Hint, ...]
+    hints: tuple[RobotHint, ...]
 
 
-def robot_from(options: RobotOptions, wheels: int, files: tuple[Study, ...]) -> GuessedRobot:
+def guess_robot(options: RobotOptions, wheels: int, files: tuple[FileStudy, ...]) -> RobotGuess:
     """The robot of the options, the rest as the logs have it; DataError as of `ask`."""
-    drive, hint = _drive(wheels, sideways(files))
+    drive, hint = _likely_drive(wheels, drives_sideways(files))
     drive = options.drive or drive
     if wheels == 2 and drive in ("mecanum", "skid") and options.shared is None:
         options = replace(options, shared="yes")
@@ -47,11 +47,11 @@ def robot_from(options: RobotOptions, wheels: int, files: tuple[Study, ...]) -> 
         options = replace(options, wheels=str(wheels))
     known = ask(options, None, drive)
     if drive == "general" and options.places_m is None and wheels >= 2:
-        known = _in_rows(known, wheels)
-    return GuessedRobot(known, (Hint("drive", hint),))
+        known = _two_rows(known, wheels)
+    return RobotGuess(known, (RobotHint("drive", hint),))
 
 
-def _drive(wheels: int, aside: bool | None) -> tuple[str, str]:
+def _likely_drive(wheels: int, aside: bool | None) -> tuple[str, str]:
     """The likeliest drive, and the question that remains."""
     if wheels == 2:
         return (
@@ -72,13 +72,13 @@ def _drive(wheels: int, aside: bool | None) -> tuple[str, str]:
     return "omni", "no column tells how wheels turn: which drive is it, and how many wheels?"
 
 
-def sideways(files: tuple[Study, ...]) -> bool | None:
+def drives_sideways(files: tuple[FileStudy, ...]) -> bool | None:
     """Whether the robot was told to drive sideways, or did; None where nothing says."""
     for one in files:
         command = one.columns.get("twist_command_y")
         if command is not None and np.nanmax(np.abs(command.values)) > 0:
             return True
-    posed = pose_study(files)
+    posed = file_with_pose(files)
     if posed is None or (turned := posed.columns.get("pose_heading")) is None:
         return None
     if not turned.unit:
@@ -93,7 +93,7 @@ def sideways(files: tuple[Study, ...]) -> bool | None:
     return left > _SIDEWAYS * (ahead + left) if ahead + left > 0 else None
 
 
-def _in_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
+def _two_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
     """Wheels in two rows, left and right, as a place to start from; in one where they are odd."""
     pairs = wheels // 2
     places = [
@@ -111,12 +111,12 @@ def _in_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
     )
 
 
-_RUNS = 4
+_MORE_RUNS = 4
 """Runs beside the first that are looked into."""
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class RunFiles:
     """Files of a run: those of one kind with the wheels, and others beside them.
 
     Attributes:
@@ -126,13 +126,13 @@ class Group:
         others: the same of further runs.
     """
 
-    kind: Kind
-    main: Study
-    beside: tuple[tuple[str, Study], ...] = ()
-    others: tuple["Group", ...] = ()
+    kind: FileKind
+    main: FileStudy
+    beside: tuple[tuple[str, FileStudy], ...] = ()
+    others: tuple["RunFiles", ...] = ()
 
     @property
-    def all(self) -> tuple[Study, ...]:
+    def all(self) -> tuple[FileStudy, ...]:
         """Every file of the first run."""
         return (self.main, *(one for _, one in self.beside))
 
@@ -145,58 +145,58 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False)
-class SortedLogs:
+class SortedFiles:
     """All files that were found: those of published formats, and others by run.
 
     `sentences` are lines about what was found and left out.
     """
 
     root: Path
-    presets: tuple[tuple[Kind, str], ...]
-    groups: tuple[Group, ...]
-    also: tuple[Kind, ...]
+    presets: tuple[tuple[FileKind, str], ...]
+    groups: tuple[RunFiles, ...]
+    also: tuple[FileKind, ...]
     hints: tuple[str, ...]
     sentences: tuple[str, ...]
     no_logs: tuple[Path, ...]
 
 
-def sorted_logs(path: Path) -> SortedLogs:
+def sort_files(path: Path) -> SortedFiles:
     """All files that belong to what was named."""
     if path.is_dir():
         formats, no_logs = formats_below(path)
-        root, kinds = path, kinds_of(formats)
+        root, kinds = path, file_kinds(formats)
     else:
         formats, no_logs = [format_of(path)], []
-        root, kinds = path.parent, kinds_of(formats)
+        root, kinds = path.parent, file_kinds(formats)
     presets, others, hints = [], [], []
     for kind in kinds:
-        likely = likely_presets(kind)
+        likely = matching_presets(kind)
         if likely.sure:
             presets.append((kind, likely.sure))
             continue
-        others.append((kind, study(kind.formats[0])))
+        others.append((kind, study_file(kind.formats[0])))
         if likely.perhaps:
             hints.append(
                 f"If {kind.paths[0].name} is of the published logs: format = "
                 f"{' or '.join(likely.perhaps)} in [[logs]] reads it, and no layout is needed."
             )
-    if path.is_file() and others and not _complete(others[0][1]):
+    if path.is_file() and others and not _is_complete(others[0][1]):
         others += _siblings(path, others[0][0])
-    groups, left_out = _groups(others)
+    groups, left_out = _run_files(others)
     sentences = [
         f"{len(kind.paths)} of format {name}: {kind.paths[0]} ..." for kind, name in presets
     ]
-    sentences += [_found(group) for group in groups]
+    sentences += [_sentence(group) for group in groups]
     sentences += [f"left out: {line}" for line in (*left_out, *(one.why for one in no_logs[:3]))]
     sentences += [f"left out: {len(no_logs) - 3} more that are no logs"] * (len(no_logs) > 3)
     paths = tuple(one.path for one in no_logs)
     also = tuple(kind for kind, _ in others)
-    return SortedLogs(
+    return SortedFiles(
         root, tuple(presets), tuple(groups), also, tuple(hints), tuple(sentences), paths
     )
 
 
-def _siblings(path: Path, kind: Kind) -> list[tuple[Kind, Study]]:
+def _siblings(path: Path, kind: FileKind) -> list[tuple[FileKind, FileStudy]]:
     """Files beside one that lacks something."""
     near = [p for p in sorted(path.parent.iterdir()) if p.is_file() and p.suffix in SUFFIXES]
     out = []
@@ -206,25 +206,25 @@ def _siblings(path: Path, kind: Kind) -> list[tuple[Kind, Study]]:
         except DataError:
             continue
         if format.signature != kind.formats[0].signature:
-            out.append((Kind((format,)), study(format)))
+            out.append((FileKind((format,)), study_file(format)))
     return out
 
 
-def _complete(one: Study) -> bool:
+def _is_complete(one: FileStudy) -> bool:
     return one.columns.wheels > 0 and one.columns.has_pose
 
 
-def _groups(kinds: list[tuple[Kind, Study]]) -> tuple[list[Group], list[str]]:
+def _run_files(kinds: list[tuple[FileKind, FileStudy]]) -> tuple[list[RunFiles], list[str]]:
     """Runs: kinds that have wheels, and with each the kinds that lie beside it."""
     mains = [pair for pair in kinds if pair[1].columns.wheels] or kinds[:1]
     rest = [pair for pair in kinds if pair not in mains]
-    if len(mains) > 1 and not any(_complete(one) for _, one in mains):
+    if len(mains) > 1 and not any(_is_complete(one) for _, one in mains):
         # the same wheels in two files: the one with the better channel leads
         mains, more = mains[:1], mains[1:]
         rest = more + rest
     groups, used = [], []
     for kind, main in mains:
-        beside: list[tuple[str, Study]] = []
+        beside: list[tuple[str, FileStudy]] = []
         have = frozenset(one.channel for one in main.columns.found) - {"time"}
         for other, one in rest:
             pattern = pattern_beside(kind, other)
@@ -232,13 +232,13 @@ def _groups(kinds: list[tuple[Kind, Study]]) -> tuple[list[Group], list[str]]:
             fresh = {found.channel for found in one.columns.found} - {"time"}
             if pattern is None or not fresh or one.clock is None or main.clock is None:
                 continue
-            if not _together(main, one):
+            if not _overlap(main, one):
                 continue
             beside.append((pattern, one))
             have |= fresh
             used.append(other)
-        group = Group(kind, main, tuple(beside))
-        groups.append(replace(group, others=_further(group)))
+        group = RunFiles(kind, main, tuple(beside))
+        groups.append(replace(group, others=_more_runs(group)))
     lost = [kind for kind, _ in rest if kind not in used]
     lines = [
         f"{k.paths[0]}: no wheels in it, and nothing of a run that it lies beside" for k in lost
@@ -246,10 +246,10 @@ def _groups(kinds: list[tuple[Kind, Study]]) -> tuple[list[Group], list[str]]:
     return groups, lines
 
 
-def _further(group: Group) -> tuple[Group, ...]:
+def _more_runs(group: RunFiles) -> tuple[RunFiles, ...]:
     """Some more runs of a kind, spread over all of them."""
     count = len(group.kind.formats)
-    chosen = sorted({k * count // (_RUNS + 1) for k in range(1, _RUNS + 1)} - {0})
+    chosen = sorted({k * count // (_MORE_RUNS + 1) for k in range(1, _MORE_RUNS + 1)} - {0})
     out = []
     for k in chosen:
         format = group.kind.formats[k]
@@ -257,19 +257,19 @@ def _further(group: Group) -> tuple[Group, ...]:
             (n, format.path.parent / n.replace("{stem}", format.path.stem)) for n, _ in group.beside
         ]
         try:
-            beside = tuple((name, study(format_of(path))) for name, path in names)
-            out.append(Group(group.kind, study(format), beside))
+            beside = tuple((name, study_file(format_of(path))) for name, path in names)
+            out.append(RunFiles(group.kind, study_file(format), beside))
         except DataError:
             continue  # the reader will say it of this run; the first one tells enough
     return tuple(out)
 
 
-def _together(one: Study, other: Study) -> bool:
+def _overlap(one: FileStudy, other: FileStudy) -> bool:
     """Whether two files cover the same time: then they are of one run."""
     return bool(max(one.time[0], other.time[0]) < min(one.time[-1], other.time[-1]))
 
 
-def _found(group: Group) -> str:
+def _sentence(group: RunFiles) -> str:
     """What a group of files holds, in a sentence."""
     listed = [", ".join(found.channel for found in one.columns.found) for one in group.all]
     more = [

@@ -7,9 +7,9 @@ import pytest
 from sklearn.metrics import roc_auc_score
 
 from slipid.fit.variances import DEGREES
-from slipid.lab.benchmark.judge import Row, scored
-from slipid.lab.benchmark.summary import Number, Resampled, RowSummary, area, summary
-from slipid.lab.benchmark.tuned import sentence
+from slipid.lab.benchmark.scores import FoldScore, scored
+from slipid.lab.benchmark.summary import Bootstrap, MeanInterval, RowSummary, area, summary
+from slipid.lab.benchmark.tuning import sentence
 from slipid.predict.score import forecast
 from slipid.predict.slip_model import PredictedRun, path_of
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
@@ -138,7 +138,7 @@ def rows(errors, floor="gray"):
         replace(base, name=f"{floor}{k}", floor=floor, cluster=k, endpoint_error=e)
         for k, e in enumerate(errors)
     ]
-    return Row(runs=tuple(runs), numbers=3, fit_s=1.0)
+    return FoldScore(runs=tuple(runs), numbers=3, fit_s=1.0)
 
 
 def test_means_are_over_runs_and_then_over_floors():
@@ -164,7 +164,9 @@ def test_a_difference_is_paired():
     found = summary({"slipid": own, "other": other}, "slipid")
     behind = found["other"].behind
     assert behind is not None
-    assert behind == pytest.approx(Number(0.01, 0.01, 0.01))  # runs that scatter do not hide it
+    assert behind == pytest.approx(
+        MeanInterval(0.01, 0.01, 0.01)
+    )  # runs that scatter do not hide it
     assert found["slipid"].behind is None
 
 
@@ -181,7 +183,7 @@ def test_intervals_hold_the_true_mean_as_often_as_they_say():
 
 def test_runs_of_a_cluster_are_drawn_together():
     runs = [replace(run, cluster=k // 5) for k, run in enumerate(rows(np.zeros(20)).runs)]
-    drawn = Resampled.of(runs).draws
+    drawn = Bootstrap.of(runs).draws
     assert (drawn[:, ::5] == drawn[:, 4::5]).all()
     assert (drawn.sum(axis=1) == 20).all()
     assert len({tuple(row) for row in drawn.tolist()}) > 20
@@ -189,7 +191,7 @@ def test_runs_of_a_cluster_are_drawn_together():
 
 def test_runs_of_a_floor_with_one_cluster_are_drawn_one_by_one():
     runs = [replace(run, cluster=7) for run in rows((0.1, 0.3, 0.2, 0.9)).runs]
-    draws = Resampled.of(runs).mean(np.array([run.endpoint_error for run in runs]))
+    draws = Bootstrap.of(runs).mean(np.array([run.endpoint_error for run in runs]))
     assert draws[0] == pytest.approx(0.375)
     assert np.std(draws) > 0.05
 
@@ -207,8 +209,8 @@ def test_the_force_balances_region_holds_nine_tenths_of_a_student_t():
 def test_a_row_that_is_absent_in_one_fold_is_absent():
     folds = {
         "slipid": [rows([0.1, 0.2]), rows([0.3, 0.4], "green")],
-        "broken": [rows([0.1, 0.2]), Row.of_error(ValueError("no rank\nmore"))],
-        "ojeda_gyro": [Row.lacking(["gyro"]), Row.lacking(["gyro"])],
+        "broken": [rows([0.1, 0.2]), FoldScore.of_error(ValueError("no rank\nmore"))],
+        "ojeda_gyro": [FoldScore.lacking(["gyro"]), FoldScore.lacking(["gyro"])],
     }
     found = summary(folds, "slipid")
     assert found["broken"].failed
@@ -220,27 +222,27 @@ def test_a_row_that_is_absent_in_one_fold_is_absent():
 
 def test_rows_outlive_their_files():
     row = rows([0.1, 0.2])
-    assert Row.of_json(row.to_json()) == row
+    assert FoldScore.of_json(row.to_json()) == row
 
 
 def ends(value, low=None, high=None, behind=None):
-    error = Number(value, value - 0.01, value + 0.01)
+    error = MeanInterval(value, value - 0.01, value + 0.01)
     return RowSummary(endpoint_error=error, behind=behind, runs=9)
 
 
 def test_the_reading_says_who_is_ahead():
-    ahead = {"slipid": ends(0.1), "rival": ends(0.05, behind=Number(-0.05, -0.07, -0.03))}
+    ahead = {"slipid": ends(0.1), "rival": ends(0.05, behind=MeanInterval(-0.05, -0.07, -0.03))}
     assert sentence("carpet", "new_floor", ahead) == (
         "carpet, new floor: rival is ahead of slipid: 5.0 % against 10.0 %, "
         "-5.0 points [-7.0, -3.0]"
     )
-    both = {**ahead, "third": ends(0.06, behind=Number(-0.04, -0.06, -0.02))}
+    both = {**ahead, "third": ends(0.06, behind=MeanInterval(-0.04, -0.06, -0.02))}
     assert "new floor: rival (and 1 more) is ahead of slipid:" in sentence("x", "new_floor", both)
-    tied = {"slipid": ends(0.1), "rival": ends(0.09, behind=Number(-0.01, -0.03, 0.01))}
+    tied = {"slipid": ends(0.1), "rival": ends(0.09, behind=MeanInterval(-0.01, -0.03, 0.01))}
     assert sentence("x", "sectors", tied).endswith("by 9.0 %; not told apart from rival")
-    many = {f"row{k}": ends(0.1 + 0.01 * k, behind=Number(0.0, -0.1, 0.1)) for k in range(6)}
+    many = {f"row{k}": ends(0.1 + 0.01 * k, behind=MeanInterval(0.0, -0.1, 0.1)) for k in range(6)}
     assert sentence("x", "sectors", {"slipid": ends(0.1), **many}).endswith(
         "not told apart from row0, row1, row2, row3 and 2 more"
     )
-    behind = {"slipid": ends(0.1), "rival": ends(0.2, behind=Number(0.1, 0.08, 0.12))}
+    behind = {"slipid": ends(0.1), "rival": ends(0.2, behind=MeanInterval(0.1, 0.08, 0.12))}
     assert sentence("x", "sectors", behind).endswith("by 20.0 %, +10.0 points [+8.0, +12.0]")

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from slipid.infer.bench.moments import scatter, start, sums
-from slipid.infer.bench.motor import REST, Record, noise_of
-from slipid.infer.bench.windows import Windows, electrical, mechanical
+from slipid.infer.bench.motor import REST, BenchRecord, noise_of
+from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
 from slipid.support.errors import DataError
 
 FEWEST_WINDOWS = 30
@@ -19,7 +19,7 @@ POWER = 2e4
 """U^2 / R above which a current is rather in milliamperes [W]."""
 
 
-def refuse(records: Sequence[Record], label: str, units_said: bool = False) -> None:
+def check_records(records: Sequence[BenchRecord], label: str, units_said: bool = False) -> None:
     """DataError where the records cannot be what they are said to be; what to do stands in it.
 
     `units_said`: the unit of the current is not doubted, whatever comes of it.
@@ -64,7 +64,9 @@ def _signed(where: str, speed: np.ndarray, current: np.ndarray) -> None:
         )
 
 
-def _signs(where: str, records: Sequence[Record], volts: Windows | None, amps: Windows) -> None:
+def _signs(
+    where: str, records: Sequence[BenchRecord], volts: BenchWindows | None, amps: BenchWindows
+) -> None:
     """Refuse columns that are exchanged or reversed, by signs no motor has.
 
     Inertia makes the current rise with acceleration, and back-EMF the voltage with speed.
@@ -89,7 +91,7 @@ def _signs(where: str, records: Sequence[Record], volts: Windows | None, amps: W
         _fail(where, found, "their columns the other way round")
 
 
-def _sure(w: Windows, column: int) -> float:
+def _sure(w: BenchWindows, column: int) -> float:
     """A coefficient over its std, with nothing known but the equation."""
     signals = w.even.signals.shape[1] - (w.even.signals.shape[1] == 6)
     found = start(w, signals, list(range(signals)))
@@ -99,7 +101,7 @@ def _sure(w: Windows, column: int) -> float:
     return float(found[column] / max(std[column], 1e-300))
 
 
-def _milliamperes(where: str, records: Sequence[Record], volts: Windows) -> None:
+def _milliamperes(where: str, records: Sequence[BenchRecord], volts: BenchWindows) -> None:
     found = start(volts, 5, list(range(5)))
     highest = max(float(np.abs(r.voltage).max()) for r in records if r.voltage is not None)
     if 0 < found[0] < highest**2 / POWER and _sure(volts, 0) > SURE:

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slipid.lab.benchmark.judge import scored
-from slipid.lab.benchmark.own import NAME
 from slipid.lab.benchmark.protocols import INNER, inner
-from slipid.lab.benchmark.summary import Number, RowSummary
-from slipid.predict.slip_model import TRIES, ByFloor, Machine, Run, SlipModel
+from slipid.lab.benchmark.scores import scored
+from slipid.lab.benchmark.slipid_rows import NAME
+from slipid.lab.benchmark.summary import MeanInterval, RowSummary
+from slipid.predict.slip_model import TRIES, ByFloor, RobotSpec, Run, SlipModel
 
 WORST = 2.0
 """Relative error beyond which it does not matter how far a setting is off."""
@@ -27,7 +27,7 @@ class Tuned:
     tried: int
 
 
-def tuned(method: SlipModel, runs: Sequence[Run], machine: Machine, kind: str) -> Tuned:
+def tuned(method: SlipModel, runs: Sequence[Run], spec: RobotSpec, kind: str) -> Tuned:
     """The method with the best of its settings, unfitted.
 
     Each is fitted without a part of the runs, of the kind that the method will be judged by as far
@@ -42,19 +42,19 @@ def tuned(method: SlipModel, runs: Sequence[Run], machine: Machine, kind: str) -
     pools = isinstance(method, ByFloor) and len({method.group_of(run.signals) for run in runs}) > 1
     if len(candidates) == 1 and not pools:
         return Tuned(method, "", 1)
-    losses = [_loss(candidate, runs, part, machine) for candidate in candidates]
+    losses = [_loss(candidate, runs, part, spec) for candidate in candidates]
     best = candidates[int(np.argmin(losses))]
     settings = [settings_of(best, candidates)]
     if pools and isinstance(best, ByFloor):
         pooled = replace(best, pooled=True)
-        if _loss(pooled, runs, part, machine) < min(losses):
+        if _loss(pooled, runs, part, spec) < min(losses):
             best = pooled
             settings.append("one fit to all runs")
     words = ", ".join(word for word in settings if word)
     return Tuned(best, words, len(candidates) + pools)
 
 
-def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, machine: Machine) -> float:
+def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, spec: RobotSpec) -> float:
     """Mean error over parts left out in turn, over runs and then over floors."""
     errors: dict[str, list[float]] = {}
     for k in range(INNER):
@@ -66,11 +66,11 @@ def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, machine: Mac
         if not fitted or not left_out:
             continue
         try:
-            said = method.fit(fitted, machine).predict([run.signals for run in left_out], machine)
+            said = method.fit(fitted, spec).predict([run.signals for run in left_out], spec)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             return np.inf
         for run, one in zip(left_out, said, strict=True):
-            found = scored(run, one, machine, "path")
+            found = scored(run, one, spec, "path")
             error = found.energy_error if method.aim == "energy" else found.endpoint_error
             error = np.inf if error is None else error
             mine = errors.setdefault(run.floor, [])
@@ -129,10 +129,10 @@ def sentence(name: str, protocol: str, found: Mapping[str, RowSummary]) -> str:
     return f"{said}, {_points(behind)}" if behind is not None else said
 
 
-def _percent(x: Number) -> str:
+def _percent(x: MeanInterval) -> str:
     return f"{100 * x.value:.1f} %"
 
 
-def _points(x: Number) -> str:
+def _points(x: MeanInterval) -> str:
     """A difference in points of percent, with its interval."""
     return f"{100 * x.value:+.1f} points [{100 * x.low:+.1f}, {100 * x.high:+.1f}]"
