@@ -234,7 +234,7 @@ def read_camera(path: Path) -> CameraFile:
     if not (
         np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
     ):
-        raise DataError(f"{path}: rotation_from_world is not a rotation matrix")
+        raise DataError(f"{path}: rotation_from_world is not a rotation")
     if not (place[2] > 0 and rotation[2, 2] < 0):
         raise DataError(
             f"{path}: the camera is {place[2]:g} m high and "
