@@ -89,7 +89,7 @@ def test_a_view_that_does_not_fit_is_named_and_left_out():
     fit = fit_robustly(views, SIZE, False)
     assert len(fit.left_out) == 1
     assert fit.left_out[0].startswith("view view4 left out")
-    np.testing.assert_allclose(fit.parameters, clean.numbers, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(fit.parameters, clean.parameters, rtol=1e-3, atol=1e-3)
 
 
 def test_a_corner_that_does_not_fit_is_left_out_alone():
