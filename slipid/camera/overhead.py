@@ -16,8 +16,9 @@ from jaxtyping import Float
 from pydantic import Field, FiniteFloat
 
 from slipid.camera.opencv import ideal_points, opencv
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content, read_json, write_json
+from slipid.support.files import read_json, write_json
 from slipid.support.toml_file import Section, checked
 
 SCHEMA = "slipid.camera/1"

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import Json, Quiet, emit, guarded
+from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from slipid.camera.calibration.calibrate import CalibratedLens
     from slipid.camera.calibration.place import FloorFit
     from slipid.report.page import Page
-    from slipid.support.files import Content
 
 SIZE_STD = 0.001
 """Relative std of the size of a printed board or a tape [1]."""
@@ -206,7 +206,7 @@ def _write(lens: "CalibratedLens", fit: "FloorFit | None", out: Path, json: str 
     return 1 if report.get("poor") else 0
 
 
-def _show(page: "Page", report: "Content", lens_too: bool = True) -> None:
+def _show(page: "Page", report: Content, lens_too: bool = True) -> None:
     """Print the report of a camera."""
     from slipid.camera.calibration.report import report_lines
 

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import DataFolder, Json, Out, OutFolder, Quiet, emit, for_robots
+from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.report.page import Page
-    from slipid.support.files import Content
 
 
 MOST_BEYOND = 0.05
@@ -49,7 +49,7 @@ def floors(
     return 0 if content["beyond_the_map"] <= MOST_BEYOND else 1
 
 
-def show(page: "Page", content: "Content") -> None:
+def show(page: "Page", content: Content) -> None:
     """Print the share of each run in which each floor was under each wheel."""
     from slipid.report.page import table
 

@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field, FiniteFloat
 
 from slipid.data.floor_map import MOST_CELLS, Colour, FloorMap
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content, read_json, write_json
+from slipid.support.files import read_json, write_json
 from slipid.support.toml_file import Section, checked
 
 SCHEMA = "slipid.map/2"

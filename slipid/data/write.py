@@ -8,7 +8,7 @@ import numpy as np
 from slipid.data.log import Log
 from slipid.data.reading.layout import PER_WHEEL
 from slipid.data.reading.presets import preset
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 OPTIONAL = {
     "voltage": ("V", "%.2f"),

@@ -23,8 +23,9 @@ from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, Validity, build
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space, with_values
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content, checksum, json_text, read_json, write_bytes
+from slipid.support.files import checksum, json_text, read_json, write_bytes
 
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"

@@ -11,7 +11,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.design.proposal import Design
 from slipid.plots import drawing
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 CURVES = (
     ("greedy", drawing.BLUE, "-", "chosen one after another"),

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from slipid.infer.bench.verdict import BenchFit
 from slipid.report.page import Page, percent, table, verdict
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 if TYPE_CHECKING:
     from slipid.app.trust import TrustReport

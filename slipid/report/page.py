@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from slipid.data.check.columns import listed
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 COLOUR = {
     "identified": "green",

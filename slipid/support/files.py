@@ -1,7 +1,4 @@
-"""Plain values, as JSON and TOML files hold them.
-
-Files that are either whole or not there: atomic writes, strict JSON, arrays without pickle.
-"""
+"""Files that are either whole or not there: atomic writes, strict JSON, arrays without pickle."""
 
 import hashlib
 import io
@@ -16,9 +13,6 @@ from typing import Any
 import numpy as np
 
 from slipid.support.errors import DataError
-
-Content = dict[str, Any]
-"""Content of such a file, or of a table in it: numbers, words, lists and tables by name."""
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -10,8 +10,8 @@ from typing import Annotated, Literal, TypeVar, Union, get_args, get_origin, get
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
+from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
-from slipid.support.files import Content
 
 CLOSED = ConfigDict(extra="forbid")
 """Of a dataclass that a config declares: other keys are refused."""

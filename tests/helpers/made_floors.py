@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from slipid.camera.floor.light import to_linear, to_srgb
 
+from slipid.camera.floor.light import to_linear, to_srgb
 from slipid.camera.overhead import Lens, OverheadCamera
 from slipid.data.floor_map import FloorMap, from_polygons
 

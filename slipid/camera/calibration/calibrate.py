@@ -21,8 +21,8 @@ from slipid.camera.calibration.quality import Quality, quality_of
 from slipid.camera.calibration.report import floor_report, lens_report, scale_std, straight_report
 from slipid.camera.calibration.views import not_detected, usable
 from slipid.camera.overhead import Lens, OverheadCamera, read_camera
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 
 
 @dataclass(frozen=True, eq=False)

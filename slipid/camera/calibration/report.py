@@ -9,7 +9,7 @@ from slipid.camera.calibration.lens import NAMES, rms
 from slipid.camera.calibration.place import TWIN_RATIO, FloorFit, PlaceUncertainty, tilt_deg
 from slipid.camera.calibration.quality import Quality
 from slipid.camera.overhead import OverheadCamera
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 POOR_SCALE = 0.005
 POOR_FLOOR_PX = 1.5

@@ -15,8 +15,8 @@ from slipid.camera.floor.region import FloorPicture, FloorRegion
 from slipid.camera.floor.surfaces import UNKNOWN, Surfaces
 from slipid.camera.frames.source import is_picture
 from slipid.data.geojson_map import Patch, VectorMap
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 
 HARDLY, NOT = 5.0, 3.5
 """Difference of looks below which surfaces are hardly, or not, distinguishable [spreads].

@@ -17,8 +17,8 @@ from slipid.camera.tracking.preview import check_drawable, write_preview
 from slipid.camera.tracking.target import Marker, Target
 from slipid.camera.tracking.track import Flag, TrackedPoses, track_of
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.track/1"

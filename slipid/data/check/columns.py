@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float
 from slipid.data.check.joined import JoinedChannel, JoinedRuns
 from slipid.data.log import Log
 from slipid.data.wheel_signals import integral, interpolate, swapped_order
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 
 Severity = Literal["wrong", "suspicious", "note"]
 """Wrong: do not fit before it is put right. Suspicious: look. Note: what could not be checked."""

@@ -14,8 +14,8 @@ from slipid.infer.design.scope import DesignOptions, Scope
 from slipid.infer.result import Fit
 from slipid.infer.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.model.robot import Validity
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
