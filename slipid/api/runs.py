@@ -22,7 +22,7 @@ from slipid.lab.selftest.logs import simulate_logs
 from slipid.model.robot import Robot, motor_current, twist, wheel_torque
 from slipid.report.estimates import show_check
 from slipid.report.page import text_of
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,7 +51,7 @@ def motor(
     """Resistance, back-EMF, friction, inertia and more of a motor, from voltage, current and speed.
 
     Columns that are not named are guessed. Several motors: names by commas. The speed must be that
-    of the motor shaft: no log shows that it was taken behind a gear. With --out it writes
+    of the motor shaft: no log shows that it was columns_used behind a gear. With --out it writes
     motor.json and a picture. Exit code 1 where the model does not explain the log.
     """
     from slipid.app.bench import read_motor_log
@@ -78,7 +78,7 @@ def motor(
             report.stage("drawing")
             write_json(out / "motor.json", content)
             written += [path.name for path in bench_plots(fit, out)]
-    emit(json, content, lambda page: show_bench(page, fit, task.taken), out, written)
+    emit(json, content, lambda page: show_bench(page, fit, task.columns_used), out, written)
     return 0 if fit.good else 1
 
 

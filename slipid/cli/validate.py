@@ -1,13 +1,10 @@
 """`slipid validate`: open-loop prediction of runs."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from slipid.cli.common import DataFolder, Json, OutFolder, Quiet, emit, for_robots
+from slipid.support.content import Content
 from slipid.support.progress import Reporter
-
-if TYPE_CHECKING:
-    from slipid.support.files import Content
 
 
 @for_robots
@@ -21,7 +18,7 @@ def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet =
     return 0
 
 
-def run(out: Path, data: Path, report: Reporter) -> "Content":
+def run(out: Path, data: Path, report: Reporter) -> Content:
     """Content of the validation file, and pictures; arguments as of `job.validate.validate`."""
     from slipid.app.compare import validate
     from slipid.plots.fit import validate_plots

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from slipid.plots import drawing
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 TIED = "#cfe3f1"
 SHOWN = {

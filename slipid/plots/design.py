@@ -11,7 +11,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.design.proposal import Design
 from slipid.plots import drawing
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 CURVES = (
     ("greedy", drawing.BLUE, "-", "chosen one after another"),
@@ -22,20 +22,20 @@ CURVES = (
 
 def design_figure(found: Design) -> Figure:
     """Proposed runs by floor and load on what was driven (left), uncertainty by runs (right)."""
-    setups = list(dict.fromkeys((d.surface, d.load) for d in found.drives))
+    setups = list(dict.fromkeys((d.surface, d.load) for d in found.runs))
     columns = min(len(setups), 2 if len(setups) < 5 else 3)
     rows = math.ceil(len(setups) / columns)
     made = drawing.figure(3.6 * columns + 5.6, max(3.7 * rows, 4.4) + 0.8, _title(found))
     halves = made.subfigures(1, 2, width_ratios=(3.6 * columns, 5.4), squeeze=False)
     left, right = halves[0]
     axes = list(left.subplots(rows, columns, squeeze=False).flat)
-    order = {d: k for k, d in reversed(list(enumerate(found.drives, 1)))}
+    order = {d: k for k, d in reversed(list(enumerate(found.runs, 1)))}
     for ax, setup in zip(axes, setups, strict=False):
-        mine = Counter(d for d in found.drives if (d.surface, d.load) == setup)
+        mine = Counter(d for d in found.runs if (d.surface, d.load) == setup)
         _commands(ax, found, setup, mine, order)
     for spare in axes[len(setups) :]:
         spare.remove()
-    words = "numbers: in which order (x3: three times)\nbent or round arrows: turning as it drives"
+    words = "numbers: in which order (x3: three times)\nbent or round arrows: turning as it runs"
     left.supxlabel(f"{words}\ngray dots: driven already", fontsize=9, color=drawing.SHADE)
     _falling(right.subplots(), found.content["runs_saved"]["paper_grid"])
     return made
@@ -46,7 +46,7 @@ def _title(found: Design) -> str:
     names = [g["name"] for g in goals[:2]] + ["..."] * (len(goals) > 2)
     last = found.content["runs"][-1]["expected"]
     kept = math.sqrt(found.content["criterion"][-1])
-    head = f"Drive these {len(found.drives)} runs next to know more of {', '.join(names)}\n"
+    head = f"Drive these {len(found.runs)} runs next to know more of {', '.join(names)}\n"
     if len(goals) > 1:
         return head + f"uncertainty falls to {kept:.0%} of what it is now"
     g = goals[0]
@@ -63,7 +63,7 @@ def _commands(
 ) -> None:
     """Commanded velocities of one floor and load."""
     floor, load = setup
-    seen = found.seen[floor]
+    seen = found.validity[floor]
     reach = 1.4 * max(d.speed or abs(d.turn) * found.base_radius for d in mine)
     if load in seen.loads:
         angle = np.radians(seen.headings_deg)

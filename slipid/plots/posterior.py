@@ -24,7 +24,7 @@ def interval_figure(found: Posterior) -> Figure:
     """90 % intervals of draws and of the fit's curvature, in prior standard deviations."""
     fit, z = found.fit, found.flat
     chosen = np.flatnonzero(fit.space.where(lambda e: e.session is None)).tolist()
-    mean, std = fit.judged.prior_mean[chosen], fit.judged.prior_std[chosen]
+    mean, std = fit.verdict_space.prior_mean[chosen], fit.verdict_space.prior_std[chosen]
     low, middle, high = (np.quantile(z[:, chosen], (0.05, 0.5, 0.95), axis=0) - mean) / std
     half = 1.645 * np.sqrt(np.diag(fit.covariance))[chosen] / std
     fitted = (fit.z[chosen] - mean) / std
@@ -132,6 +132,6 @@ def _panel(ax: Axes, p: Profile) -> None:
         ax.set_xscale("log")
     unit = "" if p.unit == "1" else f" [{p.unit}]"
     ax.set_xlabel(f"{p.path}{unit}")
-    head, _, rest = p.said.partition(": ")
+    head, _, rest = p.sentence.partition(": ")
     given = f"\ngiven {p.given}" if p.given else ""
     ax.set_title(f"{head}\n{rest}{given}", fontsize=10)

@@ -21,8 +21,8 @@ from slipid.predict.score import setups
 from slipid.predict.slip_models import slip_models
 from slipid.predict.validation import ScoredRun, add_scores, plain_values
 from slipid.search_space import Choice, Space
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 
 Fold = Int[np.ndarray, " run"]
 

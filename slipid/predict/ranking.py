@@ -21,8 +21,8 @@ from slipid.predict.score import Score, clusters, main_load, mean_error
 from slipid.predict.slip_model import body_twist
 from slipid.predict.validation import ScoredRun, by_floor, finite
 from slipid.search_space import Choice
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from slipid.predict import open_loop as replay
 from slipid.predict.predictive import ForceBalance
 from slipid.predict.score import Score, chords, lengths, scores, setups
 from slipid.predict.slip_models import FloorModels
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from slipid.report.page import Page, table
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 if TYPE_CHECKING:
     from slipid.deploy.export import Exported

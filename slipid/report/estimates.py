@@ -12,7 +12,7 @@ from rich.text import Text
 
 from slipid.infer.bench.verdict import BenchFit
 from slipid.report.page import Page, percent, table, verdict
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 if TYPE_CHECKING:
     from slipid.app.trust import TrustReport
@@ -87,7 +87,7 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
     if fit.derived:
         page.table(estimates(fit.derived.values(), "\nknown as ratios, or not even so"))
     for profile in profiles:
-        page.line(f"profile: {profile.said}")
+        page.line(f"profile: {profile.sentence}")
     page.notes(fit.messages)
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
 

@@ -69,7 +69,7 @@ def test_a_comparison_ranks_every_model_on_left_out_runs(fit):
 @pytest.mark.slow
 def test_a_proposal_has_the_runs_that_were_asked_for(fit):
     proposal = fit.design("surface.soft.creep", runs=2)
-    assert len(proposal.drives) == 2
+    assert len(proposal.runs) == 2
     assert str(proposal).startswith("run,floor,load,vx_m_s")
     assert proposal.plot().axes
     with pytest.raises(sl.DataError, match="matches no parameter"):

@@ -114,7 +114,7 @@ def test_every_field_has_a_unit():
     plain = {f.name for s in code("contact").structs for f in s.fields if f.comment.endswith("[1]")}
     assert plain == {
         *("floors_belief", "floors_expected", "place_toward", "begun", "slip"),
-        *("surface_probability", "believed_probability", "stale", "immobilised", "out_of_range"),
+        *("surface_probability", "stale", "immobilised", "out_of_range"),
     }
 
 

@@ -378,7 +378,7 @@ def test_a_refit_that_dies_while_it_is_written_never_leaves_parts_of_two(
         else:
             save(new, tmp_path)
     if writes == 2:  # identified.json is still the old one's
-        with pytest.raises(DataError, match="of another fit than"):
+        with pytest.raises(DataError, match="belongs to another fit than"):
             load(tmp_path)
         (tmp_path / "identified.json").unlink()
     back, left = load(tmp_path), new if writes >= 2 else old

@@ -121,7 +121,8 @@ def test_another_robot_and_other_settings_step_without_compiling(robots, kind):
         steps(kind(one, OTHER))
     assert found == []
     assert not any(np.allclose(before[-1], said[-1]) for said in after)
-    assert not np.allclose(after[1][-1], after[2][-1])
+    if kind is Estimator:  # odometry from wheel angles alone has no use for these settings
+        assert not np.allclose(after[1][-1], after[2][-1])
 
 
 def test_another_robot_and_other_settings_run_a_log_without_compiling(robots):
@@ -143,7 +144,7 @@ def test_another_robot_other_gains_and_limits_are_controlled_without_compiling(r
         return np.asarray(commanded(controller, controller.init(), REFERENCE, estimate, 0.05)[1])
 
     before = step(Controller(one, Gains()))
-    gains = Gains.at((2.0, 1.0, 0.1, 0.5, 0.2, 0.1))
+    gains = Gains.at((2.0, 1.0, 0.1, 0.2, 0.1))
     with compilations() as found:
         after = [
             step(Controller(two)),

@@ -516,7 +516,7 @@ def test_the_observer_takes_a_constant_disturbance_out():
 
 def test_the_integral_asks_for_no_more_than_it_may_however_long_a_robot_is_off():
     f = robot()
-    con = Controller(f, Gains.at((0.0, 0.0, 1.0, 0.0, 0.0, 0.0)))
+    con = Controller(f, Gains.at((0.0, 0.0, 1.0, 0.0, 0.0)))
     step = jax.jit(lambda s, e: con.step(s, jnp.array([0.3, -0.1, 0.0, 0.0, 0.0, 0.0]), e, DT))
     state = con.init()
     for _ in range(40):

@@ -16,7 +16,8 @@ from slipid.infer.fit_file import SCHEMA, number_json
 from slipid.infer.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
 from slipid.infer.verdicts.wording import VOLTAGE
-from slipid.support.files import Content, hash_of
+from slipid.support.content import Content
+from slipid.support.files import hash_of
 
 BINS = 8
 """Of about as many windows."""

@@ -18,9 +18,10 @@ from slipid.lab.benchmark.summary import RowSummary, summary
 from slipid.lab.benchmark.tuning import reading
 from slipid.lab.benchmark.work import OWN_MAP, QUICK_KIND, BenchmarkOptions, FoldTask, data_of
 from slipid.support.checkpoint import versions
+from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
 from slipid.support.executor import results
-from slipid.support.files import Content, writable, write_json
+from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 

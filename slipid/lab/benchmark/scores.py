@@ -23,7 +23,7 @@ from slipid.predict.slip_model import (
     path_of,
     relative_to_start,
 )
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 SLIPS = 0.2
 """A robot slips where its twist is off that of its wheels by more than this part of the latter."""

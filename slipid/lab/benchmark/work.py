@@ -21,7 +21,7 @@ from slipid.lab.systems.motion.features import common
 from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, SlipModel
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
-from slipid.support.files import Content
+from slipid.support.content import Content
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 

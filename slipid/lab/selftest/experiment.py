@@ -21,8 +21,9 @@ from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_lo
 from slipid.lab.selftest.replicates import NumberRecovery, Replicate
 from slipid.model.robot import build
 from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content, writable, write_json
+from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 

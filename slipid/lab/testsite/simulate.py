@@ -23,9 +23,10 @@ from slipid.lab.testsite.driving import SiteRun, Trace, drive
 from slipid.lab.testsite.plant import engine
 from slipid.lab.testsite.site import Site, SiteCamera
 from slipid.lab.testsite.studio import Studio, film
+from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.executor import InProcess, Processes, results
-from slipid.support.files import Content, read_json, write_arrays, write_bytes, write_json
+from slipid.support.files import read_json, write_arrays, write_bytes, write_json
 from slipid.support.progress import Reporter
 
 

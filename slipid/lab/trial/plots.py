@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from slipid.data.floor_map import FloorMap
 from slipid.plots.drawing import INK, SHADE, figure, plain, save
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 Paths = Mapping[str, np.ndarray]
 TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")

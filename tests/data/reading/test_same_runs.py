@@ -85,7 +85,7 @@ def bag(root, storage):
     motors = bags.joint_states("/motors", AMPS, JOINTS, effort=amps(AMPS))
     kind = "geometry_msgs/msg/PoseStamped"
     poses = [
-        bags.Said("/mocap", kind, bags.pose_fields(kind, float(t), *pose(t).tolist()), float(t))
+        bags.Message("/mocap", kind, bags.pose_fields(kind, float(t), *pose(t).tolist()), float(t))
         for t in POSES
     ]
     path = root / f"run{bags.SUFFIX[storage]}"

@@ -88,10 +88,10 @@ def test_turning_counts_with_the_way_of_the_wheels():
     """A yaw rate is a speed at the base radius beside those ahead and sideways."""
     rolling = straight(0.0) + np.array([0.0, 0.0, 0.4])
     run = made_run(rolling, rolling - np.array([0.0, 0.0, 0.3]))
-    one = judged(run, said(run, run.heard.rolling(ROBOTINO)), ROBOTINO, "chord")
+    one = scored(run, said(run, run.signals.rolling(ROBOTINO)), ROBOTINO, "chord")
     assert one.twist_error == pytest.approx(0.3 * ROBOTINO.base_radius, rel=1e-6)
     assert not any(one.slips)  # 0.0375 m/s are less than a fifth of the speed, 0.3 would be more
-    other = judged(run, said(run, run.twist), ROBOTINO, "chord")
+    other = scored(run, said(run, run.twist), ROBOTINO, "chord")
     rim = np.hypot(0.2, 0.4 * ROBOTINO.base_radius)
     assert other.scores == pytest.approx([0.3 * ROBOTINO.base_radius / rim] * 8, abs=1e-4)
 

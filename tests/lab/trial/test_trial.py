@@ -61,6 +61,15 @@ def test_the_rectangle_is_that_of_the_paper_and_stops_at_its_corners():
     assert np.hypot(rows[:, 3], rows[:, 4]).max() <= 0.2 + 1e-9
 
 
+def test_a_way_too_short_for_its_speed_is_half_speeding_up_and_half_braking():
+    path = reference.waypoints([(0.0, 0.0), (0.02, 0.0)], speed=0.5, acceleration=0.5, pause=0.1)
+    place, rate = np.asarray(path.rows)[:, [0, 3]].T
+    assert rate.max() == pytest.approx(0.1, rel=1e-6)  # the root of 0.02 * 0.5
+    assert np.abs(np.diff(rate)).max() <= 0.5 * reference.STEP + 1e-12
+    np.testing.assert_allclose(np.diff(place)[:-1], (rate[:-1] + rate[1:])[:-1] * 0.01, atol=1e-9)
+    np.testing.assert_allclose([place[-1], rate[-1]], [0.02, 0.0], atol=1e-12)
+
+
 @pytest.mark.parametrize("name", reference.PATHS)
 @pytest.mark.parametrize("speed", [0.1, 0.2])
 def test_paths_have_the_rates_of_their_places_and_rest_where_they_began(name, speed):

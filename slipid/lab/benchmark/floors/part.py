@@ -28,7 +28,8 @@ from slipid.lab.systems.floors.gaussian import GaussianClassifier
 from slipid.lab.systems.floors.interface import FloorClassifier
 from slipid.predict.slip_model import RobotSpec
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
-from slipid.support.files import Content, hash_of
+from slipid.support.content import Content
+from slipid.support.files import hash_of
 from slipid.support.jax_setup import setup_jax
 
 FOLDER = "borealtc"
