@@ -11,7 +11,7 @@ import pytest
 
 from slipid.fit import shared_effects as shared
 from slipid.robot.estimator import Estimator
-from slipid.robot.filter.effects import FORGETS, EffectTable, RolledMotion
+from slipid.robot.filter.effects import FORGETS, EffectLookup, RolledMotion
 from slipid.robot.interface import Measurement, Settings
 from tests.helpers.small_twin import deployed
 from tests.helpers.stepped import stepped
@@ -26,7 +26,7 @@ def table():
     rows = np.zeros((2, 3, 8, 6))
     rows[1, :, :, 0] = 0.01 * np.arange(8)
     rows[..., 3:] = np.array([0.3, 0.5, 0.7])[:, None, None]
-    return EffectTable(jnp.log(jnp.asarray(SPEEDS)), jnp.asarray(rows))
+    return EffectLookup(jnp.log(jnp.asarray(SPEEDS)), jnp.asarray(rows))
 
 
 def at(angle, speed, turn=0.0):
@@ -71,7 +71,7 @@ def driven(told, hypothesis):
     if told:
         rows = jnp.concatenate([MISSED, PARTS], axis=1)[:, None, None]
         robot = eqx.tree_at(
-            lambda r: r.effect_table, robot, EffectTable(jnp.log(jnp.asarray([0.2])), rows)
+            lambda r: r.effect_table, robot, EffectLookup(jnp.log(jnp.asarray([0.2])), rows)
         )
     watched = Estimator(robot, Settings(patch_m=1e9))
     run = partial(stepped(watched), dt=DT)

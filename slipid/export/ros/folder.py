@@ -15,7 +15,6 @@ from slipid.export.description import (
     header,
     in_markdown,
     number_rows,
-    verdict_markdown,
 )
 from slipid.export.ros import localization, node
 from slipid.export.ros import localization as noise
@@ -158,8 +157,8 @@ def _numbers(folder: ReadmeContent) -> Iterator[str]:
     lines = []
     for row in number_rows(folder.robot):
         number = (short(row.value), row.unit, interval(row.interval90))
-        known = (*number, verdict_markdown(row.verdict), row.provenance)
-        lines.append((f"`{row.path}`", row.entry, row.about, *known))
+        known = (*number, row.verdict_markdown, row.provenance)
+        lines.append((f"`{row.name}`", row.entry, row.about, *known))
     head = ("robot.json", "", "", "value", "unit", "90 % interval", "verdict", "provenance")
     yield from ("", *table(head, lines), "", "What the verdicts mean:", "")
     yield from (f"- *{v.replace('_', ' ')}*: {text}." for v, text in VERDICTS.items())
