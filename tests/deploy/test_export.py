@@ -187,7 +187,7 @@ def test_a_robot_is_found_in_a_folder_or_a_file_with_some_of_its_floors(tmp_path
         (ExportOptions(speed=9.0), "speed 9 m/s"),
     ],
 )
-def test_what_cannot_be_exported_is_said_before_anything_is_written(tmp_path, wish, said):
+def test_invalid_options_are_refused_before_anything_is_written(tmp_path, wish, said):
     with pytest.raises(DataError, match=said):
         export(ROBOT, tmp_path / "out", wish, QUIET)
     assert not (tmp_path / "out").exists()
