@@ -187,10 +187,11 @@ _DRIFT = (
     "Columns two and three are those of the drive controller, which ignores slip: they include the "
     "slip of the wheels by the identified contact model and the errors of that model. The last "
     "column is that of an estimator that knows slip and floor. Velocities are at {speed} m/s, the "
-    "highest rim speed of the fitted runs, with one message every {period} s. Every message carries "
-    "the same numbers, while the true uncertainty grows with the path: `pose` is right about {way} m "
-    "after the pose was last corrected, and too small beyond. Slip and effects are not noise: they "
-    "push in the same direction over metres, which no covariance in a message can express."
+    "highest rim speed of the fitted runs, with one message every {period} s. Every message has "
+    "the same numbers, while the true uncertainty grows with the path: `pose` is right about "
+    "{way} m after the pose was last corrected, and too small beyond. Slip and effects are not "
+    "noise: they push in the same direction over metres, which no covariance in a message can "
+    "express."
 )
 _ONLY = (
     "`slipid.yaml` has the numbers of the robot, not how they hang together: draws of the "
@@ -277,7 +278,7 @@ def _covariances(
         f"(effect^2 + slip^2) d^2 + process^2 d, the larger of along and across for x and y, and "
         f"with what the heading's error carries sideways. Effect {own}, slip {slip} (along, across "
         f"[m/m], yaw [rad/m]), process {', '.join(map(short, e.process))} (per sqrt(m)). They are "
-        f"constant here while true ones grow with the path; wheels do not measure z, roll and pitch."
+        f"constant here while true ones grow with the path; wheels measure no z, roll and pitch."
     )
     twist = (
         f"Variances of velocities [m^2/s^2, rad^2/s^2]: (effect^2 + slip^2) v^2 + process^2 v / T "

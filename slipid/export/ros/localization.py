@@ -173,9 +173,9 @@ def process_noise(robot: DeployedRobot, errs: OdometryErrors) -> Parameter:
     matrix, most = np.diag(_diagonal(robot, errs)), float(Limits().acceleration)
     about = (
         f"On '{errs.floor}'. Pose: errors that stay the same over the path, and so are no noise "
-        f"of single velocities, as a random walk with the same error after {short(DISTANCE_M)} m, at "
-        f"the highest speed of the fitted runs, {short(top_speed(robot))} m/s. Velocity: the change that "
-        f"the limit of wheel acceleration, {short(most)} rad/s^2, allows within "
+        f"of single velocities, as a random walk with the same error after {short(DISTANCE_M)} m, "
+        f"at the highest speed of the fitted runs, {short(top_speed(robot))} m/s. Velocity: the "
+        f"change that the limit of wheel acceleration, {short(most)} rad/s^2, allows within "
         f"{short(PERIOD_S)} s. Accelerations: the package's default. two_d_mode holds the rest."
     )
     entries = tuple(float(x) for x in matrix.reshape(-1))
