@@ -1,4 +1,4 @@
-"""What an overhead camera saw: poses from a video."""
+"""Track a robot in the video of an overhead camera."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,20 +20,22 @@ def track(
     times: Path | str | None = None,
     quiet: bool = False,
 ) -> Tracked:
-    """Poses of a robot with a marker, in every frame of a video or of a folder of pictures.
+    """Return poses of a robot with a marker, in every frame of a video or of a folder of pictures.
 
     `tracked.tracks[0].pose` has x, y [m] and heading [rad], NaN where the flag says why there is
-    none; `tracked.write(path)` writes the file that the layout `tracked` reads beside a log.
+    none;
+    `tracked.write(path)` writes the file that the layout `tracked` reads beside a log.
 
     Args:
+        video: file of a video, or folder of pictures.
         camera: calibrated and with its place above the floor, or its file.
         marker: in the middle of the robot; or the file that places several, boards or robots.
         fps: frames per second where the video has no times.
         times: CSV file of frame and time, instead.
-        quiet: no progress.
+        quiet: show no progress.
 
     Raises:
-        DataError: what cannot be read, no marker, or frames of another size than calibrated.
+        DataError: unreadable files, no marker, or frames of another size than calibrated.
     """
     above = camera if isinstance(camera, OverheadCamera) else OverheadCamera.load(camera)
     source = open_source(str(video), fps, None if times is None else Path(times))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from slipid.report.page import Page
 
 SIZE_STD = 0.001
-"""How well a printed board or a tape is known, relative."""
+"""Relative standard deviation of a printed board or a tape measure."""
 
 
 @guarded
@@ -39,10 +39,10 @@ def calibrate(
         float | None, typer.Option(metavar="M", help="Edge of a marker, in m.")
     ] = None,
     dictionary: Annotated[
-        str, typer.Option(metavar="NAME", help="Of the board's markers.")
+        str, typer.Option(metavar="NAME", help="ArUco dictionary of the board.")
     ] = "4X4_50",
     legacy: Annotated[
-        bool, typer.Option("--legacy", help="The board is of OpenCV before 4.6.")
+        bool, typer.Option("--legacy", help="The board was drawn by OpenCV before 4.6.")
     ] = False,
     k3: Annotated[
         bool, typer.Option("--k3", help="Also k3, for wide lenses whose error stays large.")
@@ -51,41 +51,46 @@ def calibrate(
         Path | None, typer.Option(metavar="FILE", help="Camera file with a known lens.")
     ] = None,
     floor: Annotated[
-        Path | None, typer.Option(metavar="PICTURE", help="Of the board lying on the floor.")
+        Path | None,
+        typer.Option(metavar="PICTURE", help="Picture of the board lying on the floor."),
     ] = None,
     board_height: Annotated[
-        float, typer.Option(metavar="M", help="Of the lying board's face above the floor, in m.")
+        float, typer.Option(metavar="M", help="Height of the board's face above the floor, in m.")
     ] = 0.0,
     points: Annotated[
         Path | None, typer.Option(metavar="CSV", help="Measured points: u, v, x, y and maybe z.")
     ] = None,
     size_std: Annotated[
         float | None,
-        typer.Option(metavar="PART", help="How well board or tape are known; 0.001 by default."),
+        typer.Option(metavar="PART", help="Relative error of board or tape; 0.001 by default."),
     ] = None,
     metres_per_pixel: Annotated[
-        float | None, typer.Option(metavar="M", help="On the floor, without any calibration.")
+        float | None, typer.Option(metavar="M", help="Scale on the floor, without any calibration.")
     ] = None,
     lens_height: Annotated[
-        float | None, typer.Option(metavar="M", help="Of the lens, with --metres-per-pixel.")
+        float | None, typer.Option(metavar="M", help="Height of the lens, with --metres-per-pixel.")
     ] = None,
     turn: Annotated[
         float | None,
-        typer.Option(metavar="DEG", help="Of the world's x and y, with --metres-per-pixel."),
+        typer.Option(metavar="DEG", help="Turn of the world's axes, with --metres-per-pixel."),
     ] = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """An overhead camera from ChArUco pictures: its lens, and its place above the floor.
+    """Calibrate an overhead camera from ChArUco pictures: its lens, and its place above the floor.
 
     The lens comes from PICTURE... or --camera, the floor from --floor or --points. The world's
-    origin is on the floor below the middle of the lying board, x along its columns, y up its rows,
-    z up; or as the points say. Without any calibration, --metres-per-pixel and --lens-height make
-    a camera that looks straight down: origin in the middle of the picture, x right, y up.
+    origin
+    is on the floor below the middle of the lying board, x along its columns, y up its rows, z up;
+    or as
+    the points say. Without any calibration, --metres-per-pixel and --lens-height make a camera that
+    looks straight down: origin in the middle of the picture, x right, y up.
 
     What lies h above the floor, seen from a height H, appears H / (H - h) times as far from the
-    point below the lens as it is: with H = 2.4 m and h = 0.25 m lengths read on the floor would be
-    11.6 % too long. Calibrate on the floor, and give a marker's height where it is read.
+    point
+    below the lens as it is: with H = 2.4 m and h = 0.25 m lengths read on the floor would be 11.6 %
+    too
+    long. Calibrate on the floor, and give a marker's height where it is read.
 
     Exit code 1 where the camera is poor but usable: the file is written, and says why.
     """
@@ -94,8 +99,8 @@ def calibrate(
     if any(value is not None for value in told):
         if any((board, camera, floor, points)) or len(words) != 1:
             raise DataError(
-                "--metres-per-pixel, --lens-height and --turn are without any calibration; "
-                "expected a single picture beside them, and no board, camera, floor or points"
+                "--metres-per-pixel, --lens-height and --turn replace a calibration; expected a "
+                "single picture beside them, and no board, camera, floor or points"
             )
         return _uncalibrated(Path(words[0]), told, size_std, out, json)
     _refuse_combinations(words, camera, floor, points)
@@ -113,16 +118,17 @@ def calibrate(
 def _refuse_combinations(
     words: list[str], camera: Path | None, floor: Path | None, points: Path | None
 ) -> None:
-    """Refuse options that do not go together."""
+    """Raise `DataError` for options that exclude each other."""
     if bool(words) == (camera is not None):
         raise DataError("expected either pictures of a board, or --camera FILE with a known lens")
     if floor is not None and points is not None:
-        raise DataError("--floor and --points; expected one of them: each tells the whole place")
+        raise DataError("--floor and --points; expected one of them: each gives the whole place")
     if camera is not None and floor is None and points is None:
         raise DataError(f"--camera {camera} alone; expected --floor PICTURE or --points CSV too")
 
 
 def _positive(option: str, value: float | None) -> float:
+    """Return a number above 0; raise `DataError` naming the option otherwise."""
     if value is None or not 0 < value < math.inf:
         found = "is missing" if value is None else f"{value:g}"
         raise DataError(f"{option} {found}; expected a number above 0")
@@ -178,7 +184,7 @@ def _uncalibrated(
     out: Path,
     json: str | None,
 ) -> int:
-    """A camera straight above the floor, without a calibration."""
+    """Write a camera that looks straight down, without a calibration."""
     from slipid.camera.calibration.calibrate import told as camera_told
 
     per_pixel = _positive("--metres-per-pixel", told[0])
@@ -192,7 +198,7 @@ def _uncalibrated(
 
 
 def _write(lens: "LensFound", place: "FloorFound | None", out: Path, json: str | None) -> int:
-    """Write the camera and its pictures, and say what was found."""
+    """Write the camera and its pictures, print the result and return the exit code."""
     from slipid.camera.calibration.calibrate import save_lens
     from slipid.plots.calibration import coverage_picture, floor_picture
     from slipid.support.files import read_json
@@ -215,7 +221,7 @@ def _write(lens: "LensFound", place: "FloorFound | None", out: Path, json: str |
 
 
 def _show(page: "Page", report: Content, lens_too: bool = True) -> None:
-    """Print what was found, and what is not as it should be."""
+    """Print the calibration and its warnings."""
     from slipid.camera.calibration.report import described
 
     for line in described(report, lens_too):

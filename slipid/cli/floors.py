@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 MOST_BEYOND = 0.05
-"""Part of the rows in which wheels may be beyond the map."""
+"""Largest share of wheel places beyond the map at exit code 0."""
 
 
 @for_robots
@@ -32,7 +32,7 @@ def floors(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Which floor was under each wheel in logged runs, and how far its border was.
+    """Say which floor was under each wheel in logged runs, and how far its border was.
 
     Poses are corrected by the camera of the fit. Writes a CSV file for each run. Exit code 1 where
     wheels are often beyond the map.
@@ -50,7 +50,7 @@ def floors(
 
 
 def show(page: "Page", content: Content) -> None:
-    """Print how much of each run every floor was under every wheel."""
+    """Print the share of each run that every wheel spent on every floor."""
     from slipid.report.page import table
 
     shares = table(("run", *content["surfaces"]), "percent of the time under wheel 1, 2, ...")

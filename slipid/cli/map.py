@@ -1,4 +1,4 @@
-"""`slipid map`: which surface lies where, from a picture from above."""
+"""`slipid map`: a floor map from a picture taken from above."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -38,19 +38,23 @@ def map_(
         str, typer.Option(metavar="NAME", help="ArUco dictionary of the robot's marker.")
     ] = "4X4_50",
     robot_radius: Annotated[
-        float, typer.Option(metavar="M", min=0, max=10, help="Around the marker; is masked.")
+        float,
+        typer.Option(metavar="M", min=0, max=10, help="Radius around the marker that is masked."),
     ] = 0.2,
     marker_height: Annotated[
-        float, typer.Option(metavar="M", min=0, max=10, help="Of the marker above the floor.")
+        float,
+        typer.Option(metavar="M", min=0, max=10, help="Height of the marker above the floor."),
     ] = 0.25,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    r"""Map of the floor from one picture from above: patches of surfaces; needs slipid\[camera].
+    r"""Map the floor from one picture from above as patches of surfaces; needs slipid\[camera].
 
-    Without a config it proposes surfaces and writes a palette.toml to rename them in and to run
-    again with. Writes map.geojson, which every option for a map takes, and a picture to check it.
-    Exit code 1 where the map is poor.
+    Without a config it proposes surfaces and writes a palette.toml, to rename them in and to run
+    again
+    with. Writes map.geojson, which every option for a map takes, and a picture to check it. Exit
+    code 1
+    where the map is poor.
     """
     from slipid.camera.floor.grid import Robot
     from slipid.camera.floor.picture import Wish, map_of
@@ -82,7 +86,7 @@ def map_(
 
 
 def show(page: "Page", found: "FoundMap", out: Path) -> None:
-    """Print the surfaces, what is doubtful, and what to do next."""
+    """Print the surfaces, the warnings, and what to do next."""
     from slipid.report.page import table
 
     content = found.to_json()
@@ -94,7 +98,7 @@ def show(page: "Page", found: "FoundMap", out: Path) -> None:
         rows.add_row(one["surface"], one["colour"], str(one["patches"]), area, share, sure)
     page.table(rows)
     page.line(
-        "confidence: by how many spreads the next best surface explains the least sure patch worse"
+        "confidence: how many spreads worse the next best surface fits the least certain patch"
     )
     for robot in found.robots:
         page.line(

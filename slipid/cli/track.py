@@ -1,4 +1,4 @@
-"""`slipid track`: poses from a video."""
+"""`slipid track`: robot poses from a video."""
 
 import math
 from pathlib import Path
@@ -30,10 +30,10 @@ def track(
         float | None, typer.Option(metavar="M", help="Edge of the marker's black square, in m.")
     ] = None,
     marker_height: Annotated[
-        float | None, typer.Option(metavar="M", help="Of the marker above the floor, in m.")
+        float | None, typer.Option(metavar="M", help="Height of the marker above the floor, in m.")
     ] = None,
     marker_yaw: Annotated[
-        float, typer.Option(metavar="DEG", help="Of its top edge, counter-clockwise from ahead.")
+        float, typer.Option(metavar="DEG", help="Heading of its top edge, counter-clockwise.")
     ] = 0.0,
     dictionary: Annotated[
         str, typer.Option(metavar="NAME", help="Dictionary of the marker.")
@@ -61,12 +61,13 @@ def track(
         Path | None, typer.Option(metavar="FILE", help="Also draw one frame, to check by eye.")
     ] = None,
     preview_frame: Annotated[
-        int | None, typer.Option(metavar="N", min=0, help="Which; by default the first seen.")
+        int | None,
+        typer.Option(metavar="N", min=0, help="Its number; by default the first with a marker."),
     ] = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Poses of a robot with a marker, from the video of a calibrated camera above it.
+    """Track a robot with a marker in the video of a calibrated camera above it.
 
     Every frame has a row with pose and covariance, or with the reason why it has none; nothing is
     filled. Exit code 1 where the poses should not be used as they are.
@@ -112,7 +113,7 @@ def track(
 
 
 def _region(text: str | None) -> "Region | None":
-    """A part of the picture from four numbers; DataError where they are none."""
+    """Return a region of the picture from four numbers in a text."""
     from slipid.camera.tracking.finder import Region
     from slipid.support.errors import DataError
 
