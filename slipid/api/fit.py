@@ -43,8 +43,7 @@ def fit(
     """Fit motors, floors, wheel loads and camera to runs, end to end.
 
     Names of numbers are paths such as `motor.resistance` or `surface.gray.creep`; `*` and `?` stand
-    for
-    any text. Numbers that are not named keep their declared prior or value.
+    for any text. Numbers that are not named keep their declared prior or value.
 
     Args:
         runs: runs from `read_runs`, each on one floor.

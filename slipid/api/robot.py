@@ -93,7 +93,9 @@ def drive(
     row, begin = ROWS[controller], places[start]
     plant = twin_plant(robot, floor, begin, seed, actuator_model_of(robot, gyro=row.gyro))
     loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
-    driven = closed_loop.run_closed_loop(loop, reference.moved(begin).waiting(REST_S), plant, begin)
+    driven = closed_loop.run_closed_loop(
+        loop, reference.moved(begin).after_rest(REST_S), plant, begin
+    )
     return DriveResult(driven, floor, closed_loop.path_metrics(driven))
 
 
@@ -114,8 +116,7 @@ def export(
             out.
         folder: that is new, empty, or an older export, which is then replaced.
         to: `c` (C99 of the very steps of estimator and controller), `ros2` (parameters by the names
-            of
-            ros2_controllers and robot_localization), `stablehlo`, `table` (Markdown and CSV).
+            of ros2_controllers and robot_localization), `stablehlo`, `table` (Markdown and CSV).
         controller: a controller of `slipid trial`.
         path: path that the example in C follows.
         speed: speed along it [m/s].

@@ -90,8 +90,7 @@ def simulate_runs(
 
     Args:
         floors: names of the floors; `firm` and `soft` have numbers of their own, others the
-            declared
-            ones.
+            declared ones.
         headings: number of headings, evenly spread, on every floor at every speed.
         speeds: speeds [m/s].
         turns: number of curved runs beside them, at every speed.

@@ -31,11 +31,9 @@ def benchmark(
     The folder of --data has the folders of the public data sets: robotino2022, robotino2021,
     drive_skid, borealtc; absent ones are skipped. Recorded runs of the virtual test site are always
     included. It takes about 17 minutes on two cores, --quick about two, and three the first time.
-    Rows
-    are published systems by name, such as ojeda_gyro or quann_slip; a wrong name lists all of them.
-    Writes benchmark.json and benchmark.html. An interrupted benchmark is continued from what is
-    done.
-    The exit code is 1 where anything failed.
+    Rows are published systems by name, such as ojeda_gyro or quann_slip; a wrong name lists all of
+    them. Writes benchmark.json and benchmark.html. An interrupted benchmark is continued from what
+    is done. The exit code is 1 where anything failed.
     """
     from slipid.lab.benchmark.benchmark import benchmark as run
     from slipid.lab.benchmark.plots import benchmark_pictures

@@ -109,8 +109,7 @@ def emit(
     """Print a result for people with the files written to `out`; write JSON where `--json` says so.
 
     The JSON goes to a file, which is written whole or not at all, or for `-` to stdout, which then
-    has
-    nothing else.
+    has nothing else.
     """
     from slipid.report.page import Page
     from slipid.support.files import json_text, write_json

@@ -22,8 +22,7 @@ def compare(
     """Say which slip model is right for each floor, or that the data cannot decide it.
 
     Every model is fitted without some runs and judged on them. Writes comparison.json and a
-    picture;
-    finished folds are kept and not fitted again.
+    picture; finished folds are kept and not fitted again.
     """
     from slipid.app.compare import compare as run
     from slipid.plots.compare import compare_plot

@@ -47,8 +47,7 @@ def export(
     """Write robot.json and its exported forms to a folder: C99, ROS 2, StableHLO, tables of gains.
 
     The folder has a README, and the checksum of every file. With --check nothing is written, and
-    exit
-    code 2 says that a byte was changed.
+    exit code 2 says that a byte was changed.
     """
     from slipid.deploy.export import ExportOptions, robot_at
     from slipid.deploy.export import export as run

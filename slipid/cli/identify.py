@@ -35,8 +35,7 @@ def identify(
     """Fit motors, floors, loads and camera to the logs, end to end.
 
     Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt. Exit code
-    1
-    where it did not converge, or predicts worse than the encoders.
+    1 where it did not converge, or predicts worse than the encoders.
     """
     from slipid.app.config import BenchMotors, read_config
     from slipid.report.estimates import show_fit, show_trust

@@ -52,10 +52,8 @@ def motor(
     """Identify a motor's resistance, back-EMF, friction and inertia from voltage, current, speed.
 
     Columns that are not named are guessed. Several motors: names by commas. The speed must be that
-    of
-    the motor shaft: no log shows that it was taken behind a gear. With --out it writes motor.json
-    and a
-    picture. Exit code 1 where the model does not explain the log.
+    of the motor shaft: no log shows that it was taken behind a gear. With --out it writes
+    motor.json and a picture. Exit code 1 where the model does not explain the log.
     """
     from slipid.app.bench import read_motor_log
     from slipid.report.estimates import show_bench

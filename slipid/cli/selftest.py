@@ -25,8 +25,7 @@ def selftest(
     r"""Simulate this very experiment with known truth, fit it, and report what it recovers.
 
     Without --data it is the plan of \[selftest] in the config. Writes selftest.json; goes on from
-    the
-    replicates that are done. Exit code 1 where a wanted number is not recovered.
+    the replicates that are done. Exit code 1 where a wanted number is not recovered.
     """
     from slipid.lab.selftest.experiment import selftest as run
     from slipid.report.estimates import show_selftest

@@ -19,8 +19,7 @@ def simulate(
     r"""Make logs on the virtual test site, whose physics is MuJoCo's; needs slipid\[testsite].
 
     Writes logs, a config that identifies them, floor maps, and the truth in a folder of its own.
-    Runs
-    that are done are kept and not driven again.
+    Runs that are done are kept and not driven again.
     """
     from slipid.lab.testsite.config import plan as read
     from slipid.lab.testsite.simulate import simulate as run

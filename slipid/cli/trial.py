@@ -45,8 +45,7 @@ def trial(
     """Drive the 2021 paper's rectangle, or another path, with every controller, and judge them.
 
     Gains are those set by hand, or tuned ones of an older robot.json that are better. Writes
-    trial.json
-    and trial.png to OUT; runs that are done are kept and not driven again.
+    trial.json and trial.png to OUT; runs that are done are kept and not driven again.
     """
     from slipid.lab.trial.plots import trial_plot
     from slipid.lab.trial.trial import TrialOptions, controller_names

@@ -1,22 +1,11 @@
-"""A motor on a bench as a picture: measured against fitted, and what is left.
-
-Picture to check a map of the floor by: the photograph with its outlines, beside the map.
-"""
+"""A motor on a bench as a picture: measured against fitted values, and the residuals."""
 
 from pathlib import Path
-from textwrap import shorten
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch as Swatch
-from matplotlib.patches import PathPatch, Rectangle
-from matplotlib.path import Path as Outline
-from matplotlib.patheffects import withStroke
 
-from slipid.data.geojson_map import Patch, VectorMap, covered
 from slipid.infer.bench.fit import MotorFit
 from slipid.infer.bench.moments import MomentSums
 from slipid.infer.bench.verdict import BenchFit
@@ -95,111 +84,3 @@ def _residuals(panels: list[Axes], unit: str, w: BenchWindows, s: MomentSums) ->
         axes.set(ylim=(-limit, limit), xlabel=what)
     panels[0].set_ylabel(f"left [{unit}]")
     panels[0].set_title("what is left, and its mean (orange)", fontsize=9, loc="left", color=INK)
-
-
-NAMED = 0.01
-"""Patches of a larger share of the map have their name on them."""
-HATCH = "////"
-
-
-def floor_plot(
-    found: VectorMap,
-    photograph: UInt8[np.ndarray, "row column 3"],
-    seen: Bool[np.ndarray, "row column"],
-    path: Path,
-) -> Path:
-    """The photograph as the floor shows it, with outlines and names, beside the map in colours.
-
-    Args:
-        photograph: blue, green, red of every cell of the map, the first row at the lowest y.
-        seen: cells that the camera sees.
-        path: of the picture.
-    """
-    known = f"{100 * (1 - found.unknown):.0f} % of its rectangle known"
-    title = (
-        f"Map of the floor: {len(found.colours)} surfaces, {len(found.patches)} patches, {known}"
-    )
-    tall = (found.high_y - found.low_y) / (found.high_x - found.low_x)
-    made = figure(13.0, float(np.clip(6.2 * tall, 3.0, 12.0)) + 1.4, title)
-    left, right = made.subplots(1, 2, sharex=True, sharey=True)
-    extent = (found.low_x, found.high_x, found.low_y, found.high_y)
-    shown = np.dstack([photograph[..., ::-1], np.where(seen, 255, 0)]).astype(np.uint8)
-    step = max(1, max(shown.shape[:2]) // 1200)
-    for axes, name in ((left, "photograph, laid onto the floor"), (right, "map")):
-        axes.set_title(name, fontsize=10, loc="left")
-        axes.add_patch(_unknown(found))
-        axes.set(xlabel="x [m]", aspect="equal", xlim=extent[:2], ylim=extent[2:])
-    left.set_ylabel("y [m]")
-    left.imshow(shown[::step, ::step], origin="lower", extent=extent, interpolation="antialiased")
-    for patch in found.patches:
-        _outline(left, patch, None)
-        _outline(right, patch, found.colours[patch.surface])
-    for axes in (left, right):
-        _names(axes, found)
-    made.legend(handles=_swatches(found), loc="outside lower center", ncols=5, fontsize=8)
-    return save(made, path)
-
-
-def _unknown(found: VectorMap) -> Rectangle:
-    """Hatching below everything."""
-    size = (found.high_x - found.low_x, found.high_y - found.low_y)
-    corner = (found.low_x, found.low_y)
-    return Rectangle(corner, *size, facecolor="white", edgecolor=SHADE, hatch=HATCH, lw=0, zorder=0)
-
-
-def _outline(axes: Axes, patch: Patch, colour: str | None) -> None:
-    """A patch with its holes; without a colour its edge alone, seen on light and dark."""
-    rings = [np.concatenate([ring, ring[:1]]) for ring in patch.rings]
-    codes = [_codes(len(ring)) for ring in rings]
-    shape = Outline(np.concatenate(rings), np.concatenate(codes))
-    if colour is None:
-        for width, shade in ((2.6, "white"), (1.1, INK)):
-            axes.add_patch(PathPatch(shape, fill=False, edgecolor=shade, lw=width))
-    else:
-        axes.add_patch(PathPatch(shape, facecolor=colour, edgecolor=INK, lw=0.5))
-
-
-def _codes(count: int) -> np.ndarray:
-    """Of a closed ring."""
-    return np.array([Outline.MOVETO, *[Outline.LINETO] * (count - 2), Outline.CLOSEPOLY])
-
-
-def _names(axes: Axes, found: VectorMap) -> None:
-    """Names of the large patches, where they have most room."""
-    whole = (found.high_x - found.low_x) * (found.high_y - found.low_y)
-    for patch in found.patches:
-        if patch.area < NAMED * whole:
-            continue
-        x, y = middle(patch)
-        dark = np.dot(to_rgb(found.colours[patch.surface]), [0.3, 0.6, 0.1]) < 0.5
-        ink, around = ("white", INK) if dark else (INK, "white")
-        text = axes.text(x, y, shorten(patch.surface, 16, placeholder="…"), fontsize=7, color=ink)
-        text.set(
-            ha="center", va="center", path_effects=[withStroke(linewidth=1.8, foreground=around)]
-        )
-
-
-def middle(patch: Patch) -> Float[np.ndarray, "2"]:
-    """The place within a patch that is farthest from its edge [m], to a hundredth of its size."""
-    from scipy.ndimage import distance_transform_edt
-
-    low, high = patch.rings[0].min(axis=0), patch.rings[0].max(axis=0)
-    step = float((high - low).max()) / 100
-    columns, rows = (int(n) for n in np.maximum(np.ceil((high - low) / step), 1))
-    inside = covered([(ring - low) / step for ring in patch.rings], rows, columns)
-    far = distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1]
-    row, column = np.unravel_index(int(np.argmax(far)), far.shape)
-    return low + step * (np.array([column, row]) + 0.5)
-
-
-def _swatches(found: VectorMap) -> list[Swatch]:
-    """Colours, names and areas, and what is hatched."""
-    areas = dict.fromkeys(found.colours, 0.0)
-    for patch in found.patches:
-        areas[patch.surface] += patch.area
-    known = [
-        Swatch(facecolor=colour, edgecolor=INK, label=f"{name} ({areas[name]:.2f} m²)")
-        for name, colour in found.colours.items()
-    ]
-    unknown = Swatch(facecolor="white", edgecolor=SHADE, hatch=HATCH, label="unknown")
-    return [*known, unknown]

@@ -110,8 +110,7 @@ def turning_grid(
     """Return runs of wheels that do not drive sideways, on every (floor, load).
 
     Each speed has `count` runs between straight ahead and turning on the spot, evenly around the
-    circle
-    of (ahead, turn times base radius [m]).
+    circle of (ahead, turn times base radius [m]).
     """
     drives = []
     for surface, load in setups:

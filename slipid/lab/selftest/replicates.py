@@ -1,8 +1,8 @@
 """Simulate an experiment with known truth and fit it, again and again, to see what it recovers.
 
 A replicate draws true numbers from what is plausible before the logs, fills the windows of the
-experiment with the readings that a robot of these numbers would give, noise included, and fits
-them from the usual start. Wheel motion, floors, loads, sessions and sampling are those of the given
+experiment with the readings that a robot of these numbers would give, noise included, and fits them
+from the usual start. Wheel motion, floors, loads, sessions and sampling are those of the given
 windows. The noise is the likelihood's own at typical variances: the test shows what the experiment
 can recover if the model is right, and cannot show an error of the model itself.
 
@@ -52,8 +52,7 @@ def simulate_windows(
         w: windows that were driven; channels that they lack are not made.
         rng: random numbers of the noise.
         std: std of the variance components by name (`fit.noise`); a name without its floor stands
-            for
-            every floor, and missing ones are zero.
+            for every floor, and missing ones are zero.
     """
     b = lk.batch(w, truth)
     increment, amps, start = (np.asarray(x) for x in _predicted(truth, b, jnp.asarray(w.pose)))
@@ -190,8 +189,7 @@ def plausible(
     """Return centre and scatter of the true numbers, in the search space.
 
     The centre is the prior's and the scatter half its std. Numbers in `[selftest.truth]` have
-    exactly
-    the value given there.
+    exactly the value given there.
 
     Raises:
         DataError: a truth for a number that does not exist, is fixed, or cannot have it.

@@ -24,8 +24,7 @@ class MotorBuild:
         coulomb_nm, viscous_nms: friction at the wheel [N m], [N m s].
         efficiency: efficiency of the gear while the motor drives.
         supply_v, supply_ohm: voltage and resistance of the battery that all motors share; its
-            voltage
-            never falls below a twentieth.
+            voltage never falls below a twentieth.
         ticks_per_revolution: ticks of the encoder in one turn of the motor shaft.
     """
 
@@ -47,8 +46,7 @@ class SpeedLoop:
 
     Attributes:
         kind: `pi`; `feed_forward` (proportional, and the back-EMF of the commanded speed);
-            `cascade` (PI
-            to a current, and a current loop below it).
+            `cascade` (PI to a current, and a current loop below it).
         gain: gain of the error in motor speed [V s/rad]; in a cascade [A s/rad].
         integral: gain of its integral [V/rad]; in a cascade [A/rad].
         current_gain: gain of the cascade's inner loop [V/A].
@@ -236,8 +234,7 @@ def mjcf(
     """Return MuJoCo's XML of the robot at the origin of a flat floor.
 
     Rollers carry the contact parameters (they have priority over the floor), so that `plant` can
-    give
-    each roller those of the surface beneath it.
+    give each roller those of the surface beneath it.
 
     Args:
         load: load set-up, which sets the centre of mass.

@@ -126,8 +126,7 @@ def simulate(plan: SimulationPlan, out: Path, executor: Executor, report: Report
     """Drive every run of a plan that is not done yet; return the content of simulate.json.
 
     A run's truth is written last: a run that has one is done, and an interrupted simulation
-    continues
-    from there.
+    continues from there.
 
     Raises:
         DataError: MuJoCo is missing, or the folder holds runs of another config.

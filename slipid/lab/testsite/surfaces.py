@@ -33,8 +33,7 @@ class SurfacePhysics:
         friction: Coulomb coefficient of a roller on it [1].
         rolling_m: lever arm of the rolling friction, about both axes of a roller [m].
         softness_m: approximate sinkage of a wheel that carries a third of the robot, for any weight
-            of
-            the robot [m].
+            of the robot [m].
         shear_n_m: horizontal stiffness of the floor beneath one roller [N/m].
         compaction: resistance of a sunk wheel per sinkage to the power of 1.5 [N/m^1.5].
         body_drag_n: resistance of what touches the body, against its motion, not its turning [N].

@@ -59,8 +59,7 @@ def inverse_kinematics(
 
     Raises:
         ValueError: rollers that run freely along the drive direction, or wheels that leave a motion
-            of
-            the body free.
+            of the body free.
     """
     across = np.sin(roller_angle)
     if np.abs(across).min() < LEAST_SINE:

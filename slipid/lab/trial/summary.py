@@ -50,8 +50,7 @@ class ControllerSummary:
 
     Attributes:
         median: medians by name, see `columns`; without those that a plant does not measure (the
-            twin's
-            energy).
+            twin's energy).
         interval90: intervals of the medians by name.
         runs: number of runs.
         finished_share: share of the runs that reached the end.
@@ -104,8 +103,7 @@ def best_controllers(runs: Sequence[TrialRun], draws: int = 2000) -> tuple[str, 
 
     The others are those whose errors, start by start, are not clearly larger: the 90 % bootstrap
     interval of the difference of medians over the shared starts does not lie above 0. A controller
-    that
-    left more runs unfinished than another does not close best.
+    that left more runs unfinished than another does not close best.
     """
     names = list(dict.fromkeys(run.controller for run in runs))
     of = {name: [run for run in runs if run.controller == name] for name in names}
@@ -127,8 +125,7 @@ def columns(runs: Sequence[TrialRun]) -> Columns:
     """Return the errors of every run by name.
 
     `first_side_along_track_mm` and `heading_error_deg` are the errors' sizes;
-    `first_side_travelled` is
-    the part of the first side. Of a curve, that is its first quarter.
+    `first_side_travelled` is the part of the first side. Of a curve, that is its first quarter.
     """
     m = [run.metrics for run in runs]
     side, whole = np.array([(x.along_track_mm[0], x.sides_mm[0]) for x in m]).T

@@ -69,8 +69,7 @@ class TrialOptions:
 
     Attributes:
         plant: `testsite` (MuJoCo) or `twin` (the identified model itself, another draw of its
-            numbers
-            for every start).
+            numbers for every start).
         map: file of a floor map; None for patches of the identified floors.
         told_map: file of the map given to controllers with a map; None for the true one.
         controllers: names of `ROWS`.
@@ -118,8 +117,7 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
 
     Raises:
         DataError: no fit, no such plant, controller, path, load or map, MuJoCo missing, floors that
-            the
-            plant or the fit does not know, or a speed beyond those of the fit.
+            the plant or the fit does not know, or a speed beyond those of the fit.
     """
     setup_jax(quiet=True)
     tasks = _tasks(out, options)
@@ -216,7 +214,7 @@ def drive(task: TrialTask) -> None:
     setup_jax(quiet=True)
     row = ROWS[task.row]
     robot = jax.tree.map(jnp.asarray, task.robot)
-    path = task.path.moved(task.start).waiting(REST_S)
+    path = task.path.moved(task.start).after_rest(REST_S)
     plant: closed_loop.Plant
     if task.plant == "twin":
         truth = drawn_robot(robot, task.seed)
@@ -226,9 +224,9 @@ def drive(task: TrialTask) -> None:
     else:
         plant = SitePlant(task.floor, robot.load_setup, task.start, task.seed, row.gyro)
     there = floor_of(task.known_map, robot.labels)
-    pilot = control_loop_of(robot, row, task.settings, task.forced, there)
-    course = closed_loop.run_closed_loop(pilot, path, plant, task.start)
-    off = course.pose[-1] - course.believed[-1]
+    loop = control_loop_of(robot, row, task.settings, task.forced, there)
+    course = closed_loop.run_closed_loop(loop, path, plant, task.start)
+    off = course.pose[-1] - course.estimated_pose[-1]
     run = TrialRun(
         controller=task.row,
         start=task.start,
@@ -237,7 +235,7 @@ def drive(task: TrialTask) -> None:
         believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
     )
     # the path first, because a run with metrics counts as finished
-    poses = {"time": course.time, "pose": course.pose, "believed": course.believed}
+    poses = {"time": course.time, "pose": course.pose, "believed": course.estimated_pose}
     task.kept.save(task.name, poses)
     task.kept.save_json(task.name, asdict(run))
 
