@@ -7,9 +7,16 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, UInt8
 
 from slipid.support.errors import DataError, did_you_mean
+
+Mask = Bool[np.ndarray, "row column"]
+"""Some of the pixels of a picture or of the cells of a grid."""
+Labels = Int[np.ndarray, "row column"]
+"""A number for each cell of a grid."""
+Grey = UInt8[np.ndarray, "row column"]
+"""Grey levels of a picture, from 0 to 255."""
 
 
 @cache

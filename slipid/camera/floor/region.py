@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from slipid.camera.floor.grid import (
     LEAST_CELLS,
@@ -23,6 +23,7 @@ from slipid.camera.floor.grid import (
 from slipid.camera.floor.light import Features, lab_of, linear_of_code
 from slipid.camera.floor.palette import Palette, Places, Polygon
 from slipid.camera.floor.surfaces import MarkedCells, Seeds
+from slipid.camera.opencv import Mask
 from slipid.camera.overhead import OverheadCamera
 from slipid.support.errors import DataError
 
@@ -64,8 +65,8 @@ class FloorRegion:
     """
 
     floor: Rectified
-    requested: Bool[np.ndarray, "row column"]
-    visible: Bool[np.ndarray, "row column"]
+    requested: Mask
+    visible: Mask
     robots: tuple[DetectedRobot, ...]
 
 
@@ -131,9 +132,7 @@ def _extent(source: FloorPicture, region: Polygon | None) -> Extent:
     return Extent(*(float(v) for v in (*low, *high)))
 
 
-def _cells(
-    source: FloorPicture, floor: Rectified, polygon: Polygon
-) -> Bool[np.ndarray, "row column"]:
+def _cells(source: FloorPicture, floor: Rectified, polygon: Polygon) -> Mask:
     """Return the cells in a polygon."""
     if polygon.at_m is not None:
         return floor.grid.inside(np.array(polygon.at_m))
@@ -162,7 +161,7 @@ def seeds_of(
             colours[k] = np.median(features.rgb[own.row, own.column], axis=0)
         else:
             colours[k] = linear_of_code(palette.palette[name])
-            _check_present(source, name, palette, features.look[region.visible][:, :3])
+            _check_present(source, name, palette, features.appearance[region.visible][:, :3])
     return Seeds(colours, marked)
 
 

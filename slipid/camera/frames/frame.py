@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import Grey, opencv
 from slipid.support.errors import DataError, bad_data
 
 LOST = 0.02
@@ -34,7 +34,7 @@ class Frame:
 
     index: int
     time: float
-    grey: UInt8[np.ndarray, "row column"]
+    grey: Grey
 
 
 @runtime_checkable
@@ -85,7 +85,7 @@ def stamp(path: Path) -> tuple[str, int, int]:
     return path.name, status.st_size, status.st_mtime_ns
 
 
-def grey_of(picture: np.ndarray) -> UInt8[np.ndarray, "row column"]:
+def grey_of(picture: np.ndarray) -> Grey:
     """Return the grey levels of a picture in blue, green, red, or of one that is grey already."""
     if picture.ndim == 2 or picture.shape[2] == 1:
         return np.asarray(picture).reshape(picture.shape[:2])

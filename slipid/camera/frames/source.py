@@ -91,10 +91,7 @@ class PictureFolder:
 
 
 def open_source(
-    place: str,
-    fps: float | None = None,
-    times: Path | None = None,
-    seconds: float | None = None,
+    place: str, fps: float | None = None, times: Path | None = None, seconds: float | None = None
 ) -> FrameSource:
     """Return the frames of a video file, a folder of pictures or a device.
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import Grey, opencv
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.track import TrackedPoses
 from slipid.support.errors import DataError
@@ -18,11 +18,7 @@ FLOOR, EDGE, AHEAD, LEFT = (190, 190, 60), (0, 170, 255), (40, 40, 230), (60, 19
 
 
 def write_preview(
-    path: Path,
-    grey: UInt8[np.ndarray, "row column"],
-    camera: OverheadCamera,
-    tracks: tuple[TrackedPoses, ...],
-    row: int,
+    path: Path, grey: Grey, camera: OverheadCamera, tracks: tuple[TrackedPoses, ...], row: int
 ) -> None:
     """Write a frame with a grid on the floor, the markers' edges and the bodies' axes.
 
