@@ -1,12 +1,12 @@
 """Video frames: their pixels, their times, and the interface of everything that supplies them."""
 
 import csv
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -37,30 +37,25 @@ class Frame:
     grey: Grey
 
 
-@runtime_checkable
-class FrameSource(Protocol):
-    """A video, a folder of pictures or a device that supplies frames."""
+@dataclass(frozen=True, eq=False)
+class FrameSource(ABC):
+    """A video, a folder of pictures or a device that supplies frames.
 
-    @property
-    def name(self) -> str:
-        """Its name in messages."""
+    Attributes:
+        name: its name in messages.
+        image_px: width and height of every frame.
+        count: expected number of frames; None where it is not known.
+        exact: whether `count` is exact, as where each frame has a given time.
+        identity: text that changes with its content, such as name, size and date.
+    """
 
-    @property
-    def image_px(self) -> tuple[int, int]:
-        """Width and height of every frame."""
+    name: str
+    image_px: tuple[int, int]
+    count: int | None
+    exact: bool
+    identity: str
 
-    @property
-    def count(self) -> int | None:
-        """Expected number of frames; None where it is not known."""
-
-    @property
-    def exact(self) -> bool:
-        """Whether `count` is exact, as where each frame has a given time."""
-
-    @property
-    def identity(self) -> str:
-        """Name, size and date, which distinguish it from other sources."""
-
+    @abstractmethod
     def frames(self, first: int = 0) -> Iterator[Frame]:
         """Yield the frames from a number on, in order."""
 

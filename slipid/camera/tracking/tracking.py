@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slipid.camera.frames.frame import FrameSource, cut_off, read_ahead, uneven
-from slipid.camera.frames.video import Device
+from slipid.camera.frames.source import Device
 from slipid.camera.opencv import marker_dictionary, opencv
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.detections import detect_all, only_marker
