@@ -88,6 +88,11 @@ def read_picture(path: Path) -> np.ndarray:
     return np.asarray(picture)
 
 
+def size_of(picture: np.ndarray) -> tuple[int, int]:
+    """Return width and height of a picture [pixel]."""
+    return int(picture.shape[1]), int(picture.shape[0])
+
+
 def ideal_points(
     pixels: Float[np.ndarray, "point 1 2"],
     matrix: Float[np.ndarray, "3 3"],

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slipid.camera.frames.frame import Frame, FrameSource
+from slipid.camera.frame import Frame, FrameSource
 from tests.helpers.made_videos import FPS
 
 

@@ -20,7 +20,7 @@ from slipid.camera.floor.surfaces import (
     learnt,
     without_small_patches,
 )
-from slipid.camera.frames.source import still
+from slipid.camera.frame_source import still
 from slipid.camera.opencv import Labels
 from slipid.camera.overhead import OverheadCamera
 from slipid.support.errors import DataError

@@ -23,7 +23,7 @@ from slipid.camera.floor.grid import (
 from slipid.camera.floor.light import Features, lab_of, linear_of_code
 from slipid.camera.floor.palette import Palette, Places, Polygon
 from slipid.camera.floor.surfaces import MarkedCells, Seeds
-from slipid.camera.opencv import Mask
+from slipid.camera.opencv import Mask, size_of
 from slipid.camera.overhead import OverheadCamera
 from slipid.support.errors import DataError
 
@@ -46,11 +46,6 @@ class FloorPicture:
     config: Path
     picture: UInt8[np.ndarray, "y x 3"]
     camera: OverheadCamera
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height [pixel]."""
-        return self.picture.shape[1], self.picture.shape[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +80,7 @@ def requested_region(
         DataError: another resolution than the camera's, or a region without visible floor.
     """
     picture, camera = source.picture, source.camera
-    camera.of_size(source.size, source.path)
+    camera.lens.check_size(size_of(picture), source.path)
     grid = grid_over(_extent(source, palette.region), cell or pixel_size(camera), source.path)
     floor = rectified(picture, camera, grid)
     requested = floor.in_view.copy()
@@ -136,7 +131,7 @@ def _cells(source: FloorPicture, floor: Rectified, polygon: Polygon) -> Mask:
     """Return the cells in a polygon."""
     if polygon.at_m is not None:
         return floor.grid.inside(np.array(polygon.at_m))
-    width, height = source.size
+    width, height = size_of(source.picture)
     return floor.of_picture(filled(np.array(polygon.at_px), height, width))
 
 
@@ -171,7 +166,7 @@ def _marked(
     """Return row and column of the marked points of entry `k` of a config."""
     grid = region.floor.grid
     given = np.array(marked.at_px or marked.at_m, float)
-    width, height = source.size
+    width, height = size_of(source.picture)
     if marked.at_px is not None:
         out = ~((given >= -0.5) & (given < [width - 0.5, height - 0.5])).all(axis=1)
         _refuse(source, given[out], k, f"outside the picture of {width} x {height} pixels")

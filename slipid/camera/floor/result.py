@@ -12,7 +12,7 @@ from slipid.camera.floor.outline import PatchOutline, outlines_of, signed_area
 from slipid.camera.floor.palette import Palette
 from slipid.camera.floor.region import FloorPicture, FloorRegion
 from slipid.camera.floor.surfaces import UNKNOWN, Costs, Surfaces
-from slipid.camera.frames.source import is_picture
+from slipid.camera.frame_source import is_picture
 from slipid.camera.opencv import Labels, Mask
 from slipid.data.geojson_map import Patch, VectorMap
 from slipid.support.content import Content

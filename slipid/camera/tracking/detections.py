@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.camera.frames.frame import Frame, FrameSource, read_ahead
+from slipid.camera.frame import Frame, FrameSource, read_ahead
 from slipid.camera.opencv import Grey, dictionary_names
 from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region
 from slipid.support.checkpoint import Checkpoint

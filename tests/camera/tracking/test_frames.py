@@ -10,16 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from slipid.camera.frames.frame import (
-    DEPTH,
-    cut_off,
-    even_times,
-    grey_of,
-    read_ahead,
-    read_times,
-    uneven,
-)
-from slipid.camera.frames.source import Capture, Device, open_source
+from slipid.camera.frame import DEPTH, cut_off, even_times, grey_of, read_ahead, read_times, uneven
+from slipid.camera.frame_source import Capture, Device, open_source
 from slipid.support.errors import DataError
 from tests.helpers.made_sources import InMemory, write_video
 

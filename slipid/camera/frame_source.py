@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.frames.frame import Frame, FrameSource, even_times, grey_of, read_times, stamp
-from slipid.camera.opencv import opencv, read_picture
+from slipid.camera.frame import Frame, FrameSource, even_times, grey_of, read_times, stamp
+from slipid.camera.opencv import opencv, read_picture, size_of
 from slipid.support.errors import DataError
 
 BROKEN = 25
@@ -89,7 +89,7 @@ class Video(FrameSource):
         if times is not None:
             count = len(times)
         identity = repr((stamp(path), fps, None if times is None else times.tolist()))
-        return cls(str(path), _size(first), count, times is not None, identity, times, fps)
+        return cls(str(path), size_of(first), count, times is not None, identity, times, fps)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
         """Yield the frames from a number on; those before are skipped without decoding.
@@ -149,7 +149,7 @@ class Device(FrameSource):
             first = capture.next_picture()
         if first is None:
             raise DataError(f"{name}: it shows nothing; expected a camera that is not in use")
-        return cls(name, _size(first), None, False, f"{place} {time.time_ns()}", place, seconds)
+        return cls(name, size_of(first), None, False, f"{place} {time.time_ns()}", place, seconds)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
         """Yield the frames from now on, until the recording is over."""
@@ -199,25 +199,20 @@ class PictureFolder(FrameSource):
     @classmethod
     def of(cls, place: Path, paths: Sequence[Path], times: Times) -> "PictureFolder":
         """Return pictures of the first one's size; DataError where the first is no picture."""
-        size, identity = _size(read_picture(paths[0])), repr([stamp(path) for path in paths])
+        size, identity = size_of(read_picture(paths[0])), repr([stamp(path) for path in paths])
         return cls(str(place), size, len(paths), True, identity, tuple(paths), times)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
         """Yield the pictures from a number on; DataError where one has another size."""
         for k in range(first, len(self.paths)):
             picture = read_picture(self.paths[k])
-            if _size(picture) != self.image_px:
-                (w, h), (width, height) = _size(picture), self.image_px
+            if size_of(picture) != self.image_px:
+                (w, h), (width, height) = size_of(picture), self.image_px
                 raise DataError(
                     f"{self.paths[k]}: {w} x {h} pixels; expected {width} x {height} as "
                     f"{self.paths[0].name}"
                 )
             yield Frame(k, float(self.times[k]), grey_of(picture))
-
-
-def _size(picture: np.ndarray) -> tuple[int, int]:
-    """Return width and height of a picture."""
-    return int(picture.shape[1]), int(picture.shape[0])
 
 
 def open_source(
