@@ -3,7 +3,7 @@
 The file is CSV or Parquet, with a row for each frame. Columns: frame; time [s]; x, y [m],
 heading [rad], empty where the frame has no pose; their covariance (var_x, var_y, var_heading,
 cov_xy, cov_x_heading, cov_y_heading) [m, rad]; size, the apparent over the true size of the markers
-[1]; rejected_x, rejected_y, rejected_heading, a pose that was fitted and rejected; and flag, a word.
+[1]; rejected_x, rejected_y, rejected_heading, a fitted but rejected pose; and flag, a word.
 """
 
 import io
