@@ -63,7 +63,7 @@ def _clock(w: BenchWindows) -> np.ndarray:
 
 def _signals(axes: Axes, name: str, unit: str, w: BenchWindows, s: MomentSums) -> None:
     plain(axes)
-    clock, left = _clock(w), w.both.left
+    clock, left = _clock(w), w.both.measured
     fitted = left - (s.even.residual + s.odd.residual) / 2
     some = slice(None, None, max(1, len(clock) // MOST))
     used = np.where(w.usable, fitted, np.nan)
