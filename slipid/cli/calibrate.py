@@ -194,7 +194,7 @@ def _uncalibrated(
 def _write(lens: "LensFound", place: "FloorFound | None", out: Path, json: str | None) -> int:
     """Write the camera and its pictures, and say what was found."""
     from slipid.camera.calibration.calibrate import save_lens
-    from slipid.plots.calibration import coverage_picture, floor_picture
+    from slipid.plots.camera import coverage_picture, floor_picture
     from slipid.support.files import read_json
 
     files = [out]

@@ -55,7 +55,7 @@ def map_(
     from slipid.camera.floor.grid import Robot
     from slipid.camera.floor.picture import Wish, map_of
     from slipid.camera.overhead import OverheadCamera
-    from slipid.plots.bench import floor_plot
+    from slipid.plots.camera import floor_plot
     from slipid.support.files import write_bytes
     from slipid.support.jax_setup import one_blas_thread
 

@@ -93,9 +93,9 @@ class Validation:
 
     def plot(self) -> "Figure":
         """End-point errors of every model."""
-        from slipid.plots.compare import ladder_figure
+        from slipid.plots.compare import validation_figure
 
-        return ladder_figure(self.to_json(), self.which)
+        return validation_figure(self.to_json(), self.which)
 
     @property
     def summary(self) -> dict[str, dict[str, FloorSummary]]:

@@ -16,6 +16,7 @@ spectra of three noises and the voltage between rows. The moments need neither.
 import fnmatch
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -58,6 +59,22 @@ MOMENTS = (len(VOLTS) - 1, len(AMPS))
 """Number of moments of each equation; only the mechanical one uses the sign of a magnitude."""
 
 
+class Equation(NamedTuple):
+    """One of the two equations of a motor, at the fitted numbers.
+
+    Attributes:
+        channel: `voltage` or `current`.
+        unit: unit of the channel.
+        windows: windows of the records.
+        sums: weights and residuals.
+    """
+
+    channel: str
+    unit: str
+    windows: BenchWindows
+    sums: MomentSums
+
+
 @dataclass(frozen=True, eq=False)
 class MotorFit:
     """Fit of one motor.
@@ -69,10 +86,7 @@ class MotorFit:
         choices: user's choices.
         z: search vector at the optimum.
         covariance: its covariance.
-        volts: windows of the electrical equation, None without voltage.
-        amps: windows of the mechanical equation.
-        volts_sums: weights and residuals of the electrical equation, None without voltage.
-        amps_sums: weights and residuals of the mechanical equation.
+        equations: the electrical equation, absent without voltage, and the mechanical one.
         noise: noise of the sensors.
         correlation_time: time over which residuals are correlated [s].
         independent_times: length of the records over the correlation time.
@@ -87,10 +101,7 @@ class MotorFit:
     choices: tuple[Choice, ...]
     z: Float[np.ndarray, " free"]
     covariance: Float[np.ndarray, "free free"]
-    volts: BenchWindows | None
-    amps: BenchWindows
-    volts_sums: MomentSums | None
-    amps_sums: MomentSums
+    equations: tuple[Equation, ...]
     noise: SensorNoise
     correlation_time: float
     independent_times: float
@@ -106,7 +117,7 @@ class MotorFit:
 
     @property
     def has_voltage(self) -> bool:
-        return self.volts is not None
+        return len(self.equations) > 1
 
     @property
     def period(self) -> float:
@@ -161,7 +172,10 @@ def fit_motor(
             volts = electrical(records, zero)
         v = None if volts is None else sums(volts, np.asarray(motor.volts()), MOMENTS[0])
         a = sums(amps, np.asarray(motor.amps()), MOMENTS[1])
-        s, correlation_time, independent_times = _scatter(volts, v, amps, a)
+        equations = [Equation("current", "A", amps, a)]
+        if volts is not None and v is not None:
+            equations.insert(0, Equation("voltage", "V", volts, v))
+        s, correlation_time, independent_times = _scatter(equations)
         new, covariance = _solved(space, z, v, a, s)
         moved = float(np.max(np.abs(new - z) / np.sqrt(np.diag(covariance)), initial=0.0))
         z, rounds = new, rounds + 1
@@ -174,10 +188,7 @@ def fit_motor(
         choices=tuple(choices),
         z=z,
         covariance=covariance,
-        volts=volts,
-        amps=amps,
-        volts_sums=v,
-        amps_sums=a,
+        equations=tuple(equations),
         noise=noise_of(records),
         correlation_time=correlation_time,
         independent_times=independent_times,
@@ -225,17 +236,16 @@ def _chosen(space: Space, choices: Sequence[Choice]) -> np.ndarray:
 
 
 def _scatter(
-    volts: BenchWindows | None, v: MomentSums | None, amps: BenchWindows, a: MomentSums
+    equations: Sequence[Equation],
 ) -> tuple[Float[np.ndarray, "moment moment"], float, float]:
     """Return the scatter of all moments, the correlation time [s], and the count of such times."""
-    pairs = [(amps, a)] if volts is None or v is None else [(volts, v), (amps, a)]
-    length = cell_length([w for w, _ in pairs])
-    parts = [celled(s.moments, w, length) for w, s in pairs]
+    length = cell_length([e.windows for e in equations])
+    parts = [celled(e.sums.moments, e.windows, length) for e in equations]
     count = max(len(p) for p in parts)
     g = np.concatenate([np.pad(p, ((0, count - len(p)), (0, 0))) for p in parts], axis=1)
-    residuals = [celled(s.residual[:, None], w, length)[:, 0] for w, s in pairs]
+    residuals = [celled(e.sums.residual[:, None], e.windows, length)[:, 0] for e in equations]
     lags = 2 * max(correlation_cells(x) for x in residuals) + 2
-    groups = np.concatenate([grouped(s, w) for w, s in pairs], axis=1)
+    groups = np.concatenate([grouped(e.sums, e.windows) for e in equations], axis=1)
     return widened(scatter(g, lags), groups), lags * length / 2, count / lags
 
 

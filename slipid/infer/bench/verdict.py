@@ -4,14 +4,13 @@ A misfit is a dependence of residuals on speed, current or time.
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from jaxtyping import Int
 
-from slipid.infer.bench.fit import MotorFit
-from slipid.infer.bench.moments import MomentSums, cell_length, celled
-from slipid.infer.bench.windows import BenchWindows
+from slipid.infer.bench.fit import Equation, MotorFit
+from slipid.infer.bench.moments import cell_length, celled
 from slipid.infer.fit_file import SCHEMA, number_json
 from slipid.infer.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
@@ -63,45 +62,38 @@ class Misfit:
 
 def misfits(fit: MotorFit) -> tuple[Misfit, ...]:
     """Return the largest misfit of each equation, if it is significant and large enough."""
-    pairs = [("current", "A", fit.amps, fit.amps_sums)]
-    if fit.volts is not None and fit.volts_sums is not None:
-        pairs.insert(0, ("voltage", "V", fit.volts, fit.volts_sums))
-    found = (_worst(fit, *pair) for pair in pairs)
-    return tuple(m for m in found if m is not None)
+    return tuple(m for e in fit.equations if (m := _worst(fit, e)) is not None)
 
 
-def _worst(fit: MotorFit, channel: str, unit: str, w: BenchWindows, s: MomentSums) -> Misfit | None:
+def _worst(fit: MotorFit, equation: Equation) -> Misfit | None:
     """Return the largest mean of a bin [std] over speed, current and time."""
+    w = equation.windows
     size = MATTERS * float(np.ptp(w.both.measured))
     best: Misfit | None = None
     used = np.flatnonzero(w.usable)
-    time = w.time, w.time
     for over, (odd, even), what in (
         ("speed", (w.odd.speed, w.even.speed), "rad/s"),
         ("current", (w.odd.current, w.even.current), "A"),
-        ("time", time, "s"),
+        ("time", (w.time, w.time), "s"),
     ):
         # bins depend on the rows that a residual is not computed from, or noise would sort them
         bins = [np.array_split(used[np.argsort(v[used], kind="stable")], BINS) for v in (odd, even)]
         for one, other in zip(*bins, strict=True):
-            off, sure = _mean(fit, w, s, one, other)
+            off, sure = _mean(fit, equation, one, other)
             if abs(off) > size and sure > max(SURE, 0.0 if best is None else best.sure):
                 at = f"{odd[one].min():.3g} to {odd[one].max():.3g} {what}"
-                best = Misfit(channel, unit, off, over, at, sure)
+                best = Misfit(equation.channel, equation.unit, off, over, at, sure)
     return best
 
 
 def _mean(
-    fit: MotorFit,
-    w: BenchWindows,
-    s: MomentSums,
-    even: Int[np.ndarray, " some"],
-    odd: Int[np.ndarray, " some"],
+    fit: MotorFit, equation: Equation, even: Int[np.ndarray, " some"], odd: Int[np.ndarray, " some"]
 ) -> tuple[float, float]:
     """Return the weighted mean residual of even and odd rows of some windows, and its size [std].
 
     Cells as long as the residuals' correlation time count as independent.
     """
+    w, s = equation.windows, equation.sums
     weight, sum_ = np.zeros(len(w.time)), np.zeros(len(w.time))
     for half, some in ((s.even, even), (s.odd, odd)):
         weight[some] += half.weight[some]
@@ -267,7 +259,8 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
 
 def _one_point(f: MotorFit) -> bool:
     """Return True if the speed keeps to one value."""
-    used = f.amps.both.speed[f.amps.usable]
+    amps = f.equations[-1].windows
+    used = amps.both.speed[amps.usable]
     return float(np.ptp(np.quantile(used, (0.02, 0.98)))) < ONE_POINT * float(np.abs(used).max())
 
 
@@ -322,14 +315,14 @@ def _remarks(f: MotorFit) -> list[str]:
 
 def _about(f: MotorFit) -> Content:
     """Return how one motor was fitted, for identified.json."""
-    kept = [w.usable.mean() for w in (f.volts, f.amps) if w is not None]
+    windows = [e.windows for e in f.equations]
     return {
         "rounds": f.rounds,
         "reason": f.reason,
         "row_period_s": f.period,
-        "noise": {"voltage": f.noise.voltage, "current": f.noise.current, "speed": f.noise.speed},
+        "noise": asdict(f.noise),
         "memory_s": f.correlation_time,
-        "windows": [len(w.time) for w in (f.volts, f.amps) if w is not None],
-        "usable": [float(np.round(k, 3)) for k in kept],
+        "windows": [len(w.time) for w in windows],
+        "usable": [float(np.round(w.usable.mean(), 3)) for w in windows],
         "misfit": [m.text for m in misfits(f)],
     }
