@@ -89,7 +89,7 @@ def new(
         proposal = propose(log, options)
         for sentence in proposal.sentences:
             typer.echo(sentence)
-        config, data = new_config(proposal.sketch, out.name), proposal.sketch.data
+        config, data = new_config(proposal.draft, out.name), proposal.draft.data
     else:
         config = new_config(template_draft(ask(options, None if yes else _ask)), out.name)
     config.write(out, force)

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from slipid.data.check.columns import listed
+from slipid.data.check.findings import listed
 from slipid.support.content import Content
 
 COLOUR = {
