@@ -88,8 +88,8 @@ def drive(
         raise ValueError(f"controller '{controller}' from start {start}; expected {names}; 0 to 19")
     row, begin = ROWS[controller], places[start]
     plant = twin_plant(robot, floor, begin, seed, actuator_model_of(robot, gyro=row.gyro))
-    pilot = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
-    driven = closed_loop.run_closed_loop(pilot, course.moved(begin).waiting(REST_S), plant, begin)
+    loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
+    driven = closed_loop.run_closed_loop(loop, course.moved(begin).after_rest(REST_S), plant, begin)
     return DriveResult(driven, floor, closed_loop.path_metrics(driven))
 
 
@@ -120,5 +120,5 @@ def export(
             lie there.
     """
     file = None if map is None else Path(map)
-    wish = ExportOptions(tuple(to), controller, path, speed, map=file)
-    return run(robot, Path(folder), wish, Reporter(quiet=True), ROWS)
+    options = ExportOptions(tuple(to), controller, path, speed, map=file)
+    return run(robot, Path(folder), options, Reporter(quiet=True), ROWS)

@@ -11,7 +11,7 @@ from slipid.app.config import read_config
 from slipid.app.logs import layout_of
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task
 from slipid.data.align.clock import Clock
-from slipid.data.check.columns import Finding, worst_first, wrong
+from slipid.data.check.findings import Finding, worst_first, wrong
 from slipid.data.check.sanity import findings
 from slipid.data.log import Log
 from slipid.data.reading.reader import AnyLayout

@@ -72,8 +72,8 @@ def export(
     with Reporter(quiet=quiet) as report:
         report.stage("reading the robot")
         robot = robot_at(source, load, _names(floors))
-        wish = ExportOptions(_names(to), controller, path, speed, map)
-        done = run(robot, out, wish, report, ROWS)
+        options = ExportOptions(_names(to), controller, path, speed, map)
+        done = run(robot, out, options, report, ROWS)
     content = {
         "schema": "slipid.export/1",
         "folder": str(done.folder),

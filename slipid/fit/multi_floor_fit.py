@@ -1,7 +1,7 @@
-"""What runs over several floors teach beside those that each keep to one floor.
+"""Fit of runs over several floors together with the runs that each keep to one floor.
 
-They are further pieces of the one likelihood. How well they are predicted is told by left-out ones:
-each half of the runs is judged by a fit that has seen the other half only.
+They are further segments of the same likelihood. The quality of their prediction is judged on
+held-out runs: each half of them is predicted by a fit to the other half.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,20 +22,21 @@ from slipid.fit.optimise import Optimum, optimise
 from slipid.fit.problem import FitState, Problem
 
 _ROUNDS = 6
-"""Most rounds of the fits to half of the runs, which only judge."""
+"""Largest number of rounds of the fits to half of the runs, which serve for judgement only."""
 
 
 @dataclass(frozen=True, eq=False)
 class MultiFloorFit:
-    """A fit of runs on one floor and on several together.
+    """A fit of runs on one floor and on several floors together.
 
     Attributes:
-        problem, optimum: of all runs.
-        before: errors of the runs over several floors by a fit that has seen none of them.
-        after: of each half by a fit that has seen the other, None where there is only one run.
-        learnt: by the fit to all of them.
-        as_if: the same had all wheels stood on one floor all the while, by floor; a map that is
-            right predicts better than that.
+        problem: problem of all runs.
+        optimum: optimum of all runs.
+        before: errors of the runs over several floors by a fit without any of them.
+        after: errors of each half by a fit to the other half, None where there is only one run.
+        learnt: errors by the fit to all of them.
+        as_if: errors as if all wheels had always stood on one floor, by floor; a correct map
+            predicts better than that.
     """
 
     problem: Problem
@@ -54,7 +55,7 @@ def fit_multi_floor(
     most_rounds: int = 30,
     tolerance: float = 0.02,
 ) -> MultiFloorFit:
-    """Goes on from the optimum of a problem with runs over several floors.
+    """Continue from the optimum of a problem with runs over several floors.
 
     `tell` is called after every round of the fit to all runs; the limits are those of `optimise`.
     """

@@ -80,7 +80,7 @@ def test_a_proposal_has_the_runs_that_were_asked_for(fit):
 def test_a_drive_says_what_became_of_its_path(fit):
     robot = fit.deploy()
     found = sl.drive(robot, "encoder", start=1, seed=2)
-    assert found.course.pose.shape == found.course.believed.shape
+    assert found.course.pose.shape == found.course.estimated_pose.shape
     assert f"{found.metrics.closure_mm:.0f} mm from where it should" in str(found)
     with pytest.raises(ValueError, match="controller 'magic' from start 0; expected encoder"):
         sl.drive(robot, "magic")

@@ -17,7 +17,7 @@ from slipid.app.new.guess import RunFiles, SortedFiles, guess_robot, sort_files
 from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, robot_of
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
-from slipid.data.reading.bag.runs import PAUSE_S, parts_between_pauses
+from slipid.data.reading.bag.runs import PAUSE_S, runs_between_pauses
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.motor_layout import motor_layout
 from slipid.data.reading.presets import PRESETS
@@ -169,7 +169,7 @@ def _bags_checked(draft: ConfigDraft, first: Path) -> ConfigDraft:
     if tried.problem:
         questions = (*bag.questions, f"the reader says: {tried.problem}")
         return replace(draft, bags=(replace(bag, questions=questions),))
-    count = max((parts_between_pauses(log, PAUSE_S) for log in tried.logs), default=1)
+    count = max((runs_between_pauses(log, PAUSE_S) for log in tried.logs), default=1)
     if count < 2:
         return draft
     comment = f"cut where no wheel moves for longer: {count} runs in the first bag"

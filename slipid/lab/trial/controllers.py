@@ -53,7 +53,9 @@ def _tuned_gains(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
     times, rows = np.arange(0.0, float(path.marks[1]), PERIOD), np.asarray(path.rows)
     own = STEP * np.arange(len(rows))
     reference = np.stack([np.interp(times, own, column) for column in rows.T], axis=1)
-    task = TuningTask(reference, np.array(TUNING_STARTS), habits.held(), habits.follow, PERIOD)
+    task = TuningTask(
+        reference, np.array(TUNING_STARTS), habits.command_shares(), habits.lag_gain, PERIOD
+    )
     return tuple((by_swarm(task) if by == "swarm" else by_gradient(task)).tolist())
 
 

@@ -213,7 +213,7 @@ def drive(task: TrialTask) -> None:
     setup_jax(quiet=True)
     row = ROWS[task.row]
     robot = jax.tree.map(jnp.asarray, task.robot)
-    path = task.path.moved(task.start).waiting(REST_S)
+    path = task.path.moved(task.start).after_rest(REST_S)
     plant: closed_loop.Plant
     if task.plant == "twin":
         truth = drawn_robot(robot, task.seed)
@@ -223,9 +223,9 @@ def drive(task: TrialTask) -> None:
     else:
         plant = SitePlant(task.floor, robot.load_setup, task.start, task.seed, row.gyro)
     there = floor_of(task.told, robot.labels)
-    pilot = control_loop_of(robot, row, task.settings, task.forced, there)
-    course = closed_loop.run_closed_loop(pilot, path, plant, task.start)
-    off = course.pose[-1] - course.believed[-1]
+    loop = control_loop_of(robot, row, task.settings, task.forced, there)
+    course = closed_loop.run_closed_loop(loop, path, plant, task.start)
+    off = course.pose[-1] - course.estimated_pose[-1]
     run = TrialRun(
         controller=task.row,
         start=task.start,
@@ -234,7 +234,7 @@ def drive(task: TrialTask) -> None:
         believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
     )
     # the path first: a run that has metrics is done
-    poses = {"time": course.time, "pose": course.pose, "believed": course.believed}
+    poses = {"time": course.time, "pose": course.pose, "believed": course.estimated_pose}
     task.kept.save(task.name, poses)
     task.kept.save_json(task.name, asdict(run))
 
