@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slipid.camera.frames.source import open_source
+from slipid.camera.frame_source import open_source
 from slipid.camera.overhead import Lens, OverheadCamera
 from slipid.camera.tracking.tracking import LoneMarker, track
 from slipid.data.floor_map import uniform
