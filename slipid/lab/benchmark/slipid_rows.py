@@ -202,7 +202,7 @@ def _estimator(
         robot = robot.with_unseen()
     settings = Settings.of(robot)
     if several or place.map is not None:
-        settings = replace(settings, alike=MIXED_FLOORS_PENALTY)
+        settings = replace(settings, further_floor_penalty=MIXED_FLOORS_PENALTY)
     known = None if place.map is None else floor_of(place.map, robot.labels)
     return Estimator(robot, settings, known)
 

@@ -98,13 +98,13 @@ def test_an_estimator_has_the_floors_that_it_may_meet(made, driven):
 
 def test_only_a_robot_that_may_stand_on_several_floors_looks_for_them(made, driven):
     labels(FloorKnowledge(), made, driven)
-    assert driven[0][0].settings.alike != MIXED_FLOORS_PENALTY
+    assert driven[0][0].settings.further_floor_penalty != MIXED_FLOORS_PENALTY
     cuts = [
         replace(one, runs=tuple(replace(run, floor="unknown") for run in one.runs))
         for one in run_batches(made.runs, made.robot)
     ]
     estimator_runs(own_of(made), cuts, made.runs, FloorKnowledge())
-    assert driven[1][0].settings.alike == MIXED_FLOORS_PENALTY
+    assert driven[1][0].settings.further_floor_penalty == MIXED_FLOORS_PENALTY
 
 
 def test_an_estimator_hears_currents_only_if_it_was_fitted_to_some(made, driven):
