@@ -137,28 +137,27 @@ def contradiction(
         by_map: error of the runs over several floors [m/s], with the map for the wheels' floors.
         as_if: error as if all wheels had always stood on one floor, by floor [m/s].
     """
-    worse = [
-        f"{floor} from {100 * e.before:.1f} to {100 * e.after:.1f} % of the way"
+    worse = ", ".join(
+        f"{floor} from {100 * e.before:.1f} to {100 * e.after:.1f} % of the distance driven"
         for floor, e in found.items()
         if e.is_worse
-    ]
-    if worse:
-        return f"{_NOT_USED} (end-point errors on {', '.join(worse)}); {_WHY}"
-    if not np.isfinite(moved.sigma):
-        return f"{_NOT_USED} (the fit to all found no rest); {_WHY}"
-    if moved.sigma > FAR:
-        return f"{_NOT_USED} ({moved.name} moves by {moved.sigma:.0f} standard errors); {_WHY}"
+    )
     best = min(as_if, key=lambda floor: as_if[floor])
-    if as_if[best] < BETTER * by_map:
-        told = (
-            f"{1000 * by_map:.1f} mm/s by their map, {1000 * as_if[best]:.1f} as if all on {best}"
-        )
-        return f"{_NOT_USED} (errors of {told}); {_WHY}"
-    return None
-
-
-_NOT_USED = "the runs over several floors were not learnt from: they contradict those on one floor"
-_WHY = "their map may be wrong or out of place, or the contact law where floors meet"
+    if worse:
+        reason = f"end-point errors on {worse}"
+    elif not np.isfinite(moved.sigma):
+        reason = "the fit to all of them did not settle"
+    elif moved.sigma > FAR:
+        reason = f"{moved.name} moves by {moved.sigma:.0f} standard errors"
+    elif as_if[best] < BETTER * by_map:
+        errors = f"{1000 * by_map:.1f} mm/s by their map, {1000 * as_if[best]:.1f} mm/s"
+        reason = f"errors of {errors} as if all on {best}"
+    else:
+        return None
+    return (
+        "the runs over several floors were not used: they contradict those on one floor "
+        f"({reason}); their map may be wrong or misplaced, or the contact law where floors meet"
+    )
 
 
 _TINY = 1e-6
