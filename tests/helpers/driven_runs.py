@@ -33,7 +33,7 @@ def driven(law: ForceLaw, seed: int, machine=ROBOTINO, **more) -> Run:
     return made_run(twice, true, machine=machine, name=f"made{seed}", **more)
 
 
-def scattered(count: int, gyro: bool, noise: Noise = TRUE) -> list[Run]:
+def scattered(count: int, gyro: bool, noise: FilterNoise = TRUE) -> list[Run]:
     """Runs as the filter believes in: rho, bias and twists scatter as its noise says."""
     rng = np.random.default_rng(0)
     dynamics, dt = Dynamics.of(ROBOTINO, FLOOR), np.full(count, 0.1)
