@@ -1,6 +1,6 @@
 """Identify a wheeled robot's motors, load shares and wheel-floor contact from its own logs.
 
-Everything below is loaded when it is first asked for: importing slipid loads and changes nothing.
+Every name below is loaded at its first use: importing slipid loads and changes nothing.
 """
 
 from importlib import import_module
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from slipid.api.robot import drive as drive
     from slipid.api.robot import export as export
     from slipid.api.runs import check as check
-    from slipid.api.runs import made_runs as made_runs
-    from slipid.api.runs import move as move
+    from slipid.api.runs import simulate_runs as simulate_runs
+    from slipid.api.runs import steady_motion as steady_motion
     from slipid.camera.overhead import OverheadCamera as OverheadCamera
     from slipid.camera.tracking.tracking import LoneMarker as LoneMarker
     from slipid.data.reading.presets import layout as layout
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from slipid.robot.interface import Measurement as Measurement
     from slipid.support.errors import DataError as DataError
     from slipid.support.jax_setup import setup_jax as setup_jax
+
+    made_runs, move = simulate_runs, steady_motion
 
 __version__ = "0.1.0"
 _ROOMS = {
@@ -59,19 +61,22 @@ _ROOMS = {
     "fit": "slipid.api.fit",
     "floor_map": "slipid.deploy.floors",
     "layout": "slipid.data.reading.presets",
-    "made_runs": "slipid.api.runs",
-    "move": "slipid.api.runs",
     "plot_runs": "slipid.plots.fit",
     "read_runs": "slipid.data.reading.reader",
     "setup_jax": "slipid.support.jax_setup",
+    "simulate_runs": "slipid.api.runs",
+    "steady_motion": "slipid.api.runs",
     "track": "slipid.api.camera",
     "wheel_curve": "slipid.plots.wheels",
 }
-__all__ = sorted(_ROOMS)
+_ALIASES = {"made_runs": "simulate_runs", "move": "steady_motion"}
+"""Older public names, which keep working, and the names that replace them."""
+__all__ = sorted([*_ROOMS, *_ALIASES])
 
 
 def __getattr__(name: str) -> object:
-    """A public name from the room it lives in (PEP 562)."""
+    """Return a public name from the module that defines it (PEP 562)."""
+    name = _ALIASES.get(name, name)
     if name not in _ROOMS:
         raise AttributeError(f"module 'slipid' has no attribute '{name}'")
     return getattr(import_module(_ROOMS[name]), name)

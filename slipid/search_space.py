@@ -1,4 +1,4 @@
-"""What the user wants of declared numbers, and the free ones as a vector without bounds."""
+"""The user's choices for declared numbers, and the free numbers as one vector without bounds."""
 
 import fnmatch
 from collections.abc import Callable, Mapping, Sequence
@@ -16,13 +16,13 @@ from slipid.parameter import Entry, entries, share_basis
 
 @dataclass(frozen=True)
 class Choice:
-    """What the user wants of the paths that match a pattern.
+    """The user's choice for all numbers whose path matches a pattern.
 
     Attributes:
-        pattern: path, `*` and `?` allowed: `surface.*.creep`.
-        start: value to begin with [SI]; a number that is fixed stays so, at this value.
-        fixed: value it keeps [SI]; None leaves it free.
-        free: True or False to say it without a value.
+        pattern: path, with `*` and `?` as wildcards: `surface.*.creep`.
+        start: start value [SI]; a number that is fixed keeps this value.
+        fixed: value at which the number is fixed [SI]; None leaves it free.
+        free: True or False to free or fix the number without giving a value.
         prior_mean: centre of the prior [SI].
         prior_std: std of the prior, in SI around its centre, which without `prior_mean` is the
             declared start.
@@ -37,16 +37,19 @@ class Choice:
 
 
 class Space(eqx.Module):
-    """The free numbers of a tree as one vector without bounds, Gaussian prior included.
+    """The free numbers of a tree as one vector without bounds, with their Gaussian prior.
 
-    Goes through compiled functions as an argument: spaces of the same parameters share them.
+    A space is passed to compiled functions as an argument: spaces of the same parameters share
+    them.
 
     Attributes:
-        template: the tree; what is fixed keeps its value here.
-        start, prior_mean, prior_std: in the search space.
-        pooled: deviations whose prior std is found from the data, for the user gave none.
+        template: tree that holds the values of the fixed numbers.
+        start, prior_mean, prior_std: start vector, and mean and std of the prior, in the search
+            space.
+        pooled: coordinates of deviations whose prior std is estimated from the data because the
+            user gave none.
         all: every declared number of the tree.
-        free: those that are fitted.
+        free: the numbers that are fitted.
     """
 
     template: Any
@@ -58,7 +61,7 @@ class Space(eqx.Module):
     free: tuple[Entry, ...] = eqx.field(static=True)
 
     def __init__(self, tree: Any, choices: Sequence[Choice] = ()):
-        """Space of a module with declared numbers; later choices win.
+        """Build the space of a module with declared numbers; later choices override earlier ones.
 
         Raises:
             ValueError: a pattern matches no path, or a value lies outside its bounds.
@@ -72,7 +75,7 @@ class Space(eqx.Module):
         free, starts, means, spreads, pooled = [], [], [], [], []
         for entry in self.all:
             picked = [c for c in choices if fnmatch.fnmatchcase(entry.path, c.pattern)]
-            value, mean, spread, is_free = _settle(entry, entry.get(tree), picked)
+            value, mean, spread, is_free = _resolved(entry, entry.get(tree), picked)
             values[entry] = value
             if is_free:
                 free.append(entry)
@@ -81,7 +84,7 @@ class Space(eqx.Module):
                 spreads.append(spread)
                 found = entry.declaration.deviation and all(c.prior_std is None for c in picked)
                 pooled.append(np.full(entry.coordinates, found))
-        self.template = put(tree, values)
+        self.template = with_values(tree, values)
         self.free = tuple(free)
         self.start, self.prior_mean, self.prior_std = (
             np.concatenate([np.zeros(0), *parts]) for parts in (starts, means, spreads)
@@ -89,24 +92,24 @@ class Space(eqx.Module):
         self.pooled = np.concatenate([np.zeros(0, bool), *pooled])
 
     def with_pooled(self, std: float) -> "Space":
-        """The same with the prior std that was found for the deviations."""
+        """Return the same space with an estimated prior std for the pooled deviations."""
         prior_std = np.where(self.pooled, std, self.prior_std)
         return eqx.tree_at(lambda space: space.prior_std, self, prior_std)
 
     @property
-    def place(self) -> dict[str, slice]:
-        """Where the coordinates of every free number are, by path."""
+    def slices(self) -> dict[str, slice]:
+        """Slice of the search vector that holds each free number, by path."""
         ends = np.cumsum([0, *(e.coordinates for e in self.free)]).tolist()
         return {e.path: slice(a, b) for e, a, b in zip(self.free, ends, ends[1:], strict=False)}
 
     def where(self, wanted: Callable[[Entry], bool]) -> Bool[np.ndarray, " free"]:
-        """Coordinates of the free numbers that are wanted."""
+        """Return a mask of the coordinates whose number satisfies a condition."""
         count = [e.coordinates for e in self.free]
         return np.repeat(np.array([wanted(e) for e in self.free], bool), count)
 
     @property
     def electric(self) -> Bool[np.ndarray, " free"]:
-        """Coordinates that are read from currents and voltages given the motion."""
+        """Mask of the coordinates estimated from currents and voltages given the motion."""
         return self.where(lambda e: e.declaration.electric)
 
     @property
@@ -124,22 +127,24 @@ class Space(eqx.Module):
         ]
 
     def tree(self, z: Float[Array, " free"] | Float[np.ndarray, " free"]) -> Any:
-        """Tree of SI values at a search-space vector; jit-able."""
-        z, place = z if isinstance(z, jax.core.Tracer) else np.asarray(z, float), self.place
-        return put(self.template, {e: e.declaration.to_si(z[place[e.path]]) for e in self.free})
+        """Return the tree of SI values at a search-space vector; can be compiled."""
+        z, slices = z if isinstance(z, jax.core.Tracer) else np.asarray(z, float), self.slices
+        return with_values(
+            self.template, {e: e.declaration.to_si(z[slices[e.path]]) for e in self.free}
+        )
 
     def vector(self, tree: Any) -> np.ndarray:
-        """Search-space vector of a tree's free numbers."""
+        """Return the search-space vector of a tree's free numbers."""
         parts = [e.declaration.to_search(np.asarray(e.get(tree))) for e in self.free]
         return np.concatenate([np.zeros(0), *parts])
 
 
-def put(tree: Any, values: Mapping[Entry, Any]) -> Any:
-    """The tree with these values [SI] at their places; compiles nothing where nothing is traced."""
+def with_values(tree: Any, values: Mapping[Entry, Any]) -> Any:
+    """Return the tree with new values [SI] at some entries; nothing is compiled without tracing."""
     changed: dict[tuple[str, ...], tuple[Entry, Any]] = {}
     for entry, value in values.items():
         whole = changed[entry.leaf][1] if entry.leaf in changed else entry.whole(tree)
-        changed[entry.leaf] = entry, _placed(whole, entry.index, value)
+        changed[entry.leaf] = entry, _replaced(whole, entry.index, value)
     if not changed:
         return tree
     places, arrays = zip(*changed.values(), strict=True)
@@ -148,8 +153,8 @@ def put(tree: Any, values: Mapping[Entry, Any]) -> Any:
     )
 
 
-def _placed(whole: Any, index: int | None, value: Any) -> Any:
-    """An array with a value in one of its rows, or in place of all of it."""
+def _replaced(whole: Any, index: int | None, value: Any) -> Any:
+    """Return an array with a new value in one of its rows, or in place of the whole array."""
     shape = whole.shape if index is None else whole.shape[1:]
     if isinstance(whole, jax.core.Tracer) or isinstance(value, jax.core.Tracer):
         traced = jnp.asarray(value, dtype=whole.dtype).reshape(shape)
@@ -162,24 +167,24 @@ def _placed(whole: Any, index: int | None, value: Any) -> Any:
     return out
 
 
-def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, Any, bool]:
-    """Value, prior mean and std in the search space, and whether it is free."""
+def _resolved(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, Any, bool]:
+    """Return the value, prior mean and std in the search space, and whether it is free."""
     d = entry.declaration
     usual = np.full(entry.size, 1 / entry.size if d.shares else d.start)
     is_free, mean_si, std_si = d.free, None, None
     for c in picked:
         if c.fixed is not None:
-            value, is_free = _inside(entry, c.fixed), False
+            value, is_free = _checked_value(entry, c.fixed), False
         if c.start is not None:
-            value = _inside(entry, c.start)
+            value = _checked_value(entry, c.start)
         if c.prior_mean is not None or c.prior_std is not None:
-            mean_si = _inside(entry, usual if c.prior_mean is None else c.prior_mean)
-            std_si = _spread(entry, c.prior_std)
+            mean_si = _checked_value(entry, usual if c.prior_mean is None else c.prior_mean)
+            std_si = _checked_std(entry, c.prior_std)
             value = value if c.prior_mean is None or c.start is not None else mean_si
             is_free = True
         if c.free is not None:
             is_free = c.free
-    value = _inside(entry, value)
+    value = _checked_value(entry, value)
     mean = d.to_search(usual if mean_si is None else mean_si)
     if std_si is None:
         spread = np.full(entry.coordinates, d.spread)
@@ -196,8 +201,8 @@ def _settle(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, A
     return value, mean, spread, is_free
 
 
-def _spread(entry: Entry, std: Any) -> np.ndarray | None:
-    """Std of a prior, checked; None where only its centre was given."""
+def _checked_std(entry: Entry, std: Any) -> np.ndarray | None:
+    """Return a valid std of a prior, None where only its centre was given."""
     if std is None:
         return None
     x = np.asarray(std, float).ravel()
@@ -206,8 +211,8 @@ def _spread(entry: Entry, std: Any) -> np.ndarray | None:
     return x
 
 
-def _inside(entry: Entry, value: Any) -> np.ndarray:
-    """Value as an array, checked; one number stands for all of a vector."""
+def _checked_value(entry: Entry, value: Any) -> np.ndarray:
+    """Return a valid value as an array; one number stands for all entries of a vector."""
     x, d = np.asarray(value, float), entry.declaration
     if x.size not in (1, entry.size):
         raise ValueError(f"{entry.path} takes {entry.size} numbers, got {x.size}")

@@ -32,7 +32,7 @@ def test_each_coordinate_moves_its_own_number_only(tree):
     before = {e.path: np.asarray(e.get(tree)) for e in space.all}
     for entry in space.free:
         z = space.start.copy()
-        z[space.place[entry.path]] += 0.3
+        z[space.slices[entry.path]] += 0.3
         after = space.tree(jnp.asarray(z))
         moved = [
             e.path
@@ -46,7 +46,7 @@ def test_tree_is_jittable_and_its_gradient_is_the_slope(tree):
     space = Space(tree)
     grad = jax.jit(jax.grad(lambda z: space.tree(z).floors.creep[1]))(jnp.asarray(space.start))
     expected = np.zeros(space.size)
-    expected[space.place["floor.b.creep"]] = 0.2  # d exp(z) / dz
+    expected[space.slices["floor.b.creep"]] = 0.2  # d exp(z) / dz
     np.testing.assert_allclose(grad, expected, atol=1e-14)
 
 
@@ -58,25 +58,25 @@ def test_a_choice_without_wildcard_touches_one_path(tree):
 
 def test_wildcards_and_the_later_choice_wins(tree):
     space = Space(tree, [Choice("floor.*.creep", fixed=0.5), Choice("floor.b.creep", free=True)])
-    assert "floor.a.creep" not in space.place
-    assert "floor.b.creep" in space.place
+    assert "floor.a.creep" not in space.slices
+    assert "floor.b.creep" in space.slices
     np.testing.assert_allclose(space.template.floors.creep, 0.5)
 
 
 def test_a_fixed_number_keeps_its_value(tree):
     space = Space(tree, [Choice("inner.gain", fixed=3.5)])
     z = jnp.asarray(space.start + 1.0)
-    assert "inner.gain" not in space.place
+    assert "inner.gain" not in space.slices
     assert float(space.tree(z).inner.gain) == 3.5
 
 
 def test_without_choice_the_declared_prior_holds(tree):
     space = Space(tree)
-    at = space.place["floor.b.creep"]
+    at = space.slices["floor.b.creep"]
     # the value of the tree is where the search starts, the declared start is the prior's centre
     np.testing.assert_allclose(space.start[at], math.log(0.2))
     np.testing.assert_allclose(space.prior_mean[at], math.log(0.3))
-    np.testing.assert_allclose(space.prior_std[space.place["inner.gain"]], 0.7)
+    np.testing.assert_allclose(space.prior_std[space.slices["inner.gain"]], 0.7)
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_without_choice_the_declared_prior_holds(tree):
 )
 def test_a_prior_given_in_si_has_that_std_in_si(tree, path, mean, std):
     space = Space(tree, [Choice(path, prior_mean=mean, prior_std=std)])
-    at = space.place[path]
+    at = space.slices[path]
     rng = np.random.default_rng(1)
     z = space.prior_mean[at] + space.prior_std[at] * rng.normal(size=(20000, 1))
     d = next(e for e in space.free if e.path == path).declaration
@@ -104,7 +104,7 @@ def test_a_prior_given_in_si_has_that_std_in_si(tree, path, mean, std):
 @pytest.mark.parametrize("share", [(1 / 3, 1 / 3, 1 / 3), (0.28, 0.27, 0.45)])
 def test_a_prior_on_shares_has_that_std_in_si(tree, share):
     space = Space(tree, [Choice("share@full", prior_mean=share, prior_std=0.01)])
-    at = space.place["share@full"]
+    at = space.slices["share@full"]
     rng = np.random.default_rng(2)
     z = space.prior_mean[at] + space.prior_std[at] * rng.normal(size=(20000, 2))
     draws = np.asarray(jax.vmap(declaration(shares=True).to_si)(jnp.asarray(z)))
@@ -114,7 +114,7 @@ def test_a_prior_on_shares_has_that_std_in_si(tree, share):
 
 def test_a_std_alone_is_a_prior_around_the_declared_start(tree):
     space = Space(tree, [Choice("floor.b.creep", prior_std=0.06)])
-    at = space.place["floor.b.creep"]
+    at = space.slices["floor.b.creep"]
     np.testing.assert_allclose(space.prior_mean[at], math.log(0.3))
     np.testing.assert_allclose(space.prior_std[at], 0.06 / 0.3)
     np.testing.assert_allclose(space.start[at], math.log(0.2))

@@ -7,10 +7,10 @@ import numpy as np
 
 from slipid.app.config import FitSection
 from slipid.app.identify import optimised, summarised
-from slipid.app.problem import Task, on_runs, said_of
+from slipid.app.problem import FitTask, robot_for_runs, stated_sizes
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
-from slipid.fit.problem import still_viscosities
+from slipid.fit.problem import fixed_viscosities
 from slipid.infer.result import Fit
 from slipid.model.robot import Robot
 from slipid.search_space import Choice
@@ -65,13 +65,13 @@ def fit(
     """
     refuse_misordered(runs.logs)
     wishes = priors or {}, fixed or {}, start or {}, free
-    task = task_of(runs, robot, *wishes, image_centre, windows_per_piece, seed)
+    task = fit_task_of(runs, robot, *wishes, image_centre, windows_per_piece, seed)
     with Reporter(quiet=quiet) as report:
         problem, optimum = optimised(task, task.problem(), None, report)
         return summarised(task, problem, optimum, report)
 
 
-def task_of(
+def fit_task_of(
     runs: Runs,
     robot: Robot,
     priors: Mapping[str, Prior],
@@ -81,19 +81,21 @@ def task_of(
     image_centre: tuple[float, float] = (0.0, 0.0),
     windows_per_piece: int = 4,
     seed: int = 0,
-) -> Task:
+) -> FitTask:
     """What is to be fitted; arguments as of `fit`."""
-    full = on_runs(robot, runs, image_centre)
-    choices = [*still_viscosities(runs), *said_of(full, float(full.body.mass))]
+    full = robot_for_runs(robot, runs, image_centre)
+    choices = [*fixed_viscosities(runs), *stated_sizes(full, float(full.body.mass))]
     choices += [Choice(path, free=True) for path in free]
     for path, prior in priors.items():
-        choices.append(Choice(path, prior_mean=_plain(prior.mean), prior_std=_plain(prior.std)))
-    choices += [Choice(path, fixed=_plain(value)) for path, value in fixed.items()]
-    choices += [Choice(path, start=_plain(value)) for path, value in start.items()]
+        choices.append(
+            Choice(path, prior_mean=_json_numbers(prior.mean), prior_std=_json_numbers(prior.std))
+        )
+    choices += [Choice(path, fixed=_json_numbers(value)) for path, value in fixed.items()]
+    choices += [Choice(path, start=_json_numbers(value)) for path, value in start.items()]
     settings = FitSection(windows_per_piece=windows_per_piece, seed=seed)
-    return Task(runs, full, tuple(choices), settings)
+    return FitTask(runs, full, tuple(choices), settings)
 
 
-def _plain(value: Numbers) -> float | list[float]:
+def _json_numbers(value: Numbers) -> float | list[float]:
     """A number, or a list of them, as JSON holds them."""
     return np.asarray(value, float).tolist()

@@ -8,12 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from slipid.data.floor_map import FloorMap, read_map
-from slipid.deploy.controllers import pilot_of
-from slipid.deploy.deploy import NO_CONTROLLER, habits_of
-from slipid.deploy.export import FORMS, Exported, Wish
+from slipid.deploy.controllers import control_loop_of
+from slipid.deploy.deploy import NO_CONTROLLER, actuator_model_of
+from slipid.deploy.export import FORMS, Exported, ExportOptions
 from slipid.deploy.export import export as run
 from slipid.deploy.floors import floor_of
-from slipid.deploy.twin_run import REST_S, known_to_fit, path_of, site, starts, twin
+from slipid.deploy.twin_run import (
+    REST_S,
+    path_of,
+    require_known_surfaces,
+    starts,
+    twin_floor,
+    twin_plant,
+)
 from slipid.lab.trial.controllers import ROWS
 from slipid.robot import closed_loop
 from slipid.robot.deployed import DeployedRobot
@@ -21,7 +28,7 @@ from slipid.support.progress import Reporter
 
 
 @dataclass(frozen=True, eq=False)
-class ClosedLoopDrive:
+class DriveResult:
     """One closed-loop run; `print` says what became of the path.
 
     Attributes:
@@ -30,9 +37,9 @@ class ClosedLoopDrive:
         metrics: what became of the path, from true poses.
     """
 
-    course: closed_loop.Course
+    course: closed_loop.ClosedLoopRun
     floor: FloorMap
-    metrics: closed_loop.Metrics
+    metrics: closed_loop.PathMetrics
 
     def __str__(self) -> str:
         m = self.metrics
@@ -52,7 +59,7 @@ def drive(
     speed: float = 0.2,
     start: int = 0,
     seed: int = 0,
-) -> ClosedLoopDrive:
+) -> DriveResult:
     """Drive the 2021 paper's rectangle, or another path, on the twin of a robot.
 
     The twin is the model itself, with delays and noise.
@@ -73,17 +80,17 @@ def drive(
     if not robot.steers:
         raise ValueError(NO_CONTROLLER)
     course = path_of(path, speed, robot)
-    floor = site(robot) if map is None else read_map(Path(map))
-    known_to_fit(floor, robot, str(map))
+    floor = twin_floor(robot) if map is None else read_map(Path(map))
+    require_known_surfaces(floor, robot, str(map))
     places = starts(20, floor, course)
     if controller not in ROWS or not 0 <= start < len(places):
         names = ", ".join(ROWS)
         raise ValueError(f"controller '{controller}' from start {start}; expected {names}; 0 to 19")
     row, begin = ROWS[controller], places[start]
-    plant = twin(robot, floor, begin, seed, habits_of(robot, gyro=row.gyro))
-    pilot = pilot_of(robot, row, floor=floor_of(floor, robot.labels))
-    driven = closed_loop.drive(pilot, course.moved(begin).waiting(REST_S), plant, begin)
-    return ClosedLoopDrive(driven, floor, closed_loop.metrics(driven))
+    plant = twin_plant(robot, floor, begin, seed, actuator_model_of(robot, gyro=row.gyro))
+    loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
+    driven = closed_loop.run_closed_loop(loop, course.moved(begin).after_rest(REST_S), plant, begin)
+    return DriveResult(driven, floor, closed_loop.path_metrics(driven))
 
 
 def export(
@@ -113,5 +120,5 @@ def export(
             lie there.
     """
     file = None if map is None else Path(map)
-    wish = Wish(tuple(to), controller, path, speed, map=file)
-    return run(robot, Path(folder), wish, Reporter(quiet=True), ROWS)
+    options = ExportOptions(tuple(to), controller, path, speed, map=file)
+    return run(robot, Path(folder), options, Reporter(quiet=True), ROWS)

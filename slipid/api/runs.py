@@ -13,16 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.api.fit import Numbers, Prior, task_of
-from slipid.app.check import Expected, expected, overview
+from slipid.api.fit import Numbers, Prior, fit_task_of
+from slipid.app.check import ExpectedEstimates, expected, overview
 from slipid.data.runs import Runs, collect
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.lab.selftest import logs as known
-from slipid.lab.selftest.logs import make_logs
+from slipid.lab.selftest.logs import simulate_logs
 from slipid.model.robot import Robot, motor_current, twist, wheel_torque
 from slipid.report.estimates import show_check
 from slipid.report.page import text_of
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class LogCheck:
     """
 
     content: Content
-    result: Expected
+    result: ExpectedEstimates
 
     def __str__(self) -> str:
         return text_of(show_check, self.content | self.result.to_json())
@@ -54,12 +54,12 @@ def check(
     free: Sequence[str] = (),
 ) -> LogCheck:
     """Look before you fit: arguments and errors as of `fit`, which takes far longer."""
-    task = task_of(runs, robot, priors or {}, fixed or {}, {}, free)
+    task = fit_task_of(runs, robot, priors or {}, fixed or {}, {}, free)
     return LogCheck(overview(task), expected(task, task.problem()))
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class SimulatedRuns:
     """Made runs and what is true of them.
 
     Attributes:
@@ -73,10 +73,10 @@ class Made:
     @cached_property
     def truth(self) -> dict[str, float | list[float]]:
         """Every true number by its path [SI]."""
-        return known.numbers(self.robot)
+        return known.true_numbers(self.robot)
 
 
-def made_runs(
+def simulate_runs(
     floors: Sequence[str] = ("firm", "soft"),
     *,
     headings: int = 12,
@@ -86,7 +86,7 @@ def made_runs(
     current: bool = True,
     voltage: bool = True,
     seed: int = 0,
-) -> Made:
+) -> SimulatedRuns:
     """Drive a grid of runs with known numbers, seen by noisy sensors as those of a real Robotino.
 
     Args:
@@ -101,12 +101,16 @@ def made_runs(
     Raises:
         ValueError: no such number; names those there are.
     """
-    drives = known.grid([(floor, "as_built") for floor in floors], headings, speeds, turns)
-    robot = known.truth(drives, truth)
-    if wrong := sorted(set(truth or {}) - set(known.numbers(robot))):
-        raise ValueError(f"no parameter '{wrong[0]}'; there are: {', '.join(known.numbers(robot))}")
-    logs = make_logs(robot, drives, seed, known.Sensors(has_voltage=voltage))
-    return Made(collect(logs if current else [replace(log, current=None) for log in logs]), robot)
+    drives = known.heading_grid([(floor, "as_built") for floor in floors], headings, speeds, turns)
+    robot = known.true_robot(drives, truth)
+    if wrong := sorted(set(truth or {}) - set(known.true_numbers(robot))):
+        raise ValueError(
+            f"no parameter '{wrong[0]}'; there are: {', '.join(known.true_numbers(robot))}"
+        )
+    logs = simulate_logs(robot, drives, seed, known.SimulatedSensors(has_voltage=voltage))
+    return SimulatedRuns(
+        collect(logs if current else [replace(log, current=None) for log in logs]), robot
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +132,7 @@ class SteadyMotion:
     current: Float[np.ndarray, "command drive"]
 
 
-def move(
+def steady_motion(
     robot: Robot, floor: str, command: Sequence[Sequence[float]] | np.ndarray, load: str = ""
 ) -> SteadyMotion:
     """Steady motion of a robot whose wheels keep the speeds that commands ask for.
@@ -146,11 +150,11 @@ def move(
     """
     places = robot.surface_index(floor), robot.load_index(load or robot.body.loads[0])
     rows = jnp.atleast_2d(jnp.asarray(command, dtype=float))
-    return SteadyMotion(*(np.asarray(x) for x in _moved(robot, rows, *map(jnp.asarray, places))))
+    return SteadyMotion(*(np.asarray(x) for x in _steady(robot, rows, *map(jnp.asarray, places))))
 
 
 @eqx.filter_jit
-def _moved(
+def _steady(
     robot: Robot, command: Float[Array, "command 3"], floor: Array, load: Array
 ) -> tuple[Array, ...]:
     frame = robot.geometry.frame()
@@ -161,7 +165,7 @@ def _moved(
         way, stands = jnp.sign(speed), jnp.abs(speed) < 1e-6
         xi = twist(robot, frame, speed, floor, load)
         torque = wheel_torque(robot, frame, xi, speed, floor, load)
-        rim = jnp.where(stands, jnp.nan, frame.radius * frame.pull * speed)
+        rim = jnp.where(stands, jnp.nan, frame.radius * frame.drive_share * speed)
         current = motor_current(robot, frame, xi, driven, floor, load) * jnp.sign(driven)
         return xi, speed, 1 - frame.hold @ xi / rim, torque * way, current
 

@@ -1,7 +1,4 @@
-"""What is wrong with the logs of a job or with its config, before anything is fitted.
-
-What a set of logs holds and can tell before anything is fitted: what `slipid check` does.
-"""
+"""Check logs and config before a fit, and predict how well a fit will know each number."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,9 +9,9 @@ import numpy as np
 
 from slipid.app.config import read_config
 from slipid.app.logs import layout_of
-from slipid.app.problem import Job, Task, read_job
+from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task
 from slipid.data.align.clock import Clock
-from slipid.data.check.columns import Finding, worst_first, wrong
+from slipid.data.check.findings import Finding, worst_first, wrong
 from slipid.data.check.sanity import findings
 from slipid.data.log import Log
 from slipid.data.reading.reader import AnyLayout
@@ -24,26 +21,27 @@ from slipid.infer import slip_curves as curves_of
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
 from slipid.predict.agreement import scatter
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content, write_json
+from slipid.support.files import write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 _AT_MOTOR = ("wheel_ticks", "motor_angle", "motor_speed", "motor_speed_command")
-"""Channels that the gear ratio of a layout turns into motion of the wheel."""
+"""Channels that the gear ratio of a layout converts to motion of the wheel."""
 
 
-def sanity(task: Task) -> tuple[Finding, ...]:
-    """Findings about the runs of a task, and about the config where there is one; worst first."""
-    mass = task.config.content.wheels.mass_kg if isinstance(task, Job) else None
-    said = [*_braking(task), *findings(task.dataset, task.robot.geometry, mass)]
-    if isinstance(task, Job):
-        said += [*_forgotten(task), *_two_gears(task)]
-    return worst_first(said)
+def sanity(task: FitTask) -> tuple[Finding, ...]:
+    """Return findings about the runs of a task, and about its config if it has one; worst first."""
+    mass = task.config.content.wheels.mass_kg if isinstance(task, ConfigFitTask) else None
+    found = [*_braking(task), *findings(task.dataset, task.robot.geometry, mass)]
+    if isinstance(task, ConfigFitTask):
+        found += [*_missing_sizes(task), *_different_gears(task)]
+    return worst_first(found)
 
 
 def refuse_if_wrong(found: Sequence[Finding]) -> None:
-    """DataError with all that is wrong, if anything is."""
+    """Raise `DataError` with every finding of severity "wrong"."""
     if bad := wrong(found):
         listed = "\n".join(f"  {k}. {finding}" for k, finding in enumerate(bad, start=1))
         raise DataError(
@@ -52,10 +50,11 @@ def refuse_if_wrong(found: Sequence[Finding]) -> None:
         )
 
 
-def _braking(task: Task) -> Iterator[Finding]:
-    """Magnitudes of currents beside voltages, of wheels that drag each other along in turns.
+def _braking(task: FitTask) -> Iterator[Finding]:
+    """Find unsigned currents beside voltages on robots whose wheels drag each other along in turns.
 
-    On made runs of a skid-steer robot R then was off by ten of its stds, and called identified.
+    On simulated runs of a skid-steer robot the resistance was then wrong by ten standard deviations
+    and yet called identified.
     """
     runs = task.dataset
     has = runs.current is not None and runs.voltage is not None
@@ -69,15 +68,15 @@ def _braking(task: Task) -> Iterator[Finding]:
         )
 
 
-def _forgotten(job: Job) -> Iterator[Finding]:
-    """Numbers of the robot that torques scale with, and that were left at their defaults."""
-    logged = [n for n in ("current", "voltage") if getattr(job.dataset, n) is not None]
-    robot = job.config.content.wheels
+def _missing_sizes(task: ConfigFitTask) -> Iterator[Finding]:
+    """Find numbers of the robot that torques scale with and that were left at their defaults."""
+    logged = [n for n in ("current", "voltage") if getattr(task.dataset, n) is not None]
+    robot = task.config.content.wheels
     absent = ["mass_kg"] if robot.mass_kg is None else []
     absent += [] if "gear_ratio" in robot.model_fields_set else ["gear_ratio"]
     if not logged or not absent:
         return
-    taken = {"mass_kg": f"{float(job.robot.body.mass):g} kg", "gear_ratio": "1"}
+    taken = {"mass_kg": f"{float(task.robot.body.mass):g} kg", "gear_ratio": "1"}
     yield Finding(
         "forgotten",
         f"{' and '.join(f'{n} ({taken[n]} would be taken)' for n in absent)} left out of [robot], "
@@ -87,17 +86,17 @@ def _forgotten(job: Job) -> Iterator[Finding]:
     )
 
 
-def _two_gears(job: Job) -> Iterator[Finding]:
-    """Gear ratios of the robot and of a layout that differ."""
-    robot = job.config.content.wheels
+def _different_gears(task: ConfigFitTask) -> Iterator[Finding]:
+    """Find gear ratios that differ between the robot and a layout."""
+    robot = task.config.content.wheels
     if "gear_ratio" not in robot.model_fields_set:
         return
-    seen: set[str] = set()
-    for section in job.config.content.logs:
-        layout = layout_of(job.config, section)
-        if section.format in seen or not _uses_gear(layout):
+    checked: set[str] = set()
+    for section in task.config.content.logs:
+        layout = layout_of(task.config, section)
+        if section.format in checked or not _uses_gear(layout):
             continue
-        seen.add(section.format)
+        checked.add(section.format)
         if abs(layout.gear_ratio / robot.gear_ratio - 1) > 1e-3:
             yield Finding(
                 "two_gear_ratios",
@@ -120,10 +119,13 @@ _CHANNELS = (
 
 
 @dataclass(frozen=True)
-class Expected:
-    """What logs can be expected to tell of every number and ratio, by path.
+class ExpectedEstimates:
+    """Expected verdict of every number and ratio, by path.
 
-    `messages` say what stays open and what would close it, one sentence each.
+    Attributes:
+        parameters: expected estimate of each number.
+        derived: expected estimate of each ratio.
+        messages: a sentence for each thing that stays unknown, with a measurement that would help.
     """
 
     parameters: dict[str, Estimate]
@@ -131,10 +133,10 @@ class Expected:
     messages: tuple[str, ...]
 
     def to_json(self) -> Content:
-        """Its part of check.json."""
+        """Return the part of check.json that holds the expectations."""
         return {
-            "parameters": {path: _before(e) for path, e in self.parameters.items()},
-            "derived": {path: _before(e) for path, e in self.derived.items()},
+            "parameters": {path: _expected_json(e) for path, e in self.parameters.items()},
+            "derived": {path: _expected_json(e) for path, e in self.derived.items()},
             "messages": list(self.messages),
         }
 
@@ -142,32 +144,29 @@ class Expected:
 def check(
     config_path: Path, data: Path, out: Path | None, report: Reporter
 ) -> tuple[Runs, Content]:
-    """Say what the logs hold, and what they can be expected to tell, before any fit.
-
-    That is the content of check.json, which is written to `out`, if that is wanted.
-    """
+    """Return the runs and the content of check.json, which is also written to `out` where given."""
     setup_jax(quiet=True)
-    job = read_job(read_config(config_path), data, report)
+    task = read_fit_task(read_config(config_path), data, report)
     report.stage("do logs and config go together?")
-    content = overview(job, job.skipped)
+    content = overview(task, task.skipped)
     report.stage("expected information")
-    content |= _expected_if_any(job).to_json()
+    content |= _expected_if_any(task).to_json()
     if out is not None:
         write_json(out / "check.json", content)
-    return job.dataset, content
+    return task.dataset, content
 
 
-def _expected_if_any(job: Task) -> Expected:
-    """`expected`; nothing where what is wrong with the logs leaves no windows to fit."""
+def _expected_if_any(task: FitTask) -> ExpectedEstimates:
+    """Return `expected`, or a message alone where the logs leave no windows to fit."""
     try:
-        return expected(job, job.problem())
+        return expected(task, task.problem())
     except DataError as error:
-        return Expected({}, {}, (f"nothing can be expected of a fit: {error}",))
+        return ExpectedEstimates({}, {}, (f"nothing can be expected of a fit: {error}",))
 
 
-def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
-    """Findings, runs by floor, load and session, channels, repairs, what was left out."""
-    data = job.dataset
+def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
+    """Return findings, runs by floor, load and session, channels, repairs, and skipped logs."""
+    data = task.dataset
     groups: dict[tuple[str, str, str], list[int]] = {}
     for k, log in enumerate(data.logs):
         groups.setdefault((log.surface or "unknown", log.load, data.session[k]), []).append(k)
@@ -175,7 +174,7 @@ def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
     notes = Counter(note for log in data.logs for note in log.notes)
     return {
         "schema": "slipid.check/1",
-        "findings": [finding.to_json() for finding in sanity(job)],
+        "findings": [finding.to_json() for finding in sanity(task)],
         "runs": len(data),
         "groups": [
             {
@@ -193,12 +192,12 @@ def overview(job: Task, skipped: Sequence[str] = ()) -> Content:
         "clocks": {log.name: _clock(log.pose_clock) for log in data.logs if log.pose_clock},
         "notes": dict(notes.most_common()),
         "skipped": list(skipped),
-        "data": {"hash": job.data_hash, "logs": {log.name: log.sha256 for log in data.logs}},
+        "data": {"hash": task.data_hash, "logs": {log.name: log.sha256 for log in data.logs}},
     }
 
 
 def _clock(clock: Clock) -> Content:
-    """The clock of a run's poses against the robot's; intervals of 90 %."""
+    """Return the clock of a run's poses relative to the robot's clock, with 90 % intervals."""
     return {
         "offset_s": clock.offset,
         "offset_interval90_s": clock.offset_interval90,
@@ -209,22 +208,22 @@ def _clock(clock: Clock) -> Content:
 
 
 def _channels(logs: tuple[Log, ...]) -> list[str]:
-    """Channels that logs have, and what is special of them."""
-    said = []
+    """Return the names of the logged channels, each with its exceptions."""
+    names = []
     for name in _CHANNELS:
         if count := sum(getattr(log, name) is not None for log in logs):
             part = "" if count == len(logs) else f" ({count} of {len(logs)} runs)"
             unsigned = name == "current" and not all(log.current_is_signed for log in logs)
-            said.append(f"{name}{part}{' (unsigned)' if unsigned else ''}")
-    return said
+            names.append(f"{name}{part}{' (unsigned)' if unsigned else ''}")
+    return names
 
 
-def expected(job: Task, problem: Problem) -> Expected:
-    """Verdicts from the expected information, with noise as the runs scatter, if not typical.
+def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
+    """Return verdicts from the expected information, with the noise that the runs show.
 
-    What floors are like is not known yet: of the start values and of every creep that a fit starts
-    from, the one counts for a number at which the runs tell least of it, and for what stays open
-    the one at which they tell least of all.
+    The floors' numbers are not known yet. Therefore the start values and every creep that a fit
+    starts from are tried: each number gets its least informative estimate, and the messages
+    describe the start with the largest covariance of all.
     """
     space, w = problem.space, problem.windows
     log_v, keep, volt = scatter(problem), np.ones(len(w)), w.has_voltage
@@ -237,21 +236,21 @@ def expected(job: Task, problem: Problem) -> Expected:
     covariances = [problem.laplace(z, log_v, keep) for z in starts]
     # after them: what it compiles they have traced
     robot = space.tree(space.start)
-    validity = curves_of.validity(job.dataset, robot, problem.batch)
+    validity = curves_of.validity(task.dataset, robot, problem.batch)
     where = w.has_current, volt, validity, robot.geometry.determines_twist
     for covariance in covariances:
         flat = flat_directions(space, covariance, *where)
-        found = estimates(space, job.choices, space.start, covariance, volt, members(flat))
+        found = estimates(space, task.choices, space.start, covariance, volt, members(flat))
         _least(parameters, found)
         _least(ratios, derived(space, space.start, covariance, volt))
         left = float(np.linalg.slogdet(covariance)[1])
         if left > most:
             most, open_ = left, flat
-    return Expected(parameters, ratios, sentences(open_))
+    return ExpectedEstimates(parameters, ratios, sentences(open_))
 
 
 def _least(kept: dict[str, Estimate], found: Iterable[Estimate]) -> None:
-    """Keep of every number the estimate that promises less."""
+    """Keep the less informative of two estimates of every number."""
     order = ("identified", "weak", "not_identified")
 
     def promise(e: Estimate) -> tuple[int, float]:
@@ -261,6 +260,6 @@ def _least(kept: dict[str, Estimate], found: Iterable[Estimate]) -> None:
         kept[e.path] = max(kept.get(e.path, e), e, key=promise)
 
 
-def _before(e: Estimate) -> Content:
+def _expected_json(e: Estimate) -> Content:
     kept = {"unit": e.unit, "start": e.value, "expected_std": e.std}
     return kept | {"ratio": e.ratio, "verdict": e.verdict}

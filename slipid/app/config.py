@@ -1,7 +1,7 @@
-"""The config of a job: what the TOML file may say, checked once, every mistake with its key.
+"""The config of a robot and its logs: a TOML file checked once, every mistake with its key.
 
-Units stand in the names of the keys; everything is optional that has a default here. What a key
-means stands in the docstring of its section: `slipid reference` and `slipid new` print it.
+Units are part of the key names, and every key with a default is optional. The docstring of a
+section explains its keys: `slipid reference` and `slipid new` print it.
 """
 
 import hashlib
@@ -21,18 +21,21 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 Numbers = Number | list[Number]
 
 
-class Wheeled(Section):
-    """What every robot has.
+class WheeledDrive(Section):
+    """Keys of every robot.
 
     Attributes:
-        wheel_radius_m: of the wheels as they roll under the robot's weight.
+        wheel_radius_m: rolling radius of the wheels under the robot's weight.
         gear_ratio: motor turns per wheel turn.
-        mass_kg: of the robot as it drives; friction scales with it.
+        mass_kg: mass of the robot as it drives; friction scales with it.
         drives: which wheels, counted from 1, share a motor with its encoder and ammeter, in the
-            order of the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together.
-            Without it each wheel has its own.
-        motor: file that `slipid identify` or `slipid motor` wrote of its motor on a bench,
-            relative to the config.
+            order of
+            the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together. Without
+                it
+            each wheel has its own.
+        motor: file that `slipid identify` or `slipid motor` wrote about its motor on a bench,
+            relative
+            to the config.
     """
 
     wheel_radius_m: Positive
@@ -42,7 +45,7 @@ class Wheeled(Section):
     motor: str | None = None
 
     def drive_of(self, wheels: int) -> tuple[int, ...]:
-        """Number of the drive that turns each wheel, from 0; empty where each has its own."""
+        """Return the number of each wheel's drive, from 0; empty where each has its own."""
         if self.drives is None:
             return ()
         turned = [wheel for drive in self.drives for wheel in drive]
@@ -55,14 +58,15 @@ class Wheeled(Section):
         )
 
 
-class Omni(Wheeled):
+class OmniDrive(WheeledDrive):
     """Wheels on a circle, each driving 90 deg ahead of its azimuth.
 
     Attributes:
-        base_radius_m: from the middle to the wheel centres.
-        wheel_azimuths_deg: where the wheels stand, counter-clockwise from ahead, in the order of
-            the columns of the logs.
-        roller_angle_deg: of the rollers' free direction to the drive direction.
+        base_radius_m: distance from the middle to the wheel centres.
+        wheel_azimuths_deg: directions of the wheels from the middle, counter-clockwise from ahead,
+            in
+            the order of the columns of the logs.
+        roller_angle_deg: angle from the rollers' free direction to the drive direction.
     """
 
     drive: Literal["omni"]
@@ -71,7 +75,7 @@ class Omni(Wheeled):
     roller_angle_deg: Number = 90.0
 
 
-class Box(Wheeled):
+class FourWheelDrive(WheeledDrive):
     """Four wheels, front left, front right, rear left, rear right: mecanum in X, or ordinary.
 
     Attributes:
@@ -84,25 +88,27 @@ class Box(Wheeled):
     half_width_m: Positive
 
 
-class Differential(Wheeled):
+class DifferentialDrive(WheeledDrive):
     """Two ordinary wheels on an axle, left and right, and casters.
 
     Attributes:
-        track_m: between the middles of the wheels.
+        track_m: distance between the middles of the wheels.
     """
 
     drive: Literal["differential"]
     track_m: Positive
 
 
-class General(Wheeled):
+class GeneralDrive(WheeledDrive):
     """Any wheels: centres, drive directions, roller angles.
 
     Attributes:
         wheel_places_m: x (ahead) and y (left) of every wheel's centre, in the order of the columns.
-        drive_directions_deg: where each wheel rolls when its speed is positive, counter-clockwise
+        drive_directions_deg: direction in which each wheel rolls at a positive speed,
+            counter-clockwise
             from ahead.
-        roller_angles_deg: of each wheel's rollers to its drive direction; "none" is an ordinary
+        roller_angles_deg: angle from each wheel's rollers to its drive direction; "none" is an
+            ordinary
             wheel.
     """
 
@@ -114,7 +120,7 @@ class General(Wheeled):
     roller_angles_deg: list[Number | Literal["none"]]
 
     @model_validator(mode="after")
-    def _one_per_wheel(self) -> "General":
+    def _one_per_wheel(self) -> "GeneralDrive":
         wheels = len(self.wheel_places_m)
         for key in ("drive_directions_deg", "roller_angles_deg"):
             if (count := len(getattr(self, key))) != wheels:
@@ -122,33 +128,35 @@ class General(Wheeled):
         return self
 
 
-class Motor(Section):
+class BenchMotors(Section):
     """No wheels: motors on a bench, logged at their shafts.
 
     Attributes:
-        names: of the motors in the order of the columns, where there are several.
+        names: names of the motors in the order of the columns, where there are several.
     """
 
     drive: Literal["motor"]
     names: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]] = Field(default_factory=list)
 
 
-Wheels = Omni | Box | Differential | General
+Wheels = OmniDrive | FourWheelDrive | DifferentialDrive | GeneralDrive
 
 
-class Logs(Section):
+class LogsSection(Section):
     """Log files of one kind, found by a glob below the data folder.
 
     Attributes:
-        glob: which files, below the data folder.
+        glob: selects the files, below the data folder.
         format: one of the config's own layouts, or a preset.
-        surface: name of the floor; "folder" takes that of the folder that each file lies in.
+        surface: name of the floor; "folder" takes the name of the folder that each file lies in.
         map: file of a floor map, relative to the config, instead of a surface: runs cross the
-            floors it shows, and their poses are in its frame.
+            floors it
+            shows, and their poses are in its frame.
         load: name of the load set-up; each has its own wheel loads.
-        session: what runs have in common between which the marker stayed as it was.
-        session_name: instead of session: which runs belong together, of this section and of others
-            with the same name, such as those of a day, or between two set-ups of the robot.
+        session: what the runs of a session have in common; the marker stays in place within one.
+        session_name: instead of session: runs that belong together, of this section and of others
+            with
+            the same name, such as those of a day, or between two set-ups of the robot.
         min_rows: shorter runs are left out.
     """
 
@@ -162,7 +170,7 @@ class Logs(Section):
     min_rows: int = Field(default=2, ge=2)
 
     @model_validator(mode="after")
-    def _one_floor_or_many(self) -> "Logs":
+    def _one_floor_or_many(self) -> "LogsSection":
         if self.map is not None and self.surface != "folder":
             raise ValueError("surface and map at once; expected one of them")
         if self.session_name is not None and "session" in self.model_fields_set:
@@ -170,12 +178,13 @@ class Logs(Section):
         return self
 
 
-class Camera(Section):
-    """The camera that saw the pose.
+class CameraSection(Section):
+    """The camera that measured the pose.
 
     Attributes:
         image_centre_m: middle of the picture in the frame of the poses, where tilt and distortion
-            are zero.
+            are
+            zero.
     """
 
     image_centre_m: tuple[Number, Number] = (0.0, 0.0)
@@ -193,14 +202,14 @@ class PriorSection(Section):
     std: Positive | list[Positive]
 
 
-class Setting(Section):
-    """What is wanted of the parameters that match a pattern.
+class ParameterSection(Section):
+    """Choice for the parameters that match a pattern.
 
     Attributes:
-        start: value to begin with [SI]; a number that is not fitted stays so.
-        fixed: value that it keeps [SI].
+        start: start value [SI]; a number that is not fitted keeps it.
+        fixed: value that the number keeps [SI].
         free: whether it is fitted.
-        prior: what is known of it beforehand.
+        prior: what is known about it beforehand.
     """
 
     start: Numbers | None = None
@@ -209,23 +218,24 @@ class Setting(Section):
     prior: PriorSection | None = None
 
     @model_validator(mode="after")
-    def _not_both(self) -> "Setting":
+    def _not_both(self) -> "ParameterSection":
         if self.fixed is not None and (self.prior is not None or self.free):
             raise ValueError("fixed and free or prior at once; expected one of them")
         return self
 
 
-class Weights(Section):
-    """What is known of the weight on the wheels in a load set-up.
+class WeightsSection(Section):
+    """Known weight on the wheels in a load set-up.
 
     Either what scales show under each wheel, `kg`; or that it is `like` another set-up, with
-    `mass_kg` more (or less) at `place_m`.
+    `mass_kg`
+    more (or less) at `place_m`.
 
     Attributes:
         std_kg: standard deviation of each scale, or of the weight that the mass adds to each wheel.
         kg: what scales show under each wheel, in the order of the wheels.
         like: name of another load set-up.
-        mass_kg: what was added to that one; negative where it was taken away.
+        mass_kg: mass added to that one; negative where it was taken away.
         place_m: x (ahead) and y (left) of that mass, from the middle.
     """
 
@@ -236,7 +246,7 @@ class Weights(Section):
     place_m: tuple[Number, Number] | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> "Weights":
+    def _one_way(self) -> "WeightsSection":
         added = (self.like, self.mass_kg, self.place_m)
         if self.kg is None and None in added:
             raise ValueError("expected kg, or like, mass_kg and place_m")
@@ -248,17 +258,19 @@ class Weights(Section):
 class FitSection(Section):
     """How finely runs are cut, how long to fit, and which lengths are trusted.
 
-    Motion tells the wheel radius over the scale of the poses and no more.
+    Motion determines the ratio of wheel radius to pose scale, and neither of them alone.
 
     Attributes:
-        lengths_from: which of the two is known: "poses" that are in true metres, as those of motion
-            capture, lidar and RTK are, make the wheel radius free; "wheels" that were measured make
-            the scale of the camera free. Without it both are as `[parameters]` says.
-        windows_per_piece: a run is cut into pieces of so many windows.
-        longest_window_s: longer windows become more pieces.
-        rounds: at most.
-        tolerance: done when nothing moves more than this part of its standard deviation.
-        seed: of the draws behind the curves' bands.
+        lengths_from: which of the two is known: "poses" in true metres, as those of motion capture,
+            lidar and RTK are, make the wheel radius free; "wheels" that were measured make the
+            scale of
+            the camera free. Without it both are as `[parameters]` says.
+        windows_per_piece: number of windows in a segment of a run.
+        longest_window_s: longer windows become more segments.
+        rounds: largest number of rounds.
+        tolerance: the fit ends when no number changes by more than this part of its standard
+            deviation.
+        seed: seed of the draws behind the bands of the curves.
     """
 
     lengths_from: Literal["poses", "wheels"] | None = None
@@ -276,20 +288,20 @@ class ValidateSection(Section):
         logs: sections as `[[logs]]`, for `slipid validate`.
     """
 
-    logs: list[Logs] = Field(default_factory=list)
+    logs: list[LogsSection] = Field(default_factory=list)
 
 
 class SelftestSection(Section):
-    """What `selftest` drives where no logs are given, what it takes for true and asks for.
+    """Plan and true values of a `selftest`, and the numbers that it must recover.
 
     Attributes:
-        surfaces: names of the floors that are made up.
-        headings: directions in which runs are driven, evenly around.
+        surfaces: names of the simulated floors.
+        headings: number of directions in which runs are driven, evenly spread.
         speeds_m_s: speeds of the runs.
         turns: curved runs on each floor with each load set-up.
-        distance_m: of a run.
-        truth: parameters by name, and the value that is true of them in the simulation.
-        wanted: patterns of the parameters that shall be recovered; otherwise all free ones.
+        distance_m: length of a run.
+        truth: parameters by name, and their true value in the simulation.
+        wanted: patterns of the parameters that must be recovered; otherwise all free ones.
     """
 
     surfaces: list[str] = Field(default=["firm", "soft"], min_length=1)
@@ -301,64 +313,70 @@ class SelftestSection(Section):
     wanted: list[str] | None = None
 
 
-class Content(Section):
+class ConfigContent(Section):
     """The whole file.
 
     Attributes:
         robot: its wheels.
         layouts: which column of your files holds what, by names of your own.
         logs: one section for each set of log files.
-        camera: what saw the poses.
-        parameters: what is wanted of them, by patterns of their names.
-        weights: what is known of the wheel loads, by load set-up.
+        camera: the camera that measured the poses.
+        parameters: choices for parameters, by patterns of their names.
+        weights: known wheel loads, by load set-up.
         fit: how finely runs are cut and how long to fit.
-        selftest: what `slipid selftest` drives where there are no logs.
+        selftest: plan that `slipid selftest` simulates where there are no logs.
         validate: runs to predict instead of those that were fitted.
     """
 
-    robot: Annotated[Wheels | Motor, Field(discriminator="drive")]
+    robot: Annotated[Wheels | BenchMotors, Field(discriminator="drive")]
     layouts: dict[str, dict[str, object]] = Field(default_factory=dict)
-    logs: list[Logs] = Field(min_length=1)
-    camera: Camera = Camera()
-    parameters: dict[str, Setting] = Field(default_factory=dict)
-    weights: dict[str, Weights] = Field(default_factory=dict)
+    logs: list[LogsSection] = Field(min_length=1)
+    camera: CameraSection = CameraSection()
+    parameters: dict[str, ParameterSection] = Field(default_factory=dict)
+    weights: dict[str, WeightsSection] = Field(default_factory=dict)
     fit: FitSection = FitSection()
     selftest: SelftestSection = SelftestSection()
     validate_: ValidateSection = Field(default_factory=ValidateSection, alias="validate")
 
     @property
     def wheels(self) -> Wheels:
-        """The robot, which has some.
+        """The robot's wheels.
 
         Raises:
-            ValueError: it is a motor on a bench.
+            ValueError: the config describes a motor on a bench.
         """
-        if isinstance(self.robot, Motor):
+        if isinstance(self.robot, BenchMotors):
             raise ValueError("drive = 'motor' has no wheels on a floor")
         return self.robot
 
     @model_validator(mode="after")
-    def _floors_one_by_one(self) -> "Content":
+    def _floors_one_by_one(self) -> "ConfigContent":
         for name, sections in (("logs", self.logs), ("validate.logs", self.validate_.logs)):
-            if sections and not one_floor(sections):
+            if sections and not single_floor_sections(sections):
                 raise ValueError(
                     f"{name}: every section has a map; expected one without, of runs on one floor"
                 )
         return self
 
 
-def one_floor(sections: Sequence[Logs]) -> list[Logs]:
-    """Sections whose runs keep to one floor each."""
+def single_floor_sections(sections: Sequence[LogsSection]) -> list[LogsSection]:
+    """Return the sections whose runs stay on one floor each."""
     return [section for section in sections if section.map is None]
 
 
 @dataclass(frozen=True)
 class Config:
-    """A config file that was read and found right; its text is kept beside the results."""
+    """A checked config file; its text is kept beside the results.
+
+    Attributes:
+        path: where it was read.
+        text: its text.
+        content: its checked content.
+    """
 
     path: Path
     text: str
-    content: Content
+    content: ConfigContent
 
     @property
     def hash(self) -> str:
@@ -367,26 +385,26 @@ class Config:
 
 
 def read_config(path: Path) -> Config:
-    """Config from a TOML file; errors as of `parsed`, and where it is unreadable."""
+    """Return the config in a TOML file; errors as in `parsed`, also where it is unreadable."""
     return parsed(path, text_of(path))
 
 
 def parsed(path: Path, text: str) -> Config:
-    """Config from TOML text; DataError with every mistake on a line that begins with the path."""
-    return Config(path, text, checked(path, mapping_of(path, text), Content))
+    """Return the config in TOML text; raise `DataError` with every mistake on a line of its own."""
+    return Config(path, text, checked(path, mapping_of(path, text), ConfigContent))
 
 
 def geometry(robot: Wheels) -> Geometry:
-    """Geometry of a `[robot]` section; ValueError where it cannot drive."""
+    """Return the geometry of a `[robot]` section; raise `ValueError` where it cannot drive."""
     radius, gear = robot.wheel_radius_m, robot.gear_ratio
-    if isinstance(robot, Omni):
+    if isinstance(robot, OmniDrive):
         azimuths, base = robot.wheel_azimuths_deg, robot.base_radius_m
         shared = robot.drive_of(len(azimuths))
         return g.omni(azimuths, base, radius, gear, robot.roller_angle_deg, shared)
-    if isinstance(robot, Box):
+    if isinstance(robot, FourWheelDrive):
         make = g.mecanum if robot.drive == "mecanum" else g.skid_steer
         return make(robot.half_length_m, robot.half_width_m, radius, gear, robot.drive_of(4))
-    if isinstance(robot, Differential):
+    if isinstance(robot, DifferentialDrive):
         robot.drive_of(2)
         return g.differential(robot.track_m / 2, radius, gear)
     rollers = [None if a == "none" else float(a) for a in robot.roller_angles_deg]

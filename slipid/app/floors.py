@@ -1,4 +1,4 @@
-"""Which floor was under each wheel in logged runs, from a map and a fit that knows the camera."""
+"""Look up the floor under each wheel in logged runs, with a map and a fitted camera."""
 
 import io
 from dataclasses import dataclass
@@ -9,30 +9,32 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.app.config import Logs, read_config
+from slipid.app.config import LogsSection, read_config
 from slipid.app.logs import read_dataset
 from slipid.data.log import Log
 from slipid.data.reading.reader import find_logs
 from slipid.deploy.floors import FloorLookup
 from slipid.infer.fit_file import load
 from slipid.model.robot import Robot
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content, write_bytes
+from slipid.support.files import write_bytes
 from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.floors/1"
 
 
 @dataclass(frozen=True, eq=False)
-class FloorsOfRun:
-    """A run with the floor under each wheel, in the rows in which a pose was read.
+class RunFloors:
+    """A run with the floor under each wheel, in the rows that have a new pose.
 
     Attributes:
-        name: of the run.
-        time: [s]; pose: of the body in the frame of the map, x, y [m], heading [rad].
+        name: name of the run.
+        time: time of each row [s].
+        pose: pose of the body in the frame of the map: x, y [m], heading [rad].
         surface: number of the surface under each wheel.
         border: distance of each wheel from the nearest other surface [m].
-        inside: whether each wheel is on the map; nothing is known of its floor where it is not.
+        inside: whether each wheel is on the map; elsewhere its floor is unknown.
     """
 
     name: str
@@ -45,14 +47,14 @@ class FloorsOfRun:
 
 def floors_under(
     out: Path, map_file: Path, data: Path, glob: str | None, report: Reporter
-) -> tuple[FloorLookup, list[FloorsOfRun]]:
-    """Floors under the wheels in runs over a map, by the camera of a fit.
+) -> tuple[FloorLookup, list[RunFloors]]:
+    """Return the floor under each wheel in runs over a map, using the camera of a fit.
 
     Args:
         out: folder that `slipid identify` wrote.
-        map_file: of the floor; its frame is that of the poses.
+        map_file: map of the floor, in the frame of the poses.
         data: folder of the logs.
-        glob: which logs below it; by default those that the config of the fit names with a map.
+        glob: selects logs below it; by default those that the fit's config names with a map.
 
     Raises:
         DataError: no fit, no map, no logs, or logs without poses.
@@ -64,7 +66,9 @@ def floors_under(
     sections = [section for section in named if section.map is not None]
     if glob is not None:
         find_logs(data, glob)
-        sections = [Logs(glob=glob, format=named[0].format, map=str(map_file), load=named[0].load)]
+        sections = [
+            LogsSection(glob=glob, format=named[0].format, map=str(map_file), load=named[0].load)
+        ]
     if not sections:
         raise DataError(
             f"{out / 'config.toml'}: no [[logs]] with a map; expected --logs GLOB for runs over it"
@@ -75,7 +79,7 @@ def floors_under(
         report.line(sentence)
     report.stage("looking up floors")
     sessions = zip(runs.logs, runs.session, strict=True)
-    found = [_of_run(fit.robot, lookup, log, session) for log, session in sessions]
+    found = [_run_floors(fit.robot, lookup, log, session) for log, session in sessions]
     if not any(run.inside.any() for run in found):
         x, y = np.concatenate([run.pose for run in found])[0, :2]
         raise DataError(
@@ -85,7 +89,7 @@ def floors_under(
     return lookup, found
 
 
-def _of_run(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> FloorsOfRun:
+def _run_floors(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> RunFloors:
     if log.pose is None or log.pose_fresh is None:
         raise DataError(f"{log.name}: no pose; expected poses in the frame of the map")
     rows = np.flatnonzero(log.pose_fresh)
@@ -95,7 +99,7 @@ def _of_run(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> Floors
         jnp.asarray(robot.geometry.place) * robot.geometry.base_radius - robot.camera.marker_place
     )
     found = lookup.under(pose, wheels)
-    return FloorsOfRun(
+    return RunFloors(
         log.name,
         log.time[rows],
         np.asarray(pose),
@@ -105,8 +109,8 @@ def _of_run(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> Floors
     )
 
 
-def write_floors(folder: Path, lookup: FloorLookup, runs: list[FloorsOfRun]) -> list[Path]:
-    """A CSV file for each run: time, pose, and of every wheel floor and distance to the border."""
+def write_floors(folder: Path, lookup: FloorLookup, runs: list[RunFloors]) -> list[Path]:
+    """Write a CSV file for each run: time, pose, and each wheel's floor and border distance."""
     paths = []
     for run in runs:
         wheels = run.surface.shape[1]
@@ -130,8 +134,8 @@ def write_floors(folder: Path, lookup: FloorLookup, runs: list[FloorsOfRun]) -> 
     return paths
 
 
-def summary(lookup: FloorLookup, runs: list[FloorsOfRun]) -> Content:
-    """How much of each run every floor was under every wheel."""
+def summary(lookup: FloorLookup, runs: list[RunFloors]) -> Content:
+    """Return the share of each run that every wheel spent on every floor."""
     return {
         "schema": SCHEMA,
         "surfaces": list(lookup.surfaces),

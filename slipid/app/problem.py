@@ -1,9 +1,8 @@
-"""Load shares from what scales show, and from masses whose place is known.
+"""From a config and a data folder to a fitting problem.
 
-A mass m at p adds weights n_i to wheels at p_i, with sum n_i = m and sum n_i p_i = m p. Three
-wheels have one solution; of more, the smallest is taken, as for wheels that give alike.
-
-From a config and a data folder to a fitting problem.
+Load shares follow from scales under the wheels, or from masses whose place is known: a mass m at p
+adds weights n_i to wheels at p_i, with sum n_i = m and sum n_i p_i = m p. Three wheels have one
+solution; of more, the smallest is taken, as for wheels that yield alike.
 """
 
 import fnmatch
@@ -15,7 +14,14 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.app.bench_priors import bench_of, bench_priors
-from slipid.app.config import Config, FitSection, Logs, Weights, geometry, one_floor
+from slipid.app.config import (
+    Config,
+    FitSection,
+    LogsSection,
+    WeightsSection,
+    geometry,
+    single_floor_sections,
+)
 from slipid.app.logs import files_of, read_dataset
 from slipid.data.align.lag import pose_lag
 from slipid.data.check.columns import refuse_misordered
@@ -23,35 +29,36 @@ from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
-from slipid.fit.problem import Problem, still_viscosities
+from slipid.fit.problem import Problem, fixed_viscosities
+from slipid.infer.bench.motor import BenchRoot
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.files import hash_of
 from slipid.support.progress import Reporter
 
 
-def share_priors(weights: Mapping[str, Weights], shape: Geometry) -> dict[str, Choice]:
-    """Prior of the load shares of every set-up that something is known of.
+def share_priors(weights: Mapping[str, WeightsSection], shape: Geometry) -> dict[str, Choice]:
+    """Return the prior of the load shares of every set-up whose weights are known.
 
     Raises:
-        ValueError: a set-up is like none that is known, or a wheel would be lifted.
+        ValueError: a set-up refers to an unknown one, or a wheel would lift off.
     """
     out = {}
     for name in weights:
-        kg, variance = _weighed(weights, name, shape, ())
+        kg, variance = _wheel_weights(weights, name, shape, ())
         whole, std = kg.sum(), float(np.sqrt(variance)) / kg.sum()
         share = (kg / whole).tolist()
         out[name] = Choice(f"robot.load_share@{name}", prior_mean=share, prior_std=[std] * len(kg))
     return out
 
 
-def _weighed(
-    weights: Mapping[str, Weights], name: str, shape: Geometry, above: tuple[str, ...]
+def _wheel_weights(
+    weights: Mapping[str, WeightsSection], name: str, shape: Geometry, above: tuple[str, ...]
 ) -> tuple[Float[np.ndarray, " wheel"], float]:
-    """Weight on each wheel [kg], and its variance."""
+    """Return the weight on each wheel [kg] and its variance [kg^2]."""
     known = weights.get(name)
     if known is None or name in above:
         there = ", ".join(k for k in weights if k not in above)
@@ -62,7 +69,7 @@ def _weighed(
         return np.asarray(known.kg), known.std_kg**2
     if known.like is None or known.mass_kg is None or known.place_m is None:
         raise ValueError(f"weights.{name}: expected kg, or like, mass_kg and place_m")
-    below, variance = _weighed(weights, known.like, shape, (*above, name))
+    below, variance = _wheel_weights(weights, known.like, shape, (*above, name))
     place = np.asarray(shape.place) * float(shape.base_radius)
     balance = np.concatenate([np.ones((1, shape.wheels)), place.T])
     added = np.linalg.pinv(balance) @ (known.mass_kg * np.array([1.0, *known.place_m]))
@@ -73,26 +80,25 @@ def _weighed(
     return total, variance + known.std_kg**2
 
 
-LENGTHS = {"poses": "robot.wheel_radius", "wheels": "camera.scale"}
-"""What is free where these lengths are trusted."""
+FREE_LENGTH = {"poses": "robot.wheel_radius", "wheels": "camera.scale"}
+"""Number that is fitted when the other kind of length is trusted."""
 SIZE_STD = 0.1
-"""Std of its prior, as a part of the nominal value: tyres give way, cameras are set up by eye."""
-ANEW_S = 0.02
-"""Gap between a fitted lag and that at which windows were cut, from which they are cut anew [s]."""
+"""Std of its prior as a part of the nominal value: tyres deform, and cameras are set up by eye."""
+RECUT_LAG_S = 0.02
+"""Difference between fitted and assumed lag from which windows are cut again [s]."""
 LAG_STD, MOST_LAG = 0.1, 3.0
-"""Std of the prior of a lag that was found from the motion, and the longest that a fit starts from
-[s]."""
+"""Std of the prior of a lag found from the motion, and longest lag that a fit starts from [s]."""
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
-    """Runs, the robot that drove them, and what is wanted of its numbers: all a fit is made of.
+class FitTask:
+    """Runs, the robot that drove them, and choices for its numbers: everything a fit needs.
 
     Attributes:
         dataset: the runs, each on one floor.
-        robot: with its geometry, and every number at its declared start.
-        choices: free, fixed, priors.
-        settings: how finely runs are cut and how long to fit.
+        robot: robot with its geometry and every number at its declared start.
+        choices: free, fixed and prior values of its numbers.
+        settings: how finely runs are cut into windows, and how long to fit.
         mixed: runs over several floors, with the map of each set.
     """
 
@@ -104,7 +110,7 @@ class Task:
 
     @property
     def logs(self) -> tuple[Log, ...]:
-        """Every run, those over several floors last."""
+        """Logs of all runs; those over several floors come last."""
         return self.dataset.logs + tuple(log for data, _ in self.mixed for log in data.logs)
 
     @property
@@ -113,76 +119,79 @@ class Task:
         return hash_of((log.name, log.sha256) for log in self.logs)
 
     def problem(self, near: Robot | None = None) -> Problem:
-        """Likelihood of the runs, cut into windows as the settings say, `near` an optimum."""
-        return Problem(self.windows(self.cut_as(near)), self.robot, list(self.choices))
+        """Return the likelihood of the runs in windows, cut for a robot `near` an optimum."""
+        return Problem(self.windows(self.cutting_robot(near)), self.robot, list(self.choices))
 
-    def cut_as(self, near: Robot | None) -> Robot:
-        """The robot at whose radius and lag windows are cut: as a fit starts, but for the lag.
+    def cutting_robot(self, near: Robot | None) -> Robot:
+        """Return the robot whose wheel radius and lag decide where windows are cut.
 
-        That is the one of a robot `near` an optimum where it is `ANEW_S` away: what wheels turned
-        in a window is linear in the lag only near the one that it was cut at.
+        It is the robot at the start of a fit, with the lag of a robot `near` an optimum where the
+        two lags differ by more than `RECUT_LAG_S`: the wheel angle turned in a window is linear in
+        the lag only near the lag at which the window was cut.
         """
         robot = Space(self.robot, self.choices).template
-        if near is None or abs(float(near.camera.lag - robot.camera.lag)) <= ANEW_S:
+        if near is None or abs(float(near.camera.lag - robot.camera.lag)) <= RECUT_LAG_S:
             return robot
         return replace(robot, camera=replace(robot.camera, lag=near.camera.lag))
 
     def windows(self, robot: Robot) -> Windows:
-        """Windows of the runs at the wheel radius and the camera lag of a robot."""
+        """Return windows of the runs, cut at the wheel radius and the camera lag of a robot."""
         return windows(
             self.dataset,
             float(robot.geometry.wheel_radius),
             lag=float(robot.camera.lag),
-            per_piece=self.settings.windows_per_piece,
+            per_segment=self.settings.windows_per_piece,
             longest=self.settings.longest_window_s,
         )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Job(Task):
-    """What a config says about the logs that are there.
+class ConfigFitTask(FitTask):
+    """Fit task that a config describes.
 
     Attributes:
-        config: as read.
-        skipped: what the config names and the folder does not have, one line each.
+        config: the config.
+        skipped: a line for each thing that the config names and the data folder lacks.
     """
 
     config: Config
     skipped: tuple[str, ...]
 
 
-def read_job(config: Config, root: Path, report: Reporter) -> Job:
+def read_fit_task(config: Config, root: Path, report: Reporter) -> ConfigFitTask:
     """Read every log of runs on one floor that the config names, and set up its robot.
 
-    The bench's file of its motor is looked at first: one that is missing costs no reading of logs.
+    The file of its motor's bench is read first, so that a missing one costs no reading of logs.
     """
     bench_of(config)
     report.stage("reading logs")
-    dataset, skipped = read_dataset(config, one_floor(config.content.logs), root, report)
-    return job_of(config, dataset, skipped, report)
+    dataset, skipped = read_dataset(
+        config, single_floor_sections(config.content.logs), root, report
+    )
+    return fit_task(config, dataset, skipped, report)
 
 
-def with_mixed(job: Job, root: Path, report: Reporter) -> Job:
-    """The job with the runs over several floors that its config names."""
-    wanted = [section for section in job.config.content.logs if section.map is not None]
-    found, absent = files_of(job.config, wanted, root)
+def with_mixed(task: ConfigFitTask, root: Path, report: Reporter) -> ConfigFitTask:
+    """Return the task with the runs over several floors that its config names."""
+    sections = [section for section in task.config.content.logs if section.map is not None]
+    found, absent = files_of(task.config, sections, root)
     for section, _ in found:
-        floor = _map(job, section)
-        data, short = read_dataset(job.config, [section], root, report)
+        floor = _map(task, section)
+        data, short = read_dataset(task.config, [section], root, report)
         absent += short
         refuse_misordered(data.logs)
-        _go_together(job, data)
-        job = replace(job, mixed=(*job.mixed, (data, floor)))
+        _go_together(task, data)
+        task = replace(task, mixed=(*task.mixed, (data, floor)))
     for sentence in absent:
         report.line(sentence)
-    return replace(job, skipped=(*job.skipped, *absent))
+    return replace(task, skipped=(*task.skipped, *absent))
 
 
-def _map(job: Job, section: Logs) -> FloorMap:
-    """Map of a log section; DataError where it is unreadable, or of a floor no run keeps to."""
-    path = job.config.path.parent / str(section.map)
+def _map(task: ConfigFitTask, section: LogsSection) -> FloorMap:
+    """Return the map of a log section; raise `DataError` for a floor that no other run stays on."""
+    path = task.config.path.parent / str(section.map)
     floor = read_map(path)
-    known = job.robot.surfaces.labels
+    known = task.robot.surfaces.labels
     for name in floor.surfaces:
         if name not in known:
             raise DataError(
@@ -191,25 +200,27 @@ def _map(job: Job, section: Logs) -> FloorMap:
     return floor
 
 
-def _go_together(job: Job, data: Runs) -> None:
-    """DataError where runs over several floors need what those on one floor do not tell."""
-    seen, first = {log.name for log in job.logs}, job.dataset.logs[0]
+def _go_together(task: ConfigFitTask, data: Runs) -> None:
+    """Raise `DataError` where runs over several floors need what runs on one floor lack."""
+    names, first = {log.name for log in task.logs}, task.dataset.logs[0]
     for log in data.logs:
-        if log.name in seen:
+        if log.name in names:
             raise DataError(
-                f"{log.name}: found by two globs of {job.config.path}; expected it once"
+                f"{log.name}: found by two globs of {task.config.path}; expected it once"
             )
-        if log.load not in job.robot.body.loads:
+        if log.load not in task.robot.body.loads:
             raise DataError(
                 f"{log.name}: load set-up '{log.load}': no run with it on one floor; "
-                f"expected one of {', '.join(job.robot.body.loads)}"
+                f"expected one of {', '.join(task.robot.body.loads)}"
             )
         if log.wheels != first.wheels:
             raise DataError(f"{log.name}: {log.wheels} wheels; expected {first.wheels}")
 
 
-def job_of(config: Config, dataset: Runs, skipped: Sequence[str], report: Reporter) -> Job:
-    """Job of runs that are there already."""
+def fit_task(
+    config: Config, dataset: Runs, skipped: Sequence[str], report: Reporter
+) -> ConfigFitTask:
+    """Return the fit task of runs that were read already."""
     shape = shape_of(config)
     logged = dataset.logs[0]
     if shape.drives != logged.wheels:
@@ -219,29 +230,31 @@ def job_of(config: Config, dataset: Runs, skipped: Sequence[str], report: Report
             f"{config.path}: robot: {drives}, but {logged.name} has {logged.wheels}; expected the "
             f"same{shared if shape.wheels == 2 * logged.wheels else ''}"
         )
-    robot = on_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
+    robot = robot_for_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
     choices, left_out = _choices(config, robot)
-    # what the user says comes later and wins
+    # the choices of the config come last and override the others
     given = any(fnmatch.fnmatchcase("camera.lag", p) for p in config.content.parameters)
-    lag = [] if given else told_lag(dataset)
-    known = [*lag, *without_rollers(shape), *still_viscosities(dataset)]
+    lag = [] if given else lag_from_motion(dataset)
+    known = [*lag, *without_rollers(shape), *fixed_viscosities(dataset)]
     trusted = config.content.fit.lengths_from
     choices = [*known, *choices]
-    if trusted is not None and {*LENGTHS.values()} <= {e.path for e in Space(robot, choices).free}:
-        freed = LENGTHS["wheels" if trusted == "poses" else "poses"]
+    if trusted is not None and {*FREE_LENGTH.values()} <= {
+        e.path for e in Space(robot, choices).free
+    }:
+        freed = FREE_LENGTH["wheels" if trusted == "poses" else "poses"]
         raise DataError(
             f"{config.path}: fit.lengths_from = '{trusted}' with {freed} free in parameters; "
-            "expected one of the two: motion tells them apart by no means"
+            "expected one of the two: no motion tells them apart"
         )
     skipped = (*skipped, *left_out)
     for sentence in skipped:
         report.line(sentence)
     settings = config.content.fit
-    return Job(dataset, robot, tuple(choices), settings, config=config, skipped=skipped)
+    return ConfigFitTask(dataset, robot, tuple(choices), settings, config=config, skipped=skipped)
 
 
-def told_lag(dataset: Runs) -> list[Choice]:
-    """The choice of a free camera lag around the one that the motion shows, if it shows one."""
+def lag_from_motion(dataset: Runs) -> list[Choice]:
+    """Return a choice for a free camera lag near the one that the motion shows, if any."""
     lag = pose_lag(dataset)
     if lag is None or abs(lag.seconds) > MOST_LAG:
         return []
@@ -249,48 +262,48 @@ def told_lag(dataset: Runs) -> list[Choice]:
 
 
 def lengths(trusted: str | None, shape: Geometry) -> list[Choice]:
-    """The wheel radius free and the scale of the poses held, or the other way round."""
+    """Free the wheel radius and hold the scale of the poses, or the other way round."""
     if trusted is None:
         return []
     radius = float(shape.wheel_radius)
     nominal = {"robot.wheel_radius": radius, "camera.scale": 1.0}
     return [
-        Choice(path, prior_mean=mean, prior_std=SIZE_STD * mean, free=path == LENGTHS[trusted])
+        Choice(path, prior_mean=mean, prior_std=SIZE_STD * mean, free=path == FREE_LENGTH[trusted])
         for path, mean in nominal.items()
     ]
 
 
 def without_rollers(shape: Geometry) -> list[Choice]:
-    """Numbers of rollers held, where no wheel has any."""
+    """Hold the numbers of rollers fixed where no wheel has rollers."""
     if not all(shape.grips):
         return []
     names = ("roller_drag", "roller_creep", "roller_viscosity")
     return [Choice(f"surface.*.{name}", free=False) for name in names]
 
 
-def on_runs(robot: Robot, runs: Runs, centre: tuple[float, float]) -> Robot:
-    """A robot for the floors, load set-ups and sessions of some runs; image centre [m]."""
+def robot_for_runs(robot: Robot, runs: Runs, centre: tuple[float, float]) -> Robot:
+    """Return a robot with the floors, load set-ups and sessions of runs; image centre in [m]."""
     floors = {log.surface or "unknown" for log in runs.logs}
     loads = {log.load for log in runs.logs}
     return robot.on(sorted(floors), sorted(loads), sorted(set(runs.session)), centre)
 
 
 def shape_of(config: Config) -> Geometry:
-    """Geometry of the config's robot; DataError where it cannot drive."""
+    """Return the geometry of the config's robot; raise `DataError` where it cannot drive."""
     try:
         return geometry(config.content.wheels)
     except ValueError as error:
         raise DataError(f"{config.path}: robot: {error}") from error
 
 
-_SAID = ("robot.wheel_radius", "robot.base_radius", "robot.mass")
+_STATED = ("robot.wheel_radius", "robot.base_radius", "robot.mass")
 
 
-def said_of(robot: Robot, mass: float) -> list[Choice]:
-    """Size and mass as they are said: held, and the centre of the prior of what is freed."""
+def stated_sizes(robot: Robot, mass: float) -> list[Choice]:
+    """Hold size and mass at their stated values, the prior means of those that are freed."""
     choices = []
     for e in entries(robot):
-        if e.path in _SAID:
+        if e.path in _STATED:
             value = mass if e.path == "robot.mass" else float(e.get(robot))
             std = e.declaration.spread * value
             choices.append(Choice(e.path, prior_mean=value, prior_std=std, free=False))
@@ -298,13 +311,13 @@ def said_of(robot: Robot, mass: float) -> list[Choice]:
 
 
 def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
-    """The config's parameter settings, checked, less those of floors and loads that are absent."""
+    """Return the config's choices for numbers, and lines about floors and loads that are absent."""
     paths, skipped = [e.path for e in entries(robot)], []
-    choices = said_of(robot, config.content.wheels.mass_kg or float(robot.body.mass))
+    choices = stated_sizes(robot, config.content.wheels.mass_kg or float(robot.body.mass))
     choices += lengths(config.content.fit.lengths_from, robot.geometry)
-    measured, told = bench_priors(config, float(robot.motor.gear_ratio))
+    measured, lines = bench_priors(config, float(robot.motor.gear_ratio))
     choices += measured
-    skipped += told
+    skipped += lines
     try:
         known = share_priors(config.content.weights, robot.geometry)
     except ValueError as error:
@@ -314,27 +327,38 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
             choices.append(prior)
         else:
             skipped.append(f"skipped: weights.{load}: no run that has it")
-    for pattern, setting in config.content.parameters.items():
+    for pattern in config.content.parameters:
         if not fnmatch.filter(paths, pattern):
             if fnmatch.filter(paths, _any_label(pattern)):
                 skipped.append(f"skipped: parameters '{pattern}': no run that has it")
                 continue
-            raise DataError(
-                f"{config.path}: parameters.'{pattern}': no such parameter{near(pattern, paths)}; "
-                f"expected one of {', '.join(paths)}"
-            )
-        gauss = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)
-        choice = Choice(pattern, setting.start, setting.fixed, setting.free, *gauss)
-        try:
-            Space(robot, [choice])
-        except ValueError as error:
-            raise DataError(f"{config.path}: parameters.'{pattern}': {error}") from error
-        choices.append(choice)
+            raise unknown_parameter(config, pattern, pattern, paths)
+        choices.append(checked_choice(config, pattern, pattern, robot))
     return choices, skipped
 
 
+def unknown_parameter(config: Config, pattern: str, name: str, paths: list[str]) -> DataError:
+    """Return the error about a pattern of `[parameters]` whose `name` matches no path."""
+    return DataError(
+        f"{config.path}: parameters.'{pattern}': no such parameter{did_you_mean(name, paths)}; "
+        f"expected one of {', '.join(paths)}"
+    )
+
+
+def checked_choice(config: Config, pattern: str, name: str, root: Robot | BenchRoot) -> Choice:
+    """Return the choice in `[parameters]` at a pattern for `name`; `DataError` where impossible."""
+    setting = config.content.parameters[pattern]
+    gauss = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)
+    choice = Choice(name, setting.start, setting.fixed, setting.free, *gauss)
+    try:
+        Space(root, [choice])
+    except ValueError as error:
+        raise DataError(f"{config.path}: parameters.'{pattern}': {error}") from error
+    return choice
+
+
 def _any_label(pattern: str) -> str:
-    """The pattern with the name of a floor, load or session replaced by any."""
+    """Return the pattern with the name of a floor, load or session replaced by `*`."""
     head, at, _ = pattern.partition("@")
     parts = head.split(".")
     if parts[0] == "surface" and len(parts) == 3:

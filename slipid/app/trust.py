@@ -1,4 +1,4 @@
-"""How far a fit may be trusted: its open-loop predictions against those of the encoders."""
+"""Verdict on a fit: its open-loop predictions compared with those of the encoders."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -9,25 +9,25 @@ from slipid.data.runs import Runs
 from slipid.infer.result import Fit
 from slipid.infer.verdicts.disputed import EndPoints, Trust, verdict_of_trust
 from slipid.predict import open_loop as replay
-from slipid.predict.floor_models import FloorModels
 from slipid.predict.kinematics import Encoder
+from slipid.predict.slip_models import FloorModels
 from slipid.predict.validation import ScoredRun, add_scores
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 
 ENCODER = FloorModels(Encoder())
 MOST_RUNS = 24
-"""Runs that are replayed of every floor, evenly picked from those that were fitted."""
+"""Most runs predicted on each floor, evenly picked from the fitted ones."""
 
 
 @dataclass(frozen=True)
-class Judgement:
-    """A verdict and the errors it rests on.
+class TrustReport:
+    """Verdict on a fit and the errors it rests on.
 
     Attributes:
-        trust: the verdict, with its reasons.
-        floors: mean end-point error over the way, of the fit and of the encoders alone.
-        runs: how many were replayed.
+        trust: the verdict with its reasons.
+        floors: mean end-point error over path length, of the fit and of the encoders alone.
+        runs: number of predicted runs.
     """
 
     trust: Trust
@@ -36,12 +36,12 @@ class Judgement:
 
     @property
     def warning(self) -> str | None:
-        """What a picture must say of a fit that is not to be used."""
+        """Warning that every picture of an unusable fit shows."""
         return f"THIS FIT IS {self.trust.word.upper()}" if self.is_bad else None
 
     @property
     def is_bad(self) -> bool:
-        """Whether the fit is not to be trusted at all."""
+        """True where the fit must not be used."""
         return self.trust.word == "not to be trusted"
 
     def to_json(self) -> Content:
@@ -53,16 +53,16 @@ class Judgement:
         }
 
 
-def judgement(fit: Fit, data: Runs) -> Judgement:
-    """Verdict on a fit by the runs it was made of, replayed from their first pose on."""
+def trust_report(fit: Fit, data: Runs) -> TrustReport:
+    """Return the verdict on a fit from open-loop predictions of the runs that it was fitted to."""
     some = data.subset(_picked(data))
     runs: dict[int, ScoredRun] = {}
     try:
-        cuts = replay.cuts(some, fit.robot)
+        cuts = replay.replay_windows(some, fit.robot)
     except DataError:  # a fitted lag can be so long that a short run shows nothing
         cuts = []
     for w in cuts:
-        plain = replay.follow(fit.robot, w, ENCODER.increments(w, fit.robot))
+        plain = replay.tracks_from_increments(fit.robot, w, ENCODER.increments(w, fit.robot))
         for name, tracks in ((fit.contact.name, fit.contact.tracks(w)), (ENCODER.name, plain)):
             add_scores(runs, some, name, tracks, None)
     errors: dict[str, list[list[float]]] = {}
@@ -73,11 +73,11 @@ def judgement(fit: Fit, data: Runs) -> Judgement:
         name: EndPoints(*np.mean(each, axis=0).tolist()) for name, each in sorted(errors.items())
     }
     trust = verdict_of_trust(floors, fit.converged, fit.parameters.values())
-    return Judgement(trust, floors, len(runs))
+    return TrustReport(trust, floors, len(runs))
 
 
 def _picked(data: Runs) -> list[int]:
-    """Numbers of at most `MOST_RUNS` runs of every floor."""
+    """Return the numbers of at most `MOST_RUNS` runs on every floor."""
     of_floor: dict[str, list[int]] = {}
     for k, log in enumerate(data.logs):
         of_floor.setdefault(log.surface or "unknown", []).append(k)

@@ -23,11 +23,11 @@ def check(
     Exit code 1 where logs and config do not go together.
     """
     from slipid.app import check as job
-    from slipid.app.config import Motor, read_config
+    from slipid.app.config import BenchMotors, read_config
     from slipid.report.estimates import show_check
 
     wanted = read_config(config)
-    if isinstance(wanted.content.robot, Motor):
+    if isinstance(wanted.content.robot, BenchMotors):
         return bench(wanted, data, out, json, quiet)
     with Reporter(quiet=quiet) as report:
         logs, found = job.check(config, data, out, report)

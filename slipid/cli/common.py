@@ -40,10 +40,10 @@ Words = ParamSpec("Words")
 
 def executor_of(jobs: int | None) -> "Executor":
     """So many processes, by default one for every core; this one where that is one."""
-    from slipid.support.executor import Here, Processes
+    from slipid.support.executor import InProcess, Processes
 
     count = jobs or os.cpu_count() or 1
-    return Here() if count == 1 else Processes(count)
+    return InProcess() if count == 1 else Processes(count)
 
 
 def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
@@ -64,7 +64,7 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
     return run
 
 
-def on_wheels(command: Callable[Words, int]) -> Callable[Words, None]:
+def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:
     """`guarded`, of a command that has nothing to say of a motor on a bench: it says so first.
 
     The config, or the folder of a result, is the first path among the arguments of a command.

@@ -4,11 +4,11 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, on_wheels
+from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, for_robots
 from slipid.support.progress import Reporter
 
 
-@on_wheels
+@for_robots
 def compare(
     config: ConfigFile,
     data: DataFolder,

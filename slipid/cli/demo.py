@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import Out, Quiet, executor_of, guarded
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from slipid.app.identify import Identified
+    from slipid.app.identify import IdentifyResult
 
 PARTS = ("fit", "unseen")
 """What is fitted, and what is predicted: folders, and configs `testsite_<part>.toml`."""
@@ -49,7 +49,7 @@ def demo(
 
 def run(
     out: Path, plant: str, seed: int | None, executor: "Executor", report: Reporter
-) -> tuple["Identified", Content, Content]:
+) -> tuple["IdentifyResult", Content, Content]:
     """Logs of the test site, identify, predict unseen runs: the fit, what validate says, the truth.
 
     Raises:

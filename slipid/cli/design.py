@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, on_wheels
+from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.infer.design.proposal import Design
 
 
-@on_wheels
+@for_robots
 def design(
     out: OutFolder,
     parameter: Annotated[
@@ -70,7 +70,7 @@ def design(
         report.stage("drawing")
         written = write(found, out)
     emit(json, found.content, lambda page: show_design(page, found.content), out, written)
-    return 0 if found.reached else 1
+    return 0 if found.reachable else 1
 
 
 def write(found: "Design", out: Path) -> list[str]:
@@ -82,7 +82,7 @@ def write(found: "Design", out: Path) -> list[str]:
 
     write_json(out / "design.json", found.content)
     table, picture = out / "design_commands.csv", out / "design.png"
-    if not found.drives:
+    if not found.runs:
         for old in (table, picture):
             old.unlink(missing_ok=True)
         return ["design.json"]

@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, Load, Quiet, emit, on_wheels
+from slipid.cli.common import Json, Load, Quiet, emit, for_robots
 from slipid.support.progress import Reporter
 
 
-@on_wheels
+@for_robots
 def export(
     source: Annotated[
         Path,
@@ -49,7 +49,7 @@ def export(
     The folder has a README, and the checksum of every file. With --check nothing is written, and
     exit code 2 says that a byte was changed.
     """
-    from slipid.deploy.export import Wish, robot_at
+    from slipid.deploy.export import ExportOptions, robot_at
     from slipid.deploy.export import export as run
     from slipid.export.folder import check_folder
     from slipid.lab.trial.controllers import ROWS
@@ -72,8 +72,8 @@ def export(
     with Reporter(quiet=quiet) as report:
         report.stage("reading the robot")
         robot = robot_at(source, load, _names(floors))
-        wish = Wish(_names(to), controller, path, speed, map)
-        done = run(robot, out, wish, report, ROWS)
+        options = ExportOptions(_names(to), controller, path, speed, map)
+        done = run(robot, out, options, report, ROWS)
     content = {
         "schema": "slipid.export/1",
         "folder": str(done.folder),

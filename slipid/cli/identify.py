@@ -13,7 +13,7 @@ from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.app.config import Config
-    from slipid.app.identify import Identified
+    from slipid.app.identify import IdentifyResult
     from slipid.report.page import Page
 
 
@@ -37,12 +37,12 @@ def identify(
     Writes identified.json, fit.json, robot.json and pictures; goes on after an interrupt. Exit code
     1 where it did not converge, or predicts worse than the encoders.
     """
-    from slipid.app.config import Motor, read_config
+    from slipid.app.config import BenchMotors, read_config
     from slipid.report.estimates import show_fit, show_trust
     from slipid.support.files import read_json
 
     wanted = read_config(config)
-    if isinstance(wanted.content.robot, Motor):
+    if isinstance(wanted.content.robot, BenchMotors):
         return bench(wanted, data, out, profile or (), json, quiet)
     with Reporter(quiet=quiet) as report:
         done = run(config, data, out, report, profile or (), anyway)
@@ -50,10 +50,10 @@ def identify(
 
     def show(page: "Page") -> None:
         show_fit(page, done.fit, done.profiles)
-        show_trust(page, done.judgement)
+        show_trust(page, done.trust)
 
     emit(json, content, show, out, done.written)
-    return 0 if done.fit.converged and not done.judgement.is_bad else 1
+    return 0 if done.fit.converged and not done.trust.is_bad else 1
 
 
 def run(
@@ -63,7 +63,7 @@ def run(
     report: Reporter,
     profiles: Sequence[str] = (),
     anyway: bool = False,
-) -> "Identified":
+) -> "IdentifyResult":
     """The fit and its pictures; arguments as of `slipid.app.identify.identify`.
 
     Raises:
@@ -79,8 +79,8 @@ def run(
     report.stage("drawing")
     drawn = [out / name for name in write_robot(out, done.fit)]
     try:
-        warning = done.judgement.warning
-        drawn += identify_plots(done.fit, done.job.dataset, out, warning)
+        warning = done.trust.warning
+        drawn += identify_plots(done.fit, done.task.dataset, out, warning)
     except DataError as error:  # the numbers are written; a run too short to draw spoils none
         report.line(f"no more pictures: {error}")
     if done.profiles:

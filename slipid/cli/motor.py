@@ -51,10 +51,10 @@ def motor(
     """Resistance, back-EMF, friction, inertia and more of a motor, from voltage, current and speed.
 
     Columns that are not named are guessed. Several motors: names by commas. The speed must be that
-    of the motor shaft: no log shows that it was taken behind a gear. With --out it writes
+    of the motor shaft: no log shows that it was columns_used behind a gear. With --out it writes
     motor.json and a picture. Exit code 1 where the model does not explain the log.
     """
-    from slipid.app.bench import read_one
+    from slipid.app.bench import read_motor_log
     from slipid.report.estimates import show_bench
     from slipid.support.files import write_json
 
@@ -69,8 +69,8 @@ def motor(
     }
     with Reporter(quiet=quiet) as report:
         report.stage("reading the log")
-        job = read_one(file, _named(columns), delimiter, not unsigned)
-        fit = job.fit(report)
+        task = read_motor_log(file, _given(columns), delimiter, not unsigned)
+        fit = task.fit(report)
         content, written = fit.to_json(), ["motor.json"]
         if out is not None:
             from slipid.plots.bench import bench_plots
@@ -78,11 +78,11 @@ def motor(
             report.stage("drawing")
             write_json(out / "motor.json", content)
             written += [path.name for path in bench_plots(fit, out)]
-    emit(json, content, lambda page: show_bench(page, fit, job.taken), out, written)
+    emit(json, content, lambda page: show_bench(page, fit, task.columns_used), out, written)
     return 0 if fit.good else 1
 
 
-def _named(columns: dict[str, str | None]) -> "dict[str, GivenColumns]":
+def _given(columns: dict[str, str | None]) -> "dict[str, GivenColumns]":
     """What was named, by channel."""
     from slipid.data.reading.motor_layout import given_columns
 

@@ -62,12 +62,12 @@ def new(
     force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False,
 ) -> int:
     """Write a commented config for your robot: asks for it, or looks into its logs (--from)."""
-    from slipid.app.new.config_text import absent, new_config
+    from slipid.app.new.config_text import new_config, refuse_existing
+    from slipid.app.new.draft import template_draft
     from slipid.app.new.propose import propose
     from slipid.app.new.robot_questions import RobotOptions, ask
-    from slipid.app.new.sketch import blank
 
-    absent(out, force)
+    refuse_existing(out, force)
     options = RobotOptions(
         drive=drive,
         wheels=wheels,
@@ -89,15 +89,15 @@ def new(
         proposal = propose(log, options)
         for sentence in proposal.sentences:
             typer.echo(sentence)
-        config, data = new_config(proposal.sketch, out.name), proposal.sketch.data
+        config, data = new_config(proposal.draft, out.name), proposal.draft.data
     else:
-        config = new_config(blank(ask(options, None if yes else _asked)), out.name)
+        config = new_config(template_draft(ask(options, None if yes else _ask)), out.name)
     config.write(out, force)
     _show(config, out, data)
     return 0
 
 
-def _asked(asks: str, default: str, wrong: str) -> str:
+def _ask(asks: str, default: str, wrong: str) -> str:
     """A person's answer."""
     from slipid.support.errors import DataError
 

@@ -5,12 +5,12 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, on_wheels
+from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
 
-@on_wheels
+@for_robots
 def sample(
     out: OutFolder,
     data: Annotated[

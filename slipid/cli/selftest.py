@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import ConfigFile, Json, Out, Quiet, emit, on_wheels
+from slipid.cli.common import ConfigFile, Json, Out, Quiet, emit, for_robots
 from slipid.support.progress import Reporter
 
 
-@on_wheels
+@for_robots
 def selftest(
     config: ConfigFile,
     data: Annotated[

@@ -4,11 +4,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from slipid.cli.common import ConfigFile, Jobs, Json, Out, Quiet, emit, executor_of, guarded
-from slipid.support.files import Content
+from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
-    from slipid.lab.testsite.config import Plan
+    from slipid.lab.testsite.config import SimulationPlan
     from slipid.report.page import Page
 
 
@@ -32,7 +32,7 @@ def simulate(
     return 0
 
 
-def show(page: "Page", found: Content, plan: "Plan", out: Path) -> None:
+def show(page: "Page", found: Content, plan: "SimulationPlan", out: Path) -> None:
     """Print how much was driven, and what to do with it."""
     from slipid.lab.testsite.config import can_identify
 

@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Jobs, Json, Load, OutFolder, Quiet, emit, executor_of, on_wheels
+from slipid.cli.common import Jobs, Json, Load, OutFolder, Quiet, emit, executor_of, for_robots
 from slipid.support.progress import Reporter
 
 
-@on_wheels
+@for_robots
 def trial(
     out: OutFolder,
     plant: Annotated[
@@ -48,15 +48,15 @@ def trial(
     Writes trial.json and trial.png to OUT; runs that are done are kept and not driven again.
     """
     from slipid.lab.trial.plots import trial_plot
-    from slipid.lab.trial.trial import Wish, names_of
+    from slipid.lab.trial.trial import TrialOptions, controller_names
     from slipid.lab.trial.trial import trial as run
     from slipid.report.answers import show_trial
 
-    wish = Wish(
+    wish = TrialOptions(
         plant=plant,
         map=map,
         told_map=told_map,
-        controllers=names_of(controllers),
+        controllers=controller_names(controllers),
         path=path,
         speed=speed,
         starts=starts,

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from slipid.cli.common import DataFolder, Json, OutFolder, Quiet, emit, on_wheels
-from slipid.support.files import Content
+from slipid.cli.common import DataFolder, Json, OutFolder, Quiet, emit, for_robots
+from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
 
-@on_wheels
+@for_robots
 def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet = False) -> int:
     """Predict runs open loop and compare with the camera, model by model."""
     from slipid.report.estimates import show_validation

@@ -1,6 +1,6 @@
 """The numbers of a robot as plain tables, for a person who types them into a controller.
 
-`gains.md` is for reading: values rounded beside those with all digits. `gains.csv` has the same
+`gains.md` is for reading: rounded values beside those with all digits. `gains.csv` has the same
 rows with all digits; its lines that start with # are comments.
 """
 
@@ -11,8 +11,16 @@ from dataclasses import asdict, dataclass
 
 from jaxtyping import Array, Float
 
-from slipid.export.header import header, in_markdown
-from slipid.export.rows import DOUBTED, LIMITS, VERDICTS, origin, rows_of, said
+from slipid.export.description import (
+    LIMITS,
+    VERDICTS,
+    WARNED_VERDICTS,
+    gains_origin,
+    header,
+    in_markdown,
+    number_rows,
+    verdict_text,
+)
 from slipid.export.text import interval, one_line, short, table
 from slipid.parameter import entries
 from slipid.robot.controller import Gains, Limits
@@ -38,13 +46,20 @@ _TWIST = (("vx", "m/s"), ("vy", "m/s"), ("W", "rad/s"))
 
 
 @dataclass(frozen=True)
-class Line:
+class TableRow:
     """One number.
 
     Attributes:
-        group: key of the table it stands in; name, entry: which one.
-        low_high: 90 % interval, None where there is none.
-        verdict, provenance: how sure it is, as people read it.
+        group: key of its table.
+        name: name of the number.
+        entry: entry of the number, such as a wheel.
+        symbol: symbol in equations.
+        value: value [unit].
+        unit: unit of the value.
+        low_high: 90 % interval; None where there is none.
+        verdict: how certain it is, as people read it.
+        provenance: its origin, as people read it.
+        meaning: meaning in words.
     """
 
     group: str
@@ -60,23 +75,23 @@ class Line:
 
 
 def table_files(robot: DeployedRobot) -> dict[str, str]:
-    """Text of gains.md and gains.csv, for the robot's load set-up."""
+    """Return the text of gains.md and gains.csv, for the robot's load set-up."""
     lines = tuple(_lines(robot))
     return {"gains.md": _markdown(robot, lines), "gains.csv": _csv(robot, lines)}
 
 
-def _lines(robot: DeployedRobot) -> Iterator[Line]:
+def _lines(robot: DeployedRobot) -> Iterator[TableRow]:
     yield from _gains(robot)
     for name, value in asdict(Limits()).items():
         unit, about = LIMITS[name]
         sure = ("by hand", "default of slipid")
-        yield Line("limits", f"limits.{name}", "", "", float(value), unit, None, *sure, about)
+        yield TableRow("limits", f"limits.{name}", "", "", float(value), unit, None, *sure, about)
     yield from _matrices(robot)
     yield from _curve(robot)
     yield from _numbers(robot)
 
 
-def _gains(robot: DeployedRobot) -> Iterator[Line]:
+def _gains(robot: DeployedRobot) -> Iterator[TableRow]:
     gains, tuned = Gains.of(robot), robot.record.gains
     taken = tuned is not None and tuned.is_better and tuned.load == robot.load_setup
     sure = ("tuned, better than by hand", "robot.json") if taken else ("by hand", "default")
@@ -85,47 +100,47 @@ def _gains(robot: DeployedRobot) -> Iterator[Line]:
         spread = getattr(tuned.values, e.path).spread if tuned is not None and taken else None
         doc = d.doc if spread is None else f"{d.doc}; std at the end of the search {short(spread)}"
         about = (d.symbol, float(e.get(gains)), d.unit, None)
-        yield Line("gains", f"gains.{e.path}", "", *about, *sure, doc)
+        yield TableRow("gains", f"gains.{e.path}", "", *about, *sure, doc)
 
 
-def _matrices(robot: DeployedRobot) -> Iterator[Line]:
+def _matrices(robot: DeployedRobot) -> Iterator[TableRow]:
     known = robot.record.parameters
-    made_of = [f"{path} ({said(known[path].verdict)})" for path in _GEOMETRY]
+    made_of = [f"{path} ({verdict_text(known[path].verdict)})" for path in _GEOMETRY]
     sure = ("derived", f"from {', '.join(made_of)}")
     for k in range(robot.wheels):
         for axis, (name, unit) in enumerate(_TWIST):
             about = ("J", float(robot.forward[k, axis]), f"m/s per {unit}", None, *sure)
             meaning = f"rim speed of wheel {k + 1} per {name}"
-            yield Line("forward", f"forward[{k + 1}]", name, *about, meaning)
+            yield TableRow("forward", f"forward[{k + 1}]", name, *about, meaning)
     for axis, (name, unit) in enumerate(_TWIST):
         for k in range(robot.wheels):
             about = ("J^+", float(robot.inverse[axis, k]), f"{unit} per m/s", None, *sure)
             meaning = f"{name} per rim speed of wheel {k + 1}"
-            yield Line("inverse", f"inverse[{name}]", f"wheel {k + 1}", *about, meaning)
+            yield TableRow("inverse", f"inverse[{name}]", f"wheel {k + 1}", *about, meaning)
 
 
-def _curve(robot: DeployedRobot) -> Iterator[Line]:
+def _curve(robot: DeployedRobot) -> Iterator[TableRow]:
     curve: Float[Array, "wheel 2"] = robot.wheel_curve
     for k in range(robot.wheels):
         for column, (name, unit, meaning) in enumerate(
             (("a", "1", "slip ratio without current"), ("b", "1/A", "slip ratio per current"))
         ):
             about = (name, float(curve[k, column]), unit, None, "derived", _FITTED, meaning)
-            yield Line("wheel_curve", f"wheel_curve.{name}", f"wheel {k + 1}", *about)
+            yield TableRow("wheel_curve", f"wheel_curve.{name}", f"wheel {k + 1}", *about)
 
 
-def _numbers(robot: DeployedRobot) -> Iterator[Line]:
-    """The robot's numbers, the gear ratio among those of the motor."""
+def _numbers(robot: DeployedRobot) -> Iterator[TableRow]:
+    """Yield the robot's numbers, with the gear ratio among those of the motor."""
     ratio = robot.record.wheels.gear_ratio
     about = ("fixed", "override", "motor speed over wheel speed")
-    yield Line("motor", "wheels.gear_ratio", "", "n", float(ratio), "1", None, *about)
-    for row in rows_of(robot):
+    yield TableRow("motor", "wheels.gear_ratio", "", "n", float(ratio), "1", None, *about)
+    for row in number_rows(robot):
         number = (row.symbol, row.value, row.unit, row.interval90)
-        sure = (said(row.verdict), row.provenance, row.about)
-        yield Line(row.path.partition(".")[0], row.path, row.entry, *number, *sure)
+        sure = (verdict_text(row.verdict), row.provenance, row.about)
+        yield TableRow(row.path.partition(".")[0], row.path, row.entry, *number, *sure)
 
 
-def _csv(robot: DeployedRobot, lines: tuple[Line, ...]) -> str:
+def _csv(robot: DeployedRobot, lines: tuple[TableRow, ...]) -> str:
     text = io.StringIO()
     for line in header(robot):
         text.write(f"# {line}".replace('"', "'") + "\n")  # a quote might hold lines together
@@ -138,20 +153,20 @@ def _csv(robot: DeployedRobot, lines: tuple[Line, ...]) -> str:
     return text.getvalue()
 
 
-def _markdown(robot: DeployedRobot, lines: tuple[Line, ...]) -> str:
+def _markdown(robot: DeployedRobot, lines: tuple[TableRow, ...]) -> str:
     text = ["# Numbers of a robot identified by slipid", "", *in_markdown(robot)]
-    text += [origin(robot), ""]
+    text += [gains_origin(robot), ""]
     for group, title in _TITLES.items():
         rows = [_shown(x) for x in lines if x.group == group]
         head = ("name", "", "symbol", "rounded", "value", "unit", "90 % interval", "verdict")
         text += [f"## {title}", "", *table((*head, "provenance", "meaning"), rows), ""]
     text += ["## Verdicts", ""]
-    text += [f"- *{said(v)}*: {about}." for v, about in VERDICTS.items()]
+    text += [f"- *{verdict_text(v)}*: {about}." for v, about in VERDICTS.items()]
     return "\n".join(text) + "\n"
 
 
-def _shown(x: Line) -> tuple[str, ...]:
-    warned = x.verdict in {said(v) for v in DOUBTED}
+def _shown(x: TableRow) -> tuple[str, ...]:
+    warned = x.verdict in {verdict_text(v) for v in WARNED_VERDICTS}
     verdict = f"**{x.verdict}**" if warned else x.verdict
     number = (short(x.value), repr(x.value), x.unit, interval(x.low_high))
     return (f"`{x.name}`", x.entry, x.symbol, *number, verdict, x.provenance, x.meaning)

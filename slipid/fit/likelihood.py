@@ -1,6 +1,6 @@
-"""What a robot predicts of every piece of every run, and how far that is from what was measured.
+"""Predictions of a robot for every segment of every run, and their residuals to the measurements.
 
-A piece is a few neighbouring windows of one run. How the difference is weighed is in `noise`.
+A segment is a few neighbouring windows of one run. The weighting of residuals is in `noise`.
 """
 
 from collections.abc import Callable
@@ -17,42 +17,42 @@ from slipid.model import robot as model
 from slipid.model import se2
 from slipid.model.robot import Robot
 
-Marker = Float[Array, "piece window 3"]
+Marker = Float[Array, "segment window 3"]
 """Increments of the marker [m, m, rad], or body twists [m/s, m/s, rad/s], of every window."""
-PerDrive = Float[Array, "piece window drive"]
-Felt = Float[Array, "piece window drive 2"]
-"""What `model.robot.felt` says of the wheels of every drive."""
-PerChannel = Float[Array, "piece m"]
-"""Window by window the drives of every piece, as residuals are."""
+PerDrive = Float[Array, "segment window drive"]
+MotorForce = Float[Array, "segment window drive 2"]
+"""Forces of `model.robot.motor_forces`, summed over the wheels of every drive."""
+PerChannel = Float[Array, "segment m"]
+"""Values of every segment in one row, window by window and drive by drive, as residuals are."""
 Std = Float[Array, ""] | float
 SMOOTH = 0.03
 """Magnitude below which the mean of an unsigned current levels off [A]."""
 FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
-"""Variance added to every residual: rounding of the logs [m^2, A^2, V^2]."""
+"""Variance added to every residual for the rounding of the logs [m^2, A^2, V^2]."""
 
-_AS_THEY_ARE = ("dt", "turn", "faster", "pose", "current", "voltage", "current_var", "lag")
+_AS_THEY_ARE = ("dt", "turn", "speed_change", "pose", "current", "voltage", "current_var", "lag")
 
 
 def with_slope(of: Callable[[Array], Array], z: Array | np.ndarray) -> tuple[Array, Array]:
-    """A function's value at a vector and its derivative by it, from one pass."""
+    """Return a function's value at a vector and its derivative by the vector, from one pass."""
     slope, value = jax.jacfwd(lambda x: (of(x),) * 2, has_aux=True)(z)
     return value, slope
 
 
 class Batch(eqx.Module):
-    """Windows as arrays for a jitted function; names are indices of the robot's stacks.
+    """Windows as arrays for a compiled function, with indices of the robot's stacks as names.
 
-    The surface is the one under the robot (piece,), or under each of its wheels in every window
-    (piece, window, wheel).
+    The surface is the one under the robot (segment,), or under each of its wheels in every window
+    (segment, window, wheel).
     """
 
-    surface: Int[Array, "piece *window_wheel"]
-    load: Int[Array, " piece"]
-    session: Int[Array, " piece"]
-    dt: Float[Array, "piece window"]
+    surface: Int[Array, "segment *window_wheel"]
+    load: Int[Array, " segment"]
+    session: Int[Array, " segment"]
+    dt: Float[Array, "segment window"]
     turn: PerDrive
-    faster: PerDrive
-    pose: Float[Array, "piece edge 3"]
+    speed_change: PerDrive
+    pose: Float[Array, "segment edge 3"]
     current: PerDrive
     voltage: PerDrive
     current_var: PerDrive
@@ -63,11 +63,11 @@ class Batch(eqx.Module):
 
 
 def batch(
-    windows: Windows, robot: Robot, floor: Int[np.ndarray, "piece window wheel"] | None = None
+    windows: Windows, robot: Robot, floor: Int[np.ndarray, "segment window wheel"] | None = None
 ) -> Batch:
-    """Batch for a robot that knows the floors, loads and sessions of the windows.
+    """Return the batch for a robot that knows the floors, loads and sessions of the windows.
 
-    The floor is the surface under each wheel in every window, where the windows do not know theirs.
+    `floor` is the surface under each wheel in every window, for windows on several floors.
     """
     if floor is None:
         floor = np.asarray([robot.surface_index(s) for s in windows.surface])
@@ -83,12 +83,15 @@ def batch(
 
 
 class ElectricNoise(eqx.Module):
-    """What voltages are predicted with: the voltmeter's std [V], and how far currents scatter.
+    """Noise that the prediction of voltages depends on.
 
-    The scatter is the variance of the true current of every window around the predicted one [A^2],
-    without the ammeter's noise. The resistance [ohm] says how far what stays unknown of the true
-    current moves voltages: a fit holds it in every round, as it holds the variances, because these
-    are fitted to the size of the residuals, which then tells nothing more of R.
+    Attributes:
+        voltage_std: std of the voltmeter [V].
+        scatter: variance of the true current of every window around the predicted one [A^2],
+            without the ammeter's noise.
+        resistance: winding resistance [ohm], which converts unknown current to voltage. It is fixed
+            during every round of a fit, as the variances are: these are fitted to the size of the
+            residuals, which then contains no information about R.
     """
 
     voltage_std: Std
@@ -97,113 +100,117 @@ class ElectricNoise(eqx.Module):
 
 
 class Predicted(eqx.Module):
-    """What the robot says of each window: marker increments (x, y [m], yaw [rad]), body twists.
+    """Predicted motion and motor forces of every window.
 
-    Felt is what each motor works against, in units of mu m g.
+    Attributes:
+        increment: increments of the marker (x, y [m], yaw [rad]).
+        twist: body twists.
+        motor_force: forces each motor works against, in units of mu m g.
     """
 
     increment: Marker
     twist: Marker
-    felt: Felt
+    motor_force: MotorForce
 
 
 def wheel_speed(robot: Robot, b: Batch) -> PerDrive:
-    """Mean wheel speed of every drive and window at the robot's camera lag [rad/s]."""
-    return (b.turn - (robot.camera.lag - b.lag) * b.faster) / b.dt[..., None]
+    """Return the mean wheel speed of every drive and window at the robot's camera lag [rad/s]."""
+    return (b.turn - (robot.camera.lag - b.lag) * b.speed_change) / b.dt[..., None]
 
 
 def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
-    """Contact equilibrium of every window, looked for near twists as `model.robot.twist` does."""
+    """Return the contact equilibrium of every window; `near` is as in `model.robot.twist`."""
     shape, frame = robot.geometry, robot.geometry.frame()
 
     def window(w: Array, near: Array | None, surface: Array, load: Array) -> tuple[Array, Array]:
         w = shape.at_wheels(w)
         xi = model.twist(robot, frame, w, surface, load, near)
-        return xi, shape.at_drives(model.felt(robot, frame, xi, w, surface, load).T).T
+        return xi, shape.at_drives(model.motor_forces(robot, frame, xi, w, surface, load).T).T
 
-    twist, felt = each_window(window, b, wheel_speed(robot, b), near)
-    return Predicted(seen(robot, twist, b.dt, b.session), twist, felt)
+    twist, motor_force = each_window(window, b, wheel_speed(robot, b), near)
+    return Predicted(marker_increments(robot, twist, b.dt, b.session), twist, motor_force)
 
 
 def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | None = None) -> Any:
-    """A function of every window's wheel speeds, a twist near it, its surface and its load.
+    """Apply a function to every window: wheel speeds, a nearby twist, surface and load.
 
-    All windows are one axis meanwhile: two, one inside the other, take JAX half as long again to
-    trace.
+    All windows are one axis meanwhile: two nested ones take JAX half as long again to trace.
     """
-    pieces, windows = b.dt.shape
+    segments, windows = b.dt.shape
 
     def flat(x: Array) -> Array:
-        return x.reshape(pieces * windows, *x.shape[2:])
+        return x.reshape(segments * windows, *x.shape[2:])
 
-    def of_piece(x: Array) -> Array:
-        return jnp.repeat(x, windows, axis=0, total_repeat_length=pieces * windows)
+    def of_segment(x: Array) -> Array:
+        return jnp.repeat(x, windows, axis=0, total_repeat_length=segments * windows)
 
-    surface = flat(b.surface) if b.surface.ndim > 1 else of_piece(b.surface)
+    surface = flat(b.surface) if b.surface.ndim > 1 else of_segment(b.surface)
     at = None if near is None else flat(near)
     found = jax.vmap(of, (0, None if near is None else 0, 0, 0))(
-        flat(w), at, surface, of_piece(b.load)
+        flat(w), at, surface, of_segment(b.load)
     )
-    return jax.tree.map(lambda x: x.reshape(pieces, windows, *x.shape[1:]), found)
+    return jax.tree.map(lambda x: x.reshape(segments, windows, *x.shape[1:]), found)
 
 
-def seen(
-    robot: Robot, twist: Marker, dt: Float[Array, "piece window"], session: Int[Array, " piece"]
+def marker_increments(
+    robot: Robot, twist: Marker, dt: Float[Array, "segment window"], session: Int[Array, " segment"]
 ) -> Marker:
-    """Marker increments of every window for given body twists."""
+    """Return the marker increments of every window for given body twists."""
 
     def window(xi: Array, dt: Array, session: Array) -> Array:
-        return robot.camera.seen(se2.advance(xi, dt), session)
+        return robot.camera.marker_increment(se2.advance(xi, dt), session)
 
     return jax.vmap(jax.vmap(window, (0, 0, None)))(twist, dt, session)
 
 
-def predicted_current(robot: Robot, b: Batch, felt: Felt) -> PerDrive:
-    """Motor current of every window [A] given what motors work against, or its size."""
+def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDrive:
+    """Return the motor current of every window [A], its magnitude if logs are unsigned."""
     friction = robot.surfaces.friction[b.surface]  # of the wheels on average, as `felt` has it
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
     weight = friction * robot.body.mass * model.GRAVITY
-    torque = robot.geometry.wheel_radius * weight[..., None] * robot.motor.borne(felt)
+    torque = (
+        robot.geometry.wheel_radius * weight[..., None] * robot.motor.opposing_force(motor_force)
+    )
     amps = robot.motor.current(torque, wheel_speed(robot, b))
     if b.signed:
         return amps + robot.motor.current_offset
     return jnp.sqrt(amps**2 + SMOOTH**2) + robot.motor.current_offset
 
 
-def measured(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Marker:
-    """Marker increments in the frame of each window's start, in corrected metres."""
+def measured_increments(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Marker:
+    """Return measured marker increments in the frame of each window's start [m, m, rad]."""
 
-    def piece(edges: Float[Array, "edge 3"]) -> Float[Array, "window 3"]:
+    def segment(edges: Float[Array, "edge 3"]) -> Float[Array, "window 3"]:
         p = jax.vmap(robot.camera.corrected)(edges)
         c, s = jnp.cos(p[:-1, 2]), jnp.sin(p[:-1, 2])
         d = p[1:] - p[:-1]
         return jnp.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], d[:, 2]], axis=-1)
 
-    return jax.vmap(piece)(pose)
+    return jax.vmap(segment)(pose)
 
 
-def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "piece m"]:
-    """Predicted less measured marker increments, a row per piece [m, m, rad]."""
-    return (p.increment - measured(robot, b.pose)).reshape(b.dt.shape[0], -1)
+def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "segment m"]:
+    """Return predicted less measured marker increments, a row per segment [m, m, rad]."""
+    return (p.increment - measured_increments(robot, b.pose)).reshape(b.dt.shape[0], -1)
 
 
 def electric_residuals(
-    robot: Robot, b: Batch, felt: Felt, noise: ElectricNoise
+    robot: Robot, b: Batch, motor_force: MotorForce, noise: ElectricNoise
 ) -> dict[str, Array]:
-    """Predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
+    """Return predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
 
-    Voltages are predicted from what is expected of the true current given the measured and the
-    predicted one: predicted from the measured one alone, its noise would make R too small.
+    Voltages are predicted from the expected true current given the measured and the predicted one:
+    predicted from the measured current alone, its noise would bias R towards small values.
     """
     if not b.has_current:
         return {}
-    predicted = predicted_current(robot, b, felt)
+    predicted = predicted_current(robot, b, motor_force)
     out = {"current": _flat(predicted - b.current)}
     if b.has_voltage:
-        amps = predicted + _flow(b, noise)[0] * (b.current - predicted)
+        amps = predicted + _true_current_share(b, noise)[0] * (b.current - predicted)
         w = b.turn / b.dt[..., None]
         volts = robot.motor.voltage((amps - robot.motor.current_offset) * _direction(b), w)
-        out["voltage"] = _flat(volts - b.voltage) / spread(b, noise)
+        out["voltage"] = _flat(volts - b.voltage) / voltage_spread(b, noise)
     return out
 
 
@@ -212,16 +219,16 @@ def _flat(x: PerDrive) -> PerChannel:
 
 
 def _direction(b: Batch) -> PerDrive:
-    """What a logged current counts for in the direction of the wheel: 1 if it is signed."""
+    """Return the factor from a logged current to the wheel's direction, 1 if it is signed."""
     return jnp.ones_like(b.turn) if b.signed else jnp.tanh(b.turn / b.dt[..., None] / 0.2)
 
 
-def _flow(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDrive]:
-    """Share k of the gap of a measured current that is true current, and what stays unknown of it.
+def _true_current_share(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDrive]:
+    """Return the share k of measured less predicted current that is true, and the variance left.
 
     The true current is N(predicted, s^2) before it is measured with the noise sigma^2. Afterwards
-    it is N(predicted + k (measured - predicted), k sigma^2) with k = s^2 / (s^2 + sigma^2).
-    Source: Kelly 2007, ApJ 665(2), whose population of true values is here the model's prediction.
+    it is N(predicted + k (measured - predicted), k sigma^2) with k = s^2 / (s^2 + sigma^2). Source:
+    Kelly 2007, ApJ 665(2), whose population of true values is here the model's prediction.
     """
     scatter = noise.scatter.reshape(b.current.shape)
     share = scatter / (scatter + b.current_var)
@@ -229,33 +236,35 @@ def _flow(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDrive]:
 
 
 def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, Array]:
-    """Log |d residuals / d data| of the motion and of the voltage of every piece.
+    """Return log |d residuals / d data| of the motion and of the voltage of every segment.
 
-    The camera corrects measured places and the voltage residual is scaled by its own spread:
+    The camera corrects measured positions and the voltage residual is scaled by its own spread:
     without these terms a smaller scale would fit better only because it shrinks the residuals.
     """
     camera = camera_log_jacobian(robot, b.pose)
     if not (b.has_current and b.has_voltage):
         return camera, jnp.zeros_like(camera)
-    return camera, -jnp.sum(jnp.log(spread(b, noise)), axis=1)
+    return camera, -jnp.sum(jnp.log(voltage_spread(b, noise)), axis=1)
 
 
-def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, " piece"]:
-    """Log |d motion residuals / d logged poses| of every piece; its first pose is given."""
+def camera_log_jacobian(
+    robot: Robot, pose: Float[Array, "segment edge 3"]
+) -> Float[Array, " segment"]:
+    """Return log |d motion residuals / d logged poses| of every segment, given its first pose."""
     return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
 
 
-def spread(b: Batch, noise: ElectricNoise) -> PerChannel:
-    """Std of the voltage residual over that of the voltage noise.
+def voltage_spread(b: Batch, noise: ElectricNoise) -> PerChannel:
+    """Return the std of the voltage residual over that of the voltage noise.
 
-    The rest is of the true current that the ammeter and the model leave unknown, times R.
+    The remainder comes from the true current that ammeter and model leave unknown, times R.
     """
-    unknown = (noise.resistance * _direction(b)) ** 2 * _flow(b, noise)[1]
+    unknown = (noise.resistance * _direction(b)) ** 2 * _true_current_share(b, noise)[1]
     return _flat(jnp.sqrt(1.0 + unknown / noise.voltage_std**2))
 
 
 def voltage_std(log_variance: Float[Array, ""]) -> Float[Array, ""]:
-    """Std of the voltage noise, rounding included, from the log of its variance [V].
+    """Return the std of the voltage noise, rounding included, from the log of its variance [V].
 
     The voltage residual is in units of it: without the floor it would vanish with the noise.
     """

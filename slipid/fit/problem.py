@@ -1,4 +1,4 @@
-"""Posterior of a robot given windows of its runs, compiled for all windows of the same shapes."""
+"""Posterior of a robot given windows of its runs, compiled once for all windows of equal shapes."""
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,33 +16,44 @@ from slipid.data.runs import Runs
 from slipid.data.windows import Windows
 from slipid.fit import likelihood as lk
 from slipid.fit import variances
-from slipid.fit.crossing import CURRENT, Crossing, Several
+from slipid.fit.multi_floor import MULTI_FLOOR_CURRENT, MultiFloorBatch, MultiFloorRuns
 from slipid.fit.noise import POOLED, SHARED, electric_noise, noise
-from slipid.fit.shared import Tie, freed, shared_effects, shared_of, ties
+from slipid.fit.shared_effects import (
+    EffectPosterior,
+    effect_posteriors,
+    effects_by_floor,
+    marginal_residuals,
+    mean_effects,
+)
 from slipid.fit.variances import (
     VARIANCE_SPREAD,
     Blocks,
+    Objective,
     Search,
-    Target,
-    ThroughVoltage,
     Vector,
+    VoltageInformation,
     Whitening,
-    through_voltage,
+    voltage_information,
 )
 from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
 
 CREEPS = (0.05, 0.4, 1.0)
-"""Starts of the creep of every floor; others end in poor minima."""
+"""Start values of the creep of every floor; other starts end in poor minima."""
 
 
 @dataclass(frozen=True)
-class State:
-    """Where a fit stands; enough to go on from.
+class FitState:
+    """State of a fit, sufficient to continue it.
 
-    The effect is what runs were found to share, along, across and in yaw. The loss is minus log
-    posterior up to a constant, `moved` the largest step of the last round in
-    posterior stds, the stage what it was doing, for progress.
+    Attributes:
+        z: search vector.
+        log_variance: log variances of the noise.
+        round: number of finished rounds.
+        loss: minus log posterior up to a constant.
+        moved: largest step of the last round in posterior stds.
+        stage: current activity, for progress.
+        effect: mean shared effects along, across and in yaw.
     """
 
     z: Search
@@ -51,20 +62,20 @@ class State:
     loss: float
     moved: float
     stage: str
-    effect: Float[np.ndarray, "piece 3"] | None = None
+    effect: Float[np.ndarray, "segment 3"] | None = None
 
-    def shared(self, pieces: int) -> Float[np.ndarray, "piece 3"]:
-        """The effects, zero where none were found yet."""
-        return np.zeros((pieces, 3)) if self.effect is None else self.effect
+    def shared(self, segments: int) -> Float[np.ndarray, "segment 3"]:
+        """Return the shared effects of that many segments, zero before any were estimated."""
+        return np.zeros((segments, 3)) if self.effect is None else self.effect
 
     @property
     def arrays(self) -> dict[str, Any]:
-        """What a checkpoint keeps of it, by name."""
+        """Values that a checkpoint stores, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @classmethod
-    def of(cls, kept: Mapping[str, np.ndarray]) -> "State":
-        """The state whose `arrays` a checkpoint has kept."""
+    def of(cls, kept: Mapping[str, np.ndarray]) -> "FitState":
+        """Return the state whose `arrays` a checkpoint has stored."""
         plain: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in kept.items()}
         return cls(**plain)
 
@@ -72,12 +83,12 @@ class State:
 class Problem:
     """Likelihood of a set of windows as functions of the search vector.
 
-    Currents and voltages do not move the numbers of the motion ("cut"): the torque scale
-    is read from currents given the motion, whose errors are carried along. A friction model good to
-    5 % in current would otherwise outvote forces that motion shows to 1 %.
+    Currents and voltages do not move the numbers of the motion ("cut"): the torque scale is
+    estimated from currents given the motion, whose errors are propagated. A friction model good to
+    5 % in current would otherwise outvote forces that motion determines to 1 %.
 
-    `keep`, below, chooses the pieces that count. `compiled` holds what was compiled for windows of
-    these shapes by others, under their own keys.
+    The argument `keep` of the methods weighs segments with 1 or 0. `compiled` holds functions that
+    other modules compiled for windows of these shapes, under their own keys.
     """
 
     def __init__(self, windows: Windows, robot: Robot, choices: Sequence[Choice]):
@@ -87,186 +98,203 @@ class Problem:
         self._read(windows, None)
 
     def of(self, windows: Windows) -> "Problem":
-        """The same problem for other windows; those of the same shapes share what is compiled."""
+        """Return the same problem for other windows; equal shapes share compiled functions."""
         other = copy.copy(self)
-        other._read(windows, self.several)
+        other._read(windows, self.multi_floor)
         return other
 
-    def crossed(self, several: Crossing) -> "Problem":
-        """The same problem with runs over several floors."""
+    def with_multi_floor(self, multi_floor: MultiFloorRuns) -> "Problem":
+        """Return the same problem with runs over several floors."""
         other = copy.copy(self)
         other.compiled = {}
-        other._read(self.windows, several)
+        other._read(self.windows, multi_floor)
         return other
 
-    def _read(self, windows: Windows, several: Crossing | None) -> None:
-        self.windows, self.several = windows, several
-        self.noise = noise(windows, self.robot, several)
-        shared, self.paces = shared_of(windows, self.robot, self.noise)
+    def _read(self, windows: Windows, multi_floor: MultiFloorRuns | None) -> None:
+        self.windows, self.multi_floor = windows, multi_floor
+        self.noise = noise(windows, self.robot, multi_floor)
+        shared, self.speeds_and_loads = effects_by_floor(windows, self.robot, self.noise)
         kinds = np.array([c.kind for c in self.noise.components])
-        self.target = Target(
+        self.objective = Objective(
             space=self.space,
             batch=lk.batch(windows, self.robot),
-            several=None if several is None else Several.of(several, self.robot),
+            multi_floor=None
+            if multi_floor is None
+            else MultiFloorBatch.of(multi_floor, self.robot),
             blocks=self.noise.blocks,
             shared=shared,
             typical=jnp.asarray(2 * np.log(self.noise.typical)),
             scored=~np.isin(kinds, ("run", "pooled", *SHARED)),
             pooled=self.noise.names.index(POOLED),
-            joint=not windows.has_current and CURRENT not in self.noise.blocks,
+            joint=not windows.has_current and MULTI_FLOOR_CURRENT not in self.noise.blocks,
         )
 
     @property
-    def every(self) -> Float[np.ndarray, " piece"]:
-        """Weights with which every piece counts, those of runs over several floors last."""
+    def full_weight(self) -> Float[np.ndarray, " segment"]:
+        """Weight 1 for every segment, those of runs over several floors last."""
         return np.ones(
-            len(self.windows) + (0 if self.several is None else len(self.several.counts))
+            len(self.windows) + (0 if self.multi_floor is None else len(self.multi_floor.counts))
         )
 
-    def restated(self, state: State, of: "Problem") -> State:
-        """A state of another problem with the same numbers as one of this problem."""
+    def carried_over(self, state: FitState, of: "Problem") -> FitState:
+        """Return the state of another problem with the same numbers as a state of this problem."""
         known = dict(zip(of.noise.names, state.log_variance, strict=True))
         log_v = [known.get(c.name, 2 * np.log(c.typical)) for c in self.noise.components]
         return replace(state, log_variance=np.array(log_v), moved=np.inf)
 
-    def apart(self) -> "Problem":
-        """The same problem as if runs shared nothing."""
+    def without_shared_effects(self) -> "Problem":
+        """Return the same problem as if runs shared no effects."""
         other = copy.copy(self)
-        other.target = replace(self.target, shared=())
+        other.objective = replace(self.objective, shared=())
         return other
 
     @property
     def batch(self) -> lk.Batch:
-        return self.target.batch
+        return self.objective.batch
 
     def linear(self, z: Vector, electric: lk.ElectricNoise) -> tuple[Blocks, Blocks]:
-        """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
-        return linear(self.target, z, electric)[:2]
+        """Return residual blocks (segment, m) and their Jacobians (segment, m, free)."""
+        return linear(self.objective, z, electric)[:2]
 
     def covariance(self, block: str, log_v: Vector) -> Array:
-        """Covariance of the residuals of a block (piece, m, m)."""
+        """Return the covariance of the residuals of a block (segment, m, m)."""
         return self.noise.blocks[block].covariance(log_v)
 
     def whitening(self, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
         return variances.whitening(self.noise.blocks, residual, log_v, keep)
 
     def precision(self, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
-        return variances.precision(self.target, jacobian, log_v, keep)
+        return variances.precision(self.objective, jacobian, log_v, keep)
 
     def laplace(
         self, z: Vector, log_v: Vector, keep: Vector, alone: bool = False
     ) -> Float[np.ndarray, "free free"]:
-        """Covariance of the search vector: inverse information, prior included."""
+        """Return the covariance of the search vector: inverse information, prior included."""
         jacobian = self.linear(z, self.electric(z, log_v))[1]
-        told = variances.precision(self.target, jacobian, log_v, keep, alone)
-        return np.linalg.inv(np.asarray(told))
+        information = variances.precision(self.objective, jacobian, log_v, keep, alone)
+        return np.linalg.inv(np.asarray(information))
 
-    def seen(self, residual: Blocks, log_v: Vector, keep: Vector, effect: Vector) -> "Seen":
-        """Residuals weighed: outliers are so only for what they do not share with other runs.
+    def weighed(
+        self, residual: Blocks, log_v: Vector, keep: Vector, effect: Vector
+    ) -> "WeighedResiduals":
+        """Return weighed residuals; outliers are judged without the effects they share.
 
-        The effect is what they were found to share (piece, 3).
+        `effect` are the shared effects found so far (segment, 3).
         """
         where = jnp.asarray(log_v), jnp.asarray(keep), jnp.asarray(effect)
-        return _seen(self.target, residual, *where)
+        return _weighed(self.objective, residual, *where)
 
     def loss(
-        self, z: Vector, log_v: Vector, keep: Vector, seen: "Seen", electric: lk.ElectricNoise
+        self,
+        z: Vector,
+        log_v: Vector,
+        keep: Vector,
+        seen: "WeighedResiduals",
+        electric: lk.ElectricNoise,
     ) -> float:
-        """Minus log posterior of structure and variances given the residuals, less constants."""
+        """Return minus the log posterior of numbers and variances, less constants."""
         nll = float(seen.loss)
-        nll -= float(log_jacobian(self.target, z, electric, keep)[0])
-        prior_std = np.asarray(self.target.prior_std(log_v))
-        pull = (np.asarray(z) - self.space.prior_mean) / prior_std
+        nll -= float(log_jacobian(self.objective, z, electric, keep)[0])
+        prior_std = np.asarray(self.objective.prior_std(log_v))
+        deviation = (np.asarray(z) - self.space.prior_mean) / prior_std
         nll += float(np.log(prior_std).sum())
-        spread = (np.asarray(log_v) - np.asarray(self.target.typical)) / VARIANCE_SPREAD
-        return nll + 0.5 * float(np.sum(pull**2)) + 0.5 * float(np.sum(spread**2))
+        spread = (np.asarray(log_v) - np.asarray(self.objective.typical)) / VARIANCE_SPREAD
+        return nll + 0.5 * float(np.sum(deviation**2)) + 0.5 * float(np.sum(spread**2))
 
     def electric(self, z: Vector, log_v: Vector) -> lk.ElectricNoise:
-        """What voltages are predicted with at this resistance and these variances."""
-        return _electric(self.target, z, log_v)
+        """Return the noise that voltages are predicted with at these numbers and variances."""
+        return _electric(self.objective, z, log_v)
 
-    def through_voltage(self, z: Vector, log_v: Vector, felt: Array) -> ThroughVoltage | None:
-        """What voltages tell of variances given the traction, None where none are logged."""
+    def voltage_information(
+        self, z: Vector, log_v: Vector, motor_force: Array
+    ) -> VoltageInformation | None:
+        """Return the information of voltages about variances, None where none are logged."""
         if "voltage" not in self.noise.blocks:
             return None
-        return through_voltage(self.target, z, log_v, felt)
+        return voltage_information(self.objective, z, log_v, motor_force)
 
 
-class Seen(NamedTuple):
-    """Residuals of a problem at given variances, and what runs share.
+class WeighedResiduals(NamedTuple):
+    """Residuals of a problem at given variances, and the effects that runs share.
 
     Attributes:
-        whitening: weights and roots of residuals less the effects that runs share.
-        tied: what runs share, given residuals whitened by these roots.
+        whitening: weights and roots of residuals less the shared effects.
+        effects: posterior of the shared effects given residuals whitened by these roots.
         loss: minus log posterior of the residuals, less constants.
     """
 
     whitening: Whitening
-    tied: tuple[Tie, ...]
+    effects: tuple[EffectPosterior, ...]
     loss: Array
 
 
 @eqx.filter_jit
-def _seen(target: Target, residual: Blocks, log_v: Array, keep: Array, effect: Array) -> Seen:
-    found = variances.whitening(target.blocks, less(target, residual, effect), log_v, keep)
+def _weighed(
+    objective: Objective, residual: Blocks, log_v: Array, keep: Array, effect: Array
+) -> WeighedResiduals:
+    found = variances.whitening(
+        objective.blocks, without_effects(objective, residual, effect), log_v, keep
+    )
     root = found.root["motion"]
-    tied = ties(target.shared, log_v, root)
-    coefs = freed(tied, jnp.einsum("nij,nj->ni", root, residual["motion"]))[
+    posteriors = effect_posteriors(objective.shared, log_v, root)
+    coefs = marginal_residuals(posteriors, jnp.einsum("nij,nj->ni", root, residual["motion"]))[
         residual["motion"].size :
     ]
-    log_det = sum(jnp.sum(jnp.log(jnp.diagonal(tie.factor))) for tie in tied)
-    return Seen(found, tied, found.loss + 0.5 * jnp.sum(coefs**2) + log_det)
+    log_det = sum(jnp.sum(jnp.log(jnp.diagonal(posterior.factor))) for posterior in posteriors)
+    return WeighedResiduals(found, posteriors, found.loss + 0.5 * jnp.sum(coefs**2) + log_det)
 
 
 @eqx.filter_jit
-def less(target: Target, residual: Blocks, effect: Array) -> Blocks:
-    """Residual blocks less effects that runs share (piece, 3)."""
+def without_effects(objective: Objective, residual: Blocks, effect: Array) -> Blocks:
+    """Return residual blocks less shared effects (segment, 3)."""
     motion = residual["motion"]
-    for of in target.shared:
-        off = jnp.einsum("nma,na->nm", of.effect, effect[of.pieces])
-        motion = motion.at[of.pieces].add(-off)
+    for of in objective.shared:
+        off = jnp.einsum("nma,na->nm", of.effect, effect[of.segments])
+        motion = motion.at[of.segments].add(-off)
     return residual | {"motion": motion}
 
 
 @eqx.filter_jit
-def effects_of(tied: tuple[Tie, ...], root: Array, motion: Array) -> Array:
-    """Conditional mean of the effects that runs share (piece, 3) given residuals of the motion."""
-    return shared_effects(tied, jnp.einsum("nij,nj->ni", root, motion))
+def effects_given(posteriors: tuple[EffectPosterior, ...], root: Array, motion: Array) -> Array:
+    """Return the conditional mean of the shared effects (segment, 3) given motion residuals."""
+    return mean_effects(posteriors, jnp.einsum("nij,nj->ni", root, motion))
 
 
 @eqx.filter_jit
-def linear(target: Target, z: Vector, electric: lk.ElectricNoise) -> tuple[Blocks, Blocks, Array]:
-    """Residual blocks, their Jacobians, and the traction of every wheel's motor."""
+def linear(
+    objective: Objective, z: Vector, electric: lk.ElectricNoise
+) -> tuple[Blocks, Blocks, Array]:
+    """Return residual blocks, their Jacobians, and the forces of every motor."""
 
     def blocks(x: Array) -> tuple[Blocks, tuple[Blocks, Array]]:
-        robot = target.space.tree(x)
-        p = lk.predict(robot, target.batch)
-        motion = {"motion": lk.motion_residual(robot, target.batch, p)}
-        out = motion | lk.electric_residuals(robot, target.batch, p.felt, electric)
-        if (of := target.several) is not None:
+        robot = objective.space.tree(x)
+        p = lk.predict(robot, objective.batch)
+        motion = {"motion": lk.motion_residual(robot, objective.batch, p)}
+        out = motion | lk.electric_residuals(robot, objective.batch, p.motor_force, electric)
+        if (of := objective.multi_floor) is not None:
             out |= of.residuals(robot, lk.predict(robot, of.batch))
-        return out, (out, p.felt)
+        return out, (out, p.motor_force)
 
-    jacobian, (out, felt) = jax.jacfwd(blocks, has_aux=True)(z)
-    return out, jacobian, felt
+    jacobian, (out, motor_force) = jax.jacfwd(blocks, has_aux=True)(z)
+    return out, jacobian, motor_force
 
 
 @eqx.filter_jit
-def _electric(target: Target, z: Vector, log_v: Vector) -> lk.ElectricNoise:
-    return electric_noise(target.blocks, log_v, target.space.tree(z).motor.resistance)
+def _electric(objective: Objective, z: Vector, log_v: Vector) -> lk.ElectricNoise:
+    return electric_noise(objective.blocks, log_v, objective.space.tree(z).motor.resistance)
 
 
 @eqx.filter_jit
 def log_jacobian(
-    target: Target, z: Vector, electric: lk.ElectricNoise, keep: Vector
+    objective: Objective, z: Vector, electric: lk.ElectricNoise, keep: Vector
 ) -> tuple[Array, Array]:
-    """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
+    """Return log |d residuals / d data| of all segments, and its gradient by the search vector."""
 
     def total(x: Array) -> Array:
-        robot = target.space.tree(x)
-        each = sum(lk.log_jacobians(robot, target.batch, electric))
-        if target.several is not None:
-            each = jnp.concatenate([each, target.several.log_jacobian(robot)])
+        robot = objective.space.tree(x)
+        each = sum(lk.log_jacobians(robot, objective.batch, electric))
+        if objective.multi_floor is not None:
+            each = jnp.concatenate([each, objective.multi_floor.log_jacobian(robot)])
         return jnp.asarray(keep) @ each
 
     return jax.value_and_grad(total)(z)
@@ -274,15 +302,15 @@ def log_jacobian(
 
 @eqx.filter_jit
 def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
-    """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
+    """Return every window's body twist (segment, window, 3) and its derivative by z (.., free)."""
     return lk.with_slope(lambda x: lk.predict(space.tree(x), batch).twist, z)
 
 
-def still_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:
-    """Viscous terms held near zero on every floor that was driven at one speed only.
+def fixed_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:
+    """Return choices that fix viscous terms near zero on floors driven at one speed only.
 
-    With one speed they cannot be told from creep, and what they take from it is wrong at every
-    other speed.
+    With one speed they cannot be distinguished from creep, and a wrong split of the two is wrong at
+    every other speed.
     """
     seen: dict[str, list[float]] = {}
     for k in range(len(data)) if runs is None else runs:

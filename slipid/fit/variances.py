@@ -1,8 +1,8 @@
 """Weights of residuals given their variances, and the variances by Fisher scoring.
 
-Residuals of a piece are a multivariate Student t with the scale matrix V of `noise`. The restricted
-likelihood of the variances takes into account what the structural numbers have been fitted to
-(Patterson and Thompson 1971, Biometrika 58(3)).
+Residuals of a segment are a multivariate Student t with the scale matrix V of `noise`. The
+restricted likelihood of the variances accounts for the numbers having been fitted to the same
+residuals (Patterson and Thompson 1971, Biometrika 58(3)).
 """
 
 from typing import Any, NamedTuple
@@ -14,61 +14,74 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from slipid.fit import likelihood as lk
-from slipid.fit.crossing import CURRENT, MOTION, Several
+from slipid.fit.multi_floor import MULTI_FLOOR_CURRENT, MULTI_FLOOR_MOTION, MultiFloorBatch
 from slipid.fit.noise import Components, electric_noise
-from slipid.fit.shared import FloorShared, Tie, freed_slopes, shared_slopes, shared_spread, ties
+from slipid.fit.shared_effects import (
+    EffectPosterior,
+    SharedEffects,
+    effect_covariances,
+    effect_posteriors,
+    marginal_slopes,
+    mean_effect_slopes,
+)
 from slipid.search_space import Space
 
 Vector = Array | np.ndarray
-"""One-dimensional, of jax or numpy."""
+"""One-dimensional array of jax or numpy."""
 Search = Float[np.ndarray, " free"]
 """A search vector, or one number for each of its coordinates."""
 Square = Float[np.ndarray, "free free"]
 """Covariance or information of the search vector."""
 Blocks = dict[str, Array]
-"""An array for every block of residuals: `motion`, `current`, `voltage`, those of `crossing`."""
+"""An array for every block of residuals: `motion`, `current`, `voltage`, `crossing.*`."""
 Noises = dict[str, Components]
-"""Covariance pieces of every block."""
-MOTIONS = ("motion", MOTION)
-"""Blocks of residuals of the motion; the others are read given it."""
+"""Covariance components of every block."""
+MOTION_BLOCKS = ("motion", MULTI_FLOOR_MOTION)
+"""Blocks of residuals of the motion; the others are conditional on it."""
 DEGREES = 8.0
 """Degrees of freedom of the Student-t weight of a run."""
 VARIANCE_SPREAD = 3.0
 """Std of the prior of every log variance."""
 
 
-class Target(eqx.Module):
-    """What a fit maximises, as an argument of compiled functions.
+class Objective(eqx.Module):
+    """Data and priors of a fit, as an argument of compiled functions.
 
     Attributes:
-        several: runs over several floors, None where there are none.
-        shared: what runs on each floor share.
+        space: free numbers and their prior.
+        batch: runs on one floor each.
+        multi_floor: runs over several floors, None where there are none.
+        blocks: covariance components of every block.
+        shared: effects that the runs on each floor share.
         typical: centre of the prior of the log variances.
-        scored: variances that are found from the residuals of each piece alone.
-        pooled: number of the variance that the space's pooled coordinates have a priori.
-        joint: there are no currents, and all numbers are the motion's.
+        scored: variances that are estimated from the residuals of each segment alone.
+        pooled: number of the prior variance of the space's pooled coordinates.
+        joint: whether there are no currents, so that all numbers are estimated from motion.
     """
 
     space: Space
     batch: lk.Batch
-    several: Several | None
+    multi_floor: MultiFloorBatch | None
     blocks: dict[str, Components]
-    shared: tuple[FloorShared, ...]
+    shared: tuple[SharedEffects, ...]
     typical: Float[Array, " variance"]
     scored: Bool[np.ndarray, " variance"]
     pooled: int = eqx.field(static=True)
     joint: bool = eqx.field(static=True)
 
     def prior_std(self, log_v: Vector) -> Array:
-        """Std of the prior of every coordinate at given variances."""
+        """Return the prior std of every coordinate at given variances."""
         pooled = jnp.exp(0.5 * jnp.asarray(log_v)[self.pooled])
         return jnp.where(self.space.pooled, pooled, jnp.asarray(self.space.prior_std))
 
 
 class Whitening(NamedTuple):
-    """Root W of every piece with W^T W = w V^-1, weight w, small for an outlier, and the loss.
+    """Weighted inverse roots of the covariance of every segment.
 
-    The loss is minus log likelihood, less constants.
+    Attributes:
+        root: W with W^T W = w V^-1.
+        weight: Student-t weight w, small for an outlier.
+        loss: minus log likelihood, less constants.
     """
 
     root: Blocks
@@ -76,16 +89,16 @@ class Whitening(NamedTuple):
     loss: Array
 
 
-class ThroughVoltage(NamedTuple):
-    """What voltages tell of variances, each (piece, m).
+class VoltageInformation(NamedTuple):
+    """Information of voltages about variances, each (segment, m).
 
     Attributes:
-        residual: of the voltages, in units of their own noise.
-        share: part that this noise has in the variance of every residual.
+        residual: residual of the voltages in units of their own noise.
+        share: share of this noise in the variance of every residual.
         slope: derivative of the log likelihood by the scatter of the true current.
-        information: expected, of that scatter.
-        steeper: by how much the loss bends more than expected in the log of the voltage noise,
-            where others explain the residuals.
+        information: expected information about that scatter.
+        steeper: curvature of the loss beyond its expectation in the log of the voltage noise, where
+            other variances explain the residuals.
     """
 
     residual: Array
@@ -96,14 +109,16 @@ class ThroughVoltage(NamedTuple):
 
 
 @eqx.filter_jit
-def through_voltage(target: Target, z: Vector, log_v: Vector, felt: Array) -> ThroughVoltage:
-    """What voltages tell of variances given the traction of every wheel's motor."""
-    robot, b = target.space.tree(z), target.batch
-    noise = electric_noise(target.blocks, log_v, robot.motor.resistance)
+def voltage_information(
+    objective: Objective, z: Vector, log_v: Vector, motor_force: Array
+) -> VoltageInformation:
+    """Return the information of voltages about variances, given the forces of every motor."""
+    robot, b = objective.space.tree(z), objective.batch
+    noise = electric_noise(objective.blocks, log_v, robot.motor.resistance)
 
     def scaled(scatter: Array) -> tuple[Array, Array]:
         at = lk.ElectricNoise(noise.voltage_std, scatter, noise.resistance)
-        return lk.electric_residuals(robot, b, felt, at)["voltage"], lk.spread(b, at)
+        return lk.electric_residuals(robot, b, motor_force, at)["voltage"], lk.voltage_spread(b, at)
 
     # every residual depends on its own scatter only
     (r, spread), (more, wider) = jax.jvp(scaled, (noise.scatter,), (jnp.ones_like(noise.scatter),))
@@ -113,16 +128,16 @@ def through_voltage(target: Target, z: Vector, log_v: Vector, felt: Array) -> Th
     slope = -wider - weight * r * more / variance
     share = 1 / spread**2
     steeper = 0.5 * share * (2 * share - 1) * (weight * r**2 / variance - 1)
-    return ThroughVoltage(r, share, slope, moved + 2 * wider**2, steeper)
+    return VoltageInformation(r, share, slope, moved + 2 * wider**2, steeper)
 
 
 @eqx.filter_jit
 def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
-    """Weights of residuals, for pieces that count as `keep` says."""
+    """Return the weights of residuals; `keep` is 1 for segments that count."""
     roots, weights, loss = {}, {}, jnp.zeros(())
     for k, r in residual.items():
         inverse = inverse_root(noises[k].covariance(log_v))
-        m, kept = noises[k].count, jnp.asarray(keep)[noises[k].pieces]
+        m, kept = noises[k].count, jnp.asarray(keep)[noises[k].segments]
         q = jnp.sum(jnp.einsum("nij,nj->ni", inverse, r) ** 2, axis=-1)
         weights[k] = (DEGREES + m) / (DEGREES + q) * kept
         roots[k] = jnp.sqrt(weights[k])[:, None, None] * inverse
@@ -133,10 +148,10 @@ def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> 
 
 @eqx.filter_jit
 def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> Blocks:
-    """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
+    """Return Jacobians H (segment, m, free) such that H^T H is a segment's expected information."""
     out = {}
     for k, jac in jacobian.items():
-        factor = jnp.asarray(keep)[noises[k].pieces] * expected(noises[k].count)
+        factor = jnp.asarray(keep)[noises[k].segments] * expected(noises[k].count)
         root = inverse_root(noises[k].covariance(log_v)) * jnp.sqrt(factor)[:, None, None]
         out[k] = jnp.einsum("nij,njp->nip", root, jac)
     return out
@@ -144,169 +159,183 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> B
 
 @eqx.filter_jit
 def precision(
-    target: Target, jacobian: Blocks, log_v: Vector, keep: Vector, alone: bool = False
+    objective: Objective, jacobian: Blocks, log_v: Vector, keep: Vector, alone: bool = False
 ) -> Array:
-    """Expected information of the search vector, prior included (free, free).
+    """Return the expected information of the search vector, prior included (free, free).
 
-    What runs share is marginalised; `alone` counts every run as if it shared nothing.
+    Shared effects are marginalised; with `alone` every run counts as if it shared none.
     """
-    prior = jnp.diag(1 / target.prior_std(log_v) ** 2)
+    prior = jnp.diag(1 / objective.prior_std(log_v) ** 2)
     total, of_motion = prior, prior
-    for k, half in whitened(target.blocks, jacobian, log_v, keep).items():
+    for k, half in whitened(objective.blocks, jacobian, log_v, keep).items():
         flat = half.reshape(-1, half.shape[-1])
         if k == "motion" and not alone:
-            tied = expected_ties(target, log_v, keep)
-            flat = freed_slopes(tied, half)
+            posteriors = expected_posteriors(objective, log_v, keep)
+            flat = marginal_slopes(posteriors, half)
         total += flat.T @ flat
-        of_motion += flat.T @ flat if k in MOTIONS else 0.0
-    return total if target.joint else _cut(total, of_motion, jnp.asarray(target.space.electric))
+        of_motion += flat.T @ flat if k in MOTION_BLOCKS else 0.0
+    return (
+        total if objective.joint else _cut(total, of_motion, jnp.asarray(objective.space.electric))
+    )
 
 
-def expected_ties(target: Target, log_v: Vector, keep: Vector) -> tuple[Tie, ...]:
-    """What runs share, given residuals whitened by `whitened`."""
-    block = target.blocks["motion"]
+def expected_posteriors(
+    objective: Objective, log_v: Vector, keep: Vector
+) -> tuple[EffectPosterior, ...]:
+    """Return the posteriors of shared effects, given residuals whitened by `whitened`."""
+    block = objective.blocks["motion"]
     roots = inverse_root(block.covariance(jnp.asarray(log_v)))
-    factor = expected(block.count) * jnp.asarray(keep)[block.pieces]
-    return ties(target.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None])
+    factor = expected(block.count) * jnp.asarray(keep)[block.segments]
+    return effect_posteriors(
+        objective.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None]
+    )
 
 
 def expected(m: Array | float | int) -> Any:
-    """Fisher information of a Student-t location in m dimensions, over that of a Gaussian."""
+    """Return the Fisher information of an m-dimensional Student-t location over the Gaussian's."""
     return (DEGREES + m) / (DEGREES + m + 2)
 
 
 def _cut(total: Array, of_motion: Array, e: Array) -> Array:
-    """Information of p(motion | motion data) p(electric | motion, all data).
+    """Return the information of p(motion | motion data) p(electric | motion, all data).
 
-    Where wheels stand on several floors motion depends on their friction, which is electric: it is
-    marginalised in the first factor, as if currents told nothing of it. The fit's estimate of the
-    motion does follow what currents tell of friction: its interval is rather too wide there.
+    Where wheels stand on several floors, motion depends on their friction, which is electric: it is
+    marginalised in the first factor as if currents contained no information about it. The estimate
+    of the motion does follow the friction from currents: its interval is rather too wide there.
     """
-    first = of_motion - _carried(of_motion, e)
+    first = of_motion - _schur_term(of_motion, e)
     motion = ~e[:, None] & ~e[None, :]
-    return jnp.where(motion, first + _carried(total, e), total)
+    return jnp.where(motion, first + _schur_term(total, e), total)
 
 
-def _carried(information: Array, e: Array) -> Array:
-    """B^T A^-1 B for the block A of the coordinates e, and B between these and the others."""
+def _schur_term(information: Array, e: Array) -> Array:
+    """Return B^T A^-1 B for the block A of the coordinates e, and B between it and the rest."""
     own = jnp.where(e[:, None] & e[None, :], information, jnp.diag(jnp.where(e, 0.0, 1.0)))
     cross = jnp.where(e[:, None] & ~e[None, :], information, 0.0)
     return cross.T @ jnp.linalg.solve(own, cross)
 
 
 @eqx.filter_jit
-def spread_of(target: Target, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
-    """Covariance of the residuals from fitted numbers and from what runs share (piece, m, m).
+def fitted_covariance(objective: Objective, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
+    """Return the residuals' covariance due to fitted numbers and shared effects (segment, m, m).
 
-    The Jacobian is of the structural numbers; what runs share follows them.
+    The Jacobian is that of the structural numbers; the shared effects follow them.
     """
-    cov = jnp.linalg.inv(precision(target, jacobian, log_v, keep))
-    tied = expected_ties(target, log_v, keep)
-    half = whitened(target.blocks, jacobian, log_v, keep)["motion"]
-    followed = shared_slopes(tied, half)
+    cov = jnp.linalg.inv(precision(objective, jacobian, log_v, keep))
+    posteriors = expected_posteriors(objective, log_v, keep)
+    half = whitened(objective.blocks, jacobian, log_v, keep)["motion"]
+    followed = mean_effect_slopes(posteriors, half)
     motion = jacobian["motion"]
-    for of in target.shared:
-        off = jnp.einsum("nma,nap->nmp", of.effect, followed[of.pieces])
-        motion = motion.at[of.pieces].add(-off)
+    for of in objective.shared:
+        off = jnp.einsum("nma,nap->nmp", of.effect, followed[of.segments])
+        motion = motion.at[of.segments].add(-off)
     slopes = jacobian | {"motion": motion}
     spread = {k: jnp.einsum("nip,pq,njq->nij", jac, cov, jac) for k, jac in slopes.items()}
-    around = shared_spread(tied, len(motion))
-    for of in target.shared:
-        more = jnp.einsum("nma,nab,nlb->nml", of.effect, around[of.pieces], of.effect)
-        spread["motion"] = spread["motion"].at[of.pieces].add(more)
+    around = effect_covariances(posteriors, len(motion))
+    for of in objective.shared:
+        more = jnp.einsum("nma,nab,nlb->nml", of.effect, around[of.segments], of.effect)
+        spread["motion"] = spread["motion"].at[of.segments].add(more)
     return spread
 
 
 @eqx.filter_jit
-def scored(
-    target: Target,
+def scoring_step(
+    objective: Objective,
     residual: Blocks,
     spread: Blocks,
     log_v: Array,
     keep: Array,
-    voltage: ThroughVoltage | None,
+    voltage: VoltageInformation | None,
 ) -> Array:
-    """One Fisher-scoring step of the restricted likelihood in the log variances of blocks.
+    """Return the log variances after one Fisher-scoring step of the restricted likelihood.
 
-    Residuals are those of a model, this or another, less what runs share. `spread` is their
-    covariance from what was fitted to them (piece, m, m); the degrees of freedom it stands for are
-    not the variances' to have.
+    Residuals are those of any model, less shared effects. `spread` is their covariance due to what
+    was fitted to them (segment, m, m); the degrees of freedom spent there are not available to the
+    variances.
     """
-    _, weights, _ = whitening(target.blocks, residual, log_v, keep)
+    _, weights, _ = whitening(objective.blocks, residual, log_v, keep)
     score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])
     for k, r in residual.items():
-        noise, mine = target.blocks[k], _own(k, voltage)
+        noise, mine = objective.blocks[k], _own_share(k, voltage)
         root = inverse_root(noise.covariance(log_v))
         inverse = jnp.einsum("nji,njk->nik", root, root)
-        base, which = _shared(noise.base, mine), noise.which
+        base, which = _scaled_base(noise.base, mine), noise.which
         v = jnp.exp(log_v)[which]
-        vr, kept = jnp.einsum("nij,nj->ni", inverse, r), keep[noise.pieces]
+        vr, kept = jnp.einsum("nij,nj->ni", inverse, r), keep[noise.segments]
         fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
         trace = jnp.einsum("nij,ncij->nc", inverse, base)
         spent = jnp.einsum("nij,njk,nkl->nil", inverse, spread[k], inverse)
         lost = jnp.einsum("nij,ncij->nc", spent, base)
         slope = 0.5 * v * (fit + kept[:, None] * (lost - trace))
         if voltage is not None and k == "current":
-            told = jnp.einsum("ni,nci->nc", voltage.slope, noise.single)
-            slope += v * kept[:, None] * told
+            by_scatter = jnp.einsum("ni,nci->nc", voltage.slope, noise.single)
+            slope += v * kept[:, None] * by_scatter
         score = score.at[which].add(slope)
         if voltage is not None and k == "voltage":
             steeper = steeper.at[which].add((kept * jnp.sum(voltage.steeper, axis=1))[:, None])
-        if k in (MOTION, CURRENT) or (voltage is not None and k == "current"):
-            # a logarithm that falls bends the more: its slope is in proportion to the variance
+        if k in (MULTI_FLOOR_MOTION, MULTI_FLOOR_CURRENT) or (
+            voltage is not None and k == "current"
+        ):
+            # the curvature grows where a log variance falls: the slope is in proportion to it
             steeper = steeper.at[which].add(-slope)
-    score -= (log_v - target.typical) / VARIANCE_SPREAD**2
-    info = information(target.blocks, log_v, keep, voltage)
+    score -= (log_v - objective.typical) / VARIANCE_SPREAD**2
+    info = information(objective.blocks, log_v, keep, voltage)
     info += jnp.diag(jnp.maximum(steeper, 0.0))
     step = jnp.clip(jnp.linalg.solve(info, score), -1.5, 1.5)
-    return log_v + jnp.where(target.scored, step, 0.0)
+    return log_v + jnp.where(objective.scored, step, 0.0)
 
 
 @eqx.filter_jit
 def information(
-    noises: Noises, log_v: Vector, keep: Vector, voltage: ThroughVoltage | None
+    noises: Noises, log_v: Vector, keep: Vector, voltage: VoltageInformation | None
 ) -> Array:
-    """Expected information of the log variances, prior included (variance, variance)."""
+    """Return the expected information of the log variances, prior included (variance, variance)."""
     info = jnp.eye(log_v.shape[0]) / VARIANCE_SPREAD**2
     for k, noise in noises.items():
-        base, which = _shared(noise.base, _own(k, voltage)), noise.which
+        base, which = _scaled_base(noise.base, _own_share(k, voltage)), noise.which
         root = inverse_root(noise.covariance(log_v))
         vb = jnp.einsum("nji,njk,nckl->ncil", root, root, base)
         v = jnp.exp(log_v)[which]
         cross = 0.5 * jnp.einsum("ncij,ndji->ncd", vb, vb)
         cross *= v[:, :, None] * v[:, None, :]
-        kept = jnp.asarray(keep)[noise.pieces, None, None]
+        kept = jnp.asarray(keep)[noise.segments, None, None]
         info = info.at[which[:, :, None], which[:, None, :]].add(kept * cross)
-    return info if voltage is None else info + _through(noises["current"], log_v, keep, voltage)
+    return (
+        info
+        if voltage is None
+        else info + _scatter_information(noises["current"], log_v, keep, voltage)
+    )
 
 
-def _through(noise: Components, log_v: Vector, keep: Vector, voltage: ThroughVoltage) -> Array:
-    """Expected information of the log variances that voltages have of the scatter of currents."""
+def _scatter_information(
+    noise: Components, log_v: Vector, keep: Vector, voltage: VoltageInformation
+) -> Array:
+    """Return the voltages' information about log variances through the currents' scatter."""
     grown = jnp.exp(log_v)[noise.which][..., None] * noise.single
-    kept = jnp.asarray(keep)[noise.pieces]
+    kept = jnp.asarray(keep)[noise.segments]
     cross = jnp.einsum("n,ni,nci,ndi->ncd", kept, voltage.information, grown, grown)
     info = jnp.zeros((log_v.shape[0],) * 2)
     return info.at[noise.which[:, :, None], noise.which[:, None, :]].add(cross)
 
 
-def _own(block: str, voltage: ThroughVoltage | None) -> Array | None:
-    """Part that the variances have in that of the residuals of a block, None for all."""
+def _own_share(block: str, voltage: VoltageInformation | None) -> Array | None:
+    """Return the share of a block's own noise in its residual variance, None for all of it."""
     return voltage.share if voltage is not None and block == "voltage" else None
 
 
-def _shared(base: Array, own: Array | None) -> Array:
-    """How the covariance of residuals grows with each variance, of which only a part is in them."""
+def _scaled_base(base: Array, own: Array | None) -> Array:
+    """Return covariance components scaled by the share of their noise in the residuals."""
     if own is None:
         return base
     root = jnp.sqrt(own)
     return base * root[:, None, :, None] * root[:, None, None, :]
 
 
-def inverse_root(v: Float[Array, "piece m m"]) -> Float[Array, "piece m m"]:
-    """L^-1 of V = L L^T for many small matrices, all at once, column by column.
+def inverse_root(v: Float[Array, "segment m m"]) -> Float[Array, "segment m m"]:
+    """Return L^-1 of V = L L^T for many small matrices at once, column by column.
 
     Written out because batched LAPACK calls that run beside each other inside one compiled function
-    can wait for each other for ever on a machine with two cores (seen with jax 0.10).
+    can deadlock on a computer with two cores (jax 0.10).
     """
     a = jnp.moveaxis(v, 0, -1)
     m = a.shape[0]

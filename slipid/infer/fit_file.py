@@ -1,8 +1,7 @@
-"""A fit as files: fit.json names its arrays by their hash, identified.json is for people.
+"""Files of a fit: fit.json refers to its arrays by their hash, identified.json is for people.
 
-Whatever a fit consists of is covered by one checksum, and renaming fit.json is what puts a new fit
-in the place of an old one: a process that dies before it leaves the old fit, and one that dies
-after it the new one.
+One checksum covers the whole fit, and the renaming of fit.json replaces an old fit by the new one:
+a process that dies before it leaves the old fit, one that dies after it leaves the new one.
 """
 
 import hashlib
@@ -16,16 +15,17 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.fit.shared import FoundShared, Pace
+from slipid.fit.shared_effects import EffectTable, SpeedAndLoad
 from slipid.infer.result import Channels, Fit
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot, Validity, build
 from slipid.parameter import entries
-from slipid.search_space import Choice, Space, put
+from slipid.search_space import Choice, Space, with_values
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content, checksum, json_text, read_json, write_bytes
+from slipid.support.files import checksum, json_text, read_json, write_bytes
 
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
@@ -37,11 +37,11 @@ _SHAPE = ("place", "drive_angle", "roller_angle", "grips", "drive_of", "gear_rat
 
 
 def save(fit: Fit, folder: Path) -> tuple[str, ...]:
-    """Write a fit to a folder, in the place of the one that may be there; returns names of files.
+    """Write a fit to a folder, replacing the one there; return the names of the files.
 
     Raises:
         ValueError: a number is not finite; nothing is written then.
-        DataError: nothing can be written there.
+        DataError: the folder cannot be written to.
     """
     arrays = _packed(fit)
     sha256 = hashlib.sha256(arrays).hexdigest()
@@ -60,13 +60,13 @@ def save(fit: Fit, folder: Path) -> tuple[str, ...]:
 
 
 def write_identified(folder: Path, content: Content) -> None:
-    """Write identified.json for the fit that is there, under whose checksum it is valid."""
+    """Write identified.json beside fit.json, with the checksum of that fit."""
     fit = read_json(folder / FIT, _RESULT)
     write_bytes(folder / IDENTIFIED, json_text(content | {"fit": fit["checksum"]}).encode())
 
 
 def load(folder: Path) -> Fit:
-    """Fit from the files `save` wrote.
+    """Read a fit from the files that `save` wrote.
 
     Raises:
         DataError: a file is absent, damaged, of another version or of another fit.
@@ -89,8 +89,8 @@ def load(folder: Path) -> Fit:
     other = read_json(table, _RESULT) if table.exists() else {"fit": mark}
     if not isinstance(other, dict) or other.get("fit") != mark:
         raise DataError(
-            f"{table}: of another fit than {FIT} beside it, its writing was interrupted; "
-            "expected both of one fit (run `slipid identify` again)"
+            f"{table}: it belongs to another fit than {FIT} beside it, since writing was "
+            "interrupted; expected both of one fit (run `slipid identify` again)"
         )
     return fit
 
@@ -105,7 +105,7 @@ def _packed(fit: Fit) -> bytes:
 
 
 def _unpacked(folder: Path, file: str, sha256: str) -> dict[str, np.ndarray]:
-    """The arrays of a fit; damage is noticed before they are decoded."""
+    """Return the arrays of a fit; the hash is checked before they are decoded."""
     path = folder / file
     try:
         packed = path.read_bytes()
@@ -118,7 +118,7 @@ def _unpacked(folder: Path, file: str, sha256: str) -> dict[str, np.ndarray]:
 
 
 def identified_json(fit: Fit) -> Content:
-    """Content of identified.json."""
+    """Return the content of identified.json."""
     return {
         "schema": SCHEMA,
         "parameters": {path: number_json(e) for path, e in fit.parameters.items()},
@@ -132,14 +132,14 @@ def identified_json(fit: Fit) -> Content:
 
 
 def number_json(e: Estimate) -> Content:
-    """A number as identified.json has it."""
+    """Return a number in the form of identified.json."""
     shape = [len(e.labels)] if e.labels else []
     known = {k: getattr(e, k) for k in ("std", "interval90", "source", "verdict", "provenance")}
     return {"value": e.value, "unit": e.unit, "shape": shape, "labels": list(e.labels)} | known
 
 
 def curves_json(curves: Mapping[str, SlipCurve]) -> Content:
-    """Slip curves by floor."""
+    """Return slip curves by floor, as plain values."""
     return {
         floor: {name: getattr(c, name).tolist() for name in _CURVE}
         | {"at": {"wheel_speed": c.wheel_speed, "load_share": c.load_share}}
@@ -148,7 +148,7 @@ def curves_json(curves: Mapping[str, SlipCurve]) -> Content:
 
 
 def to_json(fit: Fit) -> Content:
-    """Content of fit.json: everything but the large arrays, and what people read of it."""
+    """Return the content of fit.json: the fit without its large arrays, with texts for people."""
     return {
         "schema": SCHEMA_FIT,
         **{name: getattr(fit, name) for name in _PLAIN},
@@ -177,7 +177,10 @@ def to_json(fit: Fit) -> Content:
         | ({} if fit.mixed is None else {"mixed": dict(fit.mixed)})
         | ({} if fit.refused is None else {"refused": dict(fit.refused)}),
         "current_trend": list(fit.current_trend),
-        "shared": {floor: [asdict(p) for p in found.paces] for floor, found in fit.shared.items()},
+        "shared": {
+            floor: [asdict(p) for p in found.speeds_and_loads]
+            for floor, found in fit.shared.items()
+        },
         "extrapolation": dict(fit.extrapolation),
         "baselines": dict(fit.baselines),
         "data": {"hash": fit.data_hash, "runs": [list(r) for r in fit.runs]},
@@ -185,7 +188,7 @@ def to_json(fit: Fit) -> Content:
 
 
 def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
-    """Fit from the content of fit.json and its arrays."""
+    """Return the fit from the content of fit.json and its arrays."""
     choices = tuple(Choice(**c) for c in content["choices"])
     space = Space(_robot_of(content["robot"]), choices)
     if space.names != content["names"]:
@@ -214,8 +217,8 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         baselines=content["baselines"],
         current_trend=(content["current_trend"][0], content["current_trend"][1]),
         shared={
-            floor: FoundShared(
-                tuple(Pace(**pace) for pace in paces),
+            floor: EffectTable(
+                tuple(SpeedAndLoad(**pace) for pace in paces),
                 **{name: arrays[f"shared/{floor}/{name}"] for name in _SHARED},
             )
             for floor, paces in content["shared"].items()
@@ -232,7 +235,7 @@ def _curve_of(content: Content) -> SlipCurve:
 
 
 def _tuples(plain: Content) -> Content:
-    """With tuples, and tuples in them, where JSON has lists."""
+    """Return the content with nested lists of JSON replaced by tuples."""
 
     def deep(x: Any) -> Any:
         return tuple(map(deep, x)) if isinstance(x, list) else x
@@ -241,7 +244,7 @@ def _tuples(plain: Content) -> Content:
 
 
 def _robot_json(robot: Robot) -> Content:
-    """A robot as plain values: its shape, its names, every number."""
+    """Return a robot as plain values: its shape, its names, every number."""
     return {
         "geometry": {name: getattr(robot.geometry, name) for name in _SHAPE},
         "surfaces": list(robot.surfaces.labels),
@@ -260,5 +263,5 @@ def _robot_of(kept: Content) -> Robot:
     )
     names = kept["surfaces"], kept["loads"], kept["sessions"]
     robot = build(geometry, *names, centre=tuple(kept["centre"]))
-    restored: Robot = put(robot, {e: kept["values"][e.path] for e in entries(robot)})
+    restored: Robot = with_values(robot, {e: kept["values"][e.path] for e in entries(robot)})
     return restored

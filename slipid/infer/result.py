@@ -1,6 +1,6 @@
 """The result of a fit: a frozen value with intervals and verdicts, identifiability included.
 
-What shows, samples, deploys or writes a fit lies above it and is loaded when a method asks for it.
+Modules that show, sample, deploy or write a fit are loaded when a method needs them.
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,8 +18,13 @@ from slipid.data.runs import Runs
 from slipid.fit.noise import POOLED
 from slipid.fit.optimise import Optimum
 from slipid.fit.problem import Problem, log_jacobian
-from slipid.fit.shared import FoundShared, Tie, freed, freed_slopes
-from slipid.fit.variances import MOTIONS, Search, Square
+from slipid.fit.shared_effects import (
+    EffectPosterior,
+    EffectTable,
+    marginal_residuals,
+    marginal_slopes,
+)
+from slipid.fit.variances import MOTION_BLOCKS, Search, Square
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.disputed import Dispute, disputes, marked
@@ -27,7 +32,7 @@ from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.profile import Profile, profile
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
 from slipid.model.robot import Robot, Validity
-from slipid.predict.predictive import Contact, contact_of
+from slipid.predict.predictive import ForceBalance, force_balance_of
 from slipid.predict.ranking import Comparison, compared
 from slipid.predict.slip_models import restored
 from slipid.predict.validation import Validation, validation
@@ -46,14 +51,14 @@ if TYPE_CHECKING:
 Evidence = TypeVar("Evidence")
 
 CONFLICT = 4.0
-"""Prior stds from the prior mean beyond which a reader is told."""
+"""Distance from the prior mean beyond which a message warns [prior std]."""
 REMAINING = 0.3
-"""Largest remaining Gauss-Newton step of a fit that may be called converged [posterior std]."""
+"""Largest remaining Gauss-Newton step of a converged fit [posterior std]."""
 
 
 @dataclass(frozen=True)
 class Channels:
-    """What runs log, whether the current has a sign, and how many windows make a piece."""
+    """Logged channels, whether the current is signed, and the number of windows per segment."""
 
     current: bool = True
     voltage: bool = False
@@ -63,33 +68,38 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a fit found; `print` shows its numbers, and `fit[path]` gives one of them.
+    """Fitted numbers with their uncertainty; `print` shows all, and `fit[path]` returns one.
 
     Attributes:
-        space: free and fixed numbers, priors; its template holds the fixed values.
-        choices: what the user wanted.
+        space: free and fixed numbers with their priors; its template holds the fixed values.
+        choices: user's priors, start values and fixed values.
         z: search vector at the optimum.
-        covariance: of the search vector: Laplace, with what runs share marginalised.
-        laplace: as if runs shared nothing, the curvature of their likelihood alone.
-        shared: what neighbouring runs were found to share, by floor.
-        extrapolation: by what variances are too small for unseen runs, by floor@load.
-        variance: every variance component by name, those of sessions included [unit squared].
+        covariance: Laplace covariance of the search vector, with shared effects marginalised.
+        laplace: Laplace covariance without shared effects, from the runs' likelihood alone.
+        shared: shared effects of neighbouring runs, by floor.
+        extrapolation: factors of the variances of unseen runs, by floor@load.
+        variance: variance components by name, those of sessions included [unit squared].
         variance_unit: unit of each component's std.
-        runs: (name, sha256) of every run that was fitted, those over several floors last.
-        channels: that were logged.
+        runs: (name, sha256) of every fitted run, runs over several floors last.
+        channels: logged channels.
         curves: slip over torque of every floor.
-        current_trend: a + b v, measured currents over the model's at speed v [A], [A s/m].
-        validity: what each floor was seen with.
-        converged, reason, rounds, history: how the fit ended.
-        remaining: largest step a full Gauss-Newton step would still take, in posterior stds; a
-            solver that finds no way ahead is not at an optimum because of it.
-        lag, seed: of the windows [s]; of the draws the curves' bands are made of.
-        baselines: what simpler models learnt from the same runs, for comparison.
-        mixed: how runs over several floors were predicted before they were learnt from, and by a
-            fit to half of them; end-point errors of the others before and after, by floor.
-        refused: the same, and why, where they contradict the others and were not learnt from.
-        data, problem, optimum: the runs on one floor each, their likelihood, and where the search
-            ended; None where the fit was loaded from its files, which have none of them.
+        current_trend: a, b of the measured less the predicted current a + b v [A], [A s/m].
+        validity: ranges that the runs on each floor cover.
+        converged: True if the rounds settled and the remaining step is small.
+        reason: sentence on how the fit ended.
+        rounds: number of rounds.
+        history: loss after each round.
+        remaining: largest coordinate of the full Gauss-Newton step at the end [posterior std]; a
+            solver that stops without descending need not be at an optimum.
+        lag: camera lag of the windows [s].
+        seed: seed of the draws behind the curves' bands.
+        baselines: fitted numbers of simpler slip models, for comparison.
+        mixed: predictions of runs over several floors before they were fitted, and by a fit to
+            half of them; end-point errors of the other runs before and after, by floor.
+        refused: the same, with the reason why runs that contradict the others were not fitted.
+        data: runs on one floor each; None for a fit that was loaded from its files.
+        problem: likelihood of those runs; None for a loaded fit.
+        optimum: end of the search; None for a loaded fit.
     """
 
     space: Space
@@ -114,7 +124,7 @@ class Fit:
     current_trend: tuple[float, float] = (0.0, 0.0)
     mixed: Mapping[str, Any] | None = None
     refused: Mapping[str, Any] | None = None
-    shared: Mapping[str, FoundShared] = field(default_factory=dict)
+    shared: Mapping[str, EffectTable] = field(default_factory=dict)
     extrapolation: Mapping[str, float] = field(default_factory=dict)
     data: Runs | None = None
     problem: Problem | None = None
@@ -127,56 +137,56 @@ class Fit:
         return text_of(show_fit, self)
 
     def __repr__(self) -> str:
-        """The table, so that a notebook shows it."""
+        """Return the table, so that a notebook shows it."""
         return str(self)
 
     def __getitem__(self, path: str) -> Estimate:
-        """One number with its interval and verdict.
+        """Return one number with its interval and verdict.
 
         Raises:
-            KeyError: no such number; names those there are.
+            KeyError: the fit has no such number; the message lists all.
         """
         if path not in self.parameters:
             raise KeyError(f"no parameter '{path}'; there are {', '.join(self.parameters)}")
         return self.parameters[path]
 
     def plot(self, name: str) -> "Figure":
-        """One of the fit's pictures.
+        """Draw one of the fit's pictures.
 
         Args:
             name: `load_share`, `slip_by_heading`, `slip_by_torque`, `current_by_traction` or
                 `paths`.
 
         Raises:
-            ValueError: no such picture, or the runs have nothing for it.
+            ValueError: the picture does not exist, or the runs lack the data that it needs.
         """
         from slipid.plots.fit import picture
 
         return picture(self, required(self.data), name)
 
     def profile(self, path: str, quiet: bool = False) -> Profile:
-        """Profile likelihood of one free number: every other one is fitted again at each point.
+        """Return the profile likelihood of one free number, all others refitted at each point.
 
         Raises:
-            ValueError: no such number, fixed, or a vector; names the choices.
+            ValueError: the number does not exist, is fixed or a vector; the message lists choices.
         """
         with Reporter(quiet=quiet) as report:
             report.stage(f"profile of {path}")
             return profile(required(self.problem), required(self.optimum), path)
 
     def validate(self, runs: Runs) -> Validation:
-        """Open-loop prediction of runs, by the fit and by every simpler model that it learnt.
+        """Predict runs open loop with the fit and with every simpler slip model fitted beside it.
 
         Raises:
-            DataError: a run on a floor or with a load set-up that was not identified.
+            DataError: a run has a floor or a load set-up that was not identified.
         """
         models = restored(self.space.template.geometry, dict(self.baselines))
         return validation(self.contact, models, runs, self.new_runs(runs))
 
     def new_runs(self, data: Runs) -> int:
-        """Number of runs that the fit has not seen."""
-        seen = {sha for _, sha in self.runs}
-        return sum(log.sha256 not in seen for log in data.logs)
+        """Return the number of runs that the fit does not contain."""
+        fitted = {sha for _, sha in self.runs}
+        return sum(log.sha256 not in fitted for log in data.logs)
 
     def sample(
         self,
@@ -186,14 +196,14 @@ class Fit:
         plan: "Plan | None" = None,
         quiet: bool = False,
     ) -> "Posterior":
-        """Posterior by emcee, several ensembles; needs `pip install slipid[posterior]`.
+        """Sample the posterior with several emcee ensembles; needs `slipid[posterior]`.
 
         Args:
-            seed: of everything.
-            draws: that are kept of each of the ensembles.
-            most: blocks of steps after which it ends without having converged.
-            plan: of walkers and steps, in place of `seed` and `most`.
-            quiet: no progress.
+            seed: seed of all random numbers.
+            draws: number of draws kept from each ensemble.
+            most: number of blocks after which sampling ends without convergence.
+            plan: walkers and steps, in place of `seed` and `most`.
+            quiet: show no progress.
         """
         from slipid.infer.posterior import blocks, sample
 
@@ -202,26 +212,27 @@ class Fit:
             return sample.sampled(self, plan, draws, None, report)
 
     def compare(self, question: str = "sectors", parts: int = 6, quiet: bool = False) -> Comparison:
-        """Every slip model fitted anew without some runs, and judged on those.
+        """Compare slip models by cross-validation: each is refitted and scored on held-out runs.
 
         Args:
-            question: what is left out together: `sectors` of 60 degrees of headings, `speeds`, or
-                `random` headings.
-            parts: into which runs are dealt, 2 at least: one after another is left out. With 2,
-                every second sector.
+            question: how runs are grouped: by `sectors` of 60 degrees of headings, by `speeds`, or
+                by `random` headings.
+            parts: number of folds, 2 at least. With 2, a fold is every second sector.
             quiet: show no progress.
 
         Raises:
-            DataError: no such question.
+            DataError: the question is unknown.
         """
         problem, data = required(self.problem), required(self.data)
         return compared(problem, self.choices, data, question, parts, quiet)
 
     def design(self, *parameters: str, runs: int = 12) -> "Design":
-        """Runs to drive next, that shrink some numbers most; without names whatever is weak.
+        """Propose the next runs: those that shrink the intervals of some numbers most.
+
+        Without names they serve the predictions and all numbers with the verdict weak.
 
         Raises:
-            DataError: no such number, or fixed.
+            DataError: a number does not exist or is fixed.
         """
         from slipid.infer.design import proposal
         from slipid.infer.design.scope import DesignOptions
@@ -229,7 +240,7 @@ class Fit:
         return proposal.design(self, DesignOptions(parameters=parameters, runs=runs))
 
     def deploy(self) -> "DeployedRobot":
-        """What runs on the robot, with the intervals of the fit's own curvature.
+        """Return the model for the robot, with the intervals of the Laplace covariance.
 
         Raises:
             ValueError: the wheels' kinematics have rank below 3.
@@ -246,7 +257,7 @@ class Fit:
 
     @classmethod
     def load(cls, folder: Path | str) -> "Fit":
-        """The fit whose files are in a folder.
+        """Read a fit from the files in a folder.
 
         Raises:
             DataError: a file is absent, damaged, of another version or of another fit.
@@ -256,74 +267,71 @@ class Fit:
         return fit_file.load(Path(folder))
 
     @cached_property
-    def contact(self) -> Contact:
-        """The fit as a model that predicts runs."""
+    def contact(self) -> ForceBalance:
+        """The fit as a slip model that predicts runs."""
         shared, extrapolation = self.shared, self.extrapolation
-        return Contact(
+        return ForceBalance(
             self.robot, self.variance, self.covariance, self.space, self.z, shared, extrapolation
         )
 
     @cached_property
     def robot(self) -> Robot:
-        """The robot with every number at its fitted or fixed value."""
+        """Robot with every number at its fitted or fixed value."""
         return self.space.tree(jnp.asarray(self.z))
 
     @cached_property
     def parameters(self) -> dict[str, Estimate]:
         """Every number by path, with interval and verdict."""
         volts, flat = self.channels.voltage, members(self.flat)
-        found = estimates(self.judged, self.choices, self.z, self.covariance, volts, flat)
+        found = estimates(self.verdict_space, self.choices, self.z, self.covariance, volts, flat)
         return marked({e.path: e for e in found}, self.disputes)
 
     @cached_property
-    def judged(self) -> Space:
-        """The space with the prior that deviations were found to have.
-
-        Against it a number is told to be measured or not.
-        """
+    def verdict_space(self) -> Space:
+        """Search space with the fitted prior std of deviations; verdicts compare stds with it."""
         if POOLED not in self.variance:
             return self.space
         return self.space.with_pooled(float(np.sqrt(self.variance[POOLED])))
 
     @cached_property
     def disputes(self) -> tuple[Dispute, ...]:
-        """Floors that disagree about the loads on the wheels."""
-        return disputes(self.judged, self.z, self.covariance)
+        """Pairs of floors that disagree about the loads on the wheels."""
+        return disputes(self.verdict_space, self.z, self.covariance)
 
     @cached_property
     def flat(self) -> tuple[FlatDirection, ...]:
-        """Directions the likelihood leaves open; what sessions share blurs numbers, opens none."""
-        has = self.channels
-        sideways = self.robot.geometry.determines_twist
-        where = has.current, has.voltage, self.validity, sideways
-        return flat_directions(self.space, self.laplace, *where)
+        """Flat directions of the likelihood; shared effects widen intervals but open none."""
+        has, sideways = self.channels, self.robot.geometry.determines_twist
+        return flat_directions(
+            self.space, self.laplace, has.current, has.voltage, self.validity, sideways
+        )
 
     @cached_property
     def derived(self) -> dict[str, Estimate]:
-        """Ratios that may be known where the numbers themselves are not."""
+        """Ratios that may be identified where the numbers themselves are not."""
         found = derived(self.space, self.z, self.covariance, self.channels.voltage)
         return {e.path: e for e in found}
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """What a reader of the numbers must know, one sentence each."""
-        said = [*sentences(self.flat), *(d.sentence for d in self.disputes)]
-        said += [
+        """Warnings about the numbers, one sentence each."""
+        found = [*sentences(self.flat), *(d.sentence for d in self.disputes)]
+        found += [
             f"{e.path} ended at its bound ({e.value:.3g} {e.unit})"
             for e in self.parameters.values()
             if e.verdict == "at_bound" and isinstance(e.value, float)
         ]
-        said += [
+        found += [
             f"{e.path} lies {abs(e.pull):.1f} prior stds from its prior: "
             "the prior is wrong, or the model lacks something"
             for e in self.parameters.values()
             if e.pull is not None and abs(e.pull) > CONFLICT and e.verdict != "at_bound"
         ]
         if self.refused is not None:
-            said.append(str(self.refused["reason"]))
+            found.append(str(self.refused["reason"]))
         if not self.converged:
-            said.append(f"the fit did not converge: {self.reason}")
-        return tuple(said)
+            found.append(f"the fit did not converge: {self.reason}")
+        return tuple(found)
 
     @property
     def data_hash(self) -> str:
@@ -334,7 +342,7 @@ class Fit:
 
 
 def required(evidence: Evidence | None) -> Evidence:
-    """What a fit was made of; ValueError where it was loaded from files, which do not hold it."""
+    """Return the data or likelihood of a fit; raise `ValueError` if it was loaded from files."""
     if evidence is None:
         raise ValueError(
             "this fit was loaded from its files, which hold neither runs nor their likelihood; "
@@ -346,32 +354,35 @@ def required(evidence: Evidence | None) -> Evidence:
 def summarise(
     problem: Problem, optimum: Optimum, data: Runs, choices: Iterable[Choice], seed: int = 0
 ) -> Fit:
-    """Fit from the end of an optimisation, and what runs of one session were found to share.
+    """Return the fit at the end of an optimisation.
 
-    `data` are the runs on one floor each that the problem's windows were cut from, `choices` what
-    it was given, and `seed` is of the draws the curves' bands are made of.
+    Args:
+        problem: likelihood of the runs.
+        optimum: end of the search.
+        data: runs on one floor each that the problem's windows were cut from.
+        choices: user's choices that the problem was built with.
+        seed: seed of the draws behind the curves' bands.
     """
     z, log_v = optimum.state.z, optimum.state.log_variance
-    contact = contact_of(problem, optimum.state, optimum.covariance, problem.every)
-    left, name = _remaining(problem, optimum)
-    settled = left < REMAINING
-    stuck = f"the solver stopped {left:.2g} stds of {name} away from where its own step leads"
+    contact = force_balance_of(problem, optimum.state, optimum.covariance, problem.full_weight)
+    remaining, name = _remaining(problem, optimum)
+    settled = remaining < REMAINING
+    stuck = f"the solver stopped {remaining:.2g} stds of {name} away from where its own step leads"
     windows, robot = problem.windows, contact.robot
     several = draws(z, contact.covariance, 400, seed)
     unit = {c.name: c.unit for c in problem.noise.components}
-    every = problem.every
     return Fit(
         space=problem.space,
         choices=tuple(choices),
         z=np.asarray(z),
         covariance=contact.covariance,
-        laplace=problem.laplace(z, log_v, every, alone=True),
+        laplace=problem.laplace(z, log_v, problem.full_weight, alone=True),
         shared=contact.shared,
         extrapolation=contact.extrapolation,
         variance=contact.variance,
         variance_unit={name: unit[name] for name in contact.variance},
         runs=tuple((log.name, log.sha256) for log in data.logs)
-        + (() if problem.several is None else problem.several.runs),
+        + (() if problem.multi_floor is None else problem.multi_floor.runs),
         channels=Channels(
             current=bool(windows.has_current),
             voltage=bool(windows.has_voltage),
@@ -382,7 +393,7 @@ def summarise(
         validity=curves_of.validity(data, robot, problem.batch),
         converged=bool(optimum.converged) and settled,
         reason=optimum.reason if settled or not optimum.converged else stuck,
-        remaining=left,
+        remaining=remaining,
         rounds=int(optimum.state.round),
         history=tuple(float(x) for x in optimum.history),
         lag=float(windows.lag),
@@ -397,32 +408,32 @@ def summarise(
 
 
 def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
-    """Largest step of a full Gauss-Newton step in posterior stds, and the number that takes it.
+    """Return the largest coordinate of a full Gauss-Newton step [posterior std], and its name.
 
-    The stds are those of the Laplace covariance, as the rounds are stopped by: the rows that the
-    solver sees hold what is felt as exact, and so tell friction far better than the logs do.
+    The stds are those of the Laplace covariance, as in the stopping rule of the rounds: the
+    solver's own rows take contact forces as exact, and so determine friction far better than logs.
 
     delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), W with the weights of outliers, g
     the slope of log |d residuals / d data|; where currents were logged, their rows move the
     electric numbers only.
     """
-    state, every = optimum.state, problem.every
+    state, every = optimum.state, problem.full_weight
     z, log_v = state.z, state.log_variance
     electric = problem.electric(z, log_v)
     residual, jacobian = problem.linear(z, electric)
-    seen = problem.seen(residual, log_v, every, state.shared(len(problem.windows)))
+    seen = problem.weighed(residual, log_v, every, state.shared(len(problem.windows)))
     roots = seen.whitening.root
     own = problem.space.electric.astype(float)
-    prior = np.asarray(problem.target.prior_std(log_v)) ** -2
-    _, slope = log_jacobian(problem.target, z, electric, every)
+    prior = np.asarray(problem.objective.prior_std(log_v)) ** -2
+    _, slope = log_jacobian(problem.objective, z, electric, every)
     gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
     info = np.diag(prior)
     for k, root in roots.items():
         white = jnp.einsum("nij,nj->ni", root, residual[k])
         half = jnp.einsum("nij,njp->nip", root, jacobian[k])
         if k == "motion":
-            white, half = _freed(seen.tied, white, half)
-        flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k in MOTIONS else own)
+            white, half = _freed(seen.effects, white, half)
+        flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k in MOTION_BLOCKS else own)
         gradient = gradient + flat.T @ np.asarray(white).ravel()
         info = info + flat.T @ flat
     std = np.sqrt(np.diag(optimum.covariance))
@@ -432,12 +443,12 @@ def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
 
 
 @jax.jit
-def _freed(tied: tuple[Tie, ...], white: Array, half: Array) -> tuple[Array, Array]:
-    return freed(tied, white), freed_slopes(tied, half)
+def _freed(tied: tuple[EffectPosterior, ...], white: Array, half: Array) -> tuple[Array, Array]:
+    return marginal_residuals(tied, white), marginal_slopes(tied, half)
 
 
 def draws(z: Search, covariance: Square, count: int, seed: int) -> Float[np.ndarray, "draw free"]:
-    """Draws of a Gaussian in the search space."""
+    """Return draws of a Gaussian in the search space."""
     rng = np.random.default_rng(seed)
     root = np.linalg.cholesky(covariance)
     return z + rng.standard_normal((count, len(root))) @ root.T

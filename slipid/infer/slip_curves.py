@@ -1,4 +1,4 @@
-"""Slip against torque of every floor, with its band, and what range the data saw."""
+"""Slip over torque of every floor with its 90 % band, and the ranges that the data cover."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -19,18 +19,27 @@ from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.search_space import Space
 
 POINTS = 41
-_STEADY, _MOVED = 0.1, 0.1
-"""Parts: of a command, by which rows may differ from it; of the fastest window, to have moved."""
+"""Number of points of a curve."""
+_STEADY = 0.1
+"""Largest deviation of a row's command from the run's median command, relative to it."""
+_MOVED = 0.1
+"""Speed over that of the fastest window above which a window counts as moving."""
 _SECTOR, _COMMON = 30.0, 0.02
-"""Directions that count as one [deg], and the part of all windows from which one counts."""
+"""Width of a sector of headings [deg], and the share of windows above which a sector counts."""
 _SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])
 
 
 @dataclass(frozen=True, eq=False)
 class SlipCurve:
-    """Slip of a wheel over its torque on one floor, from rest to what occurred, with its 90 % band.
+    """Slip of a wheel over its torque on one floor, up to the measured torques, with a 90 % band.
 
-    It is given for this speed [rad/s] and this share of the weight.
+    Attributes:
+        torque_nm: torque at the wheel [N m].
+        slip: slip at each torque.
+        slip_lo: lower end of the 90 % band.
+        slip_hi: upper end of the 90 % band.
+        wheel_speed: wheel speed that the curve is computed for [rad/s].
+        load_share: share of the weight on the wheel that the curve is computed for.
     """
 
     torque_nm: Float[np.ndarray, " torque"]
@@ -43,10 +52,10 @@ class SlipCurve:
 
 @jax.jit
 def wheel_states(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
-    """Wheel speeds [rad/s], torques [N m] and slips of every window (piece, window, wheel).
+    """Return wheel speeds [rad/s], torques [N m] and slips (segment, window, wheel).
 
-    The slip is the sliding speed over the wheel's activity, rim and roller speed together, so that
-    it stays finite at a wheel that stands.
+    The slip is the sliding speed over the root sum of squares of rim and roller speed, so that it
+    stays finite for a wheel at rest.
     """
     frame = robot.geometry.frame()
     speed = robot.geometry.at_wheels(lk.wheel_speed(robot, b))
@@ -56,7 +65,7 @@ def wheel_states(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
         rim = frame.radius * w
         active = jnp.sqrt(rim**2 + (frame.roll @ xi) ** 2 + 1e-12)
         torque = model.wheel_torque(robot, frame, xi, w, surface, load)
-        return torque, (rim * frame.pull - frame.hold @ xi) / active
+        return torque, (rim * frame.drive_share - frame.hold @ xi) / active
 
     return speed, *jax.vmap(jax.vmap(one, (0, None, None)))(speed, b.surface, b.load)
 
@@ -64,10 +73,14 @@ def wheel_states(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
 def torque_of_slip(
     robot: Robot, wheel_speed: Float[Array, " surface"], share: float
 ) -> Float[Array, "surface slip"]:
-    """Torque [N m] of a wheel that slips by `_SLIP` along its drive direction, on every floor.
+    """Return the torque [N m] of a wheel that slips by `_SLIP` along its drive direction.
 
-    At this speed [rad/s], with this share of the weight on the wheel. Source:
-    `slipid.model.contact_law` without sideways rolling.
+    Source: `slipid.model.contact_law` without sideways rolling.
+
+    Args:
+        robot: fitted robot.
+        wheel_speed: speed of the wheel on each floor [rad/s].
+        share: share of the weight on the wheel.
     """
     radius, weight = robot.geometry.wheel_radius, robot.body.mass * GRAVITY
 
@@ -82,9 +95,9 @@ def torque_of_slip(
 def curves(
     space: Space, z: np.ndarray, draws: Float[np.ndarray, "draw free"], b: lk.Batch
 ) -> dict[str, SlipCurve]:
-    """Slip over torque per floor with a 90 % band, over the torques that occurred.
+    """Return slip over torque by floor with a 90 % band, up to the measured torques.
 
-    Taken at the median speed of the wheels that turned and an even load.
+    Curves are computed at the median speed of the wheels that turned, for an even load.
     """
     robot = space.tree(jnp.asarray(z))
     speed, torque = (np.abs(np.asarray(x)) for x in wheel_states(robot, b)[:2])
@@ -111,20 +124,20 @@ def curves(
 
 
 def slip_on(robot: Robot, floor: str, curve: SlipCurve) -> Float[np.ndarray, " torque"]:
-    """Slip by a robot's own law at the torques, the speed and the load of a curve of `curves`."""
+    """Return the slip of a robot's contact law at the torques, speed and load of a curve."""
     at = jnp.full(len(robot.surfaces.labels), curve.wheel_speed)
     torque = torque_of_slip(robot, at, curve.load_share)[robot.surface_index(floor)]
     return np.interp(curve.torque_nm, np.asarray(torque), _SLIP)
 
 
 def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
-    """What each floor was seen with."""
+    """Return the ranges of speed, torque, slip and motion that the runs on each floor cover."""
     speed, torque, slip = (np.asarray(x) for x in wheel_states(robot, b))
-    back = np.asarray(robot.geometry.least()) * float(robot.geometry.wheel_radius)
-    # by the encoders: what was driven, not how it slipped
+    back = np.asarray(robot.geometry.pseudo_inverse()) * float(robot.geometry.wheel_radius)
+    # the encoders show the driven motion, without slip
     twist = np.asarray(lk.wheel_speed(robot, b)) @ back.T
     yaw = twist[..., 2]
-    floor, far = np.asarray(b.surface), travel(b, robot)[0].sum(axis=1)
+    floor, length = np.asarray(b.surface), travel(b, robot)[0].sum(axis=1)
     out: dict[str, Validity] = {}
     for k, label in enumerate(robot.surfaces.labels):
         runs = [i for i, log in enumerate(data.logs) if (log.surface or "unknown") == label]
@@ -145,16 +158,20 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
             torque_nm=(0.0, most[1]),
             slip=(0.0, most[2]),
             yaw_rate=(0.0, most[3]),
-            headings_deg=driven.headings_deg,
-            speeds=driven.speeds,
-            turn_rates=driven.turn_rates,
-            distance=round(float(far[mine].sum()) / max(len(runs), 1), 3),
+            **driven._asdict(),
+            distance=round(float(length[mine].sum()) / max(len(runs), 1), 3),
         )
     return out
 
 
 class DrivenRange(NamedTuple):
-    """Headings [deg], speeds [m/s] and turn rates [rad/s] that were driven, each once, rising."""
+    """Distinct driven motions, in rising order.
+
+    Attributes:
+        headings_deg: directions of travel in the body frame [deg].
+        speeds: speeds [m/s].
+        turn_rates: yaw rates [rad/s].
+    """
 
     headings_deg: tuple[float, ...]
     speeds: tuple[float, ...]
@@ -162,7 +179,7 @@ class DrivenRange(NamedTuple):
 
 
 def has_steady_command(log: Log) -> bool:
-    """Whether a run was asked for one motion most of the time, which then tells what it drove."""
+    """Return True if a run had one command most of the time, which then describes its motion."""
     if log.twist_command is None:
         return False
     gap = np.linalg.norm(log.twist_command - np.median(log.twist_command, axis=0), axis=1)
@@ -171,13 +188,13 @@ def has_steady_command(log: Log) -> bool:
 
 
 def by_encoders(twist: Float[np.ndarray, "window 3"]) -> DrivenRange:
-    """What windows drove by their wheels: roughly, of windows that moved, what is no exception."""
+    """Return the driven motions by the encoders, roughly: common headings, quantiles of speeds."""
     speed = np.linalg.norm(twist[:, :2], axis=1)
     ahead = speed > _MOVED * speed.max(initial=0.0)
     turned = np.abs(twist[:, 2])
     on = turned > _MOVED * turned.max(initial=0.0)
-    way = np.degrees(np.arctan2(twist[ahead, 1], twist[ahead, 0]))
-    headings, count = np.unique((np.round(way / _SECTOR) * _SECTOR) % 360.0, return_counts=True)
+    angle = np.degrees(np.arctan2(twist[ahead, 1], twist[ahead, 0]))
+    headings, count = np.unique((np.round(angle / _SECTOR) * _SECTOR) % 360.0, return_counts=True)
     common = headings[count >= _COMMON * count.sum()]
     signed = np.where(common > 180.0, common - 360.0, common)  # as commands have them
     parts = (0.1, 0.5, 0.9)
@@ -187,16 +204,19 @@ def by_encoders(twist: Float[np.ndarray, "window 3"]) -> DrivenRange:
 
 
 def distinct(x: np.ndarray, digits: int) -> tuple[float, ...]:
-    """Values that are known, rounded, each once, rising."""
+    """Return the finite values, rounded, each once, in rising order."""
     return tuple(sorted({round(float(v), digits) + 0.0 for v in x[np.isfinite(x)]}))
 
 
 def current_trend(robot: Robot, b: lk.Batch) -> tuple[float, float]:
-    """Least squares a [A] + b [A s/m] v of measured less predicted currents' sizes, all floors."""
-    predicted = lk.predicted_current(robot, b, lk.predict(robot, b).felt)
-    gap = np.asarray((b.current - predicted) * jnp.sign(predicted))
-    speed = np.broadcast_to((travel(b, robot)[0] / b.dt)[..., None], gap.shape).ravel()
+    """Return a [A], b [A s/m] of the least squares line a + b v of the current residual's size.
+
+    The residual is measured less predicted current along the predicted one, on all floors.
+    """
+    predicted = lk.predicted_current(robot, b, lk.predict(robot, b).motor_force)
+    residual = np.asarray((b.current - predicted) * jnp.sign(predicted))
+    speed = np.broadcast_to((travel(b, robot)[0] / b.dt)[..., None], residual.shape).ravel()
     rows = np.stack([np.ones_like(speed), speed], axis=1)
-    known = np.isfinite(gap).ravel() & np.isfinite(speed)
-    a, slope = np.linalg.lstsq(rows[known], gap.ravel()[known])[0]
+    known = np.isfinite(residual).ravel() & np.isfinite(speed)
+    a, slope = np.linalg.lstsq(rows[known], residual.ravel()[known])[0]
     return float(a), float(slope)

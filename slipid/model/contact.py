@@ -1,7 +1,7 @@
-"""Contact equilibrium: the body moves so that wheel traction, roller drag and scrub balance.
+"""Contact equilibrium: the twist at which wheel traction, roller drag and scrub balance.
 
 The forces are those of `slipid.model.contact_law`. The root of their balance is found by a fixed
-number of chord steps, which come near from anywhere, and then of damped Newton steps with the
+number of chord steps, which come near it from anywhere, followed by damped Newton steps with the
 analytic 3x3 Jacobian; its derivative comes from the implicit function theorem.
 """
 
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from slipid.model.contact_balance import Balance, Stance, stand, total
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Frame
+from slipid.model.geometry import WheelFrame
 from slipid.model.se2 import Columns, Planar, solve3
 
 _CHORD_STEPS = 30
@@ -25,34 +25,34 @@ _ROUNDING = 1e-20
 _NEAR = 1e-6
 _MOST_NEAR = 12
 CHORD, NEWTON = 4, 2
-"""Steps of each kind that `settle` takes from the twist of a moment ago.
+"""Number of steps of each kind that `settle` takes from the twist of the previous time step.
 
-Wheel speeds that change by up to 1.25 rad/s a step, three floors: 99 % of all twists are then
-within 3 mm/s (20 mm/s with 2 and 3 steps), half of them within rounding.
+With wheel speeds that change by up to 1.25 rad/s per time step and three floors, 99 % of all twists
+are then within 3 mm/s (20 mm/s with 2 and 3 steps), half of them within rounding.
 """
 
 
 class ContactProblem(eqx.Module):
-    """What the twist of a robot depends on.
+    """Inputs that determine the twist of a robot.
 
     Attributes:
-        rim, frame, surface, rest: as of `equilibrium`.
-        start: where the twist is looked for.
+        rim, frame, surface, rest: as in `equilibrium`.
+        start: twist from which the search starts.
     """
 
     rim: Float[Array, " wheel"]
-    frame: Frame
+    frame: WheelFrame
     surface: ContactSurface
     rest: Float[Array, " wheel"]
     start: Float[Array, "3"]
 
     def balance(self) -> Balance:
-        """The forces as a function of the twist."""
+        """Return the forces as a function of the twist."""
         return Balance(self.rim, stand(self.frame, self.surface, self.rest))
 
 
 def _damped(balance: Balance, xi: Planar) -> Planar:
-    """The best of some damped Newton steps, or a chord step."""
+    """Return the best of several damped Newton steps, or a chord step if none of them improves."""
     step, before = balance.newton(xi), balance.size(balance.force(xi))
 
     def less(alpha: Array) -> Planar:
@@ -72,7 +72,7 @@ def _damped(balance: Balance, xi: Planar) -> Planar:
 
 @jax.custom_jvp
 @jax.jit
-def _root(problem: ContactProblem) -> Float[Array, "3"]:
+def _solve(problem: ContactProblem) -> Float[Array, "3"]:
     balance = problem.balance()
 
     def chord(xi: Array, _: None) -> tuple[Array, None]:
@@ -87,7 +87,7 @@ def _root(problem: ContactProblem) -> Float[Array, "3"]:
 
 @jax.custom_jvp
 @jax.jit
-def _root_near(problem: ContactProblem) -> Float[Array, "3"]:
+def _solve_near(problem: ContactProblem) -> Float[Array, "3"]:
     balance = problem.balance()
 
     def far(state: tuple[Array, Array, Array]) -> Array:
@@ -104,18 +104,20 @@ def _root_near(problem: ContactProblem) -> Float[Array, "3"]:
     return jnp.where(jnp.max(jnp.abs(step)) > _NEAR, jnp.nan, xi)
 
 
-One = tuple[ContactProblem]
+OneProblem = tuple[ContactProblem]
 
 
-def _implicit(root: Callable[[ContactProblem], Array]) -> Callable[[One, One], tuple[Array, Array]]:
-    """Derivative of a root of the balance by what it depends on."""
+def _implicit_derivative(
+    root: Callable[[ContactProblem], Array],
+) -> Callable[[OneProblem, OneProblem], tuple[Array, Array]]:
+    """Return the derivative rule of a root of the balance by its inputs."""
 
-    def rule(primals: One, tangents: One) -> tuple[Array, Array]:
+    def rule(primals: OneProblem, tangents: OneProblem) -> tuple[Array, Array]:
         xi = root(*primals)
         return xi, moved(xi, primals, tangents)
 
     @jax.jit
-    def moved(xi: Array, primals: One, tangents: One) -> Array:
+    def moved(xi: Array, primals: OneProblem, tangents: OneProblem) -> Array:
         at = Planar(*xi)
         _, force = jax.jvp(lambda problem: problem.balance().force(at), primals, tangents)
         return -jnp.stack(solve3(primals[0].balance().jacobian(at), force))
@@ -123,74 +125,75 @@ def _implicit(root: Callable[[ContactProblem], Array]) -> Callable[[One, One], t
     return rule
 
 
-_root.defjvp(_implicit(_root))
-_root_near.defjvp(_implicit(_root_near))
+_solve.defjvp(_implicit_derivative(_solve))
+_solve_near.defjvp(_implicit_derivative(_solve_near))
 
 
-def guess(rim: Float[Array, " wheel"], frame: Frame) -> Float[Array, "3"]:
-    """Start of the root finder: the twist without slip, a little slower (least squares)."""
+def initial_twist(rim: Float[Array, " wheel"], frame: WheelFrame) -> Float[Array, "3"]:
+    """Return the start of the root finder: 0.8 times the twist without slip (least squares)."""
     j = frame.hold
     m = Columns(*(Planar(*column) for column in j.T @ j + 1e-6 * jnp.eye(3)))
-    return 0.8 * jnp.stack(solve3(m, Planar(*(j.T @ (rim * frame.pull)))))
+    return 0.8 * jnp.stack(solve3(m, Planar(*(j.T @ (rim * frame.drive_share)))))
 
 
 def equilibrium(
     rim: Float[Array, " wheel"],
-    frame: Frame,
+    frame: WheelFrame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
     near: Float[Array, "3"] | None = None,
 ) -> Float[Array, "3"]:
-    """Body twist (vx [m/s], vy [m/s], yaw rate [rad/s]) at which the contact forces balance.
+    """Return the body twist (vx [m/s], vy [m/s], yaw rate [rad/s]) at which contact forces balance.
 
     Args:
         rim: r w, rim speed of each wheel [m/s].
         frame: wheel directions.
         surface: one floor, or one under each wheel.
         rest: load shares at rest, sum 1.
-        near: a twist so close that plain Newton steps arrive, about ten times cheaper; NaN comes
-            back where they do not. The last step is below 1e-6, which Newton's squares.
+        near: a twist so close to the root that plain Newton steps converge, which is about ten
+            times cheaper; the result is NaN where they do not. The last step is below 1e-6, so the
+            remaining error is about its square.
 
     Source: the balance at the head of `slipid.model.contact_law`.
     """
-    start = jax.lax.stop_gradient(guess(rim, frame) if near is None else near)
+    start = jax.lax.stop_gradient(initial_twist(rim, frame) if near is None else near)
     problem = ContactProblem(rim, frame, surface, rest, start)
-    return _root(problem) if near is None else _root_near(problem)
+    return _solve(problem) if near is None else _solve_near(problem)
 
 
 def traction(
     xi: Float[Array, "3"],
     rim: Float[Array, " wheel"],
-    frame: Frame,
+    frame: WheelFrame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
 ) -> Float[Array, " wheel"]:
-    """Traction along the drive of each wheel that its motor works against at a twist [mu m g]."""
-    return Balance(rim, stand(frame, surface, rest)).felt(Planar(*xi))
+    """Return the traction along the drive of each wheel that its motor works against [mu m g]."""
+    return Balance(rim, stand(frame, surface, rest)).motor_force(Planar(*xi))
 
 
-def rolled(
+def rolling_drag(
     xi: Float[Array, "3"],
     rim: Float[Array, " wheel"],
-    frame: Frame,
+    frame: WheelFrame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
 ) -> Float[Array, " wheel"]:
-    """Drag of each wheel along its drive at a twist, if it is that of its rollers [mu m g].
+    """Return the drag of each wheel along its drive if it equals that of its rollers [mu m g].
 
-    The motor bears it, in units of `Motor.rolling_drag`, and the body does not feel it.
+    It counts in units of `Motor.rolling_drag`; the motor works against it, the body does not.
     """
-    return Balance(rim, stand(frame, surface, rest)).rolled(Planar(*xi))
+    return Balance(rim, stand(frame, surface, rest)).rolling_drag(Planar(*xi))
 
 
 def settle(
     start: Float[Array, "3 floors"], rim: Array, on: Stance, plain: Float[Array, "3 wheel"]
 ) -> tuple[Float[Array, "3 floors"], Float[Array, "wheel floors"]]:
-    """Equilibrium of many floors at once from the twist of a moment ago, and the traction felt.
+    """Return the equilibria on many floors at once, and the tractions, from recent twists.
 
-    A few chord steps, then Newton's where these come nearer: for a robot's computer. Where a number
-    is lost it is the twist without slip. What a jump of the wheel speeds leaves over, the next call
-    settles.
+    It takes a few chord steps, then Newton steps where these reduce the residual: made for a
+    robot's computer. Where a number is not finite, the twist is that without slip. What remains
+    after a jump of the wheel speeds is settled by the next call.
 
     Args:
         start: twists [m/s, m/s, rad/s].
@@ -218,5 +221,5 @@ def settle(
     sound = jnp.isfinite(found.x + found.y + found.yaw)
     free = Planar(*(total(row[:, None] * rim) for row in plain))
     twist = jnp.stack(jax.tree.map(lambda x, p: jnp.where(sound, x, p), found, free))
-    felt = jnp.where(nearer, balance.felt(xi), balance.felt(near))
-    return twist, jnp.where(jnp.isfinite(felt), felt, 0.0)
+    motor_force = jnp.where(nearer, balance.motor_force(xi), balance.motor_force(near))
+    return twist, jnp.where(jnp.isfinite(motor_force), motor_force, 0.0)

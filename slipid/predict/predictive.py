@@ -1,16 +1,16 @@
-"""What any slip model predicts of runs it has not seen, and how sure it may be.
+"""Predictive distributions of fitted models for runs they were not fitted to.
 
-Every model gets a predictive distribution of the same form: a Student t around what it predicts,
-with scale
+Every model gets a predictive distribution of the same form: a Student t around its prediction, with
+scale
 
     V + E diag(v) E^T + J C J^T
 
 V of its own camera, process and run variances, found by restricted likelihood from its own
-residuals; v what runs share, E what that moves; J the slope by its own numbers and the camera's, C
-their covariance. Simpler models have v of sessions (`slipid.fit.sessions`); the force
-balance has what its fit found of sessions and neighbours (`slipid.fit.shared`), and v
-grows where leaving out sectors asks for it. All models share the fitted camera;
-the numbers of a simpler model follow it.
+residuals; v the variances of shared effects and E their derivative; J the derivative by its own
+numbers and the camera's, C their covariance. Simpler models have v of sessions
+(`slipid.fit.session_effects`); the force balance has the effects of sessions and neighbours of its
+fit (`slipid.fit.shared_effects`), and its v grows where held-out sectors ask for it. All models
+share the fitted camera; the numbers of a simpler model follow it.
 """
 
 import abc
@@ -27,27 +27,36 @@ from scipy.special import gammaln
 
 from slipid.data.windows import Windows
 from slipid.fit import likelihood as lk
-from slipid.fit.hierarchy import Courses, extrapolation
+from slipid.fit.hierarchy import TravelDirections, extrapolation
 from slipid.fit.noise import SHARED, effects, travel
-from slipid.fit.problem import Problem, State
-from slipid.fit.sessions import Linear, by_axis, shared
-from slipid.fit.shared import AXES, Directions, FoundShared, Told, told_of
-from slipid.fit.variances import DEGREES, Search, Square, Vector, expected_ties, whitened
+from slipid.fit.problem import FitState, Problem
+from slipid.fit.session_effects import LinearModel, by_axis, with_session_effects
+from slipid.fit.shared_effects import (
+    AXES,
+    EffectForecast,
+    EffectTable,
+    TravelConditions,
+    forecast_effects,
+)
+from slipid.fit.variances import DEGREES, Search, Square, Vector, expected_posteriors, whitened
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.search_space import Space
 
-Gaps = Float[np.ndarray, "piece m"]
-Slopes = Float[np.ndarray, "piece m number"]
-Fitted = TypeVar("Fitted", bound="Predictive")
+Gaps = Float[np.ndarray, "segment m"]
+Slopes = Float[np.ndarray, "segment m number"]
+Fitted = TypeVar("Fitted", bound="PredictiveModel")
 
 
 @dataclass(frozen=True, eq=False)
-class Predictive(abc.ABC):
-    """A fitted model with noise of its own, seen by the camera of its robot.
+class PredictiveModel(abc.ABC):
+    """A fitted model with noise of its own, and the camera of its robot.
 
-    Variances are of every noise component by name, and of what sessions share, where they do. The
-    covariance is of the model's numbers and the camera's.
+    Attributes:
+        robot: the fitted robot, for its camera and geometry.
+        variance: variance of every noise component by name, and of session effects where there are
+            any.
+        covariance: covariance of the model's numbers and the camera's.
     """
 
     robot: Robot
@@ -57,44 +66,46 @@ class Predictive(abc.ABC):
     @property
     @abc.abstractmethod
     def name(self) -> str:
-        """Of the model."""
+        """Name of the model."""
 
     @property
     @abc.abstractmethod
     def numbers(self) -> dict[str, int]:
-        """How many were fitted: of every floor, and `shared` by all, the camera's not counted."""
+        """Count of fitted numbers by floor, and of those `shared` by all, except the camera's."""
 
     def log_variance(self, problem: Problem) -> Float[np.ndarray, " variance"]:
-        """Of every noise component of a problem."""
+        """Return the log variance of every noise component of a problem."""
         return np.log([self.variance[name] for name in problem.noise.names])
 
     @abc.abstractmethod
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
-        """Predicted less measured increments of every piece, and their slope."""
+        """Return predicted less measured increments of every segment, and their derivative."""
 
     @abc.abstractmethod
-    def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
-        """Tracks of whole runs, and the covariance of their ends, scale matrix of a Student t."""
+    def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "segment 2 2"]]:
+        """Return tracks of whole runs and the scale matrix of their ends' Student t."""
 
-    def scale(self, problem: Problem) -> tuple[Gaps, Float[np.ndarray, "piece m m"]]:
-        """Gaps of every piece, and the scale matrix of their distribution."""
+    def scale(self, problem: Problem) -> tuple[Gaps, Float[np.ndarray, "segment m m"]]:
+        """Return the residuals of every segment, and the scale matrix of their distribution."""
         gap, slope = self.linear(problem)
         noise = np.asarray(problem.covariance("motion", self.log_variance(problem)))
         e = effects(problem.windows, problem.robot)
         v = self.effect_covariance(problem.windows)
-        numbers = self.growth(problem.windows)[:, None, None] * around(slope, self.covariance)
+        numbers = self.growth(problem.windows)[:, None, None] * parameter_covariance(
+            slope, self.covariance
+        )
         return gap, noise + np.einsum("nma,nab,nlb->nml", e, v, e) + numbers
 
-    def growth(self, w: Windows) -> Float[np.ndarray, " piece"]:
-        """Factor of the variances of numbers and shared effects, of runs it has not seen."""
+    def growth(self, w: Windows) -> Float[np.ndarray, " segment"]:
+        """Return the factor of the variances of numbers and shared effects for new runs."""
         return np.ones(len(w))
 
-    def effect_covariance(self, w: Windows) -> Float[np.ndarray, "piece 3 3"]:
-        """Of what a run shares with others, in a session that was not seen."""
+    def effect_covariance(self, w: Windows) -> Float[np.ndarray, "segment 3 3"]:
+        """Return the covariance of a run's shared effects in a session that was not fitted."""
         return by_axis(self.variance, "session", w)[:, :, None] * np.eye(len(AXES))
 
-    def log_density(self, problem: Problem) -> Float[np.ndarray, " piece"]:
-        """Log density of every piece's logged poses but the first, in logged units."""
+    def log_density(self, problem: Problem) -> Float[np.ndarray, " segment"]:
+        """Return the log density of every segment's logged poses but the first, in logged units."""
         return log_student(*self.scale(problem)) + np.asarray(
             _camera_log_jacobian(self.robot, problem.batch.pose)
         )
@@ -106,8 +117,8 @@ class Predictive(abc.ABC):
         wide: np.ndarray,
         keep: np.ndarray,
     ) -> Fitted:
-        """The model with what runs of a session share in its variances and in its covariance."""
-        model = Linear(
+        """Return the model with session effects in its variances and in its covariance."""
+        model = LinearModel(
             *linear,
             covariance=self.covariance,
             wide=wide,
@@ -115,14 +126,14 @@ class Predictive(abc.ABC):
             effect=effects(problem.windows, problem.robot),
             run=by_axis(self.variance, "run", problem.windows),
         )
-        variance, covariance = shared(model, problem.windows, np.asarray(keep, float))
+        variance, covariance = with_session_effects(model, problem.windows, np.asarray(keep, float))
         return replace(self, variance={**self.variance, **variance}, covariance=covariance)
 
 
 def log_student(
-    gap: Gaps, scale: Float[np.ndarray, "piece m m"] | Float[np.ndarray, "m m"]
-) -> Float[np.ndarray, " piece"]:
-    """Log density of a multivariate Student t around zero with `DEGREES` degrees of freedom.
+    gap: Gaps, scale: Float[np.ndarray, "segment m m"] | Float[np.ndarray, "m m"]
+) -> Float[np.ndarray, " segment"]:
+    """Return the log density of a multivariate Student t around zero, `DEGREES` degrees of freedom.
 
     Source: Kotz and Nadarajah 2004, Multivariate t Distributions, eq. 1.1.
     """
@@ -139,16 +150,20 @@ _camera_log_jacobian = jax.jit(lk.camera_log_jacobian)
 
 
 @dataclass(frozen=True, eq=False)
-class Contact(Predictive):
-    """The force balance where a fit has left it, at the search vector z.
+class ForceBalance(PredictiveModel):
+    """The fitted force balance, at the search vector z.
 
-    Variances of numbers and of shared effects are too small for runs it has not seen, by the factor
-    `extrapolation` of their floor and load.
+    Attributes:
+        space: free numbers and their prior.
+        z: search vector of the fit.
+        shared: effects that neighbouring runs share, by floor.
+        extrapolation: factor, by floor and load, of the variances of numbers and shared effects for
+            runs that were not fitted.
     """
 
     space: Space
     z: Search
-    shared: Mapping[str, FoundShared]
+    shared: Mapping[str, EffectTable]
     extrapolation: Mapping[str, float]
 
     @property
@@ -157,7 +172,7 @@ class Contact(Predictive):
 
     @property
     def forecast(self) -> dict[str, float]:
-        """Variances of runs it has not seen, with the load of each floor that is the least sure."""
+        """Variances for runs that were not fitted, at each floor's least certain load set-up."""
         out = dict(self.variance)
         for name in out:
             kind, _, rest = name.partition(".")
@@ -167,15 +182,15 @@ class Contact(Predictive):
                 out[name] *= max(grown, default=1.0)
         return out
 
-    def told(self, w: Windows) -> Told:
-        """What neighbours among the fitted runs tell of runs."""
-        return told_of(self.shared, w, self.robot, self.space.size)
+    def expected_effects(self, w: Windows) -> EffectForecast:
+        """Return the effects of runs that are expected from their fitted neighbours."""
+        return forecast_effects(self.shared, w, self.robot, self.space.size)
 
-    def effect_covariance(self, w: Windows) -> Float[np.ndarray, "piece 3 3"]:
-        shared = super().effect_covariance(w) + self.told(w).covariance
+    def effect_covariance(self, w: Windows) -> Float[np.ndarray, "segment 3 3"]:
+        shared = super().effect_covariance(w) + self.expected_effects(w).covariance
         return self.growth(w)[:, None, None] * shared
 
-    def growth(self, w: Windows) -> Float[np.ndarray, " piece"]:
+    def growth(self, w: Windows) -> Float[np.ndarray, " segment"]:
         return np.array([self.extrapolation.get(name, 1.0) for name in setups(w)])
 
     @property
@@ -194,31 +209,31 @@ class Contact(Predictive):
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
         electric = problem.electric(self.z, self.log_variance(problem))
         blocks, jac = problem.linear(self.z, electric)
-        told, e = self.told(problem.windows), effects(problem.windows, problem.robot)
+        told, e = self.expected_effects(problem.windows), effects(problem.windows, problem.robot)
         gap = np.asarray(blocks["motion"]) - np.einsum("nma,na->nm", e, told.mean)
         slope = np.asarray(jac["motion"]) - np.einsum("nma,nap->nmp", e, told.slope)
         return gap, slope
 
     def tracks(self, w: Windows) -> replay.Tracks:
-        """Of whole runs, as the force balance and what neighbours tell have them."""
-        return self._tracks(w, self._moved(w, self.told(w)))
+        """Return the tracks of whole runs by the force balance and the expected effects."""
+        return self._tracks(w, self._moved(w, self.expected_effects(w)))
 
-    def _moved(self, w: Windows, told: Told) -> Float[np.ndarray, "piece window 3"]:
-        """By what neighbours tell that the force balance moves too far."""
+    def _moved(self, w: Windows, told: EffectForecast) -> Float[np.ndarray, "segment window 3"]:
+        """Return the expected effects as increments to subtract from those of the force balance."""
         moved = np.einsum("nma,na->nm", effects(w, self.robot), told.mean)
         return moved.reshape(*w.dt.shape, 3)
 
-    def _tracks(self, w: Windows, moved: Float[np.ndarray, "piece window 3"]) -> replay.Tracks:
+    def _tracks(self, w: Windows, moved: Float[np.ndarray, "segment window 3"]) -> replay.Tracks:
         b = lk.batch(w, self.robot)
         increments = np.asarray(replay.contact_increments(self.robot, b)) - moved
-        return replay.follow(self.robot, w, increments)
+        return replay.tracks_from_increments(self.robot, w, increments)
 
-    def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
-        b, told, e = lk.batch(w, self.robot), self.told(w), effects(w, self.robot)
+    def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "segment 2 2"]]:
+        b, told, e = lk.batch(w, self.robot), self.expected_effects(w), effects(w, self.robot)
         moved = self._moved(w, told)
         tracks = self._tracks(w, moved)
         by_number = np.einsum("nma,nap->nmp", e, told.slope).reshape(*moved.shape, -1)
-        more = replay.Correction(jnp.asarray(moved), jnp.asarray(by_number))
+        more = replay.IncrementCorrection(jnp.asarray(moved), jnp.asarray(by_number))
         start = tracks.predicted[:, 0]
         jac = np.asarray(replay.end_jacobian(self.space, self.z, b, start, corrected=more))
         own = np.einsum("nip,pq,njq->nij", jac, self.covariance, jac)
@@ -227,51 +242,51 @@ class Contact(Predictive):
         return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, own)
 
 
-def contact_of(
-    problem: Problem, state: State, covariance: Square, keep: Float[np.ndarray, " piece"]
-) -> Contact:
-    """The force balance at the end of a fit of the kept pieces, with what sessions share."""
+def force_balance_of(
+    problem: Problem, state: FitState, covariance: Square, keep: Float[np.ndarray, " segment"]
+) -> ForceBalance:
+    """Return the force balance at the end of a fit of the kept segments, with shared effects."""
     robot, variance = problem.space.tree(state.z), by_name(problem, state.log_variance)
     z, log_v = np.asarray(state.z), np.asarray(state.log_variance)
     blocks, jacobian = problem.linear(z, problem.electric(z, log_v))
     motion = blocks["motion"], jacobian["motion"]
     w = problem.windows
-    direction = Directions.of(w, problem.robot).direction
-    courses = Courses(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
-    grown = extrapolation(problem.target, motion, keep[: len(w)], covariance, log_v, courses)
-    return Contact(
+    direction = TravelConditions.of(w, problem.robot).direction
+    courses = TravelDirections(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
+    grown = extrapolation(problem.objective, motion, keep[: len(w)], covariance, log_v, courses)
+    return ForceBalance(
         robot,
         variance,
         np.asarray(covariance),
         problem.space,
         z,
-        shared=found_shared(problem, state, keep),
+        shared=effect_tables(problem, state, keep),
         extrapolation=grown,
     )
 
 
-def found_shared(
-    problem: Problem, state: State, keep: Float[np.ndarray, " piece"]
-) -> dict[str, FoundShared]:
-    """What neighbouring runs on every floor share, by a fit of the kept pieces."""
+def effect_tables(
+    problem: Problem, state: FitState, keep: Float[np.ndarray, " segment"]
+) -> dict[str, EffectTable]:
+    """Return the effects that neighbouring runs share on every floor, by a fit of some segments."""
     log_v, free = jnp.asarray(state.log_variance), problem.space.size
     residual, jacobian = problem.linear(state.z, problem.electric(state.z, log_v))
-    seen = problem.seen(residual, log_v, keep, state.shared(len(problem.windows)))
+    seen = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
     white = jnp.einsum("nij,nj->ni", seen.whitening.root["motion"], residual["motion"])
-    half = whitened(problem.target.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]
-    expected = expected_ties(problem.target, log_v, jnp.asarray(keep))
+    half = whitened(problem.objective.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]
+    expected = expected_posteriors(problem.objective, log_v, jnp.asarray(keep))
     std = np.exp(0.5 * np.asarray(log_v))
     out = {}
     for floor, of, tie, to in zip(
-        problem.robot.surfaces.labels, problem.target.shared, seen.tied, expected, strict=True
+        problem.robot.surfaces.labels, problem.objective.shared, seen.effects, expected, strict=True
     ):
         near = of.near.shape[-1]
         count = near + of.session.shape[1]
         inverse = np.linalg.inv(np.asarray(to.factor))
         covariance = (inverse.T @ inverse).reshape(3, count, 3, count)
         slope = jax.vmap(to.coefs, in_axes=-1, out_axes=-1)(half)
-        out[floor] = FoundShared(
-            paces=problem.paces[floor],
+        out[floor] = EffectTable(
+            speeds_and_loads=problem.speeds_and_loads[floor],
             std=std[np.asarray(of.numbers)[1]],
             coefs=np.asarray(tie.coefs(white)).reshape(3, count)[:, :near],
             by_number=np.asarray(slope).reshape(3, count, free)[:, :near],
@@ -280,8 +295,8 @@ def found_shared(
     return out
 
 
-def around(jac: Slopes, cov: np.ndarray) -> np.ndarray:
-    """J C J^T of every piece, without the columns that are zero for it."""
+def parameter_covariance(jac: Slopes, cov: np.ndarray) -> np.ndarray:
+    """Return J C J^T of every segment, without the columns that are zero for it."""
     used = (jac != 0.0).any(axis=1)
     patterns, which = np.unique(used, axis=0, return_inverse=True)
     out = np.zeros((len(jac), jac.shape[1], jac.shape[1]))
@@ -293,10 +308,10 @@ def around(jac: Slopes, cov: np.ndarray) -> np.ndarray:
 
 
 def setups(w: Windows) -> list[str]:
-    """Floor and load of every piece, `floor@load`."""
+    """Return the floor and load of every segment, `floor@load`."""
     return [f"{floor}@{load}" for floor, load in zip(w.surface, w.load, strict=True)]
 
 
 def by_name(problem: Problem, log_v: Vector) -> dict[str, float]:
-    """Variances by the names of their components."""
+    """Return variances by the names of their components."""
     return dict(zip(problem.noise.names, np.exp(np.asarray(log_v)).tolist(), strict=True))

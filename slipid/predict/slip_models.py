@@ -1,17 +1,131 @@
-"""The slip models below the force balance that a fit is compared with, and back from files."""
+"""Slip models that are compared with the force balance, fitted floor by floor.
+
+`slip_models` lists them, `restored` builds them again from files.
+"""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from slipid.data.windows import Windows
 from slipid.model.geometry import Geometry
-from slipid.predict.curves import Curve, Saturating, above, powers, ramps, soft_torque
-from slipid.predict.floor_models import FloorModels
+from slipid.model.robot import Robot
+from slipid.predict.curves import CurveModel, Saturating, above, powers, ramps, soft_torque
 from slipid.predict.kinematics import TERMS, Corrected, Encoder, HeadingLookup, Together, nominal
-from slipid.predict.steps import TwistModel
+from slipid.predict.slip_model import Increments, RobotSpec, RunSignals, as_increments, body_twist
+from slipid.predict.steps import Steps, TrainingWindows, TwistModel
+
+
+@dataclass(frozen=True)
+class FloorModels:
+    """A slip model fitted separately for every floor.
+
+    It predicts marker increments in corrected metres.
+
+    Attributes:
+        model: the slip model, not fitted.
+        fitted: the model fitted to the windows of each floor, or of each `floor@load` where the
+            model needs it.
+    """
+
+    model: TwistModel
+    fitted: Mapping[str, TwistModel] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Name of the model."""
+        return self.model.name
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """Fitted numbers by floor: with the name, enough to build the models again."""
+        return {key: m.coefficients for key, m in self.fitted.items() if m.coefficients is not None}
+
+    def with_state(self, state: Mapping[str, np.ndarray]) -> "FloorModels":
+        """Return the models with these numbers."""
+        models = {
+            k: replace(self.fitted.get(k, self.model), coefficients=v) for k, v in state.items()
+        }
+        return replace(self, fitted=models)
+
+    def fit(self, w: Windows, robot: Robot) -> "FloorModels":
+        """Return the model fitted to these windows, floor by floor."""
+        if not self.model.learns:
+            return self
+        spec = RobotSpec.of(robot)
+        windows = {key: training_windows(part, robot) for key, part in self._parts(w).items()}
+        fitted = {key: self.model.learn(part, spec) for key, part in windows.items()}
+        return replace(self, fitted=fitted)
+
+    def twist(self, w: Windows, robot: Robot) -> np.ndarray:
+        """Return the body twist of every window (segment, window, 3) [m/s, m/s, rad/s]."""
+        spec, out = RobotSpec.of(robot), np.empty((*w.dt.shape, 3))
+        keys = np.array([self.key_of(s, load) for s, load in zip(w.surface, w.load, strict=True)])
+        for key in dict.fromkeys(keys.tolist()):
+            mine = keys == key
+            steps = steps_of(w.segments(np.flatnonzero(mine)))
+            model = self.fitted.get(key, self.model)
+            out[mine] = model.twist(steps, spec).reshape(out[mine].shape)
+        return out
+
+    def increments(self, w: Windows, robot: Robot) -> Increments:
+        """Return the marker increments of every window [m, m, rad]."""
+        return as_increments(self.twist(w, robot), w, robot)
+
+    def key_of(self, surface: str, load: str) -> str:
+        """Return the key of the model of a floor and load set-up.
+
+        A load set-up that was not fitted takes the one the floor was first driven with.
+
+        Raises:
+            ValueError: the floor was not fitted.
+        """
+        if not self.model.learns:
+            return surface
+        if (exact := f"{surface}@{load}") in self.fitted:
+            return exact
+        floors = {key.rpartition("@")[0] or key: key for key in reversed(list(self.fitted))}
+        if surface not in floors:
+            raise ValueError(f"no surface '{surface}'; identified: {', '.join(reversed(floors))}")
+        return floors[surface]
+
+    def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
+        """Return the precision of each key's flat numbers that comes from anything but the data."""
+        spec, parts = RobotSpec.of(robot), self._parts(w)
+        return {
+            key: model.stiffness(training_windows(parts[key], robot), spec)
+            for key, model in self.fitted.items()
+        }
+
+    def _parts(self, w: Windows) -> dict[str, Windows]:
+        """Return the windows by the key of the model that is fitted to them."""
+        setups = [f"{s}@{load}" for s, load in zip(w.surface, w.load, strict=True)]
+        keys = np.array(setups if self.model.by_load else w.surface)
+        return {k: w.segments(np.flatnonzero(keys == k)) for k in dict.fromkeys(keys.tolist())}
+
+
+def steps_of(w: Windows) -> Steps:
+    """Return the windows as steps, each segment a run; currents are magnitudes."""
+    drives = w.turn.shape[-1]
+    signals = RunSignals(
+        name="windows",
+        dt=w.dt.ravel(),
+        turn=w.turn.reshape(-1, drives),
+        current=np.abs(w.current).reshape(-1, drives) if w.has_current else None,
+    )
+    first = np.arange(len(w)) * w.dt.shape[1]
+    return Steps(signals, first, w.speed_change.reshape(-1, drives), w.lag)
+
+
+def training_windows(w: Windows, robot: Robot) -> TrainingWindows:
+    """Return the windows with the body twists measured in them, each window a step."""
+    twist, run = body_twist(w, robot).reshape(-1, 3), np.repeat(w.run, w.dt.shape[1])
+    return TrainingWindows(steps_of(w), np.arange(w.dt.size), w.dt.ravel(), twist, run)
+
 
 KNOTS = (0.0, 0.02, 0.04, 0.06, 0.1, 0.15, 0.25)
-"""Of the monotone spline [N m]."""
+"""Knots of the monotone spline [N m]."""
 PAPER_THRESHOLD = 0.4
 """Current above which the 2021 paper's deployed form corrects [A]."""
 
@@ -19,11 +133,11 @@ PAPER_THRESHOLD = 0.4
 def slip_models(
     shape: Geometry, has_current: bool, together: Together | None = None
 ) -> list[FloorModels]:
-    """Every slip model the logs allow, unfitted; `paper` is the form the authors ran on the robot.
+    """Return every slip model the logs allow, not fitted; `paper` is the form the authors ran.
 
-    The shape is the robot's as its config has it: wheels that do not determine the twist have
-    models of their own. The threshold of `paper` and the spline's knots are for motors of that
-    size. Runs that will be left out `together` are so, too, where a model tunes itself.
+    The shape is the robot's as in its config: wheels that do not determine the twist have models of
+    their own. The threshold of `paper` and the spline's knots are for motors of that size. Runs
+    held out `together` are also held out together where a model tunes itself.
     """
     models: list[TwistModel] = [nominal(shape), Encoder()]
     if shape.determines_twist:
@@ -34,24 +148,24 @@ def slip_models(
 
 
 def _of_wheels(has_current: bool, together: Together | None) -> list[TwistModel]:
-    """Slip wheel by wheel, and by the direction of travel."""
-    out: list[TwistModel] = [Curve("constant", powers(0))]
+    """Return models of slip by wheel, and by direction of travel."""
+    out: list[TwistModel] = [CurveModel("constant", powers(0))]
     if has_current:
         out += [
-            Curve("linear", powers(1), soft_torque),
-            Curve("affine", powers(0, 1), soft_torque),
-            Curve("svr", powers(0, 1), soft_torque, insensitive=True),
-            Curve("quadratic", powers(0, 1, 2), soft_torque),
+            CurveModel("linear", powers(1), soft_torque),
+            CurveModel("affine", powers(0, 1), soft_torque),
+            CurveModel("svr", powers(0, 1), soft_torque, insensitive=True),
+            CurveModel("quadratic", powers(0, 1, 2), soft_torque),
             Saturating(),
-            Curve("monotone_spline", ramps(KNOTS), soft_torque, monotone=True),
-            Curve("affine_current", powers(0, 1)),
-            Curve("paper", above(PAPER_THRESHOLD), per_wheel=True),
+            CurveModel("monotone_spline", ramps(KNOTS), soft_torque, monotone=True),
+            CurveModel("affine_current", powers(0, 1)),
+            CurveModel("paper", above(PAPER_THRESHOLD), per_wheel=True),
         ]
     return [*out, HeadingLookup(ridge=None, together=together)]
 
 
 def restored(shape: Geometry, states: Mapping[str, Mapping[str, Sequence]]) -> list[FloorModels]:
-    """Slip models from their names and states, as `{model.name: model.state}` wrote them."""
+    """Return slip models from their names and states, as `{model.name: model.state}` wrote them."""
     known = {model.name: model for model in slip_models(shape, has_current=True)}
     if strange := sorted(set(states) - set(known)):
         raise ValueError(f"no model '{strange[0]}'; there are: {', '.join(known)}")

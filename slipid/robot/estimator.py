@@ -1,9 +1,9 @@
-"""Slip, surface and pose from wheel speed and current, and odometry that knows no contact.
+"""Estimators of slip, floor and pose from wheel speeds and currents, and odometry without contact.
 
-In `Estimator` wheel readings go through a filter over the floors under the wheels (`floor_filter`)
-to the motion of the body, and that through a filter of the pose (`pose_filter`):
+In `Estimator` wheel readings go through a filter over the floors under the wheels (`floor_filter`),
+which yields the body's motion, and that goes through a filter of the pose (`pose_filter`):
 
-    xi = sum_c p_c xi_c,   pose <- pose * exp(xi dt) * (late news of the floors)
+    xi = sum_c p_c xi_c,   pose <- pose * exp(xi dt) * (late corrections from the floors)
 """
 
 from dataclasses import replace
@@ -15,24 +15,33 @@ from jaxtyping import Array, Bool, Float
 from slipid.model.se2 import advance, compose
 from slipid.robot.deployed import RobotArrays
 from slipid.robot.filter.floor import Floor
-from slipid.robot.filter.floor_filter import FloorFilter, FloorState, Tick, length
+from slipid.robot.filter.floor_filter import FloorFilter, FloorState, TimeStep, length
 from slipid.robot.filter.hypotheses import hypotheses_of
-from slipid.robot.filter.pose_filter import PoseFilter, turned_axes
-from slipid.robot.filter.pose_fix import PoseState, placed
+from slipid.robot.filter.pose_filter import PoseFilter, axes_rotation
+from slipid.robot.filter.pose_fix import PoseState, apply_map
 from slipid.robot.filter.wheels import WheelState, read_currents, read_wheels, time_step
-from slipid.robot.interface import AbstractEstimator, Estimate, Pose, Readings, Settings, as_arrays
+from slipid.robot.interface import (
+    AbstractEstimator,
+    Pose,
+    Readings,
+    Settings,
+    StateEstimate,
+    as_arrays,
+)
 
 CURRENT_FROM = 0.4
-"""Current from which the 2021 paper's deployed estimator counts slip [A]."""
+"""Current above which the 2021 paper's deployed estimator subtracts slip [A]."""
 
 
 class EstimatorState(eqx.Module):
-    """What an estimator keeps from step to step.
+    """State of an estimator between two steps.
 
     Attributes:
-        wheels: how they turn; current: of the motors, filtered [A].
-        floors: what is believed of them; place: pose and covariance.
-        stuck: for how long the body has hardly moved while its wheels turn [s].
+        wheels: angles, speeds and ages of the wheels' readings.
+        current: filtered currents of the motors [A].
+        floors: belief about the floors.
+        place: pose with its covariance.
+        stuck: time since the body stopped moving while its wheels turn [s].
     """
 
     wheels: WheelState
@@ -46,11 +55,11 @@ class Estimator(AbstractEstimator[EstimatorState]):
     """Filter over the floors under the wheels, with pose and covariance.
 
     Attributes:
-        robot: the identified robot; its `labels` name the floors in the order of
-            `Estimate.surface_probability`.
-        settings: by default as the robot's logs were.
-        floor: map of the place, its surfaces by number in the robot's `labels`; None where there
-            is none.
+        robot: identified robot; its `labels` name the floors in the order of
+            `StateEstimate.surface_probability`.
+        settings: settings; by default those that fit the robot's logs.
+        floor: map of the site, its surfaces numbered as in the robot's `labels`; None without a
+            map.
     """
 
     robot: RobotArrays
@@ -66,7 +75,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
     def init(
         self, pose: Pose = (0.0, 0.0, 0.0), std: tuple[float, float] = (0.0, 0.0)
     ) -> EstimatorState:
-        """State of a robot at rest at a pose [m, m, rad] that is known so well [m], [rad]."""
+        """Return the state of a robot at rest at a pose [m, m, rad] with stds [m], [rad]."""
         f, s = self.robot, self.settings
         return EstimatorState(
             wheels=WheelState.init(f, s),
@@ -78,14 +87,14 @@ class Estimator(AbstractEstimator[EstimatorState]):
 
     def advance(
         self, state: EstimatorState, z: Readings, dt: Float[Array, ""]
-    ) -> tuple[EstimatorState, Estimate]:
-        """One time step; see `AbstractEstimator.step`."""
+    ) -> tuple[EstimatorState, StateEstimate]:
+        """Return state and estimate one time step later; see `AbstractEstimator.step`."""
         f, s, old = self.robot, self.settings, state
         dt = time_step(dt, s)
         wheels = read_wheels(f, s, old.wheels, z, dt)
         w = wheels.speed
         currents = read_currents(f, s, old.current, z, w, dt)
-        tick = Tick(
+        tick = TimeStep(
             dt=dt,
             moves=jnp.max(jnp.abs(f.frame.radius * w)) > s.still_m_s,
             acceleration=jnp.max(jnp.abs(w - old.wheels.speed)) / jnp.maximum(dt, 1e-3),
@@ -100,7 +109,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
             root, supports = by_pose.mapped(before, self.floor, hypotheses)
             mapped = jnp.mean(supports, axis=0)
             floors, motion = by_floor.step(old.floors, w, currents, turn, tick, mapped)
-            before, left = placed(before, root, supports, motion)
+            before, left = apply_map(before, root, supports, motion)
             supports = by_pose.mapped(before, self.floor, hypotheses)[1]
             floors = _corrected(floors, left, before, jnp.mean(supports, axis=0))
         place, twist, left = by_pose.step(before, motion, gyro, z, tick)
@@ -109,7 +118,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
         new = EstimatorState(wheels, currents.filtered, floors, place, stuck)
         unknown = floors.belief[-1]
         none = jnp.full((f.wheels, 1), unknown)
-        return new, Estimate(
+        return new, StateEstimate(
             pose=place.pose,
             twist=twist,
             slip=self._slip(w, twist),
@@ -124,13 +133,13 @@ class Estimator(AbstractEstimator[EstimatorState]):
         )
 
     def _slip(self, w: Array, twist: Array) -> Array:
-        """Slip ratio of each drive, 0 for one that stands."""
+        """Return the slip ratio of each drive, which is 0 while it stands."""
         f, turns = self.robot, jnp.abs(w) > 1e-3
         rim = f.frame.radius * jnp.where(turns, w, 1.0)
         return jnp.where(turns, jnp.clip(1 - f.forward @ twist / rim, -2.0, 2.0), 0.0)
 
-    def _stuck(self, before: Array, w: Array, twist: Array, tick: Tick) -> Array:
-        """For how long the body has hardly moved while its wheels turn [s].
+    def _stuck(self, before: Array, w: Array, twist: Array, tick: TimeStep) -> Array:
+        """Return the time since the body stopped moving while its wheels turn [s].
 
         Source: Ward and Iagnemma 2008, below a fifth of the wheels' speed.
         """
@@ -140,24 +149,25 @@ class Estimator(AbstractEstimator[EstimatorState]):
         return jnp.where(blocked, jnp.minimum(before + tick.dt, 1e3), 0.0)
 
     def _beyond(self, w: Array, amps: Array, unknown: Array) -> Bool[Array, ""]:
-        """Whether speed or currents leave what the fit has seen, or no floor explains them."""
+        """Return whether speed or currents exceed the fitted runs', or no floor explains them."""
         highest = self.robot.highest
         fast = jnp.max(jnp.abs(w)) > 1.3 * highest[0]
         return fast | (jnp.max(jnp.abs(amps)) > 1.3 * highest[1]) | (unknown > 0.5)
 
 
 def _corrected(floors: FloorState, left: Array, place: PoseState, expected: Array) -> FloorState:
-    """Hypotheses once a map has corrected the pose, `left` in the world's axes."""
-    world = turned_axes(place.pose[2])
+    """Return the belief after a map corrected the pose, with `left` in the world's axes."""
+    world = axes_rotation(place.pose[2])
     return replace(floors, apart=floors.apart @ (world.T @ left @ world).T, expected=expected)
 
 
 class OdometryState(eqx.Module):
-    """What wheel-by-wheel odometry keeps from step to step.
+    """State of wheel-by-wheel odometry between two steps.
 
     Attributes:
         pose: x, y [m], heading [rad].
-        wheels: how they turn; current: of the motors, smoothed and without a sign [A].
+        wheels: angles, speeds and ages of the wheels' readings.
+        current: smoothed magnitude of the motors' currents [A].
     """
 
     pose: Float[Array, "3"]
@@ -169,10 +179,11 @@ class Odometry(AbstractEstimator[OdometryState]):
     """Wheel-by-wheel odometry, w_eff = w (1 - s).
 
     Attributes:
-        settings: by default as the robot's logs were.
-        curve: whether slip is taken from `DeployedRobot.wheel_curve`, a + b |I| where the smoothed
-            current exceeds `CURRENT_FROM`, as the 2021 paper's robot did; else the encoders are
-            believed.
+        robot: identified robot.
+        settings: settings; by default those that fit the robot's logs.
+        curve: whether slip follows `DeployedRobot.wheel_curve`, a + b |I| where the smoothed
+            current exceeds `CURRENT_FROM`, as on the 2021 paper's robot; else encoders count as
+            free of slip.
     """
 
     robot: RobotArrays
@@ -184,7 +195,7 @@ class Odometry(AbstractEstimator[OdometryState]):
         self.settings = as_arrays(Settings.of(robot) if settings is None else settings)
 
     def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> OdometryState:
-        """State of a robot at rest at a pose [m, m, rad]."""
+        """Return the state of a robot at rest at a pose [m, m, rad]."""
         return OdometryState(
             pose=jnp.asarray(pose, dtype=float),
             wheels=WheelState.init(self.robot, self.settings),
@@ -193,8 +204,8 @@ class Odometry(AbstractEstimator[OdometryState]):
 
     def advance(
         self, state: OdometryState, z: Readings, dt: Float[Array, ""]
-    ) -> tuple[OdometryState, Estimate]:
-        """One time step; see `AbstractEstimator.step`. Neither gyro nor pose fixes are used."""
+    ) -> tuple[OdometryState, StateEstimate]:
+        """Return state and estimate one time step later; neither gyro nor pose fixes are used."""
         f, s, old = self.robot, self.settings, state
         dt = time_step(dt, s)
         wheels = read_wheels(f, s, old.wheels, z, dt)
@@ -210,7 +221,7 @@ class Odometry(AbstractEstimator[OdometryState]):
         twist = f.inverse @ (f.frame.radius * w * (1 - slip))
         pose = compose(old.pose, advance(twist, dt))
         unknown = jnp.zeros((f.wheels, len(f.labels) + 1)).at[:, -1].set(1.0)
-        return OdometryState(pose=pose, wheels=wheels, current=amps), Estimate(
+        return OdometryState(pose=pose, wheels=wheels, current=amps), StateEstimate(
             pose=pose,
             twist=twist,
             slip=slip,

@@ -69,7 +69,7 @@ def test_a_comparison_ranks_every_model_on_left_out_runs(fit):
 @pytest.mark.slow
 def test_a_proposal_has_the_runs_that_were_asked_for(fit):
     proposal = fit.design("surface.soft.creep", runs=2)
-    assert len(proposal.drives) == 2
+    assert len(proposal.runs) == 2
     assert str(proposal).startswith("run,floor,load,vx_m_s")
     assert proposal.plot().axes
     with pytest.raises(sl.DataError, match="matches no parameter"):
@@ -80,7 +80,7 @@ def test_a_proposal_has_the_runs_that_were_asked_for(fit):
 def test_a_drive_says_what_became_of_its_path(fit):
     robot = fit.deploy()
     found = sl.drive(robot, "encoder", start=1, seed=2)
-    assert found.course.pose.shape == found.course.believed.shape
+    assert found.course.pose.shape == found.course.estimated_pose.shape
     assert f"{found.metrics.closure_mm:.0f} mm from where it should" in str(found)
     with pytest.raises(ValueError, match="controller 'magic' from start 0; expected encoder"):
         sl.drive(robot, "magic")

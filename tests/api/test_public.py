@@ -16,11 +16,11 @@ import slipid as sl
 from slipid.data.write import robotino2022_csv
 from slipid.infer.posterior import blocks, sample
 from slipid.infer.posterior.blocks import Plan
-from slipid.lab.selftest.logs import Sensors, grid, make_logs, truth
+from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOORS = (("gray", "as_built"),)
-DRIVES = grid(setups=FLOORS, headings=6, speeds=(0.1, 0.3), turns=0)
+DRIVES = heading_grid(setups=FLOORS, headings=6, speeds=(0.1, 0.3), turns=0)
 
 
 def example() -> str:
@@ -30,7 +30,7 @@ def example() -> str:
 
 def write_runs(folder: Path) -> None:
     """Made logs of the drives, laid out as those of 2022."""
-    for k, log in enumerate(make_logs(truth(DRIVES), DRIVES, 1, Sensors())):
+    for k, log in enumerate(simulate_logs(true_robot(DRIVES), DRIVES, 1, SimulatedSensors())):
         path = folder / "one_surface" / str(log.surface) / f"exp{k:02d}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(

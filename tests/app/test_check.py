@@ -7,14 +7,20 @@ import pytest
 
 from slipid.app.check import expected
 from slipid.app.config import FitSection
-from slipid.app.problem import Task, on_runs
+from slipid.app.problem import FitTask, robot_for_runs
 from slipid.data.runs import collect
 from slipid.fit.optimise import optimise
 from slipid.infer.result import summarise
-from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.lab.selftest.logs import (
+    SimulatedSensors,
+    heading_grid,
+    nominal_robot,
+    simulate_logs,
+    true_robot,
+)
 from slipid.search_space import Choice
 
-PLAN = grid(setups=(("soft", "as_built"),), headings=8, speeds=(0.1, 0.2))
+PLAN = heading_grid(setups=(("soft", "as_built"),), headings=8, speeds=(0.1, 0.2))
 CHOICES = (Choice("motor.*", free=False), Choice("camera.scale", free=True))
 ORDER = ("not_identified", "weak", "identified")
 fit = partial(optimise, most_rounds=15)
@@ -22,11 +28,15 @@ fit = partial(optimise, most_rounds=15)
 
 def promised_and_kept(times, creep):
     """Verdicts before and after the fit of runs with so many times the usual noise."""
-    usual = Sensors()
+    usual = SimulatedSensors()
     std = {name: (times if "floor" in name else 1) * v for name, v in usual.std.items()}
-    logs = make_logs(truth(PLAN, {"surface.soft.creep": creep}), PLAN, 3, Sensors(std=std))
+    logs = simulate_logs(
+        true_robot(PLAN, {"surface.soft.creep": creep}), PLAN, 3, SimulatedSensors(std=std)
+    )
     data = collect(logs)
-    task = Task(data, on_runs(blank(PLAN), data, (0.0, 0.0)), CHOICES, FitSection())
+    task = FitTask(
+        data, robot_for_runs(nominal_robot(PLAN), data, (0.0, 0.0)), CHOICES, FitSection()
+    )
     problem = task.problem()
     before = expected(task, problem)
     after = summarise(problem, fit(problem), data, CHOICES)

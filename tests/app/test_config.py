@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slipid.app.config import geometry, read_config
-from slipid.app.problem import read_job
+from slipid.app.problem import read_fit_task
 from slipid.support.errors import DataError
 from tests.helpers.broken_logs import generic_text, robotino_text, write_good
 from tests.helpers.said import KeptMessages
@@ -148,7 +148,7 @@ def test_absent_and_unreadable_files(tmp_path):
 
 
 def job_of(folder: Path, text: str, said: KeptMessages | None = None):
-    return read_job(read_config(written(folder, text)), folder, said or KeptMessages())
+    return read_fit_task(read_config(written(folder, text)), folder, said or KeptMessages())
 
 
 def test_a_job_reads_floors_from_folders_and_takes_the_mass(tmp_path):
@@ -165,10 +165,10 @@ def test_a_job_reads_floors_from_folders_and_takes_the_mass(tmp_path):
     assert job.dataset.session == ("gray/as_built/0.10", "green/as_built/0.10")
     problem = job.problem()
     assert float(problem.robot.body.mass) == 12.0
-    assert not [p for p in problem.space.place if p.startswith("robot.") and "share" not in p]
+    assert not [p for p in problem.space.slices if p.startswith("robot.") and "share" not in p]
     assert problem.windows.lag == pytest.approx(0.05)  # where the lag starts
     assert float(problem.robot.surfaces.lead[0]) == 0.001
-    assert "surface.gray.lead" not in problem.space.place
+    assert "surface.gray.lead" not in problem.space.slices
 
 
 def test_what_the_robot_section_says_is_the_centre_of_its_prior(tmp_path):
@@ -178,7 +178,7 @@ def test_what_the_robot_section_says_is_the_centre_of_its_prior(tmp_path):
     space = job_of(tmp_path, text).problem().space
 
     def prior(path):
-        at = space.place[path]
+        at = space.slices[path]
         return np.exp(space.prior_mean[at]), space.prior_std[at]
 
     np.testing.assert_allclose(prior("robot.wheel_radius"), [[0.04], [0.02]])
@@ -191,7 +191,7 @@ def test_any_name_of_a_floor_will_do(tmp_path):
     (tmp_path / "one_surface/gray").rename(tmp_path / "one_surface/gray[1]*")
     problem = job_of(tmp_path, GOOD).problem()
     assert problem.robot.surfaces.labels == ("gray[1]*",)
-    assert "surface.gray[1]*.slide_viscosity" not in problem.space.place
+    assert "surface.gray[1]*.slide_viscosity" not in problem.space.slices
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ import pytest
 
 from slipid.app import identify, sample
 from slipid.app.config import FitSection
-from slipid.app.problem import ANEW_S, Task
+from slipid.app.problem import RECUT_LAG_S, FitTask
 from slipid.fit.optimise import Optimum
-from slipid.fit.problem import State
+from slipid.fit.problem import FitState
 from slipid.model.robot import build
 from slipid.search_space import Choice
 from slipid.support.progress import Reporter
@@ -26,7 +26,7 @@ def task():
     made = experiment("differential", headings=2)
     robot = build(SHAPES["differential"], ["firm", "soft"], ("as_built",), made.data.session)
     lag = Choice("camera.lag", prior_mean=EXPECTED, prior_std=0.1, free=True)
-    return Task(made.data, robot, (lag,), FitSection())
+    return FitTask(made.data, robot, (lag,), FitSection())
 
 
 def at_lag(task, lag):
@@ -34,7 +34,7 @@ def at_lag(task, lag):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("off", "moves"), [(0.9 * ANEW_S, False), (1.1 * ANEW_S, True)])
+@pytest.mark.parametrize(("off", "moves"), [(0.9 * RECUT_LAG_S, False), (1.1 * RECUT_LAG_S, True)])
 def test_windows_are_cut_at_the_expected_lag_unless_another_is_farther_off(task, off, moves):
     found = task.problem(at_lag(task, EXPECTED + off)).windows
     lag = EXPECTED + off * moves
@@ -50,9 +50,9 @@ def test_a_fit_goes_on_with_windows_at_the_lag_it_found(task, monkeypatch):
         """Finds a lag of 0.12 s, whatever the windows are."""
         fitted.append((problem.windows.lag, before[0]))
         z = np.array(problem.space.start)
-        z[problem.space.place["camera.lag"]] += 0.12 - EXPECTED
+        z[problem.space.slices["camera.lag"]] += 0.12 - EXPECTED
         shared = np.ones((len(problem.windows), 3))
-        state = State(z, np.zeros(len(problem.noise.names)), 9, 1.0, 0.001, "joint", shared)
+        state = FitState(z, np.zeros(len(problem.noise.names)), 9, 1.0, 0.001, "joint", shared)
         return Optimum(state, np.eye(len(z)), True, "settled", (1.0,))
 
     monkeypatch.setattr(identify, "_optimised", fit)
@@ -76,10 +76,10 @@ def test_chains_are_of_windows_as_the_fit_has_cut_them(monkeypatch, tmp_path):
             raise Asked(near)
 
     fit = SimpleNamespace(robot="the robot of the fit")
-    nothing = ("_on_one_floor", "_where_the_logs_are", "_same_logs", "read_config")
+    nothing = ("_refuse_mixed", "_log_folder", "_refuse_other_logs", "read_config")
     for name in nothing:
         monkeypatch.setattr(sample, name, lambda *_: None)
     monkeypatch.setattr(sample, "load", lambda _: fit)
-    monkeypatch.setattr(sample, "read_job", lambda *_: Job())
+    monkeypatch.setattr(sample, "read_fit_task", lambda *_: Job())
     with Reporter(quiet=True) as report, pytest.raises(Asked, match="the robot of the fit"):
         sample.sample(tmp_path, None, sample.Plan(), 1, report)

@@ -6,21 +6,21 @@ from pathlib import Path
 import pytest
 
 from slipid.app.config import parsed
-from slipid.app.problem import Job, read_job
+from slipid.app.problem import ConfigFitTask, read_fit_task
 from slipid.search_space import Space
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.helpers.plain_config import config
 
 
-def job(folder: Path, more: str) -> Job:
+def job(folder: Path, more: str) -> ConfigFitTask:
     file = config(folder)
     text = file.read_text(encoding="utf-8") + more
     with Reporter(quiet=True) as report:
-        return read_job(parsed(file, text), folder / "logs", report)
+        return read_fit_task(parsed(file, text), folder / "logs", report)
 
 
-def free(made: Job) -> set[str]:
+def free(made: ConfigFitTask) -> set[str]:
     return {e.path for e in Space(made.robot, made.choices).free}
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from slipid.app.config import geometry, parsed
-from slipid.app.new.config_lines import ASKS, ConfigLine, drawing
+from slipid.app.new.config_lines import QUESTION_MARK, ConfigLine, drawing
 from slipid.app.new.config_text import new_config
+from slipid.app.new.draft import template_draft
 from slipid.app.new.robot_questions import DRIVES, RobotOptions, ask
-from slipid.app.new.sketch import blank
 from slipid.data.reading.presets import declared_layout
 from slipid.model import geometry as g
 from slipid.support.errors import DataError
@@ -47,7 +47,7 @@ CASES = {
 
 def made(drive: str, **more: str):
     told = RobotOptions(**{**CASES[drive][0], **SIZES, "drive": drive, **more})
-    return new_config(blank(ask(told, None)), "mine.toml")
+    return new_config(template_draft(ask(told, None)), "mine.toml")
 
 
 def refuse(*_: object) -> str:
@@ -58,7 +58,7 @@ def refuse(*_: object) -> str:
 def test_wheels_stand_where_they_were_said_to_be(drive):
     _, places, directions, drives = CASES[drive]
     told = RobotOptions(**{**CASES[drive][0], **SIZES, "drive": drive})
-    config = new_config(blank(ask(told, refuse)), "mine.toml")
+    config = new_config(template_draft(ask(told, refuse)), "mine.toml")
     content = parsed(Path("mine.toml"), config.text).content
     robot = geometry(content.robot)
     place = np.asarray(robot.place) * float(robot.base_radius)
@@ -107,15 +107,17 @@ def test_logs_without_ticks_have_speeds():
 
 
 def test_what_nobody_said_is_a_question_in_the_file_and_in_the_list():
-    config = new_config(blank(ask(RobotOptions(drive="skid", track_m="0.5"), None)), "mine.toml")
+    config = new_config(
+        template_draft(ask(RobotOptions(drive="skid", track_m="0.5"), None)), "mine.toml"
+    )
     asked = [question.partition(":")[0] for question in config.questions]
     assert "half_length_m" in asked
     assert "half_width_m" not in asked
     lines = config.text.splitlines()
-    assert sum(line.startswith(ASKS) for line in lines) == len(config.questions)
+    assert sum(line.startswith(QUESTION_MARK) for line in lines) == len(config.questions)
     assert lines[
         lines.index(next(x for x in lines if x.startswith("half_length_m"))) - 1
-    ].startswith(ASKS)
+    ].startswith(QUESTION_MARK)
 
 
 def test_people_are_asked_only_what_the_drive_needs_and_again_where_they_are_wrong():
@@ -128,7 +130,7 @@ def test_people_are_asked_only_what_the_drive_needs_and_again_where_they_are_wro
 
     known = ask(RobotOptions(), asker)
     assert (known.drive, known.wheelbase_m, known.track_m, known.shared) == ("skid", 0.5, 0.6, True)
-    assert not known.taken
+    assert not known.defaults
     wrong = [text for _, text in said if text]
     assert wrong[0] == (
         "'skidd': no such drive, did you mean skid?; "
@@ -155,7 +157,7 @@ def test_people_are_asked_only_what_the_drive_needs_and_again_where_they_are_wro
 )
 def test_what_was_told_wrong_is_one_clear_error(told, message):
     with pytest.raises(DataError) as caught:
-        new_config(blank(ask(RobotOptions(**told), None)), "mine.toml")
+        new_config(template_draft(ask(RobotOptions(**told), None)), "mine.toml")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 

@@ -11,9 +11,17 @@ from pydantic import BaseModel, Field
 
 from slipid.app import config as c
 from slipid.app.config import read_config
-from slipid.app.reference.kinds import in_words, keys_of
+from slipid.app.reference.keys import (
+    in_short,
+    in_words,
+    keys,
+    keys_of,
+    meaning,
+    parameter_rows,
+    prior,
+    purpose,
+)
 from slipid.app.reference.page import CHAPTERS, reference
-from slipid.app.reference.parameters import in_short, keys, meaning, parameter_rows, prior, purpose
 from slipid.data.reading.bag.layout import RunRule, TopicChannel
 from slipid.data.reading.layout import CHANNELS, Channel, Layout
 from slipid.data.reading.presets import PRESETS
@@ -26,19 +34,19 @@ from slipid.support.errors import DataError
 ROOT = Path(__file__).resolve().parents[2]
 MODELS = (
     *(
-        c.Content,
-        c.Omni,
-        c.Box,
-        c.Differential,
-        c.General,
-        c.Motor,
-        c.Logs,
-        c.Camera,
+        c.ConfigContent,
+        c.OmniDrive,
+        c.FourWheelDrive,
+        c.DifferentialDrive,
+        c.GeneralDrive,
+        c.BenchMotors,
+        c.LogsSection,
+        c.CameraSection,
         c.PriorSection,
-        c.Setting,
+        c.ParameterSection,
     ),
     *(
-        c.Weights,
+        c.WeightsSection,
         c.FitSection,
         c.ValidateSection,
         c.SelftestSection,

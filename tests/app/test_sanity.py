@@ -9,7 +9,7 @@ import pytest
 from slipid.app.check import sanity
 from slipid.app.config import FitSection, read_config
 from slipid.app.identify import identify
-from slipid.app.problem import Task, read_job
+from slipid.app.problem import FitTask, read_fit_task
 from slipid.model.robot import Robot
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -19,7 +19,7 @@ from tests.helpers.shared import invoke
 
 
 def kinds(file: Path) -> list[str]:
-    job = read_job(read_config(file), file.parent / "logs", Reporter(quiet=True))
+    job = read_fit_task(read_config(file), file.parent / "logs", Reporter(quiet=True))
     return [f.kind for f in sanity(job) if f.severity == "wrong"]
 
 
@@ -76,5 +76,5 @@ def test_magnitudes_beside_voltages_are_refused_where_wheels_drag_each_other(
     raws = [raw.less(*([] if volts else ["voltage"])) for raw in drive(SKID, runs=2)]
     runs = as_runs(raws, signed)
     robot = Robot.of(SKID.geometry, 50.0)
-    found = sanity(Task(runs, robot, (), FitSection()))
+    found = sanity(FitTask(runs, robot, (), FitSection()))
     assert [f.kind for f in found].count("braking_unseen") == expected

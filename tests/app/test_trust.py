@@ -4,20 +4,20 @@ import json
 
 import pytest
 
-from slipid.app.trust import Judgement
+from slipid.app.trust import TrustReport
 from slipid.infer.verdicts.disputed import EndPoints, Trust
 from slipid.plots import drawing
 
 
 def judged(word):
-    return Judgement(Trust(word, ("it predicts worse",)), {"gray": EndPoints(0.4, 0.1)}, 12)
+    return TrustReport(Trust(word, ("it predicts worse",)), {"gray": EndPoints(0.4, 0.1)}, 12)
 
 
 def test_a_fit_that_is_not_to_be_trusted_says_so_in_its_pictures():
     bad = judged("not to be trusted")
     assert bad.is_bad
     made = drawing.figure(4.0, 3.0, "a title")
-    drawing.warned(made, bad.warning)
+    drawing.add_warning(made, bad.warning)
     assert made.get_suptitle() == "THIS FIT IS NOT TO BE TRUSTED\na title"
 
 

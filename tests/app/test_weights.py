@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.app.config import Weights, parsed
-from slipid.app.problem import read_job, share_priors
+from slipid.app.config import WeightsSection, parsed
+from slipid.app.problem import read_fit_task, share_priors
 from slipid.model.geometry import mecanum, omni
 from slipid.search_space import Space
 from slipid.support.errors import DataError
@@ -16,7 +16,7 @@ from tests.helpers.broken_logs import write_good
 from tests.helpers.said import KeptMessages
 
 SHAPE = omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0)
-SCALES = Weights(kg=[3.0, 5.0, 4.0], std_kg=0.06)
+SCALES = WeightsSection(kg=[3.0, 5.0, 4.0], std_kg=0.06)
 
 
 def test_scales_are_shares():
@@ -27,7 +27,7 @@ def test_scales_are_shares():
 
 
 def test_a_mass_at_a_place_keeps_the_balance_of_forces_and_moments():
-    added = Weights(like="as_built", mass_kg=1.5, place_m=(0.03, -0.02), std_kg=0.08)
+    added = WeightsSection(like="as_built", mass_kg=1.5, place_m=(0.03, -0.02), std_kg=0.08)
     prior = share_priors({"moved": added, "as_built": SCALES}, SHAPE)["moved"]
     kg = np.asarray(prior.prior_mean) * 13.5
     place = np.asarray(SHAPE.place) * 0.125
@@ -39,15 +39,15 @@ def test_a_mass_at_a_place_keeps_the_balance_of_forces_and_moments():
 
 def test_a_mass_above_a_wheel_of_three_is_on_that_wheel():
     place = tuple(np.asarray(SHAPE.place)[1] * 0.125)
-    added = Weights(like="as_built", mass_kg=-1.0, place_m=place, std_kg=0.05)
+    added = WeightsSection(like="as_built", mass_kg=-1.0, place_m=place, std_kg=0.05)
     prior = share_priors({"as_built": SCALES, "light": added}, SHAPE)["light"]
     assert np.asarray(prior.prior_mean) * 11 == pytest.approx([3.0, 4.0, 4.0])
 
 
 def test_four_wheels_share_what_is_in_the_middle():
     shape = mecanum(0.2, 0.15, 0.05)
-    even = Weights(kg=[2.0, 2.0, 3.0, 3.0], std_kg=0.1)
-    added = Weights(like="a", mass_kg=4.0, place_m=(0.0, 0.0), std_kg=0.1)
+    even = WeightsSection(kg=[2.0, 2.0, 3.0, 3.0], std_kg=0.1)
+    added = WeightsSection(like="a", mass_kg=4.0, place_m=(0.0, 0.0), std_kg=0.1)
     prior = share_priors({"a": even, "b": added}, shape)["b"]
     assert np.asarray(prior.prior_mean) * 14 == pytest.approx([3.0, 3.0, 4.0, 4.0])
 
@@ -87,22 +87,22 @@ def test_what_makes_no_weight_is_refused(tmp_path, text, expected):
     write_good(tmp_path)
     whole = f"{GOOD}\n[weights.as_built]\n{text}\n"
     with pytest.raises(DataError, match=r"my\.toml: ") as caught:
-        read_job(parsed(tmp_path / "my.toml", whole), tmp_path, KeptMessages())
+        read_fit_task(parsed(tmp_path / "my.toml", whole), tmp_path, KeptMessages())
     assert expected in str(caught.value)
 
 
 def test_weights_are_the_prior_and_those_of_no_run_are_skipped(tmp_path):
     write_good(tmp_path)
     text = GOOD + WEIGHTS + WEIGHTS.replace("as_built", "loaded")
-    job = read_job(parsed(tmp_path / "my.toml", text), tmp_path, KeptMessages())
+    job = read_fit_task(parsed(tmp_path / "my.toml", text), tmp_path, KeptMessages())
     assert "skipped: weights.loaded: no run that has it" in job.skipped
     space = Space(job.robot, job.choices)
-    at = space.place["robot.load_share@as_built"]
+    at = space.slices["robot.load_share@as_built"]
     entry = next(e for e in space.free if e.path == "robot.load_share@as_built")
     mean = np.asarray(entry.declaration.to_si(jnp.asarray(space.prior_mean[at])))
     assert mean == pytest.approx([0.25, 5 / 12, 1 / 3])
     assert (space.prior_std[at] < 0.03).all()
-    plain = read_job(parsed(tmp_path / "my.toml", GOOD), tmp_path, KeptMessages())
+    plain = read_fit_task(parsed(tmp_path / "my.toml", GOOD), tmp_path, KeptMessages())
     assert (Space(plain.robot, plain.choices).prior_std[at] > 0.2).all()
 
 
@@ -111,7 +111,7 @@ def test_runs_of_sections_with_one_session_name_belong_together(tmp_path):
     text = GOOD.replace(
         'format = "robotino2022"', 'format = "robotino2022"\nsession_name = "may 3"'
     )
-    job = read_job(parsed(tmp_path / "my.toml", text), tmp_path, KeptMessages())
+    job = read_fit_task(parsed(tmp_path / "my.toml", text), tmp_path, KeptMessages())
     assert set(job.dataset.session) == {"may 3"}
     both = text.replace("session_name", 'session = "file"\nsession_name')
     with pytest.raises(DataError, match="session and session_name at once"):

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from slipid.app.config import read_config
-from slipid.app.problem import Job, read_job
+from slipid.app.problem import ConfigFitTask, read_fit_task
 from slipid.fit.optimise import optimise
 from slipid.predict.folds import folds_of
 from slipid.predict.predictive import log_student
@@ -29,11 +29,11 @@ WITHOUT = Choice("motor.rolling_drag", fixed=0.0)
 
 
 @pytest.fixture(scope="module")
-def job(real_data: Path) -> Job:
-    return read_job(read_config(CONFIG), real_data / "robotino2022", Reporter())
+def job(real_data: Path) -> ConfigFitTask:
+    return read_fit_task(read_config(CONFIG), real_data / "robotino2022", Reporter())
 
 
-def densities(job: Job) -> np.ndarray:
+def densities(job: ConfigFitTask) -> np.ndarray:
     """Log density of the currents of every run, given motion, from fits without its sector."""
     problem, fold = job.problem(), folds_of(job.dataset, "sectors", 6)[job.problem().windows.run]
     end = optimise(problem)
@@ -47,13 +47,13 @@ def densities(job: Job) -> np.ndarray:
         density = log_student(gap, np.asarray(problem.covariance("current", at[1])))
         out[fold == k] = density[fold == k]
     if "motor.rolling_drag" in problem.space.names:
-        where = problem.space.place["motor.rolling_drag"]
+        where = problem.space.slices["motor.rolling_drag"]
         std = np.sqrt(np.diag(end.covariance))[where]
         print(f"\ndrag along the drive {end.state.z[where]} +- {std}, in that of the rollers")
     return out
 
 
-def test_drag_along_the_drive(job: Job) -> None:
+def test_drag_along_the_drive(job: ConfigFitTask) -> None:
     without = densities(replace(job, choices=(*job.choices, WITHOUT)))
     gain = densities(job) - without
     w, fold = job.problem().windows, folds_of(job.dataset, "sectors", 6)

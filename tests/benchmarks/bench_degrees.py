@@ -18,12 +18,12 @@ import pytest
 from scipy.special import gammaln
 
 from slipid.app.config import read_config
-from slipid.app.problem import read_job
+from slipid.app.problem import read_fit_task
 from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, less
+from slipid.fit.problem import Problem, without_effects
 from slipid.predict import open_loop
 from slipid.predict.folds import folds_of
-from slipid.predict.predictive import contact_of
+from slipid.predict.predictive import force_balance_of
 from slipid.predict.validation import ScoredRun, add_scores
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK, quick
@@ -38,9 +38,9 @@ def likelihood(problem: Problem, end: Optimum, degrees: float) -> dict[str, floa
     keep, at = np.ones(len(problem.windows)), (end.state.z, end.state.log_variance)
     residual, _ = problem.linear(at[0], problem.electric(*at))
     effect = end.state.shared(len(keep))
-    seen = problem.seen(residual, at[1], keep, effect)
+    seen = problem.weighed(residual, at[1], keep, effect)
     out = {}
-    for block, r in less(problem.target, residual, effect).items():
+    for block, r in without_effects(problem.objective, residual, effect).items():
         one = {block: r}
         loss = float(problem.whitening(one, at[1], keep).loss)
         m = r.shape[1]
@@ -56,7 +56,7 @@ def test_degrees(degrees: float, real_data: Path, monkeypatch: pytest.MonkeyPatc
         if name.startswith("slipid.") and name != OWN and hasattr(module, "DEGREES"):
             monkeypatch.setattr(module, "DEGREES", degrees)
     jax.clear_caches()  # compiled functions have the degrees in them
-    job = read_job(read_config(CONFIG), real_data / "robotino2022", Reporter())
+    job = read_fit_task(read_config(CONFIG), real_data / "robotino2022", Reporter())
     problem, data = job.problem(), job.dataset
     end = optimise(problem)
     found = likelihood(problem, end, degrees)
@@ -71,10 +71,10 @@ def test_degrees(degrees: float, real_data: Path, monkeypatch: pytest.MonkeyPatc
         judged = np.flatnonzero(fold == k)
         keep = (~np.isin(problem.windows.run, judged)).astype(float)
         part = optimise(problem, keep=keep, start=replace(end.state, round=0))
-        model = contact_of(problem, part.state, part.covariance, keep)
+        model = force_balance_of(problem, part.state, part.covariance, keep)
         runs: dict[int, ScoredRun] = {}
         some = data.subset(judged)
-        for w in open_loop.cuts(some, model.robot):
+        for w in open_loop.replay_windows(some, model.robot):
             add_scores(runs, some, model.name, *model.ends(w))
         density = model.log_density(problem)
         for i, row in runs.items():

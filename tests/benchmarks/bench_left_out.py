@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 
 from slipid.app.config import read_config
-from slipid.app.problem import Job, read_job
+from slipid.app.problem import ConfigFitTask, read_fit_task
 from slipid.data.runs import Runs
 from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, still_viscosities
+from slipid.fit.problem import Problem, fixed_viscosities
 from slipid.infer.result import draws
 from slipid.model.robot import build
 from slipid.predict.folds import judge
@@ -36,9 +36,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
-def job(real_data: Path) -> Job:
+def job(real_data: Path) -> ConfigFitTask:
     config = read_config(ROOT / "configs" / "robotino2022.toml")
-    return read_job(config, real_data / "robotino2022", Reporter())
+    return read_fit_task(config, real_data / "robotino2022", Reporter())
 
 
 def show(title: str, floors: Mapping[str, Ranking]) -> None:
@@ -60,7 +60,7 @@ def count(floors: Mapping[str, Ranking]) -> int:
     return sum(floor.runs for floor in floors.values())
 
 
-def some(job: Job, runs: np.ndarray) -> tuple[Runs, Problem]:
+def some(job: ConfigFitTask, runs: np.ndarray) -> tuple[Runs, Problem]:
     """Runs and problem of a part of the runs, viscous terms held where they must be."""
     data = job.dataset.subset(runs)
     robot = build(
@@ -76,24 +76,24 @@ def some(job: Job, runs: np.ndarray) -> tuple[Runs, Problem]:
         for c in job.choices
         if not (c.pattern.startswith("surface.") and c.pattern.split(".")[1] not in floors)
     ]
-    part = replace(job, dataset=data, robot=robot, choices=tuple(still_viscosities(data) + choices))
+    part = replace(job, dataset=data, robot=robot, choices=tuple(fixed_viscosities(data) + choices))
     return data, part.problem()
 
 
-def test_sectors(job: Job) -> None:
+def test_sectors(job: ConfigFitTask) -> None:
     floors = compared(job.problem(), job.choices, job.dataset, "sectors", 6, quiet=True).floors
     show("(a) left-out 60-degree sectors", floors)
     assert count(floors) == len(job.dataset)
 
 
-def test_random_headings(job: Job) -> None:
+def test_random_headings(job: ConfigFitTask) -> None:
     floors = compared(job.problem(), job.choices, job.dataset, "random", 6, quiet=True).floors
     show("(d) random headings", floors)
     assert count(floors) == len(job.dataset)
 
 
 @pytest.mark.parametrize("seen", quick([(0.1,), (0.1, 0.2)], [(0.1,)]))
-def test_speeds(job: Job, seen: tuple[float, ...]) -> None:
+def test_speeds(job: ConfigFitTask, seen: tuple[float, ...]) -> None:
     data = job.dataset
     speed = np.round(data.speed, 2)
     several = np.array([log.surface in ("gray", "green") for log in data.logs])
@@ -107,7 +107,7 @@ def test_speeds(job: Job, seen: tuple[float, ...]) -> None:
     assert count(floors) == len(judged)
 
 
-def test_moved_load(job: Job) -> None:
+def test_moved_load(job: ConfigFitTask) -> None:
     """Fit of one_surface; of the moved load only the shares, from a third of its headings."""
     data, problem = job.dataset, job.problem()
     moved = np.array([log.load == "moved" for log in data.logs])
@@ -144,7 +144,7 @@ def without_third(data: Runs, runs: np.ndarray) -> np.ndarray:
     return runs[~np.isin(heading, np.unique(heading)[::3])]
 
 
-def test_load_shares(job: Job) -> None:
+def test_load_shares(job: ConfigFitTask) -> None:
     """Where the weight rests, from each carpet by itself and from all floors together."""
     floor = np.array([str(log.surface) for log in job.dataset.logs])
     print("\nload shares of the wheels with 90 % intervals")
@@ -171,7 +171,7 @@ def print_shares(
     z, out = optimum.state.z, {}
     for load in loads:
         entry = next(e for e in problem.space.free if e.path == f"robot.load_share@{load}")
-        at = problem.space.place[entry.path]
+        at = problem.space.slices[entry.path]
         some_z = draws(z, optimum.covariance, 4000, 0)[:, at]
         drawn = np.asarray(jax.vmap(entry.declaration.to_si)(some_z))
         low, high = np.quantile(drawn, (0.05, 0.95), axis=0)

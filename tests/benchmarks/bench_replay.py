@@ -25,17 +25,17 @@ import numpy as np
 import pytest
 
 from slipid.app.config import parsed
-from slipid.app.problem import Job, read_job, with_mixed
-from slipid.deploy.deploy import robot_of
+from slipid.app.problem import ConfigFitTask, read_fit_task, with_mixed
+from slipid.deploy.deploy import robot_of_force_balance
 from slipid.deploy.floors import floor_of
 from slipid.fit.likelihood import batch
 from slipid.fit.optimise import optimise
 from slipid.infer.slip_curves import current_trend
-from slipid.predict.folds import facts_of, sectors
-from slipid.predict.predictive import Contact, contact_of
+from slipid.predict.folds import fold_keys, sectors
+from slipid.predict.predictive import ForceBalance, force_balance_of
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
-from slipid.robot.interface import MIXED, Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK
 from tests.helpers import replayed
@@ -69,11 +69,11 @@ Made = TypeVar("Made")
 
 
 @pytest.fixture(scope="module")
-def job(real_data: Path) -> Job:
+def job(real_data: Path) -> ConfigFitTask:
     config = parsed(CONFIG, CONFIG.read_text(encoding="utf-8") + ACROSS)
     root = real_data / "robotino2022"
     report = Reporter()
-    return with_mixed(read_job(config, root, report), root, report)
+    return with_mixed(read_fit_task(config, root, report), root, report)
 
 
 def kept(name: str, make: Callable[[], Made]) -> Made:
@@ -87,20 +87,20 @@ def kept(name: str, make: Callable[[], Made]) -> Made:
     return found
 
 
-def fitted(job: Job, runs: np.ndarray) -> Contact:
+def fitted(job: ConfigFitTask, runs: np.ndarray) -> ForceBalance:
     """Fit of some of the runs on one floor."""
     problem = job.problem()
     keep = np.isin(problem.windows.run, runs).astype(float)
     optimum = optimise(problem, keep=keep)
-    return contact_of(problem, optimum.state, optimum.covariance, keep)
+    return force_balance_of(problem, optimum.state, optimum.covariance, keep)
 
 
-def deployed(job: Job, contact: Contact, runs: np.ndarray) -> DeployedRobot:
+def deployed(job: ConfigFitTask, contact: ForceBalance, runs: np.ndarray) -> DeployedRobot:
     """From a fit; `runs` on one floor are those it was fitted to."""
     windows = job.problem().windows
-    seen = windows.pieces(np.flatnonzero(np.isin(windows.run, runs)))
+    seen = windows.segments(np.flatnonzero(np.isin(windows.run, runs)))
     trend = current_trend(contact.robot, batch(seen, contact.robot))
-    return robot_of(contact, TOP, trend, load="as_built")
+    return robot_of_force_balance(contact, TOP, trend, load="as_built")
 
 
 def show(rows: list[Judged]) -> None:
@@ -129,9 +129,9 @@ def show(rows: list[Judged]) -> None:
         print(line)
 
 
-def test_one_floor(job: Job) -> None:
+def test_one_floor(job: ConfigFitTask) -> None:
     data = job.dataset
-    fold = sectors(facts_of(data)) % 3
+    fold = sectors(fold_keys(data)) % 3
     built = np.array([log.load == "as_built" for log in data.logs])
     rows: list[Judged] = []
     for k in range(3):
@@ -149,7 +149,7 @@ def test_one_floor(job: Job) -> None:
     assert QUICK or np.mean([r.told == r.surface for r in rows]) > TOLD
 
 
-def test_two_floors(job: Job) -> None:
+def test_two_floors(job: ConfigFitTask) -> None:
     data, floor = job.mixed[0]
     everything = np.arange(len(job.dataset))
     fit = kept("everything", lambda: fitted(job, everything))
@@ -161,8 +161,13 @@ def test_two_floors(job: Job) -> None:
     ]
     for title, settings, there, mapped in (
         ("any of four", Settings(), known.labels, None),
-        ("these two", Settings(alike=MIXED), PAIR, None),
-        ("their map", Settings(alike=MIXED), PAIR, floor_of(floor, PAIR)),
+        ("these two", Settings(further_floor_penalty=MIXED_FLOORS_PENALTY), PAIR, None),
+        (
+            "their map",
+            Settings(further_floor_penalty=MIXED_FLOORS_PENALTY),
+            PAIR,
+            floor_of(floor, PAIR),
+        ),
     ):
         est = Estimator(known.on(*there), settings, mapped)
         said, labels = replayed.replay(est, data.logs, np.array(begin)), est.robot.labels

@@ -41,10 +41,10 @@ def shares(found):
 
 def ends(robot):
     """Whether each case came to this end, by name of the end."""
-    from slipid.deploy.controllers import pilot_of
-    from slipid.deploy.deploy import habits_of
+    from slipid.deploy.controllers import control_loop_of
+    from slipid.deploy.deploy import actuator_model_of
     from slipid.lab.trial.controllers import ROWS
-    from slipid.lab.trial.plants import one_of
+    from slipid.lab.trial.plants import drawn_robot
     from slipid.robot import trajectory
     from slipid.robot.closed_loop import PERIOD
     from slipid.robot.filter.floor import Floor
@@ -61,7 +61,9 @@ def ends(robot):
             return self.kept
 
     rng = np.random.default_rng(SEED)
-    truths = jax.tree.map(lambda *x: jnp.stack(x), *[one_of(robot, SEED + k) for k in range(CASES)])
+    truths = jax.tree.map(
+        lambda *x: jnp.stack(x), *[drawn_robot(robot, SEED + k) for k in range(CASES)]
+    )
     under = jnp.asarray(rng.integers(len(robot.labels), size=(CASES, robot.wheels)))
     gap, way = rng.uniform(0.05, 0.3, CASES), rng.uniform(-np.pi, np.pi, CASES)
     turn, heading = rng.uniform(-0.8, 0.8, CASES), rng.uniform(-np.pi, np.pi, CASES)
@@ -69,14 +71,14 @@ def ends(robot):
     keys = jax.random.split(jax.random.key(SEED), CASES)
     line = trajectory.waypoints([(0.0, 0.0), (0.4, 0.0)], speed=0.1)
     paths = [line.moved((0.0, 0.0, float(a))) for a in heading]
-    habits = habits_of(robot, gyro=False)
-    pilot = pilot_of(robot, ROWS["contact"], Settings.of(robot))
+    habits = actuator_model_of(robot, gyro=False)
+    control_loop = control_loop_of(robot, ROWS["contact"], Settings.of(robot))
 
     @eqx.filter_jit
     def one(truth, kept, path, place, key):
         floor = OneEach(jnp.zeros((1, 1), int), jnp.zeros(2), jnp.ones(()), kept)
         plant = TellingTwin(truth, floor, habits, fix_std=jnp.full(2, 1e-3))
-        return rollout(pilot, path, plant, place, key, STEPS)
+        return rollout(control_loop, path, plant, place, key, STEPS)
 
     found = {name: np.zeros(CASES, bool) for name in ("arrive", "give up", "rest", "go on")}
     for k, path in enumerate(paths):
@@ -86,7 +88,7 @@ def ends(robot):
         off = poses[-1] - np.asarray(path.rows[-1, :3])
         off[2] = np.sin(0.5 * off[2])
         moved = np.ptp(poses[-round(LAST_S / PERIOD) :], axis=0)
-        if said.given_up[-1]:
+        if said.gave_up[-1]:
             end = "give up"
         elif said.time[-1] >= path.duration - 1e-6 and np.all(np.abs(off) < NEAR):
             end = "arrive"

@@ -35,7 +35,7 @@ def problem_of(floor):
     """Likelihood of the runs on one floor."""
     from slipid.app.config import read_config
     from slipid.app.logs import read_dataset
-    from slipid.app.problem import job_of
+    from slipid.app.problem import fit_task
     from slipid.support.jax_setup import setup_jax
     from slipid.support.progress import Reporter
 
@@ -44,7 +44,7 @@ def problem_of(floor):
     logs = config.content.logs
     dataset, _ = read_dataset(config, logs, DATA, Reporter(quiet=True))
     mine = [k for k, log in enumerate(dataset.logs) if log.surface == floor][:: quick(1, 3)]
-    return job_of(config, dataset.subset(mine), [], Reporter(quiet=True)).problem()
+    return fit_task(config, dataset.subset(mine), [], Reporter(quiet=True)).problem()
 
 
 @pytest.fixture(scope="module")
@@ -92,8 +92,8 @@ def by_slipid(density):
     x = np.repeat(d.centre[None], plan.walkers, axis=0)
     d.terms(x), d.slope(x)  # compiles
     times = [time.perf_counter()]
-    record = BlockStore(keep=lambda part, block: times.append(time.perf_counter()))
-    blocks = sampler.extended(target, plan, MOTION, record)
+    store = BlockStore(keep=lambda part, block: times.append(time.perf_counter()))
+    blocks = sampler.extended(target, plan, MOTION, store)
     warm = plan.warm_up[-1]
     chain = sampler.chain(blocks, plan)
     found = diagnose(chain, plan)

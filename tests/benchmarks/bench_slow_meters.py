@@ -11,7 +11,7 @@ that no number is more than 3.5 of its stds off.
 import pytest
 
 from slipid.data.runs import collect
-from slipid.lab.selftest.logs import Sensors, make_logs
+from slipid.lab.selftest.logs import SimulatedSensors, simulate_logs
 from tests.benchmarks.quick import QUICK, quick
 from tests.helpers.kinds import SHAPES, fitted, known, plan, wanted
 from tests.helpers.slow_meters import held
@@ -19,7 +19,7 @@ from tests.helpers.slow_meters import held
 EVERY = quick((1, 4, 16), (4,))
 """Rows from one reading of the meters to the next."""
 SEEDS = quick((0, 1, 2), (0,))
-FINE = Sensors(ripple=0.005, current_step=0.002, voltage_step=0.005, signed=True)
+FINE = SimulatedSensors(ripple=0.005, current_step=0.002, voltage_step=0.005, signed=True)
 
 
 @pytest.mark.parametrize("kind", quick(["differential", "skid"], ["differential"]))
@@ -29,7 +29,7 @@ def test_what_slow_meters_tell(kind):
     for seed in SEEDS:
         drives = plan(SHAPES[kind], 12)
         truth = known(SHAPES[kind], drives)
-        logs = make_logs(truth, drives, seed, FINE)
+        logs = simulate_logs(truth, drives, seed, FINE)
         for rows in EVERY:
             data = collect([held(log, rows, 7 * k) for k, log in enumerate(logs)])
             fit = fitted(truth, data, wanted(truth, data))

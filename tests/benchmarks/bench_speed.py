@@ -44,15 +44,15 @@ def problem():
 
 def real_job():
     from slipid.app.config import read_config
-    from slipid.app.problem import job_of, read_job
+    from slipid.app.problem import fit_task, read_fit_task
     from slipid.support.progress import Reporter
 
     config = read_config(ROOT / "configs" / "robotino2022.toml")
-    job = read_job(config, DATA, Reporter(quiet=True))
+    job = read_fit_task(config, DATA, Reporter(quiet=True))
     if not QUICK:
         return job
     few = job.dataset.subset(np.arange(0, len(job.dataset), 7))
-    return job_of(config, few, [], Reporter(quiet=True))
+    return fit_task(config, few, [], Reporter(quiet=True))
 
 
 def best_of(function, repeats):

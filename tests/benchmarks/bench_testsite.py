@@ -19,16 +19,16 @@ import jax
 import numpy as np
 
 from slipid.app.config import parsed
-from slipid.app.problem import read_job
+from slipid.app.problem import read_fit_task
 from slipid.data.floor_map import FloorMap, four_zones, patchwork
 from slipid.lab.testsite.config import plan
-from slipid.lab.testsite.driving import Run, Timed, drive, straight
-from slipid.lab.testsite.ground import GROUNDS
-from slipid.lab.testsite.motors import Machine
-from slipid.lab.testsite.plant import Plant
-from slipid.lab.testsite.sections import Headings, PaperGrid, Rectangle, Wander
-from slipid.lab.testsite.simulate import observe, simulate, truth
+from slipid.lab.testsite.driving import SiteRun, TimedTwists, drive, straight
+from slipid.lab.testsite.plant import SimulatedRobot
+from slipid.lab.testsite.robot_build import RobotBuild
+from slipid.lab.testsite.sections import HeadingRuns, PaperGridRuns, RectangleRuns, WanderRuns
+from slipid.lab.testsite.simulate import log_of, simulate, truth
 from slipid.lab.testsite.site import Site
+from slipid.lab.testsite.surfaces import SURFACES
 from slipid.predict.ranking import compared
 from slipid.support.executor import Processes
 from slipid.support.progress import Reporter
@@ -71,7 +71,7 @@ def job_of(out: Path):
     """The identification job that the simulation wrote beside its logs."""
     path = out / "robot.toml"
     config = parsed(path, path.read_text(encoding="utf-8"))
-    return read_job(config, out / "logs", Reporter(quiet=True))
+    return read_fit_task(config, out / "logs", Reporter(quiet=True))
 
 
 # speed
@@ -82,7 +82,7 @@ def test_speed_on_one_core() -> None:
     print("\nsurface   times real time   us a step: engine  motors  floor")
     # in a process of its own: in this one every call's types are checked
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        for surface, (pace, parts) in zip(GROUNDS, pool.map(_pace, GROUNDS), strict=True):
+        for surface, (pace, parts) in zip(SURFACES, pool.map(_pace, SURFACES), strict=True):
             print(f"{surface:8}  {pace:10.1f}   " + "  ".join(f"{p:14.1f}" for p in parts))
             assert QUICK or pace > 4.0
 
@@ -101,7 +101,7 @@ def _profile(surface: str) -> list[float]:
     """Microseconds a step of engine, motors and floor."""
     site = Site()
     run = straight(surface, "as_built", 1.0, 0.2, 0.5)
-    plant = Plant(site, run.map, "as_built")
+    plant = SimulatedRobot(site, run.map, "as_built")
     wanted = (site.machine.wheel_from_twist @ np.array([0.1, 0.1, 0.0])).tolist()
     spent = [0.0, 0.0, 0.0]
     engine, motors, look = plant._step, plant.drive.step, plant._look
@@ -282,15 +282,15 @@ def test_what_biases_load_shares() -> None:
 
 def test_currents_on_mixed_surfaces() -> None:
     """Wheels of a pair on two surfaces: does each draw the current of the floor beneath it?"""
-    machine = replace(Machine(), centres_m={"as_built": (0.0, 0.0)})
+    machine = replace(RobotBuild(), centres_m={"as_built": (0.0, 0.0)})
     site = Site(machine=machine)
     seeds = range(quick(6, 2))
 
     def currents(floor: FloorMap | None, surface: str | None, speed: float) -> np.ndarray:
         """Mean |current| of wheels 1 and 3, which x motion drives alike (seed, 2)."""
-        program = Timed((((speed, 0.0, 0.0), 3.0),))
+        program = TimedTwists((((speed, 0.0, 0.0), 3.0),))
         start = (-1.5 * speed, 0.0, 0.0)
-        runs = [Run(surface, "as_built", program, start, floor, "mixed") for _ in seeds]
+        runs = [SiteRun(surface, "as_built", program, start, floor, "mixed") for _ in seeds]
         each = []
         for seed, run in zip(seeds, runs, strict=True):
             trace = drive(run, site, seed)
@@ -435,13 +435,13 @@ def _figure_logs(site: Site) -> dict:
     floor = patchwork(["firm", "short", "medium", "soft"], seed=2)
     zones = four_zones(["firm", "medium", "soft", "short"])
     plans = {
-        "site": Wander(map="site", count=quick(12, 2)).runs(floor, 4),
-        "rectangle": Rectangle(map="zones", repeats=quick(6, 1)).runs(zones, 0),
+        "site": WanderRuns(map="site", count=quick(12, 2)).runs(floor, 4),
+        "rectangle": RectangleRuns(map="zones", repeats=quick(6, 1)).runs(zones, 0),
     }
     for surface in ("firm", "medium", "soft"):
-        plans[surface] = PaperGrid(surface=surface).runs()[:: quick(1, 20)]
+        plans[surface] = PaperGridRuns(surface=surface).runs()[:: quick(1, 20)]
     for surface in ("firm", "short", "medium", "soft"):
-        plan = Headings(
+        plan = HeadingRuns(
             surface=surface, step_deg=quick(10.0, 120.0), speeds_m_s=[0.2], distance_m=0.6
         )
         plans[f"{surface} headings"] = plan.runs()
@@ -453,7 +453,7 @@ def _figure_logs(site: Site) -> dict:
         )
         for (key, k, run), trace in zip(jobs, traces, strict=True):
             out[key].append(
-                trace if key == "rectangle" else observe(trace, site, run, f"{key}/{k}", k)
+                trace if key == "rectangle" else log_of(trace, site, run, f"{key}/{k}", k)
             )
     return out
 
@@ -481,7 +481,7 @@ def _points(logs: list) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _by_heading(ax, logs: list, colour: str, label: str) -> np.ndarray:
     """Draw the slip of the body against the direction of travel of every run; the slips."""
-    back = np.linalg.pinv(Machine().wheel_from_twist)
+    back = np.linalg.pinv(RobotBuild().wheel_from_twist)
     way, slip = [], []
     for log in logs:
         far = back @ log.wheel_angle[-1]

@@ -22,10 +22,9 @@ import pytest
 
 from slipid.camera.frames.source import open_source
 from slipid.camera.overhead import Lens, OverheadCamera
-from slipid.camera.tracking.track import summary
 from slipid.camera.tracking.tracking import LoneMarker, track
 from slipid.data.floor_map import uniform
-from slipid.lab.testsite.site import Camera, Site
+from slipid.lab.testsite.site import Site, SiteCamera
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.benchmarks.quick import QUICK, quick
@@ -100,7 +99,7 @@ def test_speed(video, tmp_path):
 def test_accuracy_on_the_test_site(tmp_path, speed):
     from slipid.lab.testsite.studio import Studio, film
 
-    camera, site = Camera(), Site()
+    camera, site = SiteCamera(), Site()
     try:
         studio = Studio(site, "as_built", uniform(next(iter(site.grounds))), camera, seed=5)
     except DataError as error:
@@ -133,7 +132,7 @@ def test_accuracy_on_the_test_site(tmp_path, speed):
     position = 1e3 * np.sqrt((off[:, :2] ** 2).sum(axis=1).mean())
     angle = np.degrees(np.sqrt((off[:, 2] ** 2).mean()))
     print(
-        f"\n{speed} m/s: {summary([done])[0]}; errors {position:.3f} mm, "
+        f"\n{speed} m/s: {done.summary()}; errors {position:.3f} mm, "
         f"{angle:.3f} deg, NEES {squares.mean():.2f}, in the 90 % region "
         f"{100 * (squares < 6.25).mean():.0f} %"
     )

@@ -20,8 +20,8 @@ ROWS = ("encoder", "contact", "contact_map", "contact_gyro")
 
 def test_other_starts_on_other_maps(fit_folder, robot, tmp_path):
     from slipid.data.floor_map import patchwork, write_map
-    from slipid.lab.trial.summary import not_told_apart, summaries
-    from slipid.lab.trial.trial import Wish, trial
+    from slipid.lab.trial.summary import best_controllers, summaries
+    from slipid.lab.trial.trial import TrialOptions, trial
     from slipid.support.progress import Reporter
 
     labels = robot.labels
@@ -30,7 +30,7 @@ def test_other_starts_on_other_maps(fit_folder, robot, tmp_path):
     for seed in MAPS:
         there = tmp_path / f"map{seed}.toml"
         write_map(there, patchwork(labels, seed, patch=0.35, half=2.0), colours)
-        wish = Wish(map=there, controllers=ROWS, starts=STARTS, jobs=os.cpu_count() or 1)
+        wish = TrialOptions(map=there, controllers=ROWS, starts=STARTS, jobs=os.cpu_count() or 1)
         runs += trial(fit_folder, wish, Reporter(quiet=True)).runs
     table = summaries(runs)
     base = table["encoder"].median
@@ -47,6 +47,6 @@ def test_other_starts_on_other_maps(fit_folder, robot, tmp_path):
             f" than they in {row.worse_share:3.0%}, cross-track {across.value:4.0%},"
             f" {row.finished_share:4.0%} finish"
         )
-    print("not told apart:", ", ".join(not_told_apart(runs)))
+    print("not told apart:", ", ".join(best_controllers(runs)))
     assert QUICK or min(row.finished_share for row in table.values()) > 0.9
     assert np.isfinite(base["closure_error_median"])

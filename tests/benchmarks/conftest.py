@@ -31,12 +31,12 @@ def fit_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return Path(folder)
     if not QUICK:
         pytest.skip("no fit: set SLIPID_FIT to a folder that slipid identify wrote")
-    from slipid.lab.selftest.logs import grid
+    from slipid.lab.selftest.logs import heading_grid
     from tests.helpers.shared import identify
 
     floors = ("firm", "as_built"), ("soft", "as_built")
     made = tmp_path_factory.mktemp("fit")
-    done = identify(made, grid(setups=floors, headings=6, speeds=(0.1, 0.3), turns=0))
+    done = identify(made, heading_grid(setups=floors, headings=6, speeds=(0.1, 0.3), turns=0))
     assert done.exit_code in (0, 1), done.stderr
     return made / "out"
 

@@ -23,15 +23,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.deploy.controllers import pilot_of
-from slipid.deploy.deploy import habits_of, read_robot
+from slipid.deploy.controllers import control_loop_of
+from slipid.deploy.deploy import actuator_model_of, read_robot
 from slipid.deploy.floors import floor_of
-from slipid.deploy.twin_run import site, starts
+from slipid.deploy.twin_run import starts, twin_floor
 from slipid.export.c99.code import Code
 from slipid.lab.trial.controllers import ROWS
 from slipid.model.geometry import omni
 from slipid.robot import trajectory
-from slipid.robot.closed_loop import PERIOD, Pilot
+from slipid.robot.closed_loop import PERIOD, ControlLoop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.twin import Twin
 from tests.benchmarks.quick import quick
@@ -77,22 +77,22 @@ def rounds(count: int) -> trajectory.Path:
     """So many times round a circle to the right, in 11 s each."""
     angle = np.linspace(0.0, 2 * np.pi * count, 720 * count + 1)
     places = 0.35 * np.stack([np.sin(angle), np.cos(angle) - 1.0], axis=1)
-    return trajectory.curve(places).waiting(1.0)
+    return trajectory.curve(places).after_rest(1.0)
 
 
 PATH = rounds(6)
 
 
 @cache
-def pilot(row: str) -> Pilot:
+def control_loop(row: str) -> ControlLoop:
     """Estimator and controller of a row."""
-    return pilot_of(three_floors(), ROWS[row])
+    return control_loop_of(three_floors(), ROWS[row])
 
 
 @cache
 def code(row: str) -> Code:
     """Their code."""
-    return Code(three_floors(), pilot(row), PATH)
+    return Code(three_floors(), control_loop(row), PATH)
 
 
 class Fleet(CompiledC):
@@ -128,8 +128,10 @@ class Plants:
     """Twins of a robot, one for every start, on the patches that `slipid trial` drives on."""
 
     def __init__(self, robot: DeployedRobot, path: trajectory.Path, count: int):
-        ground = site(robot)
-        self.twin = Twin(robot, floor_of(ground, robot.labels), habits_of(robot, gyro=False))
+        ground = twin_floor(robot)
+        self.twin = Twin(
+            robot, floor_of(ground, robot.labels), actuator_model_of(robot, gyro=False)
+        )
         self.starts = jnp.asarray(starts(count, ground, path))
         self.keys = jax.vmap(jax.random.key)(jnp.arange(count))
         noise = self.twin.noise

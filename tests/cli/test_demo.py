@@ -12,7 +12,7 @@ import pytest
 from slipid.app import logs as packaged
 from slipid.app.config import read_config
 from slipid.app.logs import RECORDED, packaged_config, unpack
-from slipid.app.problem import read_job
+from slipid.app.problem import read_fit_task
 from slipid.cli import demo
 from slipid.cli.demo import PARTS, drive_anew
 from slipid.lab.testsite.config import plan
@@ -20,7 +20,7 @@ from slipid.lab.testsite.driving import drive
 from slipid.plots.motion import path_figure
 from slipid.report.estimates import compared
 from slipid.support.errors import DataError
-from slipid.support.executor import Here
+from slipid.support.executor import InProcess
 from slipid.support.progress import Reporter
 from tests.helpers.golden_rows import of_identified, of_validation
 from tests.helpers.recording import pack
@@ -64,12 +64,12 @@ def test_the_recording_is_what_its_config_drives():
 
 def test_a_plant_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(DataError, match="no plant 'gazebo'; expected recorded or mujoco"):
-        demo.run(tmp_path, "gazebo", None, Here(), Reporter(quiet=True))
+        demo.run(tmp_path, "gazebo", None, InProcess(), Reporter(quiet=True))
 
 
 def test_a_seed_for_what_is_recorded_is_refused(tmp_path):
     with pytest.raises(DataError, match="expected --plant mujoco with it"):
-        demo.run(tmp_path, "recorded", 3, Here(), Reporter(quiet=True))
+        demo.run(tmp_path, "recorded", 3, InProcess(), Reporter(quiet=True))
 
 
 @pytest.mark.slow
@@ -111,17 +111,17 @@ def test_driving_anew_drives_what_ships(tmp_path, monkeypatch):
         "slipid.lab.testsite.simulate.simulate",
         lambda made, out, executor, report: seen.update({out.name: made}),
     )
-    drive_anew(tmp_path, 0, Here(), Reporter(quiet=True))
+    drive_anew(tmp_path, 0, InProcess(), Reporter(quiet=True))
     shipped = {p: plan(Path("x"), packaged_config(f"testsite_{p}.toml")) for p in PARTS}
     assert {p: made.hash for p, made in seen.items()} == {p: m.hash for p, m in shipped.items()}
-    drive_anew(tmp_path, 3, Here(), Reporter(quiet=True))
+    drive_anew(tmp_path, 3, InProcess(), Reporter(quiet=True))
     assert [seen[p].content.seed for p in PARTS] == [6, 7]
 
 
 @pytest.mark.slow
 def test_the_demo_finds_the_motor_weighs_the_robot_and_beats_the_encoders(tmp_path, golden):
     """Bars for logs whose physics slipid's model does not share; left-out headings."""
-    done, found, truth = demo.run(tmp_path, "recorded", None, Here(), Reporter(quiet=True))
+    done, found, truth = demo.run(tmp_path, "recorded", None, InProcess(), Reporter(quiet=True))
     rows = compared(done.fit, truth)
     assert done.fit.converged
     errors = {(r.path, r.label): r.value - r.truth for r in rows}
@@ -142,7 +142,9 @@ def test_the_demo_finds_the_motor_weighs_the_robot_and_beats_the_encoders(tmp_pa
     golden("demo_validation", list(of_validation(found)), rtol=1e-3, atol=1e-6)
     # the picture of the paths says what the table says
     config = read_config(tmp_path / "result" / "config.toml")
-    data = read_job(config, tmp_path / "recorded" / "unseen" / "logs", Reporter(quiet=True)).dataset
+    data = read_fit_task(
+        config, tmp_path / "recorded" / "unseen" / "logs", Reporter(quiet=True)
+    ).dataset
     order = [("firm", "as_built"), ("soft", "as_built"), ("soft", "moved")]
     drawn = path_figure(done.fit.contact, data, order, "unseen runs").axes
     for ax, floor in zip(drawn, ("firm", "soft", "soft@moved"), strict=False):

@@ -136,12 +136,12 @@ def test_a_channel_that_one_run_lacks_is_missing():
 # windows
 
 
-@pytest.mark.parametrize("per_piece", [1, 4, 7])
+@pytest.mark.parametrize("per_segment", [1, 4, 7])
 @pytest.mark.parametrize("longest", [0.4, 1.3, 6.0, np.inf])
-def test_windows_partition_every_run_from_where_it_moves(logs, per_piece, longest):
+def test_windows_partition_every_run_from_where_it_moves(logs, per_segment, longest):
     data = collect(logs)
-    w = windows(data, RADIUS, per_piece=per_piece, longest=longest)
-    assert w.dt.shape == (len(w), per_piece)
+    w = windows(data, RADIUS, per_segment=per_segment, longest=longest)
+    assert w.dt.shape == (len(w), per_segment)
     assert (w.dt > 0).all()
     for k, log in enumerate(data.logs):
         mine = np.flatnonzero(w.run == k)
@@ -185,11 +185,11 @@ def test_faster_is_the_derivative_by_the_lag(logs, lag):
     w = windows(data, RADIUS, lag=lag)
     # a secant over the 0.16 s in which speeds are taken, but for the end of the run
     secant = turn_per_lag(data, lag, 0.08)[:, :-1]
-    np.testing.assert_allclose(-w.faster[:, :-1], secant, atol=1e-9)
+    np.testing.assert_allclose(-w.speed_change[:, :-1], secant, atol=1e-9)
     assert np.abs(secant).max() > 0.05
     # the derivative itself where the wheels swing smoothly, away from start and end
     slope = turn_per_lag(data, lag, 0.02)[:, 1:-1]
-    np.testing.assert_allclose(-w.faster[:, 1:-1], slope, atol=0.02 * np.abs(slope).max())
+    np.testing.assert_allclose(-w.speed_change[:, 1:-1], slope, atol=0.02 * np.abs(slope).max())
     assert np.abs(slope).max() > 0.05
 
 
@@ -216,7 +216,7 @@ def test_lag_shifts_the_wheels_and_not_the_poses(logs):
 def test_means_are_over_time_and_their_variance_the_ammeters_over_their_count():
     data = collect([run(pose_fresh=None)])
     log = data.logs[0]
-    w = windows(data, RADIUS, per_piece=2)
+    w = windows(data, RADIUS, per_segment=2)
     edges = [np.flatnonzero((log.pose == p).all(axis=1))[0] for p in w.pose[0]]
     for k, (a, b) in enumerate(pairwise(edges)):
         rows, seconds = slice(a, b + 1), log.time[b] - log.time[a]
@@ -234,7 +234,7 @@ def test_means_of_what_grows_are_those_of_the_middle_of_the_window(lag):
     blank = run()
     log = replace(blank, voltage=2.0 + 3.0 * blank.time[:, None] * np.ones(3))
     data = collect([log])
-    w = windows(data, RADIUS, lag=lag, per_piece=2)
+    w = windows(data, RADIUS, lag=lag, per_segment=2)
     at = np.array([log.time[(log.pose == p).all(axis=1)][0] for p in w.pose[0]]) - lag
     middle = 2.0 + 3.0 * 0.5 * (at[1:] + at[:-1])
     step = np.diff(log.time).max()
@@ -247,7 +247,7 @@ def test_a_slow_meter_is_even_between_its_readings(n):
     blank = run()
     grows = 2.0 + 3.0 * blank.time[:, None] * np.ones(3)
     log = replace(blank, current=grows, voltage=grows, current_is_signed=True)
-    often, seldom = (windows(collect([one]), RADIUS, per_piece=2) for one in (log, held(log, n)))
+    often, seldom = (windows(collect([one]), RADIUS, per_segment=2) for one in (log, held(log, n)))
     gap = log.time[n] - log.time[0]  # the last reading of a log has no next one
     np.testing.assert_allclose(seldom.voltage, often.voltage, atol=3.0 * gap**2)
     np.testing.assert_allclose(seldom.current, often.current, atol=3.0 * gap**2)
@@ -261,7 +261,7 @@ def test_a_slow_meter_is_even_between_its_readings(n):
 def test_a_meter_that_is_read_in_every_row_misses_nothing():
     """Whether a log says so, or says nothing of it."""
     log = run(pose_fresh=None)
-    often, said = (windows(collect([one]), RADIUS, per_piece=2) for one in (log, held(log, 1)))
+    often, said = (windows(collect([one]), RADIUS, per_segment=2) for one in (log, held(log, 1)))
     for name in ("current", "voltage", "current_var", "voltage_var"):
         np.testing.assert_array_equal(getattr(said, name), getattr(often, name))
 
@@ -273,7 +273,7 @@ def test_what_a_slow_meter_missed_is_covered_by_its_variance():
         blank = run(seconds=6.0)
         jumps = blank.time[:, None] > 7.0 + 0.05 * k
         log = replace(blank, voltage=np.where(jumps, 5.0, 1.0) * np.ones(3))
-        often, seldom = (windows(collect([x]), RADIUS, per_piece=2) for x in (log, held(log, 15)))
+        often, seldom = (windows(collect([x]), RADIUS, per_segment=2) for x in (log, held(log, 15)))
         told = seldom.voltage_var > 1e-9
         gap = seldom.voltage - often.voltage
         np.testing.assert_allclose(gap[~told], 0.0, atol=1e-9)

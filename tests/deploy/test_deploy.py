@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from slipid.deploy.deploy import DRAWS, deploy, read_robot, write_robot
-from slipid.deploy.effects import DIRECTIONS
-from slipid.fit.shared import Directions, Pace
+from slipid.deploy.robot_record import DIRECTIONS
+from slipid.fit.shared_effects import SpeedAndLoad, TravelConditions
 from slipid.infer.fit_file import load
 from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.interface import MIXED, Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.support.errors import DataError
-from slipid.support.files import write_json
+from slipid.support.files import checksum, write_json
 from tests.helpers.shared import DRIVES, invoke
 
 TRIAL = ("--plant", "twin", "--starts", 1, "--controllers", "encoder")
@@ -56,8 +56,12 @@ def test_a_fit_writes_its_robot(fitted):
     assert record.floors[0].seen.runs == len(DRIVES)
     assert record.floors[0].process[0] == pytest.approx(fit.variance["process.soft.along"] ** 0.5)
     assert Settings.of(robot).current_is_signed == fit.channels.signed
-    assert Settings.of(robot).alike == Settings().alike != MIXED
-    free = {path for path in fit.space.place if not path.startswith("camera.")}
+    assert (
+        Settings.of(robot).further_floor_penalty
+        == Settings().further_floor_penalty
+        != MIXED_FLOORS_PENALTY
+    )
+    free = {path for path in fit.space.slices if not path.startswith("camera.")}
     assert set(record.draws) == free
     again = deploy(fit)
     assert again.record == record
@@ -70,10 +74,10 @@ def test_what_it_is_told_of_effects_is_what_forecasts_know(fitted):
     told = robot.record.loads[0].told
     for n, speed in enumerate(told.speeds):
         for k in (0, 17, 50):
-            pace = (Pace(float(np.log(speed)), robot.load_setup),)
+            pace = (SpeedAndLoad(float(np.log(speed)), robot.load_setup),)
             mirror = contact.robot.geometry.mirror()
-            way = Directions(np.array([2 * np.pi * k / DIRECTIONS]), pace, mirror)
-            known = contact.shared[robot.labels[0]].told(way)
+            way = TravelConditions(np.array([2 * np.pi * k / DIRECTIONS]), pace, mirror)
+            known = contact.shared[robot.labels[0]].forecast(way)
             np.testing.assert_allclose(told.mean[0][n][k], -known.mean[0], rtol=2e-3, atol=1e-6)
             # the numbers are not known either
             least = np.sqrt(np.diag(known.covariance[0]))
@@ -94,6 +98,7 @@ def test_gains_of_an_older_file_outlive_the_same_numbers_and_are_driven_with(fit
     out, fit = tmp_path / "out", load(fitted)
     shutil.copytree(fitted, out)
     older = json.loads((out / "robot.json").read_text()) | {"gains": older_gains()}
+    older["checksum"] = checksum({k: v for k, v in older.items() if k != "checksum"})
     write_json(out / "robot.json", older)
     tuned = agree(out).record
     found = {name: gain["value"] for name, gain in older_gains()["values"].items()}

@@ -12,9 +12,9 @@ import jax
 import numpy as np
 import pytest
 
-from slipid.deploy.controllers import pilot_of
-from slipid.deploy.export import FORMS, Wish, export, robot_at
-from slipid.deploy.twin_run import REST_S, site, starts
+from slipid.deploy.controllers import control_loop_of
+from slipid.deploy.export import FORMS, ExportOptions, export, robot_at
+from slipid.deploy.twin_run import REST_S, starts, twin_floor
 from slipid.export.c99.folder import c_files
 from slipid.export.folder import check_folder
 from slipid.lab.trial.controllers import ROWS
@@ -37,7 +37,7 @@ QUIET = Reporter(quiet=True)
 def folder(tmp_path_factory):
     """Everything, for a controller that traces fast."""
     out = tmp_path_factory.mktemp("export") / "robot"
-    export(ROBOT, out, Wish(controller="slip_odometry"), QUIET)
+    export(ROBOT, out, ExportOptions(controller="slip_odometry"), QUIET)
     return out
 
 
@@ -123,16 +123,19 @@ class Program:
 def test_the_program_drives_the_test_site_to_the_last_printed_digit(tmp_path):
     """One process is the robot, in C; the other is the world, in MuJoCo."""
     pytest.importorskip("mujoco")
-    pilot, path = pilot_of(ROBOT, ROWS["contact"]), rectangle(0.4, 0.2).waiting(REST_S)
-    for name, text in c_files(ROBOT, pilot, path).items():
+    control_loop, path = (
+        control_loop_of(ROBOT, ROWS["contact"]),
+        rectangle(0.4, 0.2).after_rest(REST_S),
+    )
+    for name, text in c_files(ROBOT, control_loop, path).items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     sources = ("examples/drive/drive.c", "src/slipid.c", "-lm")
     command = ["cc", "-O2", "-DDIGITS=15", "-Isrc", "-o", "drive", *sources]
     subprocess.run(command, cwd=tmp_path, check=True)
-    floor = site(ROBOT)
+    floor = twin_floor(ROBOT)
     plant = SitePlant(floor, "as_built", starts(20, floor, rectangle())[3], 5, False)
-    wanted = closed_loop.drive(pilot, path, plant, (0.0, 0.0, 0.0))
+    wanted = closed_loop.run_closed_loop(control_loop, path, plant, (0.0, 0.0, 0.0))
     program, reading, rows = Program(tmp_path / "drive"), plant.reset(), []
     for _ in wanted.time:
         pose = plant.pose
@@ -147,9 +150,9 @@ def test_the_program_drives_the_test_site_to_the_last_printed_digit(tmp_path):
     assert printed(same) == printed(wanted)
 
 
-def printed(course: closed_loop.Course) -> list[str]:
+def printed(course: closed_loop.ClosedLoopRun) -> list[str]:
     """Metrics of a run as a trial prints them, and two digits more."""
-    numbers = asdict(closed_loop.metrics(course))
+    numbers = asdict(closed_loop.path_metrics(course))
     known = {name: value for name, value in numbers.items() if value is not None}
     return [f"{name} {np.round(np.asarray(value, float), 2)}" for name, value in known.items()]
 
@@ -172,13 +175,16 @@ def test_a_robot_is_found_in_a_folder_or_a_file_with_some_of_its_floors(tmp_path
 @pytest.mark.parametrize(
     ("wish", "said"),
     [
-        (Wish(("c", "ros")), "no form 'ros', did you mean ros2"),
-        (Wish(()), "no form"),
-        (Wish(controller="contacts"), "no controller 'contacts', did you mean contact"),
-        (Wish(controller="contact_map"), "told the map of its floors; name one with --map"),
-        (Wish(map=Path("site.toml")), "told no map; leave out --map"),
-        (Wish(path="square"), "no path 'square'"),
-        (Wish(speed=9.0), "speed 9 m/s"),
+        (ExportOptions(("c", "ros")), "no form 'ros', did you mean ros2"),
+        (ExportOptions(()), "no form"),
+        (ExportOptions(controller="contacts"), "no controller 'contacts', did you mean contact"),
+        (
+            ExportOptions(controller="contact_map"),
+            "needs the map of its floors; name one with --map",
+        ),
+        (ExportOptions(map=Path("site.toml")), "uses no map; leave out --map"),
+        (ExportOptions(path="square"), "no path 'square'"),
+        (ExportOptions(speed=9.0), "speed 9 m/s"),
     ],
 )
 def test_what_cannot_be_exported_is_said_before_anything_is_written(tmp_path, wish, said):
@@ -191,4 +197,4 @@ def test_a_folder_with_other_files_is_refused_before_anything_is_made(tmp_path, 
     (tmp_path / "mine.txt").write_text("kept")
     monkeypatch.setattr("slipid.deploy.export._form", lambda *_: pytest.fail("made a form"))
     with pytest.raises(DataError, match="files that no export wrote"):
-        export(ROBOT, tmp_path, Wish(), QUIET)
+        export(ROBOT, tmp_path, ExportOptions(), QUIET)

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from slipid.app.floors import _of_run, summary
+from slipid.app.floors import _run_floors, summary
 from slipid.data.floor_map import from_polygons, write_map
 from slipid.data.log import Log
 from slipid.deploy.floors import FloorLookup
@@ -56,7 +56,7 @@ def test_a_marker_that_sits_aside_and_is_turned_is_taken_into_account(tmp_path):
         surface=None,
         load="as_built",
     )
-    found = _of_run(replace(robot, camera=camera), lookup, log, "day")
+    found = _run_floors(replace(robot, camera=camera), lookup, log, "day")
     body = heading[::2] - yaw
     c, s = np.cos(body), np.sin(body)
     centre = 1.1 * logged[::2, 0] - (c * aside[0] - s * aside[1])

@@ -11,7 +11,7 @@ import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from slipid.export.header import header
+from slipid.export.description import header
 from slipid.export.ros.folder import ros2_files
 from slipid.export.ros.yaml_text import scalar
 from slipid.export.text import identifiers

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from slipid.export.ros.folder import ros2_files
-from slipid.export.ros.localization import DISTANCE_M, PERIOD_S, Errs, errs_of, top_speed
+from slipid.export.ros.localization import (
+    DISTANCE_M,
+    PERIOD_S,
+    OdometryErrors,
+    odometry_errors,
+    top_speed,
+)
 from slipid.export.text import identifiers
 from slipid.model import contact
 from slipid.model.geometry import general, mecanum, omni
@@ -144,9 +150,11 @@ def test_a_robot_that_no_controller_fits_gets_none(shape):
 @pytest.mark.parametrize(
     "errs",
     [
-        Errs("goes off ahead", (0.05, 0.02, 0.01), (0.03, 0.02, 0.03), (0.04, 0.0, 0.0)),
-        Errs("turns all the way", (0.01, 0.02, 0.01), (0.01, 0.03, 0.1), (0.01, 0.02, 0.1)),
-        Errs("turns anew", (0.01, 0.02, 0.2), (0.01, 0.02, 0.01), (0.0, 0.0, 0.0)),
+        OdometryErrors("goes off ahead", (0.05, 0.02, 0.01), (0.03, 0.02, 0.03), (0.04, 0.0, 0.0)),
+        OdometryErrors(
+            "turns all the way", (0.01, 0.02, 0.01), (0.01, 0.03, 0.1), (0.01, 0.02, 0.1)
+        ),
+        OdometryErrors("turns anew", (0.01, 0.02, 0.2), (0.01, 0.02, 0.01), (0.0, 0.0, 0.0)),
     ],
     ids=lambda errs: errs.floor,
 )
@@ -175,7 +183,7 @@ def test_variances_are_those_of_errors_that_are_drawn(errs):
 @pytest.mark.slow
 def test_slip_is_what_wheels_go_beyond_the_body(robot):
     speed, ways, forward = top_speed(robot), np.arange(24) * np.pi / 12, np.asarray(robot.forward)
-    for k, errs in enumerate(errs_of(robot)):
+    for k, errs in enumerate(odometry_errors(robot)):
         missed = []
         for angle in ways:
             u = np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -194,7 +202,7 @@ def test_slip_is_what_wheels_go_beyond_the_body(robot):
 @pytest.mark.parametrize("made", [doubtful, mecanum_robot])
 def test_covariances_are_those_of_the_floor_and_by_default_of_the_worst(made):
     robot = made()
-    files, errs = ros2_files(robot), errs_of(robot)
+    files, errs = ros2_files(robot), odometry_errors(robot)
     four = robot.wheels == 4
     controller = MECANUM if four else OMNI
     names = ("pose_covariance_diagonal", "twist_covariance_diagonal")
@@ -218,7 +226,7 @@ def test_the_filter_fuses_velocities_and_has_noise_by_floor(robot, files):
     assert len(p["odom0_config"]) == 15
     assert p["odom0"] == f"/{OMNI}/odom"
     noise = {}
-    for name, e in zip(identifiers(robot.labels, "floor"), errs_of(robot), strict=True):
+    for name, e in zip(identifiers(robot.labels, "floor"), odometry_errors(robot), strict=True):
         own = parameters(files, f"floors/{name}.yaml", EKF)
         assert list(own) == ["process_noise_covariance"]
         matrix = np.reshape(own["process_noise_covariance"], (15, 15))

@@ -11,7 +11,7 @@ import pytest
 from slipid.export.table import HEAD, table_files
 from slipid.robot.controller import Gains, Limits
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.robot_file import declared
+from slipid.robot.robot_file import declared_numbers
 from tests.helpers.exported import LOADS, doubtful, mecanum_robot
 from tests.helpers.known_robot import USED
 
@@ -42,7 +42,7 @@ def test_every_number_reads_back_to_the_last_bit(made):
     assert values(rows, "gains") == [float(x) for x in vars(gains).values()]
     assert values(rows, "limits") == list(vars(limits).values())
     assert values(rows, "motor")[0] == robot.record.wheels.gear_ratio
-    for e in declared(robot.record):
+    for e in declared_numbers(robot.record):
         number = robot.record.parameters[e.path]
         found = [row for row in rows if row["name"] == e.path]
         assert [float(row["value"]) for row in found] == np.ravel(number.value).tolist()
@@ -59,7 +59,7 @@ def test_names_are_those_of_the_robot_and_stand_once(robot):
     rows = table(robot)
     names = [(row["name"], row["entry"]) for row in rows]
     assert len(set(names)) == len(names)
-    assert {e.path for e in declared(robot.record)} < {name for name, _ in names}
+    assert {e.path for e in declared_numbers(robot.record)} < {name for name, _ in names}
 
 
 def test_rows_of_a_matrix_say_which_wheel_and_part_of_the_twist(robot):

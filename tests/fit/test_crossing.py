@@ -16,22 +16,22 @@ from typer.testing import CliRunner
 
 from slipid.app.config import read_config
 from slipid.app.logs import packaged_config
-from slipid.app.problem import read_job, with_mixed
+from slipid.app.problem import read_fit_task, with_mixed
 from slipid.cli.main import app
 from slipid.data.floor_map import from_polygons, uniform
 from slipid.data.runs import collect
 from slipid.data.windows import Windows
 from slipid.deploy.deploy import read_robot
-from slipid.fit import crossing as cut
 from slipid.fit import likelihood as lk
-from slipid.fit.crossing_fit import across
+from slipid.fit import multi_floor as cut
+from slipid.fit.multi_floor_fit import fit_multi_floor
 from slipid.fit.optimise import optimise
 from slipid.fit.problem import Problem
 from slipid.fit.variances import _cut, whitened
 from slipid.infer.fit_file import load
-from slipid.lab.selftest.logs import Sensors, grid, make_logs, truth
+from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.model import se2
-from slipid.robot.interface import MIXED, Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from slipid.search_space import Choice
 from slipid.support.errors import DataError
 from tests.app.test_config import GOOD, written
@@ -64,10 +64,10 @@ def still(lag, runs, per_run):
         surface=("unknown",) * runs,
         load=("as_built",) * runs,
         session=("elsewhere",) * runs,
-        began=np.zeros(runs),
+        start=np.zeros(runs),
         dt=np.full((runs, per_run), 0.25),
         turn=zero,
-        faster=zero,
+        speed_change=zero,
         pose=np.zeros((runs, per_run + 1, 3)),
         current=zero,
         voltage=zero,
@@ -96,7 +96,7 @@ def crossed(truth_, runs, seed, offset=OFFSET):
     @jax.jit
     def seen(b):
         p = lk.predict(truth_, b)
-        return p.increment, lk.predicted_current(truth_, b, p.felt)
+        return p.increment, lk.predicted_current(truth_, b, p.motor_force)
 
     increment, amps = seen(lk.batch(w, truth_, floor))
 
@@ -112,7 +112,7 @@ def crossed(truth_, runs, seed, offset=OFFSET):
     noise = CURRENT * rng.normal(size=amps.shape) + offset * rng.normal(size=(runs, 1, 3))
     w = replace(w, pose=pose, current=np.asarray(amps) + noise)
     runs_ = tuple((f"site/run{k}.csv", f"{k:x}") for k in range(runs))
-    return cut.Crossing(w, floor, rng.uniform(size=shape) > 0.2, runs_)
+    return cut.MultiFloorRuns(w, floor, rng.uniform(size=shape) > 0.2, runs_)
 
 
 STD = {"camera.place": PLACE, "camera.heading": HEADING, "current.window": CURRENT}
@@ -130,14 +130,14 @@ def fitted():
 @pytest.fixture(scope="module")
 def learnt(fitted):
     true, problem, optimum = fitted
-    return across(problem, optimum, crossed(true, 12, 1), lambda state: None)
+    return fit_multi_floor(problem, optimum, crossed(true, 12, 1), lambda state: None)
 
 
 def ratio(space, z, covariance):
     """Log of the ratio of both frictions, and its std."""
     c = np.zeros(space.size)
     for floor, sign in (("firm", 1.0), ("soft", -1.0)):
-        c[space.place[f"surface.{floor}.friction"]] = sign
+        c[space.slices[f"surface.{floor}.friction"]] = sign
     return float(c @ z), float(np.sqrt(c @ covariance @ c))
 
 
@@ -176,16 +176,18 @@ def test_the_noise_of_currents_and_the_offsets_of_runs_are_told_apart(learnt):
 def test_what_a_run_is_off_all_along_counts_once_not_once_a_window(fitted):
     """Information of currents falls to that of a mean over runs as their offsets grow."""
     true, problem, optimum = fitted
-    whole = problem.crossed(crossed(true, 12, 1))
-    state = whole.restated(optimum.state, problem)
+    whole = problem.with_multi_floor(crossed(true, 12, 1))
+    state = whole.carried_over(optimum.state, problem)
     jacobian = whole.linear(state.z, whole.electric(state.z, state.log_variance))[1]
     at = whole.noise.names.index("crossing.current.run")
     told = []
     for offset in (1e-4, OFFSET):
         log_v = np.array(state.log_variance)
         log_v[at] = 2 * np.log(offset)
-        half = whitened(whole.noise.blocks, jacobian, log_v, whole.every)[cut.CURRENT]
-        k = whole.space.place["motor.back_emf"]
+        half = whitened(whole.noise.blocks, jacobian, log_v, whole.full_weight)[
+            cut.MULTI_FLOOR_CURRENT
+        ]
+        k = whole.space.slices["motor.back_emf"]
         told.append(float((half[..., k] ** 2).sum()))
     assert told[1] < 0.3 * told[0]
 
@@ -194,8 +196,8 @@ def test_what_a_run_is_off_all_along_counts_once_not_once_a_window(fitted):
 def test_windows_that_do_not_count_say_nothing(fitted):
     true, problem, optimum = fitted
     several = crossed(true, 6, 5)
-    whole = problem.crossed(several)
-    state = whole.restated(optimum.state, problem)
+    whole = problem.with_multi_floor(several)
+    state = whole.carried_over(optimum.state, problem)
     where = state.z, whole.electric(state.z, state.log_variance)
     dead = ~several.counts
     moved = replace(
@@ -203,8 +205,8 @@ def test_windows_that_do_not_count_say_nothing(fitted):
         current=np.where(dead[..., None], 7.0, several.windows.current),
         turn=np.where(dead[..., None], 0.3, several.windows.turn),
     )
-    other = problem.crossed(replace(several, windows=moved))
-    for k in (cut.MOTION, cut.CURRENT):
+    other = problem.with_multi_floor(replace(several, windows=moved))
+    for k in (cut.MULTI_FLOOR_MOTION, cut.MULTI_FLOOR_CURRENT):
         (r, slope), (r2, slope2) = (
             (p.linear(*where)[0][k], p.linear(*where)[1][k]) for p in (whole, other)
         )
@@ -214,8 +216,8 @@ def test_windows_that_do_not_count_say_nothing(fitted):
         assert not np.asarray(r)[~live].any()
         assert np.asarray(r)[live].all()
         v = np.asarray(whole.covariance(k, state.log_variance))
-        piece, row = np.argwhere(~live)[0]
-        np.testing.assert_array_equal(v[piece, row], np.eye(v.shape[1])[row])
+        segment, row = np.argwhere(~live)[0]
+        np.testing.assert_array_equal(v[segment, row], np.eye(v.shape[1])[row])
         np.testing.assert_array_equal(
             np.asarray(whole.noise.blocks[k].count), 3.0 * several.counts.sum(axis=1)
         )
@@ -223,18 +225,20 @@ def test_windows_that_do_not_count_say_nothing(fitted):
 
 @pytest.mark.slow
 def test_pieces_left_out_change_nothing(fitted):
-    """The loss of kept pieces does not know what was measured in the others."""
+    """The loss of kept segments does not know what was measured in the others."""
     true, problem, optimum = fitted
     several = crossed(true, 6, 5)
     keep = np.concatenate([np.ones(len(problem.windows)), np.arange(6) % 2])
     losses = []
     for shift in (0.0, 0.4):
         current = several.windows.current + shift * (1 - np.arange(6) % 2)[:, None, None]
-        whole = problem.crossed(replace(several, windows=replace(several.windows, current=current)))
-        state = whole.restated(optimum.state, problem)
+        whole = problem.with_multi_floor(
+            replace(several, windows=replace(several.windows, current=current))
+        )
+        state = whole.carried_over(optimum.state, problem)
         electric = whole.electric(state.z, state.log_variance)
         blocks, _ = whole.linear(state.z, electric)
-        seen = whole.seen(blocks, state.log_variance, keep, state.shared(len(problem.windows)))
+        seen = whole.weighed(blocks, state.log_variance, keep, state.shared(len(problem.windows)))
         losses.append(whole.loss(state.z, state.log_variance, keep, seen, electric))
     assert losses[0] == losses[1]
 
@@ -242,9 +246,11 @@ def test_pieces_left_out_change_nothing(fitted):
 @pytest.mark.slow
 def test_a_single_run_judges_nothing(fitted):
     true, problem, optimum = fitted
-    found = across(problem, optimum, crossed(true, 1, 3), lambda state: None, most_rounds=2)
+    found = fit_multi_floor(
+        problem, optimum, crossed(true, 1, 3), lambda state: None, most_rounds=2
+    )
     assert found.after is None
-    assert len(found.problem.every) == len(problem.windows) + 1
+    assert len(found.problem.full_weight) == len(problem.windows) + 1
 
 
 def test_electric_numbers_that_move_motion_are_marginalised_first():
@@ -282,9 +288,11 @@ def test_wheels_stand_where_the_camera_says_less_the_marker():
 
 @pytest.fixture(scope="module")
 def driven():
-    drives = grid(setups=(("soft", "as_built"), ("firm", "as_built")), headings=2, turns=0)
-    true = truth(drives)
-    logs = [replace(log, surface=None) for log in make_logs(true, drives, 1, Sensors())]
+    drives = heading_grid(setups=(("soft", "as_built"), ("firm", "as_built")), headings=2, turns=0)
+    true = true_robot(drives)
+    logs = [
+        replace(log, surface=None) for log in simulate_logs(true, drives, 1, SimulatedSensors())
+    ]
     return true, collect(logs)
 
 
@@ -295,14 +303,14 @@ RIGHT = [[0.0, -9.0], [9.0, -9.0], [9.0, 9.0], [0.0, 9.0]]
 def test_windows_in_which_no_wheel_changes_floors(driven):
     true, data = driven
     half = from_polygons("soft", [("firm", RIGHT)], (-3.0, -3.0, 3.0, 3.0))
-    whole = cut.crossing([(data, uniform("soft", 3.0))], true)
-    some = cut.crossing([(data, half)], true)
+    whole = cut.multi_floor_runs([(data, uniform("soft", 3.0))], true)
+    some = cut.multi_floor_runs([(data, half)], true)
     assert set(whole.floor.ravel()) == {true.surface_index("soft")}
     assert 0 < some.counts.sum() < whole.counts.sum()
     for run, window in np.argwhere(some.counts):
         w = some.windows
         edges = w.pose[run : run + 1, window : window + 2]
-        alone = replace(w.pieces(np.array([run])), pose=edges)
+        alone = replace(w.segments(np.array([run])), pose=edges)
         x = cut.wheel_places(true, alone)[0, ..., 0]
         assert ((x > 0) == (some.floor[run, window] == true.surface_index("firm"))).all()
     w = whole.windows
@@ -315,10 +323,10 @@ def test_windows_in_which_no_wheel_changes_floors(driven):
 def test_windows_of_a_run_stand_in_a_row_and_two_maps_go_together(driven):
     true, data = driven
     floor = uniform("soft", 3.0)
-    one = cut.crossing([(data, floor)], true)
+    one = cut.multi_floor_runs([(data, floor)], true)
     assert one.counts.shape[1] <= cut.MOST_WINDOWS
     for k in range(len(data)):
-        row = one.windows.pieces(np.array([k]))
+        row = one.windows.segments(np.array([k]))
         poses = data.pose[data.rows(k)]
         at = [np.flatnonzero((poses == place).all(axis=1))[0] for place in row.pose[0]]
         there = np.flatnonzero(one.counts[k])[-1] + 2  # beyond it the last window is repeated
@@ -326,7 +334,7 @@ def test_windows_of_a_run_stand_in_a_row_and_two_maps_go_together(driven):
         live = one.counts[k]
         steps = np.diff(row.pose[0], axis=0)[live]
         assert (np.abs(steps).max(axis=1) > 0).all()
-    both = cut.crossing([(data, floor), (data.subset([0]), floor)], true)
+    both = cut.multi_floor_runs([(data, floor), (data.subset([0]), floor)], true)
     assert both.runs == (*one.runs, one.runs[0])
     assert both.windows.run.tolist() == [*one.windows.run.tolist(), len(data)]
     np.testing.assert_array_equal(both.windows.turn[-1], one.windows.turn[0])
@@ -337,7 +345,7 @@ def test_runs_without_a_window_are_refused(driven, monkeypatch):
     true, data = driven
     monkeypatch.setattr(cut, "LEAST_SPEED", 9.0)
     with pytest.raises(DataError, match=r"no window in which .*expected larger patches"):
-        cut.crossing([(data, uniform("soft", 3.0))], true)
+        cut.multi_floor_runs([(data, uniform("soft", 3.0))], true)
 
 
 # configs ----------------------------------------------------------------------------------------
@@ -362,7 +370,7 @@ def folder(tmp_path):
 
 def mixed_job(folder: Path, text: str, said=None):
     said = said or KeptMessages()
-    return with_mixed(read_job(read_config(written(folder, text)), folder, said), folder, said)
+    return with_mixed(read_fit_task(read_config(written(folder, text)), folder, said), folder, said)
 
 
 def test_runs_with_a_map_are_kept_apart(folder):
@@ -422,10 +430,17 @@ def invoke(*words):
 
 @pytest.mark.slow
 def test_identify_learns_from_them_and_later_commands_know(tmp_path):
-    drives = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
-    true = truth(drives)
-    write_logs(make_logs(true, drives, 1, Sensors()), true, tmp_path / "logs", tmp_path / "t")
-    write_logs(make_logs(true, drives[:4], 2, Sensors()), true, tmp_path / "site", tmp_path / "t")
+    drives = heading_grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
+    true = true_robot(drives)
+    write_logs(
+        simulate_logs(true, drives, 1, SimulatedSensors()), true, tmp_path / "logs", tmp_path / "t"
+    )
+    write_logs(
+        simulate_logs(true, drives[:4], 2, SimulatedSensors()),
+        true,
+        tmp_path / "site",
+        tmp_path / "t",
+    )
     (tmp_path / "site/as_built/soft").rename(tmp_path / "logs/site")
     (tmp_path / "site.toml").write_text(MAP.replace("gray", "soft"), encoding="utf-8")
     section = '[[logs]]\nglob = "site/*.csv"\nformat = "demo"\nmap = "site.toml"\n[parameters]'
@@ -459,7 +474,7 @@ def deployed(out):
     """The fit drives its twin; what is done is not done again."""
     fit = load(out)
     robot = read_robot(out)
-    assert Settings.of(robot).alike == MIXED
+    assert Settings.of(robot).alike == MIXED_FLOORS_PENALTY
     assert fit.current_trend != (0.0, 0.0)
     np.testing.assert_array_equal(robot.current_trend, fit.current_trend)
     wish = ("trial", out, "--plant", "twin", "--starts", 2, "--jobs", 1)
@@ -487,13 +502,17 @@ def deployed(out):
 @pytest.mark.nightly
 def test_runs_with_a_wrong_map_are_refused(tmp_path):
     """They were driven on `soft`, and their map says `firm`."""
-    drives = grid(
+    drives = heading_grid(
         setups=(("soft", "as_built"), ("firm", "as_built")), headings=6, speeds=(0.1, 0.3), turns=0
     )
-    true = truth(drives)
-    write_logs(make_logs(true, drives, 1, Sensors()), true, tmp_path / "logs", tmp_path / "t")
+    true = true_robot(drives)
+    write_logs(
+        simulate_logs(true, drives, 1, SimulatedSensors()), true, tmp_path / "logs", tmp_path / "t"
+    )
     soft = [d for d in drives if d.surface == "soft"]
-    write_logs(make_logs(true, soft, 2, Sensors()), true, tmp_path / "site", tmp_path / "t")
+    write_logs(
+        simulate_logs(true, soft, 2, SimulatedSensors()), true, tmp_path / "site", tmp_path / "t"
+    )
     (tmp_path / "site/as_built/soft").rename(tmp_path / "logs/site")
     (tmp_path / "site.toml").write_text(MAP.replace("gray", "firm"), encoding="utf-8")
     section = '[[logs]]\nglob = "site/*.csv"\nformat = "demo"\nmap = "site.toml"\n[parameters]'

@@ -16,7 +16,7 @@ from slipid.fit import likelihood as lk
 from slipid.fit import noise as of_noise
 from slipid.fit import variances
 from slipid.fit.problem import Problem, linear
-from slipid.fit.variances import DEGREES, inverse_root, scored, spread_of
+from slipid.fit.variances import DEGREES, fitted_covariance, inverse_root, scoring_step
 from slipid.infer.slip_curves import current_trend
 from slipid.search_space import Choice
 from tests.helpers.dense import of_shared
@@ -81,7 +81,7 @@ def test_the_frame_of_the_world_does_not_matter(truth):
     turned = w.pose.copy()
     turned[..., :2] = w.pose[..., :2] @ np.array([[c, s], [-s, c]]) + [3.0, -2.0]
     turned[..., 2] += 0.7
-    one, two = (lk.measured(truth, jnp.asarray(pose)) for pose in (w.pose, turned))
+    one, two = (lk.measured_increments(truth, jnp.asarray(pose)) for pose in (w.pose, turned))
     np.testing.assert_allclose(one, two, atol=1e-12)
 
 
@@ -116,11 +116,11 @@ def test_voltages_are_predicted_from_what_is_expected_of_the_true_current(truth,
     """A normal around the predicted current, seen with the ammeter's noise."""
     w = made(truth, std=NOISE, signed=signed)
     truth = eqx.tree_at(lambda r: r.motor.current_offset, truth, jnp.asarray(0.02))
-    b, felt = lk.batch(w, truth), lk.predict(truth, lk.batch(w, truth)).felt
+    b, motor_force = lk.batch(w, truth), lk.predict(truth, lk.batch(w, truth)).motor_force
     sigma, s, volt = 0.2, 0.05, 0.1
     b = replace(b, current_var=jnp.full_like(b.current, sigma**2))
-    found = lk.electric_residuals(truth, b, felt, electric_noise(b, volt, s))["voltage"]
-    speed, m = w.turn / w.dt[..., None], np.asarray(lk.predicted_current(truth, b, felt))
+    found = lk.electric_residuals(truth, b, motor_force, electric_noise(b, volt, s))["voltage"]
+    speed, m = w.turn / w.dt[..., None], np.asarray(lk.predicted_current(truth, b, motor_force))
     amps = (m / s**2 + w.current / sigma**2) / (1 / s**2 + 1 / sigma**2) - 0.02
     way = 1.0 if signed else np.tanh(speed / 0.2)
     left = 1 / (1 / s**2 + 1 / sigma**2) * (5.5 * way) ** 2
@@ -135,7 +135,7 @@ def only_piece(b, k):
 
 @pytest.mark.slow
 def test_log_jacobian_is_the_determinant_of_residuals_by_data(truth):
-    """Of the 3 numbers per window that a piece measures, its first pose given."""
+    """Of the 3 numbers per window that a segment measures, its first pose given."""
     bent = eqx.tree_at(
         lambda r: (r.camera.tilt, r.camera.radial, r.camera.tangential),
         truth,
@@ -149,7 +149,7 @@ def test_log_jacobian_is_the_determinant_of_residuals_by_data(truth):
         pose, one = jnp.asarray(w.pose[k]), only_piece(b, k)
 
         def of_poses(later, first=pose[:1]):
-            return lk.measured(bent, jnp.concatenate([first, later])[None]).ravel()
+            return lk.measured_increments(bent, jnp.concatenate([first, later])[None]).ravel()
 
         def of_volts(volt, one=one):
             still = jnp.zeros((*one.current.shape, 2))
@@ -174,7 +174,9 @@ def test_camera_noise_enters_as_the_poses_do(truth, which, block):
     w = made(truth, std=NOISE)
     base = of_noise.noise(w, truth).blocks["motion"].base[:, which]
     for k in range(0, len(w), 5):
-        g = jax.jacfwd(lambda pose: lk.measured(truth, pose[None])[0])(jnp.asarray(w.pose[k]))
+        g = jax.jacfwd(lambda pose: lk.measured_increments(truth, pose[None])[0])(
+            jnp.asarray(w.pose[k])
+        )
         g = np.asarray(g).reshape(6, 3, 3)
         g = g[..., :2].reshape(6, 6) if block == "place" else g[..., 2]
         # process noise bends the path a little, so that turns differ from those of the poses
@@ -255,8 +257,8 @@ def test_the_loss_is_a_student_t_per_run(everything):
         total = 0.0
         for k, r in blocks.items():
             v = np.asarray(everything.covariance(k, log_v))
-            for piece in np.flatnonzero(keep):
-                total -= multivariate_t.logpdf(np.asarray(r[piece]), shape=v[piece], df=DEGREES)
+            for segment in np.flatnonzero(keep):
+                total -= multivariate_t.logpdf(np.asarray(r[segment]), shape=v[segment], df=DEGREES)
         return total
 
     def ours(log_v):
@@ -281,7 +283,7 @@ def test_whitened_residuals_are_weighted_mahalanobis_distances(everything):
 
 def information(problem, jacobian, log_v, blocks):
     """Expected information in numpy, prior included, what runs share by their whole covariance."""
-    total = np.diag(1 / np.asarray(problem.target.prior_std(log_v)) ** 2)
+    total = np.diag(1 / np.asarray(problem.objective.prior_std(log_v)) ** 2)
     for k in blocks:
         j = np.asarray(jacobian[k])
         factor = (DEGREES + j.shape[1]) / (DEGREES + j.shape[1] + 2)
@@ -341,8 +343,14 @@ def test_runs_that_are_left_out_change_nothing(truth):
         )
         info = problem.precision(jacobian, log_v, keep)
         at = jnp.asarray(log_v), jnp.asarray(keep)
-        step = scored(problem.target, blocks, spread_of(problem.target, jacobian, *at), *at, None)
-        seen = problem.seen(blocks, log_v, keep, np.zeros((24, 3)))
+        step = scoring_step(
+            problem.objective,
+            blocks,
+            fitted_covariance(problem.objective, jacobian, *at),
+            *at,
+            None,
+        )
+        seen = problem.weighed(blocks, log_v, keep, np.zeros((24, 3)))
         results.append((np.asarray(info), np.asarray(step), float(seen.loss)))
     for one, two in zip(*results, strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-7, atol=1e-9)
@@ -355,12 +363,12 @@ def test_runs_that_are_left_out_change_nothing(truth):
 def toy(gaussian):
     """A linear Gaussian problem with many structural numbers for its data, and its truth.
 
-    The covariance pieces are those of real windows; residuals and Jacobian are random numbers.
+    The covariance segments are those of real windows; residuals and Jacobian are random numbers.
     """
     true = robot(floors=("soft",), loads=("as_built",), sessions=("one",))
     w = replace(made(true, runs=80), has_current=False, has_voltage=False)
     held = [Choice(f"surface.*.{name}", free=False) for name in ("load_bias", "drag_exponent")]
-    problem = Problem(w, true, [Choice("*", free=True), *held]).apart()
+    problem = Problem(w, true, [Choice("*", free=True), *held]).without_shared_effects()
     rng = np.random.default_rng(11)
     std = problem.noise.typical.copy()
     std[:8] = [0.0008, 0.004, 0.006, 0.004, 0.012, 0.008, 0.012, 0.03]
@@ -381,7 +389,7 @@ def alternate(problem, jacobian, y, rounds=60):
     """Generalised least squares and a scoring step in turn, until both rest."""
     log_v, keep = 2 * np.log(problem.noise.typical), jnp.ones(len(y))
     of_effects = np.isin(np.arange(len(log_v)), OF_MOTION)  # as for a rung
-    target = replace(problem.target, scored=problem.target.scored | of_effects)
+    target = replace(problem.objective, scored=problem.objective.scored | of_effects)
     for _ in range(rounds):
         v = np.linalg.inv(np.asarray(problem.covariance("motion", log_v)))
         info = np.einsum("nip,nij,njq->pq", jacobian, v, jacobian)
@@ -391,7 +399,7 @@ def alternate(problem, jacobian, y, rounds=60):
         spread = np.einsum("nip,pq,njq->nij", jacobian, np.linalg.inv(info), jacobian)
         before = log_v
         told = {"motion": jnp.asarray(spread)}
-        log_v = np.asarray(scored(target, r, told, jnp.asarray(log_v), keep, None))
+        log_v = np.asarray(scoring_step(target, r, told, jnp.asarray(log_v), keep, None))
     assert np.abs(log_v - before).max() < 1e-6
     return log_v
 
@@ -433,11 +441,11 @@ def test_variances_are_recovered_although_the_structure_eats_degrees_of_freedom(
     flat = jacobian.reshape(-1, jacobian.shape[-1])
     total = (flat * problem.space.prior_std**2) @ flat.T
     base = np.zeros((len(std), *total.shape))
-    pieces = problem.noise.blocks["motion"].base
+    segments = problem.noise.blocks["motion"].base
     for k, v in enumerate(np.asarray(problem.covariance("motion", 2 * np.log(std)))):
         at = slice(6 * k, 6 * k + 6)
         total[at, at] += v
-        base[OF_MOTION, at, at] = pieces[k]
+        base[OF_MOTION, at, at] = segments[k]
     scaled = [v * np.linalg.solve(total, b) for v, b in zip(std**2, base, strict=True)]
     info = 0.5 * np.array([[np.sum(a * b.T) for a in scaled] for b in scaled])
     info += np.eye(len(std)) / 9
@@ -457,12 +465,14 @@ def test_scores_of_variances_have_no_bias_where_degrees_of_freedom_are_given_bac
     left_open = np.linalg.inv(told + np.diag(1 / problem.space.prior_std**2))
     spread = np.einsum("nip,pq,njq->nij", jacobian, left_open, jacobian)
     of_effects = np.isin(np.arange(len(log_v)), OF_MOTION)
-    target = replace(problem.target, scored=problem.target.scored | of_effects)
+    target = replace(problem.objective, scored=problem.objective.scored | of_effects)
 
     def step(residual):
         around = {"motion": jnp.asarray(spread if careful else 0 * spread)}
         seen = {"motion": jnp.asarray(residual)}
-        return np.asarray(scored(target, seen, around, jnp.asarray(log_v), keep, None)) - log_v
+        return (
+            np.asarray(scoring_step(target, seen, around, jnp.asarray(log_v), keep, None)) - log_v
+        )
 
     # what is left of data by the best structural numbers: the covariance, summed over its columns
     flat = jacobian.reshape(480, -1)
@@ -471,11 +481,11 @@ def test_scores_of_variances_have_no_bias_where_degrees_of_freedom_are_given_bac
     still, mean = step(np.zeros((80, 6))), np.zeros(len(std))
     for column in np.linalg.cholesky(of_left + 1e-14 * np.eye(480)).T:
         mean += (step(small * column.reshape(80, 6)) - still) / small**2
-    info = np.asarray(variances.information(problem.target.blocks, log_v, keep, None))
-    score = -(log_v - np.asarray(problem.target.typical)) / 9
-    pieces = problem.noise.blocks["motion"].base
+    info = np.asarray(variances.information(problem.objective.blocks, log_v, keep, None))
+    score = -(log_v - np.asarray(problem.objective.typical)) / 9
+    segments = problem.noise.blocks["motion"].base
     spent = np.einsum("nij,njk,nkl->nil", inverse, spread, inverse)
-    lost = 0.5 * np.exp(log_v[OF_MOTION]) * np.einsum("nij,ncij->c", spent, pieces)
+    lost = 0.5 * np.exp(log_v[OF_MOTION]) * np.einsum("nij,ncij->c", spent, segments)
     score[OF_MOTION] -= 0.0 if careful else lost
     expected = np.linalg.solve(info, score)
     np.testing.assert_allclose((still + mean)[OF_MOTION], expected[OF_MOTION], atol=1e-5)
@@ -500,19 +510,19 @@ def test_scoring_steps_end_where_the_loss_is_level_in_electric_noise(truth, amme
     problem = Problem(
         replace(w, current_var=noisy), truth, [NOTHING, Choice("motor.inductance", free=True)]
     )
-    z, keep, target = problem.space.start, jnp.ones(len(w)), problem.target
+    z, keep, target = problem.space.start, jnp.ones(len(w)), problem.objective
     log_v = np.asarray(target.typical)
-    blocks, _, felt = linear(target, z, problem.electric(z, log_v))
+    blocks, _, motor_force = linear(target, z, problem.electric(z, log_v))
     certain = {k: jnp.zeros((*r.shape, r.shape[1])) for k, r in blocks.items()}
     for _ in range(60):
-        told = problem.through_voltage(z, log_v, felt)
+        told = problem.voltage_information(z, log_v, motor_force)
         blocks = blocks | {"voltage": told.residual}
-        log_v = np.asarray(scored(target, blocks, certain, jnp.asarray(log_v), keep, told))
+        log_v = np.asarray(scoring_step(target, blocks, certain, jnp.asarray(log_v), keep, told))
 
     def loss(step):
         electric = problem.electric(z, log_v + step)
         blocks, _ = problem.linear(z, electric)
-        seen = problem.seen(blocks, log_v + step, keep, np.zeros((len(w), 3)))
+        seen = problem.weighed(blocks, log_v + step, keep, np.zeros((len(w), 3)))
         return problem.loss(z, log_v + step, keep, seen, electric)
 
     for k, name in enumerate(problem.noise.names):
@@ -526,7 +536,7 @@ def test_scoring_steps_end_where_the_loss_is_level_in_electric_noise(truth, amme
 def test_the_trend_of_currents_is_of_their_sizes_over_the_encoders_speed(signed):
     truth = robot()
     b = lk.batch(made(truth, signed=signed), truth)
-    predicted = lk.predicted_current(truth, b, lk.predict(truth, b).felt)
+    predicted = lk.predicted_current(truth, b, lk.predict(truth, b).motor_force)
     speed = (of_noise.travel(b, truth)[0] / b.dt)[..., None]
     more = jnp.sign(predicted) * (0.05 - 0.3 * speed)
     told = eqx.tree_at(lambda x: x.current, b, (predicted + more).at[0, 0, 0].set(jnp.nan))

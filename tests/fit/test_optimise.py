@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 from slipid.fit import problem as of_problem
 from slipid.fit import variances
 from slipid.fit.optimise import levenberg, optimise
-from slipid.fit.problem import Problem, State, effects_of, less
+from slipid.fit.problem import FitState, Problem, effects_given, without_effects
 from slipid.fit.variances import DEGREES
 from slipid.search_space import Choice
 from tests.helpers.dense import of_shared
@@ -48,7 +48,7 @@ SURFACE = [
 
 def begin(problem, z=None):
     """State to start from without the staged start."""
-    return State(
+    return FitState(
         z=problem.space.start if z is None else z,
         log_variance=2 * np.log(problem.noise.typical),
         round=0,
@@ -96,8 +96,8 @@ def test_a_fit_ends_where_the_loss_is_level(truth, path):
         blocks, _ = problem.linear(jnp.asarray(z), volt)
         effect = best.state.effect
         for _ in range(8):  # what runs share follows the numbers
-            seen = problem.seen(blocks, best.state.log_variance, keep, effect)
-            effect = effects_of(seen.tied, seen.whitening.root["motion"], blocks["motion"])
+            seen = problem.weighed(blocks, best.state.log_variance, keep, effect)
+            effect = effects_given(seen.effects, seen.whitening.root["motion"], blocks["motion"])
         return problem.loss(z, best.state.log_variance, keep, seen, volt)
 
     z = best.state.z
@@ -177,7 +177,7 @@ def test_camera_scale_is_that_of_weighted_least_squares(truth):
     y = r + scale * x  # what the robot predicts
     log_v = best.state.log_variance
     v = np.asarray(problem.covariance("motion", log_v))
-    own = np.asarray(less(problem.target, {"motion": r}, best.state.effect)["motion"])
+    own = np.asarray(without_effects(problem.objective, {"motion": r}, best.state.effect)["motion"])
     q = np.einsum("ni,nij,nj->n", own, np.linalg.inv(v), own)
     scaled = v * ((DEGREES + q) / (DEGREES + 6))[:, None, None]
     both = np.linalg.inv(block_diag(*scaled) + of_shared(problem, log_v))
@@ -211,7 +211,7 @@ def test_the_optimum_is_one(surface_problem, surface_fit):
 
     def loss(z):
         blocks = surface_problem.linear(z, volt)[0]
-        seen = surface_problem.seen(blocks, log_v, np.ones(48), best.state.effect)
+        seen = surface_problem.weighed(blocks, log_v, np.ones(48), best.state.effect)
         return surface_problem.loss(z, log_v, np.ones(48), seen, volt)
 
     lowest = loss(best.state.z)
@@ -248,7 +248,7 @@ def test_too_few_rounds_are_said(surface_problem):
 def test_left_out_runs_are_as_good_as_absent(truth, surface_problem):
     keep = np.ones(48)
     keep[::4] = 0.0
-    part = surface_problem.windows.pieces(np.flatnonzero(keep))
+    part = surface_problem.windows.segments(np.flatnonzero(keep))
     masked = optimise(surface_problem, keep=keep, start=begin(surface_problem), **PRECISE)
     alone = surface_problem.of(part)
     subset = optimise(alone, start=begin(alone), **PRECISE)
@@ -295,12 +295,12 @@ def test_a_problem_is_forgotten_after_use_and_those_like_it_compile_nothing(trut
         return made_of
 
     first = fit(0)
-    kept = weakref.ref(first), weakref.ref(first.target), weakref.ref(first.space)
+    kept = weakref.ref(first), weakref.ref(first.objective), weakref.ref(first.space)
     del first
     gc.collect()
     assert [ref() for ref in kept] == [None] * 3
     jitted = (of_problem.linear, of_problem.log_jacobian, levenberg)
-    jitted += (variances.whitening, variances.scored, variances.precision)
+    jitted += (variances.whitening, variances.scoring_step, variances.precision)
     before = [f._cached._cache_size() for f in jitted]
     assert min(before) > 0
     fit(1)

@@ -8,9 +8,9 @@ from scipy.stats import chi2
 
 from slipid.data.windows import windows
 from slipid.fit.optimise import optimise
-from slipid.fit.problem import State, linear
+from slipid.fit.problem import FitState, linear
 from slipid.infer.result import summarise
-from slipid.lab.selftest.logs import blank, truth
+from slipid.lab.selftest.logs import nominal_robot, true_robot
 from tests.helpers import recovery
 
 SEEDS = (0, 1, 2)
@@ -76,7 +76,7 @@ def test_another_start_ends_at_the_same_place():
     problem = recovery.problem()
     found = recovered(0)
     mirrored = 2 * problem.space.vector(recovery.TRUTH) - problem.space.start
-    start = State(mirrored, 2 * np.log(3 * problem.noise.typical), 0, np.inf, np.inf, "joint")
+    start = FitState(mirrored, 2 * np.log(3 * problem.noise.typical), 0, np.inf, np.inf, "joint")
     end = optimise(problem, start=start)
     assert end.converged
     assert np.abs((end.state.z - found.z) / found.std).max() < 0.2
@@ -114,7 +114,7 @@ def test_without_voltage_no_number_is_silent(path):
 @pytest.mark.slow
 def test_without_voltage_the_resistance_is_its_prior():
     problem, fit = without_voltage()
-    at = problem.space.place["motor.resistance"].start
+    at = problem.space.slices["motor.resistance"].start
     assert fit.z[at] == pytest.approx(problem.space.prior_mean[at], abs=1e-3)
     assert np.sqrt(fit.covariance[at, at]) == pytest.approx(problem.space.prior_std[at], rel=1e-6)
 
@@ -124,8 +124,8 @@ def test_motion_does_not_need_the_voltage():
     problem, fit = without_voltage()
     full = recovered(0)
     for path in ("surface.soft.creep", "surface.soft.lead", "robot.load_share@moved"):
-        mine = problem.space.place[path]
-        there = recovery.problem().space.place[path]
+        mine = problem.space.slices[path]
+        there = recovery.problem().space.slices[path]
         gap = (fit.z[mine] - full.z[there]) / full.std[there]
         assert np.abs(gap).max() < 0.2
 
@@ -146,7 +146,7 @@ def test_windows_of_one_shape_share_what_is_compiled():
 
 
 def test_blank_robot_knows_names_and_no_numbers():
-    a, b = blank(recovery.PLAN), truth(recovery.PLAN)
+    a, b = nominal_robot(recovery.PLAN), true_robot(recovery.PLAN)
     assert a.surfaces.labels == b.surfaces.labels == ("firm", "soft")
     assert a.body.loads == ("as_built", "moved")
     assert float(a.motor.resistance) != pytest.approx(5.5)

@@ -13,20 +13,20 @@ from scipy.stats import multivariate_normal
 from slipid.fit import hierarchy
 from slipid.fit.noise import SHARED, effects
 from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem, State, effects_of, less
-from slipid.fit.shared import (
+from slipid.fit.problem import FitState, Problem, effects_given, without_effects
+from slipid.fit.shared_effects import (
     LENGTH,
     OTHER_LOAD,
     OTHER_SIDE,
     SPEED_LENGTH,
-    Directions,
-    FoundShared,
-    Pace,
-    freed,
-    told_of,
+    EffectTable,
+    SpeedAndLoad,
+    TravelConditions,
+    forecast_effects,
+    marginal_residuals,
 )
-from slipid.fit.variances import spread_of
-from slipid.predict.predictive import contact_of, setups
+from slipid.fit.variances import fitted_covariance
+from slipid.predict.predictive import force_balance_of, setups
 from slipid.search_space import Choice
 from tests.helpers.dense import of_shared
 from tests.helpers.made_windows import made, robot
@@ -74,9 +74,9 @@ def motion(problem, log_v, z=None):
 @pytest.mark.parametrize("mirror", [None, 0.0, np.pi / 2])
 def test_neighbours_are_correlated_as_the_periodic_kernel_says(mirror):
     turn = np.radians([0.0, 3.0, 10.0, 25.0, 180.0, 350.0])
-    slow, fast, moved = Pace(-2.25, "a"), Pace(-1.5, "a"), Pace(-2.25, "b")
+    slow, fast, moved = SpeedAndLoad(-2.25, "a"), SpeedAndLoad(-1.5, "a"), SpeedAndLoad(-2.25, "b")
     pace = (slow, fast, moved)
-    rows = [Directions(turn, (p,) * len(turn), mirror).basis(pace) for p in pace]
+    rows = [TravelConditions(turn, (p,) * len(turn), mirror).basis(pace) for p in pace]
 
     def near(apart):
         return np.exp(-2 * (np.sin(apart / 2) / LENGTH) ** 2)
@@ -92,10 +92,10 @@ def test_neighbours_are_correlated_as_the_periodic_kernel_says(mirror):
 
 
 def test_a_run_on_the_spot_has_no_neighbours_and_a_new_speed_is_less_known():
-    pace = (Pace(-2.0, "a"),)
-    still = Directions(np.array([np.nan]), pace, 0.0).basis(pace)
+    pace = (SpeedAndLoad(-2.0, "a"),)
+    still = TravelConditions(np.array([np.nan]), pace, 0.0).basis(pace)
     assert not still.any()
-    other = Directions(np.zeros(1), (Pace(-1.0, "a"),), None).basis(pace)
+    other = TravelConditions(np.zeros(1), (SpeedAndLoad(-1.0, "a"),), None).basis(pace)
     squares = (other**2).sum(axis=-1)
     np.testing.assert_allclose(squares, np.exp(-((1 / SPEED_LENGTH) ** 2)), atol=0.01)
 
@@ -103,10 +103,10 @@ def test_a_run_on_the_spot_has_no_neighbours_and_a_new_speed_is_less_known():
 @pytest.mark.parametrize("mirror", [None, 0.0])
 def test_new_paces_keep_the_variance_of_the_process(mirror):
     """What neighbours cannot tell is left, so that far from them all of it is."""
-    seen, other = Pace(-2.0, "a"), Pace(-1.4, "b")
+    seen, other = SpeedAndLoad(-2.0, "a"), SpeedAndLoad(-1.4, "b")
     turn, count = np.array([0.0, 0.05, 1.0, np.nan]), 3 * 31
-    of = FoundShared(
-        paces=(seen,),
+    of = EffectTable(
+        speeds_and_loads=(seen,),
         std=np.array([0.1, 0.2, 0.3]),
         coefs=np.zeros((3, 31)),
         by_number=np.zeros((3, 31, 1)),
@@ -114,7 +114,7 @@ def test_new_paces_keep_the_variance_of_the_process(mirror):
     )
     near = np.exp(-2 * (np.sin(turn) / LENGTH) ** 2)
     for pace in (seen, other):
-        told = of.told(Directions(turn, (pace,) * 4, mirror))
+        told = of.forecast(TravelConditions(turn, (pace,) * 4, mirror))
         for k, sign in enumerate((1, -1, -1)):
             whole = 1.0 if mirror is None else 1 + sign * OTHER_SIDE * near
             expected = of.std[k] ** 2 * np.where(np.isfinite(turn), whole, 1.0)
@@ -132,15 +132,15 @@ def test_the_loss_is_the_marginal_likelihood_of_all_runs(problem):
     blocks, _ = motion(problem, log_v)
     found = []
     for step in (np.zeros(len(log_v)), np.linspace(-0.5, 0.7, len(log_v))):
-        seen = problem.seen(blocks, log_v + step, keep, none)
+        seen = problem.weighed(blocks, log_v + step, keep, none)
         root = np.asarray(seen.whitening.root["motion"])
         own = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
         whole = block_diag(*own) + of_shared(problem, log_v + step)
         flat = np.asarray(blocks["motion"]).ravel()
         white = jnp.einsum("nij,nj->ni", root, blocks["motion"])
-        square = float(jnp.sum(freed(seen.tied, white) ** 2))
+        square = float(jnp.sum(marginal_residuals(seen.effects, white) ** 2))
         assert square == pytest.approx(flat @ np.linalg.solve(whole, flat), rel=1e-9)
-        factors = sum(float(jnp.log(jnp.diagonal(t.factor)).sum()) for t in seen.tied)
+        factors = sum(float(jnp.log(jnp.diagonal(t.factor)).sum()) for t in seen.effects)
         exact = 0.5 * (np.linalg.slogdet(whole)[1] - np.linalg.slogdet(block_diag(*own))[1])
         assert factors == pytest.approx(exact, rel=1e-9)
         found.append(square)
@@ -151,13 +151,13 @@ def test_the_loss_is_the_marginal_likelihood_of_all_runs(problem):
 def test_effects_found_are_their_conditional_mean(problem):
     log_v, keep = log_variance(problem), np.ones(RUNS)
     blocks, _ = motion(problem, log_v)
-    seen = problem.seen(blocks, log_v, keep, np.zeros((RUNS, 3)))
+    seen = problem.weighed(blocks, log_v, keep, np.zeros((RUNS, 3)))
     root = np.asarray(seen.whitening.root["motion"])
     own = block_diag(*np.linalg.inv(np.swapaxes(root, 1, 2) @ root))
     flat, whole = np.asarray(blocks["motion"]).ravel(), of_shared(problem, log_v)
     expected = whole @ np.linalg.solve(own + whole, flat)
-    effect = effects_of(seen.tied, seen.whitening.root["motion"], blocks["motion"])
-    left = less(problem.target, blocks, effect)["motion"]
+    effect = effects_given(seen.effects, seen.whitening.root["motion"], blocks["motion"])
+    left = without_effects(problem.objective, blocks, effect)["motion"]
     np.testing.assert_allclose(flat - np.asarray(left).ravel(), expected, atol=1e-12)
 
 
@@ -167,14 +167,16 @@ def test_the_spread_of_residuals_is_that_of_numbers_and_effects_together(problem
     log_v, keep = log_variance(problem), np.ones(RUNS)
     _, jacobian = motion(problem, log_v)
     told = np.asarray(
-        spread_of(problem.target, jacobian, jnp.asarray(log_v), jnp.asarray(keep))["motion"]
+        fitted_covariance(problem.objective, jacobian, jnp.asarray(log_v), jnp.asarray(keep))[
+            "motion"
+        ]
     )
     j = np.asarray(jacobian["motion"])
     n, m, free = j.shape
     factor = (8.0 + m) / (8.0 + m + 2.0)
     own = block_diag(*(np.asarray(problem.covariance("motion", log_v)) / factor))
     # residuals less effects: J z - E e, with prior covariances of both
-    prior = np.asarray(problem.target.prior_std(log_v)) ** 2
+    prior = np.asarray(problem.objective.prior_std(log_v)) ** 2
     flat = j.reshape(n * m, free)
     signal = (flat * prior) @ flat.T + of_shared(problem, log_v)
     posterior = signal - signal @ np.linalg.solve(own + signal, signal)
@@ -196,9 +198,9 @@ def test_what_neighbours_tell_is_that_of_the_dense_gaussian(problem):
         problem.windows,
     )
     state = replace(end.state, log_variance=log_v)
-    model = contact_of(problem, state, end.covariance, keep)
+    model = force_balance_of(problem, state, end.covariance, keep)
     blocks, _ = motion(problem, log_v, state.z)
-    seen = problem.seen(blocks, log_v, keep, state.effect)
+    seen = problem.weighed(blocks, log_v, keep, state.effect)
     root = np.asarray(seen.whitening.root["motion"])
     whole = of_shared(problem, log_v)
     flat = np.asarray(blocks["motion"]).ravel()
@@ -209,7 +211,7 @@ def test_what_neighbours_tell_is_that_of_the_dense_gaussian(problem):
     silent = [-80.0 if n.startswith("session.") else v for n, v in zip(names, log_v, strict=True)]
     near = of_shared(problem, np.asarray(silent))  # of a session that was not seen
     expected = (near[:, used] @ inverse @ flat[used]).reshape(RUNS, -1)
-    told = told_of(model.shared, w, problem.robot, problem.space.size)
+    told = forecast_effects(model.shared, w, problem.robot, problem.space.size)
     moved = np.einsum("nma,na->nm", effects(w, problem.robot), told.mean)
     out = keep == 0
     assert np.abs(expected[out]).max() > 1e-4
@@ -241,7 +243,7 @@ def axis_of(rng, runs=60):
     whole = fixed + sum(v * b for v, b in zip(true, bases, strict=True))
     left = np.linalg.cholesky(whole + 1e-9 * np.eye(runs)) @ rng.normal(size=runs)
     noise = np.full(runs, 0.2)
-    return hierarchy._Axis(0, np.arange(runs), left, fixed, noise, [0, 1, 2], bases)
+    return hierarchy._AxisEffects(0, np.arange(runs), left, fixed, noise, [0, 1, 2], bases)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -254,7 +256,7 @@ def test_scoring_ends_at_the_summit_of_the_likelihood(seed):
         own = multivariate_normal(np.zeros(len(whole)), whole).logpdf(axis.left)
         return -own + 0.5 * float(np.sum((log_v / 3.0) ** 2))
 
-    found = hierarchy._scored(axis, np.array([1.0, -1.0, 2.0]), typical)
+    found = hierarchy._scoring_steps(axis, np.array([1.0, -1.0, 2.0]), typical)
     step = 1e-4 * np.eye(3)
     slope = [(loss(found + e) - loss(found - e)) / 2e-4 for e in step]
     np.testing.assert_allclose(slope, 0.0, atol=1e-2)
@@ -265,8 +267,8 @@ def test_sectors_left_out_are_predicted_as_the_dense_gaussian_of_the_others_does
     rng, log_v = np.random.default_rng(0), np.zeros(3)
     axis = axis_of(rng)
     way = np.linspace(0.1, 2 * np.pi - 0.1, 60)
-    found = hierarchy._left_out([axis], log_v, way)
-    whole = hierarchy._whole(axis, np.ones(3))
+    found = hierarchy._held_out_effects([axis], log_v, way)
+    whole = hierarchy._covariance(axis, np.ones(3))
     for out in (np.arange(60) // 10 == k for k in range(6)):
         to = whole[np.ix_(out, ~out)] @ np.linalg.inv(whole[np.ix_(~out, ~out)])
         spread = np.diag(whole[np.ix_(out, out)] - to @ whole[np.ix_(~out, out)])
@@ -284,20 +286,20 @@ def left_out(size, runs=4000):
     gap = np.sqrt(own) * normal + size * np.sqrt(share) * other
     gap *= np.sqrt(8.0 / rng.chisquare(8.0, (runs, 1)))  # of one run together, as ends are
     spread = np.broadcast_to(own + share, gap.shape)
-    return hierarchy._LeftOut(gap, spread, np.broadcast_to(own, gap.shape))
+    return hierarchy._HeldOutEffects(gap, spread, np.broadcast_to(own, gap.shape))
 
 
 @pytest.mark.parametrize(("size", "growth"), [(1.0, 1.0), (0.5, 1.0), (1.5, 2.25), (9.0, 10.0)])
 def test_variances_grow_until_nine_ends_in_ten_lie_in_their_regions(size, growth):
     far, every = np.full(4000, 0.6), np.ones(4000, bool)
-    assert hierarchy._growth(left_out(size), far, every) == pytest.approx(growth, rel=0.08)
+    assert hierarchy._variance_growth(left_out(size), far, every) == pytest.approx(growth, rel=0.08)
 
 
 def test_few_runs_or_sectors_say_nothing_of_the_tail():
     few = np.arange(4000) < hierarchy.LEAST_RUNS - 1
-    assert hierarchy._growth(left_out(1.5), np.full(4000, 0.6), few) == 1.0
+    assert hierarchy._variance_growth(left_out(1.5), np.full(4000, 0.6), few) == 1.0
     axis = axis_of(np.random.default_rng(0))
-    found = hierarchy._left_out([axis], np.zeros(3), np.linspace(0.0, 1.5, 60))
+    found = hierarchy._held_out_effects([axis], np.zeros(3), np.linspace(0.0, 1.5, 60))
     assert np.isnan(found.gap).all()
 
 
@@ -308,10 +310,10 @@ def test_every_axis_has_the_covariance_of_its_own_effects(problem):
     blocks, jacobian = motion(problem, log_v)
     moved = blocks["motion"], jacobian["motion"]
     covariance = np.diag(problem.space.prior_std**2)
-    axes = list(hierarchy._axes(problem.target, moved, jnp.ones(RUNS), covariance, log_v))
-    assert len(axes) == 3 * len(problem.target.shared)
+    axes = list(hierarchy._axes(problem.objective, moved, jnp.ones(RUNS), covariance, log_v))
+    assert len(axes) == 3 * len(problem.objective.shared)
     for k, axis in enumerate(axes):
-        root = problem.target.shared[k // 3].root(jnp.asarray(log_v))[axis.number]
+        root = problem.objective.shared[k // 3].root(jnp.asarray(log_v))[axis.number]
         v = np.exp(log_v)[axis.numbers]
         found = sum(v[j] * axis.bases[j] for j in range(1, len(v)))  # but what each has alone
         np.testing.assert_allclose(found, root @ root.T, rtol=1e-9, atol=1e-12)
@@ -322,8 +324,8 @@ def test_forecasts_grow_but_for_what_each_run_has_alone(problem):
     """Ends and increments; the own part is that of a model which knows all else for sure."""
     log_v, w = log_variance(problem), problem.windows
     covariance = np.diag((0.1 * problem.space.prior_std) ** 2)
-    state = State(problem.space.start, log_v, 0, 0.0, 0.0, "joint", np.zeros((RUNS, 3)))
-    plain = replace(contact_of(problem, state, covariance, np.ones(RUNS)), extrapolation={})
+    state = FitState(problem.space.start, log_v, 0, 0.0, 0.0, "joint", np.zeros((RUNS, 3)))
+    plain = replace(force_balance_of(problem, state, covariance, np.ones(RUNS)), extrapolation={})
     grown = replace(plain, extrapolation=dict.fromkeys(setups(w), 4.0))
     kept = {n: v for n, v in plain.variance.items() if n.split(".")[0] not in SHARED}
     sure = {name: replace(x, covariance=0 * x.covariance) for name, x in plain.shared.items()}
@@ -353,8 +355,8 @@ def test_sectors_are_cut_where_no_runs_are_parted():
 
 def test_what_floors_differ_by_has_the_pooled_std_a_priori(problem):
     log_v = log_variance(problem)
-    log_v[problem.target.pooled] = 2 * np.log(0.03)
-    std = np.asarray(problem.target.prior_std(log_v))
+    log_v[problem.objective.pooled] = 2 * np.log(0.03)
+    std = np.asarray(problem.objective.prior_std(log_v))
     pooled = problem.space.pooled
     assert 0 < pooled.sum() < len(std)
     np.testing.assert_allclose(std[pooled], 0.03, rtol=1e-12)
@@ -370,13 +372,13 @@ def test_the_pooled_variance_weighs_every_std_by_its_evidence(problem):
     at = np.flatnonzero(problem.space.pooled)
     told = root @ root.T + np.eye(free)
     precision = told.copy()
-    precision[at, at] += np.exp(-log_v[problem.target.pooled])
+    precision[at, at] += np.exp(-log_v[problem.objective.pooled])
     best = np.linalg.solve(precision, told @ rng.normal(size=free) * 0.05)
     best[np.setdiff1d(np.arange(free), at)] = 0.0
-    found = hierarchy.pooled(precision, best, problem.target, log_v)
+    found = hierarchy.pooled(precision, best, problem.objective, log_v)
     # the likelihood that has this posterior: information told, and where it is highest
     centre = precision @ np.where(problem.space.pooled, best, 0.0)
-    typical = np.exp(0.5 * float(problem.target.typical[problem.target.pooled]))
+    typical = np.exp(0.5 * float(problem.objective.typical[problem.objective.pooled]))
     std = np.linspace(0.1, 4.0, 4000) * typical
     log = np.empty(len(std))
     for k, s in enumerate(std):

@@ -18,7 +18,7 @@ def weights(w):
     problem = Problem(w, ROBOT, [])
     z, log_v = problem.space.start, 2 * np.log(problem.noise.typical)
     residual, _ = problem.linear(z, problem.electric(z, log_v))
-    root = problem.whitening(residual, log_v, problem.every).root
+    root = problem.whitening(residual, log_v, problem.full_weight).root
     return {k: np.asarray(jnp.einsum("nij,nj->ni", root[k], residual[k])) for k in root}
 
 

@@ -89,9 +89,9 @@ def experiment(seed: int) -> tuple[Fit, np.ndarray]:
     space, typical = common.space, 2 * np.log(common.noise.typical)
     normal = rng.standard_normal(len(typical))
     log_v = typical + VARIANCE_SPREAD * normal
-    pooled = common.target.pooled  # the prior of its root is half-normal
+    pooled = common.objective.pooled  # the prior of its root is half-normal
     log_v[pooled] = typical[pooled] + 2 * np.log(np.abs(normal[pooled]))
-    prior_std = np.asarray(common.target.prior_std(log_v))
+    prior_std = np.asarray(common.objective.prior_std(log_v))
     z = space.prior_mean + prior_std * rng.standard_normal(space.size)
     this = common.of(filled(common, z, log_v, rng))
     optimum = optimise(this)
@@ -189,17 +189,21 @@ def noise(this: Problem, block: str, log_v: np.ndarray, rng: np.random.Generator
 def shared(this: Problem, log_v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """What effects that runs share move in the motion residuals of every piece (piece, m)."""
     out = np.zeros(np.asarray(this.noise.blocks["motion"].known).shape)
-    for of in this.target.shared:
+    for of in this.objective.shared:
         root = np.asarray(of.root(jnp.asarray(log_v)))
         effect = np.einsum("anq,aq->na", root, rng.standard_normal(root.shape[::2]))
-        out[np.asarray(of.pieces)] = np.einsum("nma,na->nm", np.asarray(of.effect), effect)
+        out[np.asarray(of.segments)] = np.einsum("nma,na->nm", np.asarray(of.effect), effect)
     return out
 
 
 @jax.jit
 def _predicted(truth, b):
     p = lk.predict(truth, b)
-    return p.increment, corrected(truth, b.pose)[:, 0], lk.predicted_current(truth, b, p.felt)
+    return (
+        p.increment,
+        corrected(truth, b.pose)[:, 0],
+        lk.predicted_current(truth, b, p.motor_force),
+    )
 
 
 @jax.jit

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import pytest
 
-from slipid.deploy.controllers import pilot_of
+from slipid.deploy.controllers import control_loop_of
 from slipid.export.c99.code import Code
 from slipid.export.fields import Struct
 from slipid.lab.trial.controllers import ROWS
@@ -45,7 +45,7 @@ NEEDS_COMPILER = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a 
 def code(row: str) -> Code:
     """Of a row of the trial for a small robot, with a rectangle to follow."""
     robot = small_twin.deployed(1.0, 1.0, 0.3)
-    return Code(robot, pilot_of(robot, ROWS[row]), rectangle())
+    return Code(robot, control_loop_of(robot, ROWS[row]), rectangle())
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Kinds:
 
 
 class CompiledC:
-    """A pilot's code, compiled: its structs as numpy records, its functions on them.
+    """A control loop's code, compiled: its structs as numpy records, its functions on them.
 
     Attributes:
         code: that was compiled; kinds: of its numbers.
@@ -95,7 +95,7 @@ class CompiledC:
         self.controller = np.zeros((), self.kinds.of(code.controller))
         self.reading = np.zeros((), self.kinds.of(code.reading))
         self.estimate = np.zeros((), self.kinds.of(code.estimate))
-        self.command = np.zeros(code.pilot.controller.robot.wheels, self.kinds.real)
+        self.command = np.zeros(code.loop.controller.robot.wheels, self.kinds.real)
         self.time = np.zeros((), self.kinds.real)
         self.reference = np.zeros(6, self.kinds.real)
 

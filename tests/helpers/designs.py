@@ -16,7 +16,7 @@ from slipid.data.windows import windows
 from slipid.fit import likelihood as lk
 from slipid.fit import noise as of_noise
 from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.infer.design import fisher as info
 from slipid.infer.design.planned_runs import (
     HEADINGS,
@@ -27,17 +27,17 @@ from slipid.infer.design.planned_runs import (
 )
 from slipid.infer.design.planner import Planner, parameter_goal, prediction_goal, weighed
 from slipid.infer.result import Channels
-from slipid.lab.selftest.logs import Sensors, blank, make_logs, truth
+from slipid.lab.selftest.logs import SimulatedSensors, nominal_robot, simulate_logs, true_robot
 from slipid.predict import open_loop as replay
 from slipid.search_space import Choice
-from tests.helpers.made_windows import measure
+from tests.helpers.made_windows import simulate_windows
 
 SETUP = ("soft", "as_built")
 LOAD = "robot.load_share@as_built"
 DISTANCE = 0.7
-SENSORS = Sensors(has_voltage=False)
+SENSORS = SimulatedSensors(has_voltage=False)
 ANY = PlannedRun(*SETUP, 0.0, 0.2)
-TRUTH = truth([ANY])
+TRUTH = true_robot([ANY])
 CHOICES = [
     Choice("camera.scale", prior_mean=1.117, prior_std=0.002),
     Choice("camera.lag", prior_mean=0.056, prior_std=0.01),
@@ -93,7 +93,7 @@ def plans(count):
 @functools.cache
 def problem(count):
     """Compiled for so many runs."""
-    return Problem(steady_windows([ANY] * count, TRUTH, Channels()), blank([ANY]), CHOICES)
+    return Problem(steady_windows([ANY] * count, TRUTH, Channels()), nominal_robot([ANY]), CHOICES)
 
 
 def fit_windows(drives, seed):
@@ -101,17 +101,17 @@ def fit_windows(drives, seed):
     rng = np.random.default_rng(seed)
     std = {n: std_of(n) for n in problem(len(drives)).noise.names}
     clean = steady_windows(drives, TRUTH, Channels())
-    made = measure(TRUTH, clean, rng, {**std, "current": std["current.soft.window"]})
+    made = simulate_windows(TRUTH, clean, rng, {**std, "current": std["current.soft.window"]})
     this = problem(len(drives)).of(made)
     log_v = np.log([std[n] ** 2 for n in this.noise.names])
-    begin = State(this.space.vector(TRUTH), log_v, 0, np.inf, np.inf, "joint")
+    begin = FitState(this.space.vector(TRUTH), log_v, 0, np.inf, np.inf, "joint")
     end = optimise(this, start=begin, most_rounds=15)
     return end.state.z, end.converged
 
 
 def fit_logs(drives, seed):
     """Fit of logs with every trap, from the staged start; (z, converged)."""
-    data = collect(make_logs(truth(drives), drives, seed, SENSORS))
+    data = collect(simulate_logs(true_robot(drives), drives, seed, SENSORS))
     end = optimise(problem(len(drives)).of(windows(data, 0.04, 0.056)))
     return end.state.z, end.converged
 

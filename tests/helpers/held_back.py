@@ -5,7 +5,7 @@ from pathlib import Path
 
 from slipid.app.config import read_config
 from slipid.app.identify import optimised, summarised
-from slipid.app.problem import Job, job_of, read_job
+from slipid.app.problem import ConfigFitTask, fit_task, read_fit_task
 from slipid.data.runs import Runs
 from slipid.predict.validation import Validation
 from slipid.support.progress import Reporter
@@ -17,8 +17,8 @@ def held_back(
     """Fitted to runs that have one of some words in their names, judged on those with others."""
     with Reporter(quiet=True) as report:
         read = read_config(config)
-        whole: Job = read_job(read, folder, report)
-        job = job_of(read, part(whole.dataset, fitted), (), report)
+        whole: ConfigFitTask = read_fit_task(read, folder, report)
+        job = fit_task(read, part(whole.dataset, fitted), (), report)
         problem, optimum = optimised(job, job.problem(), None, report)
         fit = summarised(job, problem, optimum, report)
     assert fit.converged, fit.reason

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slipid.app.problem import told_lag
+from slipid.app.problem import lag_from_motion
 from slipid.data.runs import Runs, collect
 from slipid.data.windows import windows
 from slipid.fit.optimise import optimise
 from slipid.fit.problem import Problem
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.result import Fit, summarise
-from slipid.lab.selftest.logs import Sensors, grid, make_logs, turning_grid
+from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, turning_grid
 from slipid.model.geometry import Geometry, differential, mecanum, omni, skid_steer
 from slipid.model.robot import Robot, build
 from slipid.parameter import entries
@@ -43,8 +43,8 @@ def experiment(kind: str, seed: int = 0, headings: int = 12) -> Experiment:
     drives = plan(shape, headings)
     truth = known(shape, drives)
     # wheels that are dragged along brake, which magnitudes of currents do not tell
-    fine = Sensors(ripple=0.005, current_step=0.002, voltage_step=0.005, signed=True)
-    data = collect(make_logs(truth, drives, seed, fine))
+    fine = SimulatedSensors(ripple=0.005, current_step=0.002, voltage_step=0.005, signed=True)
+    data = collect(simulate_logs(truth, drives, seed, fine))
     return Experiment(truth, data, wanted(truth, data))
 
 
@@ -67,7 +67,7 @@ def fitted(truth: Robot, data: Runs, choices: Sequence[Choice]) -> Fit:
 def plan(shape: Geometry, headings: int) -> tuple[PlannedRun, ...]:
     setups = [(floor, "as_built") for floor in FLOORS]
     if shape.determines_twist:
-        return grid(setups, headings, (0.15, 0.3), turns=4)
+        return heading_grid(setups, headings, (0.15, 0.3), turns=4)
     return turning_grid(setups, headings, (0.15, 0.3), float(shape.base_radius))
 
 
@@ -97,7 +97,7 @@ def wanted(truth: Robot, data: Runs) -> tuple[Choice, ...]:
     return (
         *(Choice(f"surface.*.{name}", free=False) for name in held),
         Choice("robot.mass", fixed=20.0),
-        *told_lag(data),
+        *lag_from_motion(data),
         Choice("motor.resistance", start=3.0, prior_mean=2.5, prior_std=1.5),
         Choice("motor.back_emf", start=0.03, prior_mean=0.04, prior_std=0.02),
     )

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import jax
 
-from slipid.deploy.deploy import given
-from slipid.deploy.record_of import record_of
+from slipid.deploy.deploy import given_numbers
+from slipid.deploy.robot_record import robot_record
 from slipid.model.robot import Robot
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.record import GainRecord, GainsRecord, GainValues, Losses, ToldRecord
+from slipid.robot.record import EffectRecord, GainRecord, GainsRecord, GainValues, Losses
 
 GAINS = GainsRecord(
     values=GainValues(*(GainRecord(0.1 * k, "1", 0.01) for k in range(6))),
@@ -34,14 +35,14 @@ def deploy_known(
     draws: Robot | None = None,
     highest_speed: float = 20.0,
     current_trend: tuple[float, float] = (0.0, 0.0),
-    told: Mapping[str, ToldRecord] | None = None,
+    effects: Mapping[str, EffectRecord] = MappingProxyType({}),
 ) -> DeployedRobot:
-    """The robot as it drives with a load set-up; arguments as of `record_of`.
+    """Return the robot with a load set-up; arguments are those of `robot_record`.
 
-    Without draws of its posterior its numbers have no spread.
+    Without posterior draws its numbers have no spread.
     """
     several = jax.tree.map(lambda x: x[None], robot) if draws is None else draws
-    record = record_of(
-        robot, given(robot), std or {}, several, highest_speed, current_trend, {}, told
+    record = robot_record(
+        robot, given_numbers(robot), std or {}, several, highest_speed, current_trend, {}, effects
     )
     return DeployedRobot.of(record, load)

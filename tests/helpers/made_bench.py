@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from slipid.infer.bench.motor import BenchRecord
-from slipid.lab.testsite.motors import Drive, Motor, SpeedLoop
+from slipid.lab.testsite.robot_build import MotorBuild, SpeedLoop, WheelDrives
 
 FLYWHEEL, ROTOR = 1e-4, 7.1e-6
 STEPS = (0, 6, 0, -6, 12, 3, -12, -3, 0, 18, 9, -18, 8, -8, 0)
@@ -25,7 +25,7 @@ TRUTH = {
 }
 
 
-class OpenLoop(Drive):
+class OpenLoop(WheelDrives):
     """A drive that puts on the voltage it is asked for."""
 
     def _voltage(self, k: int, wanted: float, measured: float) -> float:
@@ -59,7 +59,9 @@ def driven(
 
     The drop of the brushes turns over the current `turn` [A].
     """
-    drive = OpenLoop(Motor(supply_v=48.0, supply_ohm=0.0, efficiency=1.0), SpeedLoop(), 1.0, 1, dt)
+    drive = OpenLoop(
+        MotorBuild(supply_v=48.0, supply_ohm=0.0, efficiency=1.0), SpeedLoop(), 1.0, 1, dt
+    )
     held = TRUTH["coulomb_friction"] * dt / inertia
     rows, speed = np.empty((round(seconds / dt), 4)), 0.0
     for k in range(len(rows)):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from slipid.data.log import Log
 from slipid.data.write import own_columns, own_csv
-from slipid.lab.selftest.logs import numbers
+from slipid.lab.selftest.logs import true_numbers
 from slipid.model.robot import Robot
 from slipid.parameter import entries
 from slipid.support.files import write_bytes, write_json
@@ -37,6 +37,6 @@ def write_logs(logs: Sequence[Log], robot: Robot, out: Path, truth_dir: Path) ->
         write_bytes(target, own_csv(log, gear, TICKS).encode())
         paths.append(target)
     units = {e.path: e.declaration.unit for e in entries(robot)}
-    values = {path: {"value": v, "unit": units[path]} for path, v in numbers(robot).items()}
+    values = {path: {"value": v, "unit": units[path]} for path, v in true_numbers(robot).items()}
     write_json(truth_dir / "truth.json", {"schema": "slipid.truth/1", "parameters": values})
     return paths

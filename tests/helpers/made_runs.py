@@ -4,10 +4,12 @@ import numpy as np
 
 from slipid.model.geometry import omni, skid_steer
 from slipid.model.robot import build
-from slipid.predict.slip_model import Machine, Run, RunSignals, path_of
+from slipid.predict.slip_model import RobotSpec, Run, RunSignals, path_of
 
-ROBOTINO = Machine.of(build(omni([60.0, 180.0, 300.0], 0.125, 0.040, 16.0), ("gray",)))
-HUSKY = Machine.of(build(skid_steer(0.256, 0.275, 0.165, 78.71, drive_of=(0, 1, 0, 1)), ("grass",)))
+ROBOTINO = RobotSpec.of(build(omni([60.0, 180.0, 300.0], 0.125, 0.040, 16.0), ("gray",)))
+HUSKY = RobotSpec.of(
+    build(skid_steer(0.256, 0.275, 0.165, 78.71, drive_of=(0, 1, 0, 1)), ("grass",))
+)
 
 
 def straight(angle: float, speed: float = 0.2, steps: int = 40) -> np.ndarray:
@@ -19,7 +21,7 @@ def made_run(
     rolling: np.ndarray,
     twist: np.ndarray | None = None,
     *,
-    machine: Machine = ROBOTINO,
+    spec: RobotSpec = ROBOTINO,
     current: np.ndarray | None = None,
     gyro: np.ndarray | None = None,
     signed: bool = False,
@@ -30,7 +32,7 @@ def made_run(
     """A run whose encoders say `rolling` while the body moves by `twist`, both (step, 3)."""
     twist = rolling if twist is None else twist
     each = np.full(len(rolling), dt)
-    speed = rolling @ machine.forward.T / machine.wheel_radius
+    speed = rolling @ spec.forward.T / spec.wheel_radius
     heard = RunSignals(
         name=name,
         dt=each,

@@ -8,7 +8,7 @@ import numpy as np
 
 from slipid.data.windows import Windows
 from slipid.fit import likelihood as lk
-from slipid.lab.selftest.replicates import measure
+from slipid.lab.selftest.replicates import simulate_windows
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 
@@ -66,10 +66,10 @@ def made(truth, runs=24, count=2, seed=0, std=None, signed=True, voltage=True):
         surface=tuple(labels[k % len(labels)] for k in range(runs)),
         load=tuple(loads[k // 2 % len(loads)] for k in range(runs)),
         session=tuple(sessions[k // 3 % len(sessions)] for k in range(runs)),
-        began=np.zeros(runs),
+        start=np.zeros(runs),
         dt=dt,
         turn=dt[..., None] * rate * rng.normal(1.0, 0.02, (runs, count, 3)),
-        faster=rng.normal(0.0, 0.05, (runs, count, 3)),
+        speed_change=rng.normal(0.0, 0.05, (runs, count, 3)),
         pose=rng.normal(0, 0.5, (runs, 1, 3)) * np.ones((count + 1, 1)),
         current=np.zeros((runs, count, 3)),
         voltage=np.zeros((runs, count, 3)),
@@ -80,7 +80,7 @@ def made(truth, runs=24, count=2, seed=0, std=None, signed=True, voltage=True):
         current_is_signed=signed,
         lag=float(truth.camera.lag),
     )
-    return measure(truth, w, rng, std)
+    return simulate_windows(truth, w, rng, std)
 
 
 def electric_noise(b, voltage_std, scatter=0.05, resistance=5.5):
@@ -94,4 +94,4 @@ def residuals(robot, b, noise):
     """Every block of residuals, `motion` first; the noise is what voltages are predicted with."""
     p = lk.predict(robot, b)
     motion = {"motion": lk.motion_residual(robot, b, p)}
-    return motion | lk.electric_residuals(robot, b, p.felt, noise)
+    return motion | lk.electric_residuals(robot, b, p.motor_force, noise)

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem, State
-from slipid.lab.selftest.replicates import measure
+from slipid.fit.problem import FitState, Problem
+from slipid.lab.selftest.replicates import simulate_windows
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot
 
@@ -83,13 +83,13 @@ def experiment(seed: int, ammeter: float, signed: bool = True) -> Problem:
     """Windows of a made experiment, with so much noise of a window's mean current [A]."""
     common, rng = problem(signed), np.random.default_rng(seed)
     driven = replace(common.windows, current_var=np.full_like(common.windows.current, ammeter**2))
-    return common.of(measure(truth(), driven, rng, STD))
+    return common.of(simulate_windows(truth(), driven, rng, STD))
 
 
 def fitted(this: Problem) -> Found:
     """The fit of an experiment."""
     log_v = 2 * np.log(this.noise.typical)
-    end = optimise(this, start=State(this.space.start, log_v, 0, np.inf, np.inf, "joint"))
-    at = np.array([this.space.place[path].start for path in MOTOR])
+    end = optimise(this, start=FitState(this.space.start, log_v, 0, np.inf, np.inf, "joint"))
+    at = np.array([this.space.slices[path].start for path in MOTOR])
     error = end.state.z[at] - np.log(list(MOTOR.values()))
     return Found(error, np.sqrt(np.diag(end.covariance))[at], end.converged)

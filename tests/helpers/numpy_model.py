@@ -32,9 +32,9 @@ class Rival:
             each, (self.b.surface, self.b.load, self.b.session)
         )
         self.dt = np.asarray(self.b.dt).ravel()
-        self.turn, self.faster, self.amps = (
+        self.turn, self.speed_change, self.amps = (
             np.asarray(x).reshape(-1, x.shape[2])
-            for x in (self.b.turn, self.b.faster, self.b.current)
+            for x in (self.b.turn, self.b.speed_change, self.b.current)
         )
 
     def frame(self, v):
@@ -59,7 +59,7 @@ class Rival:
         """Body twists, and what they came from."""
         hold, roll, pull, shift = self.frame(v)
         late = v["camera", "lag"] - float(self.b.lag)
-        speed = (self.turn - late * self.faster) / self.dt[:, None]
+        speed = (self.turn - late * self.speed_change) / self.dt[:, None]
         rim = v["geometry", "wheel_radius"] * speed
         s = {k[1]: x[self.floor] for k, x in v.items() if k[0] == "surfaces"}
         rest = v["body", "load_share"][self.load] * np.exp(s.pop("load_bias"))
@@ -257,7 +257,7 @@ class Posterior:
         for tie in a.tied:
             span, root = np.asarray(tie.span), np.asarray(tie.root)
             rows = np.einsum("nma,anq->nmaq", span, root).reshape(-1, root.shape[0] * root.shape[2])
-            self.tied.append((np.asarray(tie.pieces), rows, np.asarray(tie.factor)))
+            self.tied.append((np.asarray(tie.segments), rows, np.asarray(tie.factor)))
 
     def __call__(self, x):
         return np.array([self.one(row) for row in x])
@@ -278,8 +278,8 @@ class Posterior:
         """Every number of the robot, in SI."""
         out = {k: v.copy() for k, v in self.start.items()}
         for e in self.space.free:
-            mine, d = z[self.space.place[e.path]], e.declaration
-            if d.tied:
+            mine, d = z[self.space.slices[e.path]], e.declaration
+            if d.constrained:
                 value = share_basis(len(mine) + 1) @ mine
                 value = np.exp(value) / np.exp(value).sum() if d.shares else value
             elif math.isinf(d.upper):

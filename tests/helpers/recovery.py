@@ -13,12 +13,18 @@ from slipid.fit.optimise import optimise
 from slipid.fit.problem import Problem
 from slipid.infer.slip_curves import curves, slip_on
 from slipid.infer.verdicts.estimates import by_ratio, from_zero
-from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.lab.selftest.logs import (
+    SimulatedSensors,
+    heading_grid,
+    nominal_robot,
+    simulate_logs,
+    true_robot,
+)
 from slipid.search_space import Choice, Space
 
 SETUPS = (("firm", "as_built"), ("soft", "as_built"), ("soft", "moved"))
-PLAN = grid(SETUPS, headings=8, turns=1)
-TRUTH = truth(PLAN)
+PLAN = heading_grid(SETUPS, headings=8, turns=1)
+TRUTH = true_robot(PLAN)
 LAG = 0.05
 
 
@@ -45,18 +51,18 @@ def choices(robot=TRUTH, factor=2.0):
 def problem(voltage=True):
     """A compiled problem of the plan's shape, and its choices."""
     cut = windows(dataset(0, voltage), 0.04, LAG)
-    return Problem(cut, blank(PLAN), choices())
+    return Problem(cut, nominal_robot(PLAN), choices())
 
 
 @functools.cache
 def dataset(seed, voltage=True):
-    return collect(make_logs(TRUTH, PLAN, seed, Sensors(has_voltage=voltage)))
+    return collect(simulate_logs(TRUTH, PLAN, seed, SimulatedSensors(has_voltage=voltage)))
 
 
 @functools.cache
 def design():
     """Which coordinates this plan identifies: expected information at the truth."""
-    this, sensors = problem(), Sensors()
+    this, sensors = problem(), SimulatedSensors()
     rows = 40  # of a window
     white = {
         "window": sensors.ripple / np.sqrt(rows),
@@ -77,7 +83,7 @@ def said_identified(space, std):
     """Which coordinates the verdict of Laplace stds calls identified."""
     said = np.zeros(space.size, bool)
     for e in space.free:
-        at = space.place[e.path]
+        at = space.slices[e.path]
         for k in range(at.start, at.stop):
             ratio, apart = std[k] / space.prior_std[k], from_zero(e.declaration, std[k : k + 1])
             said[k] = by_ratio(ratio, apart) == "identified"
@@ -94,7 +100,7 @@ class Recovered:
     names: list[str]
     z: np.ndarray
     std: np.ndarray
-    truth: np.ndarray
+    true_robot: np.ndarray
     identified: np.ndarray
     curve_gap: dict[str, float]
     noise: dict[str, float]

@@ -21,7 +21,7 @@ from slipid.data.log import Log
 from slipid.data.runs import Runs, first_row
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
-from slipid.robot.interface import AbstractEstimator, Estimate, Readings
+from slipid.robot.interface import AbstractEstimator, Readings, StateEstimate
 
 TOGETHER = 32
 """Runs replayed in one call."""
@@ -38,7 +38,7 @@ def heard(estimator: AbstractEstimator, angle: Any, current: Any) -> Readings:
 
 def replay(
     estimator: AbstractEstimator, logs: Sequence[Log], begin: np.ndarray | None = None
-) -> list[Estimate]:
+) -> list[StateEstimate]:
     """Estimates of every row of each run; it starts at rest at a pose (run, 3), or the origin."""
     begin = np.zeros((len(logs), 3)) if begin is None else begin
 
@@ -182,7 +182,7 @@ def _ends(
 def _encoders(robot: Robot, log: Log) -> np.ndarray:
     """Path of wheels that do not slip, from the origin (row, 3)."""
     step = np.diff(log.wheel_angle, axis=0) * float(robot.geometry.wheel_radius)
-    step = step @ np.asarray(robot.geometry.least()).T
+    step = step @ np.asarray(robot.geometry.pseudo_inverse()).T
     out = np.zeros((log.samples, 3))
     for k, (x, y, turn) in enumerate(step):
         middle = out[k, 2] + 0.5 * turn

@@ -14,10 +14,16 @@ from typer.testing import CliRunner
 
 from slipid.app.logs import packaged_config
 from slipid.cli.main import app
-from slipid.lab.selftest.logs import PlannedRun, Sensors, grid, make_logs, truth
+from slipid.lab.selftest.logs import (
+    PlannedRun,
+    SimulatedSensors,
+    heading_grid,
+    simulate_logs,
+    true_robot,
+)
 from tests.helpers.made_logs import write_logs
 
-DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
+DRIVES = heading_grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
 UNSEEN = [type(d)(d.surface, d.load, d.heading + 0.4, d.speed) for d in DRIVES[:3]]
 FEW = ("--draws", "10", "--most", "40", "--block", "2", "--quiet")  # blocks: 36 are to warm up
 
@@ -53,8 +59,10 @@ def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], Said
 def identify(folder: Path, drives: Sequence[PlannedRun] = DRIVES) -> Said:
     """A config, made logs, unseen logs, and the result of identify on them."""
     for name, some, seed in (("logs", drives, 1), ("unseen", UNSEEN, 2)):
-        robot = truth(some)
-        write_logs(make_logs(robot, some, seed, Sensors()), robot, folder / name, folder / "t")
+        robot = true_robot(some)
+        write_logs(
+            simulate_logs(robot, some, seed, SimulatedSensors()), robot, folder / name, folder / "t"
+        )
     (folder / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
     args = ("identify", folder / "my.toml", "--data", folder / "logs", "--out", folder / "out")
     done = invoke(*args)

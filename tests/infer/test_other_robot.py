@@ -11,7 +11,7 @@ import pytest
 
 from slipid.app.config import read_config
 from slipid.app.logs import read_dataset
-from slipid.app.problem import read_job
+from slipid.app.problem import read_fit_task
 from slipid.fit import likelihood as lk
 from slipid.fit.optimise import optimise
 from slipid.infer.result import summarise
@@ -29,9 +29,9 @@ LEAST_SQUARES = 0.0505
 def end_errors(robot, data) -> tuple[np.ndarray, np.ndarray]:
     """Distance between predicted and tracked end of every run [m], and length of its path [m]."""
     off, way = np.zeros(len(data)), np.zeros(len(data))
-    for w in replay.cuts(data, robot):
+    for w in replay.replay_windows(data, robot):
         step = np.asarray(replay.contact_increments(robot, lk.batch(w, robot)))
-        track = replay.follow(robot, w, step)
+        track = replay.tracks_from_increments(robot, w, step)
         way[track.run] = np.linalg.norm(np.diff(track.measured[..., :2], axis=1), axis=-1).sum(1)
         off[track.run] = np.linalg.norm(track.gap[:, :2], axis=1)
     return off, way
@@ -43,7 +43,7 @@ def test_radii_from_joystick_runs_predict_squares_and_circles(real_data):
     if not root.is_dir():
         pytest.skip(f"no logs of the second robot: {root} is no folder")
     config = read_config(CONFIG)
-    job = read_job(config, root, Reporter(quiet=True))
+    job = read_fit_task(config, root, Reporter(quiet=True))
     problem = job.problem()
     fit = summarise(problem, optimise(problem), job.dataset, job.choices)
     assert fit.converged

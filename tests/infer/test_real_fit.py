@@ -49,4 +49,4 @@ def test_noise(out, golden):
 
 def test_predictions(out, real_data, golden):
     *_, found = validate(out, real_data / "robotino2022", Reporter(quiet=True))
-    golden("real_validation", list(rows.of_validation(found)), rtol=SAME, atol=1e-6)
+    golden("real_validation", list(rows.of_validation(found.to_json())), rtol=SAME, atol=1e-6)

@@ -17,7 +17,7 @@ from scipy.stats import f as fisher
 from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.fit.optimise import Optimum, one_round
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.fit.variances import DEGREES
 from slipid.infer import fit_file
 from slipid.infer.design.planned_runs import PlannedRun
@@ -27,7 +27,13 @@ from slipid.infer.result import Fit, summarise
 from slipid.infer.slip_curves import by_encoders, has_steady_command, validity
 from slipid.infer.verdicts.estimates import estimates
 from slipid.infer.verdicts.unidentified import flat_directions, members
-from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.lab.selftest.logs import (
+    SimulatedSensors,
+    heading_grid,
+    nominal_robot,
+    simulate_logs,
+    true_robot,
+)
 from slipid.predict.validation import validation
 from slipid.search_space import Choice
 from slipid.support.errors import DataError
@@ -35,8 +41,8 @@ from slipid.support.files import hash_of
 
 pytestmark = pytest.mark.slow  # traces whole fits
 
-DRIVES = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1,), turns=0)
-TRUTH = truth(DRIVES)
+DRIVES = heading_grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1,), turns=0)
+TRUTH = true_robot(DRIVES)
 CHOICES = (
     Choice("camera.scale", prior_mean=1.117, prior_std=0.002),
     Choice("camera.lag", prior_mean=0.05, prior_std=0.02),
@@ -48,10 +54,10 @@ CHOICES = (
 @functools.cache
 def made(voltage: bool):
     """A problem, its data, and the Laplace covariance at the truth."""
-    data = collect(make_logs(TRUTH, DRIVES, 1, Sensors(has_voltage=voltage)))
-    problem = Problem(windows(data, 0.04, lag=0.05), blank(DRIVES), list(CHOICES))
+    data = collect(simulate_logs(TRUTH, DRIVES, 1, SimulatedSensors(has_voltage=voltage)))
+    problem = Problem(windows(data, 0.04, lag=0.05), nominal_robot(DRIVES), list(CHOICES))
     z = problem.space.vector(TRUTH)
-    state = State(z, 2 * np.log(problem.noise.typical), 7, -1.5, 0.01, "joint")
+    state = FitState(z, 2 * np.log(problem.noise.typical), 7, -1.5, 0.01, "joint")
     laplace = problem.laplace(z, state.log_variance, np.ones(len(problem.windows)))
     end = Optimum(state, laplace, True, "it settled", (3.0, -1.5))
     return problem, data, end
@@ -66,7 +72,7 @@ def fit_of(voltage: bool) -> Fit:
 def test_intervals_are_quantiles_of_the_transformed_gaussian():
     fit = fit_of(True)
     e = fit.parameters["surface.soft.creep"]  # positive: log-normal
-    at = fit.space.place[e.path]
+    at = fit.space.slices[e.path]
     std = np.sqrt(fit.covariance[at, at][0, 0])
     exact = lognorm(std, scale=e.value).ppf([0.05, 0.95])
     assert e.interval90 == pytest.approx(exact, rel=1e-12)
@@ -98,7 +104,7 @@ def verdicts(
     """
     from slipid.search_space import Space
 
-    space = Space(blank(DRIVES), choices)
+    space = Space(nominal_robot(DRIVES), choices)
     if prior_std:
         space = eqx.tree_at(lambda s: s.prior_std, space, np.full(space.size, prior_std))
     cov = np.diag((ratio * space.prior_std) ** 2)
@@ -372,7 +378,7 @@ def test_a_refit_that_dies_while_it_is_written_never_leaves_parts_of_two(
         else:
             save(new, tmp_path)
     if writes == 2:  # identified.json is still the old one's
-        with pytest.raises(DataError, match="of another fit than"):
+        with pytest.raises(DataError, match="belongs to another fit than"):
             load(tmp_path)
         (tmp_path / "identified.json").unlink()
     back, left = load(tmp_path), new if writes >= 2 else old
@@ -433,7 +439,7 @@ def in_sessions(session, seed):
     drives = [
         PlannedRun("soft", "as_built", h, 0.1) for h in rng.uniform(0, 2 * np.pi, len(session))
     ]
-    logs = make_logs(TRUTH, drives, seed, Sensors(has_voltage=False))
+    logs = simulate_logs(TRUTH, drives, seed, SimulatedSensors(has_voltage=False))
     effect = rng.normal(size=(max(session) + 1, 2)) * [*SHARED.values()]
     moved = []
     for log, drive, (along, across) in zip(logs, drives, effect[session], strict=True):
@@ -451,10 +457,10 @@ def in_sessions(session, seed):
 
 def test_what_sessions_share_is_stored_with_its_unit():
     data = in_sessions(np.arange(24) % 6, 1)
-    problem = Problem(windows(data, 0.04, lag=0.056), blank(DRIVES), list(CHOICES))
+    problem = Problem(windows(data, 0.04, lag=0.056), nominal_robot(DRIVES), list(CHOICES))
     z, log_v = problem.space.vector(TRUTH), 2 * np.log(problem.noise.typical)
     laplace = problem.laplace(z, log_v, np.ones(len(problem.windows)))
-    end = Optimum(State(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
+    end = Optimum(FitState(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
     fit = summarise(problem, end, data, CHOICES)
     kept = to_json(fit)["variances"]
     for axis, unit in {**dict.fromkeys(SHARED, "m/m"), "yaw": "rad/m"}.items():
@@ -466,8 +472,8 @@ def test_what_sessions_share_is_stored_with_its_unit():
 def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
     """At the truth, so that all that is off is noise: 200 runs, each in a session of its own."""
     data = in_sessions(np.arange(160) % 40, 1)
-    problem = Problem(windows(data, 0.04, lag=0.056), blank(DRIVES), list(CHOICES))
-    z, sensors = problem.space.vector(TRUTH), Sensors()
+    problem = Problem(windows(data, 0.04, lag=0.056), nominal_robot(DRIVES), list(CHOICES))
+    z, sensors = problem.space.vector(TRUTH), SimulatedSensors()
     std = problem.noise.typical.copy()
     for k, name in enumerate(problem.noise.names):
         if name.startswith("session.soft."):
@@ -476,7 +482,7 @@ def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
             std[k] = max(sensors.of(name), 1e-9)
     log_v = 2 * np.log(std)
     laplace = problem.laplace(z, log_v, np.ones(len(problem.windows)))
-    end = Optimum(State(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
+    end = Optimum(FitState(z, log_v, 7, -1.5, 0.01, "joint"), laplace, True, "it settled", (0.0,))
     save(summarise(problem, end, data, CHOICES), tmp_path)
     fit = load(tmp_path)
     assert np.linalg.eigvalsh(fit.covariance - fit.laplace).min() > -1e-12

@@ -116,11 +116,11 @@ class Forces(NamedTuple):
 
 def forces_of(xi, rim, frame, floor, rest):
     at, balance = Planar(*xi), Balance(rim, stand(frame, floor, rest))
-    roll = frame.roll @ xi - rim * frame.slip_through
+    roll = frame.roll @ xi - rim * frame.roller_share
     drag = balance.wheels(frame.hold @ xi, roll).drag.force()
     x, y, moment = balance.force(at)
     residual = jnp.stack([x, y, moment / frame.base])
-    return Forces(balance.felt(at), -balance.load(at) * drag, balance.share(at), residual)
+    return Forces(balance.motor_force(at), -balance.load(at) * drag, balance.share(at), residual)
 
 
 @eqx.filter_jit
@@ -195,7 +195,7 @@ def test_another_root_finder_finds_the_same_twist():
         found = optx.least_squares(balance, solver, start / scale, max_steps=2000, throw=False)
         return scale * found.value, balance(found.value, None)
 
-    start = jnp.asarray(np.asarray(rim) @ np.asarray(ROBOTINO.least()).T)
+    start = jnp.asarray(np.asarray(rim) @ np.asarray(ROBOTINO.pseudo_inverse()).T)
     theirs, left = jax.jit(oracle)(start, rim, floors, rest)
     done = np.abs(np.asarray(left)).max(axis=1) < 1e-10
     assert done.mean() > 0.9
@@ -428,9 +428,9 @@ def test_drag_of_a_wheel_goes_with_that_power_of_its_load(power):
 
 def test_a_load_bias_is_a_load_that_the_floor_alone_sees():
     rest, bias = jnp.array([0.25, 0.3, 0.45]), jnp.array([0.2, -0.3, 0.1])
-    np.testing.assert_array_equal(law.seen_load(rest, jnp.zeros(3)), rest)
-    np.testing.assert_array_equal(law.seen_load(rest, jnp.asarray(0.0)), rest)
-    seen = law.seen_load(rest, bias)
+    np.testing.assert_array_equal(law.apparent_load(rest, jnp.zeros(3)), rest)
+    np.testing.assert_array_equal(law.apparent_load(rest, jnp.asarray(0.0)), rest)
+    seen = law.apparent_load(rest, bias)
     assert float(seen.sum()) == pytest.approx(1.0, abs=1e-15)
     np.testing.assert_allclose(seen / seen[0], rest / rest[0] * np.exp(bias - bias[0]), rtol=1e-14)
     frame, rim = ROBOTINO.frame(), jnp.array([0.1, 0.03, -0.12])
@@ -453,12 +453,14 @@ def test_energy_is_lost_at_every_wheel_and_the_motors_pay_for_it(name):
         (gap(xi, rim, frame, floors, rest) < 1e-9) & (np.asarray(felt.load) > 0).all(axis=1)
     )
     assert solved.mean() > 0.98
-    pull, through = np.asarray(frame.pull), np.asarray(frame.slip_through)
+    drive_share, through = np.asarray(frame.drive_share), np.asarray(frame.roller_share)
     along = np.asarray(xi) @ np.asarray(frame.hold).T
     roll = np.asarray(xi) @ np.asarray(frame.roll).T
     traction, drag, rim = np.asarray(felt.traction), np.asarray(felt.drag), np.asarray(rim)
-    held = (traction - drag * through) / pull  # along the direction the rollers do not give way in
-    sliding = held * (rim * pull - along)
+    held = (
+        traction - drag * through
+    ) / drive_share  # along the direction the rollers do not give way in
+    sliding = held * (rim * drive_share - along)
     rollers = -drag * (roll - rim * through)
     active = np.hypot(rim, roll - rim * through)
     seen = np.asarray(rest) * np.exp(np.asarray(floors.load_bias))
@@ -633,10 +635,10 @@ def test_a_wheel_drags_along_its_drive_as_far_as_it_rolls_that_way():
     frame, floor = ROBOTINO.frame(), FLOORS["gray"]
     xi = jnp.asarray([0.3, -0.1, 0.2])
     rim = frame.hold @ xi
-    found = contact.rolled(xi, rim, frame, floor, jnp.asarray([0.2, 0.5, 0.3]))
+    found = contact.rolling_drag(xi, rim, frame, floor, jnp.asarray([0.2, 0.5, 0.3]))
     share = np.asarray(rim) / np.hypot(np.asarray(rim), np.asarray(frame.roll @ xi))
     np.testing.assert_allclose(found, 0.31 / 3 * share * np.abs(share), rtol=1e-6)
-    back = contact.rolled(-xi, -rim, frame, floor, EVEN)
+    back = contact.rolling_drag(-xi, -rim, frame, floor, EVEN)
     np.testing.assert_allclose(back, -found, rtol=1e-6)
 
 
@@ -644,4 +646,4 @@ def test_only_wheels_with_rollers_drag_along_their_drive_as_rollers_do():
     xi = jnp.asarray([0.3, 0.0, 0.2])
     rim = SKID.forward() @ xi
     rest = jnp.full(4, 0.25)
-    assert not np.any(contact.rolled(xi, rim, SKID.frame(), FLOORS["gray"], rest))
+    assert not np.any(contact.rolling_drag(xi, rim, SKID.frame(), FLOORS["gray"], rest))

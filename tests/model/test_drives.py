@@ -66,7 +66,7 @@ def test_a_larger_left_wheel_bends_what_should_be_straight():
     made = Space(build(larger, ["floor"]), choices).template
     xi = np.asarray(twist(made, larger.frame(), jnp.full(2, 5.0), jnp.asarray(0), jnp.asarray(0)))
     np.testing.assert_allclose(xi[2] / xi[0], -0.02 / (0.4 * 1.01), rtol=1e-3)
-    plain = np.asarray(larger.least()) * 0.1 @ np.full(2, 5.0)
+    plain = np.asarray(larger.pseudo_inverse()) * 0.1 @ np.full(2, 5.0)
     np.testing.assert_allclose(plain, [0.505, 0.0, -0.025], atol=1e-9)
 
 
@@ -90,7 +90,7 @@ def test_a_larger_wheel_moves_the_body_as_one_that_turns_faster():
 def test_wheels_that_all_point_ahead_do_not_tell_motion_sideways():
     for shape in (OWN, SHARED, differential(0.2, 0.1)):
         assert not shape.determines_twist
-        back = np.asarray(shape.least())
+        back = np.asarray(shape.pseudo_inverse())
         np.testing.assert_allclose(back[1], 0.0, atol=1e-12)
         there = np.asarray(shape.forward()) @ [0.3, 0.0, 0.5]
         np.testing.assert_allclose(back @ there, [0.3, 0.0, 0.5], atol=1e-12)

@@ -31,7 +31,7 @@ def test_body_to_wheels_to_body_is_the_identity(name):
     g = GEOMETRIES[name]
     xi = twists()
     rim = xi @ np.asarray(g.forward()).T
-    np.testing.assert_allclose(rim @ np.asarray(g.least()).T, xi, atol=1e-12)
+    np.testing.assert_allclose(rim @ np.asarray(g.pseudo_inverse()).T, xi, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", GEOMETRIES)
@@ -39,7 +39,7 @@ def test_wheels_to_body_is_least_squares(name):
     g = GEOMETRIES[name]
     rim = np.random.default_rng(1).normal(size=(20, g.wheels))
     expected = np.linalg.lstsq(np.asarray(g.forward()), rim.T, rcond=None)[0].T
-    np.testing.assert_allclose(rim @ np.asarray(g.least()).T, expected, atol=1e-12)
+    np.testing.assert_allclose(rim @ np.asarray(g.pseudo_inverse()).T, expected, atol=1e-12)
 
 
 def test_the_paper_s_two_kinematic_matrices_are_exact_inverses():
@@ -49,7 +49,7 @@ def test_the_paper_s_two_kinematic_matrices_are_exact_inverses():
     to_body = np.stack([-2 * np.sin(d), 2 * np.cos(d), np.full(3, 1 / base)]) / 3
     np.testing.assert_allclose(to_wheels @ to_body, np.eye(3), atol=1e-15)
     np.testing.assert_allclose(ROBOTINO.forward(), to_wheels, atol=1e-12)
-    np.testing.assert_allclose(ROBOTINO.least(), to_body, atol=1e-12)
+    np.testing.assert_allclose(ROBOTINO.pseudo_inverse(), to_body, atol=1e-12)
 
 
 def test_mecanum_has_the_textbook_matrix():
@@ -83,7 +83,10 @@ def test_drive_is_split_over_hold_and_roll(name):
     hold, roll = np.asarray(frame.hold), np.asarray(frame.roll)
     np.testing.assert_allclose((hold[:, :2] * roll[:, :2]).sum(1), 0.0, atol=1e-14)
     np.testing.assert_allclose(np.hypot(hold[:, 0], hold[:, 1]), 1.0, rtol=1e-14)
-    drive = np.asarray(frame.pull)[:, None] * hold + np.asarray(frame.slip_through)[:, None] * roll
+    drive = (
+        np.asarray(frame.drive_share)[:, None] * hold
+        + np.asarray(frame.roller_share)[:, None] * roll
+    )
     angle = np.asarray(GEOMETRIES[name].drive_angle)
     np.testing.assert_allclose(
         drive[:, :2], np.stack([np.cos(angle), np.sin(angle)], 1), atol=1e-14
@@ -145,7 +148,7 @@ def test_the_singular_wheel_is_named():
 )
 def test_rank_below_three_has_the_smallest_twist_that_comes_nearest(g):
     assert not g.determines_twist
-    forward, back = np.asarray(g.forward()), np.asarray(g.least())
+    forward, back = np.asarray(g.forward()), np.asarray(g.pseudo_inverse())
     np.testing.assert_allclose(forward @ back @ forward, forward, atol=1e-12)
     np.testing.assert_allclose(back @ forward @ back, back, atol=1e-12)
     assert np.isfinite(np.asarray(g.frame().shift)).all()
@@ -159,8 +162,8 @@ def test_wheels_at_one_point_are_refused():
 def test_a_wheel_without_rollers_drives_like_an_omni_wheel_and_grips():
     frame = skid_steer(0.2, 0.15, 0.05).frame()
     np.testing.assert_array_equal(frame.grip, 1.0)
-    np.testing.assert_allclose(frame.pull, 1.0)
-    np.testing.assert_allclose(frame.slip_through, 0.0, atol=1e-15)
+    np.testing.assert_allclose(frame.drive_share, 1.0)
+    np.testing.assert_allclose(frame.roller_share, 0.0, atol=1e-15)
     np.testing.assert_allclose(frame.hold[:, :2], [[1.0, 0.0]] * 4, atol=1e-15)
 
 

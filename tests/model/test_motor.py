@@ -130,7 +130,7 @@ def test_braking_looks_like_driving():
 
 
 def test_a_motor_bears_drag_along_the_drive_beside_traction():
-    felt = jnp.asarray([[0.2, 0.1], [-0.3, -0.05]])
-    np.testing.assert_array_equal(MOTOR.borne(felt), [0.2, -0.3])
+    motor_force = jnp.asarray([[0.2, 0.1], [-0.3, -0.05]])
+    np.testing.assert_array_equal(MOTOR.opposing_force(motor_force), [0.2, -0.3])
     dragged = replace(MOTOR, rolling_drag=jnp.asarray(1.2))
-    np.testing.assert_allclose(dragged.borne(felt), [0.32, -0.36], rtol=1e-12)
+    np.testing.assert_allclose(dragged.opposing_force(motor_force), [0.32, -0.36], rtol=1e-12)

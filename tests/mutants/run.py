@@ -43,7 +43,8 @@ ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = shutil.ignore_patterns(".*", "__pycache__", "demo_out", "out")
 VERDICTS = {0: "survived", 1: "killed"}
 """By exit code of pytest; any other one is an error."""
-BROKEN = re.compile(r"ImportError|ModuleNotFoundError|fixture '\w+' not found")
+BROKEN = re.compile(r"ERROR (?!\S*::)|.*(ImportError|ModuleNotFoundError|fixture '\w+' not found)")
+"""Lines of what could not be collected, imported or set up: no failure of a test."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,9 @@ def tests_of(mutant: Mutant, root: Path) -> list[str]:
     for test in mutant.tests:
         path, *inside = test.split("::")
         named = root.glob(f"tests/**/{Path(path).name}")
-        there = [root / path] if (root / path).exists() else [*named]
+        has = "".join(f"def {name}(" for name in inside)
+        there = [p for p in named if p.is_dir() or has in p.read_text(encoding="utf-8")]
+        there = [root / path] if (root / path).exists() else there
         if len(there) != 1:
             raise ValueError(f"{mutant.name}: {len(there)} files {path}; expected one")
         out.append("::".join([str(there[0].relative_to(root)), *inside]))
@@ -122,7 +125,7 @@ def tested(tree: Path, tests: Sequence[str], timeout: float) -> tuple[str, str]:
     said = re.search(r"^(FAILED|ERROR) .*", run.stdout + run.stderr, re.M)
     by = said.group() if said else run.stdout.strip()[-200:]
     verdict = VERDICTS.get(run.returncode, "error")
-    return ("error" if verdict == "killed" and BROKEN.search(by) else verdict), by
+    return ("error" if verdict == "killed" and BROKEN.match(by) else verdict), by
 
 
 def outcome(mutant: Mutant, tree: Path, options: argparse.Namespace) -> Outcome:
@@ -201,16 +204,17 @@ def main() -> int:
     every = read()
     some = [every[name] for name in options.names or every]
     if options.check or options.sound:
-        return int(
-            check(some) > 0 or (options.sound and sound(some, options.timeout) != "survived")
-        )
+        bad = check(some) > 0 or (options.sound and sound(some, options.timeout) != "survived")
+        return int(bad)
     kept: dict[str, Outcome] = {}
     if options.results.exists():
         rows = json.loads(options.results.read_text(encoding="utf-8"))
         kept = {row["name"]: Outcome(**row) for row in rows}
-    due = ("survived",) if options.survivors else ("error",)
-    skipped = {n for n, o in kept.items() if o.verdict not in due and not options.again}
-    run([m for m in some if m.name not in skipped], kept, options)
+    if options.survivors:
+        some = [m for m in some if m.name in kept and kept[m.name].verdict == "survived"]
+    done = {n for n, o in kept.items() if o.verdict != "error"}
+    again = options.again or options.survivors
+    run([m for m in some if again or m.name not in done], kept, options)
     verdicts = [kept[m.name].verdict for m in some]
     print(", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts)))
     return int(set(verdicts) != {"killed"})

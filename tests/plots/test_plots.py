@@ -13,14 +13,20 @@ from matplotlib.image import imread
 from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.fit.optimise import Optimum
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.result import Fit, summarise
-from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.lab.selftest.logs import (
+    SimulatedSensors,
+    heading_grid,
+    nominal_robot,
+    simulate_logs,
+    true_robot,
+)
 from slipid.model.geometry import differential, omni
 from slipid.plots import fit as plots
 from slipid.plots import fit as plots_robot
-from slipid.plots.compare import WORDS, ladder_figure
+from slipid.plots.compare import WORDS, validation_figure
 from slipid.plots.drawing import figure, save
 from slipid.plots.measured_windows import by_heading, measured_windows
 from slipid.plots.motion import heading_figure
@@ -30,14 +36,16 @@ from slipid.search_space import Choice
 
 pytestmark = pytest.mark.slow  # traces whole fits
 
-DRIVES = grid(setups=(("soft", "as_built"), ("firm", "as_built")), headings=8, turns=0)
-ROBOT = truth(DRIVES)
-QUIET = Sensors(std=dict.fromkeys(Sensors().std, 0.0), ripple=0.0, voltage_noise=0.0, wobble=0.0)
+DRIVES = heading_grid(setups=(("soft", "as_built"), ("firm", "as_built")), headings=8, turns=0)
+ROBOT = true_robot(DRIVES)
+QUIET = SimulatedSensors(
+    std=dict.fromkeys(SimulatedSensors().std, 0.0), ripple=0.0, voltage_noise=0.0, wobble=0.0
+)
 
 
 @functools.cache
 def data():
-    return collect(make_logs(ROBOT, DRIVES, 0, QUIET))
+    return collect(simulate_logs(ROBOT, DRIVES, 0, QUIET))
 
 
 @functools.cache
@@ -51,13 +59,13 @@ def fit() -> Fit:
     choices = [Choice("camera.scale", prior_mean=1.117, prior_std=0.002)]
     choices.append(Choice("camera.lag", prior_mean=0.056, prior_std=0.02))
     choices.append(Choice("robot.mass", fixed=12.0))
-    problem = Problem(windows(data(), 0.04, lag=0.056), blank(DRIVES), choices)
+    problem = Problem(windows(data(), 0.04, lag=0.056), nominal_robot(DRIVES), choices)
     z = problem.space.vector(ROBOT)
     log_v = 2 * np.log(problem.noise.typical)
     _, jacobian = problem.linear(jnp.asarray(z), problem.electric(z, log_v))
     keep = jnp.ones(len(problem.windows))
     info = np.asarray(problem.precision(jacobian, jnp.asarray(log_v), keep))
-    state = State(z, log_v, 7, -1.5, 0.01, "joint")
+    state = FitState(z, log_v, 7, -1.5, 0.01, "joint")
     return summarise(
         problem, Optimum(state, np.linalg.inv(info), True, "settled", (0.0,)), data(), choices
     )
@@ -150,9 +158,9 @@ def test_without_currents_or_directions_those_pictures_are_left_out():
 
 def test_turning_pieces_have_no_direction():
     drives = (PlannedRun("soft", "as_built", 0.3, 0.2, turn=0.8),)
-    robot = truth(drives)
+    robot = true_robot(drives)
     assert not measured_windows(
-        robot, collect(make_logs(robot, drives, 0, QUIET)), 4
+        robot, collect(simulate_logs(robot, drives, 0, QUIET)), 4
     ).straight.any()
 
 
@@ -176,5 +184,5 @@ def test_every_rung_has_words_in_the_picture():
 def test_errors_are_drawn_to_scale():
     one = {"endpoint_error_mean": 0.02, "runs": 3}
     other = {"endpoint_error_mean": 0.3, "runs": 3}
-    made = ladder_figure({"summary": {"soft": {"identified": one, "encoder": other}}}, "3 runs")
+    made = validation_figure({"summary": {"soft": {"identified": one, "encoder": other}}}, "3 runs")
     assert [bar.get_width() for bar in made.axes[0].patches] == pytest.approx([2.0, 30.0])

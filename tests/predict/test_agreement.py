@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slipid.predict.agreement import FloorErrors, Moved, compared, contradiction, most_moved
+from slipid.predict.agreement import (
+    FloorErrors,
+    LargestShift,
+    compared,
+    contradiction,
+    largest_shift,
+)
 from slipid.search_space import Choice, Space
 from tests.helpers.made_windows import robot
 
@@ -14,7 +20,7 @@ FLOORS = ["gray"] * RUNS + ["green"] * RUNS
 
 
 FINE = {"gray": FloorErrors(0.01, 0.01, False), "green": FloorErrors(0.01, 0.01, False)}
-STILL = Moved("surface.gray.creep", 0.5)
+STILL = LargestShift("surface.gray.creep", 0.5)
 
 
 def errors(seed=0):
@@ -73,7 +79,7 @@ def test_a_map_that_predicts_worse_than_a_single_floor_is_said_to_be_wrong(green
     [(3.9, None), (25.0, "moves by 25 standard errors"), (np.inf, "found no rest")],
 )
 def test_numbers_that_move_far_are_a_contradiction(sigma, said):
-    found = contradiction(FINE, Moved("robot.load_share", sigma), 0.02, {"gray": 0.05})
+    found = contradiction(FINE, LargestShift("robot.load_share", sigma), 0.02, {"gray": 0.05})
     assert found is None if said is None else said in found
 
 
@@ -84,8 +90,8 @@ def test_what_moves_most_is_told_of_motion_and_not_of_the_camera():
     covariance = np.diag(np.full(space.size, 0.01))
     before, after = np.zeros(space.size), np.full(space.size, 5.0)
     after[space.where(lambda e: e.quantity == "surface.creep")] = 1.0
-    after[space.place["surface.soft.creep"]] = 1.5
-    found = most_moved(space, before, covariance, after, settled=True)
+    after[space.slices["surface.soft.creep"]] = 1.5
+    found = largest_shift(space, before, covariance, after, settled=True)
     assert found.name == "surface.soft.creep"
     assert found.sigma == pytest.approx(15.0)
-    assert most_moved(space, before, covariance, after, settled=False).sigma == np.inf
+    assert largest_shift(space, before, covariance, after, settled=False).sigma == np.inf

@@ -19,16 +19,16 @@ from slipid.cli.main import app
 from slipid.data.runs import collect
 from slipid.fit.likelihood import batch
 from slipid.fit.problem import Problem
-from slipid.fit.sessions import Linear, shared
+from slipid.fit.session_effects import LinearModel, with_session_effects
 from slipid.fit.variances import DEGREES
 from slipid.infer.design.planned_runs import PlannedRun
-from slipid.lab.selftest.logs import Sensors, grid, make_logs, truth
+from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.predict import open_loop as replay
+from slipid.predict.fitted_slip_model import fit_with_noise, slopes
 from slipid.predict.folds import folds_of, nested
-from slipid.predict.noisy import slopes, with_noise
-from slipid.predict.predictive import Contact, by_name, log_student
+from slipid.predict.predictive import ForceBalance, by_name, log_student
 from slipid.predict.ranking import ranking, transfer
-from slipid.predict.score import Score, mean_error
+from slipid.predict.score import Score, forecast, mean_error
 from slipid.predict.slip_models import slip_models
 from slipid.predict.validation import ScoredRun
 from slipid.search_space import Choice
@@ -69,7 +69,7 @@ def test_the_density_is_that_of_scipy():
 def test_regions_and_energy_scores_are_those_of_many_draws():
     cov, gap = np.array([[0.04, 0.01], [0.01, 0.02]]), np.array([[0.0, 0.0], [0.3, -0.1]])
     draws = multivariate_t(shape=cov, df=DEGREES).rvs(20_000, random_state=1)
-    level, score = replay.scores(gap, np.array([cov, cov]))
+    level, score = forecast(gap, np.array([cov, cov]))
     far = np.einsum("ni,ij,nj->n", gap, np.linalg.inv(cov), gap)
     inside = np.einsum("ni,ij,nj->n", draws, np.linalg.inv(cov), draws) <= far[1]
     np.testing.assert_allclose(level, [0.0, inside.mean()], atol=0.01)
@@ -77,14 +77,16 @@ def test_regions_and_energy_scores_are_those_of_many_draws():
     apart = np.linalg.norm(draws[::2] - draws[1::2], axis=1).mean()
     # of a few hundred draws; half of the distance between two draws is 0.14
     np.testing.assert_allclose(score, np.array(near) - 0.5 * apart, atol=0.03)
-    level, score = replay.scores(gap, None)
+    level, score = forecast(gap, None)
     assert level is None
     np.testing.assert_allclose(score, np.linalg.norm(gap, axis=1))
 
 
 def test_a_camera_errs_at_both_ends_of_a_way_and_turns_it_by_the_heading_at_its_start():
     w = made(ROBOT, runs=4)
-    tracks = replay.follow(ROBOT, w, np.asarray(replay.contact_increments(ROBOT, batch(w, ROBOT))))
+    tracks = replay.tracks_from_increments(
+        ROBOT, w, np.asarray(replay.contact_increments(ROBOT, batch(w, ROBOT)))
+    )
     none = np.zeros((4, 3, 3)), np.zeros((4, 2, 2))
     variance = {"camera.place": 4e-6, "camera.heading": 0.0}
     found = replay.end_covariance(ROBOT, w, tracks, variance, *none)
@@ -198,9 +200,9 @@ def driven(name, state, seed, runs=96):
 
 
 def increments_of(w):
-    from slipid.fit.likelihood import measured
+    from slipid.fit.likelihood import measured_increments
 
-    return np.asarray(measured(ROBOT, jnp.asarray(w.pose)))
+    return np.asarray(measured_increments(ROBOT, jnp.asarray(w.pose)))
 
 
 def judged(w, names):
@@ -208,10 +210,10 @@ def judged(w, names):
     problem = Problem(w, ROBOT, HELD)
     z = problem.space.vector(ROBOT)
     variance = by_name(problem, 2 * np.log(problem.noise.typical))
-    contact = Contact(ROBOT, variance, 1e-12 * np.eye(len(z)), problem.space, z, {}, {})
+    contact = ForceBalance(ROBOT, variance, 1e-12 * np.eye(len(z)), problem.space, z, {}, {})
     half = w.run // 4 % 2
     keep = (half == 0).astype(float)
-    models = [with_noise(ALL[name], contact, problem, keep) for name in names]
+    models = [fit_with_noise(ALL[name], contact, problem, keep) for name in names]
     density = {m.name: m.log_density(problem) for m in models}
     out = rows({name: values[half == 1] for name, values in density.items()})
     floors = np.asarray(w.surface)[half == 1]
@@ -303,17 +305,19 @@ def test_a_curve_carries_over_where_floors_share_it_and_nowhere_else(other):
 
 # folds, checkpoints, command --------------------------------------------------------------------
 
-PLAN = grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
+PLAN = heading_grid(setups=(("soft", "as_built"),), headings=6, speeds=(0.1, 0.3), turns=0)
 
 
 @pytest.fixture(scope="module")
 def logs():
-    return make_logs(truth(PLAN), PLAN, 1, Sensors())
+    return simulate_logs(true_robot(PLAN), PLAN, 1, SimulatedSensors())
 
 
 @pytest.mark.slow
 def test_a_turn_on_the_spot_has_no_speed_to_leave_out(logs):
-    spin = make_logs(truth(PLAN), [PlannedRun("soft", "as_built", 0.0, 0.0, 0.5)], 1, Sensors())
+    spin = simulate_logs(
+        true_robot(PLAN), [PlannedRun("soft", "as_built", 0.0, 0.0, 0.5)], 1, SimulatedSensors()
+    )
     fold = folds_of(collect([*logs, *spin]), "speeds")
     assert sorted(set(fold[:-1])) == [0, 1]
     assert fold[-1] == -1
@@ -376,7 +380,7 @@ def test_a_fold_is_kept_whole_and_only_for_the_job_it_is_of(tmp_path):
 
 @pytest.mark.slow
 def test_compare_goes_on_where_it_was_and_ends_the_same(tmp_path, logs):
-    write_logs(logs, truth(PLAN), tmp_path / "logs", tmp_path / "truth")
+    write_logs(logs, true_robot(PLAN), tmp_path / "logs", tmp_path / "true_robot")
     (tmp_path / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
     out = tmp_path / "out"
     words = ("compare", tmp_path / "my.toml", "--data", tmp_path / "logs", "--out", out)
@@ -415,7 +419,7 @@ def with_sessions(std, seed, session):
     gap = np.einsum("nma,na->nm", effect, each) + noise * rng.normal(size=(runs, 6))
     scale = np.einsum("nma,a,nla->nml", effect, run**2, effect) + noise**2 * np.eye(6)
     info = np.einsum("nmp,nml,nlq->pq", slope, np.linalg.inv(scale), slope)
-    model = Linear(
+    model = LinearModel(
         gap=gap,
         slope=slope,
         covariance=np.linalg.inv(info),
@@ -434,7 +438,7 @@ def test_what_sessions_share_is_found_and_widens_what_was_fitted():
     found = []
     for seed in range(6):
         model, w = with_sessions(std, seed, np.arange(80) % 8)
-        variance, covariance = shared(model, w, np.ones(len(w)))
+        variance, covariance = with_session_effects(model, w, np.ones(len(w)))
         found.append(list(variance.values()))
         assert np.linalg.eigvalsh(covariance - model.covariance).min() > -1e-12
     # 8 sessions know their std to a quarter, six times as many to a tenth
@@ -451,7 +455,7 @@ def test_regions_hold_runs_of_other_sessions_as_often_as_they_say():
     own = np.linalg.inv((pull @ model.slope)[keep].sum(axis=0))
     z = -own @ (pull @ model.gap[..., None])[keep].sum(axis=0)
     model = replace(model, covariance=own, gap=model.gap + (model.slope @ z)[..., 0])
-    variance, covariance = shared(model, w, keep.astype(float))
+    variance, covariance = with_session_effects(model, w, keep.astype(float))
     e, j = model.effect[judged], model.slope[judged]
 
     def covered(v, c):
@@ -473,18 +477,18 @@ def test_a_run_gone_wrong_hardly_counts_for_what_its_session_shares():
     gap = model.gap.copy()
     gap[0] += model.effect[0] @ [1.0, -1.0, 3.0]
     keep = np.ones(len(w))
-    wrong = shared(replace(model, gap=gap), w, keep)[0]
+    wrong = with_session_effects(replace(model, gap=gap), w, keep)[0]
     keep[0] = 0.0
-    without = shared(model, w, keep)[0]
+    without = with_session_effects(model, w, keep)[0]
     np.testing.assert_allclose(list(wrong.values()), list(without.values()), rtol=0.1)
 
 
 @pytest.mark.slow
 def test_runs_that_share_nothing_are_left_as_they_are():
     model, w = with_sessions(0.0, 7, np.arange(240) % 8)
-    variance, covariance = shared(model, w, np.ones(len(w)))
+    variance, covariance = with_session_effects(model, w, np.ones(len(w)))
     assert list(variance) == [f"session.firm.{axis}" for axis in ("along", "across", "yaw")]
     assert (np.array(list(variance.values())) < 0.1 * model.run[0]).all()
     np.testing.assert_allclose(covariance, model.covariance, rtol=0.3)
     alone = replace(w, session=("one",) * len(w))
-    assert shared(model, alone, np.ones(len(w)))[0] == {}
+    assert with_session_effects(model, alone, np.ones(len(w)))[0] == {}

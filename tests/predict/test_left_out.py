@@ -7,16 +7,22 @@ import numpy as np
 import pytest
 
 from slipid.app.config import FitSection
-from slipid.app.problem import Task, on_runs
+from slipid.app.problem import FitTask, robot_for_runs
 from slipid.data.runs import collect
 from slipid.fit.optimise import optimise
-from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.lab.selftest.logs import (
+    SimulatedSensors,
+    heading_grid,
+    nominal_robot,
+    simulate_logs,
+    true_robot,
+)
 from slipid.predict import folds, predictive
 from slipid.predict import open_loop as replay
-from slipid.predict.noisy import Noisy
+from slipid.predict.fitted_slip_model import FittedSlipModel
 from slipid.search_space import Choice
 
-PLAN = grid(
+PLAN = heading_grid(
     setups=(("firm", "as_built"), ("soft", "as_built")), headings=6, speeds=(0.1, 0.2), turns=0
 )
 QUESTION = "sectors"
@@ -45,14 +51,14 @@ def garbage(log, rng):
 
 def task_of(logs):
     data = collect(logs)
-    robot = on_runs(blank(PLAN), data, (0.0, 0.0))
-    return Task(data, robot, CHOICES, FitSection(windows_per_piece=3))
+    robot = robot_for_runs(nominal_robot(PLAN), data, (0.0, 0.0))
+    return FitTask(data, robot, CHOICES, FitSection(windows_per_piece=3))
 
 
 @pytest.fixture(scope="module")
 def logs():
     """Runs of which those of one speed look longer than those of the other."""
-    made = make_logs(truth(PLAN), PLAN, 1, Sensors())
+    made = simulate_logs(true_robot(PLAN), PLAN, 1, SimulatedSensors())
     longer = [1.0 + 0.03 * np.sign(d.speed - 0.15) for d in PLAN]
     return [replace(log, pose=log.pose * [k, k, 1.0]) for log, k in zip(made, longer, strict=True)]
 
@@ -66,7 +72,7 @@ def judged(logs):
 @pytest.fixture(scope="module")
 def learnt(logs, judged):
     task = task_of(logs)
-    return folds.learn(task.problem(), CHOICES, task.dataset, QUESTION, judged, fit)
+    return folds.fit_fold(task.problem(), CHOICES, task.dataset, QUESTION, judged, fit)
 
 
 def test_nothing_of_a_left_out_run_is_learnt(logs, judged, learnt):
@@ -78,10 +84,10 @@ def test_nothing_of_a_left_out_run_is_learnt(logs, judged, learnt):
     rng = np.random.default_rng(0)
     witness, spoilt = judged[0], judged[1:]
     other = task_of([garbage(log, rng) if k in spoilt else log for k, log in enumerate(logs)])
-    again = folds.learn(other.problem(), CHOICES, other.dataset, QUESTION, judged, fit)
+    again = folds.fit_fold(other.problem(), CHOICES, other.dataset, QUESTION, judged, fit)
     assert len(spoilt) > 2
     w = learnt.problem.windows
-    kept = w.pieces(np.flatnonzero(~np.isin(w.run, judged)))
+    kept = w.segments(np.flatnonzero(~np.isin(w.run, judged)))
     std = np.sqrt(np.diag(learnt.optimum.covariance))
     same(again.optimum.state.z / std, learnt.optimum.state.z / std)
     same(again.optimum.state.log_variance, learnt.optimum.state.log_variance)
@@ -95,7 +101,7 @@ def test_nothing_of_a_left_out_run_is_learnt(logs, judged, learnt):
         size = np.sqrt(np.diag(before.covariance))
         both = size * size[:, None]
         same(now.covariance / both, before.covariance / both, err_msg=now.name)
-        if isinstance(now, Noisy):
+        if isinstance(now, FittedSlipModel):
             assert now.model.state.keys() == before.model.state.keys()
             # of a curve that is straight where it was seen, numbers may be anything
             one, two = (m.model.twist(kept, m.robot) for m in (now, before))
@@ -138,14 +144,14 @@ def test_regions_of_left_out_runs_know_what_sessions_share(logs, judged, learnt,
         bare = replace(model, variance=own)
         regions = [
             (model.ends(w)[1], bare.ends(w)[1])
-            for w in replay.cuts(task.dataset.subset(judged), model.robot)
+            for w in replay.replay_windows(task.dataset.subset(judged), model.robot)
         ]
         for wide, plain in [*regions, [m.scale(learnt.problem)[1] for m in (model, bare)]]:
             growth = np.linalg.eigvalsh(wide - plain)[:, -1]
             assert (growth > 0.01 * np.linalg.eigvalsh(plain)[:, -1]).all(), model.name
     nothing = {name: 1e-30 for name in learnt.models[0].variance if name.startswith("session.")}
     monkeypatch.setattr(predictive, "shared", lambda model, *_: (nothing, model.covariance))
-    held = partial(folds.learn, fit=lambda *_, **__: learnt.optimum)
+    held = partial(folds.fit_fold, fit=lambda *_, **__: learnt.optimum)
     alone = held(task.problem(), CHOICES, task.dataset, QUESTION, judged)
     problem, state = learnt.problem, learnt.optimum.state
     of_session = [name.startswith("session.") for name in problem.noise.names]

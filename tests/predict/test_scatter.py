@@ -43,9 +43,9 @@ def test_noise_is_found_where_it_is_and_what_is_typical_elsewhere():
 @pytest.mark.slow
 def test_runs_too_few_to_be_predicted_from_each_other_scatter_far():
     w = made(ROBOT, runs=192, count=4, seed=1, std=NOISY)
-    few = w.pieces(np.flatnonzero(np.asarray(w.surface) == "soft")[:3])
+    few = w.segments(np.flatnonzero(np.asarray(w.surface) == "soft")[:3])
     assert found(few)[0]["run.soft.along"] > 0.1
-    alone = replace(few, surface=("firm",) * len(few)).pieces(np.array([0]))
+    alone = replace(few, surface=("firm",) * len(few)).segments(np.array([0]))
     assert np.isfinite(list(found(alone)[0].values())).all()
 
 
@@ -54,10 +54,10 @@ def test_where_a_robot_stands_the_noise_of_the_camera_is_no_scatter():
     w = made(ROBOT, runs=96, count=4, seed=2, std=NOISY)
     moving = found(w)[0]
     rng, stands = np.random.default_rng(0), np.arange(0, len(w), 2)
-    turn, faster, pose = w.turn.copy(), w.faster.copy(), w.pose.copy()
-    turn[stands, 3], faster[stands, 3] = 1e-5, 0.0
+    turn, speed_change, pose = w.turn.copy(), w.speed_change.copy(), w.pose.copy()
+    turn[stands, 3], speed_change[stands, 3] = 1e-5, 0.0
     pose[stands, 4] = pose[stands, 3] + rng.normal(0, [5e-4, 5e-4, 3e-3], (len(stands), 3))
-    standing = found(replace(w, turn=turn, faster=faster, pose=pose))[0]
+    standing = found(replace(w, turn=turn, speed_change=speed_change, pose=pose))[0]
     for name in NOISY:
         assert standing[name] < 1.4 * moving[name], name
 

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from slipid.predict.kinematics import Corrected, Encoder, HeadingLookup
 from slipid.predict.slip_model import TRIES, ByFloor, path_of
-from slipid.predict.steps import Steps, TrainingWindows, least
+from slipid.predict.steps import Steps, TrainingWindows, scaled_least_squares
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
 
@@ -88,10 +88,10 @@ def test_rows_are_displacements_with_yaw_at_the_base_radius():
 
 def test_columns_without_news_get_nothing():
     a = np.array([[1.0, 0.0, 1.0], [2.0, 0.0, 2.0], [0.5, 0.0, 0.5]])
-    assert np.allclose(least(a, a[:, 0] * 3), [1.5, 0.0, 1.5])
+    assert np.allclose(scaled_least_squares(a, a[:, 0] * 3), [1.5, 0.0, 1.5])
     a[:, 1] = 1e-17
-    assert least(a, np.ones(3))[1] == 0.0
-    assert np.array_equal(least(0 * a, np.ones(3)), np.zeros(3))
+    assert scaled_least_squares(a, np.ones(3))[1] == 0.0
+    assert np.array_equal(scaled_least_squares(0 * a, np.ones(3)), np.zeros(3))
 
 
 def test_a_channel_that_one_run_lacks_is_there_for_none(rng):
@@ -118,7 +118,7 @@ def skid_runs(rng, move, noise=0.0):
         s, d = rng.uniform(-1, 1, (2, 4)).repeat(10, axis=1)
         rolling = np.stack([s, 0 * s, d], axis=1)
         twist = move(s, d) + noise * rng.normal(size=(40, 3))
-        runs.append(made_run(rolling, twist, machine=HUSKY, floor="grass"))
+        runs.append(made_run(rolling, twist, spec=HUSKY, floor="grass"))
     return runs
 
 

@@ -8,10 +8,9 @@ import pytest
 
 from slipid.predict import open_loop as replay
 from slipid.predict.curves import insensitive
-from slipid.predict.floor_models import FloorModels
 from slipid.predict.kinematics import HeadingLookup
 from slipid.predict.score import chords
-from slipid.predict.slip_models import restored, slip_models
+from slipid.predict.slip_models import FloorModels, restored, slip_models
 from tests.helpers.made_windows import SCALE, made
 from tests.helpers.made_windows import robot as made_robot
 
@@ -66,7 +65,7 @@ def test_a_curve_predicts_runs_it_has_not_seen(name):
     truth = with_truth(name)
     found = ALL[name].fit(driven(windows(), truth), ROBOT)
     other = driven(windows(seed=1), truth)
-    tracks = replay.follow(ROBOT, other, found.increments(other, ROBOT))
+    tracks = replay.tracks_from_increments(ROBOT, other, found.increments(other, ROBOT))
     np.testing.assert_allclose(tracks.gap, 0.0, atol=1e-5)
 
 
@@ -107,8 +106,8 @@ def test_support_vectors_do_not_follow_a_few_spoilt_runs():
 
 def test_encoders_are_right_where_nothing_slips():
     w = driven(windows(), ALL["encoder"])
-    j = np.asarray(ROBOT.geometry.least()) * 0.04
-    tracks = replay.follow(ROBOT, w, ALL["encoder"].increments(w, ROBOT))
+    j = np.asarray(ROBOT.geometry.pseudo_inverse()) * 0.04
+    tracks = replay.tracks_from_increments(ROBOT, w, ALL["encoder"].increments(w, ROBOT))
     np.testing.assert_allclose(tracks.gap, 0.0, atol=1e-12)
     far = np.linalg.norm((w.turn.sum(axis=1) @ j.T)[:, :2], axis=1)
     chord = np.array(chords(tracks.measured))
@@ -128,8 +127,8 @@ def test_the_lookup_learns_a_smooth_series_of_each_floor_and_load():
     found = ALL["heading_lookup"].fit(driven(windows(), truth), ROBOT)
     assert sorted(found.state) == sorted(series)
     other = driven(windows(seed=1), truth)
-    gap = replay.follow(ROBOT, other, found.increments(other, ROBOT)).gap
-    plain = replay.follow(ROBOT, other, ALL["encoder"].increments(other, ROBOT)).gap
+    gap = replay.tracks_from_increments(ROBOT, other, found.increments(other, ROBOT)).gap
+    plain = replay.tracks_from_increments(ROBOT, other, ALL["encoder"].increments(other, ROBOT)).gap
     assert np.abs(gap).mean() < 0.05 * np.abs(plain).mean()
 
 
@@ -141,12 +140,12 @@ def test_the_lookup_is_tuned_on_runs_left_out_as_they_will_be():
     error, size = {}, {}
     for name, together in {"sectors": sector, "at random": None}.items():
         model = FloorModels(HeadingLookup(ridge=None, together=together))
-        found = [model.fit(w.pieces(np.flatnonzero(sector != k)), ROBOT) for k in range(6)]
+        found = [model.fit(w.segments(np.flatnonzero(sector != k)), ROBOT) for k in range(6)]
         size[name] = sum(np.abs(v[1:]).sum() for model in found for v in model.state.values())
         error[name] = 0.0
         for k, fitted in enumerate(found):
-            other = w.pieces(np.flatnonzero(sector == k))
-            gap = replay.follow(ROBOT, other, fitted.increments(other, ROBOT)).gap
+            other = w.segments(np.flatnonzero(sector == k))
+            gap = replay.tracks_from_increments(ROBOT, other, fitted.increments(other, ROBOT)).gap
             error[name] += np.hypot(*gap.T[:2]).mean()
     assert error["sectors"] < 0.95 * error["at random"]
     assert size["sectors"] < 0.6 * size["at random"]
@@ -186,7 +185,7 @@ def test_without_currents_only_models_that_need_none_are_there():
 @pytest.mark.parametrize("name", ["affine", "saturating", "heading_lookup"])
 def test_a_floor_that_was_not_fitted_is_refused(name):
     w = windows()
-    mine = w.pieces(np.flatnonzero(np.asarray(w.surface) == "firm"))
+    mine = w.segments(np.flatnonzero(np.asarray(w.surface) == "firm"))
     fitted = ALL[name].fit(driven(mine, ALL["encoder"]), ROBOT)
     with pytest.raises(ValueError, match="no surface 'soft'; identified: firm"):
         fitted.increments(w, ROBOT)

@@ -10,7 +10,7 @@ import pytest
 
 from slipid.model.geometry import omni
 from slipid.model.robot import build
-from slipid.robot.closed_loop import Pilot, drive
+from slipid.robot.closed_loop import ControlLoop, run_closed_loop
 from slipid.robot.controller import Controller, Gains, Limits
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, Odometry
@@ -29,7 +29,7 @@ OTHER = Settings(
     filter_s=0.04,
     patch_m=0.2,
     doubt_m=1.0,
-    alike=1.0,
+    further_floor_penalty=1.0,
     unknown_std=4.0,
     ammeter_std_a=0.05,
     voltmeter_std_v=0.05,
@@ -121,7 +121,8 @@ def test_another_robot_and_other_settings_step_without_compiling(robots, kind):
         steps(kind(one, OTHER))
     assert found == []
     assert not any(np.allclose(before[-1], said[-1]) for said in after)
-    assert not np.allclose(after[1][-1], after[2][-1])
+    if kind is Estimator:  # odometry from wheel angles alone has no use for these settings
+        assert not np.allclose(after[1][-1], after[2][-1])
 
 
 def test_another_robot_and_other_settings_run_a_log_without_compiling(robots):
@@ -143,7 +144,7 @@ def test_another_robot_other_gains_and_limits_are_controlled_without_compiling(r
         return np.asarray(commanded(controller, controller.init(), REFERENCE, estimate, 0.05)[1])
 
     before = step(Controller(one, Gains()))
-    gains = Gains.at((2.0, 1.0, 0.1, 0.5, 0.2, 0.1))
+    gains = Gains.at((2.0, 1.0, 0.1, 0.2, 0.1))
     with compilations() as found:
         after = [
             step(Controller(two)),
@@ -159,9 +160,9 @@ def test_another_robot_runs_a_closed_loop_without_compiling(robots):
     floor = small_twin.floor([[0, 1], [1, 0]])
 
     def course(robot: DeployedRobot, settings: Settings, limits: Limits) -> np.ndarray:
-        pilot = Pilot(Estimator(robot, settings), Controller(robot, Gains(), limits))
+        control_loop = ControlLoop(Estimator(robot, settings), Controller(robot, Gains(), limits))
         plant = TwinPlant(Twin(robot, floor), (0.0, 0.0, 0.0), jax.random.key(0))
-        return drive(pilot, PATH, plant, (0.0, 0.0, 0.0)).command
+        return run_closed_loop(control_loop, PATH, plant, (0.0, 0.0, 0.0)).command
 
     before = course(one, ONE, Limits())
     with compilations() as found:

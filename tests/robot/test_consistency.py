@@ -14,15 +14,14 @@ from scipy.stats import chi2
 
 from slipid.model import contact
 from slipid.model.se2 import advance, compose
-from slipid.robot.actuation import Habits
 from slipid.robot.estimator import Estimator
-from slipid.robot.filter.effects import SETTLES, TURN, stays
+from slipid.robot.filter.effects import SETTLES, TURN, effect_correlation
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import FloorFilter
-from slipid.robot.filter.pose_filter import PoseFilter, _learnt
-from slipid.robot.filter.pose_fix import _given, fixed
-from slipid.robot.interface import MIXED, Measurement, Readings, Settings
-from slipid.robot.twin import Twin
+from slipid.robot.filter.pose_filter import PoseFilter, _scalar_update
+from slipid.robot.filter.pose_fix import _given, apply_fix
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Measurement, Readings, Settings
+from slipid.robot.twin import ActuatorModel, Twin
 from tests.helpers.kept import kept
 from tests.helpers.small_twin import deployed, floor
 from tests.helpers.stepped import stepped
@@ -135,7 +134,7 @@ def test_what_a_late_fix_sets_aside_leaves_a_covariance(own):
             noise=jnp.asarray(cov[:3, :3]),
             history=start.history.at[:, 0].set(1.0),
         )
-        values = np.linalg.eigvalsh(fixed(now, late)[0].covariance)
+        values = np.linalg.eigvalsh(apply_fix(now, late)[0].covariance)
         assert values[0] > -1e-9 * values[-1]
 
 
@@ -178,7 +177,7 @@ def test_an_effect_correlates_over_a_turn_as_the_kernel_says_in_however_many_ste
         far = jnp.asarray(10 * SETTLES / steps)
         kept, v = 1.0, jnp.asarray(before)
         for _ in range(steps):
-            v, keep = stays(v, jnp.asarray(now), jnp.zeros(1), far)
+            v, keep = effect_correlation(v, jnp.asarray(now), jnp.zeros(1), far)
             kept *= float(keep[0])
         expected = np.exp(-np.sum((now - before) ** 2) / (2 * TURN**2))
         assert kept == pytest.approx(expected, abs=1e-3)
@@ -188,10 +187,10 @@ def test_a_direction_that_trembles_keeps_its_effect_and_a_floor_left_does_not():
     rng, v, kept = np.random.default_rng(0), jnp.zeros(3), 1.0
     for angle in rng.normal(0.0, np.radians(0.5), 200):
         now = jnp.array([jnp.cos(angle), jnp.sin(angle), 0.0])
-        v, keep = stays(v, now, jnp.zeros(1), jnp.asarray(0.005))  # a metre
+        v, keep = effect_correlation(v, now, jnp.zeros(1), jnp.asarray(0.005))  # a metre
         kept *= float(keep[0])
     assert kept > 0.9
-    _, keep = stays(v, v, jnp.array([0.0, 1.0]), jnp.asarray(0.5))
+    _, keep = effect_correlation(v, v, jnp.array([0.0, 1.0]), jnp.asarray(0.5))
     assert keep[0] == pytest.approx(1.0, abs=1e-6)
     assert keep[1] < 0.01
 
@@ -248,7 +247,9 @@ def test_a_reading_moves_what_learns_and_leaves_the_rest_with_the_right_covarian
     cov, look = mix @ mix.T / count, rng.normal(size=count)
     noise, learns = 0.3, np.isin(np.arange(count), [2, count - 1]).astype(float)
     state, var = replace(state, covariance=jnp.asarray(cov)), look @ cov @ look + noise
-    now = _learnt(state, jnp.asarray(look), jnp.asarray(0.7), jnp.asarray(var), jnp.asarray(learns))
+    now = _scalar_update(
+        state, jnp.asarray(look), jnp.asarray(0.7), jnp.asarray(var), jnp.asarray(learns)
+    )
     change = np.concatenate([now.pose - state.pose, now.nuisance - state.nuisance])
     np.testing.assert_array_equal(change[learns == 0], 0.0)
     assert np.abs(change[learns == 1]).min() > 0
@@ -296,7 +297,7 @@ def runs(gyro, fixes, count=200):
     every twentieth is heard.
     """
     whole, sure = deployed(process=1.0, run=1.0, current=1.0), Settings(gyro_bias_std=0.005)
-    twin = Twin(whole, FIRM, Habits(gyro=gyro, smooth=True, voltage=False))
+    twin = Twin(whole, FIRM, ActuatorModel(gyro=gyro, smooth=True, voltage=False))
     est, commands, std = Estimator(whole.on("firm"), sure), path(whole), jnp.array([0.002, 0.004])
     wide = std[jnp.array([0, 0, 1])]
 
@@ -356,12 +357,15 @@ def test_nis_of_fixes_and_of_the_gyro(gyro):
 def test_regions_on_floors_that_are_not_known_are_not_too_narrow():
     """Patches drawn for every run, crossed over and over."""
     whole = deployed(process=1.0, run=1.0, current=1.0)
-    est, commands = Estimator(whole, Settings(alike=MIXED)), path(whole)
+    est, commands = (
+        Estimator(whole, Settings(further_floor_penalty=MIXED_FLOORS_PENALTY)),
+        path(whole),
+    )
 
     def one(key):
         cells = jax.random.bernoulli(jax.random.fold_in(key, 3), 0.5, (5, 5)).astype(int)
         drawn = Floor(cells, jnp.array([-1.0, -1.0]), jnp.asarray(0.4))
-        twin = Twin(whole, drawn, Habits(smooth=True, voltage=False))
+        twin = Twin(whole, drawn, ActuatorModel(smooth=True, voltage=False))
 
         def step(carry, now):
             true, state = carry

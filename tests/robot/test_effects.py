@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.fit import shared
+from slipid.fit import shared_effects as shared
 from slipid.robot.estimator import Estimator
-from slipid.robot.filter.effects import FORGETS, Course, Told
+from slipid.robot.filter.effects import FORGETS, EffectTable, RolledMotion
 from slipid.robot.interface import Measurement, Settings
 from tests.helpers.small_twin import deployed
 from tests.helpers.stepped import stepped
@@ -26,12 +26,12 @@ def table():
     rows = np.zeros((2, 3, 8, 6))
     rows[1, :, :, 0] = 0.01 * np.arange(8)
     rows[..., 3:] = np.array([0.3, 0.5, 0.7])[:, None, None]
-    return Told(jnp.log(jnp.asarray(SPEEDS)), jnp.asarray(rows))
+    return EffectTable(jnp.log(jnp.asarray(SPEEDS)), jnp.asarray(rows))
 
 
 def at(angle, speed, turn=0.0):
     way = jnp.array([speed * np.cos(angle), speed * np.sin(angle), turn])
-    return [np.asarray(x) for x in table().at(Course.of(way, BASE))]
+    return [np.asarray(x) for x in table().at(RolledMotion.of(way, BASE))]
 
 
 @pytest.mark.slow
@@ -70,7 +70,9 @@ def driven(told, hypothesis):
     robot = deployed(run=1.0)
     if told:
         rows = jnp.concatenate([MISSED, PARTS], axis=1)[:, None, None]
-        robot = eqx.tree_at(lambda r: r.told, robot, Told(jnp.log(jnp.asarray([0.2])), rows))
+        robot = eqx.tree_at(
+            lambda r: r.effect_table, robot, EffectTable(jnp.log(jnp.asarray([0.2])), rows)
+        )
     watched = Estimator(robot, Settings(patch_m=1e9))
     run = partial(stepped(watched), dt=DT)
     belief, state = jnp.full(9, 1e-12).at[hypothesis].set(1.0), watched.init()

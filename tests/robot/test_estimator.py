@@ -17,8 +17,8 @@ from slipid.model import contact
 from slipid.model.geometry import omni
 from slipid.model.robot import build
 from slipid.robot import closed_loop
-from slipid.robot.closed_loop import Pilot
-from slipid.robot.controller import LONGEST_I, Controller, Gains, Limits, limited
+from slipid.robot.closed_loop import ControlLoop
+from slipid.robot.controller import LONGEST_I, Controller, Gains, Limits, limit_command
 from slipid.robot.estimator import Estimator, Odometry
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import FloorFilter
@@ -28,7 +28,7 @@ from slipid.robot.interface import UNTIMED_S, Measurement, Readings, Settings
 from slipid.robot.trajectory import rectangle
 from slipid.robot.twin import Twin, TwinPlant
 from tests.helpers import small_twin
-from tests.helpers.compiled_pilot import Flat
+from tests.helpers.compiled_loop import Flat
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.stepped import stepped
 
@@ -59,19 +59,19 @@ def robot():
 
 
 @cache
-def pilot(kind):
+def control_loop(kind):
     deployed = robot()
     if kind == "curve":
         gains = Gains.at((2.0, 2.0, 0.2, 0.0, 0.15))
-        return Pilot(Odometry(deployed, curve=True), Controller(deployed, gains))
+        return ControlLoop(Odometry(deployed, curve=True), Controller(deployed, gains))
     gains = Gains.at((2.0, 2.0, 0.2, 0.3, 0.15))
     there = CHESS if kind == "mapped" else None
-    return Pilot(Estimator(deployed, floor=there), Controller(deployed, gains))
+    return ControlLoop(Estimator(deployed, floor=there), Controller(deployed, gains))
 
 
 @cache
 def step(kind):
-    p = pilot(kind)
+    p = control_loop(kind)
     return jax.jit(lambda state, z, dt: p.step(PATH, state, z, dt))
 
 
@@ -82,9 +82,9 @@ def reading(**known):
 
 def sane(kind, state, said, before, dt):
     """Whether everything is finite and the command within its limits, for one robot."""
-    p = pilot(kind)
+    p = control_loop(kind)
     f, order = p.controller.robot, Flat(state)
-    last, now = before.held, state.held
+    last, now = before.controller, state.controller
     # an angle that was never read is NaN
     angle, numbers = order.place("seen.wheels.angle"), order.ravel(state)
     rest = jnp.concatenate([numbers[: angle.start], numbers[angle.stop :]])
@@ -154,7 +154,7 @@ def adversary(key, count, angle):
 )
 def test_adversarial_steps(kind, steps):
     """A hundred robots at once, so that the nightly ones take a million steps."""
-    p, robots = pilot(kind), 100
+    p, robots = control_loop(kind), 100
 
     def one(carry, key):
         state, angle = carry
@@ -180,7 +180,7 @@ def test_adversarial_steps(kind, steps):
 @given(data=st.data())
 def test_any_reading_leaves_a_sound_state(kind, data):
     value = st.one_of(st.sampled_from(BAD), st.floats(), st.floats(-20, 20))
-    state, size = pilot(kind).init(), SENSED.size
+    state, size = control_loop(kind).init(), SENSED.size
     for _ in range(4):
         z = SENSED.unravel(jnp.array(data.draw(st.lists(value, min_size=size, max_size=size))))
         dt = data.draw(st.one_of(st.just(DT), value))
@@ -195,7 +195,7 @@ def test_any_reading_leaves_a_sound_state(kind, data):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_stops_where_a_wheel_falls_silent_and_goes_on_without_a_bump(kind):
-    state, angle, command, rows = pilot(kind).init(), np.zeros(3), np.zeros(3), []
+    state, angle, command, rows = control_loop(kind).init(), np.zeros(3), np.zeros(3), []
     for k in range(160):
         angle = angle + command * DT
         heard = angle.copy()
@@ -216,7 +216,7 @@ def test_it_stops_where_a_wheel_falls_silent_and_goes_on_without_a_bump(kind):
 
 
 def test_a_pilot_that_wakes_on_a_moving_robot_starts_from_its_wheels():
-    state, speed = pilot("contact").init(), np.array([4.0, -3.0, 2.0])
+    state, speed = control_loop("contact").init(), np.array([4.0, -3.0, 2.0])
     state, said = step("contact")(state, reading(wheel_speed=speed), DT)
     assert np.abs(np.asarray(said.command) - speed).max() <= LIMITS.acceleration * DT + 1e-9
 
@@ -225,8 +225,8 @@ def test_a_pilot_that_wakes_on_a_moving_robot_starts_from_its_wheels():
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_state_is_of_one_kind_from_the_start(kind):
     """Else a step is compiled twice."""
-    begin = jax.eval_shape(pilot(kind).init)
-    after, _ = jax.eval_shape(pilot(kind).step, PATH, begin, reading(), jnp.asarray(DT))
+    begin = jax.eval_shape(control_loop(kind).init)
+    after, _ = jax.eval_shape(control_loop(kind).step, PATH, begin, reading(), jnp.asarray(DT))
     for a, b in zip(jax.tree.leaves(begin), jax.tree.leaves(after), strict=True):
         assert (a.shape, a.dtype, a.weak_type) == (b.shape, b.dtype, b.weak_type)
 
@@ -240,7 +240,7 @@ def test_saturation_keeps_the_direction():
     for _ in range(50):
         wanted = rng.normal(size=3) * 30
         got = np.asarray(
-            limited(jnp.asarray(wanted), jnp.zeros(3), jnp.zeros(3), robot(), LIMITS, 0.5)
+            limit_command(jnp.asarray(wanted), jnp.zeros(3), jnp.zeros(3), robot(), LIMITS, 0.5)
         )
         np.testing.assert_allclose(np.cross(got, wanted), 0.0, atol=1e-9)
         assert got @ wanted > 0
@@ -250,7 +250,9 @@ def test_saturation_keeps_the_direction():
 def test_a_command_needs_no_more_than_the_supply_has_left(amps):
     f, limits = robot(), Limits(voltage=6.0, acceleration=1e4)
     wanted, motor = np.array([10.0, -9.0, 2.0]), f.motor
-    got = np.asarray(limited(jnp.asarray(wanted), jnp.zeros(3), jnp.asarray(amps), f, limits, DT))
+    got = np.asarray(
+        limit_command(jnp.asarray(wanted), jnp.zeros(3), jnp.asarray(amps), f, limits, DT)
+    )
     np.testing.assert_allclose(got / wanted, got[0] / wanted[0], rtol=1e-12)
     needs = np.abs(got) * float(motor.gear_ratio * motor.back_emf)
     left = 6.0 - float(motor.resistance) * np.abs(amps)
@@ -398,7 +400,7 @@ def test_fixes_that_all_come_late_count_for_what_they_say():
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("lost", [(), (20,), (20, 21, 22), tuple(range(3, 60, 4))])
 def test_readings_that_are_lost_do_not_make_the_way_longer(kind, lost):
-    est = pilot(kind).estimator
+    est = control_loop(kind).estimator
     run = stepped(est)
 
     def way(lost, twice=()):
@@ -418,7 +420,7 @@ def test_readings_that_are_lost_do_not_make_the_way_longer(kind, lost):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("dt", [0.0, np.nan, -1.0])
 def test_it_stops_where_the_clock_fails_for_good(kind, dt):
-    p, run = pilot(kind), step(kind)
+    p, run = control_loop(kind), step(kind)
     state, angle = p.init(), np.zeros(3)
     moved = 0.0
     for k in range(100):
@@ -514,7 +516,7 @@ def test_the_observer_takes_a_constant_disturbance_out():
 
 def test_the_integral_asks_for_no_more_than_it_may_however_long_a_robot_is_off():
     f = robot()
-    con = Controller(f, Gains.at((0.0, 0.0, 1.0, 0.0, 0.0, 0.0)))
+    con = Controller(f, Gains.at((0.0, 0.0, 1.0, 0.0, 0.0)))
     step = jax.jit(lambda s, e: con.step(s, jnp.array([0.3, -0.1, 0.0, 0.0, 0.0, 0.0]), e, DT))
     state = con.init()
     for _ in range(40):
@@ -534,7 +536,7 @@ def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_an
     for _ in range(400):
         state, command = step(state, said)
         commands.append(np.asarray(command))
-        helpless.append(bool(state.given_up))
+        helpless.append(bool(state.gave_up))
     rows = np.array(commands)
     end = helpless.index(True)
     assert 14.0 < end * DT < 16.0
@@ -549,7 +551,7 @@ def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_an
     # it has stopped for good, whatever is believed of it afterwards
     for _ in range(20):
         state, command = step(state, estimate(f))
-    assert bool(state.given_up)
+    assert bool(state.gave_up)
     np.testing.assert_allclose(command, 0.0)
 
 
@@ -582,11 +584,11 @@ def test_a_robot_that_nothing_frees_gives_up_and_its_run_ends():
     )
     start, alone = (0.0, 0.0, 0.0), small_twin.floor([[0]])
     plant = TwinPlant(Twin(slick, alone), start, jax.random.key(0))
-    course = closed_loop.drive(
-        Pilot(Estimator(slick), Controller(slick, Gains())), PATH, plant, start
+    course = closed_loop.run_closed_loop(
+        ControlLoop(Estimator(slick), Controller(slick, Gains())), PATH, plant, start
     )
     assert 15.0 < course.time[-1] < 25.0
-    assert course.own[-1] < 0.5 * PATH.duration
+    assert course.path_time[-1] < 0.5 * PATH.duration
     rolled = DT * float(slick.frame.radius) * np.abs(course.command).max(axis=1).sum()
     assert np.abs(course.pose[:, :2]).max() < 0.02 * rolled
     assert np.abs(course.command[150:300]).max() > 2 * np.abs(course.command[:20]).max()

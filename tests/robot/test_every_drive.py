@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from slipid.api.robot import drive
-from slipid.deploy.deploy import steered
-from slipid.deploy.record_of import moved_per_metre, spread_of
-from slipid.lab.selftest.logs import Sensors, make_logs
+from slipid.deploy.deploy import require_steering
+from slipid.deploy.robot_record import moved_per_metre, spread_of
+from slipid.lab.selftest.logs import SimulatedSensors, simulate_logs
 from slipid.model.robot import build
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, Odometry
@@ -21,7 +21,7 @@ from slipid.support.errors import DataError
 from tests.helpers.kinds import FLOORS, SHAPES, numbers, plan
 from tests.helpers.known_robot import deploy_known
 
-STILL = Sensors(
+STILL = SimulatedSensors(
     std={}, ripple=0.0, current_step=1e-6, voltage_noise=0.0, voltage_step=1e-6, signed=True
 )
 """Sensors without noise, of a robot that does what its model says."""
@@ -36,7 +36,7 @@ def driven(request):
     choices = [Choice(path, fixed=value) for path, value in numbers(robot).items()]
     fixed = [*choices, Choice("camera.lag", fixed=0.0), Choice("camera.marker_place", fixed=[0, 0])]
     truth = Space(robot, fixed).template
-    return deploy_known(truth, highest_speed=40.0), make_logs(truth, drives, 0, STILL)
+    return deploy_known(truth, highest_speed=40.0), simulate_logs(truth, drives, 0, STILL)
 
 
 ROWS = 512
@@ -129,6 +129,6 @@ def test_it_has_no_controller(driven, tmp_path):
     robot, _ = driven
     assert not robot.steers
     with pytest.raises(DataError, match=r"it has an estimator .* but no controller"):
-        steered(tmp_path, robot)
+        require_steering(tmp_path, robot)
     with pytest.raises(ValueError, match=r"it has an estimator .* but no controller"):
         drive(robot)

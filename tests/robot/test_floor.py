@@ -11,24 +11,23 @@ import numpy as np
 import pytest
 
 from slipid.robot import trajectory
-from slipid.robot.actuation import Habits
-from slipid.robot.closed_loop import Pilot
+from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.controller import Controller, Gains
 from slipid.robot.estimator import Estimator
 from slipid.robot.filter.floor import LEAK, SPREAD
-from slipid.robot.filter.floor_filter import FloorFilter, Tick, _followed
+from slipid.robot.filter.floor_filter import FloorFilter, TimeStep, _followed
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.filter.pose_filter import PoseFilter
-from slipid.robot.filter.pose_fix import placed
-from slipid.robot.filter.wheels import Currents
-from slipid.robot.interface import MIXED, Measurement, Settings
-from slipid.robot.twin import Twin
+from slipid.robot.filter.pose_fix import apply_map
+from slipid.robot.filter.wheels import MotorCurrents
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Measurement, Settings
+from slipid.robot.twin import ActuatorModel, Twin
 from tests.helpers.rolled_out import rollout
 from tests.helpers.small_twin import deployed, floor
 
 CHESS = [[(i + j) % 2 for j in range(6)] for i in range(6)]
-SETTINGS = Settings(alike=MIXED)
-HABITS = Habits()
+SETTINGS = Settings(further_floor_penalty=MIXED_FLOORS_PENALTY)
+HABITS = ActuatorModel()
 CASES, STEPS = 12, 200
 ROBOT = deployed(process=1.0, run=1.0, current=0.3)
 
@@ -76,8 +75,8 @@ def met(after, before):
     hypotheses = hypotheses_of(robot).under
     by_pose, by_floor = PoseFilter(robot, SETTINGS), FloorFilter(robot, SETTINGS)
     state = by_pose.init(jnp.zeros(3), (0.2, 0.1))
-    none, still = jnp.zeros(3), Tick(jnp.asarray(0.05), jnp.zeros((), bool), jnp.zeros(()))
-    currents = Currents(none, jnp.zeros(3, int), jnp.ones(3))
+    none, still = jnp.zeros(3), TimeStep(jnp.asarray(0.05), jnp.zeros((), bool), jnp.zeros(()))
+    currents = MotorCurrents(none, jnp.zeros(3, int), jnp.ones(3))
     _, motion = by_floor.step(by_floor.init(), none, currents, jnp.asarray(jnp.nan), still)
 
     def of(belief):
@@ -86,7 +85,7 @@ def met(after, before):
 
     motion = replace(motion, known=of(after), before=of(before))
     root, supports = by_pose.mapped(state, HALVES, hypotheses)
-    return state, *placed(state, root, supports, motion)
+    return state, *apply_map(state, root, supports, motion)
 
 
 @pytest.mark.slow
@@ -120,10 +119,10 @@ def test_beliefs_that_nothing_has_changed_move_no_pose(belief):
 def driven(there, paths, starts, keys, habits, known):
     """True poses and what is believed on chess patches, told the map `known`."""
     robot = ROBOT
-    pilot = Pilot(Estimator(robot, SETTINGS, known), Controller(robot, Gains()))
+    control_loop = ControlLoop(Estimator(robot, SETTINGS, known), Controller(robot, Gains()))
 
     def one(path, start, key):
-        return rollout(pilot, path, Twin(robot, there, habits), start, key, STEPS)
+        return rollout(control_loop, path, Twin(robot, there, habits), start, key, STEPS)
 
     return jax.vmap(one)(paths, starts, keys)
 

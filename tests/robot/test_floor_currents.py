@@ -12,7 +12,7 @@ from slipid.model.robot import build, motor_current, twist
 from slipid.robot.estimator import Estimator
 from slipid.robot.filter.floor_filter import FloorFilter
 from slipid.robot.filter.hypotheses import hypotheses_of
-from slipid.robot.filter.wheels import Currents, read_currents
+from slipid.robot.filter.wheels import MotorCurrents, read_currents
 from slipid.robot.interface import Measurement, Settings
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.small_twin import deployed
@@ -51,7 +51,7 @@ def test_where_frictions_are_open_currents_rule_out_no_mixture_of_floors():
 
     def believed(covariance):
         known = eqx.tree_at(lambda r: r.friction_covariance, robot, covariance)
-        watched = Estimator(known, Settings(current_is_signed=True, alike=0.0))
+        watched = Estimator(known, Settings(current_is_signed=True, further_floor_penalty=0.0))
         state = watched.init()
         for _ in range(100):
             reading = Measurement(wheel_speed=w, current=amps[3])
@@ -73,7 +73,7 @@ def test_evidence_is_that_of_normal_errors_of_what_was_heard(turn):
     xi = 0.2 * rng.normal(size=(shape[0], 3))
     predicted = 0.5 + 0.3 * rng.normal(size=shape)
     amps, heard = np.array([0.4, -0.7, 0.1]), np.array([2, 1, 0])
-    currents = Currents(jnp.asarray(amps), jnp.asarray(heard), jnp.full(3, 1e-3))
+    currents = MotorCurrents(jnp.asarray(amps), jnp.asarray(heard), jnp.full(3, 1e-3))
     w = jnp.array([3.0, 0.1, -2.0])
     told, none = floors._evidence(
         jnp.asarray(xi), jnp.asarray(predicted), currents, w, jnp.asarray(turn)

@@ -16,17 +16,16 @@ import pytest
 from slipid.data.floor_map import patchwork
 from slipid.data.reading.presets import preset
 from slipid.data.runs import Runs, collect
-from slipid.deploy.controllers import pilot_of
+from slipid.deploy.controllers import control_loop_of
 from slipid.lab.trial.controllers import ROWS
 from slipid.model.geometry import omni
 from slipid.model.robot import Robot, build
 from slipid.robot import trajectory as reference
-from slipid.robot.actuation import Habits
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
 from slipid.robot.filter.floor import Floor
 from slipid.robot.interface import Settings
-from slipid.robot.twin import Twin
+from slipid.robot.twin import ActuatorModel, Twin
 from slipid.search_space import Choice, Space
 from tests.helpers import replayed
 from tests.helpers.known_robot import deploy_known
@@ -114,12 +113,12 @@ def test_twin_and_controllers_do_what_was_reviewed(deployed: DeployedRobot, gold
             "contact_gyro",
         ):
             kind = ROWS[row]
-            habits = Habits(voltage=False, gyro=kind.gyro)
-            pilot = pilot_of(deployed, kind, Settings(), floor=floor)
-            path = reference.rectangle().moved(start).waiting(1.0)
+            habits = ActuatorModel(voltage=False, gyro=kind.gyro)
+            control_loop = control_loop_of(deployed, kind, Settings(), floor=floor)
+            path = reference.rectangle().moved(start).after_rest(1.0)
             twin = Twin(deployed, floor, habits)
             key = jax.random.key(1000 + k)
-            pose, said = _rollout(pilot, path, twin, jnp.asarray(start), key, 400)
+            pose, said = _rollout(control_loop, path, twin, jnp.asarray(start), key, 400)
             estimates = said.estimate
             for at in (100, 399):
                 numbers = {

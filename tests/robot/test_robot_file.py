@@ -17,14 +17,14 @@ import jsonschema
 import numpy as np
 import pytest
 
-from slipid.deploy.deploy import given
-from slipid.deploy.record_of import record_of
+from slipid.deploy.deploy import given_numbers
+from slipid.deploy.robot_record import robot_record
 from slipid.model.geometry import omni
 from slipid.model.robot import Validity, build
 from slipid.parameter import entries
 from slipid.robot.controller import Gains
-from slipid.robot.deployed import DeployedRobot, drawn
-from slipid.robot.record import GainValues, ToldRecord
+from slipid.robot.deployed import DeployedRobot, posterior_robots
+from slipid.robot.record import EffectRecord, GainValues
 from slipid.support.errors import DataError
 from slipid.support.files import checksum
 from tests.helpers.known_robot import GAINS, USED, deploy_known
@@ -36,7 +36,7 @@ SEEN = Validity(
 ONE = (((0.01, -0.02, 1 / 3), (0.0, 0.1 + 0.2, 0.0)), ((0.0, 0.0, 0.0), (0.001, 0.0, -0.1)))
 """What is told of a floor at two speeds and in two directions."""
 LEFT = (((0.01, 0.02, 0.03), (0.03, 0.02, 0.01)), ((0.01, 0.01, 0.01), (0.02, 0.02, 0.0)))
-TOLD = ToldRecord((0.1, 0.3), (ONE, ONE[::-1]), (LEFT, LEFT[::-1]))
+TOLD = EffectRecord((0.1, 0.3), (ONE, ONE[::-1]), (LEFT, LEFT[::-1]))
 
 
 @pytest.fixture(scope="module")
@@ -64,13 +64,13 @@ def robot() -> DeployedRobot:
         several,
         (shaken, biases * jnp.arange(5)[:, None, None]),
     )
-    numbers = given(made)
+    numbers = given_numbers(made)
     share_path = "robot.load_share@own"
     pairs = tuple((x - 0.01, x + 0.01) for x in share[0].tolist())
     known = {"std": (0.01, 0.01, 0.01), "interval90": pairs, "verdict": "identified"}
     numbers[share_path] = replace(numbers[share_path], **known)
     std = {"process.firm.along": 0.003, "session.soft.yaw": 0.02}
-    record = record_of(
+    record = robot_record(
         made, numbers, std, several, 8.1, (0.01, -0.02), {"firm": SEEN}, {"moved": TOLD}
     )
     record = replace(record, messages=("say \u00e9 aloud",), versions={"jax": "0.1"})
@@ -101,8 +101,8 @@ def test_every_number_survives_to_the_last_bit(robot, path):
     assert float(again.floors.friction[1]) == 0.1 + 0.2
     np.testing.assert_array_equal(again.floors.load_bias, [[0.1, -0.3, 0.2], [0.0, 1 / 3, -1 / 3]])
     np.testing.assert_array_equal(again.floors.drag_exponent, [1.0, 1.6])
-    np.testing.assert_array_equal(again.told.table[..., :3], TOLD.mean)
-    np.testing.assert_array_equal(first.told.table, [[[[0, 0, 0, 1, 1, 1]]]] * 2)
+    np.testing.assert_array_equal(again.effect_table.table[..., :3], TOLD.mean)
+    np.testing.assert_array_equal(first.effect_table.table, [[[[0, 0, 0, 1, 1, 1]]]] * 2)
     text = path.read_bytes()
     first.save(path)
     assert path.read_bytes() == text
@@ -127,7 +127,7 @@ def test_gains_are_those_of_the_load_set_up_they_were_tuned_for(path):
 
 
 def test_draws_are_robots_with_other_numbers(robot):
-    several = drawn(robot, (4, 0))
+    several = posterior_robots(robot, (4, 0))
     rows = robot.record.draws["surface.soft.friction"]
     np.testing.assert_array_equal(several.floors.friction[:, 1], [rows[4], rows[0]])
     biases = np.asarray(robot.floors.load_bias)
@@ -152,7 +152,7 @@ def test_what_is_known_of_the_floors_is_saved_with_them(robot, tmp_path):
     only = robot.on("soft")
     only.save(tmp_path / "soft.json")
     same(DeployedRobot.load(tmp_path / "soft.json", "moved"), only)
-    np.testing.assert_array_equal(only.told.table[0, ..., :3], ONE[::-1])
+    np.testing.assert_array_equal(only.effect_table.table[0, ..., :3], ONE[::-1])
 
 
 def test_floors_that_nobody_drove_on_are_saved_with_the_others(robot, tmp_path):
@@ -443,13 +443,13 @@ print(sorted(new - {"slipid", "jax", *sys.stdlib_module_names}))
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import Measurement
 from slipid.robot.estimator import Odometry
-from slipid.robot.closed_loop import Pilot
+from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.controller import Controller
 from slipid.robot.trajectory import rectangle
 robot = DeployedRobot.load(sys.argv[1])
-pilot = Pilot(Odometry(robot), Controller(robot))
+control_loop = ControlLoop(Odometry(robot), Controller(robot))
 z = Measurement(wheel_angle=[0.0, 0.0, 0.0], current=[0.1, 0.1, 0.1])
-state, said = pilot.step(rectangle(), pilot.init(), z, 0.05)
+state, said = control_loop.step(rectangle(), control_loop.init(), z, 0.05)
 print(said.estimate.pose, said.estimate.surface, said.command)
 """
 

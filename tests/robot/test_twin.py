@@ -6,23 +6,22 @@ import numpy as np
 import pytest
 
 from slipid.model import contact
-from slipid.robot.actuation import RING, Habits
-from slipid.robot.closed_loop import Pilot, Plant, drive
+from slipid.robot.closed_loop import ControlLoop, Plant, run_closed_loop
 from slipid.robot.controller import Controller, Gains
 from slipid.robot.estimator import Odometry
 from slipid.robot.trajectory import waypoints
-from slipid.robot.twin import Twin, TwinPlant
+from slipid.robot.twin import RING, ActuatorModel, Twin, TwinPlant
 from tests.helpers.rolled_out import rollout
 from tests.helpers.small_twin import deployed, floor, stacked
 
 KEY = jax.random.PRNGKey(3)
 START = (0.1, -0.05, 0.3)
 FIRM, BOTH = floor([[0]]), floor([[0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 0, 1], [1, 0, 1, 0]])
-SILENT = Habits(ammeter_a=0.0, voltmeter_v=0.0, gyro_noise=0.0, gyro_bias=0.0, smooth=True)
+SILENT = ActuatorModel(ammeter_a=0.0, voltmeter_v=0.0, gyro_noise=0.0, gyro_bias=0.0, smooth=True)
 
 
-def pilot(robot, gains=(1.5, 1.5, 0.1, 0.2, 0.1)):
-    return Pilot(Odometry(robot), Controller(robot, Gains.at(gains)))
+def control_loop(robot, gains=(1.5, 1.5, 0.1, 0.2, 0.1)):
+    return ControlLoop(Odometry(robot), Controller(robot, Gains.at(gains)))
 
 
 def driven(twin, commands, key=KEY):
@@ -38,7 +37,7 @@ def driven(twin, commands, key=KEY):
 
 def test_commands_arrive_late_as_a_fine_grid_says():
     for delay in (0.0, 0.03, 0.12, 0.25):
-        share = Habits(delay_s=delay).held()
+        share = ActuatorModel(delay_s=delay).command_shares()
         grid = (np.arange(100_000) + 0.5) / 100_000 * 0.05
         index = -np.floor((grid - delay) / 0.05).astype(int)
         brute = [[np.mean(part == k) for k in range(RING)] for part in np.split(index, 2)]
@@ -48,7 +47,7 @@ def test_commands_arrive_late_as_a_fine_grid_says():
 
 def test_a_delay_beyond_the_ring_is_refused():
     with pytest.raises(ValueError, match=r"delay_s = 0\.4; expected 0 to 0\.25"):
-        Twin(deployed(), FIRM, Habits(delay_s=0.4))
+        Twin(deployed(), FIRM, ActuatorModel(delay_s=0.4))
 
 
 @pytest.mark.slow
@@ -95,14 +94,14 @@ def test_runs_differ_by_what_the_fit_says():
 
 @pytest.mark.slow
 def test_sensors_read_ticks_and_magnitudes_and_nothing_that_is_not_there():
-    habits = Habits(ticks=320.0, voltage=False)
+    habits = ActuatorModel(ticks=320.0, voltage=False)
     _, z = driven(Twin(deployed(current=1.0), FIRM, habits), jnp.full((30, 3), -3.0))
     tick = 2 * np.pi / 320.0
     np.testing.assert_allclose(z.wheel_angle / tick, np.round(z.wheel_angle / tick), atol=1e-9)
     assert np.all(np.asarray(z.current) >= 0)
     for part in (z.voltage, z.gyro, z.wheel_speed, z.fix, z.fix_age):
         assert np.all(np.isnan(part))
-    every = Habits(gyro=True, signed=True)
+    every = ActuatorModel(gyro=True, signed=True)
     state, z = driven(Twin(deployed(), FIRM, every), jnp.full((30, 3), -3.0))
     assert np.all(np.asarray(z.current[10:]).mean(axis=0) < 0)
     assert np.all(np.asarray(z.voltage[-5:]) < 0)
@@ -113,15 +112,15 @@ def test_sensors_read_ticks_and_magnitudes_and_nothing_that_is_not_there():
 def test_a_rollout_is_the_run_of_a_plant():
     robot, path = deployed(1.0, 1.0, 1.0), waypoints([(0.0, 0.0), (0.15, 0.0)], pause=0.2)
     path = path.moved(START)
-    twin, own = Twin(robot, BOTH), pilot(robot)
+    twin, own = Twin(robot, BOTH), control_loop(robot)
     plant = TwinPlant(twin, START, KEY)
     assert isinstance(plant, Plant)
-    course = drive(own, path, plant, START)
+    course = run_closed_loop(own, path, plant, START)
     pose, said = jax.jit(lambda k: rollout(own, path, twin, START, k, len(course.pose)))(KEY)
     np.testing.assert_allclose(pose[:, :2], course.pose[:, :2], atol=1e-12)
     np.testing.assert_allclose(said.command, course.command, atol=1e-12)
-    np.testing.assert_allclose(said.time, course.own, atol=1e-12)
-    other = drive(own, path, TwinPlant(twin, START, jax.random.PRNGKey(4)), START)
+    np.testing.assert_allclose(said.time, course.path_time, atol=1e-12)
+    other = run_closed_loop(own, path, TwinPlant(twin, START, jax.random.PRNGKey(4)), START)
     assert np.abs(other.pose[-1] - course.pose[-1]).max() > 1e-5
     for one, again in zip(*(jax.tree.leaves(plant.reset()) for _ in range(2)), strict=True):
         np.testing.assert_array_equal(one, again)
@@ -131,10 +130,10 @@ def test_a_rollout_is_the_run_of_a_plant():
 def test_derivative_by_gains_is_that_of_finite_differences():
     robot = deployed(1.0, 1.0)
     path = waypoints([(0.0, 0.0), (0.2, 0.0)], pause=0.2).moved(START)
-    twin = Twin(robot, FIRM, Habits(smooth=True))
+    twin = Twin(robot, FIRM, ActuatorModel(smooth=True))
 
     def end(gains):
-        return rollout(pilot(robot, gains), path, twin, START, KEY, 50)[0][-1]
+        return rollout(control_loop(robot, gains), path, twin, START, KEY, 50)[0][-1]
 
     gains = jnp.asarray([1.5, 1.2, 0.3, 0.4, 0.113])  # between rows of the path
     slope = jax.jit(jax.jacfwd(end))(gains)

@@ -17,7 +17,7 @@ from slipid.robot.estimator import Estimator, EstimatorState
 from slipid.robot.filter.floor_filter import FloorFilter
 from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.interface import Readings, Settings
-from slipid.robot.record import ToldRecord
+from slipid.robot.record import EffectRecord
 from slipid.robot.unseen import GRIP, SOFTNESS, with_unseen
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.small_twin import deployed
@@ -67,8 +67,8 @@ def test_nothing_is_told_of_them_but_how_far_off_they_are():
     made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"])
     cell = ((0.01, -0.02, 0.3), (0.0, 0.1, 0.0))
     left = ((0.01, 0.02, 0.3), (0.0, 0.1, 0.0))
-    told = ToldRecord((0.1,), ((cell,), (cell,)), ((left,), (left,)))
-    known = deploy_known(made, told={made.body.loads[0]: told}).record
+    told = EffectRecord((0.1,), ((cell,), (cell,)), ((left,), (left,)))
+    known = deploy_known(made, effects={made.body.loads[0]: told}).record
     spread = tuple(replace(load, spread=((0.2, 0.4, 0.1),) * 2) for load in known.loads)
     record = with_unseen(replace(known, loads=spread))
     (load,) = record.loads
@@ -83,7 +83,7 @@ def test_nothing_is_told_of_them_but_how_far_off_they_are():
 
 def test_together_they_are_as_rare_as_a_second_floor_under_the_robot():
     known, wider = deployed(), deployed().with_unseen()
-    settings = Settings(alike=2.0)
+    settings = Settings(further_floor_penalty=2.0)
     prior = np.asarray(FloorFilter(wider, settings).prior())
     ways = hypotheses_of(wider)
     before = np.asarray(FloorFilter(known, settings).prior())

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from slipid.support.errors import DataError
-from slipid.support.executor import Here, Processes, results
+from slipid.support.executor import InProcess, Processes, results
 from slipid.support.progress import Reporter
 
 TODO = {f"number {k}": k for k in range(5)}
@@ -34,7 +34,7 @@ def ends(k: int) -> int:
     return k
 
 
-@pytest.mark.parametrize("engine", [Here, lambda: ThreadPoolExecutor(2)])
+@pytest.mark.parametrize("engine", [InProcess, lambda: ThreadPoolExecutor(2)])
 def test_any_executor_of_the_standard_library_does(engine):
     with engine() as executor:
         assert sorted(results(executor, square, TODO, Reporter(quiet=True))) == [0, 1, 4, 9, 16]

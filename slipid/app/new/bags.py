@@ -1,15 +1,15 @@
-"""A bag looked into: which topics hold what, proposed as a layout."""
+"""Propose a layout for bags from the types and names of their topics."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from slipid.app.new.config_lines import ConfigLine, toml
+from slipid.app.new.draft import BagDraft, ConfigDraft, ConfigProposal, LogsDraft
 from slipid.app.new.file_channels import common_glob, floor_of, rank
-from slipid.app.new.robot import robot_from
+from slipid.app.new.guess import guess_robot
 from slipid.app.new.robot_questions import RobotAnswers, RobotOptions
-from slipid.app.new.sketch import BagSketch, ConfigProposal, LogsSketch, Sketch
-from slipid.app.reference.parameters import in_short, meanings
+from slipid.app.reference.keys import in_short, meanings
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.topics import Topic, topics_of
 from slipid.data.reading.column_names import meaning_of
@@ -19,7 +19,7 @@ SUFFIXES = (".bag", ".db3", ".mcap")
 _METADATA = "metadata.yaml"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_TURNS = ("wheel_ticks", "wheel_angle", "wheel_speed", "motor_speed")
+_WHEEL_CHANNELS = ("wheel_ticks", "wheel_angle", "wheel_speed", "motor_speed")
 _EFFORT = (
     "what is the effort: a current (A), a torque (motor_torque or wheel_torque, N*m), a voltage "
     "(V) or a duty (1)?"
@@ -27,14 +27,19 @@ _EFFORT = (
 
 
 _BY_NAME = ("current", "voltage", "duty")
-"""Channels that are looked for in messages of unknown types, by what their fields are called."""
+"""Channels that are recognised by field names in messages of unknown types."""
 
 
 @dataclass(frozen=True)
-class _Served:
-    """A channel, or a group of them, that a topic holds; `wheels` where it has one per wheel.
+class _TopicChannel:
+    """Channel, or group of channels, in a topic.
 
-    `field` and `unit` where the type of the messages does not tell them.
+    Attributes:
+        channel: name of the channel.
+        topic: topic that has it.
+        wheels: number of wheels with a value each; 0 for a channel of the whole robot.
+        question: question that is left to the user.
+        field, unit: field and unit, where the message type does not imply them.
     """
 
     channel: str
@@ -46,9 +51,9 @@ class _Served:
 
 
 def bags_in(path: Path) -> list[Path]:
-    """Files that a config names for bags: of a path itself, or below it.
+    """Return the bag files at or below a path, as a config names them.
 
-    That is the metadata.yaml of a rosbag2 folder, whose other files belong to it.
+    A rosbag2 folder is named by its metadata.yaml, and its other files belong to that.
     """
     if path.is_file():
         return [path] if path.suffix in SUFFIXES or path.name == _METADATA else []
@@ -58,21 +63,24 @@ def bags_in(path: Path) -> list[Path]:
 
 
 def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> ConfigProposal:
-    """The config that bags are proposed to have, by the first; DataError where it is unreadable.
+    """Return the config proposed for bags; raise `DataError` where the first is unreadable.
 
     Args:
-        bags: as of `bags_in`; path: of the log or folder that was named.
-        options: what is known of the robot.
+        bags: the files, as from `bags_in`.
+        path: the log or folder that the user named.
+        options: what the user said about the robot.
     """
     bag = bags[0]
     topics = topics_of(bag)
     joints, doubt = _joints(topics)
-    served = list(_first_of_each(topics, len(joints)))
-    wheels = next((one.wheels for name in _TURNS for one in served if one.channel == name), 0)
-    served += _by_field_names(topics, served, wheels)
-    guessed = robot_from(options, wheels, ())
+    channels = list(_best_topics(topics, len(joints)))
+    wheels = next(
+        (one.wheels for name in _WHEEL_CHANNELS for one in channels if one.channel == name), 0
+    )
+    channels += _by_field_names(topics, channels, wheels)
+    guessed = guess_robot(options, wheels, ())
     questions = [doubt] if doubt else []
-    if not any(one.channel == "pose" for one in served):
+    if not any(one.channel == "pose" for one in channels):
         questions.append("no topic with a pose was found: a fit needs one")
     if not wheels:
         questions.append("no topic tells how wheels turn: which one does, and in which field?")
@@ -80,32 +88,32 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
     root = path.parent if is_bag else path
     inside = [PurePosixPath(one.relative_to(root)) for one in bags]
     inside = [one for one in inside if len(one.parts) == len(inside[0].parts)]
-    layout = BagSketch(
+    layout = BagDraft(
         "mine",
-        _settings(guessed.robot, joints, served),
-        tuple(_lines(served)),
-        _unused(topics, served),
+        _layout_lines(guessed.robot, joints, channels),
+        tuple(_topic_lines(channels)),
+        _unused(topics, channels),
         tuple(questions),
     )
     floor = "on which floor was it driven? Or a topic or table tells: runs, in the layout"
     glob = common_glob(inside)
-    sketch = Sketch(
+    draft = ConfigDraft(
         guessed.robot,
         (),
-        (LogsSketch(glob, "mine", floor_of(glob), question=floor),),
-        carries=frozenset(one.channel for one in served if one.question != _EFFORT),
+        (LogsDraft(glob, "mine", floor_of(glob), question=floor),),
+        preset_channels=frozenset(one.channel for one in channels if one.question != _EFFORT),
         above=(f"Proposed from {bag}.",),
         data=str(root),
         hints=guessed.hints,
         bags=(layout,),
     )
     sentences = [f"{bag}: {len(topics)} topics"]
-    sentences += [f"  {one.topic.name} ({one.topic.type}): {one.channel}" for one in served]
-    return ConfigProposal(sketch, tuple(sentences))
+    sentences += [f"  {one.topic.name} ({one.topic.type}): {one.channel}" for one in channels]
+    return ConfigProposal(draft, tuple(sentences))
 
 
 def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
-    """Names of the wheels' joints in the order of the drives, and what is not sure of them."""
+    """Return the wheels' joint names in the order of the drives, and an open question or ""."""
     names = tuple(dict.fromkeys(name for topic in topics for name in topic.joints))
     labels = {name: meaning_of(f"{name}_velocity") for name in names}
     wheels = [
@@ -121,8 +129,8 @@ def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
     return ordered, doubt
 
 
-def _first_of_each(topics: Sequence[Topic], joints: int) -> Iterator[_Served]:
-    """The best topic for every channel: poses that are no odometry come before those that are."""
+def _best_topics(topics: Sequence[Topic], joints: int) -> Iterator[_TopicChannel]:
+    """Yield the best topic for every channel: a pose that is no odometry comes first."""
     order = sorted(topics, key=lambda t: (t.type == _ODOMETRY, t.type == _TRANSFORMS, t.name))
     taken: set[str] = set()
     for topic in order:
@@ -130,18 +138,18 @@ def _first_of_each(topics: Sequence[Topic], joints: int) -> Iterator[_Served]:
             if channel in taken or not topic.count:
                 continue
             taken.add(channel)
-            wheels = joints if topic.joints else _count(topic) if channel in PER_WHEEL else 0
-            yield _Served(channel, topic, wheels, _doubt(channel, topic))
+            wheels = joints if topic.joints else _array_length(topic) if channel in PER_WHEEL else 0
+            yield _TopicChannel(channel, topic, wheels, _pose_question(channel, topic))
         if any(f.path == "effort" and f.count for f in topic.fields) and "current" not in taken:
             taken.add("current")
-            yield _Served("current", topic, joints, _EFFORT)
+            yield _TopicChannel("current", topic, joints, _EFFORT)
 
 
 def _by_field_names(
-    topics: Sequence[Topic], served: Sequence[_Served], wheels: int
-) -> Iterator[_Served]:
-    """Channels in messages of unknown types: numbers of every wheel in a field of that name."""
-    taken = {one.channel for one in served}
+    topics: Sequence[Topic], channels: Sequence[_TopicChannel], wheels: int
+) -> Iterator[_TopicChannel]:
+    """Yield channels in messages of unknown types, from fields with a number for every wheel."""
+    taken = {one.channel for one in channels}
     for topic in (one for one in topics if one.count and not one.serves and not one.joints):
         for field in topic.fields:
             meaning = meaning_of(f"wheel {field.path.replace('.', ' ')}")
@@ -152,15 +160,16 @@ def _by_field_names(
             taken.add(meaning.channel)
             unit = meaning.unit or CHANNELS[meaning.channel]
             ask = f"by the name of the field: is it that, in {unit}, in the order of the joints?"
-            yield _Served(meaning.channel, topic, wheels, ask, field.path, unit)
+            yield _TopicChannel(meaning.channel, topic, wheels, ask, field.path, unit)
 
 
-def _count(topic: Topic) -> int:
-    """How many wheels a message has numbers of."""
+def _array_length(topic: Topic) -> int:
+    """Return the number of wheels that a message has numbers for."""
     return max((field.count for field in topic.fields if field.type.endswith("[]")), default=1)
 
 
-def _doubt(channel: str, topic: Topic) -> str:
+def _pose_question(channel: str, topic: Topic) -> str:
+    """Return the question about a topic with a pose; empty where its type leaves none."""
     if channel != "pose":
         return ""
     if topic.type == _ODOMETRY:
@@ -172,19 +181,21 @@ def _doubt(channel: str, topic: Topic) -> str:
     return ""
 
 
-def _lines(served: Sequence[_Served]) -> Iterator[ConfigLine]:
-    """A line for each channel."""
-    for one in served:
+def _topic_lines(channels: Sequence[_TopicChannel]) -> Iterator[ConfigLine]:
+    """Yield a config line for each channel."""
+    for one in channels:
         inside = f"topic = {toml(one.topic.name)}"
-        off = one.question == _EFFORT
-        if off:
+        commented_out = one.question == _EFFORT
+        if commented_out:
             inside += ', field = "effort", unit = "A"'
         elif one.field:
             inside += f", field = {toml(one.field)}, unit = {toml(one.unit)}"
         if one.topic.type == _TRANSFORMS and one.topic.frames:
             frame, _, child = one.topic.frames[0].partition(" -> ")
             inside += f", frame = {toml(frame)}, child = {toml(child)}"
-        yield ConfigLine(one.channel, f"{{ {inside} }}", _rate(one.topic), one.question, off)
+        yield ConfigLine(
+            one.channel, f"{{ {inside} }}", _rate(one.topic), one.question, commented_out
+        )
 
 
 def _rate(topic: Topic) -> str:
@@ -193,21 +204,21 @@ def _rate(topic: Topic) -> str:
     return f"{topic.type}, {(topic.count - 1) / (topic.last - topic.first):.3g} Hz"
 
 
-def _settings(
-    robot: RobotAnswers, joints: tuple[str, ...], served: Sequence[_Served]
+def _layout_lines(
+    robot: RobotAnswers, joints: tuple[str, ...], channels: Sequence[_TopicChannel]
 ) -> tuple[ConfigLine, ...]:
-    """Keys of the layout but for its topics."""
+    """Return the keys of the layout except its topics."""
 
     def line(key: str, value: object, question: str = "") -> ConfigLine:
         kind = BagLayout if key in meanings(BagLayout) else Layout
         return ConfigLine(key, toml(value), in_short(kind, key), question)
 
     lines = [ConfigLine("kind", toml("bag"))]
-    have = {one.channel for one in served}
+    have = {one.channel for one in channels}
     lines += [line("joints", list(joints))] if joints else []
     if "wheel_ticks" in have:
         ask = ""
-        if "ticks_per_revolution" in robot.taken:
+        if "ticks_per_revolution" in robot.defaults:
             ask = "how many, of the motor shaft, all edges counted?"
         lines.append(line("ticks_per_revolution", robot.ticks_per_revolution or 1000.0, ask))
     lines.append(ConfigLine("gear_ratio", toml(robot.gear_ratio), "as above"))
@@ -217,14 +228,14 @@ def _settings(
     return tuple(lines)
 
 
-def _unused(topics: Sequence[Topic], served: Sequence[_Served]) -> tuple[str, ...]:
-    """Other topics, with what their messages hold."""
-    used = {one.topic.name for one in served}
+def _unused(topics: Sequence[Topic], channels: Sequence[_TopicChannel]) -> tuple[str, ...]:
+    """Return a comment for each unused topic, with the fields of its messages."""
+    used = {one.topic.name for one in channels}
     others = [topic for topic in topics if topic.name not in used and topic.count]
-    return tuple(f"Not used: {topic.name} ({topic.type}){_holds(topic)}" for topic in others)
+    return tuple(f"Not used: {topic.name} ({topic.type}){_field_list(topic)}" for topic in others)
 
 
-def _holds(topic: Topic) -> str:
+def _field_list(topic: Topic) -> str:
     if topic.problem:
         return f": {topic.problem}"
     paths = [field.path for field in topic.fields if not field.path.startswith("header")]

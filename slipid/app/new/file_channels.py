@@ -1,6 +1,7 @@
-"""Which column of a file holds which channel, by their names and by what the numbers are like.
+"""Recognise the channels in a file's columns, and group the log files of a folder by kind.
 
-Log files of a folder by kind: published formats, globs that find each, which lie together.
+Columns are recognised by their names and by their numbers. Files of one kind have the same layout:
+published formats, globs that find each kind, and files that lie together are recognised.
 """
 
 from collections import Counter
@@ -22,43 +23,43 @@ from slipid.data.reading.table_format import TableFormat, TableNumbers, format_o
 from slipid.support.errors import DataError
 
 _ORDER = ("fl", "fr", "ml", "mr", "rl", "rr", "l", "r")
-"""Wheels as the drives count them."""
+"""Wheel names in the order in which the drives count wheels."""
 _QUATERNION = ("x", "y", "z", "w")
-TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
-"""Channels that tell how far the wheels turned, the best first."""
-_COUNTS = 50
-"""Whole numbers up to which a position is no count of ticks."""
+WHEEL_MOTION = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
+"""Channels of wheel motion, the most informative first."""
+_LEAST_TICKS = 50
+"""Largest whole number of a position that is not taken for a count of ticks."""
 
 
 @dataclass(frozen=True, eq=False)
 class FileChannel:
-    """A channel and where it is.
+    """A channel and its columns.
 
     Attributes:
         channel: its name.
-        at: places of its columns.
-        labels: which wheel each is of, as the names say.
-        values: of the columns, as they are in the file.
-        unit: that names or a row of units say; empty where they say none.
-        doubts: what was assumed, one sentence each.
+        columns: numbers of its columns.
+        labels: wheel of each column, as its name says.
+        values: values of the columns, as in the file.
+        unit: unit given by the names or a row of units; empty where they give none.
+        questions: a question for each assumption.
     """
 
     channel: str
-    at: tuple[int, ...]
+    columns: tuple[int, ...]
     labels: tuple[str, ...]
     values: Float[np.ndarray, "row column"]
     unit: str = ""
-    doubts: tuple[str, ...] = ()
+    questions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class FileChannels:
-    """What is in a file.
+    """The channels of a file.
 
     Attributes:
         found: its channels.
         unused: names of other columns of numbers.
-        notes: what people should know of it.
+        notes: remarks for the user.
     """
 
     found: tuple[FileChannel, ...]
@@ -66,32 +67,32 @@ class FileChannels:
     notes: tuple[str, ...] = ()
 
     def get(self, channel: str) -> FileChannel | None:
-        """A channel, if it is there."""
+        """Return a channel, if the file has it."""
         return next((one for one in self.found if one.channel == channel), None)
 
     def first(self, *channels: str) -> FileChannel | None:
-        """The first of some channels that is there."""
+        """Return the first of some channels that the file has."""
         return next((found for name in channels if (found := self.get(name))), None)
 
     @property
     def turns(self) -> FileChannel | None:
-        """The channel that tells how far the wheels turned."""
-        return self.first(*TURNS)
+        """The most informative channel of wheel motion."""
+        return self.first(*WHEEL_MOTION)
 
     @property
     def wheels(self) -> int:
-        """How many wheels, or drives, have columns."""
-        return len(self.turns.at) if self.turns else 0
+        """Number of wheels, or drives, that have columns."""
+        return len(self.turns.columns) if self.turns else 0
 
     @property
     def has_pose(self) -> bool:
-        """Whether there is a whole pose."""
+        """True where the file has a complete pose."""
         turned = self.get("pose_heading") or self.get("pose_quaternion")
         return bool(self.get("pose_x") and self.get("pose_y") and turned)
 
 
-def columns_of(numbers: TableNumbers) -> FileChannels:
-    """What the named columns of a file hold."""
+def channels_in(numbers: TableNumbers) -> FileChannels:
+    """Return the channels in the named columns of a file."""
     format, meanings = numbers.format, {}
     for at, name in enumerate(format.names):
         if at not in numbers.texts and name and not np.isnan(numbers.values[:, at]).all():
@@ -106,21 +107,23 @@ def columns_of(numbers: TableNumbers) -> FileChannels:
             also.append(f"{format.names[at]} (as {format.names[there[one.label]]})")
         else:
             there[one.label] = at
-    found = [_found(numbers, meanings, name, places) for name, places in channels.items()]
-    found = _one_of_each(_told_apart(found))
-    notes = _odometry(numbers, meanings) + [f"not used, said twice: {', '.join(also)}"] * bool(also)
-    kept, dropped = _agreeing(found)
-    used = {at for one in kept for at in one.at}
+    found = [_file_channel(numbers, meanings, name, places) for name, places in channels.items()]
+    found = _without_duplicates(_resolved(found))
+    notes = _odometry_note(numbers, meanings) + [f"not used, said twice: {', '.join(also)}"] * bool(
+        also
+    )
+    kept, dropped = _consistent(found)
+    used = {at for one in kept for at in one.columns}
     unused = [
         name for at, name in enumerate(format.names) if name and at in meanings and at not in used
     ]
     return FileChannels(tuple(kept), tuple(unused), tuple(notes + dropped))
 
 
-def _found(
+def _file_channel(
     numbers: TableNumbers, meanings: dict[int, ColumnMeaning], channel: str, places: dict[str, int]
 ) -> FileChannel:
-    """A channel with its columns in order."""
+    """Return a channel with its columns in the order of the wheels."""
     labels = sorted(places, key=rank)
     at = tuple(places[label] for label in labels)
     units = Counter(meanings[k].unit for k in at)
@@ -134,7 +137,7 @@ def _found(
 
 
 def rank(label: str) -> tuple[int, int, str]:
-    """Order of wheels: by the drives' convention, else by number."""
+    """Return the sort key of a wheel's name: the order of the drives, else its number."""
     if label in _QUATERNION:
         return (0, _QUATERNION.index(label), label)
     if label in _ORDER:
@@ -142,80 +145,83 @@ def rank(label: str) -> tuple[int, int, str]:
     return (2, int(label) if label.isdecimal() else 0, label)
 
 
-def _told_apart(found: list[FileChannel]) -> list[FileChannel]:
-    """Positions are ticks where they are whole numbers; v is a speed where no speed is logged."""
+def _resolved(found: list[FileChannel]) -> list[FileChannel]:
+    """Resolve ambiguous names: positions are ticks or angles, and "v" is a voltage or a speed."""
     speeds = {one.labels for one in found if one.channel.endswith("_speed")}
     out = []
     for one in found:
         kind, _, what = one.channel.rpartition("_")
         if what == "position":
-            ticks = one.unit in ("tick", "ticks") or (not one.unit and _counted(one.values))
+            ticks = one.unit in ("tick", "ticks") or (not one.unit and _is_ticks(one.values))
             one = replace(one, channel="wheel_ticks" if ticks else f"{kind}_angle")
         elif what == "v":
             volts = (
                 one.unit in ("V", "mV")
                 or one.labels in speeds
-                or (not one.unit and _always_far(one.values))
+                or (not one.unit and _stays_up(one.values))
             )
             one = replace(one, channel="voltage" if volts else f"{kind}_speed")
         out.append(one)
     return out
 
 
-def _counted(values: Float[np.ndarray, "row column"]) -> bool:
+def _is_ticks(values: Float[np.ndarray, "row column"]) -> bool:
+    """Return True for whole numbers that are too large for an angle."""
     known = values[~np.isnan(values)]
-    return bool((known == np.round(known)).all() and np.abs(known).max(initial=0.0) > _COUNTS)
+    return bool((known == np.round(known)).all() and np.abs(known).max(initial=0.0) > _LEAST_TICKS)
 
 
-def _always_far(values: Float[np.ndarray, "row column"]) -> bool:
-    """Whether numbers keep away from 0, as a battery's voltage does and a speed does not."""
+def _stays_up(values: Float[np.ndarray, "row column"]) -> bool:
+    """Return True for numbers away from 0, like a battery's voltage and unlike a speed."""
     known = values[~np.isnan(values)]
     return bool(known.size) and float(known.min()) > 0.5 * float(known.max()) > 0.0
 
 
-def _one_of_each(found: list[FileChannel]) -> list[FileChannel]:
-    """The first of channels that turned out to be the same."""
+def _without_duplicates(found: list[FileChannel]) -> list[FileChannel]:
+    """Return the first of channels with the same name."""
     out: dict[str, FileChannel] = {}
     for one in found:
         out.setdefault(one.channel, one)
     return list(out.values())
 
 
-def _agreeing(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
-    """Channels that go together, and a line for each that is left out."""
-    turns = [one for name in TURNS for one in found if one.channel == name]
+def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
+    """Return the channels with the same wheels, and a line for each channel that is left out."""
+    turns = [one for name in WHEEL_MOTION for one in found if one.channel == name]
     per_wheel = turns or [one for one in found if one.channel in PER_WHEEL]
-    count = len(per_wheel[0].at) if per_wheel else 0
+    count = len(per_wheel[0].columns) if per_wheel else 0
     labels = set(per_wheel[0].labels) if per_wheel else set()
     kept, dropped = [], []
     for one in found:
-        if one.channel == "pose_quaternion" and len(one.at) != 4:
-            dropped.append(f"{len(one.at)} columns of a quaternion; expected x, y, z and w")
-        elif one.channel in PER_WHEEL and (len(one.at) != count or not _alike(labels, one)):
-            what = f"{len(one.at)} columns of {one.channel}"
+        if one.channel == "pose_quaternion" and len(one.columns) != 4:
+            dropped.append(f"{len(one.columns)} columns of a quaternion; expected x, y, z and w")
+        elif one.channel in PER_WHEEL and (
+            len(one.columns) != count or not _same_wheels(labels, one)
+        ):
+            what = f"{len(one.columns)} columns of {one.channel}"
             dropped.append(f"{what} are left out: {count} wheels have {per_wheel[0].channel}")
         else:
             kept.append(one)
     return kept, dropped
 
 
-def _alike(labels: set[str], one: FileChannel) -> bool:
-    """Whether channels name the same wheels, or one names sides and the other numbers."""
+def _same_wheels(labels: set[str], one: FileChannel) -> bool:
+    """Return True where the labels are equal, or where one names sides and the other numbers."""
     numbers = all(label.isdecimal() for label in labels)
     return set(one.labels) == labels or numbers != all(label.isdecimal() for label in one.labels)
 
 
-def _odometry(numbers: TableNumbers, meanings: dict[int, ColumnMeaning]) -> list[str]:
+def _odometry_note(numbers: TableNumbers, meanings: dict[int, ColumnMeaning]) -> list[str]:
     names = [numbers.format.names[at] for at, one in meanings.items() if one.channel == "odometry"]
     if not names:
         return []
     return [f"{', '.join(names)}: odometry is no pose of its own, wheels tell it already"]
 
 
-def without_names(numbers: TableNumbers) -> FileChannels:
-    """What columns without names may hold: time, a pose and whole numbers as ticks."""
+def unnamed_channels(numbers: TableNumbers) -> FileChannels:
+    """Guess the channels of columns without names: time, a pose, and whole numbers as ticks."""
     values = numbers.values
-    whole = [k for k in range(values.shape[1]) if _counted(values[:, [k]])]
+    whole = [k for k in range(values.shape[1]) if _is_ticks(values[:, [k]])]
     time = next((k for k in range(values.shape[1]) if (np.diff(values[:, k]) > 0).all()), None)
     whole = [k for k in whole if k != time]
     others = [k for k in range(values.shape[1]) if k not in (*whole, time)]
@@ -233,13 +239,13 @@ def without_names(numbers: TableNumbers) -> FileChannels:
     for channel, at in zip(("pose_x", "pose_y", "pose_heading"), others, strict=False):
         if len(others) >= 3:
             put(channel, at)
-    used = {at for one in found for at in one.at}
+    used = {at for one in found for at in one.columns}
     unused = tuple(str(k) for k in range(values.shape[1]) if k not in used)
     return FileChannels(tuple(found), unused)
 
 
 def without(channels: FileChannels, names: frozenset[str]) -> FileChannels:
-    """Channels of a file less some channels, which another file of the run has as well."""
+    """Return the channels of a file except those that another file of the run has as well."""
     kept = tuple(one for one in channels.found if one.channel not in names)
     again = sorted(one.channel for one in channels.found if one.channel in names)
     notes = (f"Also here, but taken from the other file: {', '.join(again)}.",) if again else ()
@@ -247,26 +253,26 @@ def without(channels: FileChannels, names: frozenset[str]) -> FileChannels:
 
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".parquet")
-"""Of files that may be logs."""
-_TELLING = 8
-"""Named columns from which nobody else will have the same by chance."""
-_TRIED = 3
+"""Suffixes of files that may be logs."""
+_TELLING_COLUMNS = 8
+"""Number of named columns that no unrelated file has by chance."""
+_FILES_TRIED = 3
 """Files that are read to see whether a preset fits."""
 
 
 @dataclass(frozen=True)
-class NoLog:
-    """A file that might have been a log, and why it is none."""
+class RejectedFile:
+    """A file that is no readable log, and the reason."""
 
     path: Path
-    why: str
+    reason: str
 
 
-def formats_below(folder: Path) -> tuple[list[TableFormat], list[NoLog]]:
-    """Every log in a folder and below, and the files that are none.
+def formats_below(folder: Path) -> tuple[list[TableFormat], list[RejectedFile]]:
+    """Return the format of every log in a folder and below, and the files that are none.
 
     Raises:
-        DataError: there is none.
+        DataError: there is no log.
     """
     found, not_logs = [], []
     paths = sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix.lower() in SUFFIXES)
@@ -274,38 +280,38 @@ def formats_below(folder: Path) -> tuple[list[TableFormat], list[NoLog]]:
         try:
             found.append(format_of(path))
         except DataError as error:
-            not_logs.append(NoLog(path, str(error)))
+            not_logs.append(RejectedFile(path, str(error)))
     if not found:
         there = f"no log in {len(paths)} files" if paths else "no CSV or Parquet file below it"
-        listed = "".join(f"\n{one.why}" for one in not_logs[:3])
+        listed = "".join(f"\n{one.reason}" for one in not_logs[:3])
         raise DataError(f"{folder}: {there}; expected logs of a robot{listed}")
     return found, not_logs
 
 
 @dataclass(frozen=True)
-class Kind:
-    """Files that are laid out alike, sorted by path."""
+class FileKind:
+    """Files with the same layout, sorted by path."""
 
     formats: tuple[TableFormat, ...]
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Where they are."""
+        """Paths of the files."""
         return tuple(one.path for one in self.formats)
 
 
-def kinds_of(formats: Sequence[TableFormat]) -> list[Kind]:
-    """Files by kind, the kind with most of them first."""
+def file_kinds(formats: Sequence[TableFormat]) -> list[FileKind]:
+    """Return files by kind, the most frequent kind first."""
     groups: dict[TableFormat, list[TableFormat]] = {}
     for one in formats:
         groups.setdefault(one.signature, []).append(one)
-    return [Kind(tuple(g)) for g in sorted(groups.values(), key=len, reverse=True)]
+    return [FileKind(tuple(g)) for g in sorted(groups.values(), key=len, reverse=True)]
 
 
-def globs_of(root: Path, kind: Kind, others: Sequence[Path]) -> list[str]:
-    """Globs below a folder that find the files of a kind and none of the others.
+def globs_of(root: Path, kind: FileKind, others: Sequence[Path]) -> list[str]:
+    """Return globs below a folder that match the files of a kind and no other file.
 
-    Folders two levels deep have one each: they tell sets of logs apart.
+    Each top folder of files two levels deep has a glob of its own, as it marks a set of logs.
     """
     mine = [path.relative_to(root) for path in kind.paths]
     theirs = [PurePosixPath(path.relative_to(root)) for path in others]
@@ -313,41 +319,41 @@ def globs_of(root: Path, kind: Kind, others: Sequence[Path]) -> list[str]:
     for path in map(PurePosixPath, mine):
         top = path.parts[0] if len(path.parts) > 2 else ""
         buckets.setdefault((top, len(path.parts)), []).append(path)
-    return [glob for paths in buckets.values() for glob in _narrow(paths, theirs)]
+    return [glob for paths in buckets.values() for glob in _narrow_globs(paths, theirs)]
 
 
-def _narrow(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> list[str]:
-    """A glob for some files, narrower ones where it finds others."""
+def _narrow_globs(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> list[str]:
+    """Return a glob for some files, or narrower ones where it matches other files."""
     glob = common_glob(paths)
-    if not any(_finds(glob, path) for path in theirs):
+    if not any(_glob_matches(glob, path) for path in theirs):
         return [glob]
     folders = {path.parent for path in paths}
     if len(folders) > 1:
         parts = [[p for p in paths if p.parent == folder] for folder in sorted(folders)]
-        return [one for part in parts for one in _narrow(part, theirs)]
+        return [one for part in parts for one in _narrow_globs(part, theirs)]
     return [path.as_posix() for path in paths]
 
 
 def common_glob(paths: Sequence[PurePosixPath]) -> str:
-    """A glob that finds paths of the same depth: what they have in common, around stars."""
-    return "/".join(_part(parts) for parts in zip(*(p.parts for p in paths), strict=True))
+    """Return a glob for paths of the same depth: their common parts around stars."""
+    return "/".join(_common_name(parts) for parts in zip(*(p.parts for p in paths), strict=True))
 
 
 def floor_of(glob: str) -> str:
-    """Name of a floor by a glob: that of a folder above the runs', or only that it is a floor."""
+    """Return the name of a floor from a glob: the top folder's name, else "floor"."""
     first, *others = glob.split("/")
     return first if len(others) > 1 and "*" not in first else "floor"
 
 
-def _finds(glob: str, path: PurePosixPath) -> bool:
+def _glob_matches(glob: str, path: PurePosixPath) -> bool:
     parts = glob.split("/")
     return len(parts) == len(path.parts) and all(
         fnmatchcase(name, part) for name, part in zip(path.parts, parts, strict=True)
     )
 
 
-def _part(names: tuple[str, ...]) -> str:
-    """One name, or what several have in common around a star."""
+def _common_name(names: tuple[str, ...]) -> str:
+    """Return one name, or the common parts of several names around a star."""
     if len(set(names)) == 1:
         return names[0]
     suffixes = {PurePosixPath(name).suffix for name in names}
@@ -361,10 +367,10 @@ def _part(names: tuple[str, ...]) -> str:
     return f"{first[:alike].rstrip('0123456789')}*{end}"
 
 
-def pattern_beside(main: Kind, other: Kind) -> str | None:
-    """Name of the file beside each of the main ones, as of `Layout.beside`; None if they have none.
+def pattern_beside(main: FileKind, other: FileKind) -> str | None:
+    """Return the name of the file beside each main one, as in `Layout.beside`; None without one.
 
-    Either it is called the same in every folder, or after the main file.
+    The name is the same in every folder, or contains the stem of the main file.
     """
     there = set(other.paths)
     first = main.paths[0]
@@ -382,40 +388,40 @@ def pattern_beside(main: Kind, other: Kind) -> str | None:
     return None
 
 
-def a_folder_each(kind: Kind) -> bool:
-    """Whether every file is alone of its kind in its folder: then the folder is a run."""
+def folder_per_run(kind: FileKind) -> bool:
+    """Return True where every file is alone of its kind in its folder: a folder is a run."""
     return len(kind.paths) > 1 and len({path.parent for path in kind.paths}) == len(kind.paths)
 
 
 @dataclass(frozen=True)
-class Likely:
-    """Presets that a kind of files can be read with.
+class PresetMatches:
+    """Presets that can read a kind of files.
 
     Attributes:
-        sure: that which uses most of their columns, if its names are telling.
-        perhaps: others, whose columns anybody could have.
+        sure: preset with the most columns among those with unmistakable names, if any.
+        perhaps: other presets, whose columns any log could have.
     """
 
     sure: str | None
     perhaps: tuple[str, ...]
 
 
-def likely_presets(kind: Kind) -> Likely:
-    """Presets that read the first files of a kind."""
+def matching_presets(kind: FileKind) -> PresetMatches:
+    """Return the presets that can read the first files of a kind."""
     fits = [name for name, layout in PRESETS.items() if _matches(kind.formats[0], layout)]
     fits = [name for name in fits if _reads(kind, PRESETS[name])]
     fits.sort(key=lambda name: len(PRESETS[name].columns), reverse=True)
-    telling = [name for name in fits if PRESETS[name].names_row and _many(PRESETS[name])]
+    telling = [name for name in fits if PRESETS[name].names_row and _is_telling(PRESETS[name])]
     sure = telling[0] if telling else None
-    return Likely(sure, tuple(name for name in fits if name not in telling))
+    return PresetMatches(sure, tuple(name for name in fits if name not in telling))
 
 
-def _many(layout: Layout) -> bool:
-    return len(layout.columns) >= _TELLING
+def _is_telling(layout: Layout) -> bool:
+    return len(layout.columns) >= _TELLING_COLUMNS
 
 
 def _matches(format: TableFormat, layout: Layout) -> bool:
-    """Whether names and numbers stand where a layout says."""
+    """Return True where names and numbers stand where a layout expects them."""
     rows = (layout.delimiter, layout.names_row, layout.first_data_row)
     if rows != (format.delimiter, format.names_row, format.first_data_row):
         return False
@@ -424,8 +430,8 @@ def _matches(format: TableFormat, layout: Layout) -> bool:
     return set(layout.columns) <= set(format.names)
 
 
-def _reads(kind: Kind, layout: Layout) -> bool:
-    for path in kind.paths[:_TRIED]:
+def _reads(kind: FileKind, layout: Layout) -> bool:
+    for path in kind.paths[:_FILES_TRIED]:
         try:
             refuse_misordered(read_logs(path, layout, path.parent, "floor", "as_built").logs)
         except DataError:

@@ -1,35 +1,34 @@
-"""The reference of configs as Markdown, made from what checks them."""
+"""Write the reference of configs as Markdown, from the models that check configs."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from slipid.app import config as c
 from slipid.app.new.config_lines import drawing
-from slipid.app.reference.kinds import Key, keys_of
-from slipid.app.reference.parameters import ParameterRow, parameter_rows, purpose
+from slipid.app.reference.keys import ConfigKey, ParameterRow, keys_of, parameter_rows, purpose
 from slipid.data.reading.bag.layout import BagLayout, RunRule, TopicChannel
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, SEVERAL, Channel, Layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.units import KNOWN
-from slipid.support.errors import DataError, near
+from slipid.support.errors import DataError, did_you_mean
 
 _DRIVES: tuple[tuple[type[c.Wheels], str, dict[str, object]], ...] = (
-    (c.Omni, "omni", {"base_radius_m": 0.2, "wheel_azimuths_deg": [60, 180, 300]}),
-    (c.Box, "mecanum", {"half_length_m": 0.2, "half_width_m": 0.15}),
+    (c.OmniDrive, "omni", {"base_radius_m": 0.2, "wheel_azimuths_deg": [60, 180, 300]}),
+    (c.FourWheelDrive, "mecanum", {"half_length_m": 0.2, "half_width_m": 0.15}),
     (
-        c.Box,
+        c.FourWheelDrive,
         "skid",
         {"half_length_m": 0.2, "half_width_m": 0.15, "drives": [[1, 3], [2, 4]]},
     ),
-    (c.Differential, "differential", {"track_m": 0.3}),
+    (c.DifferentialDrive, "differential", {"track_m": 0.3}),
 )
-"""Drives with a robot to draw."""
+"""Drives with an example robot to draw."""
 _SECTIONS: tuple[tuple[str, type], ...] = (
-    ("[[logs]]", c.Logs),
-    ("[camera]", c.Camera),
-    ('[parameters] "PATTERN"', c.Setting),
+    ("[[logs]]", c.LogsSection),
+    ("[camera]", c.CameraSection),
+    ('[parameters] "PATTERN"', c.ParameterSection),
     ("prior, of a parameter", c.PriorSection),
-    ("[weights.LOAD]", c.Weights),
+    ("[weights.LOAD]", c.WeightsSection),
     ("[fit]", c.FitSection),
     ("[validate]", c.ValidateSection),
     ("[selftest]", c.SelftestSection),
@@ -38,17 +37,17 @@ _SECTIONS: tuple[tuple[str, type], ...] = (
 
 @dataclass(frozen=True)
 class Chapter:
-    """A part of the reference that can be asked for by its name."""
+    """Part of the reference that can be requested by its name."""
 
     name: str
     text: Callable[["c.Config | None"], str]
 
 
 def reference(what: str | None = None, config: "c.Config | None" = None) -> str:
-    """The reference, or a part of it; for the robot of a config, where one is given.
+    """Return the reference, or a part of it; for a config's robot, where one is given.
 
     Raises:
-        DataError: no part is called so.
+        DataError: no part has this name.
     """
     names = [chapter.name for chapter in CHAPTERS]
     if what is None:
@@ -56,7 +55,7 @@ def reference(what: str | None = None, config: "c.Config | None" = None) -> str:
         return "\n\n".join(parts) + "\n"
     found = [chapter for chapter in CHAPTERS if chapter.name == what]
     if not found:
-        raise DataError(f"'{what}'{near(what, names)}; expected one of {', '.join(names)}")
+        raise DataError(f"'{what}'{did_you_mean(what, names)}; expected one of {', '.join(names)}")
     return found[0].text(config) + "\n"
 
 
@@ -68,7 +67,7 @@ a config with what your robot needs of this, `configs/` has one for each public 
 
 
 def _config(_: object) -> str:
-    parts = ["## Config", _table_of_keys(keys_of(c.Content))]
+    parts = ["## Config", _table_of_keys(keys_of(c.ConfigContent))]
     for header, kind in _SECTIONS:
         parts += [f"### `{header}`", purpose(kind), _table_of_keys(keys_of(kind))]
     return "\n\n".join(parts)
@@ -84,17 +83,17 @@ order of `drives`. A positive speed of a wheel rolls the robot along the arrow o
 
 
 def _drives(_: object) -> str:
-    parts = [_FRAMES, "### Keys of every drive", _table_of_keys(keys_of(c.Wheeled))]
-    common = {key.name for key in keys_of(c.Wheeled)}
+    parts = [_FRAMES, "### Keys of every drive", _table_of_keys(keys_of(c.WheeledDrive))]
+    common = {key.name for key in keys_of(c.WheeledDrive)}
     for kind, name, sizes in _DRIVES:
         robot = kind.model_validate({"drive": name, "wheel_radius_m": 0.05, **sizes})
         own = [key for key in keys_of(kind) if key.name not in common and key.name != "drive"]
         picture = f"```text\n{drawing(c.geometry(robot))}\n```"
         parts += [f'### `drive = "{name}"`', purpose(kind), _table_of_keys(own), picture]
-    own = [key for key in keys_of(c.General) if key.name not in common and key.name != "drive"]
-    parts += ['### `drive = "general"`', purpose(c.General), _table_of_keys(own)]
-    own = [key for key in keys_of(c.Motor) if key.name != "drive"]
-    parts += ['### `drive = "motor"`', purpose(c.Motor), _table_of_keys(own)]
+    own = [key for key in keys_of(c.GeneralDrive) if key.name not in common and key.name != "drive"]
+    parts += ['### `drive = "general"`', purpose(c.GeneralDrive), _table_of_keys(own)]
+    own = [key for key in keys_of(c.BenchMotors) if key.name != "drive"]
+    parts += ['### `drive = "motor"`', purpose(c.BenchMotors), _table_of_keys(own)]
     return "\n\n".join(parts)
 
 
@@ -137,7 +136,7 @@ def _layouts(_: object) -> str:
 
 
 def _channels(_: object) -> str:
-    rows = [(f"`{name}`", _spelled(unit), _columns(name)) for name, unit in CHANNELS.items()]
+    rows = [(f"`{name}`", _unit_text(unit), _columns(name)) for name, unit in CHANNELS.items()]
     head = "## Channels\n\nWhat a column may hold, and the unit that slipid turns it into."
     return f"{head}\n\n{_table(('channel', 'unit', 'columns'), rows)}"
 
@@ -192,17 +191,17 @@ it."""
 
 def _cells(row: ParameterRow, of_config: bool) -> tuple[str, ...]:
     cells = (
-        *(f"`{row.path}`", str(row.size), row.symbol, _spelled(row.unit)),
+        *(f"`{row.path}`", str(row.size), row.symbol, _unit_text(row.unit)),
         *(row.means, row.start, row.prior),
     )
     return (*cells, row.here) if of_config else cells
 
 
-def _spelled(unit: str) -> str:
+def _unit_text(unit: str) -> str:
     return "1" if unit in ("1", "") else unit
 
 
-def _table_of_keys(keys: Iterable[Key]) -> str:
+def _table_of_keys(keys: Iterable[ConfigKey]) -> str:
     rows = [(f"`{key.name}`", key.kind, key.default, key.means) for key in keys]
     return _table(("key", "value", "default", "meaning"), rows)
 

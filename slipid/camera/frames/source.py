@@ -1,26 +1,34 @@
-"""A folder of pictures as frames.
-
-What a user names as the source of frames: a file, a folder or a device.
-"""
+"""Frames from the file, folder or device that a user names, and one still picture of a floor."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from itertools import count as numbers
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.frames.frame import Frame, Source, even_times, grey_of, read_times, stamp
-from slipid.camera.frames.video import Device, Video
-from slipid.camera.opencv import read_picture
+from slipid.camera.frames.frame import Frame, FrameSource, even_times, grey_of, read_times, stamp
+from slipid.camera.frames.video import Capture, Device, Video
+from slipid.camera.opencv import opencv, read_picture
 from slipid.support.errors import DataError
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+MEDIAN_FRAMES = 25
+"""Number of frames of a video from which a still picture is made."""
 
 
 @dataclass(frozen=True, eq=False)
 class PictureFolder:
-    """Pictures in the order of their names, all of one size."""
+    """Pictures in the order of their names, all of one size.
+
+    Attributes:
+        paths: files of the pictures.
+        times: time of each [s].
+        image_px: width and height of each.
+        exact: True, since there is one frame for each time.
+    """
 
     paths: tuple[Path, ...]
     times: Float[np.ndarray, " frame"]
@@ -31,47 +39,47 @@ class PictureFolder:
     def at(
         cls, folder: Path, fps: float | None, times: Float[np.ndarray, " frame"] | None
     ) -> "PictureFolder":
-        """Every picture in a folder, which have the size of the first.
+        """Return every picture in a folder, at a rate or at given times.
 
         Raises:
-            DataError: there is none, or no time for each.
+            DataError: there is no picture, or not one time for each.
         """
-        found = sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURES)
-        if not found:
+        paths = sorted(p for p in folder.iterdir() if is_picture(p))
+        if not paths:
             raise DataError(f"{folder}: no picture; expected {', '.join(PICTURES)}")
         if times is None:
             if fps is None:
                 raise DataError(f"{folder}: pictures have no times; expected --fps or --times FILE")
-            times = even_times(len(found), fps)
-        if len(times) != len(found):
+            times = even_times(len(paths), fps)
+        if len(times) != len(paths):
             raise DataError(
-                f"{folder}: {len(found)} pictures and {len(times)} times; expected one each"
+                f"{folder}: {len(paths)} pictures and {len(times)} times; expected one each"
             )
-        return cls.of(found, times)
+        return cls.of(paths, times)
 
     @classmethod
     def of(cls, paths: Sequence[Path], times: Float[np.ndarray, " frame"]) -> "PictureFolder":
-        """Some pictures; DataError where the first is none."""
+        """Return pictures of the first one's size; DataError where the first is no picture."""
         rows, columns = read_picture(paths[0]).shape[:2]
         return cls(tuple(paths), times, (columns, rows))
 
     @property
     def name(self) -> str:
-        """The folder, or the picture where there is one alone."""
+        """The folder, or the picture where there is only one."""
         return str(self.paths[0] if len(self.paths) == 1 else self.paths[0].parent)
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of pictures."""
         return len(self.paths)
 
     @property
     def identity(self) -> str:
-        """Names, sizes and dates."""
+        """Names, sizes and dates of the pictures."""
         return repr([stamp(path) for path in self.paths])
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Pictures from a number on."""
+        """Yield the pictures from a number on; DataError where one has another size."""
         for k in range(first, len(self.paths)):
             picture = read_picture(self.paths[k])
             if (picture.shape[1], picture.shape[0]) != self.image_px:
@@ -87,14 +95,14 @@ def open_source(
     fps: float | None = None,
     times: Path | None = None,
     seconds: float | None = None,
-) -> Source:
-    """Frames of a video file, a folder of pictures or a device.
+) -> FrameSource:
+    """Return the frames of a video file, a folder of pictures or a device.
 
     Args:
         place: a file, a folder, or a device: its number, or its path such as /dev/video0.
         fps: frames per second where times are not to be taken from the source.
         times: CSV file with the columns frame and time [s], instead.
-        seconds: how long to watch a device, which has no end.
+        seconds: how long to record from a device, which has no end.
 
     Raises:
         DataError: nothing there that can be read, or no times.
@@ -113,13 +121,45 @@ def open_source(
     try:
         size = path.stat().st_size
     except (OSError, ValueError):
-        what = "a video or a folder of pictures"
-        raise DataError(f"{path}: no such file or folder; expected {what}") from None
-    known = None if times is None else read_times(times)
+        expected = "a video or a folder of pictures"
+        raise DataError(f"{path}: no such file or folder; expected {expected}") from None
+    given = None if times is None else read_times(times)
     if path.is_dir():
-        return PictureFolder.at(path, fps, known)
+        return PictureFolder.at(path, fps, given)
     if not size:
         raise DataError(f"{path}: the file is empty; expected a video")
-    if path.suffix.lower() in PICTURES:
-        return PictureFolder.of((path,), even_times(1, fps or 1.0) if known is None else known)
-    return Video.at(path, fps, known)
+    if is_picture(path):
+        return PictureFolder.of((path,), even_times(1, fps or 1.0) if given is None else given)
+    return Video.at(path, fps, given)
+
+
+def is_picture(path: Path) -> bool:
+    """Return whether a file is a picture, by the end of its name."""
+    return path.suffix.lower() in PICTURES
+
+
+def still(path: Path) -> np.ndarray:
+    """Return a picture, or the median of a video's frames, as rows, columns and blue, green, red.
+
+    An object that moves through a video is not in the median, unless it stands in one place half of
+    the time.
+
+    Raises:
+        DataError: the file is neither a picture nor a video.
+    """
+    if is_picture(path) or not path.is_file() or not path.stat().st_size:
+        return read_picture(path)
+    with closing(Capture(str(path))) as capture:
+        count = int(capture.value(opencv().CAP_PROP_FRAME_COUNT))
+        every, kept = max(1, count // MEDIAN_FRAMES), []
+        for k in numbers():
+            chosen = k % every == 0
+            picture = capture.next_picture(decode=chosen)
+            if picture is None:
+                break
+            kept += [picture] if chosen else []
+            if len(kept) == 2 * MEDIAN_FRAMES:  # of a video that does not know its length
+                kept, every = kept[::2], 2 * every
+    if not kept:
+        raise DataError(f"{path}: no frame that OpenCV can decode; expected a picture or a video")
+    return np.median(np.stack(kept), axis=0).astype(np.uint8)

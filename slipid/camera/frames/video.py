@@ -1,9 +1,10 @@
-"""A video file, or a camera that is plugged in, as frames."""
+"""A video file, or a camera plugged into this computer, as frames."""
 
 import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import count as numbers
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,15 @@ BROKEN = 25
 
 @dataclass(frozen=True, eq=False)
 class Video:
-    """A video file; its own times, or given ones."""
+    """A video file, with its own times or with given ones.
+
+    Attributes:
+        path: the file.
+        image_px: width and height of a frame.
+        count: announced number of frames, or that of the times; None where it is not known.
+        times: given time of each frame [s]; None takes the file's own.
+        fps: given frame rate [1/s], instead of times.
+    """
 
     path: Path
     image_px: tuple[int, int]
@@ -31,8 +40,7 @@ class Video:
     def at(
         cls, path: Path, fps: float | None, times: Float[np.ndarray, " frame"] | None
     ) -> "Video":
-        """A video that OpenCV opens and has a first frame; DataError where there is none."""
-        cv2 = opencv()
+        """Return a video; DataError where OpenCV cannot open it or decode its first frame."""
         if fps is not None:
             even_times(1, fps)
         with closing(Capture(str(path))) as capture:
@@ -42,7 +50,7 @@ class Video:
                     f"{path}: no frame that OpenCV can decode; expected a video (a file that was "
                     "cut off, as by a full disk, may have lost its index)"
                 )
-            announced = capture.value(cv2.CAP_PROP_FRAME_COUNT)
+            announced = capture.value(opencv().CAP_PROP_FRAME_COUNT)
         count = int(announced) if 0 < announced < 1e9 else None
         if times is not None:
             count = len(times)
@@ -55,25 +63,25 @@ class Video:
 
     @property
     def exact(self) -> bool:
-        """Where every frame has a given time."""
+        """Whether every frame has a given time."""
         return self.times is not None
 
     @property
     def identity(self) -> str:
-        """Name, size, date, and what times it has."""
+        """Name, size and date of the file, and its given times or rate."""
         return repr(
             (stamp(self.path), self.fps, None if self.times is None else self.times.tolist())
         )
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Frames from a number on; those before are passed over.
+        """Yield the frames from a number on; those before are skipped without decoding.
 
         Raises:
-            DataError: the file has no times, they do not increase, or there are too few given.
+            DataError: the file has no times, they do not increase, or too few were given.
         """
         before = -np.inf
         with closing(Capture(str(self.path))) as capture:
-            for k in range(10**9):
+            for k in numbers():
                 picture = capture.next_picture(decode=k >= first)
                 if picture is None:
                     return
@@ -102,7 +110,15 @@ class Video:
 
 @dataclass(frozen=True)
 class Device:
-    """A camera that is plugged in; times are of this computer's clock, from the first frame on."""
+    """A camera plugged into this computer; times are of its clock, from the first frame on.
+
+    Attributes:
+        place: number or path of the device.
+        seconds: duration of the recording [s].
+        image_px: width and height of a frame.
+        count: None, since the number of frames is not known.
+        exact: False, likewise.
+    """
 
     place: str
     seconds: float
@@ -112,7 +128,7 @@ class Device:
 
     @classmethod
     def at(cls, place: str, seconds: float) -> "Device":
-        """A camera that shows something; DataError where there is none."""
+        """Return a camera; DataError where it supplies no frame."""
         with closing(Capture(place)) as capture:
             first = capture.next_picture()
         if first is None:
@@ -123,19 +139,19 @@ class Device:
 
     @property
     def name(self) -> str:
-        """What the user called it."""
+        """The device as the user named it."""
         return f"device {self.place}"
 
     @property
     def identity(self) -> str:
-        """Never the same: what it shows is gone."""
+        """A text that is never the same twice, since the frames of a device do not come back."""
         return f"{self.place} {time.time_ns()}"
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """What it shows from now on, until the time is over."""
+        """Yield the frames from now on, until the recording is over."""
         began: float | None = None
         with closing(Capture(self.place)) as capture:
-            for k in range(10**9):
+            for k in numbers():
                 picture = capture.next_picture()
                 now = time.monotonic()
                 began = now if began is None else began
@@ -161,21 +177,21 @@ class Capture:
             )
 
     def next_picture(self, decode: bool = True) -> np.ndarray | None:
-        """The next frame, or something empty where it is not decoded; None at the end."""
+        """Return the next frame, or an empty one where it is not decoded; None at the end."""
         for _ in range(BROKEN):
             if not self._capture.grab():
                 continue
             if not decode:
                 return np.zeros((0, 0, 3), np.uint8)
-            there, picture = self._capture.retrieve()
-            if there and picture is not None and picture.size:
+            decoded, picture = self._capture.retrieve()
+            if decoded and picture is not None and picture.size:
                 return np.asarray(picture)
         return None
 
-    def value(self, what: int) -> float:
-        """A property."""
-        return float(self._capture.get(what))
+    def value(self, property_id: int) -> float:
+        """Return one of OpenCV's properties of the file or device."""
+        return float(self._capture.get(property_id))
 
     def close(self) -> None:
-        """Give it back."""
+        """Release the file or device."""
         self._capture.release()

@@ -1,4 +1,4 @@
-"""One frame of a video with what was found in it, for a person to check."""
+"""One frame of a video with its tracked poses drawn in, to be checked by eye."""
 
 from pathlib import Path
 
@@ -7,33 +7,34 @@ from jaxtyping import Float, UInt8
 
 from slipid.camera.opencv import opencv
 from slipid.camera.overhead import OverheadCamera
-from slipid.camera.tracking.track import Track
+from slipid.camera.tracking.track import TrackedPoses
 from slipid.support.errors import DataError
 from slipid.support.files import writable, write_bytes
 
 GRID = 0.25
-"""Distance of the lines that are drawn on the floor [m]."""
+"""Distance between the lines drawn on the floor [m]."""
 FLOOR, EDGE, AHEAD, LEFT = (190, 190, 60), (0, 170, 255), (40, 40, 230), (60, 190, 60)
-"""Colours, in blue, green, red."""
+"""Colours of the floor, the markers' edges and the bodies' axes, in blue, green, red."""
 
 
 def write_preview(
     path: Path,
     grey: UInt8[np.ndarray, "row column"],
     camera: OverheadCamera,
-    tracks: tuple[Track, ...],
+    tracks: tuple[TrackedPoses, ...],
     row: int,
 ) -> None:
     """Write a frame with a grid on the floor, the markers' edges and the bodies' axes.
 
     Args:
-        path: of a PNG or JPEG file.
+        path: the PNG or JPEG file to write.
         grey: the frame.
-        tracks: of every body.
-        row: of the frame in the tracks.
+        camera: the camera that took it.
+        tracks: tracked poses of every body.
+        row: row of the frame in the tracks.
 
     Raises:
-        DataError: the suffix is of no picture, or nothing can be written there.
+        DataError: the suffix is not of a picture, or nothing can be written there.
     """
     cv2 = opencv()
     drawn = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
@@ -44,11 +45,11 @@ def write_preview(
     write_bytes(path, _encoded(path, drawn))
 
 
-def can_draw(path: Path) -> None:
-    """Try whether a picture can be written there.
+def check_drawable(path: Path) -> None:
+    """Check that a picture can be written to a file.
 
     Raises:
-        DataError: not so, or its suffix is of no picture.
+        DataError: it cannot, or the suffix is not of a picture.
     """
     _encoded(path, np.zeros((8, 8, 3), np.uint8))
     writable(path.parent)
@@ -72,7 +73,7 @@ def _line(
     colour: tuple[int, int, int],
     width: int,
 ) -> None:
-    """A line through places in the world, where the picture has room for it."""
+    """Draw a line through places in the world, unless it lies far outside of the picture."""
     cv2 = opencv()
     pixels = camera.pixels(points)
     if np.isfinite(pixels).all() and (np.abs(pixels) < 1e5).all():
@@ -81,14 +82,14 @@ def _line(
 
 
 def _grid(drawn: np.ndarray, camera: OverheadCamera) -> None:
-    """Lines on the floor, as far as the picture shows it, with their distance written down."""
+    """Draw lines on the visible floor, and write their distance."""
     cv2 = opencv()
     width, height = camera.lens.image_px
     frame = np.stack(np.meshgrid(np.linspace(0, width, 9), np.linspace(0, height, 9)), -1)
     floor = camera.on_plane(frame.reshape(-1, 2), 0.0)
     floor = floor[np.isfinite(floor).all(axis=1)]
     low, high = floor.min(axis=0), floor.max(axis=0)
-    high = np.minimum(high, low + 100 * GRID)  # a tilted camera sees the horizon
+    high = np.minimum(high, low + 100 * GRID)  # a tilted camera may see the horizon
     lines = [np.arange(np.ceil(low[k] / GRID), high[k] / GRID) * GRID for k in range(2)]
     for axis in range(2):
         along = np.linspace(low[1 - axis], high[1 - axis], 40)
@@ -105,7 +106,7 @@ def _grid(drawn: np.ndarray, camera: OverheadCamera) -> None:
 def _label(
     drawn: np.ndarray, camera: OverheadCamera, place: Float[np.ndarray, "3"], text: str
 ) -> None:
-    """Words beside a place on the floor, where the picture shows it."""
+    """Write text beside a place on the floor, where the picture shows it."""
     cv2 = opencv()
     x, y = camera.pixels(place[None])[0].tolist()
     width, height = camera.lens.image_px
@@ -115,9 +116,9 @@ def _label(
 
 
 def _body(
-    drawn: np.ndarray, camera: OverheadCamera, track: Track, pose: Float[np.ndarray, "3"]
+    drawn: np.ndarray, camera: OverheadCamera, track: TrackedPoses, pose: Float[np.ndarray, "3"]
 ) -> None:
-    """Edges of the markers, where they should be; the body's axes, x red and y green."""
+    """Draw the expected edges of the markers, and the body's axes, x red and y green."""
     cv2 = opencv()
     c, s = np.cos(pose[2]), np.sin(pose[2])
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

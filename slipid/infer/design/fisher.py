@@ -1,15 +1,15 @@
-"""What a set of runs tells: information that adds up over runs, and which runs add most.
+"""Fisher information of sets of runs, and the choice of the runs that add most.
 
-Numbers of the motion m are informed by the motion residuals, electric numbers e by currents and
-voltages given the motion, as in the fit. With whitened Jacobians J of the motion and (E, C) of
+Motion residuals inform the numbers m of the motion; currents and voltages inform the electric
+numbers e given the motion, as in the fit. With whitened Jacobians J of the motion and (E, C) of
 currents and voltages by e and m,
 
     M = M0 + sum J^T J,   O = O0 + sum E^T E,   X = X0 + sum E^T C
     cov(m) = M^-1,   e = e(m) - L (m - m^),  L = O^-1 X,   cov(e) = O^-1 + L M^-1 L^T
 
-so M, O and X of different runs add. Where currents inform the motion, or there are none, all
-numbers count as m. A criterion is tr(G cov G^T) of a matrix G (Fedorov 1972; Atkinson, Donev and
-Tobias 2007, Optimum Experimental Designs, sections 10 and 12: c- and A-optimality, exchange).
+so M, O and X of different runs add. If currents inform the motion, or there are none, all numbers
+count as m. A criterion is tr(G cov G^T) of a matrix G (Fedorov 1972; Atkinson, Donev and Tobias
+2007, Optimum Experimental Designs, sections 10 and 12: c- and A-optimality, exchange).
 """
 
 from collections.abc import Sequence
@@ -21,18 +21,24 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 ENDLESS = 1e3
-"""Times that every candidate is driven where "endless" is meant: what is left then stays."""
+"""Repetitions of every candidate that stand for endless driving."""
 
 
 class RunJacobians(NamedTuple):
-    """Whitened Jacobians of runs: J of the motion, E and C of currents (k is 0 without them)."""
+    """Whitened Jacobians of runs.
+
+    Attributes:
+        motion: J of the motion residuals.
+        electric: E of currents and voltages by electric numbers (k is 0 without currents).
+        carried: C of currents and voltages by numbers of the motion.
+    """
 
     motion: Float[np.ndarray, "run m motion"]
     electric: Float[np.ndarray, "run k electric"]
     carried: Float[np.ndarray, "run k motion"]
 
     def pick(self, index: Sequence[int] | np.ndarray) -> "RunJacobians":
-        """Some runs, in the order given; a run may come several times."""
+        """Return some runs in the given order; a run may occur several times."""
         return RunJacobians(*(part[np.asarray(index, int)] for part in self))
 
     def joined(self, *others: "RunJacobians") -> "RunJacobians":
@@ -41,7 +47,14 @@ class RunJacobians(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Information on all numbers, M, O and X, and which of them are electric."""
+    """Information on all numbers.
+
+    Attributes:
+        is_electric: mask of the electric numbers.
+        motion: M.
+        own: O.
+        cross: X.
+    """
 
     is_electric: Bool[np.ndarray, " free"]
     motion: Float[np.ndarray, "motion motion"]
@@ -49,8 +62,8 @@ class Information:
     cross: Float[np.ndarray, "electric motion"]
 
     def plus(self, rows: RunJacobians, times: float = 1.0) -> "Information":
-        """After these runs as well, each so many times; -1 takes them away."""
-        # not -1: where a part has no numbers, numpy cannot tell how many rows it has
+        """Return the information with these runs added `times` times; -1 removes them."""
+        # reshape(-1, ...) would fail for a part without numbers
         j, e, c = (x.reshape(x.shape[0] * x.shape[1], x.shape[2]) for x in rows)
         return Information(
             self.is_electric,
@@ -61,7 +74,7 @@ class Information:
 
     @cached_property
     def of_motion(self) -> Float[np.ndarray, "motion motion"]:
-        """Covariance of the motion's numbers."""
+        """Covariance of the numbers of the motion."""
         return _inverse(self.motion)
 
     @cached_property
@@ -82,10 +95,10 @@ class Information:
     def after_each(
         self, rows: RunJacobians, goal: Float[np.ndarray, "k free"]
     ) -> Float[np.ndarray, " run"]:
-        """Criterion after one more run, for every candidate.
+        """Return the criterion after one more run, for every candidate.
 
-        By Woodbury's identity (M + J^T J)^-1 = M^-1 - W^T (1 + W J^T)^-1 W with W = J M^-1, so what
-        is inverted has the size of a run, not of all numbers.
+        By Woodbury's identity (M + J^T J)^-1 = M^-1 - W^T (1 + W J^T)^-1 W with W = J M^-1, the
+        inverted matrix has the size of a run, not of all numbers.
         """
         of_motion, of_electric = goal[:, ~self.is_electric], goal[:, self.is_electric]
         rest: np.ndarray | float = 0.0
@@ -107,7 +120,7 @@ class Information:
 def information_of(
     covariance: Float[np.ndarray, "free free"], is_electric: Bool[np.ndarray, " free"]
 ) -> Information:
-    """Knowledge with this covariance."""
+    """Return the information with this covariance."""
     e, m = np.flatnonzero(is_electric), np.flatnonzero(~is_electric)
     of_motion = covariance[np.ix_(m, m)]
     motion = _inverse(of_motion)
@@ -123,7 +136,7 @@ def criterion_path(
     order: Sequence[int] | np.ndarray,
     at: Sequence[int] | None = None,
 ) -> list[float]:
-    """Criterion after so many runs of an order: before and after each, or at chosen numbers."""
+    """Return the criterion along an order of runs, before and after each or at chosen counts."""
     counts = range(len(order) + 1) if at is None else at
     found, now, done = [], start, 0
     for count in counts:
@@ -135,10 +148,12 @@ def criterion_path(
 def greedy(
     start: Information, rows: RunJacobians, goal: np.ndarray, most: int, target: float = 0.0
 ) -> tuple[list[int], list[float]]:
-    """At most so many runs, each the one that lowers the criterion most; any may come again.
+    """Choose at most `most` runs, each the one that lowers the criterion most, with repetition.
 
-    It stops where the criterion has come down to the target. Returns the runs, and the criterion
-    before and after each.
+    The choice stops once the criterion has fallen to the target.
+
+    Returns:
+        the runs, and the criterion before and after each.
     """
     now, chosen, found = start, [], [start.criterion(goal)]
     while len(chosen) < most and found[-1] > target:
@@ -152,7 +167,7 @@ def greedy(
 def exchanged(
     start: Information, rows: RunJacobians, goal: np.ndarray, chosen: Sequence[int]
 ) -> list[int]:
-    """The runs after each was once exchanged for the best in its place, the most useful first."""
+    """Exchange each run once for the best one in its place; return the most useful first."""
     kept = list(chosen)
     for k in range(len(kept)):
         others = start.plus(rows.pick(kept[:k] + kept[k + 1 :]))
@@ -169,6 +184,6 @@ def exchanged(
 
 
 def _inverse(a: np.ndarray) -> np.ndarray:
-    """Inverse of a symmetric positive matrix whose numbers differ widely in size."""
+    """Return the inverse of a symmetric positive matrix with entries of widely different size."""
     scale = 1 / np.sqrt(np.diag(a))
     return np.asarray(np.linalg.inv(a * scale[:, None] * scale) * scale[:, None] * scale)

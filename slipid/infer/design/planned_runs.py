@@ -1,4 +1,4 @@
-"""Runs that could be driven: commands, grids of them, and the windows they would be logged as."""
+"""Runs that could be driven: their commands, grids of them, and the simulated windows."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,11 +16,11 @@ from slipid.model.robot import Robot
 from slipid.predict.open_loop import chain
 
 SESSION = "next"
-"""The time in which new runs are driven: the marker is put on once more, and stays."""
+"""Session of new runs, for which the marker is mounted anew."""
 HEADINGS = tuple(15.0 * k for k in range(24))
 """Headings of candidate runs and of predictions [deg]."""
 BEND = 0.5
-"""Rim speed of a curved candidate's turn, per speed ahead."""
+"""Rim speed of a curved candidate's turn over its speed."""
 
 Setup = tuple[str, str]
 """A floor and a load set-up."""
@@ -30,8 +30,13 @@ Setup = tuple[str, str]
 class PlannedRun:
     """One run: a constant command on one floor with one load set-up.
 
-    The heading of the motion is in the body frame [rad]; speed [m/s], turn [rad/s]; the distance is
-    the commanded length [m], arc of the rim where it only turns.
+    Attributes:
+        surface: name of the floor.
+        load: name of the load set-up.
+        heading: direction of travel in the body frame [rad].
+        speed: commanded speed [m/s].
+        turn: commanded yaw rate [rad/s].
+        distance: commanded path length, or arc length of the rim for a turn on the spot [m].
     """
 
     surface: str
@@ -43,7 +48,7 @@ class PlannedRun:
 
     @property
     def session(self) -> str:
-        """Time in which the marker stayed as it was, as `slipid.data.windows` names it."""
+        """Name of the session, in which the marker stays in place, as in `slipid.data.windows`."""
         return f"{self.surface}/{self.load}/{self.speed:.2f}"
 
     @property
@@ -53,7 +58,7 @@ class PlannedRun:
         return np.array([self.speed * ahead, self.speed * left, self.turn])
 
     def seconds(self, base_radius: float) -> float:
-        """Duration [s] of a robot whose rim turns at this radius [m]."""
+        """Return the duration [s] for a robot with this radius of its rim [m]."""
         return self.distance / (self.speed or abs(self.turn) * base_radius)
 
 
@@ -65,31 +70,37 @@ def candidates(
     headings_deg: Sequence[float] = HEADINGS,
     turns: Sequence[float] | None = None,
 ) -> tuple[PlannedRun, ...]:
-    """Every heading at every speed of a floor, straight and turning, and turns on the spot.
+    """Return runs in every heading at every speed of a floor, straight, turning and on the spot.
 
-    Speeds [m/s] and distances [m] are of each floor. Turning rates [rad/s] are by default none and
-    those at which the rim turns with `BEND` of the speed ahead, and on the spot with all of it.
+    Args:
+        setups: floors and load set-ups.
+        speeds: speeds by floor [m/s].
+        distance: path length by floor [m].
+        base_radius: distance of the wheels from the robot's centre [m].
+        headings_deg: directions of travel [deg].
+        turns: yaw rates [rad/s]; by default zero and those with a rim speed of `BEND` times the
+            speed, and on the spot those with a rim speed equal to the speed.
     """
     out = []
     for surface, load in setups:
-        far = distance[surface]
+        length = distance[surface]
         for speed in speeds[surface]:
             bend = BEND * speed / base_radius
             rates = (0.0, bend, -bend) if turns is None else turns
-            ways = np.radians(headings_deg)
             if speed > 0:
-                found = product(ways, rates)
-                out += [PlannedRun(surface, load, float(a), speed, t, far) for a, t in found]
+                found = product(np.radians(headings_deg), rates)
+                out += [PlannedRun(surface, load, float(a), speed, t, length) for a, t in found]
             spin = (speed / base_radius, -speed / base_radius) if turns is None else turns
-            out += [PlannedRun(surface, load, 0.0, 0.0, t, far) for t in spin if t != 0]
+            out += [PlannedRun(surface, load, 0.0, 0.0, t, length) for t in spin if t != 0]
     return tuple(dict.fromkeys(out))
 
 
 def paper_grid(setups: Iterable[Setup], distance: Mapping[str, float]) -> tuple[PlannedRun, ...]:
-    """The 36 settings of the 2021 paper, each on every set-up before the next.
+    """Return the 36 commands of the 2021 paper, each with every set-up before the next.
 
-    Along x and y at 100 to 400 mm/s, on the diagonals at 100 to 300 mm/s in x and in y, on the spot
-    at 20 to 50 deg/s. Source: Belyaev, Brylev and Ivanov 2021, commands of its logs.
+    They go along x and y at 100 to 400 mm/s, along the diagonals at 100 to 300 mm/s in x and in y,
+    and turn on the spot at 20 to 50 deg/s. Source: Belyaev, Brylev and Ivanov 2021, commands of
+    its logs.
     """
     settings = [(a, v, 0.0) for v in (0.1, 0.2, 0.3, 0.4) for a in (0.0, 180.0, 90.0, 270.0)]
     settings += [(0.0, 0.0, s * rate) for rate in (20.0, 30.0, 40.0, 50.0) for s in (1, -1)]
@@ -104,7 +115,7 @@ def paper_grid(setups: Iterable[Setup], distance: Mapping[str, float]) -> tuple[
 def heading_grid(
     setups: Iterable[Setup], speeds: Mapping[str, Sequence[float]], distance: Mapping[str, float]
 ) -> tuple[PlannedRun, ...]:
-    """Straight runs in headings every 5 degrees at every speed, as the 2022 logs were driven."""
+    """Return straight runs in headings every 5 degrees at every speed, like the 2022 logs."""
     headings = np.radians(np.arange(0.0, 360.0, 5.0))
     return tuple(
         PlannedRun(f, load, float(heading), speed, 0.0, distance[f])
@@ -114,8 +125,8 @@ def heading_grid(
     )
 
 
-def drivable(drives: Iterable[PlannedRun], robot: Robot) -> tuple[PlannedRun, ...]:
-    """Those whose commanded twist the wheels can give: not sideways for ordinary wheels."""
+def drivable(runs: Iterable[PlannedRun], robot: Robot) -> tuple[PlannedRun, ...]:
+    """Return the runs whose commanded twist the wheels can produce."""
     j = np.asarray(robot.geometry.forward())
     reach = np.linalg.pinv(j, rcond=1e-6) @ j
     base = np.array([1.0, 1.0, float(robot.geometry.base_radius)])
@@ -124,36 +135,36 @@ def drivable(drives: Iterable[PlannedRun], robot: Robot) -> tuple[PlannedRun, ..
         lost = (reach @ d.command - d.command) * base
         return bool(np.linalg.norm(lost) < 0.05 * np.linalg.norm(d.command * base))
 
-    return tuple(filter(fits, drives))
+    return tuple(filter(fits, runs))
 
 
 def steady_windows(
-    drives: Sequence[PlannedRun],
+    runs: Sequence[PlannedRun],
     robot: Robot,
     channels: Channels,
     session: str = SESSION,
 ) -> Windows:
-    """Windows that drives at steady wheel speeds would give without noise, each run one piece.
+    """Return noise-free windows of runs at steady wheel speeds, one segment per run.
 
-    However long a run is, it is one piece: its own effect is met once. Runs are centred on the
-    middle of the image, the marker's heading is zero at their start. The ammeter counts as exact:
-    its noise is not known beforehand, and averages out over a window.
+    However long a run is, it is one segment, as it has one run effect. Runs are centred in the
+    image, and the marker's heading is zero at their start. The ammeter counts as exact, since its
+    noise is not known beforehand and averages out over a window.
     """
-    n, per_piece, motors = len(drives), channels.windows, robot.geometry.drives
+    n, per_piece, motors = len(runs), channels.windows, robot.geometry.drives
     base, radius = float(robot.geometry.base_radius), float(robot.geometry.wheel_radius)
-    command = np.stack([d.command for d in drives])
+    command = np.stack([d.command for d in runs])
     rate = command @ np.asarray(robot.geometry.forward()).T / radius
-    dt = np.array([d.seconds(base) for d in drives])[:, None] / per_piece * np.ones((n, per_piece))
+    dt = np.array([d.seconds(base) for d in runs])[:, None] / per_piece * np.ones((n, per_piece))
     blank = np.zeros((n, per_piece, motors))
     w = Windows(
         run=np.arange(n),
-        surface=tuple(d.surface for d in drives),
-        load=tuple(d.load for d in drives),
+        surface=tuple(d.surface for d in runs),
+        load=tuple(d.load for d in runs),
         session=(session,) * n,
-        began=np.zeros(n),
+        start=np.zeros(n),
         dt=dt,
         turn=dt[..., None] * rate[:, None],
-        faster=blank,
+        speed_change=blank,
         pose=np.zeros((n, per_piece + 1, 3)),
         current=blank,
         voltage=blank,
@@ -175,12 +186,12 @@ def steady_windows(
 
 @jax.jit
 def _sensed(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
-    """Logged poses, currents and voltages of windows without noise."""
+    """Return logged poses, currents and voltages of windows without noise."""
     p = lk.predict(robot, b)
     path = chain(jnp.zeros((b.dt.shape[0], 3)), p.increment)
     middle = 0.5 * (path[:, :1, :2] + path[:, -1:, :2])
     pose = jax.vmap(jax.vmap(robot.camera.logged))(path.at[..., :2].add(-middle))
-    amps = lk.predicted_current(robot, b, p.felt)
+    amps = lk.predicted_current(robot, b, p.motor_force)
     speed = lk.wheel_speed(robot, b)
     flow = amps - robot.motor.current_offset
     volts = robot.motor.voltage(flow if b.signed else flow * jnp.tanh(speed / 0.2), speed)

@@ -1,4 +1,4 @@
-"""From a fit and what is wanted to the runs that shrink it most, and what they save."""
+"""Proposal of the next runs: those that shrink the wanted intervals most, and what they save."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,27 +14,27 @@ from slipid.infer.design.scope import DesignOptions, Scope
 from slipid.infer.result import Fit
 from slipid.infer.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.model.robot import Validity
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCHEMA = "slipid.design/1"
 REACHED = 0.9
-"""A goal that keeps more than this part of its std however long one drives is out of reach."""
+"""Remaining share of a goal's std after endless driving above which the goal is unreachable."""
 ORDERS = 8
-"""Random orders of a grid that are averaged."""
+"""Number of random orders of a grid that are averaged."""
 POINTS = 40
-"""Numbers of runs at which the curve of a grid is given."""
+"""Number of points on the curve of a grid."""
 ASSUMPTIONS = (
-    "noise and run effects as fitted; a run is one piece however long it is",
-    "what runs in nearly one direction share counts as each run's own",
-    "all new runs are of one session, whose own offset they cannot average away",
-    "linear around the fitted numbers; what the fit holds fixed stays fixed",
-    "steady wheel speeds: nothing is learnt from starting and stopping",
+    "noise and run effects are as fitted, and each run is one observation however long it is",
+    "effects that runs in similar directions share count as each run's own",
+    "all new runs belong to one session, whose own offset they cannot average away",
+    "the model is linear around the fitted numbers, and fixed numbers stay fixed",
+    "wheel speeds are steady: starting and stopping add no information",
     "runs start with the marker's heading at zero and are centred in the image",
-    "the marker is put on once more for the new runs; predictions have it on as on average",
+    "the marker is mounted anew for the new runs; predictions take its mean mounting",
 )
 
 
@@ -42,40 +42,43 @@ ASSUMPTIONS = (
 class Design:
     """Proposed runs, the most useful first; `print` shows their commands as CSV.
 
-    The content is that of design.json: what each run is expected to tell, and what they save
-    against grids. Seen is what each floor was driven with; reached, whether every goal that was
-    asked for can be.
+    Attributes:
+        content: content of design.json, with expected stds after each run and savings over grids.
+        runs: the proposed runs.
+        base_radius: distance of the wheels from the robot's centre [m].
+        validity: driven ranges by floor of the fit.
+        reachable: True if candidate runs can shrink every requested goal.
     """
 
     content: Content
-    drives: tuple[PlannedRun, ...]
+    runs: tuple[PlannedRun, ...]
     base_radius: float
-    seen: Mapping[str, Validity]
-    reached: bool
+    validity: Mapping[str, Validity]
+    reachable: bool
 
     def __str__(self) -> str:
         notes = [f"note: {text}" for text in self.content["messages"]]
         return "\n".join([commands(self).rstrip(), *notes])
 
     def plot(self) -> "Figure":
-        """The runs, and how fast uncertainty falls."""
+        """Draw the runs, and the uncertainty over the number of runs."""
         from slipid.plots.design import design_figure
 
         return design_figure(self)
 
 
-def design(fit: Fit, wish: DesignOptions) -> Design:
-    """Runs that shrink what is wanted most, and how many they save against grids.
+def design(fit: Fit, options: DesignOptions) -> Design:
+    """Propose the runs that shrink the wanted goals most, and count the savings over grids.
 
     Raises:
-        DataError: a parameter, floor, load or prediction the fit does not have.
+        DataError: the fit lacks a requested parameter, floor, load or prediction.
     """
-    scope, planner = Scope(fit, wish), Planner.of(fit)
-    offered = scope.candidates()
-    rows, now = planner.rows(offered), planner.after(fit)
+    scope, planner = Scope(fit, options), Planner.of(fit)
+    candidates = scope.candidates()
+    rows, now = planner.rows(candidates), planner.after(fit)
     last = now.plus(rows, info.ENDLESS)
-    weights = _goals(fit, wish, scope, planner)
-    lost = {g.name: s for g in weights if (s := _out_of_reach(fit, g, now, last, len(offered)))}
+    weights = _goals(fit, options, scope, planner)
+    lost = {g.name: s for g in weights if (s := _out_of_reach(fit, g, now, last, len(candidates)))}
     goals = [g for g in weights if g.name not in lost]
     content: Content = {
         "schema": SCHEMA,
@@ -90,12 +93,12 @@ def design(fit: Fit, wish: DesignOptions) -> Design:
             for g in weights
         ],
         "candidates": {
-            "count": len(offered),
-            "floors": sorted({d.surface for d in offered}),
-            "loads": sorted({d.load for d in offered}),
-            "headings_deg": sorted({round(float(np.degrees(d.heading)), 3) for d in offered}),
-            "speeds": sorted({d.speed for d in offered}),
-            "turn_rates": sorted({d.turn for d in offered}),
+            "count": len(candidates),
+            "floors": sorted({d.surface for d in candidates}),
+            "loads": sorted({d.load for d in candidates}),
+            "headings_deg": sorted({round(float(np.degrees(d.heading)), 3) for d in candidates}),
+            "speeds": sorted({d.speed for d in candidates}),
+            "turn_rates": sorted({d.turn for d in candidates}),
         },
         "assumptions": list(ASSUMPTIONS),
         "criterion": [],
@@ -105,38 +108,39 @@ def design(fit: Fit, wish: DesignOptions) -> Design:
     chosen: list[int] = []
     if goals:
         goal = weighed(goals, now, [weights[g] for g in goals])
-        chosen, _ = info.greedy(now, rows, goal, wish.runs)
+        chosen, _ = info.greedy(now, rows, goal, options.runs)
         chosen = info.exchanged(now, rows, goal, chosen)
         content["criterion"] = info.criterion_path(now, rows, goal, chosen)
-        content["runs_saved"] = _saved(scope, planner, goals, goal, offered, rows)
-    drives = tuple(offered[k] for k in chosen)
+        content["runs_saved"] = _saved(scope, planner, goals, goal, candidates, rows)
+    runs = tuple(candidates[k] for k in chosen)
     after = now
-    for k, drive in zip(chosen, drives, strict=True):
+    for k, run in zip(chosen, runs, strict=True):
         after = after.plus(rows.pick([k]))
         expected = {g.name: g.std(after) for g in goals}
         content["runs"].append(
             {
-                "floor": drive.surface,
-                "load": drive.load,
-                "heading_deg": float(np.degrees(drive.heading)),
-                "speed": drive.speed,
-                "turn_rate": drive.turn,
-                "distance": drive.distance,
-                "seconds": drive.seconds(scope.base),
+                "floor": run.surface,
+                "load": run.load,
+                "heading_deg": float(np.degrees(run.heading)),
+                "speed": run.speed,
+                "turn_rate": run.turn,
+                "distance": run.distance,
+                "seconds": run.seconds(scope.base),
                 "expected": expected,
             }
         )
-    content["messages"] = [*lost.values(), *_extrapolated(fit, drives)]
+    content["messages"] = [*lost.values(), *_extrapolated(fit, runs)]
     content["data"] = {"hash": fit.data_hash, "runs": len(fit.runs)}
-    asked = bool(wish.parameters or wish.predictions)
-    return Design(content, drives, scope.base, fit.validity, not (asked and lost) and bool(goals))
+    requested = bool(options.parameters or options.predictions)
+    reachable = bool(goals) and not (requested and lost)
+    return Design(content, runs, scope.base, fit.validity, reachable)
 
 
-def _goals(fit: Fit, wish: DesignOptions, scope: Scope, planner: Planner) -> dict[Goal, float]:
-    found = [parameter_goal(planner, path) for path in _paths(fit, wish.parameters)]
+def _goals(fit: Fit, options: DesignOptions, scope: Scope, planner: Planner) -> dict[Goal, float]:
+    found = [parameter_goal(planner, path) for path in _paths(fit, options.parameters)]
     found += [
         prediction_goal(planner, f"prediction {text}", scope.predicted(text))
-        for text in dict.fromkeys(wish.predictions)
+        for text in dict.fromkeys(options.predictions)
     ]
     if found:
         return dict.fromkeys(found, 1.0)
@@ -150,7 +154,7 @@ def _goals(fit: Fit, wish: DesignOptions, scope: Scope, planner: Planner) -> dic
 
 
 def _paths(fit: Fit, patterns: Sequence[str]) -> list[str]:
-    """Free parameters that match, in order."""
+    """Return the free parameters that match the patterns, in order."""
     out: list[str] = []
     can = [e.path for e in fit.space.free if e.session is None]
     for pattern in patterns:
@@ -166,8 +170,8 @@ def _paths(fit: Fit, patterns: Sequence[str]) -> list[str]:
 def _out_of_reach(
     fit: Fit, goal: Goal, now: info.Information, last: info.Information, count: int
 ) -> str | None:
-    """Why no candidate shrinks a goal, None where one does."""
-    # a prior elsewhere must not lend them a scale
+    """Return the reason why no candidate shrinks a goal, None if one does."""
+    # priors of other numbers must not lend them a scale
     scaleless = goal.name in NEEDS_VOLTAGE and not fit.channels.voltage
     part = goal.std(last) / goal.std(now)
     if part < REACHED and not scaleless:
@@ -177,22 +181,22 @@ def _out_of_reach(
     return f"no candidate run shrinks {goal.name}: {why}"
 
 
-def _extrapolated(fit: Fit, drives: Sequence[PlannedRun]) -> list[str]:
-    """Where proposed runs leave what the fit has seen: its form is not known to hold there."""
+def _extrapolated(fit: Fit, runs: Sequence[PlannedRun]) -> list[str]:
+    """Return warnings for proposed runs outside the driven ranges, where the law is untested."""
     out = []
-    for floor, seen in fit.validity.items():
-        mine = [d for d in drives if d.surface == floor]
-        turned = any(abs(t) > 1e-3 for t in seen.turn_rates)
+    for floor, valid in fit.validity.items():
+        mine = [d for d in runs if d.surface == floor]
+        turned = any(abs(t) > 1e-3 for t in valid.turn_rates)
         if not turned and any(d.turn for d in mine):
             out.append(
                 f"{floor} was never driven turning: proposed turns trust the contact law there"
             )
-        top = max(seen.speeds, default=np.inf)
+        top = max(valid.speeds, default=np.inf)
         if any(d.speed > 1.05 * top for d in mine):
             out.append(
                 f"{floor} was driven at {top:g} m/s at most: faster runs trust the contact law"
             )
-        other = {d.load for d in mine} - set(seen.loads)
+        other = {d.load for d in mine} - set(valid.loads)
         if other:
             out.append(f"{floor} was never driven with load {', '.join(sorted(other))}")
     return out
@@ -203,13 +207,13 @@ def _saved(
     planner: Planner,
     goals: Sequence[Goal],
     goal: np.ndarray,
-    offered: Sequence[PlannedRun],
+    candidates: Sequence[PlannedRun],
     rows: info.RunJacobians,
 ) -> Content:
-    """How many runs, chosen one after another from nothing, tell as much as whole grids.
+    """Return how many runs, chosen greedily without earlier data, are worth as much as grids.
 
-    They are chosen from the candidates and the grid's own runs. The grids are driven wherever it
-    was driven before, but only with the floors and loads the goals are about.
+    The runs are chosen among the candidates and the grid's own runs. The grids cover the floors
+    and loads of earlier runs that the goals depend on.
     """
     setups = [s for s in scope.setups if any(g.is_about(s) for g in goals)]
     setups = [s for s in setups if s in scope.driven] or setups or list(scope.setups)
@@ -220,7 +224,7 @@ def _saved(
     }
     return {
         key: {"name": name, "setups": [list(s) for s in setups]}
-        | _against(planner, goal, drivable(grid, scope.fit.robot), offered, rows, scope.base)
+        | _against(planner, goal, drivable(grid, scope.fit.robot), candidates, rows, scope.base)
         for key, (name, grid) in grids.items()
     }
 
@@ -229,13 +233,13 @@ def _against(
     planner: Planner,
     goal: np.ndarray,
     grid: tuple[PlannedRun, ...],
-    offered: Sequence[PlannedRun],
+    candidates: Sequence[PlannedRun],
     rows: info.RunJacobians,
     base: float,
 ) -> Content:
     of_grid, start = planner.rows(grid), planner.nothing()
     target = start.plus(of_grid).criterion(goal)
-    both, drives = rows.joined(of_grid), [*offered, *grid]
+    both, runs = rows.joined(of_grid), [*candidates, *grid]
     chosen, found = info.greedy(start, both, goal, len(grid), target)
     count, reached = len(chosen), found[-1] <= target
     at = sorted({*np.geomspace(1, len(grid), POINTS).round().astype(int).tolist(), count})
@@ -249,7 +253,7 @@ def _against(
         "greedy_runs": count if reached else None,
         "ratio": count / len(grid) if reached else None,
         "grid_minutes": sum(d.seconds(base) for d in grid) / 60,
-        "greedy_minutes": sum(drives[k].seconds(base) for k in chosen) / 60,
+        "greedy_minutes": sum(runs[k].seconds(base) for k in chosen) / 60,
         "criterion": target,
         "criterion_random_order": float(random[at.index(count)]),
         "curves": {
@@ -261,9 +265,9 @@ def _against(
 
 
 def commands(found: Design) -> str:
-    """CSV of what to drive: body twist and duration of every run."""
+    """Return the commands as CSV: body twist and duration of every run."""
     lines = ["run,floor,load,vx_m_s,vy_m_s,turn_rad_s,seconds"]
-    for k, d in enumerate(found.drives, 1):
+    for k, d in enumerate(found.runs, 1):
         vx, vy, turn = d.command + 0.0
         seconds = d.seconds(found.base_radius)
         lines.append(f"{k},{d.surface},{d.load},{vx:.4f},{vy:.4f},{turn:.4f},{seconds:.2f}")

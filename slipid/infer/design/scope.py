@@ -1,4 +1,4 @@
-"""What a user wants to know of the next runs, and which runs may be driven for it."""
+"""Options of a proposal of runs: its goals, and the candidate runs that they allow."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -11,18 +11,23 @@ from slipid.infer.result import Fit
 from slipid.support.errors import DataError
 
 MOST_SPEEDS = 4
+"""Largest number of candidate speeds of a floor."""
 
 
 @dataclass(frozen=True)
 class DesignOptions:
-    """What a user asks for, in words of the command line; what is absent is as the fit has seen.
+    """Options of the command line; the fit's driven ranges replace those that are absent.
 
     Attributes:
-        parameters: patterns of names; predictions: `floor[@load][:speed[:heading_deg]]`.
-        runs: to propose.
-        headings, speeds, turns: of candidates, numbers with commas [deg], [m/s], [deg/s].
-        distance: of candidates [m].
-        floors, loads: of candidates.
+        parameters: patterns of the names of goals.
+        predictions: goals of the form `floor[@load][:speed[:heading_deg]]`.
+        runs: number of runs to propose.
+        headings: headings of candidates, numbers with commas [deg].
+        speeds: speeds of candidates, numbers with commas [m/s].
+        turns: yaw rates of candidates, numbers with commas [deg/s].
+        distance: path length of candidates [m].
+        floors: floors of candidates.
+        loads: load set-ups of candidates.
     """
 
     parameters: Sequence[str] = ()
@@ -51,21 +56,21 @@ def _numbers(name: str, text: str | None, least: float = -np.inf) -> tuple[float
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """What may be driven: floors and loads of the fit within the limits of the wish.
+    """Candidate runs: floors and loads of the fit, limited by the options.
 
     Raises:
-        DataError: a floor or load that the fit does not have, no numbers, none to be driven.
+        DataError: the fit lacks a floor or load, a list has no numbers, or no run is drivable.
     """
 
     fit: Fit
-    wish: DesignOptions
+    options: DesignOptions
 
     def __post_init__(self) -> None:
-        far = self.wish.distance
-        if far is not None and not 0 < far < np.inf:
-            raise DataError(f"--distance {far:g}: expected metres above zero")
-        self._known("floor", self.wish.floors, self.fit.validity)
-        self._known("load set-up", self.wish.loads, self.fit.robot.body.loads)
+        length = self.options.distance
+        if length is not None and not 0 < length < np.inf:
+            raise DataError(f"--distance {length:g}: expected metres above zero")
+        self._known("floor", self.options.floors, self.fit.validity)
+        self._known("load set-up", self.options.loads, self.fit.robot.body.loads)
 
     @staticmethod
     def _known(what: str, names: Sequence[str], known: Collection[str]) -> None:
@@ -76,14 +81,13 @@ class Scope:
     @property
     def driven(self) -> tuple[Setup, ...]:
         """Floors and loads of the fit's runs."""
-        seen = self.fit.validity
-        return tuple((floor, load) for floor in seen for load in seen[floor].loads)
+        return tuple((floor, load) for floor, v in self.fit.validity.items() for load in v.loads)
 
     @property
     def setups(self) -> tuple[Setup, ...]:
         """Floors and loads of candidates."""
-        floors = self.wish.floors or tuple(self.fit.validity)
-        loads = self.wish.loads or self.fit.robot.body.loads
+        floors = self.options.floors or tuple(self.fit.validity)
+        loads = self.options.loads or self.fit.robot.body.loads
         return tuple((floor, load) for floor in floors for load in loads)
 
     @property
@@ -92,11 +96,11 @@ class Scope:
 
     @cached_property
     def driven_speeds(self) -> dict[str, tuple[float, ...]]:
-        """A few of each floor's [m/s]; without commands in the logs what the fastest wheel did."""
+        """A few driven speeds of each floor, or parts of the fastest wheel's rim speed [m/s]."""
         out = {}
-        for floor, seen in self.fit.validity.items():
-            found = [v for v in seen.speeds if v > 0]
-            top = seen.wheel_speed[1] * float(self.fit.robot.geometry.wheel_radius)
+        for floor, valid in self.fit.validity.items():
+            found = [v for v in valid.speeds if v > 0]
+            top = valid.wheel_speed[1] * float(self.fit.robot.geometry.wheel_radius)
             if len(found) > MOST_SPEEDS:
                 at = np.linspace(0, 1, MOST_SPEEDS)
                 found = np.quantile(found, at, method="nearest").tolist()
@@ -105,20 +109,20 @@ class Scope:
 
     @property
     def distance(self) -> dict[str, float]:
-        """Of each floor's runs [m]: as driven, on the whole."""
-        if self.wish.distance is not None:
-            return dict.fromkeys(self.fit.validity, self.wish.distance)
-        return {floor: round(seen.distance, 2) for floor, seen in self.fit.validity.items()}
+        """Path length of each floor's candidates, the mean of its runs by default [m]."""
+        if self.options.distance is not None:
+            return dict.fromkeys(self.fit.validity, self.options.distance)
+        return {floor: round(v.distance, 2) for floor, v in self.fit.validity.items()}
 
     def candidates(self) -> tuple[PlannedRun, ...]:
-        speeds = _numbers("speeds", self.wish.speeds, least=0.0)
-        turns = _numbers("turns", self.wish.turns)
+        speeds = _numbers("speeds", self.options.speeds, least=0.0)
+        turns = _numbers("turns", self.options.turns)
         found = candidates(
             self.setups,
             dict.fromkeys(self.fit.validity, speeds) if speeds else self.driven_speeds,
             self.distance,
             self.base,
-            _numbers("headings", self.wish.headings) or HEADINGS,
+            _numbers("headings", self.options.headings) or HEADINGS,
             np.radians(turns).tolist() if turns else None,
         )
         return self._drivable(
@@ -128,7 +132,7 @@ class Scope:
         )
 
     def predicted(self, text: str) -> tuple[PlannedRun, ...]:
-        """Runs of a prediction `floor[@load][:speed[:heading]]`."""
+        """Return the runs of a prediction `floor[@load][:speed[:heading]]`."""
         head, *rest = text.split(":")
         floor, _, load = head.partition("@")
         try:

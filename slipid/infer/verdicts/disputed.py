@@ -1,20 +1,19 @@
-"""Floors that disagree about the loads on the wheels by more than noise.
+"""Overall judgement of a fit: floors that disagree about the wheel loads, and trust in the fit.
 
-A floor sees the loads with a bias of its own (`slipid.model.contact_law`), and a prior that was
-found from all floors holds these biases near zero: intervals of the loads count it. Whether floors
-really disagree is asked of the data alone. With P0 the precision that this prior adds to that of
-the fit, L, and P1 one of a prior so wide that it says nothing, every floor on its own would move
-the numbers z by
+Each floor has load biases of its own (`slipid.model.contact_law`). Their prior is estimated from
+all floors and keeps them near zero, and the intervals of the loads include it. The test for real
+disagreement removes it. With L the precision of the fit, P0 the part of it from this prior, and P1
+the precision of a prior so wide that it is uninformative, the biases z change by
 
-    d = (L + P1 - P0)^-1 (P0 - P1) z    of the biases
+    d = (L + P1 - P0)^-1 (P0 - P1) z
 
-and the difference of the biases of two floors, over its covariance, is a chi-square if the law is
-right about both.
+and the squared difference of two floors' biases over its covariance is a chi-square variable if the
+contact law holds for both.
 
-Whether a fit may be used: does it predict, did it settle, are its numbers those of a robot?
+A fit is trusted if it converged, predicts its runs, and has the numbers of a physical robot.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import combinations
@@ -29,14 +28,14 @@ from slipid.infer.verdicts.estimates import Estimate
 from slipid.search_space import Space
 
 CHANCE = 0.01
-"""Disagreement is said where noise alone would make as much this rarely."""
+"""Largest p-value at which a disagreement is reported."""
 _WIDE = 1.0
-"""Std of biases that nothing is known about beforehand."""
+"""Std of the uninformative prior of load biases."""
 
 
 @dataclass(frozen=True)
 class Dispute:
-    """Two floors, and how many standard errors what they say of the loads is apart."""
+    """Two floors, and the distance of their load estimates [standard error]."""
 
     floors: tuple[str, str]
     sigma: float
@@ -51,37 +50,34 @@ class Dispute:
 
 
 def disputes(space: Space, z: Search, covariance: Square) -> tuple[Dispute, ...]:
-    """Pairs of floors whose biases of the load differ by more than noise, the worst first.
+    """Return pairs of floors whose load biases differ by more than noise, the worst first.
 
-    The space has the prior that biases were found to have (`Space.with_pooled`).
+    The prior of the biases in the space has the fitted std (`Space.with_pooled`).
     """
-    bias = {e.surface: space.place[e.path] for e in space.free if e.declaration.deviation}
+    bias = {e.surface: space.slices[e.path] for e in space.free if e.declaration.deviation}
     if len(bias) < 2:
         return ()
     at = np.concatenate([np.arange(p.start, p.stop) for p in bias.values()])
-    told, less = np.linalg.inv(covariance), 1 / space.prior_std[at] ** 2 - 1 / _WIDE**2
-    told[at, at] -= less
-    wide = np.linalg.inv(told)
-    apart = np.asarray(z) + wide[:, at] @ (less * (np.asarray(z) - space.prior_mean)[at])
+    precision, less = np.linalg.inv(covariance), 1 / space.prior_std[at] ** 2 - 1 / _WIDE**2
+    precision[at, at] -= less
+    wide = np.linalg.inv(precision)
+    separate = np.asarray(z) + wide[:, at] @ (less * (np.asarray(z) - space.prior_mean)[at])
     found = []
     for one, other in combinations(bias, 2):
-        difference = np.zeros((bias[one].stop - bias[one].start, len(apart)))
-        difference[:, bias[one]] = np.eye(len(difference))
-        difference[:, bias[other]] = -np.eye(len(difference))
-        gap, spread = difference @ apart, difference @ wide @ difference.T
-        chance = float(chi2.sf(gap @ np.linalg.solve(spread, gap), len(gap)))
+        difference = separate[bias[one]] - separate[bias[other]]
+        spread = wide[bias[one]] - wide[bias[other]]
+        spread = spread[:, bias[one]] - spread[:, bias[other]]
+        chance = float(chi2.sf(difference @ np.linalg.solve(spread, difference), len(difference)))
         if chance < CHANCE:
             found.append(Dispute((str(one), str(other)), float(norm.isf(chance / 2))))
     return tuple(sorted(found, key=lambda d: -d.sigma))
 
 
-def marked(numbers: Mapping[str, Estimate], found: Iterable[Dispute]) -> dict[str, Estimate]:
-    """The same, loads called *disputed* instead of *identified* where floors disagree."""
-    if not any(True for _ in found):
-        return dict(numbers)
+def marked(numbers: Mapping[str, Estimate], found: Sequence[Dispute]) -> dict[str, Estimate]:
+    """Return the numbers with identified loads marked as disputed if floors disagree."""
     return {
         path: replace(e, verdict="disputed")
-        if path.startswith("robot.load_share@") and e.verdict == "identified"
+        if found and path.startswith("robot.load_share@") and e.verdict == "identified"
         else e
         for path, e in numbers.items()
     }
@@ -90,14 +86,13 @@ def marked(numbers: Mapping[str, Estimate], found: Iterable[Dispute]) -> dict[st
 Word = Literal["trusted", "doubtful", "not to be trusted"]
 WORDS: tuple[Word, ...] = ("trusted", "doubtful", "not to be trusted")
 WORSE, MUCH_WORSE = 1.1, 1.5
-"""Error of the model over that of encoders on a floor: doubtful from the first on, absurd from the
-second on."""
+"""Ratios of the model's error to that of encoders above which a fit is doubtful, or useless."""
 SMALL = 0.005
-"""Difference of both errors below which neither is better."""
+"""Difference of the two errors below which neither model is better."""
 ABSURD = 0.5
-"""Error, as a share of the way, with which no model is of use."""
+"""End-point error over path length above which no model is useful."""
 MANY_AT_BOUNDS = 3
-"""Numbers at their bounds from which the model does not fit the logs at all."""
+"""Count of numbers at their bounds from which a fit is not to be trusted."""
 PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "motor.resistance": (1e-3, 1e3),
     "motor.back_emf": (1e-4, 10.0),
@@ -107,12 +102,12 @@ PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "robot.wheel_radius": (2e-3, 2.0),
     "robot.base_radius": (5e-3, 10.0),
 }
-"""What such numbers of wheeled robots are, in SI."""
+"""Physically plausible ranges of the numbers of wheeled robots, in SI units."""
 
 
 @dataclass(frozen=True)
 class EndPoints:
-    """Mean open-loop end-point errors on a floor, as shares of the way: model and encoders."""
+    """Mean open-loop end-point errors over path length on a floor, of model and encoders."""
 
     model: float
     encoders: float
@@ -120,7 +115,7 @@ class EndPoints:
 
 @dataclass(frozen=True)
 class Trust:
-    """How far a fit may be trusted, and why not further, one sentence each."""
+    """Level of trust in a fit, and the reasons against it, one sentence each."""
 
     word: Word
     reasons: tuple[str, ...]
@@ -131,38 +126,38 @@ class Trust:
 
 @dataclass(frozen=True)
 class _Reason:
-    """How bad, as an index of `WORDS`, and a sentence."""
+    """Reason against a fit: its severity as an index of `WORDS`, and a sentence."""
 
     level: int
-    said: str
+    sentence: str
 
 
 def verdict_of_trust(
     floors: Mapping[str, EndPoints], converged: bool, parameters: Iterable[Estimate]
 ) -> Trust:
-    """The worst of what errors, convergence and numbers say.
+    """Return the trust in a fit: the worst of its errors, its convergence and its numbers.
 
     Args:
-        floors: errors by name of the floor; of runs that the fit has not seen, where there are any.
-        converged: whether the fit came to rest.
+        floors: errors by name of the floor, of held-out runs where there are any.
+        converged: True if the fit converged.
         parameters: every number of the fit.
     """
     numbers = list(parameters)
     reasons = [*_of_errors(floors), *_of_numbers(numbers)]
     if not converged:
-        reasons.append(_Reason(1, "the fit did not come to rest"))
-    told = [e.verdict for e in numbers if e.verdict != "fixed"]
-    if told and not any(v in ("identified", "weak", "disputed") for v in told):
-        reasons.append(_Reason(1, "the logs tell none of its numbers"))
+        reasons.append(_Reason(1, "the fit did not converge"))
+    verdicts = {e.verdict for e in numbers} - {"fixed"}
+    if verdicts and not verdicts & {"identified", "weak", "disputed"}:
+        reasons.append(_Reason(1, "the logs determine none of its numbers"))
     reasons.sort(key=lambda r: -r.level)
     level = max((r.level for r in reasons), default=0)
-    return Trust(WORDS[level], tuple(r.said for r in reasons))
+    return Trust(WORDS[level], tuple(r.sentence for r in reasons))
 
 
 def _of_errors(floors: Mapping[str, EndPoints]) -> Iterator[_Reason]:
-    """What open-loop errors say, floor by floor."""
+    """Yield reasons from open-loop errors, floor by floor."""
     for name, e in floors.items():
-        both = f"{100 * e.model:.1f} % of the way, encoders alone by {100 * e.encoders:.1f} %"
+        both = f"{100 * e.model:.1f} % of the path, encoders alone by {100 * e.encoders:.1f} %"
         if not isfinite(e.model):
             yield _Reason(2, f"on {name} its predictions are not numbers")
         elif e.model > e.encoders + SMALL and e.model > WORSE * e.encoders:
@@ -173,14 +168,14 @@ def _of_errors(floors: Mapping[str, EndPoints]) -> Iterator[_Reason]:
 
 
 def _of_numbers(numbers: list[Estimate]) -> Iterator[_Reason]:
-    """What numbers say that no robot has, or that ran into their bounds."""
+    """Yield reasons from numbers that are implausible or at their bounds."""
     for e in numbers:
         for pattern, (low, high) in PLAUSIBLE.items():
             value = np.atleast_1d(np.asarray(e.value, float))
             if fnmatchcase(e.path, pattern) and not ((value >= low) & (value <= high)).all():
                 worst = float(value[np.argmax(np.abs(value))])
                 yield _Reason(
-                    2, f"{e.path} = {worst:.3g} {e.unit}, where {low:g} to {high:g} can be"
+                    2, f"{e.path} = {worst:.3g} {e.unit}; plausible are {low:g} to {high:g}"
                 )
     bounds = [e.path for e in numbers if e.verdict == "at_bound"]
     if bounds:

@@ -1,6 +1,6 @@
-"""What may be said of every number and of ratios of them: interval and verdict.
+"""Intervals and verdicts of every number and of ratios of numbers.
 
-Before a fit from the information that is expected, after it from the Laplace posterior.
+They come from the expected information before a fit, and from the Laplace posterior after it.
 """
 
 from collections.abc import Collection, Sequence
@@ -16,24 +16,29 @@ from slipid.parameter import Declaration, Entry
 from slipid.search_space import Choice, Space
 
 IDENTIFIED, WEAK = 0.3, 0.8
-"""Largest std(posterior) / std(prior) of the verdicts, in the search space."""
+"""Largest std(posterior) / std(prior) of these verdicts, in the search space."""
 FROM_ZERO = 3.0
-"""Stds, in its own unit, by which an identified positive number is away from 0: the likelihood of a
-number that is small rises no further towards 0, however narrow the interval of its logarithm is."""
+"""Smallest distance of an identified positive number from 0, in stds of the number itself: the
+likelihood of a small number is flat towards 0, however narrow the interval of its logarithm is."""
 TAIL, SMALL = 4.0, 0.05
-"""A positive number counts as being at 0 when it is so many prior stds below its prior mean, and
-below this part of it: a tight prior that the data contradict is something else."""
+"""A positive number counts as 0 if it is this many prior stds below its prior mean and below this
+fraction of it; the second condition excludes a tight prior that the data contradict."""
 NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
-"""Without a voltage nothing sets the scale of these; a prior elsewhere must not lend them one."""
+"""Numbers whose scale only a voltage determines; priors of other numbers must not lend them one."""
 Z95 = 1.6448536269514722
+"""The 95 % quantile of a standard Gaussian."""
 LARGEST = 600.0
-"""Largest exponent at an end of an interval: of what nothing is known it would be infinite."""
+"""Largest exponent at an end of an interval, which would overflow for an unknown number."""
 
 
 class ParameterRatio(NamedTuple):
-    """A quotient of two positive numbers that may be known where neither of them is.
+    """Quotient of two positive numbers that may be identified where neither of them is.
 
-    The numerator is a quantity, of every floor where floors have their own, the denominator a path.
+    Attributes:
+        over: quantity of the numerator, on every floor if floors have their own.
+        under: path of the denominator.
+        unit: unit of the quotient.
+        doc: meaning of the quotient.
     """
 
     over: str
@@ -54,33 +59,38 @@ RATIOS = (
         "motor.viscous_friction", "motor.back_emf", "A*s/rad", "current per wheel speed"
     ),
     ParameterRatio(
-        "camera.scale", "robot.wheel_radius", "1/m", "all that motion without slip tells"
+        "camera.scale", "robot.wheel_radius", "1/m", "all that motion without slip determines"
     ),
 )
-"""Quotients with a verdict of their own, where both numbers are free.
+"""Quotients with a verdict of their own, if both numbers are free.
 
-The resistance enters the voltage equation and nothing else: contact forces decide how the body
-moves, and currents follow from them with the torque constant. So without a voltage not even
-R / C_e is known, other than in models that read slip from R I^2 + C_e I wm.
+The resistance enters only the voltage equation: contact forces determine the motion of the body,
+and currents follow from them with the torque constant. So without a voltage not even R / C_e is
+identified, unlike in models that read slip from R I^2 + C_e I wm.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """One fitted or fixed number (or short vector) as people and files get it.
+    """One fitted or fixed number (or short vector) with its uncertainty and verdict.
 
     Attributes:
-        path: its name.
-        value, std: [unit], a float or one per label; std is None where it was fixed.
-        interval90: equal-tailed, (low, high), or one such pair per label.
-        labels: of a vector's entries, () for a scalar.
-        verdict: identified, weak, disputed, not_identified, at_bound or fixed; of a vector the
+        path: name of the number.
+        unit: unit of the number.
+        doc: meaning of the number.
+        labels: labels of a vector's entries, () for a scalar.
+        value: a float, or one per label [unit].
+        std: a float, or one per label, None for a fixed number [unit].
+        interval90: equal-tailed interval (low, high), or one such pair per label [unit].
+        verdict: identified, weak, disputed, not_identified, at_bound or fixed; a vector has the
             verdict of its worst direction.
-        provenance: measured (data decide), borrowed (a prior decides), override (a choice
-            fixed it: the user's, or slipid's where one speed cannot tell).
-        ratio: std(posterior) / std(prior) in the search space, None where it was fixed.
-        pull: (estimate - prior mean) / std(prior), of a vector the largest, None where fixed.
-        prior_mean, prior_std: [unit], None where it was fixed.
+        provenance: measured (the data decide), borrowed (a prior decides) or override (a choice
+            fixed it: the user's, or slipid's if all runs have one speed).
+        ratio: std(posterior) / std(prior) in the search space, None for a fixed number.
+        pull: (estimate - prior mean) / std(prior), the largest of a vector, None if fixed.
+        prior_mean: mean of the prior, None for a fixed number [unit].
+        prior_std: std of the prior, None for a fixed number [unit].
+        source: `laplace` or `posterior`.
     """
 
     path: str
@@ -107,21 +117,27 @@ def estimates(
     has_voltage: bool,
     flat: Collection[str],
 ) -> tuple[Estimate, ...]:
-    """Every declared number with its interval and verdict, in order of declaration.
+    """Return every declared number with its interval and verdict, in order of declaration.
 
-    `flat` are the paths of the numbers that move along directions which the data leave open.
+    Args:
+        space: free and fixed numbers.
+        choices: user's choices.
+        z: search vector of the estimate.
+        covariance: its covariance.
+        has_voltage: True if voltages were logged.
+        flat: paths of the numbers that change along flat directions.
     """
     tree = space.tree(z)
     return tuple(
         _free(space, e, tree, z, covariance, has_voltage, e.path in flat)
-        if e.path in space.place
+        if e.path in space.slices
         else _fixed(e, tree, choices)
         for e in space.all
     )
 
 
 def plain(x: Any) -> Any:
-    """A single number, or a tuple of several."""
+    """Return a float for a single number, else a tuple of floats."""
     x = np.asarray(x, float)
     return float(x.reshape(())) if x.size == 1 else tuple(float(v) for v in x)
 
@@ -151,13 +167,13 @@ def _free(
     has_voltage: bool,
     is_flat: bool,
 ) -> Estimate:
-    at, d = space.place[entry.path], entry.declaration
+    at, d = space.slices[entry.path], entry.declaration
     mean, block = np.asarray(z)[at], covariance[at, at]
     prior_mean, prior_std = space.prior_mean[at], space.prior_std[at]
     value = np.atleast_1d(np.asarray(entry.get(tree), float))
     std_z = np.sqrt(np.diag(block))
     center = np.asarray(d.to_si(prior_mean))
-    if d.tied:
+    if d.constrained:
         rng = np.random.default_rng(0)
         spread = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
         draws = np.asarray(d.to_si(spread))
@@ -207,13 +223,13 @@ def _at_bound(d: Declaration, value: np.ndarray, pull: np.ndarray, prior_std: np
 
 
 def from_zero(declaration: Declaration, std_z: Float[np.ndarray, " coordinate"]) -> float:
-    """Stds by which a positive number is away from 0, from that of its logarithm; else infinite."""
+    """Return the distance of a positive number from 0 [std], infinity for any other number."""
     positive = np.isfinite(declaration.lower) and not np.isfinite(declaration.upper)
     return float(1 / std_z.max()) if positive and not declaration.shares else np.inf
 
 
 def by_ratio(ratio: float, from_zero: float = np.inf) -> str:
-    """Verdict of std(posterior) / std(prior), and of how many stds a positive number is from 0."""
+    """Return the verdict for a ratio of stds and a positive number's distance from 0 [std]."""
     if ratio < IDENTIFIED and from_zero >= FROM_ZERO:
         return "identified"
     return "weak" if ratio < WEAK else "not_identified"
@@ -222,36 +238,36 @@ def by_ratio(ratio: float, from_zero: float = np.inf) -> str:
 def verdict_of(
     ratio: float, from_zero: float, forced: str | None, is_flat: bool
 ) -> tuple[str, str]:
-    """Verdict and provenance of a number, after a fit as after sampling.
+    """Return verdict and provenance of a number, after a fit or after sampling.
 
-    Below 1/sqrt(2) the data hold more information than the prior. A number that moves along a
-    direction which the data leave open is known as part of a ratio at most: however narrow its
-    interval, another number's prior decides on its scale.
+    Below a ratio of 1/sqrt(2) the data hold more information than the prior. A number that changes
+    along a flat direction is identified only as part of a ratio at most: however narrow its
+    interval is, another number's prior determines its scale.
 
     Args:
         ratio: std(posterior) / std(prior).
-        from_zero: stds by which a positive number is from 0.
-        forced: verdict that no interval changes.
-        is_flat: whether it moves along an open direction.
+        from_zero: distance of a positive number from 0 [std].
+        forced: verdict that holds whatever the interval is.
+        is_flat: True if the number changes along a flat direction.
     """
     verdict = forced or by_ratio(ratio, from_zero)
     if is_flat and verdict == "identified":
         verdict = "weak"
-    held = verdict != "not_identified" and ratio < np.sqrt(0.5) and not is_flat
-    return verdict, "measured" if held else "borrowed"
+    measured = verdict != "not_identified" and ratio < np.sqrt(0.5) and not is_flat
+    return verdict, "measured" if measured else "borrowed"
 
 
 def derived(space: Space, z: Search, covariance: Square, has_voltage: bool) -> tuple[Estimate, ...]:
-    """`RATIOS` with interval and verdict: the log of each is a difference of coordinates.
+    """Return `RATIOS` with interval and verdict: the log of each is a difference of coordinates.
 
-    Its std under the posterior, sqrt(c^T C c) with c = (.., 1, .., -1, ..), is compared with that
-    under the prior.
+    The verdict compares its posterior std, sqrt(c^T C c) with c = (.., 1, .., -1, ..), with that
+    of the prior.
     """
     return tuple(
         _quotient(space, wanted, over.path, z, covariance, has_voltage)
         for wanted in RATIOS
         for over in space.free
-        if over.quantity == wanted.over and wanted.under in space.place
+        if over.quantity == wanted.over and wanted.under in space.slices
     )
 
 
@@ -264,7 +280,7 @@ def _quotient(
     has_voltage: bool,
 ) -> Estimate:
     c = np.zeros(len(z))
-    c[space.place[over]], c[space.place[wanted.under]] = 1.0, -1.0
+    c[space.slices[over]], c[space.slices[wanted.under]] = 1.0, -1.0
     log_value, log_prior = c @ z, c @ space.prior_mean
     std = float(np.sqrt(c @ covariance @ c))
     prior_std = float(np.sqrt(np.sum((c * space.prior_std) ** 2)))

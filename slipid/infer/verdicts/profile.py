@@ -1,14 +1,15 @@
-"""Profile likelihood of one number: how much worse the data fit when it is held elsewhere.
+"""Profile likelihood of one number: the rise of the loss when the number is held elsewhere.
 
 With -log posterior f and the other numbers eta,
 
     F(theta) = min over eta of f(theta, eta),    D(theta) = F(theta) - F at its minimum
 
-D is half a squared distance where Laplace is right; the 90 % interval of the likelihood is where
-D, less what the number's own prior puts into it, stays below chi2_1(0.9) / 2 = 1.353.
+D is half a squared distance in stds if the Laplace approximation holds. The 90 % interval of the
+likelihood is the range where D without the term of the number's own prior stays below
+chi2_1(0.9) / 2 = 1.353.
 
 Source: Venzon and Moolgavkar 1988 (Applied Statistics 37(1)); Raue et al. 2009 (Bioinformatics
-25(15)): a profile that stays level tells a number that is not identifiable.
+25(15)): a profile that stays level shows that a number is not identifiable.
 """
 
 from collections.abc import Callable
@@ -21,8 +22,8 @@ from scipy.interpolate import PchipInterpolator
 from scipy.stats import chi2
 
 from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, State
-from slipid.fit.variances import MOTIONS
+from slipid.fit.problem import FitState, Problem
+from slipid.fit.variances import MOTION_BLOCKS
 from slipid.infer.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.parameter import Entry
 from slipid.search_space import Space
@@ -33,30 +34,31 @@ if TYPE_CHECKING:
 RISE = float(chi2.ppf(0.9, 1)) / 2
 """Rise of minus log likelihood at the ends of the 90 % interval."""
 _ENOUGH, _TOO_FAR = 1.5 * RISE, 3 * RISE
-"""Rise at which a side is done, and the one that tells that an interval's end was stepped over."""
+"""Rise at which a side is complete, and rise above which a step jumped over the interval's end."""
 _FAR = 3.0
-"""A side ends so many prior stds from the prior mean: beyond it, nobody expects the number."""
+"""Distance from the prior mean at which a side ends: values beyond are implausible [prior std]."""
 _LEAST, _MOST = 0.1, 24
-"""Laplace stds below which no step is halved, and points on a side."""
+"""Shortest step that is halved [Laplace std], and largest number of points on a side."""
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Profile likelihood of one number; `print` says in a sentence what it tells.
+    """Profile likelihood of one number; `print` shows its result in one sentence.
 
     Attributes:
-        path, unit: of the number.
-        value: where it was held, rising [unit].
-        posterior: D at each, the number's own prior included.
-        likelihood: the same without it, 0 at its lowest.
-        laplace: the parabola of the Laplace posterior in the search space, given what `given` says.
-        estimate: of the fit.
-        interval90: of the likelihood, None on a side that is open.
-        ends: per side, `closed`, `open` (level as far as the prior reaches) or `at_bound` (level
-            towards the number's bound, which then ends the interval).
-        given: numbers that were held at the fit's, in words; empty where all were refitted.
-        settled: whether every refit converged.
-        said: the same for people, one sentence.
+        path: name of the number.
+        unit: unit of the number.
+        value: values at which the number was held, rising [unit].
+        posterior: D at each value, with the number's own prior.
+        likelihood: D at each value without that prior, 0 at its minimum.
+        laplace: parabola of the Laplace posterior in the search space, conditional on `given`.
+        estimate: value of the fit [unit].
+        interval90: interval of the likelihood, None on an open side [unit].
+        ends: for each side `closed`, `open` (level as far as the prior reaches) or `at_bound`
+            (level up to the number's bound, which then ends the interval).
+        given: numbers that were held at the fit's values, in words; empty if all were refitted.
+        settled: True if every refit converged.
+        sentence: result in one sentence for people.
     """
 
     path: str
@@ -70,30 +72,30 @@ class Profile:
     ends: tuple[str, str]
     given: str
     settled: bool
-    said: str
+    sentence: str
 
     def __str__(self) -> str:
-        return self.said
+        return self.sentence
 
     def plot(self) -> "Figure":
-        """How fast the fit gets worse when the number is held elsewhere."""
+        """Draw the rise of the loss when the number is held elsewhere."""
         from slipid.plots.posterior import profile_figure
 
         return profile_figure([self])
 
 
 def profiled(space: Space, path: str) -> Entry:
-    """The free scalar of a path.
+    """Return the free scalar of a path.
 
     Raises:
-        ValueError: no such number, fixed, or a vector; names the choices.
+        ValueError: the number does not exist, is fixed or a vector; the message lists the choices.
     """
     can = {e.path: e for e in space.free if e.size == 1}
     if path not in can:
         why = {e.path: f"{path} is fixed" for e in space.all}
         why |= {e.path: f"{path} has {e.size} numbers" for e in space.free}
-        said = why.get(path, f"no parameter '{path}'")
-        raise ValueError(f"{said}; a profile is of one free number: {', '.join(can)}")
+        reason = why.get(path, f"no parameter '{path}'")
+        raise ValueError(f"{reason}; a profile is of one free number: {', '.join(can)}")
     return can[path]
 
 
@@ -101,19 +103,19 @@ def profile(
     problem: Problem,
     optimum: Optimum,
     path: str,
-    tell: Callable[[int, float], None] = lambda points, rise: None,
+    progress: Callable[[int, float], None] = lambda points, rise: None,
 ) -> Profile:
-    """Profile of a number about the end of a fit; every other number is fitted again at each point.
+    """Return the profile of a number around a fit, all other numbers refitted at each point.
 
-    The noise keeps the variances of the fit. Where currents were logged, a number that
-    currents tell is profiled given the motion, and one of the motion by the motion's likelihood:
-    Laplace's parabola beside it is then the one of the same question. `tell` is called after every
-    point with their number and the rise there.
+    The variances stay as fitted. Where currents were logged, an electric number is profiled given
+    the motion, and a number of the motion by the motion's likelihood; the Laplace parabola beside
+    it is conditional on the same. `progress` is called after every point with the count of points
+    and the rise there.
     """
     entry = profiled(problem.space, path)
-    at = problem.space.place[path].start
-    walk = _Refits(problem, optimum, at, tell)
-    points = sorted([*walk.side(-1.0), *walk.side(1.0), (walk.start, walk.lowest)])
+    at = problem.space.slices[path].start
+    refits = _Refits(problem, optimum, at, progress)
+    points = sorted([*refits.side(-1.0), *refits.side(1.0), (refits.start, refits.lowest)])
     z = np.array([p[0] for p in points])
     posterior = np.array([p[1] for p in points])
     own = 0.5 * ((z - problem.space.prior_mean[at]) / problem.space.prior_std[at]) ** 2
@@ -138,27 +140,27 @@ def profile(
         value=tuple(si(x) for x in z),
         posterior=tuple(posterior.tolist()),
         likelihood=tuple(likelihood.tolist()),
-        laplace=tuple((0.5 * ((z - walk.start) / walk.std) ** 2).tolist()),
-        estimate=si(walk.start),
+        laplace=tuple((0.5 * ((z - refits.start) / refits.std) ** 2).tolist()),
+        estimate=si(refits.start),
         interval90=(interval[0], interval[1]),
         ends=(ends[0], ends[1]),
-        given="" if problem.target.joint or walk.of_motion else "the motion as fitted",
-        settled=walk.settled,
-        said=_sentence(entry, interval, ends, problem.windows.has_voltage)
-        + ("" if walk.settled else "; some refits did not settle: it may be wider"),
+        given="" if problem.objective.joint or refits.of_motion else "the motion as fitted",
+        settled=refits.settled,
+        sentence=_sentence(entry, interval, ends, problem.windows.has_voltage)
+        + ("" if refits.settled else "; some refits did not settle: it may be wider"),
     )
 
 
 class _Refits:
-    """Refits along one coordinate, each from where its neighbour ended."""
+    """Refits along one coordinate, each started at the result of its neighbour."""
 
     def __init__(
-        self, problem: Problem, optimum: Optimum, at: int, tell: Callable[[int, float], None]
+        self, problem: Problem, optimum: Optimum, at: int, progress: Callable[[int, float], None]
     ):
-        self.problem, self.at, self.tell = problem, at, tell
+        self.problem, self.at, self.progress = problem, at, progress
         self.free, self.of_motion = np.ones(problem.space.size), False
         covariance = optimum.covariance
-        if not problem.target.joint:
+        if not problem.objective.joint:
             electric = problem.space.electric
             self.of_motion = not electric[at]
             mine = electric == electric[at]
@@ -174,20 +176,20 @@ class _Refits:
         self.electric = problem.electric(optimum.state.z, optimum.state.log_variance)
         self.lowest = self.loss(optimum.state)
 
-    def loss(self, state: State) -> float:
-        """Minus log posterior at fixed noise, of the motion alone where that is the question."""
+    def loss(self, state: FitState) -> float:
+        """Return minus the log posterior at fixed noise, of the motion alone for its numbers."""
         problem, log_v = self.problem, state.log_variance
         blocks, _ = problem.linear(jnp.asarray(state.z), self.electric)
         if self.of_motion:
-            blocks = {k: r for k, r in blocks.items() if k in MOTIONS}
-        keep = problem.every
-        moving = problem.target.joint or self.of_motion
+            blocks = {k: r for k, r in blocks.items() if k in MOTION_BLOCKS}
+        keep = problem.full_weight
+        moving = problem.objective.joint or self.of_motion
         effect = (state if moving else self.fitted).shared(len(problem.windows))
-        seen = problem.seen(blocks, log_v, keep, effect)
+        seen = problem.weighed(blocks, log_v, keep, effect)
         return problem.loss(state.z, log_v, keep, seen, self.electric)
 
     def side(self, sign: float) -> list[tuple[float, float]]:
-        """Points from the estimate outward until the data object or the prior ends."""
+        """Return points from the estimate outward, until the loss or the prior ends the side."""
         points: list[tuple[float, float]] = []
         state, step, before = self.state, 0.5 * self.std, 0.0
         mean, wide = self.problem.space.prior_mean[self.at], self.problem.space.prior_std[self.at]
@@ -208,7 +210,7 @@ class _Refits:
             self.settled &= end.converged
             rise = loss - 0.5 * ((z[self.at] - mean) / wide) ** 2 - base
             self.count += 1
-            self.tell(self.count, rise)
+            self.progress(self.count, rise)
             if rise > _TOO_FAR and before < RISE and step > _LEAST * self.std:
                 step, growth = 0.5 * step, 1.0
                 continue
@@ -221,7 +223,7 @@ class _Refits:
 
 
 def _crossing(z: np.ndarray, rise: np.ndarray) -> float | None:
-    """Where the rise, going outward, first reaches `RISE`; monotone cubic between points."""
+    """Return where the rise first reaches `RISE` going outward, by monotone cubic interpolation."""
     above = np.flatnonzero(rise >= RISE)
     if not above.size:
         return None
@@ -240,9 +242,12 @@ def _sentence(
         side = f"below {high}" if ends[0] == "at_bound" else f"above {low}"
         return f"{entry.path} is at its bound: the data only put it {side} (90 %)"
     if low is None and high is None:
-        return f"{entry.path}: the data do not tell it, their likelihood is level across the prior"
+        return (
+            f"{entry.path}: the data do not determine it, "
+            "their likelihood is level across the prior"
+        )
     if entry.path in NEEDS_VOLTAGE and not has_voltage:
-        return f"{entry.path}: no voltage is logged, its limits are those of other numbers' priors"
+        return f"{entry.path}: no voltage is logged, its limits come from other numbers' priors"
     if low is None or high is None:
         side = f"below {high}" if low is None else f"above {low}"
         return f"{entry.path}: the data only put it {side} (90 %), the other side is level"

@@ -1,12 +1,13 @@
-"""What the data leave open, as formulas a person reads, with what would close it.
+"""Flat directions of the parameter space, as formulas for people with the data that would help.
 
 In coordinates scaled by the prior's stds the information P = S C^-1 S of prior and data has the
-eigenvalue 1 where the data say nothing. A direction u is flat where u^T P u < 1 / 0.8^2: a step of
-one prior std along it is hardly noticed, whatever else is known. Of all such directions those that
-move few numbers are sought: a sparse basis, found by leaving numbers out one by one.
+eigenvalue 1 where the data are uninformative. A direction u is flat if u^T P u < 1 / 0.8^2: a step
+of one prior std along it hardly changes the likelihood, even with all other numbers known. The
+directions that change few numbers are sought: a sparse basis, found by leaving out numbers one by
+one.
 
-Where currents were logged, a direction of the motion alone is judged by what motion tells,
-whether or not the numbers that currents tell are known.
+Where currents were logged, a direction of the motion's numbers alone is judged by the information
+of the motion, as if the electric numbers were unknown.
 """
 
 from collections.abc import Iterable, Mapping
@@ -23,27 +24,31 @@ from slipid.parameter import Entry
 from slipid.search_space import Space
 
 NOTICED = 1 / WEAK**2
-"""Information along a direction, that of the prior being 1, from which it is not flat."""
+"""Information along a direction from which it is not flat; that of the prior is 1."""
 TORQUE_SCALE = (
     "motor.back_emf",
     "motor.coulomb_friction",
     "motor.viscous_friction",
     "surface.friction",
 )
-"""Numbers that may all be larger by one factor without any change of the currents."""
-_UNSEEN = 1.02
-"""Below it the data say nothing at all: these directions come first, and with exact powers."""
+"""Numbers that a common factor scales without any change of the currents."""
+_NO_EFFECT = 1.02
+"""Information of uninformative data: such directions come first, with exact powers."""
 _PART = 0.3
-"""Least part of the largest prior-scaled step, or of the largest power, that is named."""
+"""Smallest prior-scaled step, or power, of a named number relative to the largest one."""
 
 
 @dataclass(frozen=True)
 class FlatDirection:
-    """A direction in which the data do not hold the parameters.
+    """Direction of the parameter space along which the likelihood is flat.
 
-    Each of the paths is multiplied by t to its power, for any t; what has no bounds moves by this
-    times t [unit]. The largest power is 1 or -1; `others` more move a little with them. The formula
-    is the same for people, the remedy the channel or the runs that would tell.
+    Attributes:
+        paths: names of the numbers that change.
+        powers: exponents p of the factors t^p for positive numbers, multiples of t [unit] for
+            unbounded ones; the largest is 1 or -1.
+        others: count of further numbers that change slightly.
+        formula: the direction in words.
+        remedy: channels to log or runs to drive that would determine the numbers.
     """
 
     paths: tuple[str, ...]
@@ -58,7 +63,7 @@ class FlatDirection:
 
 
 class _Precision:
-    """Information P in prior-scaled coordinates; currents may tell some given the motion."""
+    """Information P in prior-scaled coordinates, with that of the motion alone beside it."""
 
     def __init__(self, given: Square, electric: np.ndarray | None = None):
         self.given, self.electric = given, electric
@@ -68,7 +73,7 @@ class _Precision:
             self.motion[motion] = np.linalg.inv(np.linalg.inv(given)[motion])
 
     def of(self, picked: list[int]) -> Float[np.ndarray, "some some"]:
-        """Information on some coordinates, the others being known."""
+        """Return the information on some coordinates, given the others."""
         of_motion = self.electric is not None and not self.electric[picked].any()
         return (self.motion if of_motion else self.given)[np.ix_(picked, picked)]
 
@@ -76,7 +81,7 @@ class _Precision:
         return float(u @ self.of(picked) @ u)
 
     def flattest(self, picked: list[int]) -> tuple[float, np.ndarray]:
-        """The least information along any unit vector of these coordinates, and that vector."""
+        """Return the least information along a unit vector of these coordinates, and the vector."""
         values, vectors = np.linalg.eigh(self.of(picked))
         return float(values[0]), vectors[:, 0]
 
@@ -89,26 +94,30 @@ def flat_directions(
     validity: Mapping[str, Validity] | None = None,
     sideways: bool = True,
 ) -> tuple[FlatDirection, ...]:
-    """Directions in which the data narrow the prior by less than a fifth.
+    """Return directions in which the data narrow the prior by less than a fifth.
 
-    Numbers of which the data say nothing come first, each by itself: they would mix into the
-    directions of others. The yaws of single sessions and what a floor's law lacks are deviations by
-    declaration and are taken as known.
+    Numbers without information come first, each by itself, since they would mix into the
+    directions of others. The yaws of single sessions and deviations of floors are taken as known.
 
-    `validity`, what every floor was driven with, and whether the robot can drive in any direction,
-    `sideways`, make the remedies definite.
+    Args:
+        space: free numbers and their priors.
+        covariance: Laplace covariance of the search vector.
+        has_current: True if currents were logged.
+        has_voltage: True if voltages were logged.
+        validity: driven ranges by floor, for definite remedies.
+        sideways: True if the robot can drive in any direction.
     """
     axes = [axis for e in space.free for axis in axes_of(e)]
     kept = [k for k, axis in enumerate(axes) if not _known(axis.entry)]
     scale = [k for k in kept if axes[k].entry.quantity in TORQUE_SCALE]
     std = space.prior_std
     given = np.linalg.inv(covariance) * (std[:, None] * std)
-    told = _Precision(given, space.electric if has_current else None)
+    precision = _Precision(given, space.electric if has_current else None)
     out = []
-    for picked, u in _sparse(told, kept, scale, 1 / std):
-        main = _named(told, [axes[k] for k in picked], picked, u, std[picked])
+    for picked, u in _sparse(precision, kept, scale, 1 / std):
+        main = _named(precision, [axes[k] for k in picked], picked, u, std[picked])
         mine = [axes[k] for k, is_main in zip(picked, main, strict=True) if is_main]
-        step = _rounded(told, picked, u, std[picked], main)[main]
+        step = _rounded(precision, picked, u, std[picked], main)[main]
         power = step / step[np.argmax(np.abs(step))]
         moving, rest = [axis.entry for axis in mine], len(picked) - len(mine)
         out.append(
@@ -124,7 +133,7 @@ def flat_directions(
 
 
 def members(found: Iterable[FlatDirection]) -> frozenset[str]:
-    """Paths of the numbers that move along flat directions."""
+    """Return the paths of the numbers that change along flat directions."""
     return frozenset(path for f in found for path in f.paths)
 
 
@@ -133,7 +142,7 @@ def _known(entry: Entry) -> bool:
 
 
 def sentences(found: Iterable[FlatDirection]) -> tuple[str, ...]:
-    """One sentence per direction; numbers by themselves that one remedy would tell share one."""
+    """Return a sentence per direction; single numbers with the same remedy share a sentence."""
     alone: dict[str, list[str]] = {}
     together = []
     for f in found:
@@ -141,34 +150,35 @@ def sentences(found: Iterable[FlatDirection]) -> tuple[str, ...]:
             alone.setdefault(f.remedy, []).append(f.formula.removeprefix(NOTHING))
         else:
             together.append(f.text)
-    return (*(f"{NOTHING}{', '.join(names)}: {cure}" for cure, names in alone.items()), *together)
+    single = (f"{NOTHING}{', '.join(names)}: {cure}" for cure, names in alone.items())
+    return (*single, *together)
 
 
 def _sparse(
-    told: _Precision, among: list[int], symmetry: list[int], move: Search
+    precision: _Precision, among: list[int], symmetry: list[int], move: Search
 ) -> list[tuple[list[int], Float[np.ndarray, " some"]]]:
-    """Basis of the flat directions, each a unit vector that needs every coordinate it names.
+    """Return a basis of the flat directions, each a unit vector that needs all its coordinates.
 
-    When one is found, its largest coordinate (the first, if several are as large) counts as known
-    from there on, as in Gaussian elimination; so the next one is another. The symmetry, if it is
-    one in these data, comes first and whole: search would find parts of it. `move` is each
-    coordinate's prior-scaled step in it.
+    After each direction its largest coordinate (the first of equal ones) counts as known, as in
+    Gaussian elimination, so that the next direction differs. The symmetry, if these data have it,
+    comes first and as a whole, since the search would find parts of it. `move` is the prior-scaled
+    step of each coordinate in it.
     """
-    alone = [k for k in among if told.of([k])[0, 0] < NOTICED]
+    alone = [k for k in among if precision.of([k])[0, 0] < NOTICED]
     found = [([k], np.ones(1)) for k in alone]
     known = set(alone)
     whole = [k for k in symmetry if k not in known]
     along = move[whole] / np.linalg.norm(move[whole])
-    if len(whole) > 1 and told.along(whole, along) < NOTICED:
+    if len(whole) > 1 and precision.along(whole, along) < NOTICED:
         found.append((whole, along))
         known.add(whole[0])
-    for limit in (_UNSEEN, NOTICED):
+    for limit in (_NO_EFFECT, NOTICED):
         while left := [k for k in among if k not in known]:
-            value, u = told.flattest(left)
+            value, u = precision.flattest(left)
             if value >= limit:
                 break
             picked = left
-            while (fewer := _without_one(told, picked, u, limit)) is not None:
+            while (fewer := _without_one(precision, picked, u, limit)) is not None:
                 picked, u = fewer
             found.append((picked, u))
             largest = np.abs(u) > 0.9 * np.abs(u).max()
@@ -177,41 +187,42 @@ def _sparse(
 
 
 def _without_one(
-    told: _Precision, picked: list[int], u: np.ndarray, limit: float
+    precision: _Precision, picked: list[int], u: np.ndarray, limit: float
 ) -> tuple[list[int], np.ndarray] | None:
-    """A flat direction with a coordinate less, None where every one is needed."""
+    """Return a flat direction with one coordinate less, None if every one is needed."""
     for drop in np.argsort(np.abs(u)):
         fewer = [k for j, k in enumerate(picked) if j != drop]
         if fewer:
-            value, other = told.flattest(fewer)
+            value, other = precision.flattest(fewer)
             if value < limit:
                 return fewer, other
     return None
 
 
 def _named(
-    told: _Precision, axes: list[Axis], picked: list[int], u: np.ndarray, std: np.ndarray
+    precision: _Precision, axes: list[Axis], picked: list[int], u: np.ndarray, std: np.ndarray
 ) -> np.ndarray:
-    """Which numbers of a direction are worth naming.
+    """Return a mask of the numbers of a direction that its formula names.
 
-    Those that take a good part of the step. Where the data say nothing at all also those of a good
-    power: a wide prior makes the part of a number small whose scale is as open as the others'.
+    These have a good share of the step. Without any information in the data, numbers with a large
+    power are named as well: a wide prior makes the step of a number small whose scale is as open
+    as that of the others.
     """
     main = np.abs(u) >= _PART * np.abs(u).max()
-    if told.along(picked, u) < _UNSEEN and len({axis.is_log for axis in axes}) == 1:
+    if precision.along(picked, u) < _NO_EFFECT and len({axis.is_log for axis in axes}) == 1:
         power = np.abs(u * std)
         main |= power >= _PART * power.max()
     return np.asarray(main)
 
 
 def _rounded(
-    told: _Precision, picked: list[int], u: np.ndarray, std: np.ndarray, main: np.ndarray
+    precision: _Precision, picked: list[int], u: np.ndarray, std: np.ndarray, main: np.ndarray
 ) -> np.ndarray:
-    """Step of one prior std, with the powers of those named in halves if it is still flat."""
+    """Return the step of one prior std, with named powers rounded to halves if it stays flat."""
     step = u * std
     top = float(np.abs(step[main]).max())
     halves = np.where(main, np.round(2 * step / top) / 2 * top, step)
     size = float(np.linalg.norm(halves / std))
-    if (halves[main] != 0).all() and told.along(picked, halves / std / size) < NOTICED:
+    if (halves[main] != 0).all() and precision.along(picked, halves / std / size) < NOTICED:
         return halves / size
     return step

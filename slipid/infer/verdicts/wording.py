@@ -1,4 +1,4 @@
-"""Directions of the parameter space in words, and what would tell the numbers in them apart."""
+"""Texts on flat directions: a formula in words, and the logs or runs that would resolve it."""
 
 from collections.abc import Mapping, Sequence, Set
 from typing import NamedTuple
@@ -10,18 +10,22 @@ from slipid.model.robot import Validity
 from slipid.parameter import Entry
 
 _LARGE = 10.0
-"""Powers that differ more are no formula for people."""
+"""Ratio of powers above which a product formula would not be readable."""
 _SAME = 0.05
-"""Powers that differ less are one."""
+"""Difference below which two powers count as equal."""
 
-NOTHING = "the data say next to nothing of "
-SMALL = ", while others move a little"
+NOTHING = "the data hardly determine "
+SMALL = ", while others change slightly"
 
 
 class Axis(NamedTuple):
-    """One coordinate of the search space, the number it is of, and what people call it.
+    """One coordinate of the search space.
 
-    The unit is of a step along it; a step of a logarithm multiplies the number.
+    Attributes:
+        entry: number that the coordinate belongs to.
+        label: name for people.
+        unit: unit of a step along the coordinate.
+        is_log: True if a step multiplies the number.
     """
 
     entry: Entry
@@ -31,7 +35,7 @@ class Axis(NamedTuple):
 
 
 def axes_of(entry: Entry) -> list[Axis]:
-    """The coordinates of a free number, of shares the log ratios that their basis is made of."""
+    """Return the coordinates of a free number; those of shares are log ratios."""
     d = entry.declaration
     unit = "log-odds" if np.isfinite(d.upper) else d.unit
     is_log = bool(np.isfinite(d.lower) and not np.isfinite(d.upper))
@@ -47,7 +51,7 @@ def axes_of(entry: Entry) -> list[Axis]:
 
 
 def formula(axes: list[Axis], power: np.ndarray, step: np.ndarray) -> str:
-    """Direction in words: powers relative to the largest, step of one prior std."""
+    """Return a direction in words, from powers relative to the largest or one prior std's step."""
     names = [axis.label for axis in axes]
     if len(axes) == 1:
         return NOTHING + names[0]
@@ -59,7 +63,7 @@ def formula(axes: list[Axis], power: np.ndarray, step: np.ndarray) -> str:
         f"{axis.label} x {np.exp(s):.4g}" if axis.is_log else f"{axis.label} {s:+.2g} {axis.unit}"
         for axis, s in zip(axes, step, strict=True)
     ]
-    return f"nearly unseen if together: {', '.join(moves)}"
+    return f"almost no effect on the data if changed together: {', '.join(moves)}"
 
 
 def _product(axes: list[Axis], power: np.ndarray) -> str:
@@ -79,12 +83,12 @@ def _product(axes: list[Axis], power: np.ndarray) -> str:
         up, down = (
             listed([n for n, k in zip(names, power, strict=True) if s * k > 0]) for s in (1, -1)
         )
-        return f"unseen for any factor: {up} times it, {down} divided by it"
+        return f"no effect on the data for any factor: {up} times it, {down} divided by it"
     parts = [
         f"{name} {'times' if k > 0 else 'divided by'} {_power('t', abs(k))}"
         for name, k in zip(names, power, strict=True)
     ]
-    return f"unseen for any factor t: {', '.join(parts)}"
+    return f"no effect on the data for any factor t: {', '.join(parts)}"
 
 
 def _power(name: str, k: float) -> str:
@@ -102,11 +106,11 @@ def _sum(names: list[str], weight: np.ndarray) -> str:
         sign = "+" if k < 0 else "-"
         return f"{names[0]} and {names[1]} only as {other} {sign} {times}{first}"
     parts = [f"{n} {k:+.2g} t" for n, k in zip(names, weight, strict=True)]
-    return f"unseen for any t: {', '.join(parts)}"
+    return f"no effect on the data for any t: {', '.join(parts)}"
 
 
 def _short(axes: list[Axis]) -> list[str]:
-    """Their names, with one pattern in place of the frictions of several floors."""
+    """Return the names, with one pattern in place of the frictions of several floors."""
     others = [axis.label for axis in axes if axis.entry.quantity != "surface.friction"]
     several = len(axes) - len(others) > 1
     return [*others, "surface.*.friction"] if several else [axis.label for axis in axes]
@@ -119,11 +123,11 @@ _FLOOR = "surface"
 _CAMERA = (
     (
         ("camera.scale", "robot.wheel_radius"),
-        "measure the wheel radius, or a length in the camera's picture, motion tells no more",
+        "measure the wheel radius, or a length in the camera's picture: motion cannot help",
     ),
     (
         ("camera.marker_yaw", "robot.drive_offset"),
-        "measure how the marker stands on the body, no motion tells them apart",
+        "measure the marker's angle on the body: no motion distinguishes the two",
     ),
     (("camera.scale", _FLOOR), "add a floor on which the wheels do not slip"),
     (("robot.wheel_radius", _FLOOR), "add a floor on which the wheels do not slip"),
@@ -137,13 +141,13 @@ _CAMERA = (
     (("camera.scale",), "measure a length in the camera's picture"),
     (("robot.wheel_radius",), "measure the wheel radius"),
 )
-"""Quantities that must all occur (any of a floor) and what helps; the first that fits counts."""
+"""Quantities that must all occur (any of a floor), and their remedy; the first match counts."""
 FEW_HEADINGS = 4
-"""Directions of travel, opposite ones counted as two, below which more are asked for."""
+"""Number of headings, opposite ones counted as two, below which the remedy asks for more."""
 TURNING = 0.05
 """Yaw rate by the encoders from which a run is a curve [rad/s]."""
 LITTLE_SLIP = 0.03
-"""Slip below which a floor is hardly felt."""
+"""Slip below which a floor hardly affects the motion."""
 SPEEDS_DIFFER = 1.3
 """Factor between two speeds from which they count as two."""
 
@@ -155,9 +159,14 @@ def remedy(
     validity: Mapping[str, Validity],
     sideways: bool = True,
 ) -> str:
-    """What to log or to drive for numbers that are open, by what each floor was driven with.
+    """Return a sentence on what to log or to drive to determine numbers of a flat direction.
 
-    `sideways` is whether the robot can drive in any direction.
+    Args:
+        found: numbers of the direction.
+        has_current: True if currents were logged.
+        has_voltage: True if voltages were logged.
+        validity: driven ranges by floor.
+        sideways: True if the robot can drive in any direction.
     """
     quantities = {e.quantity for e in found}
     electric = all(e.declaration.electric or e.quantity == "robot.mass" for e in found)
@@ -184,7 +193,7 @@ def _electric(
 
 
 def _runs(found: Sequence[Entry], validity: Mapping[str, Validity], sideways: bool) -> str:
-    """What to drive for numbers of floors, loads and marker, by what was driven."""
+    """Return a sentence on further runs for numbers of floors, loads and marker."""
     floors = {e.surface for e in found if e.surface is not None}
     loads = {e.load for e in found if e.load is not None}
     mine = [
@@ -193,31 +202,31 @@ def _runs(found: Sequence[Entry], validity: Mapping[str, Validity], sideways: bo
         if (floor in floors if floors else not loads or loads & set(v.loads))
     ]
     where = " there" if floors else " with that load" if loads else ""
-    said = []
+    ways = []
     headings = sorted({h for v in mine for h in v.headings_deg})
     if sideways and len(headings) < FEW_HEADINGS:
-        seen = f" than {', '.join(f'{h:g}' for h in headings)} deg" if headings else ""
-        said.append(f"in other directions{seen}")
+        driven = f" than {', '.join(f'{h:g}' for h in headings)} deg" if headings else ""
+        ways.append(f"in other directions{driven}")
     if any(_speeds(v) < 2 for v in mine) or not mine:
-        said.append("at other speeds")
+        ways.append("at other speeds")
     if max((v.yaw_rate[1] for v in mine), default=0.0) < TURNING:
-        said.append("in curves" if sideways else "in curves and on the spot")
+        ways.append("in curves" if sideways else "in curves and on the spot")
     slip = max((v.slip[1] for v in mine), default=1.0)
     if floors and slip < LITTLE_SLIP:
-        said.append(f"loaded unevenly (wheels slip by {slip:.1%} at most, so it hardly matters)")
-    if not said and loads:
+        ways.append(f"loaded unevenly (wheels slip by {slip:.1%} at most, with little effect)")
+    if not ways and loads:
         return "weigh each wheel"
-    return f"drive{where} {listed(said) if said else 'more often'}"
+    return f"drive{where} {listed(ways) if ways else 'more often'}"
 
 
 def listed(parts: Sequence[str]) -> str:
-    """The parts as a sentence lists them."""
+    """Return the parts as a list within a sentence."""
     return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]
 
 
-def _speeds(seen: Validity) -> int:
+def _speeds(validity: Validity) -> int:
     count, last = 0, 0.0
-    for speed in np.sort(np.asarray(seen.speeds, float)):
+    for speed in sorted(validity.speeds):
         if speed > SPEEDS_DIFFER * max(last, 1e-3):
             count, last = count + 1, float(speed)
     return count

@@ -18,9 +18,10 @@ from slipid.lab.benchmark.slipid_rows import NAME
 from slipid.lab.benchmark.summary import RowSummary, reading, summary
 from slipid.lab.benchmark.work import OWN_MAP, QUICK_KIND, BenchmarkOptions, FoldTask, data_of
 from slipid.support.checkpoint import versions
-from slipid.support.errors import DataError, near
+from slipid.support.content import Content
+from slipid.support.errors import DataError, did_you_mean
 from slipid.support.executor import results
-from slipid.support.files import Content, writable, write_json
+from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -134,7 +135,7 @@ def _check(options: BenchmarkOptions) -> None:
     for name in options.only:
         if name not in every:
             raise DataError(
-                f"no row '{name}'{near(name, every)}; expected some of {', '.join(every)}"
+                f"no row '{name}'{did_you_mean(name, every)}; expected some of {', '.join(every)}"
             )
 
 

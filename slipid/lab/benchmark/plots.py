@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from slipid.plots import drawing
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 TICKS = [m * 10.0**k for k in range(-2, 4) for m in (1, 2, 5)]
 """Tick positions of a logarithmic axis of errors [%]."""

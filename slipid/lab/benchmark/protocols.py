@@ -10,7 +10,7 @@ from jaxtyping import Int
 
 from slipid.data.runs import Runs
 from slipid.predict import folds as compared
-from slipid.predict.folds import Facts, speeds
+from slipid.predict.folds import FoldKey, speeds
 from slipid.predict.slip_model import Run
 
 FOLDS = 2
@@ -82,9 +82,9 @@ def base_of(floor: str) -> str:
     return floor.partition("@")[0]
 
 
-def facts_of(data: Runs, base_radius: float) -> list[Facts]:
+def facts_of(data: Runs, base_radius: float) -> list[FoldKey]:
     """Return the facts of all runs; the direction of a skid steer is that of (speed, turning)."""
-    out = compared.facts_of(data)
+    out = compared.fold_keys(data)
     for k, log in enumerate(data.logs):
         if log.wheels == 2 and np.isfinite(data.speed[k]) and log.twist_command is not None:
             ahead = float(np.median(log.twist_command[:, 0]))
@@ -94,12 +94,12 @@ def facts_of(data: Runs, base_radius: float) -> list[Facts]:
     return out
 
 
-def facts_of_run(run: Run) -> Facts:
+def facts_of_run(run: Run) -> FoldKey:
     """Return the facts of a run."""
-    return Facts(run.floor, float(np.degrees(run.heading)), run.speed)
+    return FoldKey(run.floor, float(np.degrees(run.heading)), run.speed)
 
 
-def headings(facts: Sequence[Facts]) -> Labels:
+def headings(facts: Sequence[FoldKey]) -> Labels:
     """Return random parts by heading, with one heading in the same part on every floor.
 
     Runs without a heading are assigned one by one.
@@ -112,18 +112,18 @@ def headings(facts: Sequence[Facts]) -> Labels:
     return np.random.default_rng(0).permutation(number.max() + 1)[number] % FOLDS
 
 
-def sectors(facts: Sequence[Facts]) -> Labels:
+def sectors(facts: Sequence[FoldKey]) -> Labels:
     """Return parts of every other sector of directions; -1 for runs without a direction."""
     sector = compared.sectors(facts)
     return np.where(sector < 0, sector, sector % FOLDS)
 
 
-def floors(facts: Sequence[Facts]) -> Labels:
+def floors(facts: Sequence[FoldKey]) -> Labels:
     """Return parts of one floor each."""
     return np.unique([base_of(f.floor) for f in facts], return_inverse=True)[1]
 
 
-KINDS: dict[str, Callable[[Sequence[Facts]], Labels]] = {
+KINDS: dict[str, Callable[[Sequence[FoldKey]], Labels]] = {
     "headings": headings,
     "sectors": sectors,
     "speeds": partial(speeds, most=SPEEDS),
@@ -131,7 +131,7 @@ KINDS: dict[str, Callable[[Sequence[Facts]], Labels]] = {
 }
 
 
-def splits(facts: Sequence[Facts], kind: str) -> list[Split]:
+def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
     """Return the folds of a kind, without those that have too few training or held-out runs.
 
     Runs of part -1 are training runs in all folds. Runs on floors without training runs are not

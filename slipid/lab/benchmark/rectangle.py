@@ -7,14 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.deploy.deploy import ROBOT, robot_of
+from slipid.deploy.deploy import ROBOT, robot_of_force_balance
 from slipid.lab.benchmark.scores import FoldScore
 from slipid.lab.benchmark.slipid_rows import fit_slipid
 from slipid.lab.benchmark.work import OF_FITS, BenchmarkOptions, data_of, problem_of
 from slipid.lab.trial import trial
-from slipid.robot.record import Sensors
+from slipid.robot.record import LogSensors
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
-from slipid.support.files import Content, read_json, write_json
+from slipid.support.content import Content
+from slipid.support.files import (
+    read_json,
+    write_json,
+)
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -73,8 +77,10 @@ class RectangleTask:
         everybody = np.arange(len(data.logged))
         kept = Checkpoint(self.folder, key)
         fit = fit_slipid(data.job, problem_of(self.options, SOURCE), everybody, kept)
-        sensors = Sensors(current_is_signed=data.logged.current_is_signed, voltage=True)
-        robot_of(fit.contact, fit.highest_speed, fit.trend, sensors).save(self.folder / ROBOT)
+        sensors = LogSensors(current_is_signed=data.logged.current_is_signed, voltage=True)
+        robot_of_force_balance(fit.contact, fit.highest_speed, fit.trend, sensors).save(
+            self.folder / ROBOT
+        )
 
     def drive(self, executor: Executor, report: Reporter) -> Content:
         """Run all controllers on the virtual test site, or on the twin if MuJoCo is missing.
@@ -88,7 +94,7 @@ class RectangleTask:
         only = self.options.only or CONTROLLERS
         controllers = [name for name in CONTROLLERS if name in only]
         try:
-            wish = trial.Wish(plant, controllers=tuple(controllers), starts=STARTS)
+            wish = trial.TrialOptions(plant, controllers=tuple(controllers), starts=STARTS)
             return trial.trial(self.folder, wish, executor, report).content
         except Exception as error:  # the rest is written all the same
             return {"failed": FoldScore.of_error(error).absent}

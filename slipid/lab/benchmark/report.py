@@ -9,7 +9,8 @@ from typing import NamedTuple
 from rich.text import Text
 
 from slipid.report.page import Page, table
-from slipid.support.files import Content, write_bytes
+from slipid.support.content import Content
+from slipid.support.files import write_bytes
 
 COLUMNS: Mapping[str, tuple[str, float, int]] = {
     "endpoint_error": ("end point, %", 100.0, 1),

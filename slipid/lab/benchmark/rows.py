@@ -8,7 +8,7 @@ from slipid.lab.systems.motion.quann import QuannEnergy, QuannSlip
 from slipid.lab.systems.motion.reina import ReinaDeterministic, ReinaFuzzy
 from slipid.lab.systems.motion.ward_iagnemma import WardIagnemma
 from slipid.predict.kinematics import Corrected, Encoder, HeadingLookup
-from slipid.predict.slip_model import ByFloor, Machine, SlipModel
+from slipid.predict.slip_model import ByFloor, RobotSpec, SlipModel
 
 KINEMATIC = ("effective_track", "instantaneous_centres")
 """Names of the rows for wheels that do not determine the twist."""
@@ -37,9 +37,9 @@ ROWS = tuple(method.name for method in _every())
 """Names of all rows."""
 
 
-def rows(machine: Machine) -> list[SlipModel]:
+def rows(spec: RobotSpec) -> list[SlipModel]:
     """Return the methods for a robot, unfitted, including those whose channels are missing."""
     every = _every()
-    if machine.determines_twist:
+    if spec.determines_twist:
         every = [method for method in every if method.name not in KINEMATIC]
     return every

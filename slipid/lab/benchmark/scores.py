@@ -11,15 +11,15 @@ from slipid.lab.benchmark.sets import Over
 from slipid.predict.score import chords, clusters, lengths, scores
 from slipid.predict.slip_model import (
     WINDOW_S,
-    Machine,
     PredictedRun,
+    RobotSpec,
     Run,
     body_increments,
     groups,
     path_of,
-    seen_from_start,
+    relative_to_start,
 )
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 SLIPS = 0.2
 """Smallest relative difference between the twists of body and wheels that counts as slip."""
@@ -61,13 +61,13 @@ class RunScore:
     energy_error: float | None
 
 
-def scored(run: Run, predicted: PredictedRun, machine: Machine, over: Over) -> RunScore:
+def scored(run: Run, predicted: PredictedRun, spec: RobotSpec, over: Over) -> RunScore:
     """Return the score of a prediction of a run."""
-    true = seen_from_start(run.pose)
+    true = relative_to_start(run.pose)
     cov = None if predicted.end_covariance is None else predicted.end_covariance[None]
     (end,) = scores(predicted.path[None], true[None], cov, predicted.freedom)
     first = groups(run.signals.dt, WINDOW_S)
-    off, slip, slips = _windows(run, predicted, machine, first)
+    off, slip, slips = _windows(run, predicted, spec, first)
     return RunScore(
         name=run.signals.name,
         floor=run.floor,
@@ -80,7 +80,7 @@ def scored(run: Run, predicted: PredictedRun, machine: Machine, over: Over) -> R
         scores=[float(f"{x:.4g}") for x in slip.tolist()],
         slips=slips.tolist(),
         floor_right=_floor_right(run, predicted),
-        energy_error=_energy_error(run, predicted, machine),
+        energy_error=_energy_error(run, predicted, spec),
     )
 
 
@@ -90,16 +90,16 @@ def _length(path: Float[np.ndarray, "edge 3"], over: Over) -> float:
 
 
 def _windows(
-    run: Run, predicted: PredictedRun, machine: Machine, first: np.ndarray
+    run: Run, predicted: PredictedRun, spec: RobotSpec, first: np.ndarray
 ) -> tuple[float, Float[np.ndarray, " window"], Bool[np.ndarray, " window"]]:
     """Return the rms twist error [m/s], and slip score and true slip of the moving windows."""
     edges = np.append(first, len(run.signals))
     dt = np.diff(np.concatenate([[0.0], np.cumsum(run.signals.dt)])[edges])[:, None]
-    true = body_increments(run.pose[edges]) / dt * machine.size
-    estimate = body_increments(predicted.path[edges]) / dt * machine.size
+    true = body_increments(run.pose[edges]) / dt * spec.size
+    estimate = body_increments(predicted.path[edges]) / dt * spec.size
     # integrated like the paths, so that the path of encoders has a slip score of exactly 0
-    by_wheels = path_of(run.signals.rolling(machine), run.signals.dt)
-    rolling = body_increments(by_wheels[edges]) / dt * machine.size
+    by_wheels = path_of(run.signals.rolling(spec), run.signals.dt)
+    rolling = body_increments(by_wheels[edges]) / dt * spec.size
     size = np.linalg.norm(rolling, axis=1)
     moving = size > STANDS
     most = np.maximum(size, STANDS)
@@ -124,10 +124,10 @@ def _floor_right(run: Run, predicted: PredictedRun) -> float | None:
     return float((right * run.signals.dt).sum() / run.signals.dt.sum())
 
 
-def _energy_error(run: Run, predicted: PredictedRun, machine: Machine) -> float | None:
+def _energy_error(run: Run, predicted: PredictedRun, spec: RobotSpec) -> float | None:
     if predicted.power is None or run.signals.current is None:
         return None
-    spent = float((run.signals.power(machine) * run.signals.dt).sum())
+    spent = float((run.signals.power(spec) * run.signals.dt).sum())
     return abs(float((predicted.power * run.signals.dt).sum()) / max(spent, 1e-9) - 1)
 
 

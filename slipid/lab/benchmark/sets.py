@@ -7,15 +7,15 @@ from typing import Literal
 
 import numpy as np
 
-from slipid.app.config import Config, Logs, one_floor, parsed
+from slipid.app.config import Config, LogsSection, parsed, single_floor_sections
 from slipid.app.logs import packaged_path, read_dataset, unpack
-from slipid.app.problem import Job, job_of
+from slipid.app.problem import ConfigFitTask, fit_task
 from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.runs import Runs, collect
 from slipid.lab.benchmark.protocols import facts_of
 from slipid.lab.benchmark.steps import POSES_PER_STEP
-from slipid.predict.folds import Facts
-from slipid.predict.slip_model import Machine
+from slipid.predict.folds import FoldKey
+from slipid.predict.slip_model import RobotSpec
 from slipid.search_space import Space
 from slipid.support.files import hash_of
 from slipid.support.progress import Reporter
@@ -125,16 +125,16 @@ class DataSet:
     """
 
     source: LogSource
-    job: Job
+    job: ConfigFitTask
     logged: Runs
-    facts: tuple[Facts, ...]
+    facts: tuple[FoldKey, ...]
     crossing: Runs | None = None
     map: FloorMap | None = None
 
     @property
-    def machine(self) -> Machine:
+    def spec(self) -> RobotSpec:
         """The robot by its config."""
-        return Machine.of(Space(self.job.robot, self.job.choices).template)
+        return RobotSpec.of(Space(self.job.robot, self.job.choices).template)
 
     def thinned(self, most: int) -> "DataSet":
         """Return at most so many runs, evenly taken from every floor and speed."""
@@ -172,7 +172,7 @@ def read_set(source: LogSource, data: Path, out: Path, report: Reporter) -> Data
     path = packaged_path(source.config)
     config = parsed(path, text_of(path))
     root = data / source.folder
-    sections: Sequence[Logs] = one_floor(config.content.logs)
+    sections: Sequence[LogsSection] = single_floor_sections(config.content.logs)
     if not source.folder:
         root = out / "recorded"
         if not (root / "unseen" / "truth" / "truth.json").is_file():
@@ -211,10 +211,10 @@ def _with_currents(config: Config, currents: CurrentColumns | None) -> Config:
     return replace(config, content=config.content.model_copy(update={"layouts": layouts}))
 
 
-def _job(config: Config, logged: Runs, source: LogSource) -> Job:
+def _job(config: Config, logged: Runs, source: LogSource) -> ConfigFitTask:
     """Return the job of slipid's fit to runs, with currents only if its config reads them."""
     fitted = logged
     if source.currents is not None:
         logs = [replace(log, current=None, current_fresh=None) for log in logged.logs]
         fitted = collect(logs, logged.session)
-    return job_of(config, fitted, (), Reporter(quiet=True))
+    return fit_task(config, fitted, (), Reporter(quiet=True))

@@ -12,24 +12,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.app.problem import Job
+from slipid.app.problem import ConfigFitTask
 from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
-from slipid.deploy.deploy import robot_of
+from slipid.deploy.deploy import robot_of_force_balance
 from slipid.deploy.floors import floor_of
 from slipid.fit import likelihood as lk
 from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.fit.variances import DEGREES
 from slipid.infer.slip_curves import current_trend
 from slipid.lab.benchmark.steps import RunBatch, body_poses
-from slipid.predict.folds import of_some
-from slipid.predict.predictive import Contact, contact_of
-from slipid.predict.slip_model import Machine, PredictedRun, RunSignals, seen_from_start
+from slipid.predict.folds import problem_of_runs
+from slipid.predict.predictive import ForceBalance, force_balance_of
+from slipid.predict.slip_model import PredictedRun, RobotSpec, RunSignals, relative_to_start
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
-from slipid.robot.interface import MIXED, NO_FLOOR, Readings, Settings
-from slipid.robot.record import Sensors
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, NO_FLOOR, Readings, Settings
+from slipid.robot.record import LogSensors
 from slipid.support.checkpoint import Checkpoint
 
 NAME = "slipid"
@@ -57,8 +57,8 @@ class SlipidFit:
         converged: True if the fit converged.
     """
 
-    contact: Contact
-    job: Job
+    contact: ForceBalance
+    job: ConfigFitTask
     floors: tuple[int, ...]
     highest_speed: float
     trend: tuple[float, float]
@@ -74,15 +74,19 @@ class SlipidFit:
     def deployed(self) -> DeployedRobot:
         """The deployed robot on all floors of the data set."""
         signed = self.job.dataset.current_is_signed
-        return robot_of(self.contact, self.highest_speed, self.trend, Sensors(signed))
+        return robot_of_force_balance(
+            self.contact, self.highest_speed, self.trend, LogSensors(signed)
+        )
 
 
-def fit_slipid(job: Job, problem: Problem, training: np.ndarray, kept: Checkpoint) -> SlipidFit:
+def fit_slipid(
+    job: ConfigFitTask, problem: Problem, training: np.ndarray, kept: Checkpoint
+) -> SlipidFit:
     """Return the force balance fitted to some runs of a job, or the kept one of the same fit.
 
     Fits of one `job.problem()` share its compiled functions.
     """
-    problem = of_some(problem, job.choices, job.dataset, training)
+    problem = problem_of_runs(problem, job.choices, job.dataset, training)
     keep = np.isin(problem.windows.run, training).astype(float)
     if (found := kept.load("fit")) is None:
         began = time.perf_counter()
@@ -97,8 +101,8 @@ def fit_slipid(job: Job, problem: Problem, training: np.ndarray, kept: Checkpoin
         found = kept.load("fit")
         assert found is not None
     covariance, seconds, converged = (found.pop(k) for k in ("covariance", "seconds", "converged"))
-    contact = contact_of(problem, State.of(found), covariance, keep)
-    robot, w = contact.robot, problem.windows.pieces(np.flatnonzero(keep > 0))
+    contact = force_balance_of(problem, FitState.of(found), covariance, keep)
+    robot, w = contact.robot, problem.windows.segments(np.flatnonzero(keep > 0))
     names = {job.dataset.logs[k].surface for k in training.tolist()}
     return SlipidFit(
         contact=contact,
@@ -111,16 +115,16 @@ def fit_slipid(job: Job, problem: Problem, training: np.ndarray, kept: Checkpoin
     )
 
 
-def forecast(fit: SlipidFit, batch: RunBatch, machine: Machine) -> list[PredictedRun]:
+def forecast(fit: SlipidFit, batch: RunBatch, spec: RobotSpec) -> list[PredictedRun]:
     """Return the force balance's predictions of runs on known floors, with the electric power."""
     w = batch.windows
     tracks, cov = fit.contact.ends(w)
     robot = fit.contact.robot
     paths = body_poses(robot, w, tracks.predicted)
-    power = _power(fit, w, machine) if fit.job.dataset.current is not None else None
+    power = _power(fit, w, spec) if fit.job.dataset.current is not None else None
     return [
         PredictedRun(
-            path=seen_from_start(paths[k]),
+            path=relative_to_start(paths[k]),
             end_covariance=turned_covariance(cov[k], -float(paths[k, 0, 2])),
             freedom=DEGREES,
             power=None if power is None else power[k],
@@ -129,18 +133,18 @@ def forecast(fit: SlipidFit, batch: RunBatch, machine: Machine) -> list[Predicte
     ]
 
 
-def _power(fit: SlipidFit, w: Any, machine: Machine) -> np.ndarray:
+def _power(fit: SlipidFit, w: Any, spec: RobotSpec) -> np.ndarray:
     """Return the electric power of all motors by the predicted currents [W]."""
     robot = fit.contact.robot
     b = lk.batch(w, robot)
     amps = np.abs(np.asarray(_currents(robot, b)))
-    shaft = np.abs(machine.gear_ratio * w.turn / w.dt[..., None])
-    return np.asarray(((machine.resistance * amps + machine.back_emf * shaft) * amps).sum(-1))
+    shaft = np.abs(spec.gear_ratio * w.turn / w.dt[..., None])
+    return np.asarray(((spec.resistance * amps + spec.back_emf * shaft) * amps).sum(-1))
 
 
 @jax.jit
 def _currents(robot: Any, b: lk.Batch) -> Array:
-    return lk.predicted_current(robot, b, lk.predict(robot, b).felt)
+    return lk.predicted_current(robot, b, lk.predict(robot, b).motor_force)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +198,7 @@ def _estimator(
         robot = robot.with_unseen()
     settings = Settings.of(robot)
     if several or floors.map is not None:
-        settings = replace(settings, alike=MIXED)
+        settings = replace(settings, further_floor_penalty=MIXED_FLOORS_PENALTY)
     known = None if floors.map is None else floor_of(floors.map, robot.labels)
     return Estimator(robot, settings, known)
 
@@ -263,7 +267,7 @@ def replay(
             path = np.concatenate([begin[n][None], pose[n, ends]])
             under = {labels[row]: floors[n, ends, row] for row in known}
             predicted = PredictedRun(
-                path=seen_from_start(path),
+                path=relative_to_start(path),
                 end_covariance=turned_covariance(cov[n, ends[-1]], -float(begin[n, 2])),
                 floors=under | {NO_FLOOR: 1.0 - sum(under.values())},
             )

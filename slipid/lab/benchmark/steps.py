@@ -63,7 +63,7 @@ def _batch(data: Runs, robot: Robot, w: Windows) -> RunBatch:
     runs = []
     for n, k in enumerate(numbers):
         log = data.logs[k]
-        edges = w.began[n] + np.concatenate([[0.0], np.cumsum(w.dt[n])]) - w.lag
+        edges = w.start[n] + np.concatenate([[0.0], np.cumsum(w.dt[n])]) - w.lag
         signals = RunSignals(
             name=log.name,
             dt=w.dt[n],

@@ -8,7 +8,7 @@ import numpy as np
 
 from slipid.lab.benchmark.protocols import INNER, inner
 from slipid.lab.benchmark.scores import scored
-from slipid.predict.slip_model import TRIES, ByFloor, Machine, Run, SlipModel
+from slipid.predict.slip_model import TRIES, ByFloor, RobotSpec, Run, SlipModel
 
 WORST = 2.0
 """Relative error above which all errors of a setting count the same."""
@@ -41,7 +41,7 @@ def best_candidate(candidates: Sequence[Method], loss: Callable[[Method], float]
     return Tuned(best, settings_of(best, candidates), len(candidates), min(losses))
 
 
-def tuned(method: SlipModel, runs: Sequence[Run], machine: Machine, kind: str) -> Tuned[SlipModel]:
+def tuned(method: SlipModel, runs: Sequence[Run], spec: RobotSpec, kind: str) -> Tuned[SlipModel]:
     """Return the method with the best of its settings, unfitted.
 
     Each setting is fitted without a part of the runs, split like the protocol's runs as far as the
@@ -54,7 +54,7 @@ def tuned(method: SlipModel, runs: Sequence[Run], machine: Machine, kind: str) -
     part = inner(runs, kind)
 
     def loss(candidate: SlipModel) -> float:
-        return _loss(candidate, runs, part, machine)
+        return _loss(candidate, runs, part, spec)
 
     found = best_candidate(list(method.candidates())[:TRIES], loss)
     best = found.method
@@ -68,7 +68,7 @@ def tuned(method: SlipModel, runs: Sequence[Run], machine: Machine, kind: str) -
     return Tuned(pooled, words, found.tried + 1)
 
 
-def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, machine: Machine) -> float:
+def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, spec: RobotSpec) -> float:
     """Return the mean error over parts held back in turn, over runs and then over floors."""
     errors: dict[str, list[float]] = {}
     for k in range(INNER):
@@ -80,12 +80,12 @@ def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, machine: Mac
         if not training or not held_out:
             continue
         try:
-            fitted = method.fit(training, machine)
-            predicted = fitted.predict([run.signals for run in held_out], machine)
+            fitted = method.fit(training, spec)
+            predicted = fitted.predict([run.signals for run in held_out], spec)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             return np.inf
         for run, one in zip(held_out, predicted, strict=True):
-            score = scored(run, one, machine, "path")
+            score = scored(run, one, spec, "path")
             error = score.energy_error if method.aim == "energy" else score.endpoint_error
             known = WORST if error is None or not np.isfinite(error) else error
             errors.setdefault(run.floor, []).append(min(known, WORST))

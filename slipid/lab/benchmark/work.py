@@ -18,10 +18,10 @@ from slipid.lab.benchmark.sets import SOURCES, DataSet, LogSource, read_set
 from slipid.lab.benchmark.steps import RunBatch, in_order, run_batches
 from slipid.lab.benchmark.tuning import tuned
 from slipid.lab.systems.motion.features import common
-from slipid.predict.slip_model import Channel, Machine, PredictedRun, Run, SlipModel
+from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, SlipModel
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
-from slipid.support.files import Content
+from slipid.support.content import Content
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -148,7 +148,7 @@ def keys_of(task: FoldTask) -> list[tuple[str, str]]:
     """
     options, data, split = task.options, data_of(task.options, task.source), split_of(task)
     own = [slipid_rows.NAME] + ([OWN_MAP] if split.kind == "all" else [])
-    every = own + [method.name for method in rows(data.machine)]
+    every = own + [method.name for method in rows(data.spec)]
     names = [name for name in every if not options.only or name in options.only]
     several = len({base_of(f.floor) for f in data.facts}) > 1 and not options.quick
     protocols = [p for p in split.protocols if PROTOCOLS[p].floor_known or several]
@@ -225,17 +225,17 @@ def _score(data: FoldData, protocol: str, name: str) -> FoldScore:
     try:
         if name in (slipid_rows.NAME, OWN_MAP):
             return _slipid(data, asked, runs, name)
-        method = next(m for m in rows(data.data.machine) if m.name == name)
-        if lacks := method.needs - channels_of(runs, data.data.machine):
+        method = next(m for m in rows(data.data.spec) if m.name == name)
+        if lacks := method.needs - channels_of(runs, data.data.spec):
             return FoldScore.lacking(lacks)
         return _published(data, asked, runs, method)
     except Exception as error:  # other rows are scored all the same
         return FoldScore.of_error(error)
 
 
-def channels_of(runs: Sequence[Run], machine: Machine) -> frozenset[Channel]:
+def channels_of(runs: Sequence[Run], spec: RobotSpec) -> frozenset[Channel]:
     """Return the channels besides encoders that all runs have."""
-    twist: frozenset[Channel] = frozenset({"twist"} if machine.determines_twist else ())
+    twist: frozenset[Channel] = frozenset({"twist"} if spec.determines_twist else ())
     return common(runs) | twist
 
 
@@ -243,14 +243,14 @@ def _published(
     data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], method: SlipModel
 ) -> FoldScore:
     """Return the score of a published method."""
-    machine = data.data.machine
+    spec = data.data.spec
     training = [run.with_floor(protocol.floor_known) for run in data.training]
     began = time.perf_counter()
-    found = tuned(method, training, machine, protocol.split)
+    found = tuned(method, training, spec, protocol.split)
     picked = time.perf_counter()
-    fitted = found.method.fit(training, machine)
+    fitted = found.method.fit(training, spec)
     ended = time.perf_counter()
-    score = _timed(data, runs, lambda: fitted.predict([run.signals for run in runs], machine))
+    score = _timed(data, runs, lambda: fitted.predict([run.signals for run in runs], spec))
     return replace(
         score,
         settings=found.settings,
@@ -275,7 +275,7 @@ def _slipid(data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], name: 
     def predict() -> list[PredictedRun]:
         if not known or has_gyro:
             return slipid_rows.estimator_runs(fit, data.batches, data.held_out, floors)
-        forecasts = [slipid_rows.forecast(fit, b, data.data.machine) for b in data.batches]
+        forecasts = [slipid_rows.forecast(fit, b, data.data.spec) for b in data.batches]
         return [run for of_batch in forecasts for run in of_batch]
 
     predict()  # compiles
@@ -290,7 +290,7 @@ def _timed(
     began = time.perf_counter()
     predicted = predict()
     took = time.perf_counter() - began
-    machine, over = data.data.machine, data.data.source.over
-    scores = [scored(run, one, machine, over) for run, one in zip(runs, predicted, strict=True)]
+    spec, over = data.data.spec, data.data.source.over
+    scores = [scored(run, one, spec, over) for run, one in zip(runs, predicted, strict=True)]
     steps = sum(len(run.signals) for run in runs)
     return FoldScore(runs=tuple(scores), step_us=1e6 * took / max(steps, 1))

@@ -44,8 +44,8 @@ from jaxtyping import Float
 
 from slipid.lab.paper2021 import table as tables
 from slipid.lab.paper2021.samples import FIGURES_3_AND_4, SlipSamples
-from slipid.predict.curves import Curve, Slips, WheelSlip, above, powers, robust_std
-from slipid.predict.slip_model import Channel, Machine, RunSignals, SlipModel
+from slipid.predict.curves import CurveModel, Slips, WheelSlip, above, powers, robust_std
+from slipid.predict.slip_model import Channel, RobotSpec, RunSignals, SlipModel
 from slipid.predict.steps import Steps, TrainingWindows
 
 NEEDS: frozenset[Channel] = frozenset({"current", "twist"})
@@ -64,12 +64,12 @@ class PaperPrint(WheelSlip):
     name: str = "paper_print"
     needs: frozenset[Channel] = field(default=NEEDS, kw_only=True)
 
-    def learn(self, w: TrainingWindows, machine: Machine) -> "PaperPrint":
+    def learn(self, w: TrainingWindows, spec: RobotSpec) -> "PaperPrint":
         return self
 
-    def slip(self, steps: Steps, machine: Machine) -> Slips:
+    def slip(self, steps: Steps, spec: RobotSpec) -> Slips:
         recipe = FIGURES_3_AND_4
-        motor = replace(machine, resistance=recipe.resistance, back_emf=recipe.back_emf)
+        motor = replace(spec, resistance=recipe.resistance, back_emf=recipe.back_emf)
         torque = steps.signals.torque(motor)
         return np.clip(np.polynomial.polynomial.polyval(torque, tables.TORQUE_SVR), 0.0, 1.0)
 
@@ -83,29 +83,29 @@ class PaperCode(WheelSlip):
     name: str = "paper_code"
     needs: frozenset[Channel] = field(default=NEEDS, kw_only=True)
 
-    def learn(self, w: TrainingWindows, machine: Machine) -> "PaperCode":
+    def learn(self, w: TrainingWindows, spec: RobotSpec) -> "PaperCode":
         return self
 
-    def slip(self, steps: Steps, machine: Machine) -> Slips:
-        current = steps.smoothed(steps.signals.along(machine), TIME_CONSTANT)
+    def slip(self, steps: Steps, spec: RobotSpec) -> Slips:
+        current = steps.smoothed(steps.signals.along(spec), TIME_CONSTANT)
         if current.shape[1] == 3:
             return tables.deployed_slip(current)
         of_each = tables.deployed_slip(np.repeat(current.reshape(-1, 1), 3, axis=1))
         return np.asarray(of_each.mean(axis=1).reshape(current.shape))
 
 
-def recipe_samples(w: TrainingWindows, machine: Machine) -> SlipSamples:
+def recipe_samples(w: TrainingWindows, spec: RobotSpec) -> SlipSamples:
     """All wheels and windows that the authors' cuts leave, at most `MOST` of them by lot."""
     signals = w.signals
-    rim = signals.speed * machine.wheel_radius
-    real = w.twist @ machine.forward.T
+    rim = signals.speed * spec.wheel_radius
+    real = w.twist @ spec.forward.T
     with np.errstate(divide="ignore", invalid="ignore"):
         # a wheel at rest has no slip ratio: not finite, so that no comparison keeps it
         slip = 1.0 - real / rim
-    amps = signals.along(machine)
+    amps = signals.along(spec)
     kept = (slip > 0.0) & (slip <= 1.0) & (amps > FIGURES_3_AND_4.min_current)
     lot = np.random.default_rng(0).permutation(int(kept.sum()))[:MOST]
-    torque = signals.torque(machine)
+    torque = signals.torque(spec)
     return SlipSamples(amps[kept][lot], torque[kept][lot], slip[kept][lot])
 
 
@@ -152,8 +152,8 @@ class PaperSvr(WheelSlip):
     def candidates(self) -> Sequence["PaperSvr"]:
         return [replace(self, c=c, tube=tube) for c in (1e-3, 0.1) for tube in (0.1, 0.5)]
 
-    def learn(self, w: TrainingWindows, machine: Machine) -> "PaperSvr":
-        seen = recipe_samples(w, machine)
+    def learn(self, w: TrainingWindows, spec: RobotSpec) -> "PaperSvr":
+        seen = recipe_samples(w, spec)
         if len(np.unique(seen.torque.round(9))) <= self.degree:
             # nothing to fit a curve to: the slip that was seen, if any was
             level = float(seen.slip.mean()) if len(seen) else 0.0
@@ -161,17 +161,17 @@ class PaperSvr(WheelSlip):
         curve = insensitive_curve(seen.torque, seen.slip, self.degree, self.c, self.tube)
         return replace(self, coefficients=curve)
 
-    def slip(self, steps: Steps, machine: Machine) -> Slips:
-        torque = steps.signals.torque(machine)
+    def slip(self, steps: Steps, spec: RobotSpec) -> Slips:
+        torque = steps.signals.torque(spec)
         return np.clip(np.polynomial.polynomial.polyval(torque, self.known), 0.0, 1.0)
 
 
-def refits() -> list[Curve]:
+def refits() -> list[CurveModel]:
     """The forms that were printed and deployed, unfitted, in [-1, 1]."""
     deployed = above(tables.DEPLOYED_THRESHOLD)
     return [
-        Curve("paper_print_refit", powers(0, 1, 2), RunSignals.torque, most=1.0, needs=NEEDS),
-        Curve(
+        CurveModel("paper_print_refit", powers(0, 1, 2), RunSignals.torque, most=1.0, needs=NEEDS),
+        CurveModel(
             "paper_code_refit",
             deployed,
             per_wheel=True,

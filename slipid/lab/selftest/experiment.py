@@ -10,19 +10,20 @@ import numpy as np
 from scipy.stats import binom, chi2
 
 from slipid.app.check import expected
-from slipid.app.config import Config, one_floor, read_config
+from slipid.app.config import Config, read_config, single_floor_sections
 from slipid.app.logs import layout_of
-from slipid.app.problem import Job, job_of, read_job, shape_of
+from slipid.app.problem import ConfigFitTask, fit_task, read_fit_task, shape_of
 from slipid.data.runs import collect
 from slipid.fit.problem import Problem
 from slipid.infer.verdicts.estimates import derived
 from slipid.lab.selftest import replicates as test
-from slipid.lab.selftest.logs import Sensors, grid, make_logs, turning_grid
-from slipid.lab.selftest.replicates import Number, Replicate
+from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, turning_grid
+from slipid.lab.selftest.replicates import NumberRecovery, Replicate
 from slipid.model.robot import build
 from slipid.support.checkpoint import Checkpoint, key_of
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.files import Content, writable, write_json
+from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -32,7 +33,7 @@ CHANCE = 1e-3
 
 A number whose intervals fail this is wrong, whatever its verdict says.
 """
-SETTLED = 0.75
+LEAST_CONVERGED = 0.75
 """Least part of the fits that must converge."""
 ORDER = ("identified", "weak", "not_identified", "at_bound")
 
@@ -50,41 +51,41 @@ def selftest(
     """
     setup_jax(quiet=True)
     config = read_config(config_path)
-    job = planned(config, report) if data is None else read_job(config, data, report)
-    problem = job.problem()
-    wanted = wanted_of(config, problem)
-    test.plausible(config, job.choices, problem)
+    task = planned_task(config, report) if data is None else read_fit_task(config, data, report)
+    problem = task.problem()
+    wanted = wanted_paths(config, problem)
+    test.plausible(config, task.choices, problem)
     writable(out)
     report.stage("expected information")
-    before = expected(job, problem)
-    kept = Checkpoint(out, key_of(config.hash, job.data_hash, seed))
-    rows = test.replicates(config, job.choices, problem, count, seed, kept, report)
+    before = expected(task, problem)
+    kept = Checkpoint(out, key_of(config.hash, task.data_hash, seed))
+    rows = test.replicates(config, task.choices, problem, count, seed, kept, report)
     found = {
         "schema": SCHEMA,
         "source": "plan" if data is None else "logs",
-        "runs": len(job.dataset),
+        "runs": len(task.dataset),
         "seed": seed,
         "noise": dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True)),
         **summary(rows, wanted),
         "messages": list(before.messages),
-        "data": {"hash": job.data_hash},
+        "data": {"hash": task.data_hash},
     }
     write_json(out / "selftest.json", found)
     return found
 
 
-def planned(config: Config, report: Reporter) -> Job:
+def planned_task(config: Config, report: Reporter) -> ConfigFitTask:
     """Job of an experiment that nobody has driven yet: the grid of the config's `[selftest]`.
 
     Channels are those that the config's layouts name; every load set-up of the config is driven on
     every floor.
     """
     wanted, shape = config.content.selftest, shape_of(config)
-    sections = one_floor(config.content.logs)
+    sections = single_floor_sections(config.content.logs)
     loads = list(dict.fromkeys(section.load for section in sections))
     setups = [(floor, load) for floor in wanted.surfaces for load in loads]
     if shape.determines_twist:
-        runs = grid(setups, wanted.headings, wanted.speeds_m_s, wanted.turns)
+        runs = heading_grid(setups, wanted.headings, wanted.speeds_m_s, wanted.turns)
     else:
         base = float(shape.base_radius)
         runs = turning_grid(setups, wanted.headings, wanted.speeds_m_s, base)
@@ -95,14 +96,16 @@ def planned(config: Config, report: Reporter) -> Job:
     has_current = all("current" in c for c in channels)
     has_voltage = all("voltage" in c or {"duty", "bus_voltage"} <= c for c in channels)
     is_signed = all(layout.current_is_signed for layout in layouts)
-    logs = make_logs(robot, drives, 0, Sensors(has_voltage=has_voltage, signed=is_signed))
+    logs = simulate_logs(
+        robot, drives, 0, SimulatedSensors(has_voltage=has_voltage, signed=is_signed)
+    )
     if not has_current:
         logs = [replace(log, current=None) for log in logs]
     report.line(f"no logs given: {len(logs)} runs of [selftest] on {', '.join(wanted.surfaces)}")
-    return job_of(config, collect(logs), [], report)
+    return fit_task(config, collect(logs), [], report)
 
 
-def wanted_of(config: Config, problem: Problem) -> tuple[str, ...]:
+def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
     """Paths that must be recovered: the config's, else what the channels promise.
 
     Raises:
@@ -135,7 +138,9 @@ def summary(made: Sequence[Replicate], wanted: Sequence[str]) -> Content:
         recovered), `recovered`.
     """
     first = made[0]
-    numbers = {path: judged([one.parameters[path] for one in made]) for path in first.parameters}
+    numbers = {
+        path: number_summary([one.parameters[path] for one in made]) for path in first.parameters
+    }
     curves = {floor: [one.curves[floor] for one in made] for floor in first.curves}
     failed = [p for p in wanted if numbers[p]["recovered"] in ("no", "wrong")]
     converged = sum(one.converged for one in made)
@@ -160,11 +165,11 @@ def summary(made: Sequence[Replicate], wanted: Sequence[str]) -> Content:
         },
         "wanted": list(wanted),
         "failed": failed,
-        "recovered": not failed and converged >= SETTLED * len(made),
+        "recovered": not failed and converged >= LEAST_CONVERGED * len(made),
     }
 
 
-def judged(found: Sequence[Number]) -> Content:
+def number_summary(found: Sequence[NumberRecovery]) -> Content:
     """One number over all replicates.
 
     `recovered` is yes where most fits call it identified, roughly where they call it weak, no where

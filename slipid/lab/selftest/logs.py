@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from slipid.data.log import Log
 from slipid.data.wheel_signals import interpolate
-from slipid.fit.shared import AXES
+from slipid.fit.shared_effects import AXES
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.model.geometry import omni
 from slipid.model.robot import Robot, build, motor_current, twist
@@ -29,7 +29,7 @@ from slipid.parameter import entries
 from slipid.search_space import Choice, Space
 
 
-def numbers(robot: Robot) -> dict[str, float | list[float]]:
+def true_numbers(robot: Robot) -> dict[str, float | list[float]]:
     """Every number of a robot by its path, as plain values."""
     return {e.path: np.asarray(e.get(robot)).tolist() for e in entries(robot)}
 
@@ -65,7 +65,7 @@ TRUTH: dict[str, float | tuple[float, ...]] = {
 """Numbers of the default robot [SI], the rest as declared; of the size found on real logs."""
 
 
-def blank(drives: Sequence[PlannedRun]) -> Robot:
+def nominal_robot(drives: Sequence[PlannedRun]) -> Robot:
     """Robotino at declared starts that knows the floors, loads and sessions of a plan."""
     return build(
         omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0),
@@ -75,17 +75,17 @@ def blank(drives: Sequence[PlannedRun]) -> Robot:
     )
 
 
-def truth(
+def true_robot(
     drives: Sequence[PlannedRun], values: Mapping[str, float | Sequence[float]] | None = None
 ) -> Robot:
     """Robotino with the numbers of `TRUTH`, or others; what the plan does not need is left out."""
-    robot = blank(drives)
+    robot = nominal_robot(drives)
     known = {e.path for e in entries(robot)}
     values = {**TRUTH, **(values or {})}
     return Space(robot, [Choice(p, fixed=v) for p, v in values.items() if p in known]).template
 
 
-def grid(
+def heading_grid(
     setups: Sequence[tuple[str, str]],
     headings: int = 12,
     speeds: Sequence[float] = (0.1, 0.2),
@@ -125,7 +125,7 @@ def turning_grid(
 
 
 @dataclass(frozen=True)
-class Sensors:
+class SimulatedSensors:
     """How the logs are disturbed; stds by the names of `slipid.fit.noise.noise`.
 
     Attributes:
@@ -171,20 +171,22 @@ class Sensors:
         return self.std.get(name, self.std.get(of_any_floor, 0.0))
 
 
-def make_logs(
-    robot: Robot, drives: Sequence[PlannedRun], seed: int, sensors: Sensors | None = None
+def simulate_logs(
+    robot: Robot, drives: Sequence[PlannedRun], seed: int, sensors: SimulatedSensors | None = None
 ) -> list[Log]:
     """Logs of a plan, in memory, of a robot that knows the plan's floors, loads and sessions."""
-    return _Maker(robot, drives, sensors or Sensors(), np.random.default_rng(seed)).logs()
+    return _LogSimulator(
+        robot, drives, sensors or SimulatedSensors(), np.random.default_rng(seed)
+    ).logs()
 
 
 @dataclass(frozen=True, eq=False)
-class _Maker:
+class _LogSimulator:
     """Makes the logs of all drives at once; arrays are (run, row or step, ...)."""
 
     robot: Robot
     drives: Sequence[PlannedRun]
-    sensors: Sensors
+    sensors: SimulatedSensors
     random: np.random.Generator
 
     def logs(self) -> list[Log]:
@@ -248,7 +250,7 @@ class _Maker:
     ) -> Float[np.ndarray, "run row 3"]:
         """Body poses with process noise and run effects, centred on the origin of the camera."""
         s, shape, rng = self.sensors, self.robot.geometry, self.random
-        back = np.asarray(shape.least())
+        back = np.asarray(shape.pseudo_inverse())
         step = speed * dt[..., None] * float(shape.wheel_radius) @ back.T
         far = np.linalg.norm(step[..., :2], axis=-1)[..., None]
         u = np.where(far > 0, step[..., :2] / np.maximum(far, 1e-12), [1.0, 0.0])
@@ -299,7 +301,7 @@ class _Maker:
         s, motor, rng = self.sensors, self.robot.motor, self.random
         level = np.array([s.of(f"current.{d.surface}.run") for d in self.drives])[:, None, None]
         amps = amps + level * rng.normal(size=(len(amps), 1, amps.shape[2])) * (speed != 0)
-        true, w = _at_rows(amps), _at_rows(speed)
+        true, w = _row_means(amps), _row_means(speed)
         measured = true + s.ripple * rng.normal(size=true.shape)
         measured = measured if s.signed else np.abs(measured)
         current = np.round((measured + float(motor.current_offset)) / s.current_step)
@@ -335,7 +337,7 @@ def _as_logged(robot: Robot, pose: Array, yaw: Array) -> Array:
     return jax.vmap(lambda run, psi: jax.vmap(lambda p: one(p, psi))(run))(pose, yaw)
 
 
-def _at_rows(x: Float[np.ndarray, "run step wheel"]) -> Float[np.ndarray, "run row wheel"]:
+def _row_means(x: Float[np.ndarray, "run step wheel"]) -> Float[np.ndarray, "run row wheel"]:
     """What a sensor reads at the rows between steps: the mean of the two steps that meet there."""
     ends = np.concatenate([x[:, :1], x, x[:, -1:]], axis=1)
     return 0.5 * (ends[:, 1:] + ends[:, :-1])

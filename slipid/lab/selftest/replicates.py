@@ -29,8 +29,8 @@ from slipid.data.windows import Windows
 from slipid.fit import likelihood as lk
 from slipid.fit.noise import SHARED, axes, noise, travel
 from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, State
-from slipid.fit.shared import AXES, shared_of
+from slipid.fit.problem import FitState, Problem
+from slipid.fit.shared_effects import AXES, effects_by_floor
 from slipid.infer.result import draws
 from slipid.infer.slip_curves import curves, slip_on
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
@@ -44,7 +44,7 @@ from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
 
-def measure(
+def simulate_windows(
     truth: Robot, w: Windows, rng: np.random.Generator, std: Mapping[str, float]
 ) -> Windows:
     """The windows with poses, currents and voltages as a robot gives them, plus noise.
@@ -64,9 +64,9 @@ def measure(
     pose = np.array(_logged(truth, chain(jnp.asarray(start), jnp.asarray(steps))))
     pose[..., :2] += rng.normal(size=(*pose.shape[:2], 2)) * std.get("camera.place", 0.0)
     pose[..., 2] += rng.normal(size=pose.shape[:2]) * std.get("camera.heading", 0.0)
-    each = _of(std, w, "current", "window")[:, None, None]
+    each = _component_std(std, w, "current", "window")[:, None, None]
     of_run = rng.normal(size=(len(w), 1, amps.shape[2]))
-    same = _of(std, w, "current", "run")[:, None, None] * of_run
+    same = _component_std(std, w, "current", "run")[:, None, None] * of_run
     flowing = amps + same + each * rng.normal(size=amps.shape)
     speed = w.turn / w.dt[..., None]
     signed = flowing - float(truth.motor.current_offset)
@@ -85,7 +85,7 @@ def measure(
 @jax.jit
 def _predicted(robot: Robot, b: lk.Batch, pose: Array) -> tuple[Array, Array, Array]:
     p = lk.predict(robot, b)
-    return p.increment, lk.predicted_current(robot, b, p.felt), corrected(robot, pose)[:, 0]
+    return p.increment, lk.predicted_current(robot, b, p.motor_force), corrected(robot, pose)[:, 0]
 
 
 @jax.jit
@@ -93,7 +93,7 @@ def _logged(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, "p
     return jax.vmap(jax.vmap(robot.camera.logged))(pose)
 
 
-def _of(std: Mapping[str, float], w: Windows, kind: str, part: str) -> np.ndarray:
+def _component_std(std: Mapping[str, float], w: Windows, kind: str, part: str) -> np.ndarray:
     """Std of a component of every piece, by its floor (piece,)."""
     usual = std.get(f"{kind}.{part}", 0.0)
     return np.array([std.get(f"{kind}.{floor}.{part}", usual) for floor in w.surface])
@@ -106,8 +106,8 @@ def _process(
     far, u = travel(w, truth)
     total, shared = np.zeros((*far.shape, 3)), _shared(truth, w, rng, std)
     for k, (axis, name) in enumerate(zip(axes(u), AXES, strict=True)):
-        grown = _of(std, w, "process", name)[:, None] * np.sqrt(far)
-        own = _of(std, w, "run", name) * rng.normal(size=len(w)) + shared[:, k]
+        grown = _component_std(std, w, "process", name)[:, None] * np.sqrt(far)
+        own = _component_std(std, w, "run", name) * rng.normal(size=len(w)) + shared[:, k]
         step = grown * rng.normal(size=far.shape) + own[:, None] * far
         total += (axis @ step[..., None]).reshape(total.shape)
     return total
@@ -124,21 +124,21 @@ def _shared(
     ]
     log_v = jnp.asarray(2 * np.log(np.maximum(named, 1e-30)))
     out = np.zeros((len(w), len(AXES)))
-    for of in shared_of(w, truth, components)[0]:
+    for of in effects_by_floor(w, truth, components)[0]:
         root = np.asarray(of.root(log_v))
         drawn = np.einsum("anq,aq->na", root, rng.normal(size=root.shape[::2]))
-        out[np.asarray(of.pieces)] = drawn
+        out[np.asarray(of.segments)] = drawn
     return out
 
 
-KEPT = "replicates"
+FILE = "replicates"
 """File of the replicates that are done, which a later call goes on from."""
 SCATTER, MOST = 0.5, 0.5
 """True numbers scatter by this part of their prior's std, which counts up to `MOST` [search]."""
 
 
 @dataclass(frozen=True)
-class Number:
+class NumberRecovery:
     """One number of a replicate, or a short vector: truth against estimate, entry by entry.
 
     Attributes:
@@ -159,7 +159,7 @@ class Number:
 
 
 @dataclass(frozen=True)
-class Curve:
+class CurveRecovery:
     """Largest gap in slip to the true curve, and how much of that lies in the 90 % band."""
 
     gap: float
@@ -177,8 +177,8 @@ class Replicate:
         converged, reason: how the fit ended.
     """
 
-    parameters: dict[str, Number]
-    curves: dict[str, Curve]
+    parameters: dict[str, NumberRecovery]
+    curves: dict[str, CurveRecovery]
     predictions: dict[str, dict[str, float]]
     converged: bool
     reason: str
@@ -212,7 +212,7 @@ def plausible(
         except ValueError as error:
             raise DataError(f"{where}: {error}") from error
         for e in mine:
-            at = space.place[e.path]
+            at = space.slices[e.path]
             center[at], scatter[at] = start[at], 0.0
     return center, scatter
 
@@ -237,27 +237,27 @@ def replicates(
     center, scatter = plausible(config, choices, problem)
     std = dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True))
     fit = config.content.fit
-    found = _FILE.validate_python(kept.load_json(KEPT) or [])[:count]
+    found = _FILE.validate_python(kept.load_json(FILE) or [])[:count]
     if found:
-        report.line(f"{len(found)} of {count} replicates are in {kept.folder / KEPT}.json already")
+        report.line(f"{len(found)} of {count} replicates are in {kept.folder / FILE}.json already")
     report.stage("replicates")
 
-    def tell(state: State) -> None:
+    def tell(state: FitState) -> None:
         report.note(f"{state.stage}, round {state.round}")
 
     for k in range(len(found), count):
         rng = np.random.default_rng([seed, k])
         z = center + scatter * rng.standard_normal(len(center))
-        made = measure(problem.space.tree(jnp.asarray(z)), problem.windows, rng, std)
+        made = simulate_windows(problem.space.tree(jnp.asarray(z)), problem.windows, rng, std)
         this = problem.of(made)
         end = optimise(this, most_rounds=fit.rounds, tolerance=fit.tolerance, tell=tell)
-        found.append(compared(this, choices, z, end))
-        kept.save_json(KEPT, [asdict(one) for one in found])
+        found.append(recovery(this, choices, z, end))
+        kept.save_json(FILE, [asdict(one) for one in found])
         report.advance(len(found), count)
     return found
 
 
-def compared(
+def recovery(
     problem: Problem, choices: Sequence[Choice], true: Float[np.ndarray, " free"], end: Optimum
 ) -> Replicate:
     """The end of a fit beside its truth: every free number, every ratio, curves, predictions."""
@@ -269,7 +269,7 @@ def compared(
     flat = members(flat_directions(space, covariance, problem.windows.has_current, volt))
     judged = {e.path for e in space.free if e.session is None}
     numbers = {
-        e.path: _number(e, values[e.path], off[space.place[e.path]])
+        e.path: _number(e, values[e.path], off[space.slices[e.path]])
         for e in estimates(space, choices, z, covariance, volt, flat)
         if e.path in judged
     }
@@ -287,10 +287,10 @@ def compared(
     )
 
 
-def _number(e: Estimate, truth: np.ndarray, score: np.ndarray) -> Number:
+def _number(e: Estimate, truth: np.ndarray, score: np.ndarray) -> NumberRecovery:
     pairs = e.interval90 if e.labels else [e.interval90]
     values = e.value if e.labels else [e.value]
-    return Number(
+    return NumberRecovery(
         unit=e.unit,
         labels=list(e.labels),
         truth=truth.tolist(),
@@ -303,14 +303,14 @@ def _number(e: Estimate, truth: np.ndarray, score: np.ndarray) -> Number:
 
 def _curves(
     problem: Problem, truth: Robot, z: np.ndarray, covariance: np.ndarray
-) -> dict[str, Curve]:
+) -> dict[str, CurveRecovery]:
     """Largest gap in slip to the true curve of every floor, and how much lies in the band."""
     found = curves(problem.space, z, draws(z, covariance, 200, 0), problem.batch)
     out = {}
     for floor, curve in found.items():
         true = slip_on(truth, floor, curve)
         inside = (curve.slip_lo - 1e-9 <= true) & (true <= curve.slip_hi + 1e-9)
-        out[floor] = Curve(float(np.abs(true - curve.slip).max()), float(inside[1:].mean()))
+        out[floor] = CurveRecovery(float(np.abs(true - curve.slip).max()), float(inside[1:].mean()))
     return out
 
 
@@ -325,7 +325,7 @@ def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, 
         return np.asarray(chain(start, jnp.asarray(increment)))[:, -1, :2]
 
     true = ends(contact_increments(truth, lk.batch(w, truth)))
-    back = np.asarray(truth.geometry.least())
+    back = np.asarray(truth.geometry.pseudo_inverse())
     twist = (w.turn / w.dt[..., None]) @ (back * float(truth.geometry.wheel_radius)).T
     said = {
         "identified": ends(contact_increments(found, lk.batch(w, found))),

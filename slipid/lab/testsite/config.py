@@ -15,15 +15,15 @@ import numpy as np
 from slipid.data import floor_map as terrain
 from slipid.data.write import OPTIONAL, own_columns
 from slipid.lab.testsite import driving as ex
-from slipid.lab.testsite.ground import GROUNDS
-from slipid.lab.testsite.sections import Content, OnMap
+from slipid.lab.testsite.sections import MapRuns, SimulationContent
 from slipid.lab.testsite.site import Site
+from slipid.lab.testsite.surfaces import SURFACES
 from slipid.support.errors import DataError
 from slipid.support.toml_file import checked, mapping_of
 
 RESERVED = ("one_surface", "two_surfaces", "wheel_load")
 """Folders of the 2022 layout."""
-_IDENTIFY = """\
+_IDENTIFY_CONFIG = """\
 # Identifies the robot of these logs:
 #   slipid identify {name} --data logs --out result
 # They were made by slipid simulate; the truth lies in truth/, which nothing reads that fits.
@@ -51,7 +51,7 @@ current_is_signed = {signed}
 "motor.resistance" = {{ start = 11.0, prior = {{ mean = 8.0, std = 4.0 }} }}
 "motor.back_emf" = {{ start = 0.0257, prior = {{ mean = 0.04, std = 0.02 }} }}
 """
-_TRACKED = """
+_TRACKED_LAYOUT = """
 # what `slipid track` makes of the video of each run, such as:
 #   slipid track video/as_built/firm/run000.avi --camera video/camera.json \\
 #     --marker-size {size} --marker-height {height} --out logs/as_built/firm/run000.poses.csv
@@ -61,7 +61,7 @@ format = "tracked"
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class SimulationPlan:
     """What is to be simulated.
 
     Attributes:
@@ -72,14 +72,14 @@ class Plan:
     """
 
     hash: str
-    content: Content
+    content: SimulationContent
     site: Site
     maps: dict[str, terrain.FloorMap]
-    runs: tuple[tuple[str, ex.Run], ...]
+    runs: tuple[tuple[str, ex.SiteRun], ...]
     filmed: tuple[str, ...]
 
 
-def plan(path: Path, text: str) -> Plan:
+def plan(path: Path, text: str) -> SimulationPlan:
     """Plan of a config; the path is for messages, and maps lie beside it.
 
     Raises:
@@ -89,28 +89,28 @@ def plan(path: Path, text: str) -> Plan:
     surfaces = mapping.get("surfaces", {})
     if isinstance(surfaces, dict):  # a surface that slipid knows is changed, not made anew
         known = {
-            name: {**asdict(GROUNDS[name]), **given}
+            name: {**asdict(SURFACES[name]), **given}
             for name, given in surfaces.items()
-            if name in GROUNDS and isinstance(given, dict)
+            if name in SURFACES and isinstance(given, dict)
         }
         mapping = {**mapping, "surfaces": {**surfaces, **known}}
-    content = checked(path, mapping, Content)
+    content = checked(path, mapping, SimulationContent)
     robot = content.robot, content.motor, content.speed_loop, content.sensors
-    grounds = {**GROUNDS, **content.surfaces}
+    grounds = {**SURFACES, **content.surfaces}
     site = Site(*robot, grounds, content.command_delay_s, content.acceleration_m_s2)
-    maps, everything = {}, list[ex.Run]()
+    maps, everything = {}, list[ex.SiteRun]()
     for name, given in content.maps.items():
-        with _said_of(f"{path}: maps.{name}"):
+        with _naming(f"{path}: maps.{name}"):
             maps[name] = given.floor(path.parent)
     _check(path, content, site, maps)
     for k, runs in enumerate(content.runs, 1):
-        with _said_of(f"{path}: runs[{k}]"):
-            if isinstance(runs, OnMap):
+        with _naming(f"{path}: runs[{k}]"):
+            if isinstance(runs, MapRuns):
                 everything += runs.runs(maps[runs.map], 1000 * content.seed + k)
             else:
                 everything += runs.runs()
     jitter = float(np.radians(content.heading_jitter_deg))
-    named = tuple(ex.numbered(everything, jitter, content.seed))
+    named = tuple(ex.named_runs(everything, jitter, content.seed))
     for pattern in content.video:
         if not any(fnmatch(name, pattern) for name, _ in named):
             folders = ", ".join(dict.fromkeys(f"{name[:-3]}*" for name, _ in named))
@@ -118,10 +118,12 @@ def plan(path: Path, text: str) -> Plan:
                 f"{path}: video: no run is named '{pattern}'; expected some of {folders}"
             )
     filmed = tuple(n for n, _ in named if any(fnmatch(n, pattern) for pattern in content.video))
-    return Plan(_hash(content, site, maps), content, site, maps, named, filmed)
+    return SimulationPlan(_hash(content, site, maps), content, site, maps, named, filmed)
 
 
-def _check(path: Path, content: Content, site: Site, maps: Mapping[str, terrain.FloorMap]) -> None:
+def _check(
+    path: Path, content: SimulationContent, site: Site, maps: Mapping[str, terrain.FloorMap]
+) -> None:
     """DataError where parts of a config do not go together."""
     for load in site.machine.centres_m:
         if not re.fullmatch("[A-Za-z0-9_-]+", load) or load in RESERVED:
@@ -130,16 +132,16 @@ def _check(path: Path, content: Content, site: Site, maps: Mapping[str, terrain.
                 f"none of {', '.join(RESERVED)}"
             )
     for k, runs in enumerate(content.runs, 1):
-        _known(path, f"runs[{k}].load", runs.load, site.machine.centres_m)
-        if isinstance(runs, OnMap):
-            _known(path, f"runs[{k}].map", runs.map, maps)
+        _refuse_unknown(path, f"runs[{k}].load", runs.load, site.machine.centres_m)
+        if isinstance(runs, MapRuns):
+            _refuse_unknown(path, f"runs[{k}].map", runs.map, maps)
         else:
-            _known(path, f"runs[{k}].surface", runs.surface, site.grounds)
+            _refuse_unknown(path, f"runs[{k}].surface", runs.surface, site.grounds)
     for name, floor in maps.items():
         if name in site.grounds:
             raise DataError(f"{path}: maps.{name}: also the name of a surface; expected another")
         for surface in floor.surfaces:
-            _known(path, f"maps.{name}", surface, site.grounds)
+            _refuse_unknown(path, f"maps.{name}", surface, site.grounds)
         colours = [site.grounds[s].colour.lower() for s in floor.surfaces]
         if len(set(colours)) < len(colours):
             raise DataError(f"{path}: maps.{name}: two surfaces have one colour; expected others")
@@ -154,7 +156,7 @@ def _check(path: Path, content: Content, site: Site, maps: Mapping[str, terrain.
             )
 
 
-def _hash(content: Content, site: Site, maps: Mapping[str, terrain.FloorMap]) -> str:
+def _hash(content: SimulationContent, site: Site, maps: Mapping[str, terrain.FloorMap]) -> str:
     """Of all that decides what is driven and logged; videos may be asked for later."""
     said = content.model_dump(mode="json", exclude={"video", "camera"})
     floors = {
@@ -165,7 +167,7 @@ def _hash(content: Content, site: Site, maps: Mapping[str, terrain.FloorMap]) ->
     return sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
 
 
-def _known(path: Path, where: str, name: str, choices: Collection[str]) -> None:
+def _refuse_unknown(path: Path, where: str, name: str, choices: Collection[str]) -> None:
     if name not in choices:
         raise DataError(
             f"{path}: {where}: '{name}'; expected one of {', '.join(choices) or 'none'}"
@@ -173,7 +175,7 @@ def _known(path: Path, where: str, name: str, choices: Collection[str]) -> None:
 
 
 @contextmanager
-def _said_of(what: str) -> Iterator[None]:
+def _naming(what: str) -> Iterator[None]:
     """Says of which part of the config an error is that does not know."""
     try:
         yield
@@ -183,7 +185,7 @@ def _said_of(what: str) -> Iterator[None]:
         raise DataError(f"{what}: {error}") from error
 
 
-def identify_config(plan: Plan, by_video: bool = False) -> str:
+def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
     """Text of a config for `slipid identify` that fits the logs in slipid's own columns.
 
     With `by_video` the poses in the logs are passed over, for those that are tracked in videos.
@@ -195,17 +197,17 @@ def identify_config(plan: Plan, by_video: bool = False) -> str:
     beside, scale, lag = "", sensors.camera_scale, 0.05
     if by_video:
         columns = {name: c for name, c in columns.items() if not name.startswith("pose_")}
-        beside = _TRACKED.format(size=machine.marker_size_m, height=machine.marker_height_m)
+        beside = _TRACKED_LAYOUT.format(size=machine.marker_size_m, height=machine.marker_height_m)
         scale, lag = 1.0, 0.0
     one = {(run.load, run.surface) for _, run in plan.runs if run.surface is not None}
     where = [(load, surface, 'surface = "folder"') for load, surface in sorted(one)]
-    where += [(load, name, f'map = "maps/{name}.toml"') for load, name in _mapped(plan)]
+    where += [(load, name, f'map = "maps/{name}.toml"') for load, name in _map_sets(plan)]
     sets = "".join(
         f'\n[[logs]]\nglob = "{load}/{name}/run*[0-9].csv"\nformat = "testsite"\n'
         f'{floor}\nload = "{load}"\n'
         for load, name, floor in where
     )
-    return _IDENTIFY.format(
+    return _IDENTIFY_CONFIG.format(
         azimuths=list(machine.wheel_azimuths_deg),
         base=machine.base_radius_m,
         radius=machine.wheel_radius_m,
@@ -222,7 +224,7 @@ def identify_config(plan: Plan, by_video: bool = False) -> str:
     )
 
 
-def _mapped(plan: Plan) -> list[tuple[str, str]]:
+def _map_sets(plan: SimulationPlan) -> list[tuple[str, str]]:
     """Load and map of runs over several floors, where runs on one floor tell of each and the load.
 
     Whatever steered them, the camera logs their poses in the frame of the map.
@@ -237,9 +239,9 @@ def _mapped(plan: Plan) -> list[tuple[str, str]]:
     )
 
 
-def all_filmed(plan: Plan) -> bool:
+def all_filmed(plan: SimulationPlan) -> bool:
     """Whether every run that a config for `slipid identify` reads has a video."""
-    mapped = {f"{load}/{name}/" for load, name in _mapped(plan)}
+    mapped = {f"{load}/{name}/" for load, name in _map_sets(plan)}
     read = [
         n for n, r in plan.runs if r.surface is not None or n.rpartition("/")[0] + "/" in mapped
     ]
@@ -255,6 +257,6 @@ def _inline(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
-def can_identify(plan: Plan) -> bool:
+def can_identify(plan: SimulationPlan) -> bool:
     """Whether there are logs in slipid's own columns that a fit can use."""
     return "slipid" in plan.content.formats and any(r.surface is not None for _, r in plan.runs)

@@ -8,24 +8,24 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.floor_map import FloorMap, uniform
-from slipid.lab.testsite.plant import TIMESTEP, Plant, heading_of
+from slipid.lab.testsite.plant import TIMESTEP, SimulatedRobot, heading_of
 from slipid.lab.testsite.site import Site
 
 PERIOD = 0.05
 """Between two commands to the robot [s]."""
 REACHED_M = 0.02
 """Distance at which a way-point counts as reached [m]."""
-Twist = tuple[float, float, float]
+BodyTwist = tuple[float, float, float]
 """Ahead, left [m/s], turn [rad/s]."""
 
 
 @dataclass(frozen=True)
-class Timed:
+class TimedTwists:
     """Twists one after the other, each for so many seconds; none of the sensors is asked."""
 
-    legs: tuple[tuple[Twist, float], ...]
+    legs: tuple[tuple[BodyTwist, float], ...]
 
-    def command(self, time: float) -> Twist | None:
+    def command(self, time: float) -> BodyTwist | None:
         """Twist at a time, None when it is over."""
         for twist, seconds in self.legs:
             if time < seconds - 1e-9:
@@ -50,13 +50,13 @@ class Waypoints:
 
 
 @dataclass(frozen=True)
-class Run:
+class SiteRun:
     """One run.
 
     Attributes:
         surface: what its log says it drove on, None where that is for others to find out.
         load: name of the load set-up.
-        program: `Timed` or `Waypoints`.
+        program: `TimedTwists` or `Waypoints`.
         start: x, y [m], heading [rad].
         floor: which surface lies where, None for `surface` everywhere.
         place: name of the floor, in file names.
@@ -64,7 +64,7 @@ class Run:
 
     surface: str | None
     load: str
-    program: Timed | Waypoints
+    program: TimedTwists | Waypoints
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     floor: FloorMap | None = None
     place: str = ""
@@ -82,7 +82,7 @@ class Run:
 
 def straight(
     surface: str, load: str, heading: float, speed: float, distance: float, turn: float = 0.0
-) -> Run:
+) -> SiteRun:
     """A constant command that starts so that a robot without slip is in the middle halfway.
 
     Args:
@@ -95,10 +95,10 @@ def straight(
     twist = (speed * float(np.cos(heading)), speed * float(np.sin(heading)), turn)
     back = 0.0 if speed == 0 else 0.5 * distance
     start = (-back * float(np.cos(heading)), -back * float(np.sin(heading)), 0.0)
-    return Run(surface, load, Timed(((twist, seconds), ((0.0, 0.0, 0.0), 0.3))), start)
+    return SiteRun(surface, load, TimedTwists(((twist, seconds), ((0.0, 0.0, 0.0), 0.3))), start)
 
 
-def numbered(runs: Sequence[Run], jitter: float, seed: int) -> list[tuple[str, Run]]:
+def named_runs(runs: Sequence[SiteRun], jitter: float, seed: int) -> list[tuple[str, SiteRun]]:
     """Runs with names `<load>/<folder>/runNNN`, each put down by hand: its heading is not exact."""
     rng = np.random.default_rng(seed)
     counts: dict[str, int] = {}
@@ -140,10 +140,10 @@ class Trace:
     twist_command: Float[np.ndarray, "step 3"]
 
 
-class Rims:
+class RimSpeeds:
     """Wheel speeds that follow commands with the site's delay and acceleration."""
 
-    def __init__(self, site: Site, plant: Plant):
+    def __init__(self, site: Site, plant: SimulatedRobot):
         self.plant, self.delay = plant, site.command_delay_s
         self.slew = site.acceleration * plant.dt / site.machine.wheel_radius_m
         self.speed = self._wanted = np.zeros(len(plant.wheel_dof))
@@ -161,14 +161,14 @@ class Rims:
         return self.speed
 
 
-def drive(run: Run, site: Site, seed: int, timestep: float = TIMESTEP) -> Trace:
-    """Drive one run; arguments as of `Plant`.
+def drive(run: SiteRun, site: Site, seed: int, timestep: float = TIMESTEP) -> Trace:
+    """Drive one run; arguments as of `SimulatedRobot`.
 
     Raises:
         DataError: MuJoCo is missing, or the simulation became unstable.
     """
-    plant = Plant(site, run.map, run.load, run.start, seed, timestep)
-    recorder, rims = _Recorder(plant), Rims(site, plant)
+    plant = SimulatedRobot(site, run.map, run.load, run.start, seed, timestep)
+    recorder, rims = _Recorder(plant), RimSpeeds(site, plant)
     back = np.linalg.pinv(site.machine.wheel_from_twist)
     believed, sent, goal = np.zeros(3), np.zeros(3), 0
     before = plant.wheel_angle
@@ -196,7 +196,7 @@ def drive(run: Run, site: Site, seed: int, timestep: float = TIMESTEP) -> Trace:
 
 def _towards(
     program: Waypoints, goal: int, pose: Float[np.ndarray, "3"], time: float
-) -> tuple[int, Twist | None]:
+) -> tuple[int, BodyTwist | None]:
     """The next way-point, and the twist towards it in the body frame.
 
     It is given up after thrice the time without slip and 10 s.
@@ -227,7 +227,7 @@ def _moved(pose: Float[np.ndarray, "3"], step: Float[np.ndarray, "3"]) -> Float[
 class _Recorder:
     """Rows of a trace while they come: the engine's state as it is, made sense of at the end."""
 
-    def __init__(self, plant: Plant):
+    def __init__(self, plant: SimulatedRobot):
         self.plant = plant
         self._rows: list[tuple[float | list[float] | np.ndarray, ...]] = []
 

@@ -6,16 +6,16 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.floor_map import FloorMap
-from slipid.lab.testsite.ground import Pose, Terrain, ribs
-from slipid.lab.testsite.motors import Drive, Motor, mjcf
+from slipid.lab.testsite.robot_build import MotorBuild, WheelDrives, mjcf
 from slipid.lab.testsite.site import Site
+from slipid.lab.testsite.surfaces import Pose, Terrain, ribs
 from slipid.support.errors import DataError
 
 TIMESTEP = 1e-3
 """Time step of the engine and of the speed loop [s]."""
 SETTLING = 0.4
 """Time for which a robot stands still before anything is recorded [s]."""
-LOOK = 5
+LOOKUP_STEPS = 5
 """Time steps between two looks at what is beneath the rollers."""
 CREEP = 0.02
 """Speed at which an added force has reached 0.7 of its size [m/s]."""
@@ -38,7 +38,7 @@ def heading_of(quaternion: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "
     return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
-class Plant:
+class SimulatedRobot:
     """A robot standing on a floor.
 
     Args:
@@ -69,7 +69,7 @@ class Plant:
         rng = np.random.default_rng(seed)
         self._find(site.motor)
         self._lay(Terrain(floor, site.grounds, start, rng))
-        self.drive = Drive(
+        self.drive = WheelDrives(
             site.motor, site.loop, self.machine.gear_ratio, len(self.wheel_dof), timestep
         )
         self._place(start, rng)
@@ -98,7 +98,7 @@ class Plant:
     def step(self, wanted: list[float]) -> None:
         """One time step with these wheel speeds wanted [rad/s]."""
         d = self.data
-        if self._count % LOOK == 0:
+        if self._count % LOOKUP_STEPS == 0:
             self._look()
             if self._resists:
                 self._resist()
@@ -119,7 +119,7 @@ class Plant:
                 "expected smaller forces, gains or stiffness"
             )
 
-    def _find(self, motor: Motor) -> None:
+    def _find(self, motor: MotorBuild) -> None:
         """Addresses of wheels and rollers in the engine's arrays."""
         m, count = self.model, len(self.machine.wheel_azimuths_deg)
         joints = [m.joint(f"wheel{k}") for k in range(count)]

@@ -8,10 +8,10 @@ from pydantic import Field
 
 from slipid.data import floor_map as terrain
 from slipid.data.floor_map import read_map
-from slipid.lab.testsite.driving import Run, Waypoints, straight
-from slipid.lab.testsite.ground import Ground
-from slipid.lab.testsite.motors import Machine, Motor, SpeedLoop
-from slipid.lab.testsite.site import Camera, Sensors
+from slipid.lab.testsite.driving import SiteRun, Waypoints, straight
+from slipid.lab.testsite.robot_build import MotorBuild, RobotBuild, SpeedLoop
+from slipid.lab.testsite.site import SiteCamera, SiteSensors
+from slipid.lab.testsite.surfaces import SurfacePhysics
 from slipid.support.toml_file import Section
 
 Speed = Annotated[float, Field(gt=0, le=3)]
@@ -57,17 +57,17 @@ class FourZones(Section):
 Map = Annotated[FileMap | Patchwork | FourZones, Field(discriminator="kind")]
 
 
-class OnOneSurface(Section):
+class SurfaceRuns(Section):
     """Runs that begin anywhere on a floor of one surface."""
 
     surface: str
     load: str = "as_built"
 
-    def straight(self, heading: float, speed: float, distance: float, turn: float = 0.0) -> Run:
+    def straight(self, heading: float, speed: float, distance: float, turn: float = 0.0) -> SiteRun:
         return straight(self.surface, self.load, heading, speed, distance, turn)
 
 
-class Headings(OnOneSurface):
+class HeadingRuns(SurfaceRuns):
     """Straight runs in evenly spread directions."""
 
     kind: Literal["headings"] = "headings"
@@ -76,12 +76,12 @@ class Headings(OnOneSurface):
     speeds_m_s: Speeds = Field(default=[0.1, 0.2])
     distance_m: Distance = 0.7
 
-    def runs(self) -> list[Run]:
+    def runs(self) -> list[SiteRun]:
         ways = np.radians(self.first_deg + np.arange(0.0, 360.0, self.step_deg)).tolist()
         return [self.straight(a, v, self.distance_m) for v in self.speeds_m_s for a in ways]
 
 
-class Curves(OnOneSurface):
+class CurveRuns(SurfaceRuns):
     """Arcs, to the left and to the right in turn."""
 
     kind: Literal["curves"] = "curves"
@@ -89,7 +89,7 @@ class Curves(OnOneSurface):
     speeds_m_s: Speeds = Field(default=[0.1, 0.2])
     distance_m: Distance = 0.7
 
-    def runs(self) -> list[Run]:
+    def runs(self) -> list[SiteRun]:
         ways = (2 * np.pi * (np.arange(self.count) + 0.5) / self.count).tolist()
         return [
             self.straight(a, v, self.distance_m, (-1) ** k * 4.0 * v)
@@ -98,13 +98,13 @@ class Curves(OnOneSurface):
         ]
 
 
-class PaperGrid(OnOneSurface):
+class PaperGridRuns(SurfaceRuns):
     """The 2021 paper's grid: x, y, both, and turns on the spot, forwards and backwards."""
 
     kind: Literal["paper_grid"] = "paper_grid"
     seconds: float = Field(3.0, gt=0, le=3600)
 
-    def runs(self) -> list[Run]:
+    def runs(self) -> list[SiteRun]:
         out = []
         for ahead, left in ((1, 0), (0, 1), (1, 1), (1, -1)):
             for size in (0.1, 0.2, 0.3, 0.4)[: 4 if not (ahead and left) else 3]:
@@ -119,14 +119,14 @@ class PaperGrid(OnOneSurface):
         return out
 
 
-class OnMap(Section):
+class MapRuns(Section):
     """Runs on a map of the config."""
 
     map: str
     load: str = "as_built"
 
 
-class Wander(OnMap):
+class WanderRuns(MapRuns):
     """Random way-points on a map."""
 
     kind: Literal["wander"] = "wander"
@@ -134,7 +134,7 @@ class Wander(OnMap):
     points: int = Field(4, ge=1, le=1000)
     by: Literal["camera", "encoders"] = "camera"
 
-    def runs(self, floor: terrain.FloorMap, seed: int) -> list[Run]:
+    def runs(self, floor: terrain.FloorMap, seed: int) -> list[SiteRun]:
         rng = np.random.default_rng(seed)
         x0, y0, x1, y1 = floor.extent
         low, high = np.array([x0, y0]) + 0.3, np.array([x1, y1]) - 0.3
@@ -147,11 +147,11 @@ class Wander(OnMap):
             start = (x, y, float(rng.uniform(-np.pi, np.pi)))
             speed = float(rng.choice([0.1, 0.2, 0.3]))
             program = Waypoints(tuple((x, y) for x, y in goals), speed, self.by)
-            out.append(Run(None, self.load, program, start, floor, self.map))
+            out.append(SiteRun(None, self.load, program, start, floor, self.map))
         return out
 
 
-class Rectangle(OnMap):
+class RectangleRuns(MapRuns):
     """The 2021 paper's 900 x 400 mm rectangle on a map: ahead, right, back, left, without turning.
 
     With `encoders` the corners are those of the robot's own frame at the start.
@@ -162,7 +162,7 @@ class Rectangle(OnMap):
     repeats: int = Field(1, ge=1, le=10_000)
     speed_m_s: Speed = 0.2
 
-    def runs(self, floor: terrain.FloorMap, seed: int) -> list[Run]:
+    def runs(self, floor: terrain.FloorMap, seed: int) -> list[SiteRun]:
         x0, y0, x1, y1 = floor.extent
         if not (x0 <= 0 <= x1 and y0 <= 0 <= y1):
             raise ValueError(
@@ -171,13 +171,16 @@ class Rectangle(OnMap):
             )
         corners = ((0.9, 0.0), (0.9, -0.4), (0.0, -0.4), (0.0, 0.0))
         program = Waypoints(corners, self.speed_m_s, self.by)
-        return [Run(None, self.load, program, floor=floor, place=self.map)] * self.repeats
+        return [SiteRun(None, self.load, program, floor=floor, place=self.map)] * self.repeats
 
 
-Runs = Annotated[Headings | Curves | PaperGrid | Wander | Rectangle, Field(discriminator="kind")]
+Runs = Annotated[
+    HeadingRuns | CurveRuns | PaperGridRuns | WanderRuns | RectangleRuns,
+    Field(discriminator="kind"),
+]
 
 
-class Content(Section):
+class SimulationContent(Section):
     """The whole file."""
 
     seed: int = Field(0, ge=0)
@@ -185,12 +188,12 @@ class Content(Section):
     heading_jitter_deg: float = Field(5.0, ge=0, le=180)
     command_delay_s: float = Field(0.12, ge=0, le=10)
     acceleration_m_s2: float = Field(1.0, ge=0.01, le=1000)
-    robot: Machine = Field(default_factory=Machine)
-    motor: Motor = Motor()
+    robot: RobotBuild = Field(default_factory=RobotBuild)
+    motor: MotorBuild = MotorBuild()
     speed_loop: SpeedLoop = SpeedLoop()
-    sensors: Sensors = Sensors()
+    sensors: SiteSensors = SiteSensors()
     video: list[str] = Field(default_factory=list)
-    camera: Camera = Camera()
-    surfaces: dict[Name, Ground] = Field(default_factory=dict)
+    camera: SiteCamera = SiteCamera()
+    surfaces: dict[Name, SurfacePhysics] = Field(default_factory=dict)
     maps: dict[Name, Map] = Field(default_factory=dict)
     runs: list[Runs] = Field(min_length=1)

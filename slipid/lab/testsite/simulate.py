@@ -18,18 +18,19 @@ from slipid.data.floor_map import write_map
 from slipid.data.log import Log
 from slipid.data.wheel_signals import interpolate
 from slipid.data.write import own_csv, robotino2022_csv
-from slipid.lab.testsite.config import Plan, all_filmed, can_identify, identify_config
-from slipid.lab.testsite.driving import Run, Trace, drive
+from slipid.lab.testsite.config import SimulationPlan, all_filmed, can_identify, identify_config
+from slipid.lab.testsite.driving import SiteRun, Trace, drive
 from slipid.lab.testsite.plant import engine
-from slipid.lab.testsite.site import Camera, Site
+from slipid.lab.testsite.site import Site, SiteCamera
 from slipid.lab.testsite.studio import Studio, film
+from slipid.support.content import Content
 from slipid.support.errors import DataError
-from slipid.support.executor import Here, Processes, results
-from slipid.support.files import Content, read_json, write_arrays, write_bytes, write_json
+from slipid.support.executor import InProcess, Processes, results
+from slipid.support.files import read_json, write_arrays, write_bytes, write_json
 from slipid.support.progress import Reporter
 
 
-def observe(trace: Trace, site: Site, run: Run, name: str, seed: int) -> Log:
+def log_of(trace: Trace, site: Site, run: SiteRun, name: str, seed: int) -> Log:
     """The log of a run, by its name and the seed of its noise."""
     s, rng = site.sensors, np.random.default_rng([seed, 1])
     count = int(trace.time[-1] / s.row_s) + 1
@@ -110,18 +111,18 @@ TRUTH_STEP = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+class SiteTask:
     """One run to be driven by a process of its own."""
 
     name: str
-    run: Run
+    run: SiteRun
     site: Site
     seed: int
     formats: tuple[str, ...]
     out: Path
 
 
-def simulate(plan: Plan, out: Path, executor: Executor, report: Reporter) -> Content:
+def simulate(plan: SimulationPlan, out: Path, executor: Executor, report: Reporter) -> Content:
     """Drive every run of a plan that is not there yet; what simulate.json holds.
 
     A run's truth is written last: a run that has one is done. Called again after an interrupt it
@@ -142,42 +143,44 @@ def simulate(plan: Plan, out: Path, executor: Executor, report: Reporter) -> Con
                     f"{out}: holds runs of another {what}; expected an empty folder or the same"
                 )
     write_json(manifest, about)
-    _describe(plan, out)
+    _write_truth(plan, out)
     formats = tuple(plan.content.formats)
     every = [
-        Job(name, run, plan.site, _seed(plan.content.seed, k), formats, out)
+        SiteTask(name, run, plan.site, _seed(plan.content.seed, k), formats, out)
         for k, (name, run) in enumerate(plan.runs)
     ]
-    todo = {job.name: job for job in every if not _truth(job).is_file()}
+    todo = {task.name: task for task in every if not _truth_path(task).is_file()}
     report.stage(f"driving {len(todo)} of {len(every)} runs")
     began = time.monotonic()
     seconds = sum(results(executor, drive_and_write, todo, report), 0.0)
     pace = seconds / max(time.monotonic() - began, 1e-9)
-    filmed = [job for job in every if job.name in plan.filmed]
+    filmed = [task for task in every if task.name in plan.filmed]
     _film(filmed, plan.content.camera, executor, report)
     content = {**about, "runs": [name for name, _ in plan.runs]}
     write_json(manifest, content)
     return {**content, "driven": len(todo), "seconds": seconds, "pace": pace if todo else None}
 
 
-def _film(jobs: Sequence[Job], camera: Camera, executor: Executor, report: Reporter) -> None:
+def _film(
+    tasks: Sequence[SiteTask], camera: SiteCamera, executor: Executor, report: Reporter
+) -> None:
     """Videos of the runs that have none yet, with the camera's numbers beside them."""
-    todo = {job.name: (job, camera) for job in jobs if not _video(job).is_file()}
+    todo = {task.name: (task, camera) for task in tasks if not _video_path(task).is_file()}
     if not todo:
         return
-    write_json(jobs[0].out / "video" / "camera.json", camera.as_dict())
-    report.stage(f"filming {len(todo)} of {len(jobs)} runs")
+    write_json(tasks[0].out / "video" / "camera.json", camera.as_dict())
+    report.stage(f"filming {len(todo)} of {len(tasks)} runs")
     # not in this process, even alone: what draws has to be chosen before MuJoCo is there
-    with Processes(1) if isinstance(executor, Here) else nullcontext(executor) as apart:
+    with Processes(1) if isinstance(executor, InProcess) else nullcontext(executor) as apart:
         results(apart, film_and_write, todo, report)
 
 
-def film_and_write(what: tuple[Job, Camera]) -> None:
+def film_and_write(what: tuple[SiteTask, SiteCamera]) -> None:
     """Film one run that was driven. The video is written last."""
-    job, camera = what
-    with np.load(_truth(job)) as true:
-        studio = Studio(job.site, job.run.load, job.run.map, camera, job.seed)
-        path = _video(job)
+    task, camera = what
+    with np.load(_truth_path(task)) as true:
+        studio = Studio(task.site, task.run.load, task.run.map, camera, task.seed)
+        path = _video_path(task)
         frames = np.arange(true["time"][0] - camera.early_s, true["time"][-1], camera.frame_s)
         rows = "".join(f"{k},{t:.4f}\n" for k, t in enumerate(frames))
         write_bytes(path.with_suffix(".csv"), f"frame,time\n{rows}".encode())
@@ -185,28 +188,28 @@ def film_and_write(what: tuple[Job, Camera]) -> None:
             film(studio, dict(true), frames, path)
 
 
-def _video(job: Job) -> Path:
-    return job.out / "video" / f"{job.name}.avi"
+def _video_path(task: SiteTask) -> Path:
+    return task.out / "video" / f"{task.name}.avi"
 
 
-def _truth(job: Job) -> Path:
-    return job.out / "truth" / f"{job.name}.npz"
+def _truth_path(task: SiteTask) -> Path:
+    return task.out / "truth" / f"{task.name}.npz"
 
 
-def drive_and_write(job: Job) -> float:
+def drive_and_write(task: SiteTask) -> float:
     """Drive one run and write its log and its truth; the seconds it drove."""
     try:
-        trace = drive(job.run, job.site, job.seed)
+        trace = drive(task.run, task.site, task.seed)
     except ValueError as error:  # also the engine's, of a robot that it cannot build
-        raise DataError(f"{job.name}: {error}") from error
-    site = job.site
+        raise DataError(f"{task.name}: {error}") from error
+    site = task.site
     gear, ticks = site.machine.gear_ratio, site.motor.ticks_per_revolution
-    log = observe(trace, site, job.run, job.name, job.seed)
-    for form in job.formats:
+    log = log_of(trace, site, task.run, task.name, task.seed)
+    for form in task.formats:
         write = own_csv if form == "slipid" else robotino2022_csv
-        path = job.out / FOLDERS[form] / _place(form, job)
+        path = task.out / FOLDERS[form] / _log_path(form, task)
         write_bytes(path, write(log, gear, ticks).encode())
-    write_arrays(_truth(job), _true(trace, job.run, site))
+    write_arrays(_truth_path(task), _truth_arrays(trace, task.run, site))
     return float(trace.time[-1])
 
 
@@ -215,18 +218,18 @@ def _seed(seed: int, k: int) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=(k,)).generate_state(1)[0])
 
 
-def _place(form: str, job: Job) -> str:
+def _log_path(form: str, task: SiteTask) -> str:
     """Where the log of a format lies."""
     if form == "slipid":
-        return f"{job.name}.csv"
-    load, folder, number = job.name.split("/")
+        return f"{task.name}.csv"
+    load, folder, number = task.name.split("/")
     kind = {"as_built": "one_surface", "moved": "wheel_load"}.get(load, load)
-    if job.run.surface is None:
+    if task.run.surface is None:
         kind = "two_surfaces" if load == "as_built" else f"two_surfaces/{load}"
     return f"{kind}/{folder}/exp{number.removeprefix('run')}.csv"
 
 
-def _true(trace: Trace, run: Run, site: Site) -> dict[str, np.ndarray]:
+def _truth_arrays(trace: Trace, run: SiteRun, site: Site) -> dict[str, np.ndarray]:
     """What truly happened: poses, wheels, currents, and the surface under every wheel."""
     t = replace(trace, **{k: getattr(trace, k)[::TRUTH_STEP] for k in vars(trace)})
     c, s = np.cos(t.pose[:, 2]), np.sin(t.pose[:, 2])
@@ -238,7 +241,7 @@ def _true(trace: Trace, run: Run, site: Site) -> dict[str, np.ndarray]:
     return {**{k: getattr(t, k) for k in keep}, "surface": names.astype("S")}
 
 
-def _describe(plan: Plan, out: Path) -> None:
+def _write_truth(plan: SimulationPlan, out: Path) -> None:
     """Maps, the truth about the robot, and a config that identifies it."""
     site = plan.site
     for name, floor in plan.maps.items():

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from pydantic import Field, FiniteFloat
 from pydantic.dataclasses import dataclass
 
-from slipid.lab.testsite.ground import GROUNDS, Ground
-from slipid.lab.testsite.motors import Machine, Motor, SpeedLoop
+from slipid.lab.testsite.robot_build import MotorBuild, RobotBuild, SpeedLoop
+from slipid.lab.testsite.surfaces import SURFACES, SurfacePhysics
 from slipid.support.toml_file import CLOSED, NotNegative, Part, Positive
 
 Interval = Annotated[float, Field(ge=1e-3, le=1)]
@@ -20,7 +20,7 @@ Tilt = Annotated[float, Field(ge=-10, le=10)]
 
 
 @dataclass(frozen=True, config=CLOSED)
-class Sensors:
+class SiteSensors:
     """How logs err.
 
     Attributes:
@@ -95,11 +95,11 @@ class Site:
         acceleration: of the wheels' rims towards a new command [m/s^2].
     """
 
-    machine: Machine = field(default_factory=Machine)
-    motor: Motor = field(default_factory=Motor)
+    machine: RobotBuild = field(default_factory=RobotBuild)
+    motor: MotorBuild = field(default_factory=MotorBuild)
     loop: SpeedLoop = field(default_factory=SpeedLoop)
-    sensors: Sensors = field(default_factory=Sensors)
-    grounds: Mapping[str, Ground] = field(default_factory=lambda: dict(GROUNDS))
+    sensors: SiteSensors = field(default_factory=SiteSensors)
+    grounds: Mapping[str, SurfacePhysics] = field(default_factory=lambda: dict(SURFACES))
     command_delay_s: float = 0.12
     acceleration: float = 1.0
 
@@ -110,7 +110,7 @@ class Site:
 
 
 @dataclass(frozen=True, config=CLOSED)
-class Camera:
+class SiteCamera:
     """A camera that looks down on the floor, its image turned by half a turn from the world's axes.
 
     Attributes:

@@ -15,14 +15,14 @@ from jaxtyping import Float
 
 from slipid.data.floor_map import FloorMap
 from slipid.data.wheel_signals import interpolate
-from slipid.lab.testsite.motors import mjcf
-from slipid.lab.testsite.site import Camera, Site
+from slipid.lab.testsite.robot_build import mjcf
+from slipid.lab.testsite.site import Site, SiteCamera
 from slipid.support.errors import DataError
 
 MARKER = 0
 """Number of the marker in ArUco's dictionary 4X4_50, as on the Robotino of the published frames."""
 
-WIDE = 1.12
+DRAWN_SHARE = 1.12
 """How much more is drawn than seen: the lens bends some of the outside into view."""
 
 _SHIFT = 97
@@ -36,15 +36,15 @@ class Studio:
         DataError: OpenGL or OpenCV is not there.
     """
 
-    def __init__(self, site: Site, load: str, floor: FloorMap, camera: Camera, seed: int = 0):
-        mujoco, cv2 = _drawing()
+    def __init__(self, site: Site, load: str, floor: FloorMap, camera: SiteCamera, seed: int = 0):
+        mujoco, cv2 = _drawing_modules()
         self.camera, self._rng, self._cv2 = camera, np.random.default_rng(seed), cv2
         (x, y), half = camera.centre_m, 0.65 * camera.height_m / camera.focal_px
         wide, high = half * camera.width_px, half * camera.height_px
         x0, y0, x1, y1 = x - wide, y - high, x + wide, y + high  # what is seen, with a margin
         carpet = _carpet(floor, site, (x0, y0, x1, y1), self._rng)
         assets = {"floor.png": _png(cv2, carpet), "marker.png": _png(cv2, _marker(cv2))}
-        fovy = np.degrees(2 * np.arctan(0.5 * WIDE * camera.height_px / camera.focal_px))
+        fovy = np.degrees(2 * np.arctan(0.5 * DRAWN_SHARE * camera.height_px / camera.focal_px))
         # MuJoCo's cameras look along -z with y up
         axes = camera.rotation.T @ np.diag([1.0, -1.0, -1.0])
         frame = " ".join(str(float(v)) for v in (*axes[:, 0], *axes[:, 1]))
@@ -77,7 +77,7 @@ class Studio:
         try:
             self._renderer = mujoco.Renderer(self.model, height, width)
         except Exception as error:
-            raise _no_drawing(error) from error
+            raise _drawing_error(error) from error
         self._bent = self._lens()
         self._light = self._rng.uniform(0, 2 * np.pi, 2)
         size = (camera.height_px + _SHIFT, camera.width_px + _SHIFT, 3)
@@ -86,7 +86,7 @@ class Studio:
     @property
     def _size(self) -> tuple[int, int]:
         """Width and height of what is drawn before the lens bends it [pixel]."""
-        return round(WIDE * self.camera.width_px), round(WIDE * self.camera.height_px)
+        return round(DRAWN_SHARE * self.camera.width_px), round(DRAWN_SHARE * self.camera.height_px)
 
     def close(self) -> None:
         """Give the drawing context back."""
@@ -132,7 +132,7 @@ class Studio:
         points = grid.reshape(-1, 1, 2).astype(np.float64)
         ideal = cv2.undistortPoints(points, c.matrix, np.array(c.distortion))[:, 0]
         width, height = self._size
-        focal = c.focal_px * height / (WIDE * c.height_px)  # of the drawing
+        focal = c.focal_px * height / (DRAWN_SHARE * c.height_px)  # of the drawing
         x = (focal * ideal[:, 0] + 0.5 * (width - 1)).reshape(c.height_px, c.width_px)
         y = (focal * ideal[:, 1] + 0.5 * (height - 1)).reshape(c.height_px, c.width_px)
         return x.astype(np.float32), y.astype(np.float32)
@@ -176,7 +176,7 @@ def film(
         unfinished.unlink(missing_ok=True)
 
 
-def _drawing() -> tuple[ModuleType, ModuleType]:
+def _drawing_modules() -> tuple[ModuleType, ModuleType]:
     """The modules mujoco, ready to draw without a screen, and cv2."""
     if os.name == "posix" and "DISPLAY" not in os.environ:
         os.environ.setdefault("MUJOCO_GL", "egl")
@@ -185,16 +185,16 @@ def _drawing() -> tuple[ModuleType, ModuleType]:
         import mujoco
     except ImportError as error:
         if "EGL" in str(error) or "OpenGL" in str(error):
-            raise _no_drawing(error) from error
+            raise _drawing_error(error) from error
         raise DataError(
             f"the test site's camera needs {error.name}; expected: pip install 'slipid[testsite]'"
         ) from error
     except AttributeError as error:  # PyOpenGL where libEGL is absent
-        raise _no_drawing(error) from error
+        raise _drawing_error(error) from error
     return mujoco, cv2
 
 
-def _no_drawing(error: Exception) -> DataError:
+def _drawing_error(error: Exception) -> DataError:
     return DataError(
         f"nothing can be drawn here ({error}); expected OpenGL without a screen: MUJOCO_GL=egl "
         "and, on Debian and Ubuntu, apt-get install libegl1 libgl1-mesa-dri"

@@ -8,17 +8,17 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.deploy.controllers import OWN_ROWS, PAPER_WHEELS, ControllerRow
-from slipid.lab.trial.goswami_padhy import GoswamiPadhy, Rehearsal, by_gradient, by_swarm
+from slipid.deploy.controllers import CONTROLLERS, PAPER_WHEELS, ControllerRow
+from slipid.lab.trial.goswami_padhy import GoswamiPadhy, TuningTask, by_gradient, by_swarm
 from slipid.lab.trial.indiveri import Indiveri, inverse_kinematics
-from slipid.robot.actuation import Habits
 from slipid.robot.closed_loop import PERIOD
 from slipid.robot.controller import Gains, Law, Limits
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.trajectory import STEP, rectangle
+from slipid.robot.twin import ActuatorModel
 from slipid.support.errors import DataError
 
-BESIDE = ((0.05, 0.0, 0.2), (0.0, 0.05, -0.2), (-0.05, 0.0, 0.2), (0.0, -0.05, -0.2))
+TUNING_STARTS = ((0.05, 0.0, 0.2), (0.0, 0.05, -0.2), (-0.05, 0.0, 0.2), (0.0, -0.05, -0.2))
 """From where gains of published laws are rehearsed: beside the path's start [m, m, rad]."""
 
 
@@ -36,29 +36,31 @@ def _indiveri(robot: DeployedRobot) -> Law:
 
 
 def _goswami_padhy(robot: DeployedRobot) -> Law:
-    return GoswamiPadhy(jnp.asarray(_rehearsed("swarm")))
+    return GoswamiPadhy(jnp.asarray(_tuned_gains("swarm")))
 
 
 def _goswami_padhy_gradient(robot: DeployedRobot) -> Law:
-    return GoswamiPadhy(jnp.asarray(_rehearsed("gradient")))
+    return GoswamiPadhy(jnp.asarray(_tuned_gains("gradient")))
 
 
 @cache
-def _rehearsed(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
+def _tuned_gains(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
     """Gains [1/s] on the first two sides of the rectangle; the others mirror them.
 
     The ideal robot is late as every robot's twin is, so that gains are the same for all of them.
     """
-    path, habits = rectangle(), Habits()
+    path, habits = rectangle(), ActuatorModel()
     times, rows = np.arange(0.0, float(path.marks[1]), PERIOD), np.asarray(path.rows)
     own = STEP * np.arange(len(rows))
     reference = np.stack([np.interp(times, own, column) for column in rows.T], axis=1)
-    task = Rehearsal(reference, np.array(BESIDE), habits.held(), habits.follow, PERIOD)
+    task = TuningTask(
+        reference, np.array(TUNING_STARTS), habits.command_shares(), habits.lag_gain, PERIOD
+    )
     return tuple((by_swarm(task) if by == "swarm" else by_gradient(task)).tolist())
 
 
 ROWS: Mapping[str, ControllerRow] = {
-    **OWN_ROWS,
+    **CONTROLLERS,
     "goswami_padhy": ControllerRow(
         "encoder", "law of Goswami and Padhy, gains by a swarm", law=_goswami_padhy
     ),
@@ -72,7 +74,7 @@ ROWS: Mapping[str, ControllerRow] = {
 """The rows of slipid and of the 2021 paper, then the published laws."""
 
 
-def applying(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
+def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
     """The controllers among these that apply to a robot.
 
     Raises:

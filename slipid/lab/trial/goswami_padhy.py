@@ -81,7 +81,7 @@ class Swarm:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SwarmResult:
     """The best place of a swarm, and the least cost after its start and every iteration."""
 
     place: Float[np.ndarray, " n"]
@@ -99,7 +99,7 @@ def minimise(
     high: Float[np.ndarray, " n"],
     swarm: Swarm,
     seed: int = 0,
-) -> Found:
+) -> SwarmResult:
     """The least cost in a box that a swarm finds; the same seed finds the same.
 
     Args:
@@ -124,7 +124,7 @@ def minimise(
         better = now < value
         own, value = np.where(better[:, None], x, own), np.where(better, now, value)
         history.append(float(value.min()))
-    return Found(own[np.argmin(value)], np.array(history))
+    return SwarmResult(own[np.argmin(value)], np.array(history))
 
 
 def _finite(cost: Float[np.ndarray, " particle"]) -> Float[np.ndarray, " particle"]:
@@ -135,11 +135,11 @@ Numbers = Array | np.ndarray
 """The law is the same in jax, which drives, and in numpy, where many gains are tried at once."""
 LOW, HIGH = np.zeros(3), np.full(3, 5.0)
 """Of the gains [1/s]."""
-STEP = 1e-4
+GAIN_STEP = 1e-4
 """Of a gain, for central differences [1/s]."""
 
 
-class Plane(NamedTuple):
+class PlaneVector(NamedTuple):
     """Three numbers of the plane, each of any batch: a pose, an error, rates, a twist, or gains."""
 
     x: Numbers
@@ -147,25 +147,25 @@ class Plane(NamedTuple):
     yaw: Numbers
 
 
-def in_body(v: Plane, heading: Numbers) -> Plane:
+def in_body(v: PlaneVector, heading: Numbers) -> PlaneVector:
     """What lies along the axes of the world, as a body at a heading [rad] sees it."""
     of = heading.__array_namespace__()
     c, s = of.cos(heading), of.sin(heading)
-    return Plane(c * v.x + s * v.y, c * v.y - s * v.x, v.yaw)
+    return PlaneVector(c * v.x + s * v.y, c * v.y - s * v.x, v.yaw)
 
 
-def errors(wanted: Plane, pose: Plane) -> Plane:
+def tracking_error(wanted: PlaneVector, pose: PlaneVector) -> PlaneVector:
     """Wanted less true pose: place in the axes of the body [m, m], heading [rad]."""
-    away = Plane(wanted.x - pose.x, wanted.y - pose.y, wanted.yaw - pose.yaw)
+    away = PlaneVector(wanted.x - pose.x, wanted.y - pose.y, wanted.yaw - pose.yaw)
     return in_body(away, pose.yaw)
 
 
-def lyapunov(e: Plane) -> Numbers:
+def lyapunov(e: PlaneVector) -> Numbers:
     """V of errors; squared metres and radians are added as they are."""
     return 0.5 * (e.x * e.x + e.y * e.y) + 1.0 - e.yaw.__array_namespace__().cos(e.yaw)
 
 
-def twist(gains: Plane, e: Plane, rates: Plane, heading: Numbers) -> Plane:
+def twist(gains: PlaneVector, e: PlaneVector, rates: PlaneVector, heading: Numbers) -> PlaneVector:
     """Twist to ask for [m/s, m/s, rad/s].
 
     Args:
@@ -174,7 +174,9 @@ def twist(gains: Plane, e: Plane, rates: Plane, heading: Numbers) -> Plane:
         heading: of the body [rad].
     """
     ahead, turn = in_body(rates, heading), e.yaw.__array_namespace__().sin(e.yaw)
-    return Plane(ahead.x + gains.x * e.x, ahead.y + gains.y * e.y, ahead.yaw + gains.yaw * turn)
+    return PlaneVector(
+        ahead.x + gains.x * e.x, ahead.y + gains.y * e.y, ahead.yaw + gains.yaw * turn
+    )
 
 
 class GoswamiPadhy(eqx.Module):
@@ -189,12 +191,14 @@ class GoswamiPadhy(eqx.Module):
             reference: pose and rates of the path in the world [m, m, rad, m/s, m/s, rad/s].
             pose: that is believed [m, m, rad].
         """
-        wanted, rates, here = (Plane(*x) for x in (reference[:3], reference[3:], pose))
-        return jnp.stack(twist(Plane(*self.gains), errors(wanted, here), rates, here.yaw))
+        wanted, rates, here = (PlaneVector(*x) for x in (reference[:3], reference[3:], pose))
+        return jnp.stack(
+            twist(PlaneVector(*self.gains), tracking_error(wanted, here), rates, here.yaw)
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Rehearsal:
+class TuningTask:
     """What gains are tried on: a path, begun beside it, by an ideal robot that follows late.
 
     Attributes:
@@ -213,30 +217,30 @@ class Rehearsal:
 
     def integrals(self, gains: Places) -> Float[np.ndarray, " particle"]:
         """Of V over the path, of many gains at once, the mean of all starts [s]."""
-        k, h = Plane(*gains.T[..., None]), self.period / len(self.shares)
+        k, h = PlaneVector(*gains.T[..., None]), self.period / len(self.shares)
         pose = np.repeat(self.begin.T[:, None], len(gains), axis=1)
         goes, total = np.zeros(pose.shape), np.zeros(pose.shape[1:])
         ring = np.zeros((self.shares.shape[1], *pose.shape))
         for row in self.reference:
-            here = Plane(*pose)
-            e = errors(Plane(*row[:3]), here)
+            here = PlaneVector(*pose)
+            e = tracking_error(PlaneVector(*row[:3]), here)
             total += lyapunov(e)
             ring[1:] = ring[:-1]
-            ring[0] = twist(k, e, Plane(*row[3:]), here.yaw)
+            ring[0] = twist(k, e, PlaneVector(*row[3:]), here.yaw)
             arrives = self.shares @ ring.reshape(len(ring), -1)
             for arrived in arrives.reshape(-1, *pose.shape):
                 goes = goes + self.follow * (arrived - goes)
-                pose = _moved(pose, goes, h)
+                pose = _next_pose(pose, goes, h)
         return self.period * total.mean(axis=1)
 
     def slope(self, gains: Float[np.ndarray, "3"]) -> tuple[float, Float[np.ndarray, "3"]]:
         """The integral of V at some gains, and its derivative by them, by central differences."""
-        off = STEP * np.eye(3)
+        off = GAIN_STEP * np.eye(3)
         value = self.integrals(gains + np.concatenate([np.zeros((1, 3)), off, -off]))
-        return float(value[0]), (value[1:4] - value[4:]) / (2 * STEP)
+        return float(value[0]), (value[1:4] - value[4:]) / (2 * GAIN_STEP)
 
 
-def _moved(
+def _next_pose(
     pose: Float[np.ndarray, "3 *batch"], goes: Float[np.ndarray, "3 *batch"], h: float
 ) -> Float[np.ndarray, "3 *batch"]:
     """Poses after a short time at constant twists, their chord at the heading half-way."""
@@ -246,12 +250,12 @@ def _moved(
     return pose + h * np.array([c * x - s * y, s * x + c * y, turn])
 
 
-def by_swarm(task: Rehearsal, seed: int = 0) -> Float[np.ndarray, "3"]:
+def by_swarm(task: TuningTask, seed: int = 0) -> Float[np.ndarray, "3"]:
     """Gains that a swarm finds [1/s]."""
     return minimise(task.integrals, LOW, HIGH, Swarm(), seed).place
 
 
-def by_gradient(task: Rehearsal) -> Float[np.ndarray, "3"]:
+def by_gradient(task: TuningTask) -> Float[np.ndarray, "3"]:
     """Gains that the gradient leads to from the middle of the box [1/s]."""
     from scipy.optimize import minimize
 

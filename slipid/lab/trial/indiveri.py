@@ -37,7 +37,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-LEAST = 0.05
+LEAST_SINE = 0.05
 """Sine of a roller's angle to the drive direction below which a wheel hardly drives."""
 
 
@@ -60,7 +60,7 @@ def inverse_kinematics(
             of the body free.
     """
     across = np.sin(roller_angle)
-    if np.abs(across).min() < LEAST:
+    if np.abs(across).min() < LEAST_SINE:
         wheel = int(np.abs(across).argmin())
         raise ValueError(
             f"wheel {wheel + 1}: rollers at {np.degrees(roller_angle[wheel]):g} deg to the drive "
@@ -75,7 +75,7 @@ def inverse_kinematics(
     return matrix
 
 
-def loop(
+def pose_loop(
     gains: Float[Array, "2"], reference: Float[Array, "6"], pose: Float[Array, "3"]
 ) -> Float[Array, "3"]:
     """Twist that the pose loop asks for [m/s, m/s, rad/s].
@@ -92,7 +92,7 @@ def loop(
     return jnp.stack([c * vx + s * vy, c * vy - s * vx, turn])
 
 
-def slowed(
+def within_limit(
     asked: Float[Array, "3"], matrix: Float[Array, "wheel 3"], limit: Float[Array, ""]
 ) -> Float[Array, "3"]:
     """A twist, or as much of it as leaves no wheel faster than a limit [rad/s]."""
@@ -114,5 +114,5 @@ class Indiveri(eqx.Module):
     limit: Float[Array, ""]
 
     def __call__(self, reference: Float[Array, "6"], pose: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Twist to ask for; arguments as of `loop`."""
-        return slowed(loop(self.gains, reference, pose), self.matrix, self.limit)
+        """Twist to ask for; arguments as of `pose_loop`."""
+        return within_limit(pose_loop(self.gains, reference, pose), self.matrix, self.limit)

@@ -7,16 +7,16 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.floor_map import FloorMap
-from slipid.lab.testsite.driving import PERIOD, Rims
-from slipid.lab.testsite.ground import GROUNDS
-from slipid.lab.testsite.plant import Plant
-from slipid.lab.testsite.site import Sensors, Site
-from slipid.robot.deployed import DeployedRobot, drawn
+from slipid.lab.testsite.driving import PERIOD, RimSpeeds
+from slipid.lab.testsite.plant import SimulatedRobot
+from slipid.lab.testsite.site import Site, SiteSensors
+from slipid.lab.testsite.surfaces import SURFACES
+from slipid.robot.deployed import DeployedRobot, posterior_robots
 from slipid.robot.interface import Measurement
 from slipid.support.errors import DataError
 
 
-def known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
+def refuse_unknown_to_site(floor: FloorMap, load: str, wheels: int) -> None:
     """Refuse wheels, a load set-up or a surface that the virtual test site does not have."""
     machine, other = Site().machine, "With --plant twin the identified model is driven itself"
     has = len(machine.wheel_azimuths_deg)
@@ -24,7 +24,7 @@ def known_to_site(floor: FloorMap, load: str, wheels: int) -> None:
         raise DataError(f"the test site's robot has {has} wheels, the fit's {wheels}. {other}")
     for what, name, there in (
         ("load set-up", load, machine.centres_m),
-        *(("surface", name, GROUNDS) for name in floor.surfaces),
+        *(("surface", name, SURFACES) for name in floor.surfaces),
     ):
         if name not in there:
             raise DataError(
@@ -45,8 +45,8 @@ class SitePlant:
     def __init__(
         self, floor: FloorMap, load: str, start: tuple[float, float, float], seed: int, gyro: bool
     ):
-        self._site = Site(sensors=Sensors(gyro=gyro))
-        self._new, self._seed = partial(Plant, self._site, floor, load, start, seed), seed
+        self._site = Site(sensors=SiteSensors(gyro=gyro))
+        self._new, self._seed = partial(SimulatedRobot, self._site, floor, load, start, seed), seed
         self.reset()
 
     @property
@@ -63,7 +63,7 @@ class SitePlant:
     def reset(self) -> Measurement:
         """First readings, of the robot at rest at its start."""
         self.plant = self._new()
-        self._rims = Rims(self._site, self.plant)
+        self._rims = RimSpeeds(self._site, self.plant)
         self._rng = np.random.default_rng([self._seed, 1])
         self._bias = self._site.sensors.gyro_bias * float(self._rng.normal())
         return self._read(np.zeros((1, 2 * len(self.plant.wheel_dof))))
@@ -92,10 +92,10 @@ class SitePlant:
         )
 
 
-def one_of(robot: DeployedRobot, seed: int) -> DeployedRobot:
+def drawn_robot(robot: DeployedRobot, seed: int) -> DeployedRobot:
     """A robot that the posterior holds possible; the robot itself where nothing was drawn."""
     count = robot.record.drawn
     if count == 0:
         return robot
     picked = int(np.random.default_rng(seed).integers(count))
-    return jax.tree.map(lambda x: x[0], drawn(robot, (picked,)))
+    return jax.tree.map(lambda x: x[0], posterior_robots(robot, (picked,)))

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from slipid.data.floor_map import FloorMap
 from slipid.plots.drawing import INK, SHADE, figure, plain, save
-from slipid.support.files import Content
+from slipid.support.content import Content
 
 Paths = Mapping[str, np.ndarray]
 TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
@@ -43,10 +43,10 @@ def trial_plot(
     title = f"{course} on the {content['plant']}: {_verdict(content)}"
     made = figure(13.0, 3.1 * rows + 3.4, title)
     grid = made.add_gridspec(rows + 1, 3, height_ratios=[1.0] * rows + [1.1])
-    one = _typical(content)
+    one = _typical_start(content)
     for k, name in enumerate(names):
         axes = made.add_subplot(grid[k // 3, k % 3])
-        _one(axes, name, content, paths, wanted, floor, one)
+        _paths_panel(axes, name, content, paths, wanted, floor, one)
     _legend(made, floor)
     for k, (key, label) in enumerate(ERRORS.items()):
         _bars(made.add_subplot(grid[rows, k]), content["summary"], key, label)
@@ -62,7 +62,7 @@ def _verdict(content: Content) -> str:
     return f"{best} closes best" + (f", {100 * ratio['value']:.0f} % of encoders'" if ratio else "")
 
 
-def _typical(content: Content) -> int:
+def _typical_start(content: Content) -> int:
     """Start whose encoder run (else first controller's) is nearest to the median closure."""
     first = "encoder" if "encoder" in content["summary"] else next(iter(content["summary"]))
     runs = [r for r in content["runs"] if r["controller"] == first]
@@ -70,7 +70,7 @@ def _typical(content: Content) -> int:
     return int(np.argmin([abs(r["closure_mm"] - middle) for r in runs]))
 
 
-def _one(
+def _paths_panel(
     axes: Axes,
     name: str,
     content: Content,
@@ -82,13 +82,13 @@ def _one(
     """All starts of a controller laid on one another, the typical one over its floor."""
     runs = [r for r in content["runs"] if r["controller"] == name]
     own = [
-        (paths[f"{name}/start{k:02d}"][:, :2] - r["start"][:2]) @ _turned(r["start"][2])
+        (paths[f"{name}/start{k:02d}"][:, :2] - r["start"][:2]) @ _rotation(r["start"][2])
         for k, r in enumerate(runs)
     ]
     (left, low), (right, high) = wanted.min(axis=0) - 0.35, wanted.max(axis=0) + 0.35
     x, y = np.linspace(left, right, 320), np.linspace(low, high, 220)
     start = runs[one]["start"]
-    places = start[:2] + np.stack(np.meshgrid(x, y), -1) @ _turned(start[2]).T
+    places = start[:2] + np.stack(np.meshgrid(x, y), -1) @ _rotation(start[2]).T
     kinds = max(len(floor.surfaces), 2)
     tints = ListedColormap(TINTS[:kinds])
     axes.pcolormesh(x, y, floor.at(places), cmap=tints, vmin=0, vmax=kinds - 1)
@@ -123,7 +123,7 @@ def _legend(made: Figure, floor: FloorMap) -> None:
     made.legend(handles=[*patches, *lines], loc="outside lower center", ncols=8, fontsize=8)
 
 
-def _turned(heading: float) -> np.ndarray:
+def _rotation(heading: float) -> np.ndarray:
     """Rotation from the axes of a pose to the site's."""
     c, s = np.cos(heading), np.sin(heading)
     return np.array([[c, -s], [s, c]])

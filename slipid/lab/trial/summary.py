@@ -6,14 +6,14 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float
 
-from slipid.robot.closed_loop import Metrics
+from slipid.robot.closed_loop import PathMetrics
 
 Interval = tuple[float, float]
 """90 %, by bootstrap over starts."""
 
 
 @dataclass(frozen=True)
-class Run:
+class TrialRun:
     """One run of one controller, judged.
 
     Attributes:
@@ -25,7 +25,7 @@ class Run:
     controller: str
     start: tuple[float, float, float]
     seed: int
-    metrics: Metrics
+    metrics: PathMetrics
     believed_error_mm: float
 
     def to_json(self) -> dict[str, object]:
@@ -35,7 +35,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Ratio:
+class MedianRatio:
     """Of a median to that of the controller `encoder`, its interval over the starts they share."""
 
     value: float
@@ -43,7 +43,7 @@ class Ratio:
 
 
 @dataclass(frozen=True)
-class Summary:
+class ControllerSummary:
     """One controller over its starts.
 
     Attributes:
@@ -58,7 +58,7 @@ class Summary:
     runs: int
     finished_share: float
     worse_share: float | None
-    to_encoder: Mapping[str, Ratio] | None
+    to_encoder: Mapping[str, MedianRatio] | None
 
     def to_json(self) -> dict[str, object]:
         """As trial.json has it."""
@@ -71,7 +71,7 @@ class Summary:
 Columns = Mapping[str, Float[np.ndarray, " run"]]
 
 
-def summaries(runs: Sequence[Run], draws: int = 2000) -> dict[str, Summary]:
+def summaries(runs: Sequence[TrialRun], draws: int = 2000) -> dict[str, ControllerSummary]:
     """Medians over starts of every controller, with 90 % bootstrap intervals."""
     names = list(dict.fromkeys(run.controller for run in runs))
     of = {name: [run for run in runs if run.controller == name] for name in names}
@@ -79,21 +79,21 @@ def summaries(runs: Sequence[Run], draws: int = 2000) -> dict[str, Summary]:
     rng = np.random.default_rng(0)
     count = min(len(c["closure_error_median"]) for c in table.values())
     again = rng.integers(count, size=(draws, count))
-    out: dict[str, Summary] = {}
+    out: dict[str, ControllerSummary] = {}
     for name, mine in table.items():
         known = {k: v for k, v in mine.items() if np.all(np.isfinite(v))}
-        out[name] = Summary(
+        out[name] = ControllerSummary(
             median={k: float(np.median(v)) for k, v in known.items()},
             interval90={k: _interval(np.median(v[again], axis=1)) for k, v in known.items()},
             runs=len(of[name]),
             finished_share=float(np.mean([run.metrics.finished for run in of[name]])),
-            worse_share=_worse(mine, table["encoder"]) if "encoder" in table else None,
+            worse_share=_worse_share(mine, table["encoder"]) if "encoder" in table else None,
             to_encoder=_ratios(mine, table["encoder"], again) if "encoder" in table else None,
         )
     return out
 
 
-def not_told_apart(runs: Sequence[Run], draws: int = 2000) -> tuple[str, ...]:
+def best_controllers(runs: Sequence[TrialRun], draws: int = 2000) -> tuple[str, ...]:
     """Controllers that may close best, the one with the lowest median first.
 
     Of the others they are those whose errors, start by start, are not larger for sure: the 90 %
@@ -116,7 +116,7 @@ def not_told_apart(runs: Sequence[Run], draws: int = 2000) -> tuple[str, ...]:
     return (best, *(name for name in able if name != best and not surely_worse(name)))
 
 
-def columns(runs: Sequence[Run]) -> Columns:
+def columns(runs: Sequence[TrialRun]) -> Columns:
     """What is judged of every run.
 
     `first_side_along_track_mm` and `heading_error_deg` are the errors' sizes;
@@ -138,17 +138,17 @@ def columns(runs: Sequence[Run]) -> Columns:
     }
 
 
-def _worse(mine: Columns, base: Columns) -> float:
+def _worse_share(mine: Columns, base: Columns) -> float:
     pairs = zip(mine["closure_error_median"], base["closure_error_median"], strict=False)
     return float(np.mean([a > b for a, b in pairs]))
 
 
-def _ratios(mine: Columns, base: Columns, again: np.ndarray) -> dict[str, Ratio]:
+def _ratios(mine: Columns, base: Columns, again: np.ndarray) -> dict[str, MedianRatio]:
     out = {}
     for key in ("closure_error_median", "cross_track_rmse", "first_side_along_track_mm"):
         a, b = np.median(mine[key][again], axis=1), np.median(base[key][again], axis=1)
         value = float(np.median(mine[key]) / max(float(np.median(base[key])), 1e-9))
-        out[key] = Ratio(value, _interval(a / np.maximum(b, 1e-9)))
+        out[key] = MedianRatio(value, _interval(a / np.maximum(b, 1e-9)))
     return out
 
 

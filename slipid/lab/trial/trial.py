@@ -11,19 +11,26 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.data.floor_map import FloorMap, read_map
-from slipid.deploy.controllers import pilot_of
-from slipid.deploy.deploy import habits_of, read_robot
+from slipid.deploy.controllers import control_loop_of
+from slipid.deploy.deploy import actuator_model_of, read_robot
 from slipid.deploy.floors import floor_of
-from slipid.deploy.twin_run import REST_S, known_to_fit, path_of, site, starts, twin
-from slipid.lab.trial.controllers import ROWS, applying, check_gains, unused_gains
-from slipid.lab.trial.plants import SitePlant, known_to_site, one_of
-from slipid.lab.trial.summary import Run, not_told_apart, summaries
+from slipid.deploy.twin_run import (
+    REST_S,
+    path_of,
+    require_known_surfaces,
+    starts,
+    twin_floor,
+    twin_plant,
+)
+from slipid.lab.trial.controllers import ROWS, applicable, check_gains, unused_gains
+from slipid.lab.trial.plants import SitePlant, drawn_robot, refuse_unknown_to_site
+from slipid.lab.trial.summary import TrialRun, best_controllers, summaries
 from slipid.robot import closed_loop, trajectory
-from slipid.robot.actuation import Habits
 from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import Settings
 from slipid.robot.robot_file import typed
+from slipid.robot.twin import ActuatorModel
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.errors import DataError
 from slipid.support.executor import results
@@ -38,7 +45,7 @@ PLANTS = ("testsite", "twin")
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+class TrialTask:
     """One run of one controller from one start; `told` is the floor map that it may be told."""
 
     name: str
@@ -51,13 +58,13 @@ class Job:
     told: FloorMap
     robot: DeployedRobot
     settings: Settings
-    habits: Habits
+    habits: ActuatorModel
     forced: bool
     kept: Checkpoint
 
 
 @dataclass(frozen=True)
-class Wish:
+class TrialOptions:
     """What is asked of a trial.
 
     Attributes:
@@ -84,7 +91,7 @@ class Wish:
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
+class TrialResult:
     """End of a trial.
 
     Attributes:
@@ -95,13 +102,13 @@ class Driven:
     """
 
     content: dict[str, Any]
-    runs: tuple[Run, ...]
+    runs: tuple[TrialRun, ...]
     paths: Mapping[str, np.ndarray]
     wanted: np.ndarray
     floor: FloorMap
 
 
-def trial(out: Path, wish: Wish, executor: Executor, report: Reporter) -> Driven:
+def trial(out: Path, wish: TrialOptions, executor: Executor, report: Reporter) -> TrialResult:
     """Drive every controller from every start, and write trial.json.
 
     Runs that are done are kept, and not driven again as long as nothing they depend on changes.
@@ -111,18 +118,18 @@ def trial(out: Path, wish: Wish, executor: Executor, report: Reporter) -> Driven
             the plant or the fit does not know, or a speed beyond what the fit has seen.
     """
     setup_jax(quiet=True)
-    jobs = _jobs(out, wish)
-    rows = tuple(dict.fromkeys(job.row for job in jobs))
+    tasks = _tasks(out, wish)
+    rows = tuple(dict.fromkeys(task.row for task in tasks))
     if left := [name for name in wish.controllers if name not in rows]:
         report.line(f"left out, for robots with three wheels: {', '.join(left)}")
-    if unused := unused_gains(jobs[0].robot, wish.tuned_gains):
+    if unused := unused_gains(tasks[0].robot, wish.tuned_gains):
         report.line(unused)
-    todo = {job.name: job for job in jobs if _driven(job) is None}
-    report.stage(f"driving {len(todo)} of {len(jobs)} runs")
+    todo = {task.name: task for task in tasks if _finished_run(task) is None}
+    report.stage(f"driving {len(todo)} of {len(tasks)} runs")
     results(executor, drive, todo, report)
-    driven = {job.name: found for job in jobs if (found := _driven(job)) is not None}
+    driven = {task.name: found for task in tasks if (found := _finished_run(task)) is not None}
     runs = [run for run, _ in driven.values()]
-    table, able = summaries(runs), list(not_told_apart(runs))
+    table, able = summaries(runs), list(best_controllers(runs))
     content = {
         "schema": SCHEMA,
         "plant": wish.plant,
@@ -130,19 +137,21 @@ def trial(out: Path, wish: Wish, executor: Executor, report: Reporter) -> Driven
         "told_map": None if wish.told_map is None else str(wish.told_map),
         "path": wish.path,
         "speed_m_s": wish.speed,
-        "gains": _named(jobs[0].robot, wish.tuned_gains),
+        "gains": _gains(tasks[0].robot, wish.tuned_gains),
         "closes_best": None if len(able) > 1 else able[0],
-        "not_told_apart": able,
+        "best_controllers": able,
         "summary": {name: row.to_json() for name, row in table.items()},
         "controllers": {name: ROWS[name].about for name in rows},
         "runs": [run.to_json() for run in runs],
     }
     write_json(out / "trial.json", content)
     paths = {name: path for name, (_, path) in driven.items()}
-    return Driven(content, tuple(runs), paths, np.asarray(jobs[0].path.rows)[:, :2], jobs[0].floor)
+    return TrialResult(
+        content, tuple(runs), paths, np.asarray(tasks[0].path.rows)[:, :2], tasks[0].floor
+    )
 
 
-def _jobs(out: Path, wish: Wish) -> list[Job]:
+def _tasks(out: Path, wish: TrialOptions) -> list[TrialTask]:
     if wish.plant not in PLANTS:
         raise DataError(f"no plant '{wish.plant}'; expected {' or '.join(PLANTS)}")
     strange = [f" '{name}'" for name in wish.controllers if name not in ROWS]
@@ -151,16 +160,16 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
         raise DataError(f"no controller{said}; expected some of {', '.join(ROWS)}")
     robot = jax.tree.map(np.asarray, read_robot(out, wish.load))
     path = path_of(wish.path, wish.speed, robot)
-    floor = site(robot) if wish.map is None else read_map(wish.map)
+    floor = twin_floor(robot) if wish.map is None else read_map(wish.map)
     told = floor if wish.told_map is None else read_map(wish.told_map)
-    settings, habits = Settings.of(robot), habits_of(robot, gyro=False)
+    settings, habits = Settings.of(robot), actuator_model_of(robot, gyro=False)
     if wish.plant == "testsite":  # it has the sensors it has, whatever the logs had
-        known_to_site(floor, robot.load_setup, robot.wheels)
-        settings, habits = replace(settings, current_is_signed=False), Habits()
+        refuse_unknown_to_site(floor, robot.load_setup, robot.wheels)
+        settings, habits = replace(settings, current_is_signed=False), ActuatorModel()
     else:
-        known_to_fit(floor, robot, str(wish.map))
+        require_known_surfaces(floor, robot, str(wish.map))
     if wish.told_map is not None:
-        known_to_fit(told, robot, str(wish.told_map))
+        require_known_surfaces(told, robot, str(wish.told_map))
     if wish.tuned_gains:
         check_gains(out, robot)
     key = key_of(
@@ -169,7 +178,7 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
             wish.path,
             wish.speed,
             robot.load_setup,
-            _named(robot, wish.tuned_gains),
+            _gains(robot, wish.tuned_gains),
             settings,
             habits,
             *jax.tree.leaves(robot),
@@ -182,53 +191,55 @@ def _jobs(out: Path, wish: Wish) -> list[Job]:
     kept = Checkpoint(out / FOLDER / key[:12] / f"of{wish.starts}", key)
     shared = wish.plant, floor, told, robot, settings, habits, wish.tuned_gains, kept
     return [
-        Job(f"{row}/start{k:02d}", row, path, start, 1000 + k, *shared)
-        for row in applying(wish.controllers, robot)
+        TrialTask(f"{row}/start{k:02d}", row, path, start, 1000 + k, *shared)
+        for row in applicable(wish.controllers, robot)
         for k, start in enumerate(starts(wish.starts, floor, path))
     ]
 
 
-def _named(robot: DeployedRobot, forced: bool) -> dict[str, float]:
+def _gains(robot: DeployedRobot, forced: bool) -> dict[str, float]:
     gains = Gains.of(robot, forced)
     return {f.name: float(getattr(gains, f.name)) for f in fields(gains)}
 
 
-def _driven(job: Job) -> tuple[Run, np.ndarray] | None:
+def _finished_run(task: TrialTask) -> tuple[TrialRun, np.ndarray] | None:
     """A run and its true poses; None where it has not been driven yet."""
-    run, path = job.kept.load_json(job.name), job.kept.load(job.name)
-    return None if run is None or path is None else (typed(Run, run), path["pose"])
+    run, path = task.kept.load_json(task.name), task.kept.load(task.name)
+    return None if run is None or path is None else (typed(TrialRun, run), path["pose"])
 
 
-def drive(job: Job) -> None:
+def drive(task: TrialTask) -> None:
     """Drive one run and write its metrics and its path."""
     setup_jax(quiet=True)
-    row = ROWS[job.row]
-    robot = jax.tree.map(jnp.asarray, job.robot)
-    path = job.path.moved(job.start).waiting(REST_S)
+    row = ROWS[task.row]
+    robot = jax.tree.map(jnp.asarray, task.robot)
+    path = task.path.moved(task.start).after_rest(REST_S)
     plant: closed_loop.Plant
-    if job.plant == "twin":
-        truth = one_of(robot, job.seed)
-        plant = twin(truth, job.floor, job.start, job.seed, replace(job.habits, gyro=row.gyro))
+    if task.plant == "twin":
+        truth = drawn_robot(robot, task.seed)
+        plant = twin_plant(
+            truth, task.floor, task.start, task.seed, replace(task.habits, gyro=row.gyro)
+        )
     else:
-        plant = SitePlant(job.floor, robot.load_setup, job.start, job.seed, row.gyro)
-    there = floor_of(job.told, robot.labels)
-    pilot = pilot_of(robot, row, job.settings, job.forced, there)
-    course = closed_loop.drive(pilot, path, plant, job.start)
-    off = course.pose[-1] - course.believed[-1]
-    run = Run(
-        controller=job.row,
-        start=job.start,
-        seed=job.seed,
-        metrics=closed_loop.metrics(course),
+        plant = SitePlant(task.floor, robot.load_setup, task.start, task.seed, row.gyro)
+    there = floor_of(task.told, robot.labels)
+    loop = control_loop_of(robot, row, task.settings, task.forced, there)
+    course = closed_loop.run_closed_loop(loop, path, plant, task.start)
+    off = course.pose[-1] - course.estimated_pose[-1]
+    run = TrialRun(
+        controller=task.row,
+        start=task.start,
+        seed=task.seed,
+        metrics=closed_loop.path_metrics(course),
         believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
     )
     # the path first: a run that has metrics is done
-    poses = {"time": course.time, "pose": course.pose, "believed": course.believed}
-    job.kept.save(job.name, poses)
-    job.kept.save_json(job.name, asdict(run))
+    poses = {"time": course.time, "pose": course.pose, "believed": course.estimated_pose}
+    task.kept.save(task.name, poses)
+    task.kept.save_json(task.name, asdict(run))
 
 
-def names_of(text: str | None) -> tuple[str, ...]:
+def controller_names(text: str | None) -> tuple[str, ...]:
     """Controllers of a list by commas, all of them by default."""
     if text is None:
         return tuple(ROWS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slipid.app.new.magnitudes import heading_unit, place_unit, time_unit
+from slipid.app.new.units import heading_unit, position_unit, time_unit
 from slipid.data.reading.column_names import meaning_of, without_unit
 
 
@@ -109,9 +109,9 @@ def test_steps_that_fit_two_units_are_a_question():
 
 def test_units_of_a_pose():
     time = np.arange(0, 10, 0.1)
-    assert place_unit(time, 0.3 * time, 0 * time).unit == "m"
-    assert place_unit(time, 300 * time, 1 + 0.5 * time).unit == "mm"
-    assert "pixel" in place_unit(time, np.round(50 * time), np.round(20 * time)).doubt
+    assert position_unit(time, 0.3 * time, 0 * time).unit == "m"
+    assert position_unit(time, 300 * time, 1 + 0.5 * time).unit == "mm"
+    assert "pixel" in position_unit(time, np.round(50 * time), np.round(20 * time)).doubt
     turn = np.linspace(0, 14, 300)
     assert heading_unit(np.degrees(turn) % 360).unit == "deg"
     assert heading_unit(turn % (2 * np.pi)).unit == "rad"

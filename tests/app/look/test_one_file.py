@@ -7,7 +7,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from slipid.app.new.config_lines import ASKS
+from slipid.app.new.config_lines import QUESTION_MARK
 from slipid.data.reading.table_format import format_of
 from slipid.support.errors import DataError
 from tests.helpers.made_tables import RADIUS, motion, plain, table
@@ -20,7 +20,7 @@ def test_a_plain_file_leaves_nothing_open_and_reads(tmp_path):
     proposal, config = proposed(tmp_path, **ROBOT)
     (question,) = config.questions  # what no log without voltages tells
     assert question.startswith('"motor.resistance": without the voltages')
-    assert config.text.replace('"# ?"', "").count(ASKS) == 1
+    assert config.text.replace('"# ?"', "").count(QUESTION_MARK) == 1
     layout = layout_in(config)
     assert layout["columns"]["wheel_speed"] == {
         "columns": ["left_vel", "right_vel"],

@@ -265,7 +265,7 @@ def test_a_slow_ammeter_counts_once_a_reading(tmp_path):
     data = one(tmp_path, {"columns": columns})
     assert data.current_fresh.sum(axis=0) == pytest.approx([72, 72], abs=2)
     assert "current is read anew every 1 s" in " ".join(data.logs[0].notes)
-    w = windows(data, RADIUS, per_piece=2, longest=3.0)
+    w = windows(data, RADIUS, per_segment=2, longest=3.0)
     read = w.current_var < UNREAD
     assert np.median(w.current_var[read]) == pytest.approx(0.01 / 2.5, rel=0.5)
     short = windows(data, RADIUS, longest=0.25)

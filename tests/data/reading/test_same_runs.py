@@ -85,7 +85,7 @@ def bag(root, storage):
     motors = bags.joint_states("/motors", AMPS, JOINTS, effort=amps(AMPS))
     kind = "geometry_msgs/msg/PoseStamped"
     poses = [
-        bags.Said("/mocap", kind, bags.pose_fields(kind, float(t), *pose(t).tolist()), float(t))
+        bags.Message("/mocap", kind, bags.pose_fields(kind, float(t), *pose(t).tolist()), float(t))
         for t in POSES
     ]
     path = root / f"run{bags.SUFFIX[storage]}"
@@ -126,7 +126,7 @@ def test_every_form_of_a_run_has_the_same_windows(tmp_path, plain, form):
     data = read(tmp_path, FORMS[form])
     w = windows(data, RADIUS, 0.1, longest=0.5)
     assert len(w) == len(plain) > 2
-    for name in ("dt", "turn", "faster", "pose", "current", "current_var"):
+    for name in ("dt", "turn", "speed_change", "pose", "current", "current_var"):
         np.testing.assert_allclose(getattr(w, name), getattr(plain, name), atol=3e-6, err_msg=name)
 
 

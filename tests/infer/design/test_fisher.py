@@ -83,7 +83,7 @@ CASES = [
 def test_is_what_the_likelihood_says_of_the_same_windows(current, voltage):
     """Of one run and of several: information of different runs adds, whatever the channels."""
     this = planner(current, voltage)
-    problem = Problem(windows(DRIVES, current, voltage), robot(), CHOICES).apart()
+    problem = Problem(windows(DRIVES, current, voltage), robot(), CHOICES).without_shared_effects()
     log_v = log_variance(problem)
     blocks, jacobian = problem.linear(jnp.asarray(this.z), problem.electric(this.z, log_v))
     assert all(np.abs(r).max() < 1e-9 for r in blocks.values())  # logged as predicted
@@ -105,7 +105,7 @@ def test_runs_of_a_session_cannot_average_away_what_they_share():
     this = Planner(robot(), CHOICES, {**plain.variance, **shared}, Channels(False))
     runs = [0, 1, 2, 3, 2, 2]
     w = windows([DRIVES[k] for k in runs], False, False)
-    problem = Problem(w, robot(), CHOICES).apart()
+    problem = Problem(w, robot(), CHOICES).without_shared_effects()
     log_v = log_variance(problem)
     _, jacobian = problem.linear(jnp.asarray(this.z), problem.electric(this.z, log_v))
     j = np.asarray(jacobian["motion"]).reshape(-1, this.space.size)

@@ -15,35 +15,41 @@ from slipid.cli.main import app
 from slipid.data.runs import collect
 from slipid.data.windows import windows
 from slipid.fit.optimise import Optimum
-from slipid.fit.problem import Problem, State
+from slipid.fit.problem import FitState, Problem
 from slipid.infer.design.planner import Planner
 from slipid.infer.fit_file import load, save
 from slipid.infer.result import summarise
-from slipid.lab.selftest.logs import Sensors, blank, grid, make_logs, truth
+from slipid.lab.selftest.logs import (
+    SimulatedSensors,
+    heading_grid,
+    nominal_robot,
+    simulate_logs,
+    true_robot,
+)
 from slipid.search_space import Choice
 from tests.helpers import designs
 
 pytestmark = pytest.mark.slow  # traces a whole likelihood
 
-DRIVES = grid(setups=(("soft", "as_built"),), headings=8, speeds=(0.1, 0.2), turns=0)
+DRIVES = heading_grid(setups=(("soft", "as_built"),), headings=8, speeds=(0.1, 0.2), turns=0)
 BASE = 0.125
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A fit that ended at the truth, of straight runs without voltage."""
-    robot = truth(DRIVES)
-    data = collect(make_logs(robot, DRIVES, 0, Sensors(has_voltage=False)))
+    robot = true_robot(DRIVES)
+    data = collect(simulate_logs(robot, DRIVES, 0, SimulatedSensors(has_voltage=False)))
     choices = [
         Choice("camera.scale", prior_mean=1.117, prior_std=0.002),
         Choice("camera.session_yaw@*", free=True),
         Choice("robot.mass", fixed=12.0),
     ]
-    problem = Problem(windows(data, 0.04, lag=0.056), blank(DRIVES), choices)
+    problem = Problem(windows(data, 0.04, lag=0.056), nominal_robot(DRIVES), choices)
     z, log_v = problem.space.vector(robot), 2 * np.log(problem.noise.typical)
     _, jacobian = problem.linear(jnp.asarray(z), problem.electric(z, log_v))
     info = problem.precision(jacobian, jnp.asarray(log_v), jnp.ones(len(problem.windows)))
-    state = State(z, log_v, 7, -1.5, 0.01, "joint")
+    state = FitState(z, log_v, 7, -1.5, 0.01, "joint")
     end = Optimum(state, np.linalg.inv(np.asarray(info)), True, "settled", (0.0,))
     out = tmp_path_factory.mktemp("fit")
     save(summarise(problem, end, data, choices), out)
@@ -101,7 +107,7 @@ def test_without_a_wish_it_predicts_every_floor(folder):
     done = design(folder, "--runs", 2)
     assert done.exit_code == 0, done.output
     assert "prediction of every floor" in done.stdout
-    assert "chosen runs tell as much as the 2021 paper's grid (36 runs)" in done.stdout
+    assert "chosen runs are worth the 2021 paper's grid (36 runs)" in done.stdout
     if "deg/s" in done.stdout:
         assert "soft was never driven turning" in done.stdout
 
@@ -168,4 +174,4 @@ def test_chosen_runs_are_worth_what_is_expected_of_them():
         ratio = real[name] / plans.expected[name]
         assert (ratio > 1 / 2.5).all(), (name, ratio)
         assert (ratio < 1.6).all(), (name, ratio)
-    assert (real["chosen"] < real["grid"]).all()
+    assert (real["chosen"] < real["heading_grid"]).all()

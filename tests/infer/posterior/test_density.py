@@ -17,7 +17,7 @@ from slipid.fit import likelihood as lk
 from slipid.fit import noise as of_noise
 from slipid.fit.noise import POOLED
 from slipid.fit.problem import Problem
-from slipid.fit.shared import AXES
+from slipid.fit.shared_effects import AXES
 from slipid.fit.variances import DEGREES
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.infer.posterior.density import Density
@@ -98,8 +98,8 @@ def shared_covariance(problem):
     n, m, _ = moved.shape
     session = np.asarray(w.session)[:, None] == np.asarray(w.session)
     out = np.zeros((n, m, n, m))
-    for floor, of in zip(problem.robot.surfaces.labels, problem.target.shared, strict=True):
-        mine, near = np.asarray(of.pieces), np.asarray(of.near)
+    for floor, of in zip(problem.robot.surfaces.labels, problem.objective.shared, strict=True):
+        mine, near = np.asarray(of.segments), np.asarray(of.near)
         assert [w.surface[k] for k in mine] == [floor] * len(mine)
         for k, axis in enumerate(AXES):
             like = v[index(f"neighbours.{floor}.{axis}")] * near[k] @ near[k].T
@@ -247,7 +247,9 @@ def test_its_curvature_is_the_information_of_the_fit():
     np.testing.assert_allclose(
         bend / scale / scale[:, None], precision / scale / scale[:, None], atol=1e-3
     )
-    alone = np.asarray(problem.apart().precision(jacobian, jnp.asarray(log_v), keep))
+    alone = np.asarray(
+        problem.without_shared_effects().precision(jacobian, jnp.asarray(log_v), keep)
+    )
     assert (np.diag(alone) / np.diag(precision)).max() > 1.2
 
 

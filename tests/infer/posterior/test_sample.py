@@ -65,9 +65,9 @@ def test_variances_are_drawn_from_the_gaussian_of_their_information(problem):
     single = np.array([n.startswith(("camera", "process", "current")) for n in names])
     residual, jacobian = problem.linear(end.z, problem.electric(end.z, log_v))
     effect = effects_at(problem, residual, log_v)
-    weight = problem.seen(residual, log_v, np.ones(24), effect).whitening.weight["motion"]
+    weight = problem.weighed(residual, log_v, np.ones(24), effect).whitening.weight["motion"]
     motion = residual["motion"], jacobian["motion"]
-    of_effects = effect_information(problem.target, motion, weight, end.covariance, log_v)
+    of_effects = effect_information(problem.objective, motion, weight, end.covariance, log_v)
     of_effects += np.eye(len(log_v)) / 9
     told = np.where(single[:, None] & single, by_definition(problem, log_v), 0.0)
     told += np.where(~single[:, None] & ~single, of_effects, 0.0)
@@ -105,14 +105,14 @@ def test_runs_that_err_alike_are_no_outliers_to_variances(problem, monkeypatch):
 def test_how_far_floors_differ_is_drawn_by_how_likely_it_is(problem):
     """Load biases that are known by themselves, with a half-normal prior of their common std."""
     end, at = fitted(problem), problem.space.pooled
-    now, typical = np.exp(0.5 * end.log_variance[problem.target.pooled]), 0.05
+    now, typical = np.exp(0.5 * end.log_variance[problem.objective.pooled]), 0.05
     sure = 0.02**-2  # what data alone tell of each
     seen = np.array([0.06, -0.09, 0.12, -0.05])
     covariance = np.diag(np.where(at, 1 / (sure + now**-2), 0.01))
     z = end.z.copy()
     z[at] = seen * sure / (sure + now**-2)
     draws = drawn_variances(problem, Fitted(z, end.log_variance, covariance), SHAPE, 0)
-    std = np.exp(0.5 * draws[..., problem.target.pooled]).ravel()
+    std = np.exp(0.5 * draws[..., problem.objective.pooled]).ravel()
 
     def density(s, power=0):
         spread = np.sqrt(s**2 + 1 / sure)
@@ -123,7 +123,7 @@ def test_how_far_floors_differ_is_drawn_by_how_likely_it_is(problem):
     # the grid's steps are 6 %
     assert std.mean() == pytest.approx(mean, rel=0.01)
     assert std.std() == pytest.approx(np.sqrt(square - mean**2), rel=0.03)
-    others = drawn_variances(problem, end, (1, 2000), 0)[..., problem.target.pooled]
+    others = drawn_variances(problem, end, (1, 2000), 0)[..., problem.objective.pooled]
     assert np.exp(0.5 * others).mean() < 0.6 * mean  # biases of zero tell that floors are alike
 
 

@@ -54,7 +54,7 @@ def test_sigma_is_that_of_the_likelihood_alone(problem, size):
     precision[at, at] += 1 / pooled - 1.0
     # the prior of the biases is around zero, that of all others in what the data say
     z = np.linalg.solve(precision, own @ alone)
-    one, other = (space.place[f"surface.{floor}.load_bias"] for floor in ("firm", "soft"))
+    one, other = (space.slices[f"surface.{floor}.load_bias"] for floor in ("firm", "soft"))
     gap = alone[one] - alone[other]
     cov = np.linalg.inv(own)
     spread = cov[one, one] + cov[other, other] - cov[one, other] - cov[other, one]
@@ -73,7 +73,7 @@ def test_a_floor_with_another_law_is_named(bias):
     truth = eqx.tree_at(lambda r: r.surfaces.load_bias, truth, own)
     problem = problem_of(truth)
     end = optimise(problem)
-    pooled = np.exp(end.state.log_variance[problem.target.pooled])
+    pooled = np.exp(end.state.log_variance[problem.objective.pooled])
     found = disputes(problem.space.with_pooled(np.sqrt(pooled)), end.state.z, end.covariance)
     assert [d.floors for d in found] == [("firm", "soft")] * (bias > 0)
 

@@ -77,7 +77,7 @@ def test_what_is_called_flat_is_and_nothing_is_left_out(seed):
             fewer = picked[:k] + picked[k + 1 :]
             if fewer and len(picked) > 1:
                 lowest = np.linalg.eigvalsh(p[np.ix_(fewer, fewer)])[0]
-                assert lowest >= flat_module._UNSEEN
+                assert lowest >= flat_module._NO_EFFECT
         pivots.append(picked[int(np.argmax(np.abs(u) > 0.9 * np.abs(u).max()))])
     rest = [k for k in range(8) if k not in pivots]
     assert np.linalg.eigvalsh(p[np.ix_(rest, rest)])[0] >= NOTICED
@@ -102,7 +102,9 @@ def test_powers_differ_by_formula():
     assert wording._product(both, np.array([1.0, 0.5])) == f"{a} and {b} only as {a} / {b}^2"
     three = [*both, *wording.axes_of(numbers("surface.soft.creep")[0])]
     open_ = wording._product(three, np.array([1.0, -0.5, 0.8]))
-    assert open_.startswith(f"unseen for any factor t: {a} times t, {b} divided by t^0.5, ")
+    assert open_.startswith(
+        f"no effect on the data for any factor t: {a} times t, {b} divided by t^0.5, "
+    )
     assert open_.endswith(" times t^0.8")
     assert wording._sum([a, b], np.array([1.0, -1.0])) == f"{a} and {b} only as {b} + {a}"
     assert wording._sum([a, b], np.array([1.0, 0.5])) == f"{a} and {b} only as {a} - 2 {b}"
@@ -214,7 +216,7 @@ def test_marker_yaw_and_a_turn_of_all_drives_are_one_number():
     assert set(found.paths) == {"camera.marker_yaw", "robot.drive_offset"}
     assert len(found.paths) == 4
     assert np.abs(found.powers) == pytest.approx(1.0, abs=0.05)
-    assert "how the marker stands" in found.remedy
+    assert "the marker's angle" in found.remedy
     assert flat_directions(*seen("camera.marker_yaw", "surface.*.creep"), True, True) == ()
 
 
@@ -235,7 +237,7 @@ def test_the_torque_scale_is_open_without_voltage_and_said_once():
     free = ("motor.resistance", "motor.back_emf", "motor.*_friction", "surface.*.friction")
     found = flat_directions(*seen(*free, voltage=False), True, False)
     said = sentences(found)
-    assert f"the data say next to nothing of motor.resistance: {VOLTAGE}" in said
+    assert f"the data hardly determine motor.resistance: {VOLTAGE}" in said
     [scale] = [f for f in found if "motor.back_emf" in f.paths]
     assert scale.powers == pytest.approx([1.0] * 5, abs=0.05)
     assert scale.text.endswith(
@@ -269,7 +271,7 @@ def test_what_currents_and_voltages_tell(voltage):
     assert both.value == pytest.approx(5.5 / float(TRUTH.motor.back_emf))
     assert both.verdict == ("identified" if voltage else "not_identified")
     assert both.provenance == ("measured" if voltage else "borrowed")
-    r, c = (space.place[f"motor.{n}"].start for n in ("resistance", "back_emf"))
+    r, c = (space.slices[f"motor.{n}"].start for n in ("resistance", "back_emf"))
     std = np.sqrt(cov[r, r] + cov[c, c] - 2 * cov[r, c])
     assert both.std == pytest.approx(both.value * std)
     low, high = both.interval90
@@ -279,7 +281,7 @@ def test_what_currents_and_voltages_tell(voltage):
 
 def test_a_number_without_bounds_may_be_larger_than_any_exponent():
     space = space_of("surface.soft.lead")
-    at = space.place["surface.soft.lead"]
+    at = space.slices["surface.soft.lead"]
     z = np.array(space.start)
     z[at] = 1e4
     [e] = [one for one in estimates(space, (), z, np.eye(len(z)), True, ()) if one.std is not None]
@@ -346,7 +348,7 @@ def test_a_profile_refits_all_others():
     """Holding a number elsewhere costs less than moving it alone."""
     this, end = fitted()
     p = profile(this, end, "motor.back_emf")
-    k = this.space.place["motor.back_emf"].start
+    k = this.space.slices["motor.back_emf"].start
     z = end.state.z.copy()
     z[k] = np.log(p.value[-1])
     log_v, every = end.state.log_variance, np.ones(len(this.windows))
@@ -354,7 +356,7 @@ def test_a_profile_refits_all_others():
 
     def loss(z):
         blocks, _ = this.linear(z, electric)
-        seen = this.seen(blocks, log_v, every, end.state.effect)
+        seen = this.weighed(blocks, log_v, every, end.state.effect)
         return this.loss(z, log_v, every, seen, electric)
 
     assert p.posterior[-1] < 0.9 * (loss(z) - loss(end.state.z))
@@ -367,14 +369,14 @@ def test_a_profile_without_a_lower_end_says_bound():
     assert p.ends == ("at_bound", "closed")
     assert p.interval90[0] == 0.0
     assert p.interval90[1] < p.value[-1]
-    assert "is at its bound: the data only put it below" in p.said
+    assert "is at its bound: the data only put it below" in p.sentence
 
 
 @pytest.mark.slow
 def test_a_profile_goes_back_where_it_stepped_over_the_end_of_a_flat_stretch(monkeypatch):
     """Level for a prior's std and a half, then a wall: points close in on it."""
     this, end = fitted()
-    at = this.space.place["motor.inductance"].start
+    at = this.space.slices["motor.inductance"].start
     start, std = end.state.z[at], this.space.prior_std[at]
 
     def optimised(problem, start, **_):
@@ -402,7 +404,7 @@ def test_a_profile_of_what_no_datum_touches_is_level():
     assert p.interval90 == (None, None)
     assert max(p.likelihood) < 1e-6
     np.testing.assert_allclose(p.posterior, p.laplace, atol=1e-6)  # the prior alone
-    assert "do not tell it" in p.said
+    assert "do not determine it" in p.sentence
 
 
 @pytest.mark.parametrize(

@@ -35,9 +35,9 @@ def test_a_fit_that_predicts_and_settled_is_trusted():
 @pytest.mark.parametrize(
     ("floors", "converged", "numbers", "word", "says"),
     [
-        (GOOD, False, [number()], "doubtful", "did not come to rest"),
+        (GOOD, False, [number()], "doubtful", "did not converge"),
         ({"ice": EndPoints(0.24, 0.2)}, True, [number()], "doubtful", "on ice it is off by 24.0 %"),
-        ({"ice": EndPoints(0.8, 0.3)}, True, [number()], "not to be trusted", "80.0 % of the way"),
+        ({"ice": EndPoints(0.8, 0.3)}, True, [number()], "not to be trusted", "80.0 % of the path"),
         ({"ice": EndPoints(0.6, 0.9)}, True, [number()], "doubtful", "neither is of use"),
         ({"a": EndPoints(float("nan"), 0.1)}, True, [number()], "not to be trusted", "not numbers"),
         (GOOD, True, [number(value=4e4)], "not to be trusted", "motor.resistance = 4e+04 ohm"),
@@ -47,7 +47,7 @@ def test_a_fit_that_predicts_and_settled_is_trusted():
         (GOOD, True, [number("surface.gray.friction", 40.0)], "not to be trusted", "0.005 to 5"),
     ],
 )
-def test_what_speaks_against_it_is_said(floors, converged, numbers, word, says):
+def test_every_reason_against_it_is_reported(floors, converged, numbers, word, says):
     found = verdict_of_trust(floors, converged, numbers)
     assert found.word == word
     assert any(says in reason for reason in found.reasons)
@@ -60,4 +60,4 @@ def test_errors_that_are_both_tiny_are_no_reason():
 def test_the_worst_reason_comes_first():
     found = verdict_of_trust({"ice": EndPoints(0.8, 0.3)}, False, [number()])
     assert "ice" in found.reasons[0]
-    assert "rest" in found.reasons[1]
+    assert "converge" in found.reasons[1]

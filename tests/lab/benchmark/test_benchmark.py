@@ -22,7 +22,7 @@ from slipid.lab.benchmark.work import (
     split_of,
 )
 from slipid.support.errors import DataError
-from slipid.support.executor import Here
+from slipid.support.executor import InProcess
 from slipid.support.progress import Reporter
 
 
@@ -131,7 +131,9 @@ def test_quick_work_does_not_overwrite_what_was_kept(tmp_path):
 def test_an_unknown_row_is_named_with_the_choices(tmp_path):
     with pytest.raises(DataError, match=r"no row 'encodr'.*did you mean.*encoder"):
         benchmark(
-            BenchmarkOptions(tmp_path, tmp_path / "out", ("encodr",)), Here(), Reporter(quiet=True)
+            BenchmarkOptions(tmp_path, tmp_path / "out", ("encodr",)),
+            InProcess(),
+            Reporter(quiet=True),
         )
 
 
@@ -174,7 +176,7 @@ def test_a_data_set_that_cannot_be_read_stops_no_other(tmp_path, monkeypatch):
     monkeypatch.setattr("slipid.lab.benchmark.benchmark.SOURCES", [source_of("robotino2022")])
     found = benchmark(
         BenchmarkOptions(tmp_path / "data", tmp_path / "out", ("quann_slip",)),
-        Here(),
+        InProcess(),
         Reporter(quiet=True),
     )
     assert list(found["unread"]) == ["robotino2022"]
@@ -191,4 +193,4 @@ def test_a_robot_that_cannot_be_identified_drives_no_rectangle(tmp_path, monkeyp
 
     monkeypatch.setattr("slipid.lab.benchmark.rectangle.data_of", broken)
     assert rectangle.run() == "rectangle"
-    assert rectangle.drive(Here(), Reporter(quiet=True)) == {"failed": "OSError: disk on fire"}
+    assert rectangle.drive(InProcess(), Reporter(quiet=True)) == {"failed": "OSError: disk on fire"}

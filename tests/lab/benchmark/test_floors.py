@@ -66,7 +66,7 @@ class Meter(FloorClassifier):
     def candidates(self):
         return [replace(self, off=off) for off in self.tries] or (self,)
 
-    def fit(self, runs, machine):
+    def fit(self, runs, spec):
         labels = floors_of(runs)
         level = {
             name: float(np.mean([f.current.mean() for f in runs if f.floor == name]))
@@ -74,7 +74,7 @@ class Meter(FloorClassifier):
         }
         return replace(self, labels=labels, level=level)
 
-    def probability(self, runs, machine):
+    def probability(self, runs, spec):
         out = []
         for run in runs:
             mean = np.cumsum(run.current.mean(axis=1)) / np.arange(1, len(run) + 1) + self.off
@@ -198,10 +198,10 @@ class Memory(Meter):
     def candidates(self):
         return [self, replace(self, right=True)]
 
-    def fit(self, runs, machine):
+    def fit(self, runs, spec):
         return replace(self, labels=floors_of(runs), known=frozenset(f.name for f in runs))
 
-    def probability(self, runs, machine):
+    def probability(self, runs, spec):
         seen = [f.name in self.known for f in runs]
         each = [np.array([0.9, 0.1]) if s else np.array([0.1, 0.9]) for s in seen]
         return [np.tile(p, (len(f), 1)) for p, f in zip(each, runs, strict=True)]
@@ -441,7 +441,7 @@ def test_slipid_says_what_it_lacks():
 class Broken(Meter):
     """Cannot be fitted."""
 
-    def fit(self, runs, machine):
+    def fit(self, runs, spec):
         raise ZeroDivisionError("no wheel")
 
 

@@ -8,13 +8,13 @@ import pytest
 from slipid.lab.benchmark.protocols import PROTOCOLS, base_of, facts_of_run, inner, splits
 from slipid.lab.benchmark.tuning import _loss, tuned
 from slipid.lab.systems.motion.quann import QuannEnergy
-from slipid.predict.folds import Facts
-from slipid.predict.slip_model import FEWEST, ByFloor, Machine, PredictedRun, SlipModel, path_of
+from slipid.predict.folds import FoldKey
+from slipid.predict.slip_model import FEWEST, ByFloor, PredictedRun, RobotSpec, SlipModel, path_of
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 
 def facts(floors=("gray", "green"), speeds=(0.1, 0.2)):
-    return [Facts(f, 10.0 * k, v) for f in floors for v in speeds for k in range(36)]
+    return [FoldKey(f, 10.0 * k, v) for f in floors for v in speeds for k in range(36)]
 
 
 def test_every_protocol_has_splits_of_its_kind():
@@ -65,7 +65,7 @@ def test_a_load_driven_at_one_speed_keeps_it_and_a_floor_is_left_out_with_all_lo
 
 def test_many_speeds_are_two_halves():
     rng = np.random.default_rng(0)
-    every = [Facts("grass", 0.0, float(v)) for v in rng.uniform(0.5, 3.0, 60)]
+    every = [FoldKey("grass", 0.0, float(v)) for v in rng.uniform(0.5, 3.0, 60)]
     found = splits(every, "speeds")
     assert [abs(len(split.held_out) - 30) < 3 for split in found] == [True, True]
     fastest = [max(every[k].speed for k in split.held_out) for split in found]
@@ -73,7 +73,7 @@ def test_many_speeds_are_two_halves():
 
 
 def test_a_floor_nobody_else_has_is_not_judged_by_heading():
-    lone = [Facts("ice", 0.0, 0.1)] * 3
+    lone = [FoldKey("ice", 0.0, 0.1)] * 3
     for split in splits([*facts(), *lone], "headings"):
         assert not [k for k in split.held_out if k >= len(facts())]
 
@@ -127,12 +127,12 @@ class Scaled(SlipModel):
     def candidates(self):
         return [replace(self, factor=f) for f in (1.0, 0.85, 0.5)]
 
-    def fit(self, runs, machine: Machine):
+    def fit(self, runs, spec: RobotSpec):
         return replace(self, seen=tuple(run.signals.name for run in runs))
 
-    def predict(self, runs, machine: Machine):
+    def predict(self, runs, spec: RobotSpec):
         assert not {run.name for run in runs} & set(self.seen)
-        return [PredictedRun(path_of(self.factor * r.rolling(machine), r.dt)) for r in runs]
+        return [PredictedRun(path_of(self.factor * r.rolling(spec), r.dt)) for r in runs]
 
     @property
     def numbers(self):
@@ -156,9 +156,9 @@ class Hungry(Scaled):
     def candidates(self):
         return [self]
 
-    def fit(self, runs, machine: Machine):
+    def fit(self, runs, spec: RobotSpec):
         several = len({run.floor for run in runs}) > 1
-        return replace(super().fit(runs, machine), factor=0.5 if several else 1.0)
+        return replace(super().fit(runs, spec), factor=0.5 if several else 1.0)
 
 
 def test_a_method_by_floor_may_do_better_with_one_fit_for_all():
@@ -196,10 +196,10 @@ def test_runs_whose_floor_was_left_out_altogether_do_not_count():
 class Stubborn(Scaled):
     """One setting cannot be fitted."""
 
-    def fit(self, runs, machine: Machine):
+    def fit(self, runs, spec: RobotSpec):
         if self.factor == 0.5:
             raise ValueError("no")
-        return super().fit(runs, machine)
+        return super().fit(runs, spec)
 
 
 def test_a_setting_that_fails_is_not_picked():
@@ -210,9 +210,9 @@ def test_a_setting_that_fails_is_not_picked():
 class Mean(Scaled):
     """Encoders, times what they are off by in the mean."""
 
-    def fit(self, runs, machine: Machine):
-        slip = np.mean([r.twist[0, :2] @ r.signals.rolling(machine)[0, :2] for r in runs])
-        size = np.mean([(r.signals.rolling(machine)[0, :2] ** 2).sum() for r in runs])
+    def fit(self, runs, spec: RobotSpec):
+        slip = np.mean([r.twist[0, :2] @ r.signals.rolling(spec)[0, :2] for r in runs])
+        size = np.mean([(r.signals.rolling(spec)[0, :2] ** 2).sum() for r in runs])
         return replace(self, factor=float(slip / size))
 
 
@@ -252,8 +252,8 @@ class Powered(Scaled):
     def candidates(self):
         return [replace(self, watts=w) for w in (90.0, 10.0, 3.0)]
 
-    def predict(self, runs, machine: Machine):
-        said = super().predict(runs, machine)
+    def predict(self, runs, spec: RobotSpec):
+        said = super().predict(runs, spec)
         return [
             replace(s, power=np.full(len(r), self.watts)) for s, r in zip(said, runs, strict=True)
         ]

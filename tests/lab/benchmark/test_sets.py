@@ -40,7 +40,7 @@ def testsite(tmp_path_factory):
 def test_recorded_runs_need_no_data_folder(testsite):
     assert len(testsite.logged) == len(testsite.job.dataset) == 120
     assert {fact.floor for fact in testsite.facts} == {"firm", "soft", "soft@moved"}
-    assert testsite.machine.determines_twist
+    assert testsite.spec.determines_twist
     assert {fact.floor for fact in testsite.facts} == {"firm", "soft", "soft@moved"}
 
 
@@ -60,7 +60,7 @@ def test_currents_are_heard_where_the_fit_does_without(real_data, tmp_path):
         assert data.logged.current_is_signed is signed
         assert data.job.dataset.current is None
         assert [log.name for log in data.logged.logs] == [log.name for log in data.job.dataset.logs]
-        assert not data.machine.determines_twist
+        assert not data.spec.determines_twist
 
 
 @pytest.mark.slow

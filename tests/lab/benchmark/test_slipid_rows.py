@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from slipid.api.runs import made_runs
+from slipid.api.runs import simulate_runs
 from slipid.fit.variances import DEGREES
 from slipid.lab.benchmark import slipid_rows
 from slipid.lab.benchmark.slipid_rows import (
@@ -17,15 +17,15 @@ from slipid.lab.benchmark.slipid_rows import (
     replay,
 )
 from slipid.lab.benchmark.steps import run_batches
-from slipid.predict.slip_model import Machine, PredictedRun
+from slipid.predict.slip_model import PredictedRun, RobotSpec
 from slipid.robot.estimator import Estimator
-from slipid.robot.interface import MIXED, Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, Settings
 from tests.helpers.small_twin import deployed
 
 
 @pytest.fixture(scope="module")
 def made():
-    return made_runs(("firm", "soft"), headings=3, turns=0, seed=3)
+    return simulate_runs(("firm", "soft"), headings=3, turns=0, seed=3)
 
 
 def fit_of(made, current=True) -> SlipidFit:
@@ -49,8 +49,8 @@ def fit_of(made, current=True) -> SlipidFit:
 
 def test_where_the_floor_is_told_the_region_is_that_of_a_student_t(made):
     one = run_batches(made.runs, made.robot)[0]
-    machine = Machine.of(made.robot)
-    said = forecast(fit_of(made, current=False), one, machine)
+    spec = RobotSpec.of(made.robot)
+    said = forecast(fit_of(made, current=False), one, spec)
     assert len(said) == len(one.runs)
     for run in said:
         assert run.end_covariance is not None
@@ -98,13 +98,13 @@ def test_an_estimator_has_the_floors_that_it_may_meet(made, driven):
 
 def test_only_a_robot_that_may_stand_on_several_floors_looks_for_them(made, driven):
     labels(FloorKnowledge(), made, driven)
-    assert driven[0][0].settings.alike != MIXED
+    assert driven[0][0].settings.further_floor_penalty != MIXED_FLOORS_PENALTY
     batches = [
         replace(one, runs=tuple(replace(run, floor="unknown") for run in one.runs))
         for one in run_batches(made.runs, made.robot)
     ]
     estimator_runs(fit_of(made), batches, made.runs, FloorKnowledge())
-    assert driven[1][0].settings.alike == MIXED
+    assert driven[1][0].settings.further_floor_penalty == MIXED_FLOORS_PENALTY
 
 
 def test_an_estimator_hears_currents_only_if_it_was_fitted_to_some(made, driven):

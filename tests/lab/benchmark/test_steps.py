@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.api.runs import made_runs, move
+from slipid.api.runs import simulate_runs, steady_motion
 from slipid.data.runs import collect
 from slipid.lab.benchmark.slipid_rows import turned_covariance
 from slipid.lab.benchmark.steps import run_batches
-from slipid.predict.slip_model import seen_from_start
+from slipid.predict.slip_model import relative_to_start
 
 
 @pytest.fixture(scope="module")
 def made():
-    return made_runs(("firm", "soft"), headings=4, turns=0, seed=3)
+    return simulate_runs(("firm", "soft"), headings=4, turns=0, seed=3)
 
 
 def test_every_run_is_there_once_in_equally_many_steps(made):
@@ -33,8 +33,8 @@ def test_it_moves_as_the_robot_that_drove_it(made):
             assert log.surface == run.floor
             assert run.signals.floor is None
             steady = run.signals.speed[len(run.signals) // 2 :].mean(axis=0)
-            command = steady * 0.04 @ np.asarray(made.robot.geometry.least()).T
-            expected = move(made.robot, str(log.surface), command[None]).twist[0]
+            command = steady * 0.04 @ np.asarray(made.robot.geometry.pseudo_inverse()).T
+            expected = steady_motion(made.robot, str(log.surface), command[None]).twist[0]
             found = run.twist[len(run.signals) // 2 :].mean(axis=0)
             assert found[:2] == pytest.approx(expected[:2], abs=0.015)
 
@@ -56,13 +56,13 @@ def test_the_load_is_heard_and_gyro_and_command_are_means_over_each_step(made):
     assert signals.command == pytest.approx(np.tile([0.1, 0.2, 0.3], (len(signals), 1)))
     # in the time of the wheels, which the camera lags
     lag = float(made.robot.camera.lag)
-    middle = one.windows.began[0] + np.cumsum(signals.dt) - 0.5 * signals.dt - lag
+    middle = one.windows.start[0] + np.cumsum(signals.dt) - 0.5 * signals.dt - lag
     assert signals.gyro is not None
     assert signals.gyro[1:] == pytest.approx(3.0 * middle[1:], abs=0.01)
 
 
 def test_a_start_anywhere_is_the_origin():
     path = np.array([[1.0, 2.0, np.pi / 2], [1.0, 3.0, np.pi]])
-    assert seen_from_start(path) == pytest.approx(np.array([[0, 0, 0], [1, 0, np.pi / 2]]))
+    assert relative_to_start(path) == pytest.approx(np.array([[0, 0, 0], [1, 0, np.pi / 2]]))
     turned = turned_covariance(np.diag([4.0, 1.0]), -np.pi / 2)
     assert turned == pytest.approx(np.diag([1.0, 4.0]))

@@ -14,15 +14,21 @@ from slipid.data.windows import windows
 from slipid.fit.likelihood import batch
 from slipid.fit.noise import noise
 from slipid.infer.design.planned_runs import PlannedRun
-from slipid.lab.selftest.logs import TRUTH, Sensors, grid, make_logs, truth
+from slipid.lab.selftest.logs import (
+    TRUTH,
+    SimulatedSensors,
+    heading_grid,
+    simulate_logs,
+    true_robot,
+)
 from tests.helpers.made_logs import LAYOUT, write_logs
 from tests.helpers.made_windows import electric_noise, residuals
 from tests.helpers.one_log import read_log
 
 SETUPS = (("firm", "as_built"), ("soft", "as_built"), ("soft", "moved"))
-PLAN = grid(SETUPS, headings=4, turns=2)
-ROBOT = truth(PLAN)
-STILL = dict.fromkeys(Sensors().std, 0.0)
+PLAN = heading_grid(SETUPS, headings=4, turns=2)
+ROBOT = true_robot(PLAN)
+STILL = dict.fromkeys(SimulatedSensors().std, 0.0)
 
 
 @jax.jit
@@ -31,13 +37,13 @@ def gaps(robot, b):
 
 
 def at_truth(robot, plan, seed, sensors):
-    cut = windows(collect(make_logs(robot, plan, seed, sensors)), 0.04, float(robot.camera.lag))
+    cut = windows(collect(simulate_logs(robot, plan, seed, sensors)), 0.04, float(robot.camera.lag))
     return cut, {k: np.asarray(v) for k, v in gaps(robot, batch(cut, robot)).items()}
 
 
 @pytest.fixture(scope="module")
 def logs():
-    return make_logs(ROBOT, PLAN, seed=3)
+    return simulate_logs(ROBOT, PLAN, seed=3)
 
 
 def test_plan_covers_every_setting_once():
@@ -48,8 +54,8 @@ def test_plan_covers_every_setting_once():
 
 @pytest.mark.slow
 def test_seed_decides_everything(logs):
-    again = make_logs(ROBOT, PLAN, seed=3)
-    other = make_logs(ROBOT, PLAN, seed=4)
+    again = simulate_logs(ROBOT, PLAN, seed=3)
+    other = simulate_logs(ROBOT, PLAN, seed=4)
     for a, b, c in zip(logs, again, other, strict=True):
         assert a.sha256 == b.sha256 != c.sha256
         np.testing.assert_array_equal(a.current, b.current)
@@ -82,7 +88,7 @@ def test_sessions_are_those_a_dataset_finds(logs):
 
 @pytest.mark.slow
 def test_without_noise_the_likelihood_has_no_residual():
-    fine = Sensors(
+    fine = SimulatedSensors(
         std=STILL,
         ripple=0.0,
         voltage_noise=0.0,
@@ -109,7 +115,7 @@ def test_without_noise_the_likelihood_has_no_residual():
 @pytest.mark.slow
 def test_scatter_of_increments_is_the_likelihoods_covariance():
     """Whitened with the true variances, residuals at the truth have unit variance."""
-    sensors = Sensors()
+    sensors = SimulatedSensors()
     one = [PlannedRun("soft", "as_built", h, 0.1) for h in np.linspace(0.1, 6, len(PLAN))]
     cut, gap = at_truth(ROBOT, one, 11, sensors)
     n = noise(cut, ROBOT)

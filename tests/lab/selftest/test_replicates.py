@@ -17,16 +17,21 @@ from typer.testing import CliRunner
 
 from slipid.app.config import parsed
 from slipid.app.logs import packaged_config
-from slipid.app.problem import Job
+from slipid.app.problem import ConfigFitTask
 from slipid.cli.main import app
 from slipid.fit import likelihood as lk
 from slipid.fit import noise as of_noise
 from slipid.fit.optimise import Optimum
 from slipid.fit.problem import Problem
-from slipid.fit.shared import AXES
+from slipid.fit.shared_effects import AXES
 from slipid.lab.selftest import replicates as selftest
-from slipid.lab.selftest.experiment import judged, summary
-from slipid.lab.selftest.replicates import Curve, Number, Replicate, measure
+from slipid.lab.selftest.experiment import number_summary, summary
+from slipid.lab.selftest.replicates import (
+    CurveRecovery,
+    NumberRecovery,
+    Replicate,
+    simulate_windows,
+)
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.progress import Reporter
 from tests.fit.test_optimise import begin
@@ -79,7 +84,7 @@ def test_the_noise_made_is_the_noise_the_likelihood_expects():
     driven = replace(driven, current_var=np.full_like(driven.current_var, 1e-3))
     rng, square, count = np.random.default_rng(5), {}, 0
     for _ in range(15):
-        w = measure(BENT, driven, rng, STD)
+        w = simulate_windows(BENT, driven, rng, STD)
         noise = of_noise.noise(w, BENT)
         variance = np.array([std_of(name) ** 2 for name in noise.names])
         for block, r in gaps(BENT, lk.batch(w, BENT)).items():
@@ -106,7 +111,7 @@ def test_effects_made_are_shared_as_the_likelihood_expects():
     whole = block_diag(*own) + of_shared(problem, log_v)
     root, square = np.linalg.cholesky(whole), 0.0
     for _ in range(15):
-        w = measure(BENT, driven, rng, std)
+        w = simulate_windows(BENT, driven, rng, std)
         r = np.asarray(gaps(BENT, lk.batch(w, BENT))["motion"]).ravel()
         square += float((np.linalg.solve(root, r) ** 2).sum())
     low, high = chi2.ppf([1e-4, 1 - 1e-4], 15 * len(whole))
@@ -117,7 +122,7 @@ def test_effects_made_are_shared_as_the_likelihood_expects():
 
 
 def number(z=0.5, verdict="identified", inside=True):
-    return Number("m", [], [2.0], [2.2], inside=[inside], z=[z], verdict=verdict)
+    return NumberRecovery("m", [], [2.0], [2.2], inside=[inside], z=[z], verdict=verdict)
 
 
 @pytest.mark.parametrize(
@@ -133,7 +138,7 @@ def number(z=0.5, verdict="identified", inside=True):
     ],
 )
 def test_what_counts_as_recovered(found, recovered):
-    said = judged(found)
+    said = number_summary(found)
     assert said["recovered"] == recovered
     assert said["error_rms"] == pytest.approx(0.2)
     assert said["relative_error_rms"] == pytest.approx(0.1)
@@ -142,7 +147,7 @@ def test_what_counts_as_recovered(found, recovered):
 def row(verdict, converged=True):
     return Replicate(
         parameters={"a": number(verdict=verdict), "b": number()},
-        curves={"soft": Curve(gap=0.01, inside=0.9)},
+        curves={"soft": CurveRecovery(gap=0.01, inside=0.9)},
         predictions={"soft": {"identified": 0.01, "encoder": 0.3}},
         converged=converged,
         reason="",
@@ -188,7 +193,7 @@ def tested(tmp_path_factory):
     """A self-test that is interrupted after its first replicate, and called again."""
     folder = tmp_path_factory.mktemp("selftest")
     path = config(folder, 'wanted = ["motor.resistance", "motor.back_emf"]')
-    out, keep, make, made_once = folder / "out", Checkpoint.save_json, Job.problem, []
+    out, keep, make, made_once = folder / "out", Checkpoint.save_json, ConfigFitTask.problem, []
 
     def problem(job):
         """What the first call compiles serves the second."""
@@ -201,7 +206,7 @@ def tested(tmp_path_factory):
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Job, "problem", problem)
+        patch.setattr(ConfigFitTask, "problem", problem)
         with patch.context() as stop:
             stop.setattr(Checkpoint, "save_json", interrupted)
             stopped = invoke(path, "--out", out, "--replicates", 2)
@@ -252,14 +257,16 @@ def test_a_replicate_depends_on_seed_and_number_alone(tmp_path, monkeypatch):
     problem = Problem(w, truth, [])
     settings = parsed(Path("my.toml"), packaged_config("robotino.toml"))
     seen = []
-    monkeypatch.setattr(selftest, "measure", lambda t, w, rng, std: seen.append(rng.normal()) or w)
+    monkeypatch.setattr(
+        selftest, "simulate_windows", lambda t, w, rng, std: seen.append(rng.normal()) or w
+    )
     end = Optimum(begin(problem), np.eye(problem.space.size), True, "", ())
     monkeypatch.setattr(selftest, "optimise", lambda *_, **__: end)
 
     def truth_alone(problem, choices, z, end):
         return Replicate({"z": replace(number(), truth=z.tolist())}, {}, {}, True, "")
 
-    monkeypatch.setattr(selftest, "compared", truth_alone)
+    monkeypatch.setattr(selftest, "recovery", truth_alone)
 
     def run(count, folder, seed=3):
         kept, report = Checkpoint(tmp_path / folder, "key"), Reporter(quiet=True)

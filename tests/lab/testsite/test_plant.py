@@ -7,25 +7,41 @@ import numpy as np
 import pytest
 
 from slipid.data.floor_map import FloorMap, four_zones, uniform
-from slipid.lab.testsite.driving import Run, Timed, Trace, Waypoints, drive, numbered, straight
-from slipid.lab.testsite.ground import GRAVITY, GROUNDS, LEVELS, Ground, ribs
-from slipid.lab.testsite.motors import Drive, Machine, Motor, SpeedLoop
-from slipid.lab.testsite.plant import Plant
-from slipid.lab.testsite.sections import Curves, Headings, PaperGrid, Rectangle, Wander
+from slipid.lab.testsite.driving import (
+    SiteRun,
+    TimedTwists,
+    Trace,
+    Waypoints,
+    drive,
+    named_runs,
+    straight,
+)
+from slipid.lab.testsite.plant import SimulatedRobot
+from slipid.lab.testsite.robot_build import MotorBuild, RobotBuild, SpeedLoop, WheelDrives
+from slipid.lab.testsite.sections import (
+    CurveRuns,
+    HeadingRuns,
+    PaperGridRuns,
+    RectangleRuns,
+    WanderRuns,
+)
 from slipid.lab.testsite.site import Site
+from slipid.lab.testsite.surfaces import GRAVITY, LEVELS, SURFACES, SurfacePhysics, ribs
 from tests.helpers.floors import surface_at
 
-EVEN = {name: replace(g, unevenness=0.0) for name, g in GROUNDS.items()}
-CENTRED = replace(Machine(), centres_m={"as_built": (0.0, 0.0)})
+EVEN = {name: replace(g, unevenness=0.0) for name, g in SURFACES.items()}
+CENTRED = replace(RobotBuild(), centres_m={"as_built": (0.0, 0.0)})
 STILL = [0.0, 0.0, 0.0]
 
 
-def standing(surface: str, machine: Machine = CENTRED, seed: int = 0, **more: Ground) -> Plant:
+def standing(
+    surface: str, machine: RobotBuild = CENTRED, seed: int = 0, **more: SurfacePhysics
+) -> SimulatedRobot:
     grounds = {**EVEN, **more}
-    return Plant(Site(machine, grounds=grounds), uniform(surface), "as_built", seed=seed)
+    return SimulatedRobot(Site(machine, grounds=grounds), uniform(surface), "as_built", seed=seed)
 
 
-def loads(plant: Plant) -> np.ndarray:
+def loads(plant: SimulatedRobot) -> np.ndarray:
     """Vertical force of the floor on each wheel at this moment [N]."""
     out, force = np.zeros(len(plant.wheel_dof)), np.zeros(6)
     for k, contact in enumerate(plant.data.contact):
@@ -37,9 +53,9 @@ def loads(plant: Plant) -> np.ndarray:
     return out
 
 
-def sixths(surface: str) -> list[Run]:
+def sixths(surface: str) -> list[SiteRun]:
     """Straight runs 60 degrees apart."""
-    plan = Headings(surface=surface, step_deg=60.0, speeds_m_s=[0.2], distance_m=0.6)
+    plan = HeadingRuns(surface=surface, step_deg=60.0, speeds_m_s=[0.2], distance_m=0.6)
     return plan.runs()
 
 
@@ -50,7 +66,7 @@ def body_step(trace: Trace) -> np.ndarray:
     return np.array([c * dx + s * dy, c * dy - s * dx, trace.pose[-1, 2] - trace.pose[0, 2]])
 
 
-def rolled(trace: Trace, machine: Machine) -> np.ndarray:
+def rolled(trace: Trace, machine: RobotBuild) -> np.ndarray:
     """What the encoders say of it, integrated along the way."""
     steps = np.diff(trace.wheel_angle, axis=0) @ np.linalg.pinv(machine.wheel_from_twist).T
     heading = np.cumsum(steps[:, 2]) - 0.5 * steps[:, 2]
@@ -59,7 +75,7 @@ def rolled(trace: Trace, machine: Machine) -> np.ndarray:
     return np.array([x.sum(), y.sum(), steps[:, 2].sum()])
 
 
-def slip(trace: Trace, machine: Machine) -> float:
+def slip(trace: Trace, machine: RobotBuild) -> float:
     far, wheels = body_step(trace)[:2], rolled(trace, machine)[:2]
     return float(1 - np.hypot(*far) / np.hypot(*wheels))
 
@@ -105,17 +121,17 @@ def test_a_coasting_robot_only_loses_energy(surface):
 
 @pytest.mark.slow
 def test_the_floor_carries_the_weight_as_statics_say():
-    plant = standing("firm", Machine())
-    rim = Machine().wheel_from_twist @ np.array([0.1, 0.05, 0.0])
+    plant = standing("firm", RobotBuild())
+    rim = RobotBuild().wheel_from_twist @ np.array([0.1, 0.05, 0.0])
     found = []
     for _ in range(4000):
         plant.step(rim.tolist())
         found.append(loads(plant))
-    weight = Machine().mass_kg * GRAVITY
+    weight = RobotBuild().mass_kg * GRAVITY
     mean = np.mean(found[500:], axis=0)
     assert mean.sum() == pytest.approx(weight, rel=0.01)
     # while it stands, where on its two rows of rollers a wheel rests moves a share by up to .02
-    np.testing.assert_allclose(mean / weight, Machine().load_share("as_built"), atol=0.012)
+    np.testing.assert_allclose(mean / weight, RobotBuild().load_share("as_built"), atol=0.012)
 
 
 @pytest.mark.nightly
@@ -178,7 +194,7 @@ def test_slip_grows_with_softness_and_depends_on_the_direction():
 @pytest.mark.slow
 def test_ribs_shake_a_robot_and_do_not_hold_it():
     site = Site()
-    smooth = {**GROUNDS, "ribbed": replace(GROUNDS["ribbed"], rib_height_m=0.0)}
+    smooth = {**SURFACES, "ribbed": replace(SURFACES["ribbed"], rib_height_m=0.0)}
     run = straight("ribbed", "as_built", 0.0, 0.2, 0.5)
     over, flat = drive(run, site, 0), drive(run, Site(grounds=smooth), 0)
     assert body_step(over)[0] > 0.4
@@ -188,23 +204,23 @@ def test_ribs_shake_a_robot_and_do_not_hold_it():
 
 def test_ribs_lie_on_their_surface_only():
     floor = four_zones(["ribbed", "firm", "firm", "firm"], middle=(0.0, 0.0))
-    found = ribs(floor, GROUNDS, (0.0, 0.0, 0.0))
+    found = ribs(floor, SURFACES, (0.0, 0.0, 0.0))
     assert len(found) > 20
     for x, low, high, height in found:
         assert surface_at(floor, x, 0.5 * (low + high)) == "ribbed"
         assert low < high
-        assert height == GROUNDS["ribbed"].rib_height_m
+        assert height == SURFACES["ribbed"].rib_height_m
 
 
 def test_every_roller_feels_the_floor_beneath_it():
     cells = np.array([[0, 1]])
     floor = FloorMap(("firm", "soft"), cells, (-2.0, -2.0), 2.0)  # soft where x is above 0
-    plant = Plant(Site(CENTRED, grounds=EVEN), floor, "as_built")
+    plant = SimulatedRobot(Site(CENTRED, grounds=EVEN), floor, "as_built")
     x = plant.data.geom_xpos[plant.model.geom("roller0_0").id, 0]
     assert x > 0
     rolling = plant.model.geom_friction[:, 2]
-    assert rolling[plant.model.geom("roller0_0").id] == pytest.approx(GROUNDS["soft"].rolling_m)
-    assert rolling[plant.model.geom("roller1_0").id] == pytest.approx(GROUNDS["firm"].rolling_m)
+    assert rolling[plant.model.geom("roller0_0").id] == pytest.approx(SURFACES["soft"].rolling_m)
+    assert rolling[plant.model.geom("roller1_0").id] == pytest.approx(SURFACES["firm"].rolling_m)
     sinkage = plant.machine.wheel_radius_m - plant.data.xpos[plant.wheel_body, 2]
     assert sinkage[0] > 2 * sinkage[1]
 
@@ -212,7 +228,7 @@ def test_every_roller_feels_the_floor_beneath_it():
 def test_a_map_is_felt_up_to_its_edges():
     cells = np.array([[0, 1]])
     floor = FloorMap(("firm", "soft"), cells, (-3.0, -3.0), 3.0)
-    plant = Plant(Site(CENTRED, grounds=EVEN), floor, "as_built", (-2.8, 1.0, 0.0))
+    plant = SimulatedRobot(Site(CENTRED, grounds=EVEN), floor, "as_built", (-2.8, 1.0, 0.0))
     places = np.stack([np.linspace(-3.5, 3.5, 90), np.full(90, 1.2)], axis=1)
     places = places[np.abs(places[:, 0]) > 0.01]  # looked up in cells of some millimetres
     np.testing.assert_array_equal(plant.terrain.at(places) // LEVELS, floor.at(places))
@@ -220,7 +236,7 @@ def test_a_map_is_felt_up_to_its_edges():
 
 def test_the_centre_of_mass_is_where_it_is_put_also_with_uneven_wheels():
     machine = replace(
-        Machine(), wheel_azimuths_deg=(0.0, 90.0, 210.0), centres_m={"as_built": (0.01, 0.01)}
+        RobotBuild(), wheel_azimuths_deg=(0.0, 90.0, 210.0), centres_m={"as_built": (0.01, 0.01)}
     )
     plant = standing("firm", machine)
     mujoco.mj_comPos(plant.model, plant.data)
@@ -250,7 +266,7 @@ def test_compaction_and_body_drag_slow_a_robot():
 
 
 def test_what_is_added_to_the_engine_only_takes_energy():
-    plant = standing("soft", Machine())
+    plant = standing("soft", RobotBuild())
     rng = np.random.default_rng(0)
     twists = [[0.0, 0.0, 0.5], [0.2, 0.0, 0.0], *rng.uniform(-0.3, 0.3, (20, 3))]
     for vx, vy, turn in twists:
@@ -266,15 +282,15 @@ def test_what_is_added_to_the_engine_only_takes_energy():
 
 
 def test_a_held_motor_draws_what_ohm_says_and_a_free_one_nothing():
-    motor = Motor(supply_ohm=0.0, efficiency=1.0)
+    motor = MotorBuild(supply_ohm=0.0, efficiency=1.0)
     loop = SpeedLoop(kind="pi", gain=100.0, integral=0.0, filter_s=0.0)
-    held = Drive(motor, loop, 16.0, 1, 1e-3)
+    held = WheelDrives(motor, loop, 16.0, 1, 1e-3)
     for _ in range(30):
         torque = held.step([5.0], [0.0], [0.0])
     assert held.voltage[0] == motor.supply_v
     assert held.current[0] == pytest.approx(motor.supply_v / motor.resistance_ohm, rel=1e-6)
     assert torque[0] == pytest.approx(16 * motor.back_emf_vs * held.current[0], rel=1e-6)
-    free = Drive(motor, loop, 16.0, 1, 1e-3)
+    free = WheelDrives(motor, loop, 16.0, 1, 1e-3)
     speed = motor.supply_v / motor.back_emf_vs / 16
     for k in range(30):
         free.step([100.0], [speed * k * 1e-3], [speed])
@@ -282,8 +298,8 @@ def test_a_held_motor_draws_what_ohm_says_and_a_free_one_nothing():
 
 
 def test_current_rises_with_the_time_constant_of_the_winding():
-    motor = Motor(supply_ohm=0.0)
-    held = Drive(motor, SpeedLoop(gain=100.0, integral=0.0), 16.0, 1, 1e-4)
+    motor = MotorBuild(supply_ohm=0.0)
+    held = WheelDrives(motor, SpeedLoop(gain=100.0, integral=0.0), 16.0, 1, 1e-4)
     tau = motor.inductance_h / motor.resistance_ohm
     for _ in range(round(tau / 1e-4)):
         held.step([5.0], [0.0], [0.0])
@@ -292,8 +308,8 @@ def test_current_rises_with_the_time_constant_of_the_winding():
 
 
 def test_the_supply_sags_under_load_and_limits_the_voltage():
-    motor = Motor(supply_ohm=1.0)
-    held = Drive(motor, SpeedLoop(gain=100.0), 16.0, 3, 1e-3)
+    motor = MotorBuild(supply_ohm=1.0)
+    held = WheelDrives(motor, SpeedLoop(gain=100.0), 16.0, 3, 1e-3)
     for _ in range(50):
         held.step([5.0, 5.0, 5.0], STILL, STILL)
     drawn = sum(held.current)
@@ -303,10 +319,10 @@ def test_the_supply_sags_under_load_and_limits_the_voltage():
 
 
 def test_a_gear_takes_its_part_of_what_drives_only():
-    motor = Motor(efficiency=0.8)
+    motor = MotorBuild(efficiency=0.8)
     torque = []
     for speed in (3.0, -3.0):
-        drive_ = Drive(motor, SpeedLoop(gain=0.0, integral=0.0), 16.0, 1, 1e-3)
+        drive_ = WheelDrives(motor, SpeedLoop(gain=0.0, integral=0.0), 16.0, 1, 1e-3)
         drive_.current = [1.0]
         drive_._decay = 1.0  # current held
         torque.append(drive_.step([0.0], [0.0], [speed])[0])
@@ -331,22 +347,22 @@ def test_every_speed_loop_drives_the_robot(kind):
 
 
 def test_the_plans_have_the_runs_of_the_published_logs():
-    plan = Headings(surface="soft", step_deg=5.0, speeds_m_s=[0.1, 0.2, 0.3])
+    plan = HeadingRuns(surface="soft", step_deg=5.0, speeds_m_s=[0.1, 0.2, 0.3])
     assert len(plan.runs()) == 216
-    grid = PaperGrid(surface="soft").runs()
+    grid = PaperGridRuns(surface="soft").runs()
     assert len(grid) == 8 + 8 + 6 + 6 + 6
     assert {round(float(np.hypot(*r.program.legs[0][0][:2])), 2) for r in grid} == {
         0.0, 0.1, 0.14, 0.2, 0.28, 0.3, 0.4, 0.42,
     }  # fmt: skip
-    arcs = Curves(surface="soft", load="moved", count=4, speeds_m_s=[0.2]).runs()
+    arcs = CurveRuns(surface="soft", load="moved", count=4, speeds_m_s=[0.2]).runs()
     assert {run.program.legs[0][0][2] > 0 for run in arcs} == {True, False}
-    names = [name for name, _ in numbered(grid, 0.1, 0)]
+    names = [name for name, _ in named_runs(grid, 0.1, 0)]
     assert len(set(names)) == len(names)
     assert names[0] == "as_built/soft/run000"
 
 
 def test_a_timed_program_ends():
-    program = Timed((((0.1, 0.0, 0.0), 1.0), ((0.0, 0.0, 0.2), 0.5)))
+    program = TimedTwists((((0.1, 0.0, 0.0), 1.0), ((0.0, 0.0, 0.2), 0.5)))
     assert program.command(0.5) == (0.1, 0.0, 0.0)
     assert program.command(1.2) == (0.0, 0.0, 0.2)
     assert program.command(1.5) is None
@@ -358,7 +374,7 @@ def test_the_rectangle_is_driven_by_encoders_and_better_by_camera():
     floor = four_zones(["firm", "medium", "soft", "short"])
     closure = {}
     for by in ("encoders", "camera"):
-        trace = drive(Rectangle(map="zones", by=by).runs(floor, 0)[0], site, 0)
+        trace = drive(RectangleRuns(map="zones", by=by).runs(floor, 0)[0], site, 0)
         closure[by] = np.hypot(*(trace.pose[-1, :2] - trace.pose[0, :2]))
         if by == "encoders":
             np.testing.assert_allclose(rolled(trace, site.machine)[:2], 0.0, atol=0.05)
@@ -368,7 +384,7 @@ def test_the_rectangle_is_driven_by_encoders_and_better_by_camera():
 @pytest.mark.slow
 def test_way_points_by_camera_are_reached():
     floor = uniform("medium")
-    run = Wander(map="site", count=1, points=1).runs(floor, 5)[0]
+    run = WanderRuns(map="site", count=1, points=1).runs(floor, 5)[0]
     assert run.surface is None
     near = replace(run, program=Waypoints(((run.start[0] + 0.3, run.start[1]),), 0.3, "camera"))
     trace = drive(near, Site(), 0)
@@ -388,18 +404,24 @@ def test_the_same_seed_drives_the_same_run():
 @pytest.mark.parametrize(
     ("make", "match"),
     [
-        (lambda: Machine(rollers=7), r"rollers\s+Input should be a multiple of 2"),
-        (lambda: Machine(roller_radius_m=0.05), "rollers as large as the wheel"),
-        (lambda: Machine(mass_kg=1.0), "less than the wheels weigh"),
-        (lambda: Machine(centres_m={"far": (0.2, 0.0)}), "load far: the centre of mass"),
+        (lambda: RobotBuild(rollers=7), r"rollers\s+Input should be a multiple of 2"),
+        (lambda: RobotBuild(roller_radius_m=0.05), "rollers as large as the wheel"),
+        (lambda: RobotBuild(mass_kg=1.0), "less than the wheels weigh"),
+        (lambda: RobotBuild(centres_m={"far": (0.2, 0.0)}), "load far: the centre of mass"),
         (
-            lambda: Machine(wheel_azimuths_deg=(0.0, 90.0)),
+            lambda: RobotBuild(wheel_azimuths_deg=(0.0, 90.0)),
             r"wheel_azimuths_deg\s+Tuple should have at least 3",
         ),
-        (lambda: Motor(resistance_ohm=0.0), r"resistance_ohm\s+Input should be greater than 0"),
-        (lambda: Motor(efficiency=1.2), r"efficiency\s+Input should be less than or equal to 1"),
-        (lambda: Ground(friction=float("nan")), r"friction\s+Input"),
-        (lambda: Ground(colour="red"), r"colour\s+.*pattern"),
+        (
+            lambda: MotorBuild(resistance_ohm=0.0),
+            r"resistance_ohm\s+Input should be greater than 0",
+        ),
+        (
+            lambda: MotorBuild(efficiency=1.2),
+            r"efficiency\s+Input should be less than or equal to 1",
+        ),
+        (lambda: SurfacePhysics(friction=float("nan")), r"friction\s+Input"),
+        (lambda: SurfacePhysics(colour="red"), r"colour\s+.*pattern"),
         (lambda: SpeedLoop(gain=-1.0), r"gain\s+Input should be greater than or equal to 0"),
     ],
 )

@@ -8,13 +8,13 @@ import pytest
 from slipid.data.reading.presets import declared_layout, preset
 from slipid.data.write import OPTIONAL, own_columns, own_csv, robotino2022_csv
 from slipid.lab.testsite.driving import Trace, straight
-from slipid.lab.testsite.motors import Machine
-from slipid.lab.testsite.simulate import observe
-from slipid.lab.testsite.site import Sensors, Site
+from slipid.lab.testsite.robot_build import RobotBuild
+from slipid.lab.testsite.simulate import log_of
+from slipid.lab.testsite.site import Site, SiteSensors
 from tests.helpers.made_logs import LAYOUT
 from tests.helpers.one_log import read_log
 
-EXACT = Sensors(
+EXACT = SiteSensors(
     current_noise_a=0.0,
     voltage_noise_v=0.0,
     gyro_noise=0.0,
@@ -48,9 +48,9 @@ def trace():
 
 
 def seen(trace, sensors, seed=0):
-    site = Site(Machine(marker_yaw_deg=float(np.degrees(-0.02))), sensors=sensors)
+    site = Site(RobotBuild(marker_yaw_deg=float(np.degrees(-0.02))), sensors=sensors)
     run = straight("soft", "as_built", 0.0, 0.1, 1.0)
-    return observe(trace, site, run, "as_built/soft/run000", seed)
+    return log_of(trace, site, run, "as_built/soft/run000", seed)
 
 
 def test_every_channel_is_the_truth_to_its_quantum(trace):
@@ -114,7 +114,7 @@ def test_noise_has_the_size_asked_for(trace):
 @pytest.mark.parametrize("change", [{"row_s": 0.0}, {"dropout": 1.0}, {"lag_s": 0.001}])
 def test_sensors_that_cannot_be_are_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):
-        Sensors(**change)
+        SiteSensors(**change)
 
 
 # files

@@ -20,13 +20,13 @@ from slipid.cli.main import app
 from slipid.data.floor_map import four_zones, read_map
 from slipid.data.reading.presets import declared_layout, preset
 from slipid.lab.testsite.config import all_filmed, can_identify, identify_config, plan
-from slipid.lab.testsite.ground import GROUNDS
-from slipid.lab.testsite.motors import Machine
-from slipid.lab.testsite.simulate import Job, _place, simulate, truth
-from slipid.lab.testsite.site import Camera, Site
+from slipid.lab.testsite.robot_build import RobotBuild
+from slipid.lab.testsite.simulate import SiteTask, _log_path, simulate, truth
+from slipid.lab.testsite.site import Site, SiteCamera
 from slipid.lab.testsite.studio import MARKER, Studio, film
+from slipid.lab.testsite.surfaces import SURFACES
 from slipid.support.errors import DataError
-from slipid.support.executor import Here
+from slipid.support.executor import InProcess
 from slipid.support.progress import Reporter
 from tests.conftest import ROOT
 from tests.helpers.floors import surface_at
@@ -163,7 +163,7 @@ def test_another_config_does_not_mix_with_what_is_there(config, tmp_path):
 def test_known_surfaces_are_changed_and_others_made_anew(config):
     found = plan(config, config.read_text())
     assert found.site.grounds["soft"].friction == 0.7
-    assert found.site.grounds["soft"].rolling_m == GROUNDS["soft"].rolling_m
+    assert found.site.grounds["soft"].rolling_m == SURFACES["soft"].rolling_m
     assert found.site.grounds["snow"].friction == 0.3
     assert [name for name, _ in found.runs] == [
         "moved/snow/run000",
@@ -265,9 +265,9 @@ def test_the_same_hash_means_the_same_runs(tmp_path):
 def test_loads_on_one_map_do_not_overwrite_each_other(tmp_path):
     text = SMALL + '[[runs]]\nkind = "rectangle"\nmap = "zones"\nload = "moved"\n'
     made = plan(tmp_path / "x", text)
-    jobs = [Job(name, run, made.site, 0, (), tmp_path) for name, run in made.runs]
+    jobs = [SiteTask(name, run, made.site, 0, (), tmp_path) for name, run in made.runs]
     for form in ("slipid", "robotino2022"):
-        places = [_place(form, job) for job in jobs]
+        places = [_log_path(form, job) for job in jobs]
         assert len(set(places)) == len(places)
 
 
@@ -369,7 +369,7 @@ distance_m = 0.1
     path.write_text(text)
     try:
         with Reporter(quiet=True) as report:
-            simulate(plan(path, text), tmp_path, Here(), report)
+            simulate(plan(path, text), tmp_path, InProcess(), report)
     except DataError as error:
         pytest.skip(f"frames cannot be drawn here: {error}")
     times = np.loadtxt(tmp_path / "video/as_built/firm/run000.csv", delimiter=",", skiprows=1)
@@ -394,7 +394,7 @@ def test_the_truth_has_the_names_of_a_fit():
 
 # the camera: needs OpenGL, which a machine without EGL does not have
 
-HALF = Camera(width_px=960, height_px=540, focal_px=600.0)
+HALF = SiteCamera(width_px=960, height_px=540, focal_px=600.0)
 
 
 @pytest.fixture(scope="module")
@@ -435,7 +435,7 @@ def test_the_marker_is_seen_where_the_camera_says(studio):
         found, numbers, _ = detector.detectMarkers(image)
         assert numbers is not None
         assert numbers.ravel().tolist() == [MARKER]
-        np.testing.assert_allclose(found[0][0], corners(pose, Machine(), HALF), atol=1.2)
+        np.testing.assert_allclose(found[0][0], corners(pose, RobotBuild(), HALF), atol=1.2)
 
 
 @pytest.mark.slow
@@ -444,7 +444,7 @@ def test_the_floor_has_its_colours_where_its_patches_are(studio):
     for place, name in (((-0.3, 0.3), "firm"), ((0.9, 0.3), "medium"), ((0.0, -0.6), "short")):
         x, y = pixels(HALF, np.array([[*place, 0.0]]))[0].round().astype(int)
         seen = image[y - 8 : y + 8, x - 8 : x + 8].mean(axis=(0, 1))[::-1]
-        colour = GROUNDS[name].colour
+        colour = SURFACES[name].colour
         wanted = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], float)
         np.testing.assert_allclose(seen / seen.sum(), wanted / wanted.sum(), atol=0.03)
 
@@ -462,7 +462,7 @@ def test_light_changes_and_motion_smears(studio):
 
     bright = [studio.exposed(t, still, wheels).mean() for t in np.arange(0.0, 8.0, 1.0)]
     assert np.ptp(bright) > 0.03 * np.mean(bright)
-    x, y = corners(still(0.0), Machine(), HALF).mean(axis=0).round().astype(int)
+    x, y = corners(still(0.0), RobotBuild(), HALF).mean(axis=0).round().astype(int)
     sharp, smeared = (
         np.diff(
             studio.exposed(0.0, where, wheels)[y - 30 : y + 30, x - 30 : x + 30, 1].astype(float)

@@ -10,12 +10,12 @@ from slipid.lab.trial.goswami_padhy import (
     HIGH,
     LOW,
     GoswamiPadhy,
-    Plane,
-    Rehearsal,
+    PlaneVector,
+    TuningTask,
     by_gradient,
     by_swarm,
-    errors,
     lyapunov,
+    tracking_error,
 )
 
 PROMPT = {"shares": np.array([[1.0, 0.0]]), "follow": 1.0, "period": 0.05}
@@ -29,7 +29,7 @@ def moved(pose, twist):
 
 
 def v_of(reference, pose):
-    return lyapunov(errors(Plane(*reference[:3]), Plane(*pose)))
+    return lyapunov(tracking_error(PlaneVector(*reference[:3]), PlaneVector(*pose)))
 
 
 def test_v_falls_as_the_proof_says_at_any_pose_and_rates():
@@ -107,12 +107,12 @@ def test_a_robot_on_its_path_is_asked_for_the_paths_rates_as_it_sees_them():
 
 def test_the_integral_of_a_robot_that_does_not_lag_is_a_geometric_series():
     still, begin = np.zeros((200, 6)), np.array([[0.3, 0.0, 0.0], [0.0, -0.2, 0.0]])
-    task = Rehearsal(still, begin, **PROMPT)
+    task = TuningTask(still, begin, **PROMPT)
     k = np.array([[1.0, 2.0, 0.0], [3.0, 0.5, 4.0]])
     q = (1 - 0.05 * k[:, :2]) ** 2
     each = 0.5 * np.array([0.3, 0.2]) ** 2 * 0.05 * (1 - q**200) / (1 - q)
     np.testing.assert_allclose(task.integrals(k), each.mean(axis=1), rtol=1e-12)
-    turned = Rehearsal(still, np.array([[0.0, 0.0, 1.0]]), **PROMPT)
+    turned = TuningTask(still, np.array([[0.0, 0.0, 1.0]]), **PROMPT)
     angle, total = 1.0, 0.0
     for _ in range(200):
         total, angle = total + 0.05 * (1 - np.cos(angle)), angle - 0.05 * 4.0 * np.sin(angle)
@@ -130,7 +130,7 @@ def test_a_robot_that_lags_is_as_far_behind_as_delay_and_lag_say():
     def last(reference):
         """V in the last period."""
         whole, less = (
-            Rehearsal(r, begin, shares, follow, 0.05).integrals(np.zeros((1, 3)))[0]
+            TuningTask(r, begin, shares, follow, 0.05).integrals(np.zeros((1, 3)))[0]
             for r in (reference, reference[:-1])
         )
         return (whole - less) / 0.05
@@ -144,12 +144,12 @@ def test_an_ideal_robot_stays_on_a_bend():
     t = 0.05 * np.arange(120)
     places = np.column_stack([np.sin(t), 1 - np.cos(t), t])
     bend = np.hstack([places, np.column_stack([np.cos(t), np.sin(t), np.ones(120)])])
-    task = Rehearsal(bend, np.zeros((1, 3)), **PROMPT)
+    task = TuningTask(bend, np.zeros((1, 3)), **PROMPT)
     # the twist is the path's own, held for a period: a chord's heading is the half-way one
     assert task.integrals(np.zeros((1, 3)))[0] < 1e-5
 
 
-LATE = Rehearsal(
+LATE = TuningTask(
     np.zeros((60, 6)),
     np.array([[0.3, 0.1, 0.4], [-0.1, 0.3, -0.6]]),
     np.array([[0.0] * 4 + [1.0]]),
@@ -186,5 +186,5 @@ def test_swarm_and_gradient_find_what_another_search_finds():
 
 
 def test_gains_of_a_prompt_robot_are_the_largest_there_are():
-    task = Rehearsal(np.zeros((20, 6)), np.array([[0.1, 0.1, 0.1]]), **PROMPT)
+    task = TuningTask(np.zeros((20, 6)), np.array([[0.1, 0.1, 0.1]]), **PROMPT)
     np.testing.assert_allclose(by_gradient(task), HIGH, atol=1e-6)

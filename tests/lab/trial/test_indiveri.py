@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slipid.lab.trial.indiveri import Indiveri, inverse_kinematics, loop, slowed
+from slipid.lab.trial.indiveri import Indiveri, inverse_kinematics, pose_loop, within_limit
 from slipid.model.geometry import Geometry, general, mecanum, omni
 
 SHAPES = {
@@ -67,7 +67,7 @@ twists = st.tuples(*[st.floats(-3.0, 3.0, allow_subnormal=False)] * 3)
 @given(st.sampled_from(list(SHAPES)), twists, st.floats(0.1, 200.0))
 def test_a_limit_keeps_the_direction_of_the_twist_and_changes_none_below_it(name, twist, limit):
     matrix, asked = matrix_of(SHAPES[name]), np.array(twist)
-    out = np.asarray(slowed(jnp.asarray(asked), jnp.asarray(matrix), jnp.asarray(limit)))
+    out = np.asarray(within_limit(jnp.asarray(asked), jnp.asarray(matrix), jnp.asarray(limit)))
     before, after = np.abs(matrix @ asked).max(), np.abs(matrix @ out).max()
     if before <= limit:
         np.testing.assert_array_equal(out, asked)
@@ -79,7 +79,7 @@ def test_a_limit_keeps_the_direction_of_the_twist_and_changes_none_below_it(name
 def test_the_loop_asks_for_rates_and_errors_as_the_body_sees_them():
     pose = jnp.array([1.0, -2.0, 0.5 * np.pi])
     reference = jnp.array([1.3, -1.8, 0.5 * np.pi + 0.1, 0.2, 0.1, 0.3])
-    found = loop(jnp.array([2.0, 3.0]), reference, pose)
+    found = pose_loop(jnp.array([2.0, 3.0]), reference, pose)
     # along x of the world, which is on its right: 0.2 + 2 * 0.3
     np.testing.assert_allclose(found, [0.1 + 2 * 0.2, -0.8, 0.3 + 3 * 0.1], atol=1e-12)
 
@@ -87,7 +87,7 @@ def test_the_loop_asks_for_rates_and_errors_as_the_body_sees_them():
 def test_it_turns_the_short_way_and_no_less_where_it_is_far_off():
     still = jnp.zeros(6)
     for heading, turn in ((6.0, 2 * np.pi - 6.0), (2.0, -2.0), (-2.0, 2.0)):
-        found = loop(jnp.array([1.0, 1.0]), still, jnp.array([0.0, 0.0, heading]))
+        found = pose_loop(jnp.array([1.0, 1.0]), still, jnp.array([0.0, 0.0, heading]))
         assert float(found[2]) == pytest.approx(turn)
 
 
@@ -112,7 +112,7 @@ def test_a_robot_with_slow_wheels_goes_straight_unless_each_is_clipped_alone():
     limit = 4.0
 
     def together(matrix, asked):
-        return matrix @ slowed(asked, matrix, jnp.asarray(limit))
+        return matrix @ within_limit(asked, matrix, jnp.asarray(limit))
 
     def alone(matrix, asked):
         return jnp.clip(matrix @ asked, -limit, limit)

@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 
 from slipid.data.floor_map import four_zones, uniform, write_map
-from slipid.deploy.controllers import pilot_of
+from slipid.deploy.controllers import control_loop_of
 from slipid.deploy.floors import floor_map, floor_of
 from slipid.deploy.twin_run import path_of, starts
 from slipid.lab.testsite.driving import PERIOD
 from slipid.lab.trial import trial as tr
 from slipid.lab.trial.controllers import ROWS, check_gains, unused_gains
 from slipid.lab.trial.goswami_padhy import GoswamiPadhy
-from slipid.lab.trial.plants import SitePlant, known_to_site, one_of
-from slipid.lab.trial.summary import Run, columns, not_told_apart, summaries
+from slipid.lab.trial.plants import SitePlant, drawn_robot, refuse_unknown_to_site
+from slipid.lab.trial.summary import TrialRun, best_controllers, columns, summaries
 from slipid.model.geometry import mecanum, omni
 from slipid.model.robot import build
 from slipid.robot import closed_loop
 from slipid.robot import trajectory as reference
-from slipid.robot.closed_loop import Pilot
+from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.controller import Controller, Gains
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, Odometry
@@ -59,6 +59,15 @@ def test_the_rectangle_is_that_of_the_paper_and_stops_at_its_corners():
         np.gradient(rows[:, :2], reference.STEP, axis=0)[5:-5], rows[5:-5, 3:5], atol=0.011
     )
     assert np.hypot(rows[:, 3], rows[:, 4]).max() <= 0.2 + 1e-9
+
+
+def test_a_way_too_short_for_its_speed_is_half_speeding_up_and_half_braking():
+    path = reference.waypoints([(0.0, 0.0), (0.02, 0.0)], speed=0.5, acceleration=0.5, pause=0.1)
+    place, rate = np.asarray(path.rows)[:, [0, 3]].T
+    assert rate.max() == pytest.approx(0.1, rel=1e-6)  # the root of 0.02 * 0.5
+    assert np.abs(np.diff(rate)).max() <= 0.5 * reference.STEP + 1e-12
+    np.testing.assert_allclose(np.diff(place)[:-1], (rate[:-1] + rate[1:])[:-1] * 0.01, atol=1e-9)
+    np.testing.assert_allclose([place[-1], rate[-1]], [0.02, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", reference.PATHS)
@@ -101,7 +110,7 @@ def test_a_circle_is_round_an_eight_goes_both_ways_round_and_one_path_turns():
 
 def test_the_way_that_is_left_of_a_path_ends_with_it():
     path = reference.rectangle()
-    left = [float(path.left(t)) for t in (0.0, *np.asarray(path.marks), 99.0)]
+    left = [float(path.remaining(t)) for t in (0.0, *np.asarray(path.marks), 99.0)]
     np.testing.assert_allclose(left, [2.6, 1.7, 1.3, 0.4, 0.0, 0.0], atol=1e-6)
 
 
@@ -178,9 +187,9 @@ class Perfect:
         return Measurement(wheel_angle=self.angle, current=np.full(3, 0.5))
 
 
-def pilot(deployed, preview=0.0):
+def control_loop(deployed, preview=0.0):
     gains = replace(Gains(), preview=jnp.asarray(preview))
-    return Pilot(Odometry(deployed), Controller(deployed, gains))
+    return ControlLoop(Odometry(deployed), Controller(deployed, gains))
 
 
 @pytest.mark.slow
@@ -188,8 +197,10 @@ def pilot(deployed, preview=0.0):
 def test_encoders_close_every_path_without_slip(deployed, name):
     start = (0.2, 0.1, -1.0)
     path = reference.PATHS[name](0.2).moved(start)
-    course = closed_loop.drive(pilot(deployed, 0.05), path, Perfect(deployed, start), start)
-    found = closed_loop.metrics(course)
+    course = closed_loop.run_closed_loop(
+        control_loop(deployed, 0.05), path, Perfect(deployed, start), start
+    )
+    found = closed_loop.path_metrics(course)
     assert found.finished
     assert found.closure_mm < 5
     assert found.cross_track_rmse_mm < 10
@@ -200,8 +211,10 @@ def test_encoders_close_every_path_without_slip(deployed, name):
 def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(deployed):
     start = (0.2, 0.1, -1.0)
     path = reference.rectangle().moved(start)
-    course = closed_loop.drive(pilot(deployed), path, Perfect(deployed, start), start)
-    found = closed_loop.metrics(course)
+    course = closed_loop.run_closed_loop(
+        control_loop(deployed), path, Perfect(deployed, start), start
+    )
+    found = closed_loop.path_metrics(course)
     assert found.finished
     assert found.closure_mm < 5
     assert found.cross_track_rmse_mm < 10
@@ -218,7 +231,11 @@ def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
     far = []
     for preview in (0.0, 0.2):
         plant = Perfect(deployed, start, late=4)
-        far.append(closed_loop.drive(pilot(deployed, preview), path, plant, start).pose[:, 0].max())
+        far.append(
+            closed_loop.run_closed_loop(control_loop(deployed, preview), path, plant, start)
+            .pose[:, 0]
+            .max()
+        )
     assert far[0] > 0.92  # four periods at 0.2 m/s too far
     assert far[1] < 0.905
 
@@ -227,8 +244,10 @@ def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
 def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
     start = (0.0, 0.0, 0.0)
     path = reference.rectangle()
-    course = closed_loop.drive(pilot(deployed), path, Perfect(deployed, start, 0.8), start)
-    found = closed_loop.metrics(course)
+    course = closed_loop.run_closed_loop(
+        control_loop(deployed), path, Perfect(deployed, start, 0.8), start
+    )
+    found = closed_loop.path_metrics(course)
     assert found.along_track_mm[0] == pytest.approx(-180, abs=12)
     assert found.along_track_mm[1] == pytest.approx(-80, abs=12)
     assert found.closure_mm < 12  # every side is as short as its opposite
@@ -239,10 +258,12 @@ def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
 def test_of_a_curve_the_first_quarter_is_judged(deployed):
     start = (0.0, 0.0, 0.0)
     path = reference.circle(0.35)
-    course = closed_loop.drive(pilot(deployed), path, Perfect(deployed, start, 0.8), start)
-    found = closed_loop.metrics(course)
+    course = closed_loop.run_closed_loop(
+        control_loop(deployed), path, Perfect(deployed, start, 0.8), start
+    )
+    found = closed_loop.path_metrics(course)
     assert found.sides_mm[0] == pytest.approx(350 * np.sqrt(2), rel=0.01)
-    run = Run("encoder", start, 0, found, 0.0)
+    run = TrialRun("encoder", start, 0, found, 0.0)
     assert float(columns([run])["first_side_travelled"][0]) == pytest.approx(0.8, abs=0.03)
 
 
@@ -250,10 +271,10 @@ def test_of_a_curve_the_first_quarter_is_judged(deployed):
 def test_a_robot_that_does_not_move_has_its_whole_way_left(deployed):
     path = reference.rectangle()
     plant = Perfect(deployed, (0.0, 0.0, 0.0), 0.0)
-    course = closed_loop.drive(pilot(deployed), path, plant, (0.0, 0.0, 0.0))
-    assert closed_loop.metrics(course).closure_mm < 5  # its encoders say that it has arrived
-    course = replace(course, own=np.zeros_like(course.own))
-    found = closed_loop.metrics(course)
+    course = closed_loop.run_closed_loop(control_loop(deployed), path, plant, (0.0, 0.0, 0.0))
+    assert closed_loop.path_metrics(course).closure_mm < 5  # its encoders say that it has arrived
+    course = replace(course, path_time=np.zeros_like(course.path_time))
+    found = closed_loop.path_metrics(course)
     assert not found.finished
     assert found.closure_mm == pytest.approx(2600, abs=1)
 
@@ -262,7 +283,7 @@ def test_the_distance_from_a_path_is_from_its_line():
     line = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
     places = np.array([[0.37, 0.2], [1.3, 0.63], [1.3, 1.4], [0.5, 0.0]])
     np.testing.assert_allclose(
-        closed_loop._from_line(places, line), [0.2, 0.3, 0.5, 0.0], atol=1e-12
+        closed_loop._distance_from_line(places, line), [0.2, 0.3, 0.5, 0.0], atol=1e-12
     )
 
 
@@ -272,7 +293,7 @@ def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
     for row in ROWS.values():
         if row.law is not None:  # it takes a second to make
             continue
-        found = pilot_of(robot, row).controller.gains
+        found = control_loop_of(robot, row).controller.gains
         expected = tuned if row.tuned else Gains()
         if row.observer != "contact":
             expected = replace(expected, preview=jnp.asarray(0.0))
@@ -314,18 +335,20 @@ def test_rows_of_published_laws_are_made_for_the_robot_and_believe_its_encoders(
         (0.01 * jnp.arange(shape.wheels), 0.02 * jnp.arange(shape.wheels)),
     )
     known = deploy_known(robot, highest_speed=7.5)
-    pilots = {
-        name: pilot_of(known, ROWS[name])
+    loops = {
+        name: control_loop_of(known, ROWS[name])
         for name in ("goswami_padhy", "goswami_padhy_gradient", "indiveri")
     }
-    for pilot in pilots.values():
-        assert not pilot.estimator.curve
-        assert values(pilot.controller.gains) == values(replace(Gains(), preview=jnp.zeros(())))
-    law = pilots["indiveri"].controller.law
+    for control_loop in loops.values():
+        assert not control_loop.estimator.curve
+        assert values(control_loop.controller.gains) == values(
+            replace(Gains(), preview=jnp.zeros(()))
+        )
+    law = loops["indiveri"].controller.law
     np.testing.assert_allclose(law.matrix, known.forward / known.frame.radius, atol=1e-9)
     assert law.gains.tolist() == [1.5, 1.5]
     assert float(law.limit) == 13.0
-    swarm, gradient = (np.asarray(p.controller.law.gains) for p in list(pilots.values())[:2])
+    swarm, gradient = (np.asarray(p.controller.law.gains) for p in list(loops.values())[:2])
     np.testing.assert_allclose(swarm, gradient, atol=1e-3)
     assert swarm.tolist()[:2] == [5.0, 5.0]  # the edge of what the paper's swarm may take
     assert 4.0 < swarm[2] < 4.999
@@ -336,8 +359,10 @@ def test_rows_of_published_laws_are_made_for_the_robot_and_believe_its_encoders(
 def test_published_laws_close_the_rectangle_without_slip(deployed, row):
     start = (0.2, 0.1, -1.0)
     path = reference.rectangle().moved(start)
-    pilot = pilot_of(deployed, ROWS[row], Settings())
-    found = closed_loop.metrics(closed_loop.drive(pilot, path, Perfect(deployed, start), start))
+    control_loop = control_loop_of(deployed, ROWS[row], Settings())
+    found = closed_loop.path_metrics(
+        closed_loop.run_closed_loop(control_loop, path, Perfect(deployed, start), start)
+    )
     assert found.finished
     assert found.closure_mm < 5
     assert found.cross_track_rmse_mm < 10
@@ -466,25 +491,25 @@ def test_the_twin_is_another_robot_of_the_posterior_for_every_start():
     frictions = jnp.linspace(0.3, 0.9, 8)[:, None] * jnp.ones(2)
     several = eqx.tree_at(lambda r: r.surfaces.friction, eight, frictions)
     known = deploy_known(robot, draws=several, highest_speed=7.5)
-    found = {float(one_of(known, seed).floors.friction[0]) for seed in range(12)}
+    found = {float(drawn_robot(known, seed).floors.friction[0]) for seed in range(12)}
     assert len(found) > 3
-    assert one_of(known, 3).floors.friction[0] == one_of(known, 3).floors.friction[0]
+    assert drawn_robot(known, 3).floors.friction[0] == drawn_robot(known, 3).floors.friction[0]
 
 
 def test_what_a_trial_cannot_do_is_said(tmp_path, deployed):
     with pytest.raises(DataError, match="expected testsite or twin"):
-        tr._jobs(tmp_path, tr.Wish(plant="moon"))
+        tr._tasks(tmp_path, tr.TrialOptions(plant="moon"))
     with pytest.raises(DataError, match="no controller 'magic'; expected some of encoder"):
-        tr._jobs(tmp_path, tr.Wish(controllers=("magic",)))
+        tr._tasks(tmp_path, tr.TrialOptions(controllers=("magic",)))
     with pytest.raises(DataError, match="has no surface 'gray'; it has firm"):
-        known_to_site(uniform("gray"), "as_built", 3)
+        refuse_unknown_to_site(uniform("gray"), "as_built", 3)
     with pytest.raises(DataError, match="no load set-up 'far'; it has as_built"):
-        known_to_site(uniform("firm"), "far", 3)
+        refuse_unknown_to_site(uniform("firm"), "far", 3)
     with pytest.raises(DataError, match="has 3 wheels, the fit's 4"):
-        known_to_site(uniform("firm"), "as_built", 4)
+        refuse_unknown_to_site(uniform("firm"), "as_built", 4)
     with pytest.raises(DataError, match="no controller; expected some of encoder"):
-        tr._jobs(tmp_path, tr.Wish(controllers=tr.names_of(",")))
-    assert tr.names_of("contact, encoder,contact") == ("contact", "encoder")
+        tr._tasks(tmp_path, tr.TrialOptions(controllers=tr.controller_names(",")))
+    assert tr.controller_names("contact, encoder,contact") == ("contact", "encoder")
     with pytest.raises(DataError, match="no path 'square'; expected one of rectangle, circle"):
         path_of("square", 0.2, deployed)
     for speed in (0.0, 0.31, float("nan")):
@@ -492,7 +517,7 @@ def test_what_a_trial_cannot_do_is_said(tmp_path, deployed):
             path_of("circle", speed, deployed)
     assert path_of("circle", 0.3, deployed).duration < path_of("circle", 0.1, deployed).duration
     with pytest.raises(DataError, match=r"robot\.json: not there; `slipid identify` writes it"):
-        tr._jobs(tmp_path, tr.Wish())
+        tr._tasks(tmp_path, tr.TrialOptions())
 
 
 @pytest.mark.slow
@@ -500,7 +525,7 @@ def test_runs_of_another_path_or_speed_are_driven_anew(tmp_path, deployed):
     deployed.save(tmp_path / "robot.json")
 
     def jobs(**wish):
-        return tr._jobs(tmp_path, tr.Wish(plant="twin", controllers=("encoder",), **wish))
+        return tr._tasks(tmp_path, tr.TrialOptions(plant="twin", controllers=("encoder",), **wish))
 
     plain = jobs()[0]
     np.testing.assert_array_equal(plain.path.rows, reference.rectangle().rows)
@@ -523,7 +548,7 @@ def test_a_controller_is_told_another_map_than_the_true_one(tmp_path, deployed, 
 
     def jobs(**more):
         wish = {"plant": "twin", "controllers": ("contact_map",), "map": tmp_path / "true.toml"}
-        return tr._jobs(tmp_path, tr.Wish(**wish, **more))
+        return tr._tasks(tmp_path, tr.TrialOptions(**wish, **more))
 
     plain, other = jobs()[0], jobs(told_map=tmp_path / "told.toml")[0]
     assert plain.told is plain.floor
@@ -542,7 +567,7 @@ def test_a_controller_is_told_another_map_than_the_true_one(tmp_path, deployed, 
     def caught(robot, row, settings, forced, floor):
         raise Told(floor)
 
-    monkeypatch.setattr(tr, "pilot_of", caught)
+    monkeypatch.setattr(tr, "control_loop_of", caught)
     with pytest.raises(Told) as told:
         tr.drive(other)
     (floor,) = told.value.args
@@ -591,21 +616,21 @@ def test_tuned_gains_that_are_no_better_are_left_aside_and_that_is_said(deployed
     assert said.startswith("tuned gains are no better than by hand (loss 1.0 mm, by hand 2.0 mm)")
     assert "--tuned-gains" in said
     row = ROWS["contact"]
-    assert values(pilot_of(robot, row).controller.gains) == values(Gains())
+    assert values(control_loop_of(robot, row).controller.gains) == values(Gains())
     assert unused_gains(robot, forced=True) == ""
-    assert values(pilot_of(robot, row, forced=True).controller.gains) == TUNED
+    assert values(control_loop_of(robot, row, forced=True).controller.gains) == TUNED
 
 
 def test_a_file_with_the_gain_that_is_gone_drives_with_the_others_and_that_is_said(deployed):
     gains = tuned_for("as_built", ahead=0.7)
     robot = DeployedRobot.of(replace(deployed.record, gains=gains))
-    assert values(pilot_of(robot, ROWS["contact"]).controller.gains) == TUNED
+    assert values(control_loop_of(robot, ROWS["contact"]).controller.gains) == TUNED
     assert "tuned gain ahead = 0.7 is not taken" in unused_gains(robot, forced=False)
 
 
 def run_of(name, k, closure, finished=True):
     """A run whose numbers follow from its closure."""
-    metrics = closed_loop.Metrics(
+    metrics = closed_loop.PathMetrics(
         along_track_mm=(-90.0 * (1 + 0.1 * k), 0.0, 0.0, 0.0),
         sides_mm=(900.0, 400.0, 900.0, 400.0),
         closure_mm=closure,
@@ -617,7 +642,7 @@ def run_of(name, k, closure, finished=True):
         seconds=19.0,
         finished=finished,
     )
-    return Run(name, (0.0, 0.0, 0.1), k, metrics, 1.0)
+    return TrialRun(name, (0.0, 0.0, 0.1), k, metrics, 1.0)
 
 
 def test_the_best_is_told_apart_by_differences_from_the_same_starts():
@@ -628,13 +653,13 @@ def test_the_best_is_told_apart_by_differences_from_the_same_starts():
         return [run_of(name, k, float(c), finished) for k, c in enumerate(closures)]
 
     one, two = runs("encoder", base), runs("contact", 0.8 * base)
-    assert not_told_apart(one + two) == ("contact",)
+    assert best_controllers(one + two) == ("contact",)
     same = runs("contact", base * rng.uniform(0.7, 1.25, 20))
-    assert set(not_told_apart(one + same)) == {"encoder", "contact"}
+    assert set(best_controllers(one + same)) == {"encoder", "contact"}
     # one that leaves a run unfinished does not close best, however near it comes
     stuck = [*two[:-1], run_of("contact", 19, 1.0, finished=False)]
-    assert not_told_apart(one + stuck) == ("encoder",)
-    assert not_told_apart(one) == ("encoder",)
+    assert best_controllers(one + stuck) == ("encoder",)
+    assert best_controllers(one) == ("encoder",)
 
 
 def test_the_summary_is_of_medians_over_starts_with_intervals():
@@ -642,7 +667,7 @@ def test_the_summary_is_of_medians_over_starts_with_intervals():
 
     def run(name, k, closure):
         made = run_of(name, k, closure)
-        assert typed(Run, json.loads(json.dumps(asdict(made)))) == made
+        assert typed(TrialRun, json.loads(json.dumps(asdict(made)))) == made
         return made
 
     base = rng.uniform(100, 200, 20)

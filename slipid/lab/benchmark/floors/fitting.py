@@ -1,4 +1,4 @@
-"""Contact parameters of floors from currents and turning alone, at the measured wheel speeds.
+"""ForceBalance parameters of floors from currents and turning alone, at the measured wheel speeds.
 
 Rows of one run at the same wheel speeds are one cell: accelerations, which are not modelled, cancel
 in its mean. For every floor

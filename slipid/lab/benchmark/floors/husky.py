@@ -25,7 +25,7 @@ from slipid.lab.systems.floors.interface import FloorClassifier, FloorSignals
 from slipid.lab.systems.floors.learned import GaussianClassifier, tree_classifiers
 from slipid.model.geometry import skid_steer
 from slipid.model.robot import Robot, build
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 from slipid.support.errors import bad_data
 from slipid.support.files import hash_of
 
@@ -130,10 +130,10 @@ def husky_table(data: Path, quick: bool = False, only: tuple[str, ...] = ()) -> 
         DataError: the folder's files cannot be read.
     """
     runs = read_floor_runs(data / FOLDER, RADIUS)
-    machine = Machine.of(husky().on(["any"]))
+    spec = RobotSpec.of(husky().on(["any"]))
     methods = [method for method in husky_classifiers() if not only or method.name in only]
     settings = EvaluationSettings.quick() if quick else EvaluationSettings()
-    return classifier_table(methods, runs, machine, ABOUT, settings)
+    return classifier_table(methods, runs, spec, ABOUT, settings)
 
 
 class HuskyFloorTask(FloorTask):

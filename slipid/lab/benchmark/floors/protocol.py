@@ -27,9 +27,9 @@ from slipid.lab.benchmark.scores import FoldScore
 from slipid.lab.benchmark.tuning import Tuned, best_candidate
 from slipid.lab.benchmark.work import OF_FITS, OF_ROWS, BenchmarkOptions
 from slipid.lab.systems.floors.interface import Beliefs, FloorClassifier, FloorSignals
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
-from slipid.support.files import Content
+from slipid.support.content import Content
 from slipid.support.jax_setup import setup_jax
 
 SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
@@ -76,12 +76,12 @@ def folds_of(runs: Sequence[FloorSignals], count: int) -> Int[np.ndarray, " run"
 def answers_of(
     method: FloorClassifier,
     runs: Sequence[FloorSignals],
-    machine: Machine,
+    spec: RobotSpec,
     seconds: Sequence[float],
 ) -> list[Answer]:
     """Return the answers of a fitted classifier to all stretches of runs."""
     stretches = [part for run in runs for part in run.segments(max(seconds))]
-    beliefs = method.probability(stretches, machine)
+    beliefs = method.probability(stretches, spec)
     return [
         answer
         for stretch, belief in zip(stretches, beliefs, strict=True)
@@ -109,7 +109,7 @@ def answers_after(
 def tuned_classifier(
     method: FloorClassifier,
     runs: Sequence[FloorSignals],
-    machine: Machine,
+    spec: RobotSpec,
     settings: EvaluationSettings,
 ) -> Tuned[FloorClassifier]:
     """Return the candidate with the highest accuracy in an inner cross-validation.
@@ -121,8 +121,8 @@ def tuned_classifier(
     def loss(candidate: FloorClassifier) -> float:
         answers: list[Answer] = []
         for k in range(settings.inner):
-            fitted = candidate.fit(_some(runs, fold != k), machine)
-            answers += answers_of(fitted, _some(runs, fold == k), machine, settings.seconds)
+            fitted = candidate.fit(_some(runs, fold != k), spec)
+            answers += answers_of(fitted, _some(runs, fold == k), spec, settings.seconds)
         each = [
             np.mean([a.named == a.floor for a in answers if a.seconds == after])
             for after in sorted({a.seconds for a in answers})
@@ -153,17 +153,17 @@ def evaluated(
     method: FloorClassifier,
     training: Sequence[FloorSignals],
     held_out: Sequence[FloorSignals],
-    machine: Machine,
+    spec: RobotSpec,
     settings: EvaluationSettings,
 ) -> ScoredClassifier:
     """Return the result of one fold: settings picked, fitted, and answers on held-out runs."""
     began = time.perf_counter()
-    found = tuned_classifier(method, training, machine, settings)
+    found = tuned_classifier(method, training, spec, settings)
     tuned = time.perf_counter()
-    fitted = found.method.fit(training, machine)
+    fitted = found.method.fit(training, spec)
     ended = time.perf_counter()
     starts = [run.segments(settings.first_s)[0] for run in held_out]
-    answers = answers_of(fitted, starts, machine, settings.seconds)
+    answers = answers_of(fitted, starts, spec, settings.seconds)
     row = ClassifierRow(
         method.name,
         settings=(found.settings,),
@@ -205,7 +205,7 @@ def attempted(name: str, work: Callable[[], ScoredClassifier]) -> ScoredClassifi
 def classifier_table(
     methods: Sequence[FloorClassifier],
     runs: Sequence[FloorSignals],
-    machine: Machine,
+    spec: RobotSpec,
     about: str,
     settings: EvaluationSettings = EvaluationSettings(),
     reference: str = "slipid",
@@ -219,7 +219,7 @@ def classifier_table(
     def cross_validated(method: FloorClassifier) -> ScoredClassifier:
         return joined(
             [
-                evaluated(method, _some(runs, fold != k), _some(runs, fold == k), machine, settings)
+                evaluated(method, _some(runs, fold != k), _some(runs, fold == k), spec, settings)
                 for k in range(settings.held_out)
             ]
         )

@@ -77,9 +77,7 @@ def robotino_table(options: BenchmarkOptions) -> ClassifierTable:
         logs = data.logged.subset(split.held_out)
         work = {NAME: partial(_slipid, fit, batch, logs, held_out)}
         for method in robotino_classifiers():
-            work[method.name] = partial(
-                evaluated, method, training, held_out, data.machine, settings
-            )
+            work[method.name] = partial(evaluated, method, training, held_out, data.spec, settings)
         for name, one in work.items():
             if not only or name in only:
                 folds.setdefault(name, []).append(attempted(name, one))

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from slipid.deploy.deploy import given
+from slipid.deploy.deploy import given_numbers
 from slipid.lab.benchmark.floors.fitting import (
     MeteredMotor,
     currents_off,
@@ -37,7 +37,7 @@ from slipid.lab.benchmark.floors.fitting import (
 from slipid.lab.systems.floors.interface import Beliefs, FloorClassifier, FloorSignals, floors_of
 from slipid.model.contact_law import ContactSurface
 from slipid.model.robot import Robot
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator, EstimatorState
 from slipid.robot.interface import Readings, Settings
@@ -64,7 +64,9 @@ def deployed(robot: Robot) -> DeployedRobot:
     )
     record = RobotRecord(
         wheels=Wheels(**{f.name: getattr(shape, f.name) for f in fields(Wheels)}),
-        parameters={path: n for path, n in given(robot).items() if not path.startswith("camera.")},
+        parameters={
+            path: n for path, n in given_numbers(robot).items() if not path.startswith("camera.")
+        },
         floors=tuple(
             FloorRecord(name=name, process=none, effect=none, current_std=1.0, seen=None)
             for name in robot.surfaces.labels
@@ -90,7 +92,7 @@ SETTINGS = Settings(
     forget_s=4.0,
     filter_s=0.02,
     patch_m=50.0,
-    alike=27.0,
+    further_floor_penalty=27.0,
     unknown_std=4.0,
     ammeter_std_a=0.1,
     gyro_std=0.08,
@@ -131,7 +133,7 @@ class SlipidFloorClassifier(FloorClassifier):
     settings: Settings = SETTINGS
     fitted: FittedFloors | None = field(default=None, repr=False)
 
-    def fit(self, runs: Sequence[FloorSignals], machine: Machine) -> "SlipidFloorClassifier":
+    def fit(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> "SlipidFloorClassifier":
         labels = floors_of(runs)
         runs = [self._zeroed(run) for run in runs]
         robot = self._on(labels)
@@ -139,10 +141,10 @@ class SlipidFloorClassifier(FloorClassifier):
             robot.motor, jnp.asarray(stiffness_of(runs)), jnp.asarray(scatter_of(runs))
         )
         robot = fitted_floors(replace(robot, motor=motor), runs)
-        std = _scatter(robot, runs, machine)
+        std = _scatter(robot, runs, spec)
         return replace(self, labels=labels, fitted=FittedFloors(robot.surfaces, motor, std))
 
-    def probability(self, runs: Sequence[FloorSignals], machine: Machine) -> list[Beliefs]:
+    def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
             raise ValueError(f"{self.name} was not fitted")
         plain = deployed(self._on(self.labels))
@@ -152,7 +154,7 @@ class SlipidFloorClassifier(FloorClassifier):
         rows = -(-max(map(len, runs)) // 8) * 8
         for first in range(0, len(runs), TOGETHER):
             some = [self._zeroed(run) for run in runs[first : first + TOGETHER]]
-            beliefs = np.asarray(_beliefs(estimator, std, _FilterRows.of(some, rows, machine)))
+            beliefs = np.asarray(_beliefs(estimator, std, _FilterRows.of(some, rows, spec)))
             out += [beliefs[k, : len(run)] for k, run in enumerate(some)]
         return [row[:, :-1] / row[:, :-1].sum(axis=1, keepdims=True) for row in out]
 
@@ -178,15 +180,15 @@ class SlipidFloorClassifier(FloorClassifier):
         return replace(run, current=np.maximum(np.abs(run.current) - self.zero_a, 0.0))
 
 
-def kinds(run: FloorSignals, machine: Machine) -> Int[np.ndarray, " row"]:
+def kinds(run: FloorSignals, spec: RobotSpec) -> Int[np.ndarray, " row"]:
     """Return the kind of motion in each row: 0 straight, 1 in a bend, 2 on the spot."""
-    x, y, yaw = run.rolling(machine).T
-    turn = machine.base_radius * np.abs(yaw)
+    x, y, yaw = run.rolling(spec).T
+    turn = spec.base_radius * np.abs(yaw)
     return np.digitize(turn / np.maximum(np.hypot(x, y) + turn, 1e-9), BENDS)
 
 
 def _scatter(
-    robot: Robot, runs: Sequence[FloorSignals], machine: Machine
+    robot: Robot, runs: Sequence[FloorSignals], spec: RobotSpec
 ) -> Float[np.ndarray, "kind floor"]:
     """Return the std of current residuals on every floor in each kind of motion [A]."""
     count = len(BENDS) + 1
@@ -198,7 +200,7 @@ def _scatter(
             take = take[:: max(1, len(take) // MOST_ROWS)]
             speed.append(run.speed[take])
             current.append(run.current[take])
-            kind.append(kinds(run, machine)[take])
+            kind.append(kinds(run, spec)[take])
         off = currents_off(robot, k, np.concatenate(speed), np.concatenate(current))
         squares, of_kind = (off**2).mean(axis=1), np.concatenate(kind)
         for n in range(count):
@@ -226,7 +228,7 @@ class _FilterRows(eqx.Module):
     kind: Int[Array, "*run row"]
 
     @classmethod
-    def of(cls, runs: Sequence[FloorSignals], rows: int, machine: Machine) -> "_FilterRows":
+    def of(cls, runs: Sequence[FloorSignals], rows: int, spec: RobotSpec) -> "_FilterRows":
         """Return runs side by side, padded to so many rows and to `TOGETHER` runs."""
         drives = runs[0].speed.shape[1]
         speed, current = np.zeros((2, TOGETHER, rows, drives))
@@ -238,7 +240,7 @@ class _FilterRows(eqx.Module):
             # a robot at rest has no evidence on its floor
             dt[k, :n] = np.where(run.moving, run.dt, 0.0)
             gyro[k, :n] = np.nan if run.gyro is None else run.gyro
-            kind[k, :n] = kinds(run, machine)
+            kind[k, :n] = kinds(run, spec)
         return cls(*(jnp.asarray(x) for x in (speed, current, gyro, dt, kind)))
 
 

@@ -47,7 +47,7 @@ from slipid.lab.systems.floors.interface import (
     floors_of,
     training_rows,
 )
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 
 GRAVITY = 9.81
 """[m/s^2]"""
@@ -97,9 +97,9 @@ class CosineEnergyClassifier(FloorClassifier):
         both = (True, False)
         return [replace(self, losses=heat, logarithm=log) for heat in both for log in both]
 
-    def fit(self, runs: Sequence[FloorSignals], machine: Machine) -> "CosineEnergyClassifier":
+    def fit(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> "CosineEnergyClassifier":
         labels = floors_of(runs)
-        rows, floor = training_rows(runs, lambda run: self._direction_and_energy(run, machine))
+        rows, floor = training_rows(runs, lambda run: self._direction_and_energy(run, spec))
         known = np.isfinite(rows).all(axis=1)
         weights, stds = [], []
         for name in labels:
@@ -112,12 +112,12 @@ class CosineEnergyClassifier(FloorClassifier):
             stds.append(max(float((energy - a @ weights[-1]).std()), 1e-6))
         return replace(self, labels=labels, fitted=CosineSeries(np.stack(weights), np.array(stds)))
 
-    def probability(self, runs: Sequence[FloorSignals], machine: Machine) -> list[Beliefs]:
+    def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
             raise ValueError(f"{self.name} was not fitted")
         out = []
         for run in runs:
-            angle, energy = self._direction_and_energy(run, machine).T
+            angle, energy = self._direction_and_energy(run, spec).T
             expected = terms(angle, self.harmonics) @ self.fitted.weight.T
             z = (energy[:, None] - expected) / self.fitted.std
             log = -0.5 * z**2 - np.log(self.fitted.std)
@@ -129,19 +129,19 @@ class CosineEnergyClassifier(FloorClassifier):
         return 0 if self.fitted is None else self.fitted.weight.size + self.fitted.std.size
 
     def _direction_and_energy(
-        self, run: FloorSignals, machine: Machine
+        self, run: FloorSignals, spec: RobotSpec
     ) -> Float[np.ndarray, "row 2"]:
         """Return direction of travel [rad] and energy coefficient of every row, NaN where slow."""
         window = TrailingWindow.of(run.time, self.window_s)
-        x, y, yaw = (window.mean(column) for column in run.rolling(machine).T)
-        turn = machine.base_radius * yaw
-        sideways = y if machine.determines_twist else turn
+        x, y, yaw = (window.mean(column) for column in run.rolling(spec).T)
+        turn = spec.base_radius * yaw
+        sideways = y if spec.determines_twist else turn
         speed = np.sqrt(x**2 + y**2 + turn**2)
-        amps, shaft = np.abs(run.current), np.abs(machine.gear_ratio * run.speed)
-        heat = machine.resistance * self.losses * amps
-        power = ((heat + machine.back_emf * shaft) * amps).sum(axis=1)
+        amps, shaft = np.abs(run.current), np.abs(spec.gear_ratio * run.speed)
+        heat = spec.resistance * self.losses * amps
+        power = ((heat + spec.back_emf * shaft) * amps).sum(axis=1)
         moving = speed > SLOW
-        energy = window.mean(power) / (machine.mass * GRAVITY * np.where(moving, speed, np.nan))
+        energy = window.mean(power) / (spec.mass * GRAVITY * np.where(moving, speed, np.nan))
         energy = np.log(np.maximum(energy, 1e-9)) if self.logarithm else energy
         return np.stack([np.arctan2(sideways, x), energy], axis=1)
 

@@ -23,7 +23,7 @@ from typing import Self
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 
 Beliefs = Float[np.ndarray, "row floor"]
 """Probability of each floor after every row."""
@@ -95,9 +95,9 @@ class FloorSignals:
         edges = [*np.unique(self.segment_start(seconds)), len(self)]
         return [self.rows(int(a), int(b)) for a, b in pairwise(edges)]
 
-    def rolling(self, machine: Machine) -> Float[np.ndarray, "row 3"]:
+    def rolling(self, spec: RobotSpec) -> Float[np.ndarray, "row 3"]:
         """Return the body twist without slip [m/s, m/s, rad/s]."""
-        return np.asarray(self.speed * machine.wheel_radius @ machine.back.T)
+        return np.asarray(self.speed * spec.wheel_radius @ spec.back.T)
 
 
 @dataclass(frozen=True)
@@ -117,11 +117,11 @@ class FloorClassifier(abc.ABC):
         return (self,)
 
     @abc.abstractmethod
-    def fit(self, runs: Sequence[FloorSignals], machine: Machine) -> Self:
+    def fit(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> Self:
         """Return the classifier fitted to runs with known floors."""
 
     @abc.abstractmethod
-    def probability(self, runs: Sequence[FloorSignals], machine: Machine) -> list[Beliefs]:
+    def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         """Return the probability of each floor after every row of every run.
 
         Each run starts anew. The belief after a row depends on that row and earlier ones only.
@@ -195,7 +195,7 @@ class FeatureChannels:
 
 def features(
     run: FloorSignals,
-    machine: Machine,
+    spec: RobotSpec,
     channels: FeatureChannels = FeatureChannels(),
     windows_s: Sequence[float] = WINDOWS_S,
     restart_s: float = np.inf,
@@ -214,7 +214,7 @@ def features(
             turning = np.abs(run.speed).sum(axis=1)
             columns.append(window.mean(amps.sum(axis=1)) / (window.mean(turning) + 0.1))
         if channels.gyro and run.gyro is not None:
-            shortfall = yaw_rate_shortfall(run.gyro, run.rolling(machine)[:, 2])
+            shortfall = yaw_rate_shortfall(run.gyro, run.rolling(spec)[:, 2])
             columns.append(window.mean(np.abs(run.gyro)))
             columns += window.mean_and_std(shortfall)
         if channels.vibration and run.vibration is not None:

@@ -65,7 +65,7 @@ from slipid.lab.systems.floors.interface import (
     training_rows,
 )
 from slipid.lab.systems.one_thread import one_thread
-from slipid.predict.slip_model import Machine
+from slipid.predict.slip_model import RobotSpec
 
 if TYPE_CHECKING:
     from sklearn.ensemble import HistGradientBoostingClassifier
@@ -132,9 +132,9 @@ class GaussianClassifier(FloorClassifier):
     def candidates(self) -> Sequence["GaussianClassifier"]:
         return [replace(self, shared=shared) for shared in (0.0, 0.3, 1.0)]
 
-    def fit(self, runs: Sequence[FloorSignals], machine: Machine) -> "GaussianClassifier":
+    def fit(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> "GaussianClassifier":
         labels = floors_of(runs)
-        rows, floor = training_rows(runs, lambda run: self._features(run, machine, self.restart_s))
+        rows, floor = training_rows(runs, lambda run: self._features(run, spec, self.restart_s))
         middle, scale = np.nanmean(rows, axis=0), np.maximum(np.nanstd(rows, axis=0), 1e-9)
         comparable = np.nan_to_num((rows - middle) / scale, nan=0.0)
         groups = [comparable[floor == name] for name in labels]
@@ -146,10 +146,10 @@ class GaussianClassifier(FloorClassifier):
         fitted = FloorGaussians(middle, scale, mean, np.linalg.inv(factor), log_volume)
         return replace(self, labels=labels, fitted=fitted)
 
-    def probability(self, runs: Sequence[FloorSignals], machine: Machine) -> list[Beliefs]:
+    def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
             raise ValueError(f"{self.name} was not fitted")
-        logs = [self.fitted.log_likelihood(self._features(run, machine)) for run in runs]
+        logs = [self.fitted.log_likelihood(self._features(run, spec)) for run in runs]
         return [accumulated(log, run, self.apart_s) for log, run in zip(logs, runs, strict=True)]
 
     @property
@@ -159,9 +159,9 @@ class GaussianClassifier(FloorClassifier):
         floors, count = self.fitted.mean.shape
         return floors * (count + count * (count + 1) // 2)
 
-    def _features(self, run: FloorSignals, machine: Machine, restart_s: float = np.inf) -> Features:
+    def _features(self, run: FloorSignals, spec: RobotSpec, restart_s: float = np.inf) -> Features:
         """Return the features of one window, without the time since the start."""
-        return features(run, machine, windows_s=(self.window_s,), restart_s=restart_s)[:, 1:]
+        return features(run, spec, windows_s=(self.window_s,), restart_s=restart_s)[:, 1:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,9 +178,9 @@ class TreeEnsemble:
     trees: "HistGradientBoostingClassifier"
     frequency: Float[np.ndarray, " floor"]
 
-    def log_likelihood(self, runs: Sequence[FloorSignals], machine: Machine) -> LogLikelihood:
+    def log_likelihood(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> LogLikelihood:
         """Return the log likelihood of every floor, up to a factor per row, all runs in a row."""
-        rows = np.concatenate([features(run, machine, self.channels) for run in runs])
+        rows = np.concatenate([features(run, spec, self.channels) for run in runs])
         with one_thread():
             probability = self.trees.predict_proba(rows)
         return np.asarray(np.log(np.maximum(probability, LEAST)) - np.log(self.frequency))
@@ -220,17 +220,17 @@ class BoostedTreesClassifier(FloorClassifier):
     def candidates(self) -> Sequence["BoostedTreesClassifier"]:
         return [replace(self, leaves=n) for n in (4, 12)] if self.tuned else [self]
 
-    def fit(self, runs: Sequence[FloorSignals], machine: Machine) -> "BoostedTreesClassifier":
+    def fit(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> "BoostedTreesClassifier":
         channels = [self.channels, DRIVING] if self.without_driving else [self.channels]
-        fitted = tuple(self._ensemble(runs, machine, each) for each in channels)
+        fitted = tuple(self._ensemble(runs, spec, each) for each in channels)
         return replace(self, labels=floors_of(runs), fitted=fitted)
 
-    def probability(self, runs: Sequence[FloorSignals], machine: Machine) -> list[Beliefs]:
+    def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if not self.fitted:
             raise ValueError(f"{self.name} was not fitted")
-        log = self.fitted[0].log_likelihood(runs, machine)
+        log = self.fitted[0].log_likelihood(runs, spec)
         for other in self.fitted[1:]:
-            log = log - other.log_likelihood(runs, machine)
+            log = log - other.log_likelihood(runs, spec)
         each = np.split(log, np.cumsum([len(run) for run in runs])[:-1])
         return [
             accumulated(of_run, run, self.apart_s, self.memory_s)
@@ -243,13 +243,13 @@ class BoostedTreesClassifier(FloorClassifier):
         return len(self.fitted) * self.trees * len(self.labels) * self.leaves
 
     def _ensemble(
-        self, runs: Sequence[FloorSignals], machine: Machine, channels: FeatureChannels
+        self, runs: Sequence[FloorSignals], spec: RobotSpec, channels: FeatureChannels
     ) -> TreeEnsemble:
         from sklearn.ensemble import HistGradientBoostingClassifier
 
         rows, floor = training_rows(
             runs,
-            lambda run: features(run, machine, channels, restart_s=self.restart_s),
+            lambda run: features(run, spec, channels, restart_s=self.restart_s),
             self.rows_s,
         )
         trees = HistGradientBoostingClassifier(

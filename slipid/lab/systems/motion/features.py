@@ -33,8 +33,8 @@ from jaxtyping import Bool, Float, Int
 from slipid.predict.slip_model import (
     WINDOW_S,
     Channel,
-    Machine,
     PredictedRun,
+    RobotSpec,
     Run,
     RunSignals,
     Twists,
@@ -74,11 +74,11 @@ class SignalWindows:
     run: Int[np.ndarray, " window"]
 
     @classmethod
-    def of(cls, runs: Sequence[RunSignals], machine: Machine) -> "SignalWindows":
+    def of(cls, runs: Sequence[RunSignals], spec: RobotSpec) -> "SignalWindows":
         """Return the windows of runs given in their own steps."""
         joined = [run.windowed() for run in runs]
-        rolling = np.concatenate([run.rolling(machine) for run in joined])
-        size = np.sqrt(((rolling * machine.size) ** 2).sum(axis=1))
+        rolling = np.concatenate([run.rolling(spec) for run in joined])
+        size = np.sqrt(((rolling * spec.size) ** 2).sum(axis=1))
         return cls(joined, rolling, size, np.repeat(np.arange(len(joined)), [*map(len, joined)]))
 
     @property
@@ -86,9 +86,9 @@ class SignalWindows:
         """Windows in which the wheels turn fast enough for a slip ratio."""
         return self.size >= REST
 
-    def direction(self, machine: Machine) -> Float[np.ndarray, "window 3"]:
+    def direction(self, spec: RobotSpec) -> Float[np.ndarray, "window 3"]:
         """Return the rolling twist over its size: ahead, to the left, turning."""
-        return np.asarray(self.rolling * machine.size / self.size.clip(min=REST)[:, None])
+        return np.asarray(self.rolling * spec.size / self.size.clip(min=REST)[:, None])
 
     def speed(self) -> Float[np.ndarray, "window drive"]:
         """Return the wheel speed of each drive [rad/s]."""
@@ -98,13 +98,13 @@ class SignalWindows:
         """Return the magnitude of each drive's current [A]."""
         return np.abs(self._channel("current"))
 
-    def inputs(self, machine: Machine, channels: frozenset[Channel]) -> Inputs:
+    def inputs(self, spec: RobotSpec, channels: frozenset[Channel]) -> Inputs:
         """Return all inputs, including those of the given channels.
 
         Raises:
             ValueError: a run lacks one of the channels.
         """
-        direction = self.direction(machine)
+        direction = self.direction(spec)
         x, y = direction[:, 0], direction[:, 1]
         columns = [self.rolling, self.speed(), direction, np.stack([x * x - y * y, 2 * x * y], 1)]
         if "current" in channels:
@@ -113,7 +113,7 @@ class SignalWindows:
             columns.append(self._channel("command"))
         if "gyro" in channels:
             gyro = self._channel("gyro")
-            slip = (gyro - self.rolling[:, 2]) * machine.base_radius / self.size.clip(min=REST)
+            slip = (gyro - self.rolling[:, 2]) * spec.base_radius / self.size.clip(min=REST)
             columns.append(np.stack([gyro, slip], axis=1))
         return np.concatenate(columns, axis=1)
 
@@ -146,13 +146,13 @@ class SlipExamples:
     run: Int[np.ndarray, " window"]
 
     @classmethod
-    def of(cls, runs: Sequence[Run], machine: Machine) -> "SlipExamples":
+    def of(cls, runs: Sequence[Run], spec: RobotSpec) -> "SlipExamples":
         """Return the training windows of runs with poses.
 
         Raises:
             ValueError: the wheels turn in no window.
         """
-        channels, windows = common(runs), SignalWindows.of([run.signals for run in runs], machine)
+        channels, windows = common(runs), SignalWindows.of([run.signals for run in runs], spec)
         moving = windows.moving
         if not moving.any():
             raise ValueError("no window of the runs has turning wheels; nothing to learn from")
@@ -161,8 +161,8 @@ class SlipExamples:
         return cls(
             windows=windows,
             channels=channels,
-            inputs=windows.inputs(machine, channels)[moving],
-            ratio=(true - windows.rolling)[moving] * machine.size / size[:, None],
+            inputs=windows.inputs(spec, channels)[moving],
+            ratio=(true - windows.rolling)[moving] * spec.size / size[:, None],
             weight=weight_of(size),
             run=windows.run[moving],
         )
@@ -219,15 +219,15 @@ def weight_of(size: Float[np.ndarray, " window"]) -> Float[np.ndarray, " window"
 
 
 def with_slip(
-    runs: Sequence[RunSignals], windows: SignalWindows, ratio: Ratios, machine: Machine
+    runs: Sequence[RunSignals], windows: SignalWindows, ratio: Ratios, spec: RobotSpec
 ) -> list[PredictedRun]:
     """Return paths of runs at their own steps by encoders and the predicted slip of each window.
 
     A window's slip velocity holds for all of its steps.
     """
-    slip = at_steps(ratio * windows.size[:, None] / machine.size, windows, runs)
+    slip = at_steps(ratio * windows.size[:, None] / spec.size, windows, runs)
     return [
-        PredictedRun(path_of(run.rolling(machine) + of_run, run.dt))
+        PredictedRun(path_of(run.rolling(spec) + of_run, run.dt))
         for run, of_run in zip(runs, slip, strict=True)
     ]
 

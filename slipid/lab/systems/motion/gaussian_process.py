@@ -8,7 +8,7 @@ All outputs share one kernel, each in units of its own standard deviation. Hyper
 the marginal likelihood of `TUNED` windows, in at most `ROUNDS` steps from one start; `KEPT` windows
 make the posterior. Windows are drawn in proportion to their weight, with a fixed seed.
 
-Source: Rasmussen, Williams 2006, Gaussian Processes for Machine Learning, MIT Press, equations
+Source: Rasmussen, Williams 2006, Gaussian Processes for RobotSpec Learning, MIT Press, equations
 2.25, 2.26, 4.17 and 5.8.
 """
 

@@ -48,7 +48,7 @@ from slipid.lab.systems.motion.features import (
     with_slip,
 )
 from slipid.lab.systems.motion.polynomial_network import Growth, PolynomialNetwork, grown
-from slipid.predict.slip_model import Channel, Machine, PredictedRun, Run, RunSignals, SlipModel
+from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, RunSignals, SlipModel
 
 KEPT = 20
 LEAST = 0.05
@@ -123,18 +123,18 @@ class GmdhOne(SlipModel):
     def candidates(self) -> Sequence["GmdhOne"]:
         return [replace(self, growth=growth) for growth in CANDIDATES]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "GmdhOne":
-        data = SlipExamples.of(runs, machine)
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhOne":
+        data = SlipExamples.of(runs, spec)
         in_a = first_half(data.run, [run.floor for run in runs])
         networks = NetworkSet.grown(data.inputs, data.ratio, data.weight, in_a, self.growth)
         return replace(self, channels=data.channels, networks=networks)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.networks is None:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = SignalWindows.of(runs, machine)
-        ratio = self.networks.output(windows.inputs(machine, self.channels))
-        return with_slip(runs, windows, ratio, machine)
+        windows = SignalWindows.of(runs, spec)
+        ratio = self.networks.output(windows.inputs(spec, self.channels))
+        return with_slip(runs, windows, ratio, spec)
 
     @property
     def numbers(self) -> int:
@@ -164,8 +164,8 @@ class GmdhClass(SlipModel):
     def candidates(self) -> Sequence["GmdhClass"]:
         return [replace(self, growth=growth) for growth in CANDIDATES]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "GmdhClass":
-        data = SlipExamples.of(runs, machine)
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhClass":
+        data = SlipExamples.of(runs, spec)
         floor_of_run = [run.floor for run in runs]
         in_a = first_half(data.run, floor_of_run)
         # a floor on which no wheel turned has no training windows
@@ -187,18 +187,18 @@ class GmdhClass(SlipModel):
             self, channels=data.channels, floors=floors, loads=loads, classifier=classifier
         )
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if not self.floors:
             raise ValueError(f"{self.name}: predict before fit")
-        windows, names = SignalWindows.of(runs, machine), list(self.floors)
-        inputs = windows.inputs(machine, self.channels)
+        windows, names = SignalWindows.of(runs, spec), list(self.floors)
+        inputs = windows.inputs(spec, self.channels)
         belief = self._belief(windows, inputs, runs)
         given = np.array([names.index(run.floor) if run.floor in names else -1 for run in runs])
         floor = np.where(given[windows.run] < 0, belief.argmax(axis=1), given[windows.run])
         ratio = np.zeros((len(inputs), 3))
         for number, networks in enumerate(self.floors.values()):
             ratio[floor == number] = networks.output(inputs[floor == number])
-        predicted = with_slip(runs, windows, ratio, machine)
+        predicted = with_slip(runs, windows, ratio, spec)
         return [
             replace(of_run, floors=dict(zip(names, belief_of_run.T, strict=True)))
             for of_run, belief_of_run in zip(

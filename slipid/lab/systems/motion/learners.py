@@ -16,7 +16,7 @@ Liberties of the trees:
       stopping.
     - Windows are drawn with a probability in proportion to their weight, and then count alike.
 
-Source: Friedman 2001, Greedy function approximation: a gradient boosting machine, Annals of
+Source: Friedman 2001, Greedy function approximation: a gradient boosting spec, Annals of
 Statistics 29(5); the binning of Ke and others 2017, LightGBM, NeurIPS, as scikit-learn has it.
 
 Neural network. All three components of the slip ratio at once are
@@ -54,7 +54,7 @@ from slipid.lab.systems.motion.features import (
     with_slip,
 )
 from slipid.lab.systems.one_thread import one_thread
-from slipid.predict.slip_model import Channel, Machine, PredictedRun, Run, RunSignals, SlipModel
+from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, RunSignals, SlipModel
 
 FEWEST = 20
 """Smallest number of windows in a leaf, and smallest number of windows for early stopping."""
@@ -91,10 +91,10 @@ class BoostedTrees(SlipModel):
         pairs = (0.1, 8), (0.05, 8), (0.2, 4), (0.1, 4)
         return [replace(self, rate=rate, leaves=leaves) for rate, leaves in pairs]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "BoostedTrees":
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "BoostedTrees":
         from sklearn.ensemble import HistGradientBoostingRegressor
 
-        examples = SlipExamples.of(runs, machine)
+        examples = SlipExamples.of(runs, spec)
         # scikit-learn takes ten times as long for bins of weighted inputs
         chance = np.random.default_rng(SEED).uniform(size=len(examples.weight))
         kept = chance <= examples.weight / examples.weight.max()
@@ -112,14 +112,14 @@ class BoostedTrees(SlipModel):
             )
         return replace(self, channels=examples.channels, each=each, windows=int(kept.sum()))
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if not self.each:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = SignalWindows.of(runs, machine)
-        inputs = windows.inputs(machine, self.channels)
+        windows = SignalWindows.of(runs, spec)
+        inputs = windows.inputs(spec, self.channels)
         with one_thread():
             ratio = np.stack([trees.predict(inputs) for trees in self.each], axis=1)
-        return with_slip(runs, windows, ratio, machine)
+        return with_slip(runs, windows, ratio, spec)
 
     @property
     def numbers(self) -> int:
@@ -154,11 +154,11 @@ class NeuralNetwork(SlipModel):
         pairs = (32, 1e-3), (16, 1e-1), (16, 1.0), (32, 1.0)
         return [replace(self, hidden=(size,), alpha=alpha) for size, alpha in pairs]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "NeuralNetwork":
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "NeuralNetwork":
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.neural_network import MLPRegressor
 
-        examples = SlipExamples.of(runs, machine)
+        examples = SlipExamples.of(runs, spec)
         inputs, outputs = Scale.of(examples.inputs), Scale.of(examples.ratio)
         network = MLPRegressor(
             hidden_layer_sizes=self.hidden,
@@ -178,13 +178,13 @@ class NeuralNetwork(SlipModel):
             self, channels=examples.channels, inputs=inputs, outputs=outputs, network=network
         )
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.network is None or self.inputs is None or self.outputs is None:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = SignalWindows.of(runs, machine)
-        inputs = self.inputs.scaled(windows.inputs(machine, self.channels))
+        windows = SignalWindows.of(runs, spec)
+        inputs = self.inputs.scaled(windows.inputs(spec, self.channels))
         ratio = self.outputs.back(self.network.predict(inputs))
-        return with_slip(runs, windows, ratio, machine)
+        return with_slip(runs, windows, ratio, spec)
 
     @property
     def numbers(self) -> int:

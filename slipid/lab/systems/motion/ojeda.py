@@ -49,15 +49,15 @@ from jaxtyping import Bool, Float
 
 from slipid.predict.slip_model import (
     Channel,
-    Machine,
     PredictedRun,
+    RobotSpec,
     Run,
     RunSignals,
     SlipModel,
     Twists,
-    seen_from_start,
+    relative_to_start,
 )
-from slipid.predict.steps import Steps, TrainingWindows, least
+from slipid.predict.steps import Steps, TrainingWindows, scaled_least_squares
 
 Line = Float[np.ndarray, "2"]
 """k0 [m/s] and k1 [m/s/A]."""
@@ -104,11 +104,11 @@ class FlaggedSteps:
         sign = np.sign(self.rim) * self.flagged[:, None]
         return np.stack([sign, sign * (self.current - middle)], axis=-1)
 
-    def twist(self, line: Float[np.ndarray, "*step 2"], machine: Machine) -> Twists:
+    def twist(self, line: Float[np.ndarray, "*step 2"], spec: RobotSpec) -> Twists:
         """Return the corrected body twist of every step, by one k0 and k1 or one for each step."""
         less = self.flagged[:, None] * (line[..., :1] + line[..., 1:] * self.current)
         rim = np.sign(self.rim) * np.maximum(np.abs(self.rim) - less, 0.0)
-        return np.asarray(rim @ machine.back.T)
+        return np.asarray(rim @ spec.back.T)
 
 
 @final
@@ -132,60 +132,60 @@ class Ojeda(SlipModel):
     def candidates(self) -> Sequence["Ojeda"]:
         return [replace(self, time_constant=seconds) for seconds in (0.3, 1.0)]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "Ojeda":
-        hard = self._hard(hard_runs(runs, machine), machine)
-        lines: dict[str | None, Line] = {None: self._line(runs, hard, machine)}
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "Ojeda":
+        hard = self._hard(hard_runs(runs, spec), spec)
+        lines: dict[str | None, Line] = {None: self._line(runs, hard, spec)}
         floors = list(dict.fromkeys(run.floor for run in runs))
         for floor in floors if len(floors) > 1 else ():
-            lines[floor] = self._line([run for run in runs if run.floor == floor], hard, machine)
+            lines[floor] = self._line([run for run in runs if run.floor == floor], hard, spec)
         return replace(self, hard=hard, lines=lines)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.hard is None:
             raise ValueError(f"{self.name}: not fitted")
-        flagged = self._flagged(runs, self.hard, machine)
+        flagged = self._flagged(runs, self.hard, spec)
         line = np.stack([self.lines.get(run.floor, self.lines[None]) for run in runs])
-        twist = flagged.twist(np.repeat(line, flagged.steps.length, axis=0), machine)
+        twist = flagged.twist(np.repeat(line, flagged.steps.length, axis=0), spec)
         return flagged.steps.predicted(twist, self.hard.sigmas(flagged.current))
 
     @property
     def numbers(self) -> int:
         return 2 * len(self.lines) + 2 * (self.hard is not None)
 
-    def _hard(self, runs: Sequence[Run], machine: Machine) -> HardFloor:
+    def _hard(self, runs: Sequence[Run], spec: RobotSpec) -> HardFloor:
         steps = Steps.of([run.signals for run in runs])
-        current = steps.smoothed(steps.signals.along(machine), self.time_constant).mean(axis=1)
-        moving = np.abs(steps.signals.speed).mean(axis=1) * machine.wheel_radius > MOVING
+        current = steps.smoothed(steps.signals.along(spec), self.time_constant).mean(axis=1)
+        moving = np.abs(steps.signals.speed).mean(axis=1) * spec.wheel_radius > MOVING
         used = current[moving] if moving.any() else current
         return HardFloor(float(used.mean()), max(float(used.std()), 1e-6))
 
     def _flagged(
-        self, runs: Sequence[RunSignals], hard: HardFloor, machine: Machine
+        self, runs: Sequence[RunSignals], hard: HardFloor, spec: RobotSpec
     ) -> FlaggedSteps:
         steps = Steps.of(runs)
-        rim = steps.signals.speed * machine.wheel_radius
-        current = steps.smoothed(steps.signals.along(machine), self.time_constant)
+        rim = steps.signals.speed * spec.wheel_radius
+        current = steps.smoothed(steps.signals.along(spec), self.time_constant)
         return FlaggedSteps(steps, rim, current, hard.sigmas(current) > SIGMAS)
 
-    def _line(self, runs: Sequence[Run], hard: HardFloor, machine: Machine) -> Line:
+    def _line(self, runs: Sequence[Run], hard: HardFloor, spec: RobotSpec) -> Line:
         """Return k0 [m/s] and k1 [m/s/A] of some runs; zero where no slip was flagged."""
-        steps = self._flagged([run.signals for run in runs], hard, machine)
+        steps = self._flagged([run.signals for run in runs], hard, spec)
         if not steps.flagged.any():
             return np.zeros(2)
         if self.tuning == "sporadic":
-            return sporadic(steps, runs, machine)
+            return sporadic(steps, runs, spec)
         w = TrainingWindows.of(runs)
         if self.tuning == "continuous":
-            return continuous(steps, w, machine)
-        return by_gyro(steps, w, hard.mean, machine)
+            return continuous(steps, w, spec)
+        return by_gyro(steps, w, hard.mean, spec)
 
 
-def hard_runs(runs: Sequence[Run], machine: Machine) -> list[Run]:
+def hard_runs(runs: Sequence[Run], spec: RobotSpec) -> list[Run]:
     """Return the runs on the floor where encoders err least, or the best quarter of one floor."""
     steps = Steps.of([run.signals for run in runs])
-    rolling = steps.signals.rolling(machine)
-    gap = np.linalg.norm((steps.ends(rolling) - true_ends(runs)) * machine.size, axis=1)
-    length = np.linalg.norm(rolling * machine.size, axis=1) * steps.signals.dt
+    rolling = steps.signals.rolling(spec)
+    gap = np.linalg.norm((steps.ends(rolling) - true_ends(runs)) * spec.size, axis=1)
+    length = np.linalg.norm(rolling * spec.size, axis=1) * steps.signals.dt
     error = gap / np.maximum(np.add.reduceat(length, steps.first), 1e-9)
     floors = np.array([run.floor for run in runs])
     names = list(dict.fromkeys(floors.tolist()))
@@ -198,12 +198,12 @@ def hard_runs(runs: Sequence[Run], machine: Machine) -> list[Run]:
 
 def true_ends(runs: Sequence[Run]) -> Float[np.ndarray, "run 3"]:
     """Return the pose at each run's end relative to its start [m, m, rad]."""
-    return np.stack([seen_from_start(run.pose)[-1] for run in runs])
+    return np.stack([relative_to_start(run.pose)[-1] for run in runs])
 
 
-def continuous(steps: FlaggedSteps, w: TrainingWindows, machine: Machine) -> Line:
+def continuous(steps: FlaggedSteps, w: TrainingWindows, spec: RobotSpec) -> Line:
     """Return k0 and k1 by poses at all times, from windows with flagged slip."""
-    rows = w.rows(machine.back @ steps.features(), machine)
+    rows = w.rows(spec.back @ steps.features(), spec)
     used = rows.parts.any(axis=(1, 2))
     return forgetful(rows.parts[used], rows.gap[used], FORGETTING, PRIOR)
 
@@ -226,26 +226,26 @@ def forgetful(
     return np.linalg.solve(a.T @ a + prior, a.T @ b)
 
 
-def sporadic(steps: FlaggedSteps, runs: Sequence[Run], machine: Machine) -> Line:
+def sporadic(steps: FlaggedSteps, runs: Sequence[Run], spec: RobotSpec) -> Line:
     """Return k0 and k1 by the place at the end of each run."""
     from scipy.optimize import least_squares
 
     place = true_ends(runs)[:, :2]
 
     def gap(line: np.ndarray) -> np.ndarray:
-        return np.asarray((steps.steps.ends(steps.twist(line, machine))[:, :2] - place).ravel())
+        return np.asarray((steps.steps.ends(steps.twist(line, spec))[:, :2] - place).ravel())
 
     return np.asarray(least_squares(gap, np.zeros(2), x_scale="jac").x)
 
 
-def by_gyro(steps: FlaggedSteps, w: TrainingWindows, middle: float, machine: Machine) -> Line:
+def by_gyro(steps: FlaggedSteps, w: TrainingWindows, middle: float, spec: RobotSpec) -> Line:
     """Return k0 and k1 by the yaw rate alone; `middle` is the hard floor's mean current [A]."""
     signals = steps.steps.signals
     if signals.gyro is None:
         raise ValueError(f"{signals.name}: no gyro; this method needs one")
-    parts = w.means(machine.back[2] @ steps.features(middle)) * w.dt[:, None]
-    gap = w.means(signals.rolling(machine)[:, 2] - signals.gyro) * w.dt
-    offset, gain = least(parts, gap)
+    parts = w.means(spec.back[2] @ steps.features(middle)) * w.dt[:, None]
+    gap = w.means(signals.rolling(spec)[:, 2] - signals.gyro) * w.dt
+    offset, gain = scaled_least_squares(parts, gap)
     return np.array([offset - gain * middle, gain])
 
 

@@ -65,8 +65,8 @@ from slipid.lab.systems.motion.gaussian_process import GaussianProcess, Kernel, 
 from slipid.predict.slip_model import (
     Aim,
     Channel,
-    Machine,
     PredictedRun,
+    RobotSpec,
     Run,
     RunSignals,
     SlipModel,
@@ -101,26 +101,26 @@ class QuannEnergy(SlipModel):
     def candidates(self) -> Sequence["QuannEnergy"]:
         return [replace(self, length=length) for length in (0.1, 0.2, 0.5)]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "QuannEnergy":
-        windows = SignalWindows.of([run.signals for run in runs], machine)
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "QuannEnergy":
+        windows = SignalWindows.of([run.signals for run in runs], spec)
         speed, motion = rate(windows.rolling), motions(windows.rolling)
-        energy = np.concatenate([run.power(machine) for run in windows.signals]) / speed
+        energy = np.concatenate([run.power(spec) for run in windows.signals]) / speed
         terms = law_terms(motion)
         law = np.linalg.lstsq(terms * speed[:, None], energy * speed, rcond=1e-6)[0]
         residual = (energy - terms @ law)[:, None]
-        rows = ProcessRows(places(windows, machine), residual, speed**2)
+        rows = ProcessRows(places(windows, spec), residual, speed**2)
         kernel = Kernel((self.length,), free=False).tuned(rows)
         process = GaussianProcess.of(rows, kernel)
         return replace(self, law=law, fastest=motion.max(axis=0), process=process)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.process is None or self.law is None or self.fastest is None:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = SignalWindows.of(runs, machine)
-        residual = self.process.predict(places(windows, machine)).mean
+        windows = SignalWindows.of(runs, spec)
+        residual = self.process.predict(places(windows, spec)).mean
         motion = np.minimum(motions(windows.rolling), self.fastest)
         energy = law_terms(motion) @ self.law + residual[:, 0]
-        rolling = [run.rolling(machine) for run in runs]
+        rolling = [run.rolling(spec) for run in runs]
         of_steps = at_steps(energy[:, None], windows, runs)
         return [
             PredictedRun(path_of(twist, run.dt), power=energy_of_run[:, 0] * rate(twist))
@@ -148,9 +148,9 @@ def law_terms(motion: Float[np.ndarray, "row 2"]) -> Float[np.ndarray, "row 4"]:
     return np.stack([np.ones_like(speed), speed, speed**2, turning], axis=1)
 
 
-def places(windows: SignalWindows, machine: Machine) -> Float[np.ndarray, "window 2"]:
+def places(windows: SignalWindows, spec: RobotSpec) -> Float[np.ndarray, "window 2"]:
     """Return the place in the middle of each window by encoders, from the run's start [m]."""
-    paths = [path_of(run.rolling(machine), run.dt)[:, :2] for run in windows.signals]
+    paths = [path_of(run.rolling(spec), run.dt)[:, :2] for run in windows.signals]
     return np.concatenate([0.5 * (path[1:] + path[:-1]) for path in paths])
 
 
@@ -185,9 +185,9 @@ class QuannSlip(SlipModel):
     def candidates(self) -> Sequence["QuannSlip"]:
         return [replace(self, anisotropic=each) for each in (True, False)]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "QuannSlip":
-        examples = SlipExamples.of(runs, machine)
-        inputs = slip_inputs(examples.windows, machine)[examples.windows.moving]
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "QuannSlip":
+        examples = SlipExamples.of(runs, spec)
+        inputs = slip_inputs(examples.windows, spec)[examples.windows.moving]
         scale = Scale.of(inputs)
         rows = ProcessRows(scale.scaled(inputs), examples.ratio, examples.weight)
         lengths = (START,) * (inputs.shape[1] if self.anisotropic else 1)
@@ -198,18 +198,18 @@ class QuannSlip(SlipModel):
             # a single run is predicted by a fit to itself
             others = GaussianProcess.of(rows if mine.all() else rows.only(~mine), kernel)
             known = replace(self, scale=scale, process=others, inflation=1.0)
-            squares.append(end_squares(known, [runs[k] for k in part], machine))
+            squares.append(end_squares(known, [runs[k] for k in part], spec))
         inflation = float(np.concatenate(squares).mean())
         whole = GaussianProcess.of(rows, kernel)
         return replace(self, scale=scale, process=whole, inflation=inflation)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.process is None or self.scale is None:
             raise ValueError(f"{self.name}: predict before fit")
-        windows = SignalWindows.of(runs, machine)
-        slip = self.process.predict(self.scale.scaled(slip_inputs(windows, machine)))
-        predicted = with_slip(runs, windows, slip.mean, machine)
-        std = at_steps(slip.std * windows.size[:, None] / machine.size, windows, runs)
+        windows = SignalWindows.of(runs, spec)
+        slip = self.process.predict(self.scale.scaled(slip_inputs(windows, spec)))
+        predicted = with_slip(runs, windows, slip.mean, spec)
+        std = at_steps(slip.std * windows.size[:, None] / spec.size, windows, runs)
         return [
             replace(of_run, end_covariance=self.inflation * spread + CAMERA**2 * np.eye(2))
             for of_run, run, of_step in zip(predicted, runs, std, strict=True)
@@ -221,9 +221,9 @@ class QuannSlip(SlipModel):
         return 0 if self.process is None else 1 + self.process.numbers
 
 
-def slip_inputs(windows: SignalWindows, machine: Machine) -> Inputs:
+def slip_inputs(windows: SignalWindows, spec: RobotSpec) -> Inputs:
     """Return |I| and |w| of each drive, and the direction of travel."""
-    columns = [windows.amperes(), np.abs(windows.speed()), windows.direction(machine)]
+    columns = [windows.amperes(), np.abs(windows.speed()), windows.direction(spec)]
     return np.concatenate(columns, axis=1)
 
 
@@ -248,10 +248,10 @@ def end_spread(
 
 
 def end_squares(
-    fitted: QuannSlip, runs: Sequence[Run], machine: Machine
+    fitted: QuannSlip, runs: Sequence[Run], spec: RobotSpec
 ) -> Float[np.ndarray, " run"]:
     """Return the squared error at each run's end over its covariance, per dimension."""
-    predicted = fitted.predict([run.signals for run in runs], machine)
+    predicted = fitted.predict([run.signals for run in runs], spec)
     error = np.stack(
         [
             (of_run.path - path_of(run.twist, run.signals.dt))[-1, :2]

@@ -57,9 +57,9 @@ from slipid.lab.systems.motion.reina_indicators import (
 )
 from slipid.predict.slip_model import (
     Channel,
-    Machine,
     Numbers,
     PredictedRun,
+    RobotSpec,
     Run,
     RunSignals,
     SlipModel,
@@ -86,18 +86,18 @@ class _Detector(SlipModel):
     limits: SlipThresholds = field(default_factory=SlipThresholds)
     slip: float = 0.0
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "_Detector":
-        examples = [LabelledRun.of(run, machine, self.smoothing) for run in runs]
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "_Detector":
+        examples = [LabelledRun.of(run, spec, self.smoothing) for run in runs]
         limited = replace(self, limits=SlipThresholds.of(examples, self.quantile))
         trained = limited._trained(examples)
         return replace(trained, slip=trained._mean_slip(examples))
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         predicted = []
         for run in runs:
-            score = self.score(SmoothedSignals.of(run, machine, self.smoothing))
+            score = self.score(SmoothedSignals.of(run, spec, self.smoothing))
             kept = 1.0 - self.slip * (score >= self._threshold)
-            path = path_of(run.rolling(machine) * kept[:, None], run.dt)
+            path = path_of(run.rolling(spec) * kept[:, None], run.dt)
             predicted.append(PredictedRun(path, slipping=score))
         return predicted
 

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.predict.slip_model import WINDOW_S, Machine, Numbers, Run, RunSignals, groups
+from slipid.predict.slip_model import WINDOW_S, Numbers, RobotSpec, Run, RunSignals, groups
 
 _PRIOR = 1.0
 """Weight of the prior at the logical OR in every rule, in samples."""
@@ -99,19 +99,19 @@ class SmoothedSignals:
     moving: Bool[np.ndarray, " step"]
 
     @classmethod
-    def of(cls, run: RunSignals, machine: Machine, seconds: float) -> "SmoothedSignals":
+    def of(cls, run: RunSignals, spec: RobotSpec, seconds: float) -> "SmoothedSignals":
         """Return the signals of a run, smoothed with this time constant [s]."""
         mean = smoothing(run.dt, seconds)
-        speed, amps = mean @ run.speed, mean @ run.along(machine)
-        rim = machine.wheel_radius * speed
+        speed, amps = mean @ run.speed, mean @ run.along(spec)
+        rim = spec.wheel_radius * speed
         fastest = np.abs(rim).max(axis=1, keepdims=True)
         drives = np.abs(rim) >= _DRIVING * fastest
         turning = None
         if run.gyro is not None:
-            turning = np.abs(mean @ (run.rolling(machine)[:, 2] - run.gyro))
+            turning = np.abs(mean @ (run.rolling(spec)[:, 2] - run.gyro))
         change = np.diff(speed, axis=0, prepend=speed[:1]) / run.dt[:, None]
         return cls(
-            deviation=_deviation(rim, mean, run, machine),
+            deviation=_deviation(rim, mean, run, spec),
             change=np.abs(change).max(axis=1),
             turning=turning,
             amps=np.where(drives, amps, np.inf).min(axis=1),
@@ -203,16 +203,16 @@ class LabelledRun:
     square: Float[np.ndarray, " window"]
 
     @classmethod
-    def of(cls, run: Run, machine: Machine, seconds: float) -> "LabelledRun":
+    def of(cls, run: Run, spec: RobotSpec, seconds: float) -> "LabelledRun":
         """Return a run whose signals are smoothed with this time constant [s]."""
         joined = run.windowed()
-        rolling = joined.signals.rolling(machine) * machine.size
-        slip = rolling - joined.twist * machine.size
+        rolling = joined.signals.rolling(spec) * spec.size
+        slip = rolling - joined.twist * spec.size
         size = np.linalg.norm(rolling, axis=1)
         slips = np.where(size > _REST, np.linalg.norm(slip, axis=1) > SLIPS * size, np.nan)
         first = groups(run.signals.dt, WINDOW_S)
         return cls(
-            signals=SmoothedSignals.of(run.signals, machine, seconds),
+            signals=SmoothedSignals.of(run.signals, spec, seconds),
             first=first,
             slips=np.repeat(slips, np.diff(first, append=len(run.signals))),
             against=(slip * rolling).sum(axis=1),
@@ -232,11 +232,11 @@ def _deviation(
     rim: Float[np.ndarray, "step drive"],
     mean: Float[np.ndarray, "step step"],
     run: RunSignals,
-    machine: Machine,
+    spec: RobotSpec,
 ) -> Numbers:
     """Return the largest relative deviation of a wheel from the shape of the commanded twist."""
-    forward = machine.forward.T
-    shape = mean @ (run.rolling(machine) @ forward)
+    forward = spec.forward.T
+    shape = mean @ (run.rolling(spec) @ forward)
     if run.command is not None:
         commanded = mean @ (run.command @ forward)
         is_commanded = np.abs(commanded).max(axis=1, keepdims=True) > _REST

@@ -73,7 +73,7 @@ from slipid.lab.systems.motion.ward_iagnemma_dynamics import (
     Speeds,
 )
 from slipid.lab.systems.motion.ward_iagnemma_filter import FilterNoise, SlipFilter
-from slipid.predict.slip_model import Machine, PredictedRun, Run, RunSignals, SlipModel, path_of
+from slipid.predict.slip_model import PredictedRun, RobotSpec, Run, RunSignals, SlipModel, path_of
 
 _STEADY = 10.0
 """Time after which speeds count as steady [s]."""
@@ -116,20 +116,20 @@ class PosedWindows:
     dt: Each
 
     @classmethod
-    def of(cls, runs: Sequence[Run], machine: Machine) -> "PosedWindows":
+    def of(cls, runs: Sequence[Run], spec: RobotSpec) -> "PosedWindows":
         """Return the windows of at most `_FIT_RUNS` runs, drawn with a fixed seed."""
         drawn = np.random.default_rng(0).permutation(len(runs))[:_FIT_RUNS]
         joined = [runs[k].windowed() for k in np.sort(drawn)]
-        padded = PaddedRuns.of([run.signals for run in joined], machine)
+        padded = PaddedRuns.of([run.signals for run in joined], spec)
         run, step = np.nonzero(padded.dt > 0.0)
-        true = np.concatenate([run.twist * machine.size for run in joined])
+        true = np.concatenate([run.twist * spec.size for run in joined])
         return cls(
             run=run,
             rolling=padded.rolling[run, step],
             true=true,
             rim=padded.rim[run, step],
             force=padded.force[run, step],
-            gyro=padded.gyro[run, step] - true[:, 2] / machine.base_radius,
+            gyro=padded.gyro[run, step] - true[:, 2] / spec.base_radius,
             dt=padded.dt[run, step],
         )
 
@@ -144,7 +144,7 @@ class PosedWindows:
         return dynamics.step(self.rolling, rolling, self.rim, np.full(len(self.dt), _STEADY))
 
 
-def fitted_law(windows: PosedWindows, machine: Machine, with_drag: bool) -> ForceLaw:
+def fitted_law(windows: PosedWindows, spec: RobotSpec, with_drag: bool) -> ForceLaw:
     """Return the law with the least error of steady speeds, relative to those of the wheels."""
     from scipy.optimize import least_squares
 
@@ -158,7 +158,7 @@ def fitted_law(windows: PosedWindows, machine: Machine, with_drag: bool) -> Forc
         return ForceLaw(**dict(zip(names, np.exp(logs).tolist(), strict=True)))
 
     def residuals(logs: np.ndarray) -> np.ndarray:
-        gap = (some.steady(Dynamics.of(machine, law(logs))).speeds - some.true) / size
+        gap = (some.steady(Dynamics.of(spec, law(logs))).speeds - some.true) / size
         return np.append(gap.ravel(), _PRIOR * np.sqrt(len(gap)) * (logs - middle))
 
     starts = [middle + np.log([*times, 1.0, 1.0][: len(names)]) for times in _GRID]
@@ -252,33 +252,33 @@ class WardIagnemma(SlipModel):
     def candidates(self) -> Sequence["WardIagnemma"]:
         return [replace(self, with_drag=d, wander=w) for d in (False, True) for w in (0.0, 0.5)]
 
-    def fit(self, runs: Sequence[Run], machine: Machine) -> "WardIagnemma":
-        windows = PosedWindows.of(runs, machine)
-        law = fitted_law(windows, machine, self.with_drag)
-        noise = fitted_noise(windows, Dynamics.of(machine, law), machine.mass)
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "WardIagnemma":
+        windows = PosedWindows.of(runs, spec)
+        law = fitted_law(windows, spec, self.with_drag)
+        noise = fitted_noise(windows, Dynamics.of(spec, law), spec.mass)
         return replace(self, law=law, noise=noise)
 
-    def predict(self, runs: Sequence[RunSignals], machine: Machine) -> list[PredictedRun]:
-        padded = PaddedRuns.of(runs, machine)
-        tracked = self.filter(machine).track(padded)
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
+        padded = PaddedRuns.of(runs, spec)
+        tracked = self.filter(spec).track(padded)
         size, fastest = (np.linalg.norm(q, axis=2) for q in (tracked.speeds, padded.rolling))
         kept = np.where(fastest > REST, size / np.where(fastest > REST, fastest, 1.0), 1.0)
         slipping = np.clip(1.0 - kept, 0.0, 1.0)
         return [
             PredictedRun(
-                path_of(tracked.speeds[k, : len(run)] / machine.size, run.dt),
+                path_of(tracked.speeds[k, : len(run)] / spec.size, run.dt),
                 end_covariance=tracked.covariance[k, :2, :2],
                 slipping=slipping[k, : len(run)],
             )
             for k, run in enumerate(runs)
         ]
 
-    def filter(self, machine: Machine) -> SlipFilter:
+    def filter(self, spec: RobotSpec) -> SlipFilter:
         """Return the fitted filter for a robot."""
         return SlipFilter(
-            dynamics=Dynamics.of(machine, self.law),
+            dynamics=Dynamics.of(spec, self.law),
             noise=self.noise,
-            mass=machine.mass,
+            mass=spec.mass,
             uses_current="current" in self.needs,
             wander=self.wander * self.noise.rolling,
         )

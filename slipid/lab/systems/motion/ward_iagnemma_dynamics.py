@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.predict.slip_model import Machine, RunSignals
+from slipid.predict.slip_model import RobotSpec, RunSignals
 
 Drives = Float[np.ndarray, "run drive"]
 Speeds = Float[np.ndarray, "run 3"]
@@ -112,11 +112,11 @@ class Dynamics:
     base_radius: float
 
     @classmethod
-    def of(cls, machine: Machine, law: ForceLaw) -> "Dynamics":
+    def of(cls, spec: RobotSpec, law: ForceLaw) -> "Dynamics":
         """Return the dynamics of a robot with a force law."""
-        turning = np.array([0.0, 0.0 if machine.determines_twist else 1.0, 1.0])
-        rims = np.asarray(machine.forward / machine.size, dtype=float)
-        return cls(law, rims, turning, float(machine.base_radius))
+        turning = np.array([0.0, 0.0 if spec.determines_twist else 1.0, 1.0])
+        rims = np.asarray(spec.forward / spec.size, dtype=float)
+        return cls(law, rims, turning, float(spec.base_radius))
 
     def traction(self, slide: Drives) -> Drives:
         """Return traction of each drive over the robot's mass [m/s^2] at sliding speeds [m/s]."""
@@ -231,9 +231,9 @@ class PaddedRuns:
     force: Float[np.ndarray, "run step drive"]
 
     @classmethod
-    def of(cls, runs: Sequence[RunSignals], machine: Machine) -> "PaddedRuns":
+    def of(cls, runs: Sequence[RunSignals], spec: RobotSpec) -> "PaddedRuns":
         """Return padded runs of any lengths."""
-        shape, drives = (len(runs), max(len(run) for run in runs)), len(machine.forward)
+        shape, drives = (len(runs), max(len(run) for run in runs)), len(spec.forward)
         padded = cls(
             dt=np.zeros(shape),
             rim=np.zeros((*shape, drives)),
@@ -244,18 +244,18 @@ class PaddedRuns:
         for k, run in enumerate(runs):
             steps = slice(len(run))
             padded.dt[k, steps] = run.dt
-            padded.rim[k, steps] = run.speed * machine.wheel_radius
-            padded.rolling[k, steps] = run.rolling(machine) * machine.size
+            padded.rim[k, steps] = run.speed * spec.wheel_radius
+            padded.rolling[k, steps] = run.rolling(spec) * spec.size
             padded.gyro[k, steps] = np.nan if run.gyro is None else run.gyro
-            padded.force[k, steps] = motor_forces(run, machine)
+            padded.force[k, steps] = motor_forces(run, spec)
         return padded
 
 
-def motor_forces(run: RunSignals, machine: Machine) -> Float[np.ndarray, "step drive"]:
+def motor_forces(run: RunSignals, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
     """Return the force n C_e I / r along each drive's motion [N]; NaN if it does not drive."""
-    rim = np.abs(run.speed * machine.wheel_radius)
+    rim = np.abs(run.speed * spec.wheel_radius)
     if run.current is None:
         return np.full(rim.shape, np.nan)
     drives = (rim >= _DRIVING * rim.max(axis=1, keepdims=True)) & (rim > REST)
-    scale = machine.gear_ratio * machine.back_emf / machine.wheel_radius
-    return np.where(drives, scale * run.along(machine), np.nan)
+    scale = spec.gear_ratio * spec.back_emf / spec.wheel_radius
+    return np.where(drives, scale * run.along(spec), np.nan)

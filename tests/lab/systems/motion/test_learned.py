@@ -182,7 +182,7 @@ def test_a_network_says_nothing_beyond_what_it_was_taught():
 def test_learned_slip_of_a_skid_steer_without_currents_is_that_of_each_floor(method):
     twist = np.tile([0.5, 0.0, 0.4], (60, 1))
     runs = [
-        made_run(twist, twist * [1.0 - loss, 1.0, 0.5], machine=HUSKY, floor=floor)
+        made_run(twist, twist * [1.0 - loss, 1.0, 0.5], spec=HUSKY, floor=floor)
         for floor, loss in (("ice", 0.5), ("grass", 0.1))
         for _ in range(5)
     ]

@@ -18,19 +18,19 @@ def rng():
     return np.random.default_rng(2006)
 
 
-def corrected_run(rng, line, *, floor, level, machine=ROBOTINO, rolling=None, spread=0.15):
+def corrected_run(rng, line, *, floor, level, spec=ROBOTINO, rolling=None, spread=0.15):
     """A run on a floor that takes so much current [A], which slips as the method assumes."""
-    while rolling is None or np.abs(rolling @ machine.forward.T).min() < 0.15:
+    while rolling is None or np.abs(rolling @ spec.forward.T).min() < 0.15:
         # no wheel so slow that slip would turn it backwards
         rolling = straight(rng.uniform(-np.pi, np.pi), 0.6, 60) + np.array(
             [0, 0, rng.uniform(-1, 1)]
         )
-    drives = len(machine.forward)
+    drives = len(spec.forward)
     # the same all through a window, and long enough for the low pass not to lag
     current = level + np.tile(rng.uniform(-spread, spread, drives), (len(rolling), 1))
-    rim = rolling @ machine.forward.T
-    twist = (rim - np.sign(rim) * (line[0] + line[1] * current)) @ machine.back.T
-    kept = {"machine": machine, "current": current, "gyro": twist[:, 2], "floor": floor}
+    rim = rolling @ spec.forward.T
+    twist = (rim - np.sign(rim) * (line[0] + line[1] * current)) @ spec.back.T
+    kept = {"spec": spec, "current": current, "gyro": twist[:, 2], "floor": floor}
     return made_run(rolling, twist, **kept)
 
 
@@ -41,8 +41,8 @@ def two_floors(rng, line, count=12, **extra):
     return hard, soft
 
 
-def path_error(method, runs, machine=ROBOTINO):
-    said = method.predict([run.signals for run in runs], machine)
+def path_error(method, runs, spec=ROBOTINO):
+    said = method.predict([run.signals for run in runs], spec)
     return max(np.abs(s.path - run.pose).max() for s, run in zip(said, runs, strict=True))
 
 
@@ -68,7 +68,7 @@ def test_both_numbers_of_a_skid_steer_come_back(rng, method):
     bend = np.tile([0.6, 0.0, 0.5], (60, 1))
     hard, soft = [], []
     for rolling in (spin, -spin, bend, -bend, spin, bend):
-        a, b = two_floors(rng, line, count=1, machine=HUSKY, rolling=rolling)
+        a, b = two_floors(rng, line, count=1, spec=HUSKY, rolling=rolling)
         hard, soft = hard + a, soft + b
     fitted = method.fit(hard + soft, HUSKY)
     assert fitted.lines["soft"] == pytest.approx(line, rel=1e-3)
@@ -87,7 +87,7 @@ def test_places_are_seen_from_where_a_run_began(rng):
 
 def test_a_gyro_that_cannot_tell_leaves_no_slip_at_the_hard_floors_current(rng):
     straight_on = np.tile([0.5, 0.0, 0.0], (60, 1))
-    hard, soft = two_floors(rng, (0.05, 0.1), machine=HUSKY, rolling=straight_on)
+    hard, soft = two_floors(rng, (0.05, 0.1), spec=HUSKY, rolling=straight_on)
     fitted = GYRO.fit(hard + soft, HUSKY)
     offset, gain = fitted.lines["soft"]
     assert gain == pytest.approx(0.1)

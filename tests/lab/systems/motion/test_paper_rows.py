@@ -20,12 +20,12 @@ from slipid.lab.paper2021.deployed_form import (
 from slipid.lab.paper2021.table import CURRENT_SVR, field_table
 from slipid.model.geometry import omni
 from slipid.model.robot import build
-from slipid.predict.slip_model import SHAFT_W0, TRIES, ByFloor, Machine
+from slipid.predict.slip_model import SHAFT_W0, TRIES, ByFloor, RobotSpec
 from slipid.predict.steps import TrainingWindows
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 PRINT_REFIT, CODE_REFIT = refits()
-FOUR = Machine.of(build(omni([45.0, 135.0, 225.0, 315.0], 0.2, 0.05, 20.0), ("gray",)))
+FOUR = RobotSpec.of(build(omni([45.0, 135.0, 225.0, 315.0], 0.2, 0.05, 20.0), ("gray",)))
 
 
 @pytest.fixture
@@ -33,33 +33,33 @@ def rng():
     return np.random.default_rng(2021)
 
 
-def slipping(rng, curve, *, angle=None, low=0.2, high=0.8, dt=0.1, machine=ROBOTINO, noise=0.0):
+def slipping(rng, curve, *, angle=None, low=0.2, high=0.8, dt=0.1, spec=ROBOTINO, noise=0.0):
     """A run with currents at random, constant over half a second, whose slip is `curve` of it."""
     angle = rng.uniform(-np.pi, np.pi) if angle is None else angle
     rolling = straight(angle) + np.array([0.0, 0.0, 0.2])
     hold = round(0.5 / dt)
-    drives = len(machine.forward)
+    drives = len(spec.forward)
     current = rng.uniform(low, high, (40 // hold + 1, drives)).repeat(hold, axis=0)[:40]
-    run = made_run(rolling, current=current, machine=machine, dt=dt)
-    rim = run.signals.speed * machine.wheel_radius
-    twist = (rim * (1 - curve(run.signals))) @ machine.back.T + noise * rng.normal(size=(40, 3))
-    return made_run(rolling, twist, current=current, machine=machine, dt=dt)
+    run = made_run(rolling, current=current, spec=spec, dt=dt)
+    rim = run.signals.speed * spec.wheel_radius
+    twist = (rim * (1 - curve(run.signals))) @ spec.back.T + noise * rng.normal(size=(40, 3))
+    return made_run(rolling, twist, current=current, spec=spec, dt=dt)
 
 
 def torque(heard):
     return heard.torque(ROBOTINO)
 
 
-def path_error(method, runs, machine=ROBOTINO):
-    said = method.predict([run.signals for run in runs], machine)
+def path_error(method, runs, spec=ROBOTINO):
+    said = method.predict([run.signals for run in runs], spec)
     return max(np.abs(s.path - run.pose).max() for s, run in zip(said, runs, strict=True))
 
 
-def said_slip(method, heard, machine=ROBOTINO):
+def said_slip(method, heard, spec=ROBOTINO):
     """Slip of each drive in the first step, back from the path that is said."""
-    path = method.predict([heard], machine)[0].path
+    path = method.predict([heard], spec)[0].path
     run = replace(made_run(straight(0.0)), signals=heard, pose=path)
-    return 1 - run.twist @ machine.forward.T / (heard.speed * machine.wheel_radius)
+    return 1 - run.twist @ spec.forward.T / (heard.speed * spec.wheel_radius)
 
 
 # as printed
@@ -119,12 +119,12 @@ def test_deployed_currents_are_smoothed_over_the_authors_samples(samples):
 
 def test_four_drives_get_the_mean_of_the_three_motors():
     amps = np.array([0.5, 0.6, 0.7, 0.3])
-    heard = made_run(straight(0.3), current=np.tile(amps, (40, 1)), machine=FOUR).signals
+    heard = made_run(straight(0.3), current=np.tile(amps, (40, 1)), spec=FOUR).signals
     grip = np.mean([-0.639, -0.4559, -0.6294]) * amps + np.mean([0.988, 0.9678, 0.9913])
     slip = np.where(amps > 0.4, 1 - grip, 0.0)
-    run = made_run(straight(0.3), machine=FOUR)
+    run = made_run(straight(0.3), spec=FOUR)
     twist = (run.signals.speed * FOUR.wheel_radius * (1 - slip)) @ FOUR.back.T
-    expected = made_run(straight(0.3), twist, machine=FOUR).pose
+    expected = made_run(straight(0.3), twist, spec=FOUR).pose
     assert np.allclose(PaperCode().predict([heard], FOUR)[0].path, expected)
 
 

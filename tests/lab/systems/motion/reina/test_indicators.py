@@ -34,7 +34,7 @@ def test_smoothing_of_uneven_steps_weighs_them_by_their_length():
 
 
 def test_a_wheel_off_the_commanded_shape_is_told_by_the_encoder_indicator():
-    run = made_run(np.tile([1.0, 0.0, 0.0], (20, 1)), current=np.ones((20, 2)), machine=HUSKY)
+    run = made_run(np.tile([1.0, 0.0, 0.0], (20, 1)), current=np.ones((20, 2)), spec=HUSKY)
     heard = replace(run.signals, turn=run.signals.turn * [1.0, 1.4])
     signals = SmoothedSignals.of(heard, HUSKY, 0.3)
     # of two wheels, the median ratio is in their middle

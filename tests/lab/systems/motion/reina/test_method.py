@@ -156,7 +156,7 @@ def test_skid_steer_and_floors(method):
         slow = rolling * [0.7, 1.0, 0.5]
         amps = np.full((40, 2), 4.0) + 0.1 * np.random.default_rng(k).normal(size=(40, 2))
         gyro = slow[:, 2]
-        runs.append(made_run(rolling, slow, machine=HUSKY, current=amps, gyro=gyro, floor="grass"))
+        runs.append(made_run(rolling, slow, spec=HUSKY, current=amps, gyro=gyro, floor="grass"))
     fitted = ByFloor.of(method).fit(runs, HUSKY)
     said = fitted.predict([run.signals for run in runs], HUSKY)
     assert np.isfinite(np.concatenate([one.path for one in said])).all()

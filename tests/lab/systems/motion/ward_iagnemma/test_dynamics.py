@@ -40,9 +40,9 @@ def test_viscous_forces_alone_share_speeds_by_their_slopes():
 
 
 @MACHINES
-def test_small_steps_follow_the_differential_equation(machine):
+def test_small_steps_follow_the_differential_equation(spec):
     law = replace(FLOOR, viscous=0.3)
-    dynamics = Dynamics.of(machine, law)
+    dynamics = Dynamics.of(spec, law)
     rim, rho = np.array([[0.4, 0.1, -0.2]]) @ dynamics.rims.T, np.array([law.rolling])
 
     def rate(_time, q):
@@ -51,11 +51,11 @@ def test_small_steps_follow_the_differential_equation(machine):
         pull = law.grip * np.sign(slide) * (1 - np.exp(-law.rise * np.abs(slide)))
         force = dynamics.rims.T @ (load * (pull + law.viscous * slide))
         x, y, turn = q
-        p = np.array([x, y, 0.0]) if machine is ROBOTINO else np.array([x, 0.0, 0.0])
+        p = np.array([x, y, 0.0]) if spec is ROBOTINO else np.array([x, 0.0, 0.0])
         t = q - p
         force -= GRAVITY * law.rolling * p * (1 / np.sqrt(p @ p + REST**2) + law.drag)
         force -= GRAVITY * law.turning * t / np.sqrt(t @ t + REST**2)
-        yaw = turn / machine.base_radius
+        yaw = turn / spec.base_radius
         return force * [1, 1, 2] + np.array([yaw * y, -yaw * x, 0.0])
 
     start = np.array([0.05, -0.1, 0.2])
@@ -71,7 +71,7 @@ def test_small_steps_follow_the_differential_equation(machine):
 
 
 @MACHINES
-def test_a_step_solves_its_equation_however_stiff(machine):
+def test_a_step_solves_its_equation_however_stiff(spec):
     rng = np.random.default_rng(0)
     for _ in range(10):
         law = ForceLaw(
@@ -80,7 +80,7 @@ def test_a_step_solves_its_equation_however_stiff(machine):
             rolling=np.exp(rng.uniform(-7, -0.5)),
             turning=np.exp(rng.uniform(-7, -0.5)),
         )
-        dynamics = Dynamics.of(machine, law)
+        dynamics = Dynamics.of(spec, law)
         q, rolling = rng.normal(size=(2, 20, 3)) * 0.3
         rim, rho, dt = rolling @ dynamics.rims.T, np.full(20, law.rolling), np.full(20, 0.2)
         after = dynamics.step(q, rho, rim, dt).speeds
@@ -89,11 +89,11 @@ def test_a_step_solves_its_equation_however_stiff(machine):
 
 
 @MACHINES
-def test_the_derivatives_of_a_step(machine):
+def test_the_derivatives_of_a_step(spec):
     rng = np.random.default_rng(1)
     for _ in range(2):
         q, rolling = rng.normal(size=(2, 1, 3)) * 0.2
-        dynamics = Dynamics.of(machine, FLOOR)
+        dynamics = Dynamics.of(spec, FLOOR)
         rim, dt = rolling @ dynamics.rims.T, np.array([0.15])
 
         def after(x, axis, dynamics=dynamics, rim=rim, dt=dt):

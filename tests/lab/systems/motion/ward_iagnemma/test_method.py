@@ -34,16 +34,16 @@ def test_wheels_that_spin_on_the_spot_are_told():
 
 @pytest.mark.slow
 @MACHINES
-def test_what_was_driven_by_the_law_is_foretold(machine):
-    runs = [driven(FLOOR, k, machine) for k in range(14)]
-    fitted = WardIagnemma().fit(runs[:10], machine)
-    foretold = fitted.predict([run.signals for run in runs[10:]], machine)
+def test_what_was_driven_by_the_law_is_foretold(spec):
+    runs = [driven(FLOOR, k, spec) for k in range(14)]
+    fitted = WardIagnemma().fit(runs[:10], spec)
+    foretold = fitted.predict([run.signals for run in runs[10:]], spec)
     # after the wheels change, the robot's mass needs some steps to follow
     settled = np.r_[10:20, 30:40]
     for run, said in zip(runs[10:], foretold, strict=True):
         twist = body_increments(said.path) / run.signals.dt[:, None]
-        off = np.abs((twist - run.twist) * machine.size)[settled]
-        slip = np.abs((run.signals.rolling(machine) - run.twist) * machine.size)[settled]
+        off = np.abs((twist - run.twist) * spec.size)[settled]
+        slip = np.abs((run.signals.rolling(spec) - run.twist) * spec.size)[settled]
         assert off.max() < 0.05 * slip.max()
 
 

@@ -25,7 +25,7 @@ Pose = tuple[float, float, float]
 
 
 @dataclass(frozen=True, config=CLOSED)
-class Ground:
+class SurfacePhysics:
     """Physics of one surface.
 
     Attributes:
@@ -59,12 +59,12 @@ class Ground:
 
 
 # friction, rolling_m, softness_m, shear_n_m, compaction, body_drag_n, then as declared
-GROUNDS: dict[str, Ground] = {
-    "firm": Ground(rolling_m=0.0004, unevenness=0.05, colour="#e8e4da"),
-    "short": Ground(0.75, 0.0008, 0.001, 1.2e4, 2e4, unevenness=0.1, colour="#8a5a35"),
-    "medium": Ground(0.8, 0.0018, 0.004, 4.5e3, 4e3, unevenness=0.15, colour="#8f9194"),
-    "soft": Ground(0.8, 0.0028, 0.007, 2.2e3, 3e3, 0.5, unevenness=0.15, colour="#1f6b45"),
-    "ribbed": Ground(0.6, 0.0006, 0.001, 2e4, 0.0, 0.0, 0.0012, 0.02, 0.05, "#3f4a5a"),
+SURFACES: dict[str, SurfacePhysics] = {
+    "firm": SurfacePhysics(rolling_m=0.0004, unevenness=0.05, colour="#e8e4da"),
+    "short": SurfacePhysics(0.75, 0.0008, 0.001, 1.2e4, 2e4, unevenness=0.1, colour="#8a5a35"),
+    "medium": SurfacePhysics(0.8, 0.0018, 0.004, 4.5e3, 4e3, unevenness=0.15, colour="#8f9194"),
+    "soft": SurfacePhysics(0.8, 0.0028, 0.007, 2.2e3, 3e3, 0.5, unevenness=0.15, colour="#1f6b45"),
+    "ribbed": SurfacePhysics(0.6, 0.0006, 0.001, 2e4, 0.0, 0.0, 0.0012, 0.02, 0.05, "#3f4a5a"),
 }
 """Surfaces by name: bare, a short carpet, two deeper ones, and a ribbed mat."""
 
@@ -77,7 +77,11 @@ class Terrain:
     """
 
     def __init__(
-        self, floor: FloorMap, grounds: Mapping[str, Ground], start: Pose, rng: np.random.Generator
+        self,
+        floor: FloorMap,
+        grounds: Mapping[str, SurfacePhysics],
+        start: Pose,
+        rng: np.random.Generator,
     ):
         own = [grounds[name] for name in floor.surfaces]
         levels = np.linspace(-1.5, 1.5, LEVELS)
@@ -88,7 +92,7 @@ class Terrain:
         x = np.arange(x0, x1, self._cell) + 0.5 * self._cell
         y = np.arange(y0, y1, self._cell) + 0.5 * self._cell
         surface = floor.at(np.stack(np.meshgrid(x, y), -1))
-        self._kinds = surface * LEVELS + _uneven(x, y, rng)
+        self._kinds = surface * LEVELS + _random_levels(x, y, rng)
 
     def at(self, xy: Float[np.ndarray, "place 2"]) -> Int[np.ndarray, " place"]:
         """Kind at places [m], by number."""
@@ -97,7 +101,7 @@ class Terrain:
         return self._kinds[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
 
 
-def _uneven(
+def _random_levels(
     x: Float[np.ndarray, " column"], y: Float[np.ndarray, " row"], rng: np.random.Generator
 ) -> np.ndarray:
     """Levels of a smooth random field (row, column): plane waves of about a hand's width."""
@@ -122,7 +126,7 @@ def arena(floor: FloorMap, start: Pose) -> tuple[float, float, float, float]:
 
 
 def ribs(
-    floor: FloorMap, grounds: Mapping[str, Ground], start: Pose
+    floor: FloorMap, grounds: Mapping[str, SurfacePhysics], start: Pose
 ) -> list[tuple[float, float, float, float]]:
     """Ribs along y: x, lowest y, highest y, height [m] of each; none beyond `arena`."""
     out: list[tuple[float, float, float, float]] = []

@@ -1,6 +1,7 @@
-"""Which robot logs can be of: its drive by the number of wheels, and whether it goes sideways.
+"""Guess the robot behind logs, and sort log files into runs.
 
-Log files sorted into runs: published formats, and files that belong together.
+The drive follows from the number of wheels and from sideways motion. Files of published formats
+are recognised, and files that belong to one run are put together.
 """
 
 from dataclasses import dataclass, replace
@@ -8,38 +9,38 @@ from pathlib import Path
 
 import numpy as np
 
+from slipid.app.new.draft import RobotHint
 from slipid.app.new.file_channels import (
     SUFFIXES,
-    Kind,
+    FileKind,
+    file_kinds,
     formats_below,
-    kinds_of,
-    likely_presets,
+    matching_presets,
     pattern_beside,
     without,
 )
+from slipid.app.new.file_study import FileStudy, file_with_pose, study_file
 from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, ask
-from slipid.app.new.sketch import Hint
-from slipid.app.new.study import Study, pose_study, study
 from slipid.data.reading.table_format import format_of
 from slipid.data.reading.units import factor
 from slipid.data.wheel_signals import body_steps
 from slipid.support.errors import DataError
 
 _SIDEWAYS = 0.3
-"""Share of the way that is sideways, from which a robot can drive so."""
+"""Share of sideways motion in the path length from which a robot can drive sideways."""
 
 
 @dataclass(frozen=True)
-class GuessedRobot:
-    """A robot, with what is to be asked of it in words that fit the logs."""
+class RobotGuess:
+    """A robot, and questions about it that suit the logs."""
 
     robot: RobotAnswers
-    hints: tuple[Hint, ...]
+    hints: tuple[RobotHint, ...]
 
 
-def robot_from(options: RobotOptions, wheels: int, files: tuple[Study, ...]) -> GuessedRobot:
-    """The robot of the options, the rest as the logs have it; DataError as of `ask`."""
-    drive, hint = _drive(wheels, sideways(files))
+def guess_robot(options: RobotOptions, wheels: int, files: tuple[FileStudy, ...]) -> RobotGuess:
+    """Return the robot of the options, completed from the logs; raise `DataError` as in `ask`."""
+    drive, hint = _likely_drive(wheels, drives_sideways(files))
     drive = options.drive or drive
     if wheels == 2 and drive in ("mecanum", "skid") and options.shared is None:
         options = replace(options, shared="yes")
@@ -47,12 +48,12 @@ def robot_from(options: RobotOptions, wheels: int, files: tuple[Study, ...]) -> 
         options = replace(options, wheels=str(wheels))
     known = ask(options, None, drive)
     if drive == "general" and options.places_m is None and wheels >= 2:
-        known = _in_rows(known, wheels)
-    return GuessedRobot(known, (Hint("drive", hint),))
+        known = _two_rows(known, wheels)
+    return RobotGuess(known, (RobotHint("drive", hint),))
 
 
-def _drive(wheels: int, aside: bool | None) -> tuple[str, str]:
-    """The likeliest drive, and the question that remains."""
+def _likely_drive(wheels: int, aside: bool | None) -> tuple[str, str]:
+    """Return the likeliest drive and the question that remains."""
     if wheels == 2:
         return (
             "differential",
@@ -72,18 +73,18 @@ def _drive(wheels: int, aside: bool | None) -> tuple[str, str]:
     return "omni", "no column tells how wheels turn: which drive is it, and how many wheels?"
 
 
-def sideways(files: tuple[Study, ...]) -> bool | None:
-    """Whether the robot was told to drive sideways, or did; None where nothing says."""
+def drives_sideways(files: tuple[FileStudy, ...]) -> bool | None:
+    """Return whether commands or poses show sideways motion; None where neither is known."""
     for one in files:
-        command = one.columns.get("twist_command_y")
+        command = one.channels.get("twist_command_y")
         if command is not None and np.nanmax(np.abs(command.values)) > 0:
             return True
-    posed = pose_study(files)
-    if posed is None or (turned := posed.columns.get("pose_heading")) is None:
+    posed = file_with_pose(files)
+    if posed is None or (turned := posed.channels.get("pose_heading")) is None:
         return None
     if not turned.unit:
         return None
-    x, y = posed.columns.get("pose_x"), posed.columns.get("pose_y")
+    x, y = posed.channels.get("pose_x"), posed.channels.get("pose_y")
     assert x is not None
     assert y is not None
     heading = turned.values[:, 0] * factor(turned.unit, "rad")
@@ -93,8 +94,8 @@ def sideways(files: tuple[Study, ...]) -> bool | None:
     return left > _SIDEWAYS * (ahead + left) if ahead + left > 0 else None
 
 
-def _in_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
-    """Wheels in two rows, left and right, as a place to start from; in one where they are odd."""
+def _two_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
+    """Place wheels in a left and a right row, with an odd one at the back, as a first guess."""
     pairs = wheels // 2
     places = [
         (0.2 - 0.4 * k / max(pairs - 1, 1), side) for k in range(pairs) for side in (0.15, -0.15)
@@ -111,93 +112,100 @@ def _in_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
     )
 
 
-_RUNS = 4
-"""Runs beside the first that are looked into."""
+_MORE_RUNS = 4
+"""Number of further runs that are studied beside the first."""
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
-    """Files of a run: those of one kind with the wheels, and others beside them.
+class RunFiles:
+    """Files of a run: the kind with the wheels, and other files beside it.
 
     Attributes:
         kind: the files with the wheels.
-        main: the first of them, looked into.
-        beside: name of each other file, as of `Layout.beside`, and the first of them looked into.
-        others: the same of further runs.
+        main: study of the first of them.
+        beside: name of each other file, as in `Layout.beside`, with the study of the first.
+        others: the same for further runs.
     """
 
-    kind: Kind
-    main: Study
-    beside: tuple[tuple[str, Study], ...] = ()
-    others: tuple["Group", ...] = ()
+    kind: FileKind
+    main: FileStudy
+    beside: tuple[tuple[str, FileStudy], ...] = ()
+    others: tuple["RunFiles", ...] = ()
 
     @property
-    def all(self) -> tuple[Study, ...]:
+    def all(self) -> tuple[FileStudy, ...]:
         """Every file of the first run."""
         return (self.main, *(one for _, one in self.beside))
 
     @property
     def complete(self) -> bool:
-        """Whether it has wheels and a pose."""
-        return any(one.columns.wheels for one in self.all) and any(
-            one.columns.has_pose for one in self.all
+        """True where the run has wheels and a pose."""
+        return any(one.channels.wheels for one in self.all) and any(
+            one.channels.has_pose for one in self.all
         )
 
 
 @dataclass(frozen=True, eq=False)
-class SortedLogs:
-    """All files that were found: those of published formats, and others by run.
+class SortedFiles:
+    """All files that were found.
 
-    `sentences` are lines about what was found and left out.
+    Attributes:
+        root: folder of the files.
+        presets: kinds in a published format, with its name.
+        groups: other kinds as runs.
+        other_kinds: all kinds that are in no published format.
+        hints: comments about published formats that might fit.
+        sentences: lines about files found and left out.
+        no_logs: files that are no logs.
     """
 
     root: Path
-    presets: tuple[tuple[Kind, str], ...]
-    groups: tuple[Group, ...]
-    also: tuple[Kind, ...]
+    presets: tuple[tuple[FileKind, str], ...]
+    groups: tuple[RunFiles, ...]
+    other_kinds: tuple[FileKind, ...]
     hints: tuple[str, ...]
     sentences: tuple[str, ...]
     no_logs: tuple[Path, ...]
 
 
-def sorted_logs(path: Path) -> SortedLogs:
-    """All files that belong to what was named."""
+def sort_files(path: Path) -> SortedFiles:
+    """Return all files that belong to the file or folder that the user named."""
     if path.is_dir():
         formats, no_logs = formats_below(path)
-        root, kinds = path, kinds_of(formats)
+        root, kinds = path, file_kinds(formats)
     else:
         formats, no_logs = [format_of(path)], []
-        root, kinds = path.parent, kinds_of(formats)
+        root, kinds = path.parent, file_kinds(formats)
     presets, others, hints = [], [], []
     for kind in kinds:
-        likely = likely_presets(kind)
+        likely = matching_presets(kind)
         if likely.sure:
             presets.append((kind, likely.sure))
             continue
-        others.append((kind, study(kind.formats[0])))
+        others.append((kind, study_file(kind.formats[0])))
         if likely.perhaps:
             hints.append(
                 f"If {kind.paths[0].name} is of the published logs: format = "
                 f"{' or '.join(likely.perhaps)} in [[logs]] reads it, and no layout is needed."
             )
-    if path.is_file() and others and not _complete(others[0][1]):
+    if path.is_file() and others and not _is_complete(others[0][1]):
         others += _siblings(path, others[0][0])
-    groups, left_out = _groups(others)
+    groups, left_out = _run_files(others)
     sentences = [
         f"{len(kind.paths)} of format {name}: {kind.paths[0]} ..." for kind, name in presets
     ]
-    sentences += [_found(group) for group in groups]
-    sentences += [f"left out: {line}" for line in (*left_out, *(one.why for one in no_logs[:3]))]
+    sentences += [_sentence(group) for group in groups]
+    sentences += [f"left out: {line}" for line in (*left_out, *(one.reason for one in no_logs[:3]))]
     sentences += [f"left out: {len(no_logs) - 3} more that are no logs"] * (len(no_logs) > 3)
     paths = tuple(one.path for one in no_logs)
     also = tuple(kind for kind, _ in others)
-    return SortedLogs(
+    return SortedFiles(
         root, tuple(presets), tuple(groups), also, tuple(hints), tuple(sentences), paths
     )
 
 
-def _siblings(path: Path, kind: Kind) -> list[tuple[Kind, Study]]:
-    """Files beside one that lacks something."""
+def _siblings(path: Path, kind: FileKind) -> list[tuple[FileKind, FileStudy]]:
+    """Return files of other kinds beside one that lacks wheels or a pose."""
     near = [p for p in sorted(path.parent.iterdir()) if p.is_file() and p.suffix in SUFFIXES]
     out = []
     for other in near:
@@ -206,39 +214,39 @@ def _siblings(path: Path, kind: Kind) -> list[tuple[Kind, Study]]:
         except DataError:
             continue
         if format.signature != kind.formats[0].signature:
-            out.append((Kind((format,)), study(format)))
+            out.append((FileKind((format,)), study_file(format)))
     return out
 
 
-def _complete(one: Study) -> bool:
-    return one.columns.wheels > 0 and one.columns.has_pose
+def _is_complete(one: FileStudy) -> bool:
+    return one.channels.wheels > 0 and one.channels.has_pose
 
 
-def _groups(kinds: list[tuple[Kind, Study]]) -> tuple[list[Group], list[str]]:
-    """Runs: kinds that have wheels, and with each the kinds that lie beside it."""
-    mains = [pair for pair in kinds if pair[1].columns.wheels] or kinds[:1]
+def _run_files(kinds: list[tuple[FileKind, FileStudy]]) -> tuple[list[RunFiles], list[str]]:
+    """Return a run for each kind with wheels and the kinds beside it, and lines about the rest."""
+    mains = [pair for pair in kinds if pair[1].channels.wheels] or kinds[:1]
     rest = [pair for pair in kinds if pair not in mains]
-    if len(mains) > 1 and not any(_complete(one) for _, one in mains):
+    if len(mains) > 1 and not any(_is_complete(one) for _, one in mains):
         # the same wheels in two files: the one with the better channel leads
         mains, more = mains[:1], mains[1:]
         rest = more + rest
     groups, used = [], []
     for kind, main in mains:
-        beside: list[tuple[str, Study]] = []
-        have = frozenset(one.channel for one in main.columns.found) - {"time"}
+        beside: list[tuple[str, FileStudy]] = []
+        have = frozenset(one.channel for one in main.channels.found) - {"time"}
         for other, one in rest:
             pattern = pattern_beside(kind, other)
-            one = replace(one, columns=without(one.columns, have))
-            fresh = {found.channel for found in one.columns.found} - {"time"}
+            one = replace(one, channels=without(one.channels, have))
+            fresh = {found.channel for found in one.channels.found} - {"time"}
             if pattern is None or not fresh or one.clock is None or main.clock is None:
                 continue
-            if not _together(main, one):
+            if not _overlap(main, one):
                 continue
             beside.append((pattern, one))
             have |= fresh
             used.append(other)
-        group = Group(kind, main, tuple(beside))
-        groups.append(replace(group, others=_further(group)))
+        group = RunFiles(kind, main, tuple(beside))
+        groups.append(replace(group, others=_more_runs(group)))
     lost = [kind for kind, _ in rest if kind not in used]
     lines = [
         f"{k.paths[0]}: no wheels in it, and nothing of a run that it lies beside" for k in lost
@@ -246,10 +254,10 @@ def _groups(kinds: list[tuple[Kind, Study]]) -> tuple[list[Group], list[str]]:
     return groups, lines
 
 
-def _further(group: Group) -> tuple[Group, ...]:
-    """Some more runs of a kind, spread over all of them."""
+def _more_runs(group: RunFiles) -> tuple[RunFiles, ...]:
+    """Return further runs of a kind, spread evenly over all of them."""
     count = len(group.kind.formats)
-    chosen = sorted({k * count // (_RUNS + 1) for k in range(1, _RUNS + 1)} - {0})
+    chosen = sorted({k * count // (_MORE_RUNS + 1) for k in range(1, _MORE_RUNS + 1)} - {0})
     out = []
     for k in chosen:
         format = group.kind.formats[k]
@@ -257,21 +265,21 @@ def _further(group: Group) -> tuple[Group, ...]:
             (n, format.path.parent / n.replace("{stem}", format.path.stem)) for n, _ in group.beside
         ]
         try:
-            beside = tuple((name, study(format_of(path))) for name, path in names)
-            out.append(Group(group.kind, study(format), beside))
+            beside = tuple((name, study_file(format_of(path))) for name, path in names)
+            out.append(RunFiles(group.kind, study_file(format), beside))
         except DataError:
             continue  # the reader will say it of this run; the first one tells enough
     return tuple(out)
 
 
-def _together(one: Study, other: Study) -> bool:
-    """Whether two files cover the same time: then they are of one run."""
+def _overlap(one: FileStudy, other: FileStudy) -> bool:
+    """Return True where two files cover the same time and so belong to one run."""
     return bool(max(one.time[0], other.time[0]) < min(one.time[-1], other.time[-1]))
 
 
-def _found(group: Group) -> str:
-    """What a group of files holds, in a sentence."""
-    listed = [", ".join(found.channel for found in one.columns.found) for one in group.all]
+def _sentence(group: RunFiles) -> str:
+    """Return a sentence with the channels of a run's files."""
+    listed = [", ".join(found.channel for found in one.channels.found) for one in group.all]
     more = [
         f"; beside it {name}: {channels}"
         for (name, _), channels in zip(group.beside, listed[1:], strict=True)

@@ -17,7 +17,7 @@ from slipid.support.toml_file import CLOSED, NotNegative, Positive
 
 
 @dataclass(frozen=True, config=CLOSED)
-class Motor:
+class MotorBuild:
     """A brushed DC motor with its gear.
 
     Attributes:
@@ -65,10 +65,12 @@ class SpeedLoop:
     filter_s: NotNegative = 0.004
 
 
-class Drive:
+class WheelDrives:
     """Currents [A] and voltages [V] of all wheels, a step of `dt` [s] at a time."""
 
-    def __init__(self, motor: Motor, loop: SpeedLoop, gear_ratio: float, wheels: int, dt: float):
+    def __init__(
+        self, motor: MotorBuild, loop: SpeedLoop, gear_ratio: float, wheels: int, dt: float
+    ):
         self.motor, self.loop, self.gear, self.dt = motor, loop, gear_ratio, dt
         self._per_tick = 2 * pi / (motor.ticks_per_revolution * gear_ratio)
         self._decay = exp(-dt * motor.resistance_ohm / motor.inductance_h)
@@ -133,7 +135,7 @@ class Drive:
 
 
 @dataclass(frozen=True, config=CLOSED)
-class Machine:
+class RobotBuild:
     """What the robot is made of; by default like a Robotino 2.
 
     Attributes:
@@ -224,7 +226,7 @@ class Machine:
 
 
 def mjcf(
-    machine: Machine,
+    machine: RobotBuild,
     load: str,
     timestep: float,
     ribs: Sequence[tuple[float, float, float, float]] = (),
@@ -263,13 +265,13 @@ def mjcf(
     parts.append(
         f'<body name="chassis" pos="0 0 {m.wheel_radius_m}"><freejoint/>'
         f'<inertial pos="{x} {y} {m.centre_height_m}" mass="{m.own_mass_kg}" '
-        f'diaginertia="{inertia[0]} {inertia[1]} {inertia[2]}"/>{_dress(m)}'
+        f'diaginertia="{inertia[0]} {inertia[1]} {inertia[2]}"/>{_body_geoms(m)}'
     )
     parts += [_wheel(m, k) for k in range(len(m.wheel_azimuths_deg))]
     return "".join(parts) + "</body></worldbody></mujoco>"
 
 
-def _dress(m: Machine) -> str:
+def _body_geoms(m: RobotBuild) -> str:
     """Body and marker, for pictures: nothing touches them."""
     from_axis = m.marker_height_m - m.wheel_radius_m
     half, edge = 0.5 * m.marker_size_m, 0.62 * m.marker_size_m
@@ -286,7 +288,7 @@ def _dress(m: Machine) -> str:
     )
 
 
-def _wheel(m: Machine, k: int) -> str:
+def _wheel(m: RobotBuild, k: int) -> str:
     azimuth = np.radians(m.wheel_azimuths_deg[k])
     x, y = m.places[k]
     ring = m.wheel_radius_m - m.roller_radius_m

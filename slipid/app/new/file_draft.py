@@ -1,0 +1,260 @@
+"""Draft the layout of a log file, with units, rates and open questions, from its numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from slipid.app.new.config_lines import ConfigLine
+from slipid.app.new.draft import ChannelDraft, FileDraft, RobotHint, layout_line
+from slipid.app.new.file_channels import FileChannel
+from slipid.app.new.file_study import (
+    ANGLES,
+    CURRENTS,
+    SPEEDS,
+    FileStudy,
+    RunStudy,
+    is_battery_voltage,
+    reading_rate,
+    ticks_are_increments,
+)
+from slipid.app.new.units import (
+    RADII,
+    UnitGuess,
+    angle_unit,
+    current_unit,
+    duty_unit,
+    heading_unit,
+    speed_unit,
+    usual_unit,
+)
+from slipid.data.reading.units import factor
+
+PIXELS = ("pixel", "pixels", "pix", "px")
+ASK_EFFORT = (
+    "what is it: a current (unit A), a torque (N*m, and torque_constant in the layout), a voltage "
+    "(V) or a duty (1)?"
+)
+_SUPPLY_CURRENT = (
+    "positive whichever way the wheels drive, and negative at times, so it is what the battery "
+    "gives: slipid wants the current of each motor"
+)
+_BATTERY_VOLTAGE = (
+    "it stays up whatever the wheels do, so it is the battery's: slipid wants the voltage at the "
+    "motors, or duty beside bus_voltage"
+)
+
+
+def file_draft(one: FileStudy, run: RunStudy) -> FileDraft:
+    """Return the draft of one kind of file."""
+    channels = [channel_draft(one, found, run) for found in one.channels.found]
+    format = one.format
+    above = list(one.channels.notes)
+    if one.channels.unused:
+        above.append(f"Not used: {', '.join(one.channels.unused)}.")
+    if not format.names_row and format.delimiter:
+        above.append("Columns without names, by their places from 0.")
+    main = one is run.main
+    return FileDraft(
+        tuple(sorted(channels, key=lambda channel: channel.channel != "time")),
+        delimiter=format.delimiter,
+        names_row=format.names_row,
+        units_row=_units_row(one),
+        first_data_row=format.first_data_row,
+        settings=tuple(_row_lines(one, main) + (_layout_settings(run) if main else [])),
+        above=tuple(above),
+        questions=_questions(one),
+    )
+
+
+def _units_row(one: FileStudy) -> int:
+    """Return the row of units, which the reader checks; 0 where a used column has none."""
+    used = [at for found in one.channels.found for at in found.columns]
+    return one.format.units_row if all(one.format.units[at] for at in used) else 0
+
+
+def _questions(one: FileStudy) -> tuple[str, ...]:
+    if not one.channels.found:
+        names = ", ".join(name for name in one.format.names if name) or "none have a name"
+        return (f"which column holds what? There are: {names}",)
+    return ()
+
+
+def _row_lines(one: FileStudy, main: bool) -> list[ConfigLine]:
+    """Return keys about rows: several runs in one file, repeated rows, gaps, or no time at all."""
+    if one.clock is None:
+        ask = "no column of time: how long is a row [s]?"
+        return [layout_line("row_period", 0.05, ask)]
+    steps, lines = np.diff(one.time), []
+    usual = one.usual_step
+    if main and (steps < -10 * usual).any():
+        lines.append(layout_line("new_run", "time_restarts"))
+    elif (steps < 0).any():
+        at = int(np.argmax(steps < 0)) + 1 + one.format.first_data_row
+        ask = f"time goes backwards in row {at}: sort the rows, or is another column the time?"
+        lines.append(layout_line("new_run", "never", ask))
+    if (steps == 0).any():
+        lines.append(layout_line("drop_repeated_time", True))
+    longest = float(steps.max(initial=0.0))
+    if longest > max(1.0, 20 * usual):
+        ask = f"rows are up to {longest:.3g} s apart: a pause that may stay in a run?"
+        lines.append(layout_line("max_gap", 1.0, ask))
+    return lines
+
+
+def _layout_settings(run: RunStudy) -> list[ConfigLine]:
+    """Return keys about encoders and currents, which hold for all files of a run."""
+    lines = []
+    robot, ticks = run.robot, run.find("wheel_ticks")
+    if ticks is not None:
+        ask = ""
+        if "ticks_per_revolution" in robot.defaults:
+            ask = "how many, of the motor shaft, all edges counted?" + _ticks_by_speed(run, ticks)
+        lines.append(layout_line("ticks_per_revolution", robot.ticks_per_revolution or 1000.0, ask))
+        step = ticks_are_increments(ticks, run.main, run.by_pose)
+        ask = "do ticks add up, or does each row have those since the last?" if step is None else ""
+        lines.append(layout_line("ticks_are_increments", bool(step), ask))
+    lines.append(layout_line("gear_ratio", robot.gear_ratio, comment="as above"))
+    if run.find(*CURRENTS) is not None and not run.of_supply:
+        sign = run.has_sign
+        ask = "the logs do not tell: do currents have a sign, or are they magnitudes?"
+        lines.append(
+            layout_line(
+                "current_is_signed",
+                sign is not False,
+                ask if sign is None else "",
+                "false where only magnitudes are logged",
+            )
+        )
+    return lines
+
+
+def _ticks_by_speed(run: RunStudy, ticks: FileChannel) -> str:
+    """Return a remark about ticks per turn from the reported speeds, if one file has both."""
+    speed = run.main.channels.first(*reversed(SPEEDS))
+    if speed is None or not speed.unit or run.main.clock is None:
+        return ""
+    time, rates = run.main.time, np.nan_to_num(speed.values) * factor(speed.unit, "rad/s")
+    if len(speed.columns) != len(ticks.columns):
+        return ""
+    turned = float((np.abs(rates[1:]) * np.diff(time)[:, None]).sum()) / (2 * np.pi)
+    counted = float(np.abs(np.diff(np.nan_to_num(ticks.values), axis=0)).sum())
+    of = "motor" if speed.channel == "motor_speed" else "wheel"
+    return (
+        f" By the reported speeds about {counted / turned:.4g} a turn of the {of}" if turned else ""
+    )
+
+
+def radius_hint(run: RunStudy) -> tuple[RobotHint, ...]:
+    """Return a question with the wheel radius by the poses, if all wheels point ahead."""
+    speed, ratio = run.find("wheel_speed"), run.pose_over_wheel_speed
+    if ratio is None or speed is None or len(speed.columns) > 2:
+        return ()
+    unit = speed.unit or unit_of(run.main, speed, run).unit
+    radius = ratio / factor(unit, "rad/s")
+    if not RADII[0] <= radius <= RADII[1]:
+        return ()
+    return (
+        RobotHint(
+            "wheel_radius_m", f"taken by default: measure it; the poses say about {radius:.2g}"
+        ),
+    )
+
+
+def channel_draft(one: FileStudy, found: FileChannel, run: RunStudy) -> ChannelDraft:
+    """Return a channel with its unit, its rate and its open questions."""
+    columns = tuple(one.format.column(at) for at in found.columns)
+    unit = UnitGuess(found.unit) if found.unit else unit_of(one, found, run)
+    comments = [reading_rate(one, found) if found.channel != "time" else "", unit.reason]
+    questions = list(dict.fromkeys(found.questions)) + [unit.doubt] * bool(unit.doubt)
+    draft = ChannelDraft(
+        found.channel, columns, unit.unit, "; ".join(filter(None, comments)), " ".join(questions)
+    )
+    return _unused_draft(draft, found, run)
+
+
+def _unused_draft(draft: ChannelDraft, found: FileChannel, run: RunStudy) -> ChannelDraft:
+    """Comment out a channel that must not be used before a question about it is answered."""
+    speed = run.find(*SPEEDS)
+    if found.channel.endswith("torque") and found.unit != "N*m":
+        return replace(draft, commented_out=True, question=ASK_EFFORT)
+    if found.channel.endswith("torque"):
+        return replace(
+            draft, commented_out=True, question="give torque_constant [N m/A] in the layout"
+        )
+    if found.channel == "current" and run.of_supply:
+        return replace(draft, commented_out=True, comment=_SUPPLY_CURRENT)
+    runs = (run.find(found.channel) for run in run.runs)
+    if found.channel == "voltage" and is_battery_voltage([one for one in runs if one], speed):
+        return replace(draft, commented_out=True, comment=_BATTERY_VOLTAGE)
+    if found.channel == "bus_voltage" and run.find("duty") is None:
+        return replace(draft, commented_out=True, comment="of use beside a duty cycle alone")
+    if found.channel.startswith("pose_") and not any(s.channels.has_pose for s in run.all):
+        return replace(
+            draft, commented_out=True, comment="a pose in parts is none: x, y and a heading"
+        )
+    if found.channel.startswith("pose_") and run.by_pose.unit.unit in PIXELS:
+        ask = "give metres_per_pixel in the layout" if found.channel == "pose_x" else ""
+        return replace(draft, commented_out=True, question=ask)
+    return draft
+
+
+def unit_of(one: FileStudy, found: FileChannel, run: RunStudy) -> UnitGuess:
+    """Return the unit of a channel whose name gives none."""
+    channel = found.channel
+    most = float(np.nanmax(np.abs(found.values)))
+    if channel == "time":
+        return one.clock or UnitGuess("s")
+    if channel in ("pose_x", "pose_y"):
+        # asked once is enough
+        place = run.by_pose.unit
+        return place if channel == "pose_x" else UnitGuess(place.unit)
+    if channel == "pose_heading":
+        farthest = max(run.runs, key=_pose_heading_range)
+        turning = farthest.find(channel) or found
+        return heading_unit(turning.values[:, 0], _heading_range(farthest))
+    if channel in (*SPEEDS, *ANGLES):
+        ratio = run.pose_over_wheel_speed
+        if channel.startswith("motor") and ratio is not None:
+            unknown = "gear_ratio" in run.robot.defaults
+            ratio = None if unknown else ratio * run.robot.gear_ratio
+        unit = speed_unit if channel in SPEEDS else angle_unit
+        return unit(ratio, run.radius)
+    if channel.endswith("speed_command"):
+        speed = run.find(channel.removesuffix("_command"))
+        if speed is None:
+            return UnitGuess("rad/s", doubt="in which unit?")
+        return UnitGuess(speed.unit or "rad/s", "as the speeds")
+    if channel == "current":
+        return current_unit(most)
+    if channel == "duty":
+        return duty_unit(most)
+    if channel.startswith("twist_command") and channel != "twist_command_yaw":
+        return UnitGuess("m/s") if most < 20 else UnitGuess("mm/s", f"up to {most:.4g}")
+    if channel in ("twist_command_yaw", "gyro"):
+        return _turn_rate_unit(most)
+    return usual_unit(channel)
+
+
+def _pose_heading_range(run: RunStudy) -> float:
+    """Return the range of the logged heading, in its own unit."""
+    found = run.find("pose_heading")
+    return 0.0 if found is None else float(np.nanmax(found.values) - np.nanmin(found.values))
+
+
+def _heading_range(run: RunStudy) -> float:
+    """Return the range of the heading by a run's gyro or commands [rad]; 0 without them."""
+    for one in run.all:
+        reading_rate = one.channels.first("gyro", "twist_command_yaw")
+        if reading_rate is None or one.clock is None:
+            continue
+        unit = (
+            reading_rate.unit or _turn_rate_unit(float(np.nanmax(np.abs(reading_rate.values)))).unit
+        )
+        speeds = np.nan_to_num(reading_rate.values[:-1, 0]) * factor(unit, "rad/s")
+        return float(np.ptp(np.cumsum(speeds * np.diff(one.time))))
+    return 0.0
+
+
+def _turn_rate_unit(most: float) -> UnitGuess:
+    """Return the unit of a turn rate from its largest value."""
+    return UnitGuess("rad/s") if most < 20 else UnitGuess("deg/s", f"up to {most:.4g}")

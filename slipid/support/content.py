@@ -1,0 +1,6 @@
+"""Type of the plain values in JSON and TOML files."""
+
+from typing import Any
+
+Content = dict[str, Any]
+"""Content of a JSON or TOML file, or of a table in it: numbers, texts, lists and tables by name."""
