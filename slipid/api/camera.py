@@ -1,12 +1,12 @@
-"""What an overhead camera saw: poses from a video."""
+"""Poses of a robot from the video of an overhead camera."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from slipid.camera.frames.source import open_source
+from slipid.camera.frame_source import open_source
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.target import Target, read_targets
-from slipid.camera.tracking.tracking import LoneMarker, Tracked
+from slipid.camera.tracking.tracking import LoneMarker, TrackingResult
 from slipid.camera.tracking.tracking import track as run
 from slipid.support.progress import Reporter
 
@@ -19,26 +19,28 @@ def track(
     fps: float | None = None,
     times: Path | str | None = None,
     quiet: bool = False,
-) -> Tracked:
-    """Poses of a robot with a marker, in every frame of a video or of a folder of pictures.
+) -> TrackingResult:
+    """Return the poses of a robot with a marker in a video or a folder of pictures.
 
-    `tracked.tracks[0].pose` has x, y [m] and heading [rad], NaN where the flag says why there is
-    none; `tracked.write(path)` writes the file that the layout `tracked` reads beside a log.
+    `tracked.tracks[0].pose` has x, y [m] and heading [rad] of every frame, NaN where it was
+    rejected and the flag gives the reason; `tracked.write(path)` writes the file that the format
+    `tracked` reads beside a log.
 
     Args:
-        camera: calibrated and with its place above the floor, or its file.
-        marker: in the middle of the robot; or the file that places several, boards or robots.
+        video: file of the video, or folder of the pictures.
+        camera: calibrated camera with its place above the floor, or its file.
+        marker: marker in the middle of the robot; or a file of several markers, boards or robots.
         fps: frames per second where the video has no times.
         times: CSV file of frame and time, instead.
-        quiet: no progress.
+        quiet: whether to report no progress.
 
     Raises:
-        DataError: what cannot be read, no marker, or frames of another size than calibrated.
+        DataError: an unreadable file, no marker, or frames of another size than calibrated.
     """
     above = camera if isinstance(camera, OverheadCamera) else OverheadCamera.load(camera)
     source = open_source(str(video), fps, None if times is None else Path(times))
-    above.of_size(source.image_px, source.name)
-    # what is found is in memory: nobody goes on from this folder
+    above.lens.check_size(source.image_px, source.name)
+    # results stay in memory: nobody resumes from this folder
     with TemporaryDirectory() as folder, Reporter(quiet=quiet) as report:
         bodies: tuple[Target, ...]
         if isinstance(marker, LoneMarker):

@@ -1,1 +1,1 @@
-"""Configs, and what each command does."""
+"""Configs, and the work behind each command."""

@@ -1,10 +1,9 @@
-"""Motors on a bench: from a config, or a single file, to their numbers and files."""
+"""Identify motors on a bench, from a config or from a single log file."""
 
 import fnmatch
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import Bool
 
 from slipid.app import logs as of_config
 from slipid.app.config import BenchMotors, Config
+from slipid.app.problem import checked_choice, unknown_parameter
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
 from slipid.data.reading.checks import MIN_ROWS
@@ -25,34 +25,38 @@ from slipid.infer.bench.motor import BenchMotor, BenchRecord, BenchRoot
 from slipid.infer.bench.record_checks import check_records
 from slipid.infer.bench.verdict import BenchFit, bench_fit
 from slipid.parameter import entries
-from slipid.search_space import Choice, Space
-from slipid.support.checkpoint import versions
+from slipid.search_space import Choice
 from slipid.support.content import Content
-from slipid.support.errors import DataError, did_you_mean
-from slipid.support.files import writable, write_bytes, write_json
+from slipid.support.errors import DataError
+from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 
 @dataclass(frozen=True, eq=False)
 class BenchTask:
-    """Records of every motor by its label ("" of a single one), and what is wanted of its numbers.
+    """Records of every motor by its label ("" for a single one), and the choices for its numbers.
 
-    `skipped` and `taken` are lines for people; `units_said`: the unit of the current is not
-    doubted, as it was named, or something was said of the resistance.
+    Attributes:
+        records: records of each motor by its label.
+        choices: fixed, free and prior values of each motor's numbers by its label.
+        skipped: a line for each log that is not used.
+        columns_used: a line for each channel that columns of a single file were assigned to.
+        unit_is_known: the unit of the current was given, or the resistance is restricted, so that
+            an unlikely current is no error.
     """
 
     records: Mapping[str, tuple[BenchRecord, ...]]
     choices: Mapping[str, tuple[Choice, ...]]
     skipped: tuple[str, ...] = ()
-    taken: tuple[str, ...] = ()
-    units_said: bool = False
+    columns_used: tuple[str, ...] = ()
+    unit_is_known: bool = False
 
     def fit(self, report: Reporter) -> BenchFit:
-        """Refuse what cannot be, and fit the rest."""
+        """Return the fit of every motor; raise `DataError` where the records cannot be right."""
         setup_jax(quiet=True)
         for label, records in self.records.items():
-            check_records(records, label, self.units_said)
+            check_records(records, label, self.unit_is_known)
         fits = []
         for label, records in self.records.items():
             report.stage(f"fitting motor {label}".strip())
@@ -61,13 +65,9 @@ class BenchTask:
 
 
 def read_bench_task(config: Config, root: Path, report: Reporter) -> BenchTask:
-    """Every log of the motors that a config names; DataError where config or logs are wrong."""
+    """Read every log that a motor config names; raise `DataError` where anything is wrong."""
     report.stage("reading logs")
-    if not root.is_dir():
-        raise DataError(f"{root}: no such folder; expected the folder of the logs (--data)")
-    found, skipped = of_config.files_of(config, config.content.logs, root)
-    if not found:
-        raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
+    found, skipped = of_config.required_files(config, config.content.logs, root)
     parts: list[list[BenchRecord]] = []
     for section, paths in found:
         layout = of_config.layout_of(config, section)
@@ -87,32 +87,32 @@ def read_bench_task(config: Config, root: Path, report: Reporter) -> BenchTask:
     lines = (*skipped, *left)
     for line in lines:
         report.line(line)
-    said = any(
+    unit_is_known = any(
         fnmatch.fnmatch("motor.resistance", c.pattern) for cs in choices.values() for c in cs
     )
-    return BenchTask(records, choices, lines, (), said)
+    return BenchTask(records, choices, lines, (), unit_is_known)
 
 
 def read_motor_log(
     path: Path, given: Mapping[str, GivenColumns], delimiter: str | None, signed: bool
 ) -> BenchTask:
-    """Motors of a single file, with given columns, the others by their names."""
+    """Read one file: `given` columns as named, every other channel by its column name."""
     layout = motor_layout(format_of(path, delimiter), given, signed)
     logs = counted_once(read_logs(path, layout, path.parent, None, "bench").logs)
     refuse_misordered(logs)
     parts = [records_of(log, layout) for log in logs]
     labels = _labels((), len(parts[0]), str(path))
     records = {label: tuple(p[k] for p in parts) for k, label in enumerate(labels)}
-    taken = tuple(
+    columns_used = tuple(
         f"{channel.removeprefix('motor_')}: {', '.join(map(str, c.columns))} [{c.unit}]"
         for channel, c in layout.channels.items()
     )
-    said = "current" in given and given["current"].unit is not None
-    return BenchTask(records, dict.fromkeys(labels, ()), (), taken, said)
+    unit_is_known = "current" in given and given["current"].unit is not None
+    return BenchTask(records, dict.fromkeys(labels, ()), (), columns_used, unit_is_known)
 
 
 def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
-    """Record of each motor of a log, at its shaft."""
+    """Return the record of each motor of a log, at the motor shaft."""
     if log.current is None:
         raise DataError(f"{log.name}: no current; expected a column of it for each motor")
     if not log.wheels:
@@ -124,7 +124,7 @@ def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
     current = log.current if log.current_is_signed else np.abs(log.current) * np.sign(speed)
     out = []
     for k in range(speed.shape[1]):
-        # the halves of a window are independent only where every row is a reading of its own
+        # the two halves of a window are independent only if every row is a new reading
         read = _read(log, k)
         out.append(
             BenchRecord(
@@ -141,7 +141,7 @@ def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
 
 
 def _read(log: Log, motor: int) -> Bool[np.ndarray, " time"]:
-    """Rows in which current and voltage of a motor were read and do not repeat what was read."""
+    """Return which rows have a new reading of a motor's current and voltage."""
     out = np.ones(log.samples, dtype=bool)
     for fresh in (log.current_fresh, log.voltage_fresh):
         if fresh is not None:
@@ -163,7 +163,7 @@ def _labels(names: Sequence[str], motors: int, where: str) -> tuple[str, ...]:
 
 
 def _with_voltage(parts: list[list[BenchRecord]]) -> tuple[list[list[BenchRecord]], list[str]]:
-    """Logs with a voltage, if there are any, and a line about the others."""
+    """Return the logs that have a voltage, if any has one, and a line about the others."""
     have = [p for p in parts if p[0].voltage is not None]
     if not have or len(have) == len(parts):
         return parts, []
@@ -171,63 +171,46 @@ def _with_voltage(parts: list[list[BenchRecord]]) -> tuple[list[list[BenchRecord
 
 
 def _choices(config: Config, label: str) -> tuple[Choice, ...]:
-    """What the config wants of a motor's numbers; DataError where it names none."""
+    """Return the config's choices for a motor's numbers; raise `DataError` for an unknown name."""
     paths = [e.path for e in entries(BenchRoot(BenchMotor()))]
     choices = []
-    for pattern, setting in config.content.parameters.items():
+    for pattern in config.content.parameters:
         plain, at, _ = pattern.partition("@")
         if not fnmatch.filter(paths, plain):
-            raise DataError(
-                f"{config.path}: parameters.'{pattern}': no such parameter"
-                f"{did_you_mean(plain, paths)}; "
-                f"expected one of {', '.join(paths)}"
-            )
+            raise unknown_parameter(config, pattern, plain, paths)
         if at and not fnmatch.fnmatchcase(label, pattern.partition("@")[2]):
             continue
-        gauss = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)
-        choice = Choice(plain, setting.start, setting.fixed, setting.free, *gauss)
-        try:
-            Space(BenchRoot(BenchMotor()), [choice])
-        except ValueError as error:
-            raise DataError(f"{config.path}: parameters.'{pattern}': {error}") from error
-        choices.append(choice)
+        choices.append(checked_choice(config, pattern, plain, BenchRoot(BenchMotor())))
     return tuple(choices)
 
 
 def identify_bench(
     config: Config, data: Path, out: Path, report: Reporter
 ) -> tuple[BenchFit, tuple[str, ...]]:
-    """Fit the motors of a config and write identified.json; names of the files."""
+    """Fit the motors of a config, write identified.json, and return the fit and the file names."""
     began = time.monotonic()
     task = read_bench_task(config, data, report)
     fit = task.fit(report)
     writable(out)
     content = fit.to_json()
     write_json(out / "identified.json", content)
-    write_bytes(out / "config.toml", config.text.encode())
-    about = {
-        "schema": "slipid.run/1",
-        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-        "seconds": round(time.monotonic() - began, 1),
-        "config": {"name": config.path.name, "sha256": config.hash},
-        "data": {
-            "folder": str(data),
-            "hash": content["data"]["hash"],
-            "logs": {r.name: r.sha256 for rs in task.records.values() for r in rs},
-            "skipped": task.skipped,
-        },
-        "versions": versions(),
+
+    inputs: Content = {
+        "folder": str(data),
+        "hash": content["data"]["hash"],
+        "logs": {r.name: r.sha256 for rs in task.records.values() for r in rs},
+        "skipped": task.skipped,
     }
-    write_json(out / "run.json", about)
+    of_config.write_run_file(out, config, inputs, time.monotonic() - began, {})
     return fit, ("identified.json", "run.json", "config.toml")
 
 
 def check_bench(
     config: Config, data: Path, out: Path | None, report: Reporter
 ) -> tuple[BenchFit, Content]:
-    """What the logs of motors hold and can tell: content of check.json, written where wanted.
+    """Return a fit and the content of check.json, which is also written to `out` where given.
 
-    A fit of a motor takes less than a second: its verdicts are given, and not its numbers.
+    A fit of a motor takes less than a second, so the check reports the verdicts of a real fit.
     """
     task = read_bench_task(config, data, report)
     fit = task.fit(report)
@@ -252,7 +235,7 @@ def check_bench(
 
 
 def _record_summary(name: str, r: BenchRecord) -> Content:
-    """What one log holds of one motor."""
+    """Return the channels and their ranges in one motor's record."""
 
     def span(x: np.ndarray | None) -> list[float] | None:
         return None if x is None else [float(x.min()), float(x.max())]

@@ -1,4 +1,4 @@
-"""What a bench told of a motor, as priors of the robot that it drives."""
+"""Priors of a robot's motor from a fit of that motor on a bench."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,17 +13,17 @@ from slipid.support.files import read_json
 
 SCHEMA = "slipid.identified/1"
 COPY_NAME = "motor_bench.json"
-"""Copy of the file beside a robot's results."""
+"""Copy of the bench's file beside a robot's results."""
 GEAR_STD = 0.3
-"""Part of a friction that a gear may add to it, or take, as a std: a bench may have run without."""
+"""Std of the friction that a gear may add or remove, as a part of the friction on the bench."""
 NAMES = ("resistance", "back_emf", "brush_drop", "coulomb_friction", "viscous_friction")
-"""Zeros belong to the bench's meters; what has no part in a robot's fit is not asked for."""
+"""Numbers taken from a bench. Sensor offsets belong to the bench's meters and are left out."""
 _EXPECTED = "what `slipid identify` of a motor, or `slipid motor --out`, wrote"
 
 
 @dataclass(frozen=True)
 class BenchEstimate:
-    """What a bench says of one number of one motor."""
+    """Estimate of one number of one motor on a bench."""
 
     value: float
     std: float
@@ -32,44 +32,45 @@ class BenchEstimate:
 
 @dataclass(frozen=True)
 class BenchFile:
-    """A bench's file, and its numbers by name, one for each of its motors."""
+    """Path of a bench's file, and its estimates by name, one for each motor."""
 
     path: Path
     numbers: Mapping[str, list[BenchEstimate]]
 
 
 def bench_of(config: Config) -> BenchFile | None:
-    """The bench that the config names, None where it names none.
+    """Return the bench file that the config names; None where it names none.
 
     Raises:
-        DataError: the file is missing, damaged, or of no bench.
+        DataError: the file is missing, damaged, or not from a bench.
     """
     named = config.content.wheels.motor
     if named is None:
         return None
-    # a result keeps a copy, so that later commands need no other folder
+    # a result folder has its own copy, so that later commands need no other folder
     kept = config.path.parent / COPY_NAME
     path = kept if kept.is_file() else config.path.parent / named
     return BenchFile(path, _read(path, f"{config.path}: robot.motor"))
 
 
 def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[str]]:
-    """Priors of `motor.*` from the file that the config names, and lines about what was not taken.
+    """Return priors of `motor.*` from the config's bench file, and lines about numbers left out.
 
-    At the wheel a friction of the shaft is n times, per wheel speed n^2 times as large.
+    Seen from the wheel, a friction torque of the shaft is n times as large, and a friction per
+    speed n^2 times.
 
     Raises:
-        DataError: as of `bench_of`.
+        DataError: as in `bench_of`.
     """
     bench = bench_of(config)
     if bench is None:
         return [], []
-    path, told = bench.path, bench.numbers
-    choices, left = [], []
+    path = bench.path
+    choices, left_out = [], []
     for name in NAMES:
-        sure = [t for t in told.get(name, []) if t.verdict == "identified"]
+        sure = [t for t in bench.numbers.get(name, []) if t.verdict == "identified"]
         if not sure:
-            left.append(name)
+            left_out.append(name)
             continue
         power = {"coulomb_friction": 1, "viscous_friction": 2}.get(name, 0)
         mean, std = _pooled(sure)
@@ -78,32 +79,32 @@ def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[
         times = gear_ratio**power
         choices.append(Choice(f"motor.{name}", prior_mean=times * mean, prior_std=times * std))
     lines = [f"motor from {path}: {', '.join(c.pattern for c in choices) or 'nothing'}"]
-    if left:
-        lines.append(f"not taken from {path}, for it is not identified there: {', '.join(left)}")
+    if left_out:
+        lines.append(f"not taken from {path}, not identified there: {', '.join(left_out)}")
     return choices, lines
 
 
 def _pooled(sure: list[BenchEstimate]) -> tuple[float, float]:
-    """Mean of several motors, and std of one of them: its error and how they differ."""
+    """Return the mean of several motors and the std of one: its error and their spread together."""
     values = [t.value for t in sure]
     spread = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
     return float(np.mean(values)), float(np.hypot(spread, np.mean([t.std for t in sure])))
 
 
 def _read(path: Path, where: str) -> Mapping[str, list[BenchEstimate]]:
-    """Numbers of a bench by name, one for each of its motors."""
+    """Return the estimates of a bench by name, one for each of its motors."""
     content = read_json(path, _EXPECTED)
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema != SCHEMA or content.get("drive") != "motor":
         found = "a robot's numbers" if schema == SCHEMA else f"schema {schema}"
         raise DataError(f"{where}: {path}: {found}; expected {_EXPECTED}")
-    told: dict[str, list[BenchEstimate]] = {}
+    estimates: dict[str, list[BenchEstimate]] = {}
     try:
         for full, number in content["parameters"].items():
             if number["std"] is not None:
                 name = full.partition("@")[0].removeprefix("motor.")
                 known = float(number["value"]), float(number["std"]), str(number["verdict"])
-                told.setdefault(name, []).append(BenchEstimate(*known))
+                estimates.setdefault(name, []).append(BenchEstimate(*known))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{where}: {path}: damaged ({error}); expected {_EXPECTED}") from error
-    return told
+    return estimates

@@ -1,7 +1,4 @@
-"""What is wrong with the logs of a task or with its config, before anything is fitted.
-
-What a set of logs holds and can tell before anything is fitted: what `slipid check` does.
-"""
+"""Check logs and config before a fit, and predict how well a fit will know each number."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -14,7 +11,7 @@ from slipid.app.config import read_config
 from slipid.app.logs import layout_of
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task
 from slipid.data.align.clock import Clock
-from slipid.data.check.columns import Finding, worst_first, wrong
+from slipid.data.check.findings import Finding, worst_first, wrong
 from slipid.data.check.sanity import findings
 from slipid.data.log import Log
 from slipid.data.reading.reader import AnyLayout
@@ -31,20 +28,20 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 _AT_MOTOR = ("wheel_ticks", "motor_angle", "motor_speed", "motor_speed_command")
-"""Channels that the gear ratio of a layout turns into motion of the wheel."""
+"""Channels that the gear ratio of a layout converts to motion of the wheel."""
 
 
 def sanity(task: FitTask) -> tuple[Finding, ...]:
-    """Findings about the runs of a task, and about the config where there is one; worst first."""
+    """Return findings about the runs of a task, and about its config if it has one; worst first."""
     mass = task.config.content.wheels.mass_kg if isinstance(task, ConfigFitTask) else None
-    said = [*_braking(task), *findings(task.dataset, task.robot.geometry, mass)]
+    found = [*_braking(task), *findings(task.dataset, task.robot.geometry, mass)]
     if isinstance(task, ConfigFitTask):
-        said += [*_missing_sizes(task), *_different_gears(task)]
-    return worst_first(said)
+        found += [*_missing_sizes(task), *_different_gears(task)]
+    return worst_first(found)
 
 
 def refuse_if_wrong(found: Sequence[Finding]) -> None:
-    """DataError with all that is wrong, if anything is."""
+    """Raise `DataError` with every finding of severity "wrong"."""
     if bad := wrong(found):
         listed = "\n".join(f"  {k}. {finding}" for k, finding in enumerate(bad, start=1))
         raise DataError(
@@ -54,9 +51,10 @@ def refuse_if_wrong(found: Sequence[Finding]) -> None:
 
 
 def _braking(task: FitTask) -> Iterator[Finding]:
-    """Magnitudes of currents beside voltages, of wheels that drag each other along in turns.
+    """Find unsigned currents beside voltages on robots whose wheels drag each other along in turns.
 
-    On made runs of a skid-steer robot R then was off by ten of its stds, and called identified.
+    On simulated runs of a skid-steer robot the resistance was then wrong by ten standard deviations
+    and yet called identified.
     """
     runs = task.dataset
     has = runs.current is not None and runs.voltage is not None
@@ -71,7 +69,7 @@ def _braking(task: FitTask) -> Iterator[Finding]:
 
 
 def _missing_sizes(task: ConfigFitTask) -> Iterator[Finding]:
-    """Numbers of the robot that torques scale with, and that were left at their defaults."""
+    """Find numbers of the robot that torques scale with and that were left at their defaults."""
     logged = [n for n in ("current", "voltage") if getattr(task.dataset, n) is not None]
     robot = task.config.content.wheels
     absent = ["mass_kg"] if robot.mass_kg is None else []
@@ -89,16 +87,16 @@ def _missing_sizes(task: ConfigFitTask) -> Iterator[Finding]:
 
 
 def _different_gears(task: ConfigFitTask) -> Iterator[Finding]:
-    """Gear ratios of the robot and of a layout that differ."""
+    """Find gear ratios that differ between the robot and a layout."""
     robot = task.config.content.wheels
     if "gear_ratio" not in robot.model_fields_set:
         return
-    seen: set[str] = set()
+    checked: set[str] = set()
     for section in task.config.content.logs:
         layout = layout_of(task.config, section)
-        if section.format in seen or not _uses_gear(layout):
+        if section.format in checked or not _uses_gear(layout):
             continue
-        seen.add(section.format)
+        checked.add(section.format)
         if abs(layout.gear_ratio / robot.gear_ratio - 1) > 1e-3:
             yield Finding(
                 "two_gear_ratios",
@@ -122,9 +120,12 @@ _CHANNELS = (
 
 @dataclass(frozen=True)
 class ExpectedEstimates:
-    """What logs can be expected to tell of every number and ratio, by path.
+    """Expected verdict of every number and ratio, by path.
 
-    `messages` say what stays open and what would close it, one sentence each.
+    Attributes:
+        parameters: expected estimate of each number.
+        derived: expected estimate of each ratio.
+        messages: a sentence for each thing that stays unknown, with a measurement that would help.
     """
 
     parameters: dict[str, Estimate]
@@ -132,7 +133,7 @@ class ExpectedEstimates:
     messages: tuple[str, ...]
 
     def to_json(self) -> Content:
-        """Its part of check.json."""
+        """Return the part of check.json that holds the expectations."""
         return {
             "parameters": {path: _expected_json(e) for path, e in self.parameters.items()},
             "derived": {path: _expected_json(e) for path, e in self.derived.items()},
@@ -143,10 +144,7 @@ class ExpectedEstimates:
 def check(
     config_path: Path, data: Path, out: Path | None, report: Reporter
 ) -> tuple[Runs, Content]:
-    """Say what the logs hold, and what they can be expected to tell, before any fit.
-
-    That is the content of check.json, which is written to `out`, if that is wanted.
-    """
+    """Return the runs and the content of check.json, which is also written to `out` where given."""
     setup_jax(quiet=True)
     task = read_fit_task(read_config(config_path), data, report)
     report.stage("do logs and config go together?")
@@ -159,7 +157,7 @@ def check(
 
 
 def _expected_if_any(task: FitTask) -> ExpectedEstimates:
-    """`expected`; nothing where what is wrong with the logs leaves no windows to fit."""
+    """Return `expected`, or a message alone where the logs leave no windows to fit."""
     try:
         return expected(task, task.problem())
     except DataError as error:
@@ -167,7 +165,7 @@ def _expected_if_any(task: FitTask) -> ExpectedEstimates:
 
 
 def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
-    """Findings, runs by floor, load and session, channels, repairs, what was left out."""
+    """Return findings, runs by floor, load and session, channels, repairs, and skipped logs."""
     data = task.dataset
     groups: dict[tuple[str, str, str], list[int]] = {}
     for k, log in enumerate(data.logs):
@@ -199,7 +197,7 @@ def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
 
 
 def _clock(clock: Clock) -> Content:
-    """The clock of a run's poses against the robot's; intervals of 90 %."""
+    """Return the clock of a run's poses relative to the robot's clock, with 90 % intervals."""
     return {
         "offset_s": clock.offset,
         "offset_interval90_s": clock.offset_interval90,
@@ -210,22 +208,22 @@ def _clock(clock: Clock) -> Content:
 
 
 def _channels(logs: tuple[Log, ...]) -> list[str]:
-    """Channels that logs have, and what is special of them."""
-    said = []
+    """Return the names of the logged channels, each with its exceptions."""
+    names = []
     for name in _CHANNELS:
         if count := sum(getattr(log, name) is not None for log in logs):
             part = "" if count == len(logs) else f" ({count} of {len(logs)} runs)"
             unsigned = name == "current" and not all(log.current_is_signed for log in logs)
-            said.append(f"{name}{part}{' (unsigned)' if unsigned else ''}")
-    return said
+            names.append(f"{name}{part}{' (unsigned)' if unsigned else ''}")
+    return names
 
 
 def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
-    """Verdicts from the expected information, with noise as the runs scatter, if not typical.
+    """Return verdicts from the expected information, with the noise that the runs show.
 
-    What floors are like is not known yet: of the start values and of every creep that a fit starts
-    from, the one counts for a number at which the runs tell least of it, and for what stays open
-    the one at which they tell least of all.
+    The floors' numbers are not known yet. Therefore the start values and every creep that a fit
+    starts from are tried: each number gets its least informative estimate, and the messages
+    describe the start with the largest covariance of all.
     """
     space, w = problem.space, problem.windows
     log_v, keep, volt = scatter(problem), np.ones(len(w)), w.has_voltage
@@ -252,7 +250,7 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
 
 
 def _least(kept: dict[str, Estimate], found: Iterable[Estimate]) -> None:
-    """Keep of every number the estimate that promises less."""
+    """Keep the less informative of two estimates of every number."""
     order = ("identified", "weak", "not_identified")
 
     def promise(e: Estimate) -> tuple[int, float]:

@@ -1,6 +1,6 @@
-"""Slip models judged on left-out runs: what `slipid compare` does, but for its picture.
+"""Compare slip models on held-out runs, and predict runs open loop with a fit.
 
-Open-loop prediction of runs by a fit: what `slipid validate` does, but for its pictures.
+These are `slipid compare` and `slipid validate` without their pictures.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,7 +32,7 @@ from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.comparison/1"
 FOLDS = "folds"
-"""Folder of finished folds inside the result's; a fold there is not done again."""
+"""Folder with finished folds inside the result folder; these are not fitted again."""
 
 
 def compare(
@@ -40,19 +40,23 @@ def compare(
 ) -> Content:
     """Judge every slip model on held-out runs and write comparison.json to `out`.
 
-    What is left out say the questions, some of `slipid.predict.folds.QUESTIONS`; folds
-    that are finished in `out` are not done again. DataError where config, logs or questions are
-    wrong; nothing was written then.
+    Folds that are finished in `out` are not fitted again.
+
+    Args:
+        questions: ways to leave runs out, some of `slipid.predict.folds.QUESTIONS`.
+
+    Raises:
+        DataError: config, logs or questions are wrong; nothing was written then.
     """
     setup_jax(quiet=True)
     config = read_config(config_path)
     task = read_fit_task(config, data, report)
     refuse_misordered(task.logs)
-    asked = {name: folds_of(task.dataset, name) for name in dict.fromkeys(questions)}
-    for name in [name for name, fold in asked.items() if (fold < 0).all()]:
+    folds_by_question = {name: folds_of(task.dataset, name) for name in dict.fromkeys(questions)}
+    for name in [name for name, fold in folds_by_question.items() if (fold < 0).all()]:
         report.line(f"skipped: {name}: no floor has runs in two of them")
-        del asked[name]
-    if not asked:
+        del folds_by_question[name]
+    if not folds_by_question:
         raise DataError(
             f"{config.path}: no run can be left out; expected several headings or speeds"
         )
@@ -60,9 +64,9 @@ def compare(
     problem = task.problem()
     writable(out)
     key = key_of(config.hash, task.data_hash, problem.space.names, problem.noise.names)
-    results, robot = _folds(task, problem, asked, Checkpoint(out / FOLDS, key), report)
+    results, robot = _folds(task, problem, folds_by_question, Checkpoint(out / FOLDS, key), report)
     surfaces = transfer(problem.windows, robot) if problem.windows.has_current else {}
-    found: Content = {
+    content: Content = {
         "schema": SCHEMA,
         "questions": {
             name: {
@@ -83,8 +87,8 @@ def compare(
         "runs": {name: _rows(some) for name, some in results.items()},
     }
     report.stage("writing")
-    write_json(out / "comparison.json", found)
-    return found
+    write_json(out / "comparison.json", content)
+    return content
 
 
 def _rows(folds: Sequence[Content]) -> list[Content]:
@@ -92,7 +96,7 @@ def _rows(folds: Sequence[Content]) -> list[Content]:
 
 
 def _cost(folds: Sequence[Content]) -> Content:
-    """Fitted numbers per floor, and seconds per fold to fit and to predict, of every model."""
+    """Return fitted numbers per floor and seconds per fold of fit and prediction, by slip model."""
     out = {}
     for model, numbers in folds[0]["numbers"].items():
         seconds = [fold["seconds"][model] for fold in folds]
@@ -107,56 +111,53 @@ def _cost(folds: Sequence[Content]) -> Content:
 def _folds(
     task: ConfigFitTask,
     problem: Problem,
-    asked: Mapping[str, Fold],
+    folds_by_question: Mapping[str, Fold],
     kept: Checkpoint,
     report: Reporter,
 ) -> tuple[dict[str, list[Content]], Robot]:
-    """Every fold of every question, and the robot fitted to all runs."""
-    wanted = task.settings
+    """Return the results of every fold by question, and the robot fitted to all runs."""
+    settings = task.settings
 
     def tell(state: FitState) -> None:
         report.note(f"{state.stage}, round {state.round}")
 
-    fit = partial(optimise, most_rounds=wanted.rounds, tolerance=wanted.tolerance, tell=tell)
+    fit = partial(optimise, most_rounds=settings.rounds, tolerance=settings.tolerance, tell=tell)
 
     def whole() -> Content:
         optimum = fit(problem)
         z, log_variance = optimum.state.z, optimum.state.log_variance
         return {"z": z, "log_variance": log_variance, "covariance": optimum.covariance}
 
-    def one(name: str, judged: np.ndarray) -> Content:
-        return judge(problem, task.choices, task.dataset, name, judged, fit).to_json()
+    def one(name: str, held_out: np.ndarray) -> Content:
+        return judge(problem, task.choices, task.dataset, name, held_out, fit).to_json()
 
     work: dict[tuple[str, int], Callable[[], Content]] = {
         (name, k): partial(one, name, np.flatnonzero(fold == k))
-        for name, fold in asked.items()
+        for name, fold in folds_by_question.items()
         for k in sorted({int(f) for f in fold if f >= 0})
     }
     report.stage("fitting every fold")
-    done: dict[str, list[Content]] = {name: [] for name in asked}
+    done: dict[str, list[Content]] = {name: [] for name in folds_by_question}
     for count, ((name, k), make) in enumerate(work.items(), start=1):
         done[name].append(finished(kept, f"{name}_{k}", make))
         report.advance(count, len(work), f"{count} of {len(work)} folds, {name}")
     report.stage("fitting all runs")
-    found = finished(kept, "all", whole)
-    return done, problem.space.tree(np.asarray(found["z"], float))
+    content = finished(kept, "all", whole)
+    return done, problem.space.tree(np.asarray(content["z"], float))
 
 
 def finished(kept: Checkpoint, name: str, make: Callable[[], Content]) -> Content:
-    """A piece of work as its file has it; it is made where there is none of this very task."""
-    found: Content | None = kept.load_json(name)
-    if found is None:
+    """Return a checkpointed result, computed and kept first where the checkpoint has none."""
+    content: Content | None = kept.load_json(name)
+    if content is None:
         kept.save_json(name, make())
-        found = kept.load_json(name)
-        assert found is not None
-    return found
+        content = kept.load_json(name)
+        assert content is not None
+    return content
 
 
 def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Validation]:
-    """Predict runs of `data` with the fit in `out`, and with every simpler model that it learnt.
-
-    Returns the fit, the runs, and how they were predicted.
-    """
+    """Return a fit, runs from `data`, and their predictions by the fit and every simpler model."""
     setup_jax(quiet=True)
     fit = load(out)
     config = read_config(out / "config.toml")

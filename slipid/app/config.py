@@ -1,7 +1,7 @@
-"""The config of a task: what the TOML file may say, checked once, every mistake with its key.
+"""The config of a robot and its logs: a TOML file checked once, every mistake with its key.
 
-Units stand in the names of the keys; everything is optional that has a default here. What a key
-means stands in the docstring of its section: `slipid reference` and `slipid new` print it.
+Units are part of the key names, and every key with a default is optional. The docstring of a
+section explains its keys: `slipid reference` and `slipid new` print it.
 """
 
 import hashlib
@@ -22,16 +22,18 @@ Numbers = Number | list[Number]
 
 
 class WheeledDrive(Section):
-    """What every robot has.
+    """Keys of every robot.
 
     Attributes:
-        wheel_radius_m: of the wheels as they roll under the robot's weight.
+        wheel_radius_m: rolling radius of the wheels under the robot's weight.
         gear_ratio: motor turns per wheel turn.
-        mass_kg: of the robot as it drives; friction scales with it.
+        mass_kg: mass of the robot as it drives; friction scales with it.
         drives: which wheels, counted from 1, share a motor with its encoder and ammeter, in the
             order of the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together.
-            Without it each wheel has its own.
-        motor: file that `slipid identify` or `slipid motor` wrote of its motor on a bench,
+            Without
+                it
+            each wheel has its own.
+        motor: file that `slipid identify` or `slipid motor` wrote about its motor on a bench,
             relative to the config.
     """
 
@@ -42,7 +44,7 @@ class WheeledDrive(Section):
     motor: str | None = None
 
     def drive_of(self, wheels: int) -> tuple[int, ...]:
-        """Number of the drive that turns each wheel, from 0; empty where each has its own."""
+        """Return the number of each wheel's drive, from 0; empty where each has its own."""
         if self.drives is None:
             return ()
         turned = [wheel for drive in self.drives for wheel in drive]
@@ -59,10 +61,10 @@ class OmniDrive(WheeledDrive):
     """Wheels on a circle, each driving 90 deg ahead of its azimuth.
 
     Attributes:
-        base_radius_m: from the middle to the wheel centres.
-        wheel_azimuths_deg: where the wheels stand, counter-clockwise from ahead, in the order of
-            the columns of the logs.
-        roller_angle_deg: of the rollers' free direction to the drive direction.
+        base_radius_m: distance from the middle to the wheel centres.
+        wheel_azimuths_deg: directions of the wheels from the middle, counter-clockwise from ahead,
+            in the order of the columns of the logs.
+        roller_angle_deg: angle from the rollers' free direction to the drive direction.
     """
 
     drive: Literal["omni"]
@@ -88,7 +90,7 @@ class DifferentialDrive(WheeledDrive):
     """Two ordinary wheels on an axle, left and right, and casters.
 
     Attributes:
-        track_m: between the middles of the wheels.
+        track_m: distance between the middles of the wheels.
     """
 
     drive: Literal["differential"]
@@ -100,10 +102,10 @@ class GeneralDrive(WheeledDrive):
 
     Attributes:
         wheel_places_m: x (ahead) and y (left) of every wheel's centre, in the order of the columns.
-        drive_directions_deg: where each wheel rolls when its speed is positive, counter-clockwise
-            from ahead.
-        roller_angles_deg: of each wheel's rollers to its drive direction; "none" is an ordinary
-            wheel.
+        drive_directions_deg: direction in which each wheel rolls at a positive speed,
+            counter-clockwise from ahead.
+        roller_angles_deg: angle from each wheel's rollers to its drive direction; "none" is an
+            ordinary wheel.
     """
 
     drive: Literal["general"]
@@ -126,7 +128,7 @@ class BenchMotors(Section):
     """No wheels: motors on a bench, logged at their shafts.
 
     Attributes:
-        names: of the motors in the order of the columns, where there are several.
+        names: names of the motors in the order of the columns, where there are several.
     """
 
     drive: Literal["motor"]
@@ -140,14 +142,14 @@ class LogsSection(Section):
     """Log files of one kind, found by a glob below the data folder.
 
     Attributes:
-        glob: which files, below the data folder.
+        glob: selects the files, below the data folder.
         format: one of the config's own layouts, or a preset.
-        surface: name of the floor; "folder" takes that of the folder that each file lies in.
+        surface: name of the floor; "folder" takes the name of the folder that each file lies in.
         map: file of a floor map, relative to the config, instead of a surface: runs cross the
             floors it shows, and their poses are in its frame.
         load: name of the load set-up; each has its own wheel loads.
-        session: what runs have in common between which the marker stayed as it was.
-        session_name: instead of session: which runs belong together, of this section and of others
+        session: what the runs of a session have in common; the marker stays in place within one.
+        session_name: instead of session: runs that belong together, of this section and of others
             with the same name, such as those of a day, or between two set-ups of the robot.
         min_rows: shorter runs are left out.
     """
@@ -171,7 +173,7 @@ class LogsSection(Section):
 
 
 class CameraSection(Section):
-    """The camera that saw the pose.
+    """The camera that measured the pose.
 
     Attributes:
         image_centre_m: middle of the picture in the frame of the poses, where tilt and distortion
@@ -194,13 +196,13 @@ class PriorSection(Section):
 
 
 class ParameterSection(Section):
-    """What is wanted of the parameters that match a pattern.
+    """Choice for the parameters that match a pattern.
 
     Attributes:
-        start: value to begin with [SI]; a number that is not fitted stays so.
-        fixed: value that it keeps [SI].
+        start: start value [SI]; a number that is not fitted keeps it.
+        fixed: value that the number keeps [SI].
         free: whether it is fitted.
-        prior: what is known of it beforehand.
+        prior: what is known about it beforehand.
     """
 
     start: Numbers | None = None
@@ -216,7 +218,7 @@ class ParameterSection(Section):
 
 
 class WeightsSection(Section):
-    """What is known of the weight on the wheels in a load set-up.
+    """Known weight on the wheels in a load set-up.
 
     Either what scales show under each wheel, `kg`; or that it is `like` another set-up, with
     `mass_kg` more (or less) at `place_m`.
@@ -225,7 +227,7 @@ class WeightsSection(Section):
         std_kg: standard deviation of each scale, or of the weight that the mass adds to each wheel.
         kg: what scales show under each wheel, in the order of the wheels.
         like: name of another load set-up.
-        mass_kg: what was added to that one; negative where it was taken away.
+        mass_kg: mass added to that one; negative where it was taken away.
         place_m: x (ahead) and y (left) of that mass, from the middle.
     """
 
@@ -248,17 +250,18 @@ class WeightsSection(Section):
 class FitSection(Section):
     """How finely runs are cut, how long to fit, and which lengths are trusted.
 
-    Motion tells the wheel radius over the scale of the poses and no more.
+    Motion determines the ratio of wheel radius to pose scale, and neither of them alone.
 
     Attributes:
-        lengths_from: which of the two is known: "poses" that are in true metres, as those of motion
-            capture, lidar and RTK are, make the wheel radius free; "wheels" that were measured make
-            the scale of the camera free. Without it both are as `[parameters]` says.
-        windows_per_piece: a run is cut into pieces of so many windows.
-        longest_window_s: longer windows become more pieces.
-        rounds: at most.
-        tolerance: done when nothing moves more than this part of its standard deviation.
-        seed: of the draws behind the curves' bands.
+        lengths_from: which of the two is known: "poses" in true metres, as those of motion capture,
+            lidar and RTK are, make the wheel radius free; "wheels" that were measured make the
+            scale of the camera free. Without it both are as `[parameters]` says.
+        windows_per_piece: number of windows in a segment of a run.
+        longest_window_s: longer windows become more segments.
+        rounds: largest number of rounds.
+        tolerance: the fit ends when no number changes by more than this part of its standard
+            deviation.
+        seed: seed of the draws behind the bands of the curves.
     """
 
     lengths_from: Literal["poses", "wheels"] | None = None
@@ -280,16 +283,16 @@ class ValidateSection(Section):
 
 
 class SelftestSection(Section):
-    """What `selftest` drives where no logs are given, what it takes for true and asks for.
+    """Plan and true values of a `selftest`, and the numbers that it must recover.
 
     Attributes:
-        surfaces: names of the floors that are made up.
-        headings: directions in which runs are driven, evenly around.
+        surfaces: names of the simulated floors.
+        headings: number of directions in which runs are driven, evenly spread.
         speeds_m_s: speeds of the runs.
         turns: curved runs on each floor with each load set-up.
-        distance_m: of a run.
-        truth: parameters by name, and the value that is true of them in the simulation.
-        wanted: patterns of the parameters that shall be recovered; otherwise all free ones.
+        distance_m: length of a run.
+        truth: parameters by name, and their true value in the simulation.
+        wanted: patterns of the parameters that must be recovered; otherwise all free ones.
     """
 
     surfaces: list[str] = Field(default=["firm", "soft"], min_length=1)
@@ -308,11 +311,11 @@ class ConfigContent(Section):
         robot: its wheels.
         layouts: which column of your files holds what, by names of your own.
         logs: one section for each set of log files.
-        camera: what saw the poses.
-        parameters: what is wanted of them, by patterns of their names.
-        weights: what is known of the wheel loads, by load set-up.
+        camera: the camera that measured the poses.
+        parameters: choices for parameters, by patterns of their names.
+        weights: known wheel loads, by load set-up.
         fit: how finely runs are cut and how long to fit.
-        selftest: what `slipid selftest` drives where there are no logs.
+        selftest: plan that `slipid selftest` simulates where there are no logs.
         validate: runs to predict instead of those that were fitted.
     """
 
@@ -328,10 +331,10 @@ class ConfigContent(Section):
 
     @property
     def wheels(self) -> Wheels:
-        """The robot, which has some.
+        """The robot's wheels.
 
         Raises:
-            ValueError: it is a motor on a bench.
+            ValueError: the config describes a motor on a bench.
         """
         if isinstance(self.robot, BenchMotors):
             raise ValueError("drive = 'motor' has no wheels on a floor")
@@ -348,13 +351,19 @@ class ConfigContent(Section):
 
 
 def single_floor_sections(sections: Sequence[LogsSection]) -> list[LogsSection]:
-    """Sections whose runs keep to one floor each."""
+    """Return the sections whose runs stay on one floor each."""
     return [section for section in sections if section.map is None]
 
 
 @dataclass(frozen=True)
 class Config:
-    """A config file that was read and found right; its text is kept beside the results."""
+    """A checked config file; its text is kept beside the results.
+
+    Attributes:
+        path: where it was read.
+        text: its text.
+        content: its checked content.
+    """
 
     path: Path
     text: str
@@ -367,17 +376,17 @@ class Config:
 
 
 def read_config(path: Path) -> Config:
-    """Config from a TOML file; errors as of `parsed`, and where it is unreadable."""
+    """Return the config in a TOML file; errors as in `parsed`, also where it is unreadable."""
     return parsed(path, text_of(path))
 
 
 def parsed(path: Path, text: str) -> Config:
-    """Config from TOML text; DataError with every mistake on a line that begins with the path."""
+    """Return the config in TOML text; raise `DataError` with every mistake on a line of its own."""
     return Config(path, text, checked(path, mapping_of(path, text), ConfigContent))
 
 
 def geometry(robot: Wheels) -> Geometry:
-    """Geometry of a `[robot]` section; ValueError where it cannot drive."""
+    """Return the geometry of a `[robot]` section; raise `ValueError` where it cannot drive."""
     radius, gear = robot.wheel_radius_m, robot.gear_ratio
     if isinstance(robot, OmniDrive):
         azimuths, base = robot.wheel_azimuths_deg, robot.base_radius_m

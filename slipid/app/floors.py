@@ -1,4 +1,4 @@
-"""Which floor was under each wheel in logged runs, from a map and a fit that knows the camera."""
+"""Look up the floor under each wheel in logged runs, with a map and a fitted camera."""
 
 import io
 from dataclasses import dataclass
@@ -26,14 +26,15 @@ SCHEMA = "slipid.floors/1"
 
 @dataclass(frozen=True, eq=False)
 class RunFloors:
-    """A run with the floor under each wheel, in the rows in which a pose was read.
+    """A run with the floor under each wheel, in the rows that have a new pose.
 
     Attributes:
-        name: of the run.
-        time: [s]; pose: of the body in the frame of the map, x, y [m], heading [rad].
+        name: name of the run.
+        time: time of each row [s].
+        pose: pose of the body in the frame of the map: x, y [m], heading [rad].
         surface: number of the surface under each wheel.
         border: distance of each wheel from the nearest other surface [m].
-        inside: whether each wheel is on the map; nothing is known of its floor where it is not.
+        inside: whether each wheel is on the map; elsewhere its floor is unknown.
     """
 
     name: str
@@ -47,13 +48,13 @@ class RunFloors:
 def floors_under(
     out: Path, map_file: Path, data: Path, glob: str | None, report: Reporter
 ) -> tuple[FloorLookup, list[RunFloors]]:
-    """Floors under the wheels in runs over a map, by the camera of a fit.
+    """Return the floor under each wheel in runs over a map, using the camera of a fit.
 
     Args:
         out: folder that `slipid identify` wrote.
-        map_file: of the floor; its frame is that of the poses.
+        map_file: map of the floor, in the frame of the poses.
         data: folder of the logs.
-        glob: which logs below it; by default those that the config of the fit names with a map.
+        glob: selects logs below it; by default those that the fit's config names with a map.
 
     Raises:
         DataError: no fit, no map, no logs, or logs without poses.
@@ -109,7 +110,7 @@ def _run_floors(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> Ru
 
 
 def write_floors(folder: Path, lookup: FloorLookup, runs: list[RunFloors]) -> list[Path]:
-    """A CSV file for each run: time, pose, and of every wheel floor and distance to the border."""
+    """Write a CSV file for each run: time, pose, and each wheel's floor and border distance."""
     paths = []
     for run in runs:
         wheels = run.surface.shape[1]
@@ -134,7 +135,7 @@ def write_floors(folder: Path, lookup: FloorLookup, runs: list[RunFloors]) -> li
 
 
 def summary(lookup: FloorLookup, runs: list[RunFloors]) -> Content:
-    """How much of each run every floor was under every wheel."""
+    """Return the share of each run that every wheel spent on every floor."""
     return {
         "schema": SCHEMA,
         "surfaces": list(lookup.surfaces),

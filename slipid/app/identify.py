@@ -1,10 +1,9 @@
-"""From a config and its logs, or from runs and wishes, to a fit, its verdicts and its files."""
+"""Fit a robot, from a config and its logs or from runs, with verdicts and result files."""
 
 import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from slipid.app.bench_priors import COPY_NAME
 from slipid.app.check import refuse_if_wrong, sanity
 from slipid.app.config import read_config
+from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
 from slipid.app.trust import TrustReport, trust_report
 from slipid.fit.multi_floor import multi_floor_runs
@@ -24,21 +24,29 @@ from slipid.infer.result import Fit, summarise
 from slipid.infer.verdicts.profile import Profile, profile, profiled
 from slipid.predict.agreement import contradiction, floor_errors, largest_shift
 from slipid.predict.slip_models import slip_models
-from slipid.support.checkpoint import Checkpoint, key_of, versions
+from slipid.support.checkpoint import Checkpoint, key_of
 from slipid.support.errors import DataError
-from slipid.support.files import read_json, writable, write_bytes, write_json
+from slipid.support.files import read_json, writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 NEAR_OPTIMUM = 3
 """Round from which a fit counts as near its optimum."""
 CHECKPOINT = "checkpoint"
-"""Name of the file that a fit in progress keeps its state in."""
+"""Name of the file with the state of an unfinished fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class IdentifyResult:
-    """End of `identify`: the fit, the runs it saw, how far it may be trusted, profiles, files."""
+    """Result of `identify`.
+
+    Attributes:
+        fit: the fit.
+        task: the runs, the config and the choices that it was made from.
+        trust: verdict on the fit by its open-loop predictions.
+        profiles: the requested profile likelihoods.
+        written: names of the files.
+    """
 
     fit: Fit
     task: ConfigFitTask
@@ -57,9 +65,14 @@ def identify(
 ) -> IdentifyResult:
     """Fit the robot of a config to its logs and write everything to `out`.
 
-    A fit that was interrupted there goes on. Profile likelihoods are made of the numbers named.
-    DataError where config or logs are wrong; nothing was written then. Where they do not go
-    together, that is fitted `anyway` and said.
+    A fit that was interrupted there is continued.
+
+    Args:
+        profiles: paths of numbers whose likelihood is profiled.
+        anyway: fit even where logs and config contradict each other, and report that.
+
+    Raises:
+        DataError: config or logs are wrong; nothing was written then.
     """
     began = time.monotonic()
     setup_jax(quiet=True)
@@ -76,8 +89,8 @@ def identify(
         except ValueError as error:
             raise DataError(f"--profile: {error}") from error
     writable(out)
-    if said := _replaced_fit(out, task):
-        report.line(said)
+    if sentence := _replaced_fit(out, task):
+        report.line(sentence)
     key = key_of(config.hash, task.data_hash, problem.space.names, problem.noise.names)
     kept = Checkpoint(out, key)
     problem, optimum = optimised(task, problem, kept, report)
@@ -93,20 +106,20 @@ def identify(
     def tell(points: int, rise: float) -> None:
         report.note(f"{points} points, rise {rise:.2f}")
 
-    found = []
+    result = []
     for path in dict.fromkeys(profiles):
         report.stage(f"profile of {path}")
-        found.append(profile(problem, optimum, path, tell))
-    if found:
-        each = {p.path: asdict(p) for p in found}
+        result.append(profile(problem, optimum, path, tell))
+    if result:
+        each = {p.path: asdict(p) for p in result}
         write_json(out / "profile.json", {"schema": "slipid.profile/1", "profiles": each})
         written = (*written, "profile.json")
     kept.remove(f"{CHECKPOINT}.npz")
-    return IdentifyResult(fit, task, trust, tuple(found), written)
+    return IdentifyResult(fit, task, trust, tuple(result), written)
 
 
 def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
-    """A sentence where a folder holds the fit of another config or of other logs, else None."""
+    """Return a sentence where a folder has the fit of another config or other logs, else None."""
     try:
         before = read_json(out / "run.json", "what identify wrote")
         config, data = before["config"], before["data"]
@@ -119,12 +132,12 @@ def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
 
 
 def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:
-    """Refuse logs and config that do not go together, or say so."""
+    """Report contradictions between logs and config; refuse them unless `anyway`."""
     report.stage("do logs and config go together?")
-    found = sanity(task)
+    result = sanity(task)
     if not anyway:
-        refuse_if_wrong(found)
-    for finding in found:
+        refuse_if_wrong(result)
+    for finding in result:
         if finding.severity != "note":
             report.line(f"{finding.severity}: {finding}")
 
@@ -132,40 +145,32 @@ def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:
 def _write_run(
     task: ConfigFitTask, trust: TrustReport, data: Path, out: Path, seconds: float
 ) -> None:
-    """What later commands and readers need to know of this run."""
+    """Write run.json and the copies of config and bench file that later commands read."""
     config = task.config
-    write_bytes(out / "config.toml", config.text.encode())
     if (bench := config.content.wheels.motor) is not None:
         write_json(out / COPY_NAME, read_json(config.path.parent / bench, "the numbers of a motor"))
     logs = {log.name: log.sha256 for log in task.logs}
-    run = {
-        "schema": "slipid.run/1",
-        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-        "seconds": round(seconds, 1),
-        "config": {"name": config.path.name, "sha256": config.hash},
-        "data": {
-            "folder": str(data),
-            "hash": task.data_hash,
-            "logs": logs,
-            "skipped": task.skipped,
-        },
-        "trust": trust.to_json(),
-        "seed": task.settings.seed,
-        "versions": versions(),
+    inputs = {
+        "folder": str(data),
+        "hash": task.data_hash,
+        "logs": logs,
+        "skipped": task.skipped,
     }
-    write_json(out / "run.json", run)
+    verdict = {"trust": trust.to_json(), "seed": task.settings.seed}
+    write_run_file(out, config, inputs, seconds, verdict)
 
 
 def optimised(
     task: FitTask, problem: Problem, kept: Checkpoint | None, report: Reporter
 ) -> tuple[Problem, Optimum]:
-    """Optimum of a task, whose problem is `task.problem()`, and the problem that it is one of.
+    """Return the optimum of a task and the problem it belongs to, starting from `task.problem()`.
 
-    That is another one where the lag found was not expected, see `FitTask.cut_as`. It goes on from
-    the state that was kept of this very task, and keeps every round.
+    Windows are cut again, which makes another problem, where the fitted lag is far from the
+    expected one (see `FitTask.cutting_robot`). The fit continues from the checkpoint of this very
+    task, and every round is kept there.
     """
     optimum = _optimised(task, problem, _restored(kept, report), kept, report)
-    robot = task.cut_as(problem.space.tree(optimum.state.z))
+    robot = task.cutting_robot(problem.space.tree(optimum.state.z))
     lag, before = float(robot.camera.lag), problem.windows.lag
     if lag == before:
         return problem, optimum
@@ -182,8 +187,8 @@ def _optimised(
     kept: Checkpoint | None,
     report: Reporter,
 ) -> Optimum:
-    """Optimum of one cut, from a state, with the losses on the way to it, if there is one."""
-    wanted = task.settings
+    """Return the optimum of one problem, from an earlier state and its losses, if there is one."""
+    settings = task.settings
     start, history = before
     first: list[float] = []
 
@@ -195,36 +200,36 @@ def _optimised(
             return
         # the end is where steps that shrink as they do fall below the tolerance
         moved = max(state.moved, 1e-12)
-        first.append(max(moved, 2 * wanted.tolerance))
-        whole = math.log(first[0] / wanted.tolerance)
+        first.append(max(moved, 2 * settings.tolerance))
+        whole = math.log(first[0] / settings.tolerance)
         report.advance(min(math.log(first[0] / moved), whole), whole, what)
         history.append(state.loss)
         if kept is not None:
             kept.save(CHECKPOINT, state.arrays | {"history": np.array(history)})
 
     report.stage("compiling")
-    rounds = wanted.rounds
-    if start is not None and start.moved < wanted.tolerance:
+    rounds = settings.rounds
+    if start is not None and start.moved < settings.tolerance:
         rounds = start.round  # it had settled: only the last steps are missing
     optimum = optimise(
-        problem, start=start, most_rounds=rounds, tolerance=wanted.tolerance, tell=tell
+        problem, start=start, most_rounds=rounds, tolerance=settings.tolerance, tell=tell
     )
     return replace(optimum, history=tuple(history))
 
 
 def _restored(kept: Checkpoint | None, report: Reporter) -> tuple[FitState | None, list[float]]:
-    """Where the fit stood when it was left, and its losses so far."""
-    found = None if kept is None else kept.load(CHECKPOINT)
-    if found is None or kept is None:
+    """Return the state and the losses of an interrupted fit; None and no losses without one."""
+    result = None if kept is None else kept.load(CHECKPOINT)
+    if result is None or kept is None:
         return None, []
-    history = found.pop("history").tolist()
-    start = FitState.of(found)
+    history = result.pop("history").tolist()
+    start = FitState.of(result)
     report.line(f"going on from round {start.round} of {kept.folder / CHECKPOINT}.npz")
     return start, history
 
 
 def summarised(task: FitTask, problem: Problem, optimum: Optimum, report: Reporter) -> Fit:
-    """The fit with intervals, what runs over several floors add, and simpler models beside it."""
+    """Return the fit with intervals, runs over several floors, and simpler models beside it."""
     report.stage("intervals and verdicts")
     fit = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
     if task.mixed:
@@ -236,52 +241,52 @@ def summarised(task: FitTask, problem: Problem, optimum: Optimum, report: Report
 def _with_mixed_runs(
     fit: Fit, task: FitTask, problem: Problem, optimum: Optimum, report: Reporter
 ) -> Fit:
-    """The fit of runs on one floor and on several, or of the former where they contradict."""
+    """Return the fit to all runs, or to runs on one floor each where the others contradict it."""
     report.stage("runs over several floors")
-    several = multi_floor_runs(task.mixed, fit.robot)
+    mixed = multi_floor_runs(task.mixed, fit.robot)
 
     def tell(state: FitState) -> None:
         report.note(f"round {state.round}, loss {state.loss:.2f}, moved {state.moved:.3g} std")
 
     limits = task.settings
-    found = fit_multi_floor(problem, optimum, several, tell, limits.rounds, limits.tolerance)
-    new = summarise(found.problem, found.optimum, task.dataset, task.choices, task.settings.seed)
+    result = fit_multi_floor(problem, optimum, mixed, tell, limits.rounds, limits.tolerance)
+    new = summarise(result.problem, result.optimum, task.dataset, task.choices, task.settings.seed)
     floors = floor_errors(fit.contact, new.contact, task.dataset)
-    after = found.after and found.after._asdict()
+    after = result.after and result.after._asdict()
     about: dict[str, Any] = {
-        "runs": len(several.runs),
-        "windows": int(several.counts.sum()),
-        "before": found.before._asdict(),
+        "runs": len(mixed.runs),
+        "windows": int(mixed.counts.sum()),
+        "before": result.before._asdict(),
         "after": after,
-        "learnt": found.learnt._asdict(),
-        "as_if": {name: e._asdict() for name, e in found.as_if.items()},
+        "learnt": result.learnt._asdict(),
+        "as_if": {name: e._asdict() for name, e in result.as_if.items()},
         "floors": {name: asdict(e) for name, e in floors.items()},
     }
     report.line(_mixed_sentence(about))
-    alone = {name: e.speed for name, e in found.as_if.items()}
-    end = found.optimum
+    alone = {name: e.speed for name, e in result.as_if.items()}
+    end = result.optimum
     moved = largest_shift(fit.space, fit.z, fit.covariance, end.state.z, end.converged)
-    said = contradiction(floors, moved, found.learnt.speed, alone)
-    if said is None:
+    sentence = contradiction(floors, moved, result.learnt.speed, alone)
+    if sentence is None:
         return replace(new, mixed=about)
-    report.line(said)
-    return replace(fit, refused={**about, "reason": said})
+    report.line(sentence)
+    return replace(fit, refused={**about, "reason": sentence})
 
 
 def _mixed_sentence(about: Mapping[str, Any]) -> str:
-    """What runs over several floors told, as a sentence."""
+    """Return a sentence about the prediction of runs over several floors."""
 
     def off(errors: Mapping[str, float]) -> str:
         return f"{errors['yaw_rate']:.3f} rad/s and {1000 * errors['speed']:.1f} mm/s"
 
-    said = f"{about['runs']} runs over several floors: predicted within {off(about['before'])}"
+    sentence = f"{about['runs']} runs over several floors: predicted within {off(about['before'])}"
     if about["after"] is None:
-        return f"{said} by the others; one run cannot judge what it taught"
-    return f"{said} by the others, {off(about['after'])} when half has taught the other"
+        return f"{sentence} by the others; one run cannot judge what was learnt from it"
+    return f"{sentence} by the others, {off(about['after'])} after learning from the other half"
 
 
 def _with_baselines(fit: Fit, task: FitTask) -> Fit:
-    """The fit, with every simpler model learnt from the same runs at the fitted camera and lag."""
+    """Return the fit with simpler models, fitted to the same runs at its camera and lag."""
     cut, shape = task.windows(fit.robot), fit.space.template.geometry
     learnt = [model.fit(cut, fit.robot) for model in slip_models(shape, fit.channels.current)]
     plain = {m.name: {floor: v.tolist() for floor, v in m.state.items()} for m in learnt}

@@ -1,9 +1,7 @@
-"""The logs that a config names, read into one data set.
-
-What ships with slipid beside its code: configs, and recorded logs of the virtual test site.
-"""
+"""Read the logs that a config names into one data set, and find the files shipped with slipid."""
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -13,20 +11,18 @@ from slipid.data.reading.bag.layout import declared_bag_layout
 from slipid.data.reading.presets import PRESETS, declared_layout, preset
 from slipid.data.reading.reader import AnyLayout, find_logs, read_logs, session_of, without_beside
 from slipid.data.runs import Runs, collect, counted_once
+from slipid.support.checkpoint import versions
+from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
-from slipid.support.files import write_bytes
+from slipid.support.files import write_bytes, write_json
 from slipid.support.progress import Reporter
 
 
 def read_dataset(
     config: Config, sections: Sequence[LogsSection], root: Path, report: Reporter
 ) -> tuple[Runs, list[str]]:
-    """Runs of some log sections, and a line for each section without files."""
-    if not root.is_dir():
-        raise DataError(f"{root}: no such folder; expected the folder of the logs (--data)")
-    found, skipped = files_of(config, sections, root)
-    if not found:
-        raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
+    """Return the runs of some log sections, and a line for each section without files."""
+    found, skipped = required_files(config, sections, root)
     count = sum(len(paths) for _, paths in found)
     logs: list[Log] = []
     aside: list[str] = []
@@ -58,10 +54,22 @@ def read_dataset(
     return collect(counted_once(logs), list(sessions.values()), aside), [*skipped, *aside]
 
 
+def required_files(
+    config: Config, sections: Sequence[LogsSection], root: Path
+) -> tuple[list[tuple[LogsSection, list[Path]]], list[str]]:
+    """Return the same as `files_of`; raise `DataError` where no section has a file."""
+    if not root.is_dir():
+        raise DataError(f"{root}: no such folder; expected the folder of the logs (--data)")
+    found, skipped = files_of(config, sections, root)
+    if not found:
+        raise DataError("\n".join(s.removeprefix("skipped: ") for s in skipped))
+    return found, skipped
+
+
 def files_of(
     config: Config, sections: Sequence[LogsSection], root: Path
 ) -> tuple[list[tuple[LogsSection, list[Path]]], list[str]]:
-    """Files of every log section that has some, and a line for each that has none."""
+    """Return the files of every log section that has some, and a line for each that has none."""
     found: list[tuple[LogsSection, list[Path]]] = []
     skipped: list[str] = []
     for section in sections:
@@ -76,7 +84,7 @@ def files_of(
 
 
 def layout_of(config: Config, section: LogsSection) -> AnyLayout:
-    """Layout a log section names: one of the config's own, else a preset."""
+    """Return the layout that a log section names: one of the config's own, else a preset."""
     own = config.content.layouts
     if section.format in own:
         where, declared = f"{config.path} layouts.{section.format}", own[section.format]
@@ -96,12 +104,29 @@ def layout_of(config: Config, section: LogsSection) -> AnyLayout:
     return preset(section.format)
 
 
+def write_run_file(
+    out: Path, config: Config, inputs: Content, seconds: float, more: Content
+) -> None:
+    """Write config.toml, and run.json with the inputs of a run, its duration and `more`."""
+    write_bytes(out / "config.toml", config.text.encode())
+    content = {
+        "schema": "slipid.run/1",
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seconds": round(seconds, 1),
+        "config": {"name": config.path.name, "sha256": config.hash},
+        "data": inputs,
+        **more,
+        "versions": versions(),
+    }
+    write_json(out / "run.json", content)
+
+
 RECORDED = Path(__file__).with_name("recorded.zip")
-"""Logs of the test site that ship with slipid."""
+"""Recorded logs of the test site that ship with slipid."""
 
 
 def packaged_path(name: str) -> Path:
-    """Path of a config that ships with slipid, or of a file below it."""
+    """Return the path of a config that ships with slipid, or of a file below it."""
     package = Path(__file__).parents[1]
     # beside the package in a clone, inside it in an installation
     for folder in (package / "configs", package.parent / "configs"):
@@ -111,12 +136,12 @@ def packaged_path(name: str) -> Path:
 
 
 def packaged_config(name: str) -> str:
-    """Text of a config that ships with slipid."""
+    """Return the text of a config that ships with slipid."""
     return packaged_path(name).read_text(encoding="utf-8")
 
 
 def unpack(out: Path) -> None:
-    """Write the recorded logs, their truth and nothing else below a folder."""
+    """Write the recorded logs and their truth to a folder."""
     try:
         archive = ZipFile(RECORDED)
     except OSError as error:

@@ -1,9 +1,8 @@
-"""Load shares from what scales show, and from masses whose place is known.
+"""From a config and a data folder to a fitting problem.
 
-A mass m at p adds weights n_i to wheels at p_i, with sum n_i = m and sum n_i p_i = m p. Three
-wheels have one solution; of more, the smallest is taken, as for wheels that give alike.
-
-From a config and a data folder to a fitting problem.
+Load shares follow from scales under the wheels, or from masses whose place is known: a mass m at p
+adds weights n_i to wheels at p_i, with sum n_i = m and sum n_i p_i = m p. Three wheels have one
+solution; of more, the smallest is taken, as for wheels that yield alike.
 """
 
 import fnmatch
@@ -31,6 +30,7 @@ from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
 from slipid.fit.problem import Problem, fixed_viscosities
+from slipid.infer.bench.motor import BenchRoot
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.parameter import entries
@@ -41,10 +41,10 @@ from slipid.support.progress import Reporter
 
 
 def share_priors(weights: Mapping[str, WeightsSection], shape: Geometry) -> dict[str, Choice]:
-    """Prior of the load shares of every set-up that something is known of.
+    """Return the prior of the load shares of every set-up whose weights are known.
 
     Raises:
-        ValueError: a set-up is like none that is known, or a wheel would be lifted.
+        ValueError: a set-up refers to an unknown one, or a wheel would lift off.
     """
     out = {}
     for name in weights:
@@ -58,7 +58,7 @@ def share_priors(weights: Mapping[str, WeightsSection], shape: Geometry) -> dict
 def _wheel_weights(
     weights: Mapping[str, WeightsSection], name: str, shape: Geometry, above: tuple[str, ...]
 ) -> tuple[Float[np.ndarray, " wheel"], float]:
-    """Weight on each wheel [kg], and its variance."""
+    """Return the weight on each wheel [kg] and its variance [kg^2]."""
     known = weights.get(name)
     if known is None or name in above:
         there = ", ".join(k for k in weights if k not in above)
@@ -81,25 +81,24 @@ def _wheel_weights(
 
 
 FREE_LENGTH = {"poses": "robot.wheel_radius", "wheels": "camera.scale"}
-"""What is free where these lengths are trusted."""
+"""Number that is fitted when the other kind of length is trusted."""
 SIZE_STD = 0.1
-"""Std of its prior, as a part of the nominal value: tyres give way, cameras are set up by eye."""
+"""Std of its prior as a part of the nominal value: tyres deform, and cameras are set up by eye."""
 RECUT_LAG_S = 0.02
-"""Gap between a fitted lag and that at which windows were cut, from which they are cut anew [s]."""
+"""Difference between fitted and assumed lag from which windows are cut again [s]."""
 LAG_STD, MOST_LAG = 0.1, 3.0
-"""Std of the prior of a lag that was found from the motion, and the longest that a fit starts from
-[s]."""
+"""Std of the prior of a lag found from the motion, and longest lag that a fit starts from [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class FitTask:
-    """Runs, the robot that drove them, and what is wanted of its numbers: all a fit is made of.
+    """Runs, the robot that drove them, and choices for its numbers: everything a fit needs.
 
     Attributes:
         dataset: the runs, each on one floor.
-        robot: with its geometry, and every number at its declared start.
-        choices: free, fixed, priors.
-        settings: how finely runs are cut and how long to fit.
+        robot: robot with its geometry and every number at its declared start.
+        choices: free, fixed and prior values of its numbers.
+        settings: how finely runs are cut into windows, and how long to fit.
         mixed: runs over several floors, with the map of each set.
     """
 
@@ -111,7 +110,7 @@ class FitTask:
 
     @property
     def logs(self) -> tuple[Log, ...]:
-        """Every run, those over several floors last."""
+        """Logs of all runs; those over several floors come last."""
         return self.dataset.logs + tuple(log for data, _ in self.mixed for log in data.logs)
 
     @property
@@ -120,10 +119,10 @@ class FitTask:
         return hash_of((log.name, log.sha256) for log in self.logs)
 
     def problem(self, near: Robot | None = None) -> Problem:
-        """Likelihood of the runs, cut into windows as the settings say, `near` an optimum."""
-        return Problem(self.windows(self.cut_as(near)), self.robot, list(self.choices))
+        """Return the likelihood of the runs in windows, cut for a robot `near` an optimum."""
+        return Problem(self.windows(self.cutting_robot(near)), self.robot, list(self.choices))
 
-    def cut_as(self, near: Robot | None) -> Robot:
+    def cutting_robot(self, near: Robot | None) -> Robot:
         """Return the robot whose wheel radius and lag decide where windows are cut.
 
         It is the robot at the start of a fit, with the lag of a robot `near` an optimum where the
@@ -136,7 +135,7 @@ class FitTask:
         return replace(robot, camera=replace(robot.camera, lag=near.camera.lag))
 
     def windows(self, robot: Robot) -> Windows:
-        """Windows of the runs at the wheel radius and the camera lag of a robot."""
+        """Return windows of the runs, cut at the wheel radius and the camera lag of a robot."""
         return windows(
             self.dataset,
             float(robot.geometry.wheel_radius),
@@ -148,11 +147,11 @@ class FitTask:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ConfigFitTask(FitTask):
-    """What a config says about the logs that are there.
+    """Fit task that a config describes.
 
     Attributes:
-        config: as read.
-        skipped: what the config names and the folder does not have, one line each.
+        config: the config.
+        skipped: a line for each thing that the config names and the data folder lacks.
     """
 
     config: Config
@@ -162,7 +161,7 @@ class ConfigFitTask(FitTask):
 def read_fit_task(config: Config, root: Path, report: Reporter) -> ConfigFitTask:
     """Read every log of runs on one floor that the config names, and set up its robot.
 
-    The bench's file of its motor is looked at first: one that is missing costs no reading of logs.
+    The file of its motor's bench is read first, so that a missing one costs no reading of logs.
     """
     bench_of(config)
     report.stage("reading logs")
@@ -173,9 +172,9 @@ def read_fit_task(config: Config, root: Path, report: Reporter) -> ConfigFitTask
 
 
 def with_mixed(task: ConfigFitTask, root: Path, report: Reporter) -> ConfigFitTask:
-    """The task with the runs over several floors that its config names."""
-    wanted = [section for section in task.config.content.logs if section.map is not None]
-    found, absent = files_of(task.config, wanted, root)
+    """Return the task with the runs over several floors that its config names."""
+    sections = [section for section in task.config.content.logs if section.map is not None]
+    found, absent = files_of(task.config, sections, root)
     for section, _ in found:
         floor = _map(task, section)
         data, short = read_dataset(task.config, [section], root, report)
@@ -189,7 +188,7 @@ def with_mixed(task: ConfigFitTask, root: Path, report: Reporter) -> ConfigFitTa
 
 
 def _map(task: ConfigFitTask, section: LogsSection) -> FloorMap:
-    """Map of a log section; DataError where it is unreadable, or of a floor no run keeps to."""
+    """Return the map of a log section; raise `DataError` for a floor that no other run stays on."""
     path = task.config.path.parent / str(section.map)
     floor = read_map(path)
     known = task.robot.surfaces.labels
@@ -202,10 +201,10 @@ def _map(task: ConfigFitTask, section: LogsSection) -> FloorMap:
 
 
 def _go_together(task: ConfigFitTask, data: Runs) -> None:
-    """DataError where runs over several floors need what those on one floor do not tell."""
-    seen, first = {log.name for log in task.logs}, task.dataset.logs[0]
+    """Raise `DataError` where runs over several floors need what runs on one floor lack."""
+    names, first = {log.name for log in task.logs}, task.dataset.logs[0]
     for log in data.logs:
-        if log.name in seen:
+        if log.name in names:
             raise DataError(
                 f"{log.name}: found by two globs of {task.config.path}; expected it once"
             )
@@ -221,7 +220,7 @@ def _go_together(task: ConfigFitTask, data: Runs) -> None:
 def fit_task(
     config: Config, dataset: Runs, skipped: Sequence[str], report: Reporter
 ) -> ConfigFitTask:
-    """Job of runs that are there already."""
+    """Return the fit task of runs that were read already."""
     shape = shape_of(config)
     logged = dataset.logs[0]
     if shape.drives != logged.wheels:
@@ -233,7 +232,7 @@ def fit_task(
         )
     robot = robot_for_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
     choices, left_out = _choices(config, robot)
-    # what the user says comes later and wins
+    # the choices of the config come last and override the others
     given = any(fnmatch.fnmatchcase("camera.lag", p) for p in config.content.parameters)
     lag = [] if given else lag_from_motion(dataset)
     known = [*lag, *without_rollers(shape), *fixed_viscosities(dataset)]
@@ -245,7 +244,7 @@ def fit_task(
         freed = FREE_LENGTH["wheels" if trusted == "poses" else "poses"]
         raise DataError(
             f"{config.path}: fit.lengths_from = '{trusted}' with {freed} free in parameters; "
-            "expected one of the two: motion tells them apart by no means"
+            "expected one of the two: no motion tells them apart"
         )
     skipped = (*skipped, *left_out)
     for sentence in skipped:
@@ -255,7 +254,7 @@ def fit_task(
 
 
 def lag_from_motion(dataset: Runs) -> list[Choice]:
-    """The choice of a free camera lag around the one that the motion shows, if it shows one."""
+    """Return a choice for a free camera lag near the one that the motion shows, if any."""
     lag = pose_lag(dataset)
     if lag is None or abs(lag.seconds) > MOST_LAG:
         return []
@@ -263,7 +262,7 @@ def lag_from_motion(dataset: Runs) -> list[Choice]:
 
 
 def lengths(trusted: str | None, shape: Geometry) -> list[Choice]:
-    """The wheel radius free and the scale of the poses held, or the other way round."""
+    """Free the wheel radius and hold the scale of the poses, or the other way round."""
     if trusted is None:
         return []
     radius = float(shape.wheel_radius)
@@ -275,7 +274,7 @@ def lengths(trusted: str | None, shape: Geometry) -> list[Choice]:
 
 
 def without_rollers(shape: Geometry) -> list[Choice]:
-    """Numbers of rollers held, where no wheel has any."""
+    """Hold the numbers of rollers fixed where no wheel has rollers."""
     if not all(shape.grips):
         return []
     names = ("roller_drag", "roller_creep", "roller_viscosity")
@@ -283,14 +282,14 @@ def without_rollers(shape: Geometry) -> list[Choice]:
 
 
 def robot_for_runs(robot: Robot, runs: Runs, centre: tuple[float, float]) -> Robot:
-    """A robot for the floors, load set-ups and sessions of some runs; image centre [m]."""
+    """Return a robot with the floors, load set-ups and sessions of runs; image centre in [m]."""
     floors = {log.surface or "unknown" for log in runs.logs}
     loads = {log.load for log in runs.logs}
     return robot.on(sorted(floors), sorted(loads), sorted(set(runs.session)), centre)
 
 
 def shape_of(config: Config) -> Geometry:
-    """Geometry of the config's robot; DataError where it cannot drive."""
+    """Return the geometry of the config's robot; raise `DataError` where it cannot drive."""
     try:
         return geometry(config.content.wheels)
     except ValueError as error:
@@ -301,7 +300,7 @@ _STATED = ("robot.wheel_radius", "robot.base_radius", "robot.mass")
 
 
 def stated_sizes(robot: Robot, mass: float) -> list[Choice]:
-    """Size and mass as they are said: held, and the centre of the prior of what is freed."""
+    """Hold size and mass at their stated values, the prior means of those that are freed."""
     choices = []
     for e in entries(robot):
         if e.path in _STATED:
@@ -312,13 +311,13 @@ def stated_sizes(robot: Robot, mass: float) -> list[Choice]:
 
 
 def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
-    """The config's parameter settings, checked, less those of floors and loads that are absent."""
+    """Return the config's choices for numbers, and lines about floors and loads that are absent."""
     paths, skipped = [e.path for e in entries(robot)], []
     choices = stated_sizes(robot, config.content.wheels.mass_kg or float(robot.body.mass))
     choices += lengths(config.content.fit.lengths_from, robot.geometry)
-    measured, told = bench_priors(config, float(robot.motor.gear_ratio))
+    measured, lines = bench_priors(config, float(robot.motor.gear_ratio))
     choices += measured
-    skipped += told
+    skipped += lines
     try:
         known = share_priors(config.content.weights, robot.geometry)
     except ValueError as error:
@@ -328,28 +327,38 @@ def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
             choices.append(prior)
         else:
             skipped.append(f"skipped: weights.{load}: no run that has it")
-    for pattern, setting in config.content.parameters.items():
+    for pattern in config.content.parameters:
         if not fnmatch.filter(paths, pattern):
             if fnmatch.filter(paths, _any_label(pattern)):
                 skipped.append(f"skipped: parameters '{pattern}': no run that has it")
                 continue
-            raise DataError(
-                f"{config.path}: parameters.'{pattern}': no such parameter"
-                f"{did_you_mean(pattern, paths)}; "
-                f"expected one of {', '.join(paths)}"
-            )
-        gauss = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)
-        choice = Choice(pattern, setting.start, setting.fixed, setting.free, *gauss)
-        try:
-            Space(robot, [choice])
-        except ValueError as error:
-            raise DataError(f"{config.path}: parameters.'{pattern}': {error}") from error
-        choices.append(choice)
+            raise unknown_parameter(config, pattern, pattern, paths)
+        choices.append(checked_choice(config, pattern, pattern, robot))
     return choices, skipped
 
 
+def unknown_parameter(config: Config, pattern: str, name: str, paths: list[str]) -> DataError:
+    """Return the error about a pattern of `[parameters]` whose `name` matches no path."""
+    return DataError(
+        f"{config.path}: parameters.'{pattern}': no such parameter{did_you_mean(name, paths)}; "
+        f"expected one of {', '.join(paths)}"
+    )
+
+
+def checked_choice(config: Config, pattern: str, name: str, root: Robot | BenchRoot) -> Choice:
+    """Return the choice in `[parameters]` at a pattern for `name`; `DataError` where impossible."""
+    setting = config.content.parameters[pattern]
+    gauss = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)
+    choice = Choice(name, setting.start, setting.fixed, setting.free, *gauss)
+    try:
+        Space(root, [choice])
+    except ValueError as error:
+        raise DataError(f"{config.path}: parameters.'{pattern}': {error}") from error
+    return choice
+
+
 def _any_label(pattern: str) -> str:
-    """The pattern with the name of a floor, load or session replaced by any."""
+    """Return the pattern with the name of a floor, load or session replaced by `*`."""
     head, at, _ = pattern.partition("@")
     parts = head.split(".")
     if parts[0] == "surface" and len(parts) == 3:

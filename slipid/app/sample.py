@@ -1,4 +1,4 @@
-"""The posterior of a fit by sampling: what `slipid sample` does, but for its pictures."""
+"""Sample the posterior of a fit: the work of `slipid sample` except its pictures."""
 
 import time
 from dataclasses import dataclass, replace
@@ -22,15 +22,16 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 FOLDER = "sampling"
-"""Folder of the blocks of an unfinished chain, inside the result's."""
+"""Folder with the blocks of an unfinished chain, inside the result folder."""
 
 
 @dataclass(frozen=True, eq=False)
 class SampleResult:
-    """End of `sample`.
+    """Result of `sample`.
 
     Attributes:
-        about: content of sample.json: how the chains did.
+        posterior: the draws with their diagnosis.
+        about: content of sample.json, which describes how the chains converged.
         written: names of the files.
     """
 
@@ -40,10 +41,13 @@ class SampleResult:
 
 
 def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporter) -> SampleResult:
-    """Sample around the fit in `out`: posterior.nc, sample.json, intervals in identified.json.
+    """Sample around the fit in `out`; write posterior.nc, sample.json and new intervals.
 
-    A chain that was interrupted there goes on. The logs lie in `data`, by default where they were
-    fitted; `draws` are kept of each ensemble.
+    A chain that was interrupted there is continued. The intervals go to identified.json.
+
+    Args:
+        data: folder of the logs; by default the folder from which they were fitted.
+        draws: draws kept of each ensemble.
     """
     began = time.monotonic()
     setup_jax(quiet=True)
@@ -55,34 +59,34 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     report.stage("compiling")
     fit = replace(fit, problem=task.problem(fit.robot), data=task.dataset)
     # all that a chain depends on; how long it may become is not of it
-    told = FORMAT, fit.data_hash, replace(plan, most=10**9), draws, sorted(fit.variance.items())
-    kept = Checkpoint(out / FOLDER, key_of(*told, np.asarray(fit.z), np.asarray(fit.covariance)))
-    found = sampled(fit, plan, draws, kept, report)
+    inputs = FORMAT, fit.data_hash, replace(plan, most=10**9), draws, sorted(fit.variance.items())
+    kept = Checkpoint(out / FOLDER, key_of(*inputs, np.asarray(fit.z), np.asarray(fit.covariance)))
+    posterior = sampled(fit, plan, draws, kept, report)
     report.stage("writing")
-    about = _summary(found, plan, time.monotonic() - began)
+    about = _summary(posterior, plan, time.monotonic() - began)
     marks = {k: str(v) for k, v in about.items() if not isinstance(v, dict) and k != "schema"}
-    netcdf.write(netcdf.tree(found, marks), out / "posterior.nc")
-    write_identified(out, identified(found))
+    netcdf.write(netcdf.tree(posterior, marks), out / "posterior.nc")
+    write_identified(out, identified(posterior))
     write_json(out / "sample.json", about)
-    if found.converged:
+    if posterior.converged:
         kept.remove()
     written = ("posterior.nc", "sample.json", "identified.json")
-    return SampleResult(found, about, written)
+    return SampleResult(posterior, about, written)
 
 
-def _summary(found: Posterior, plan: Plan, seconds: float) -> Content:
-    """Content of sample.json: what was done and whether to believe it."""
-    d = found.diagnosis
+def _summary(posterior: Posterior, plan: Plan, seconds: float) -> Content:
+    """Return the content of sample.json: settings, convergence and diagnosis of each coordinate."""
+    d = posterior.diagnosis
     return {
         "schema": "slipid.sample/1",
-        "converged": found.converged,
-        "reason": found.reason,
+        "converged": posterior.converged,
+        "reason": posterior.reason,
         "ensembles": plan.ensembles,
         "walkers": plan.walkers,
         "steps": d.steps,
-        "draws": int(np.prod(found.log_prob.shape)),
+        "draws": int(np.prod(posterior.log_prob.shape)),
         "seconds": round(seconds, 1),
-        "accepted": found.accepted,
+        "accepted": posterior.accepted,
         "seed": plan.seed,
         "worst": {
             "r_hat": float(np.max(d.r_hat)),
@@ -91,14 +95,14 @@ def _summary(found: Posterior, plan: Plan, seconds: float) -> Content:
         },
         "coordinates": {
             name: {"r_hat": float(r), "tau": float(t), "effective_draws": float(n)}
-            for name, r, t, n in zip(found.names, d.r_hat, d.tau, d.ess, strict=True)
+            for name, r, t, n in zip(posterior.names, d.r_hat, d.tau, d.ess, strict=True)
         },
         "versions": versions(),
     }
 
 
 def _log_folder(out: Path, data: Path | None) -> Path:
-    """The data folder: as given, else where the fit found its logs, if they are still there."""
+    """Return the given data folder, else the folder that the fit used, if it still exists."""
     if data is not None:
         return data
     run = read_json(out / "run.json", "what `slipid identify` keeps of a run")
@@ -109,7 +113,7 @@ def _log_folder(out: Path, data: Path | None) -> Path:
 
 
 def _refuse_mixed(fit: Fit) -> None:
-    """Refuse a fit that learnt from runs over several floors: their likelihood is not sampled."""
+    """Raise `DataError` for a fit with runs over several floors, which cannot be sampled yet."""
     if fit.mixed is not None:
         raise DataError(
             "the fit learnt from runs over several floors, which are not sampled yet; "
@@ -118,7 +122,7 @@ def _refuse_mixed(fit: Fit) -> None:
 
 
 def _refuse_other_logs(fit: Fit, task: ConfigFitTask) -> None:
-    """Refuse logs other than those that were fitted; names the first that differs."""
+    """Raise `DataError` where the logs are not those of the fit, naming the first that differs."""
     then, now = dict(fit.runs), {log.name: log.sha256 for log in task.dataset.logs}
     for name in [*then, *now]:
         if then.get(name) != now.get(name):

@@ -1,4 +1,4 @@
-"""How far a fit may be trusted: its open-loop predictions against those of the encoders."""
+"""Verdict on a fit: its open-loop predictions compared with those of the encoders."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -17,17 +17,17 @@ from slipid.support.errors import DataError
 
 ENCODER = FloorModels(Encoder())
 MOST_RUNS = 24
-"""Runs that are replayed of every floor, evenly picked from those that were fitted."""
+"""Most runs predicted on each floor, evenly picked from the fitted ones."""
 
 
 @dataclass(frozen=True)
 class TrustReport:
-    """A verdict and the errors it rests on.
+    """Verdict on a fit and the errors it rests on.
 
     Attributes:
-        trust: the verdict, with its reasons.
-        floors: mean end-point error over the way, of the fit and of the encoders alone.
-        runs: how many were replayed.
+        trust: the verdict with its reasons.
+        floors: mean end-point error over path length, of the fit and of the encoders alone.
+        runs: number of predicted runs.
     """
 
     trust: Trust
@@ -36,12 +36,12 @@ class TrustReport:
 
     @property
     def warning(self) -> str | None:
-        """What a picture must say of a fit that is not to be used."""
+        """Warning that every picture of an unusable fit shows."""
         return f"THIS FIT IS {self.trust.word.upper()}" if self.is_bad else None
 
     @property
     def is_bad(self) -> bool:
-        """Whether the fit is not to be trusted at all."""
+        """True where the fit must not be used."""
         return self.trust.word == "not to be trusted"
 
     def to_json(self) -> Content:
@@ -54,7 +54,7 @@ class TrustReport:
 
 
 def trust_report(fit: Fit, data: Runs) -> TrustReport:
-    """Verdict on a fit by the runs it was made of, replayed from their first pose on."""
+    """Return the verdict on a fit from open-loop predictions of the runs that it was fitted to."""
     some = data.subset(_picked(data))
     runs: dict[int, ScoredRun] = {}
     try:
@@ -77,7 +77,7 @@ def trust_report(fit: Fit, data: Runs) -> TrustReport:
 
 
 def _picked(data: Runs) -> list[int]:
-    """Numbers of at most `MOST_RUNS` runs of every floor."""
+    """Return the numbers of at most `MOST_RUNS` runs on every floor."""
     of_floor: dict[str, list[int]] = {}
     for k, log in enumerate(data.logs):
         of_floor.setdefault(log.surface or "unknown", []).append(k)

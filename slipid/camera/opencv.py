@@ -1,4 +1,4 @@
-"""OpenCV, imported late, and what its versions 4 and 5 call the same."""
+"""OpenCV, imported when first needed, with what differs between its versions 4 and 5."""
 
 import os
 from functools import cache
@@ -7,19 +7,26 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, UInt8
 
 from slipid.support.errors import DataError, did_you_mean
+
+Mask = Bool[np.ndarray, "row column"]
+"""Some of the pixels of a picture or of the cells of a grid."""
+Labels = Int[np.ndarray, "row column"]
+"""A number for each cell of a grid."""
+Grey = UInt8[np.ndarray, "row column"]
+"""Grey levels of a picture, from 0 to 255."""
 
 
 @cache
 def opencv() -> ModuleType:
-    """The module cv2, whose readers of pictures and videos keep quiet about what they cannot read.
+    """Return the module cv2, with its own messages about unreadable files switched off.
 
     Raises:
-        DataError: it is absent, too old, or built without its ArUco module.
+        DataError: OpenCV is absent, too old, or built without its ArUco module.
     """
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet, before it is loaded
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # must be set before cv2 is loaded
     try:
         import cv2
     except ImportError as error:
@@ -32,23 +39,23 @@ def opencv() -> ModuleType:
             "opencv-contrib-python-headless, and no other build of OpenCV beside it"
         )
     log = getattr(getattr(cv2, "utils", None), "logging", None)
-    if log is not None:  # we say ourselves what is wrong with a file
+    if log is not None:  # our own messages say what is wrong with a file
         log.setLogLevel(log.LOG_LEVEL_SILENT)
     return cv2
 
 
 def dictionary_names() -> list[str]:
-    """Marker dictionaries that OpenCV knows, such as `4X4_50`."""
+    """Return the names of OpenCV's marker dictionaries, such as `4X4_50`."""
     prefix = "DICT_"
     aruco = opencv().aruco
     return sorted(name.removeprefix(prefix) for name in dir(aruco) if name.startswith(prefix))
 
 
 def marker_dictionary(name: str) -> Any:
-    """OpenCV's dictionary of a name such as `4X4_50`, with `DICT_` before it or not.
+    """Return OpenCV's marker dictionary of a name such as `4X4_50` or `DICT_4X4_50`.
 
     Raises:
-        DataError: there is none of that name.
+        DataError: no dictionary has that name.
     """
     short = name.upper().removeprefix("DICT_")
     names = dictionary_names()
@@ -60,10 +67,10 @@ def marker_dictionary(name: str) -> Any:
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """A picture as rows, columns, and blue, green, red from 0 to 255.
+    """Return a picture as rows, columns, and blue, green, red from 0 to 255.
 
     Raises:
-        DataError: the file is absent, empty or no picture.
+        DataError: the file is absent, empty or not a picture.
     """
     try:
         data = path.read_bytes()
@@ -74,11 +81,16 @@ def read_picture(path: Path) -> np.ndarray:
     cv2 = opencv()
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error:  # a size beyond what it reads
+    except cv2.error:  # the picture is larger than OpenCV reads
         picture = None
     if picture is None:
         raise DataError(f"{path}: no picture that OpenCV reads; expected PNG, JPEG or the like")
     return np.asarray(picture)
+
+
+def size_of(picture: np.ndarray) -> tuple[int, int]:
+    """Return width and height of a picture [pixel]."""
+    return int(picture.shape[1]), int(picture.shape[0])
 
 
 def ideal_points(
@@ -86,7 +98,7 @@ def ideal_points(
     matrix: Float[np.ndarray, "3 3"],
     distortion: Float[np.ndarray, " coefficient"],
 ) -> Float[np.ndarray, "point 1 2"]:
-    """Pixels as a pinhole with focal length 1 sees them, iterated until they stand still."""
+    """Return pixels as a pinhole of focal length 1 would show them, iterated to convergence."""
     cv2 = opencv()
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
     iterated = getattr(cv2, "undistortPointsIter", None)

@@ -1,10 +1,10 @@
-"""The overhead camera: lens, place above the floor, and from pixels to places at a known height.
+"""The overhead camera: its lens, its place above the floor, and places of pixels at a known height.
 
-A pixel tells a ray, not a place. What lies `h` above the floor is seen where the ray crosses the
-plane z = h: for a camera at height H that looks straight down, marker corners appear H / (H - h)
-times as far from the point below the lens as the robot really is. A marker on a robot that is read
-as if it lay on the floor makes every way too long by that factor (12 % where h is 0.105 H), and the
-marker too large by the same: its known size gives such a mistake away.
+A pixel determines a ray, not a place. A point `h` above the floor lies where its ray crosses the
+plane z = h. For a camera at height H that looks straight down, a marker's corners appear
+H / (H - h) times as far from the point below the lens as the robot really is. If a marker on a
+robot is read as if it lay on the floor, every path length is too large by that factor (12 % where h
+is 0.105 H), and the marker looks too large by the same factor, which reveals such a mistake.
 """
 
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ Three = Annotated[list[Row], Field(min_length=3, max_length=3)]
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """How a camera draws: OpenCV's pinhole with distortion.
+    """A lens: OpenCV's pinhole model with distortion.
 
     Attributes:
         image_px: width and height of its images [pixel].
@@ -42,7 +42,7 @@ class Lens:
     distortion: Float[np.ndarray, " coefficient"]
 
     def to_json(self) -> Content:
-        """What a camera file says of it."""
+        """Return the lens part of a camera file."""
         return {
             "schema": SCHEMA,
             "image_px": list(self.image_px),
@@ -51,11 +51,25 @@ class Lens:
         }
 
     def ideal(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Where a pinhole with focal length 1 sees what the lens shows at some pixels."""
+        """Return the places of pixels in the picture of a pinhole of focal length 1."""
         flat = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
         if not len(flat):
             return flat.reshape(np.shape(pixels))
         return ideal_points(flat, self.matrix, self.distortion).reshape(np.shape(pixels))
+
+    def check_size(self, image_px: tuple[int, int], source: Path | str) -> None:
+        """Check that images have the size at which the lens was calibrated.
+
+        Raises:
+            DataError: they have another; a smaller image may be a part of the picture or shrunk.
+        """
+        if tuple(image_px) != tuple(self.image_px):
+            w, h = self.image_px
+            raise DataError(
+                f"{source}: images of {image_px[0]} x {image_px[1]} pixels, but the camera was "
+                f"calibrated at {w} x {h}; expected the same resolution: record at it, or "
+                "calibrate at this one"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +77,11 @@ class OverheadCamera:
     """A calibrated camera above a floor, whose world has z = 0 on the floor and z up.
 
     Attributes:
-        lens: how it draws.
-        rotation: from the world to the camera's axes: x right, y down, z away.
-        place: of the lens in the world [m].
-        scale_std: how well lengths on the floor are known, as a part of them [1]; None where that
-            was not told.
-        report: what the calibration found, kept as it stands.
+        lens: the lens.
+        rotation: rotation from the world to the camera's axes: x right, y down, z away.
+        place: place of the lens in the world [m].
+        scale_std: relative std of lengths on the floor [1]; None where it is not known.
+        report: report of the calibration, kept as it stands.
     """
 
     lens: Lens
@@ -85,15 +98,16 @@ class OverheadCamera:
         height_m: float,
         turn_deg: float = 0.0,
     ) -> "OverheadCamera":
-        """A camera without distortion that looks straight down on the middle of its picture.
+        """Return a camera without distortion that looks straight down.
 
-        World x is the picture's right, y its up; the origin is the middle of the picture.
+        World x points to the picture's right, y up; the origin is in the middle of the picture.
 
         Args:
-            metres_per_pixel: on the floor.
-            height_m: of the lens above the floor.
-            turn_deg: by which the world's x and y are turned to the left in the picture, about z;
-                at 180, x is the picture's left and y its down.
+            image_px: width and height of its pictures.
+            metres_per_pixel: size of a pixel on the floor.
+            height_m: height of the lens above the floor.
+            turn_deg: angle by which the world's x and y are turned to the left in the picture,
+                about z; at 180, x points to the picture's left and y down.
         """
         focal, (width, height) = height_m / metres_per_pixel, image_px
         matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
@@ -108,7 +122,7 @@ class OverheadCamera:
         return float(self.place[2])
 
     def pixels(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Where places in the world [m] are seen."""
+        """Return the pixels at which places in the world [m] appear."""
         cv2 = opencv()
         flat = np.ascontiguousarray(points, float).reshape(-1, 1, 3)
         shape = (*np.shape(points)[:-1], 2)
@@ -116,39 +130,25 @@ class OverheadCamera:
             return np.zeros(shape)
         turn = cv2.Rodrigues(self.rotation)[0]
         shift = -self.rotation @ self.place
-        seen = cv2.projectPoints(flat, turn, shift, self.lens.matrix, self.lens.distortion)[0]
-        return np.asarray(seen).reshape(shape)
+        pixels = cv2.projectPoints(flat, turn, shift, self.lens.matrix, self.lens.distortion)[0]
+        return np.asarray(pixels).reshape(shape)
 
     def on_plane(
         self, pixels: Float[np.ndarray, "*batch 2"], height_m: float
     ) -> Float[np.ndarray, "*batch 2"]:
-        """x, y [m] of what is seen at some pixels and lies at a height above the floor.
+        """Return x and y [m] of points at a height above the floor that appear at some pixels.
 
-        NaN where a ray does not go down to that height.
+        They are NaN where a ray does not descend to that height.
         """
         ideal = self.lens.ideal(pixels)
         rays = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1) @ self.rotation
         with np.errstate(divide="ignore", invalid="ignore"):
-            far = (height_m - self.place[2]) / rays[..., 2:]
-            found = self.place[:2] + far * rays[..., :2]
-        return np.asarray(np.where(far > 0, found, np.nan))
-
-    def of_size(self, image_px: tuple[int, int], source: Path | str) -> None:
-        """Refuse images of another size than it was calibrated at.
-
-        Raises:
-            DataError: they have another one; a smaller image may be a part or a shrunk whole.
-        """
-        if tuple(image_px) != tuple(self.lens.image_px):
-            w, h = self.lens.image_px
-            raise DataError(
-                f"{source}: images of {image_px[0]} x {image_px[1]} pixels, but the camera was "
-                f"calibrated at {w} x {h}; expected the same resolution: record at it, or "
-                "calibrate at this one"
-            )
+            depth = (height_m - self.place[2]) / rays[..., 2:]
+            xy = self.place[:2] + depth * rays[..., :2]
+        return np.asarray(np.where(depth > 0, xy, np.nan))
 
     def to_json(self) -> Content:
-        """What `load` reads."""
+        """Return the content of a camera file, as `load` reads it."""
         return self.lens.to_json() | {
             "rotation_from_world": self.rotation.tolist(),
             "place_m": self.place.tolist(),
@@ -166,24 +166,30 @@ class OverheadCamera:
 
     @classmethod
     def load(cls, path: Path | str) -> "OverheadCamera":
-        """The camera of a file that `slipid calibrate` or `slipid simulate` wrote.
+        """Return the camera in a file that `slipid calibrate` or `slipid simulate` wrote.
 
         Raises:
-            DataError: the file is absent or no camera, or one whose floor was not calibrated.
+            DataError: the file is absent or no camera file, or its floor was not calibrated.
         """
         return read_camera(Path(path)).above_floor(path)
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFile:
-    """What a file says: the lens, and the whole camera where its floor is known too."""
+    """Content of a camera file.
+
+    Attributes:
+        lens: the lens.
+        camera: the whole camera; None where its floor was not calibrated.
+        report: report of the calibration.
+    """
 
     lens: Lens
     camera: OverheadCamera | None
     report: Content
 
     def above_floor(self, path: Path | str) -> OverheadCamera:
-        """The camera; DataError where its floor was not calibrated."""
+        """Return the camera; DataError where its floor was not calibrated."""
         if self.camera is None:
             raise DataError(
                 f"{path}: a lens without a floor; expected one with rotation_from_world and "
@@ -192,7 +198,7 @@ class CameraFile:
         return self.camera
 
 
-class _File(Section):
+class _CameraSection(Section):
     """A camera file as it stands."""
 
     schema_: Literal["slipid.camera/1"] = Field(alias="schema")
@@ -207,13 +213,13 @@ class _File(Section):
 
 
 def read_camera(path: Path) -> CameraFile:
-    """A camera file, checked.
+    """Return the content of a camera file, checked.
 
     Raises:
-        DataError: absent, no camera file, or numbers that no camera has.
+        DataError: absent, no camera file, or values that no camera can have.
     """
-    what = "a camera file (slipid.camera/1) that `slipid calibrate` wrote"
-    given = checked(path, read_json(path, what), _File)
+    expected = "a camera file (slipid.camera/1) that `slipid calibrate` wrote"
+    given = checked(path, read_json(path, expected), _CameraSection)
     matrix = np.array(given.matrix)
     if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and (matrix[2] == [0, 0, 1]).all()):
         raise DataError(
@@ -229,7 +235,7 @@ def read_camera(path: Path) -> CameraFile:
     if not (
         np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
     ):
-        raise DataError(f"{path}: rotation_from_world is no rotation")
+        raise DataError(f"{path}: rotation_from_world is not a rotation")
     if not (place[2] > 0 and rotation[2, 2] < 0):
         raise DataError(
             f"{path}: the camera is {place[2]:g} m high and "

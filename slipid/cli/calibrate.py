@@ -13,12 +13,12 @@ from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.camera.calibration.board import Board
-    from slipid.camera.calibration.calibrate import FloorFound, LensFound
+    from slipid.camera.calibration.calibrate import CalibratedLens
+    from slipid.camera.calibration.place import FloorFit
     from slipid.report.page import Page
-    from slipid.support.content import Content
 
 SIZE_STD = 0.001
-"""How well a printed board or a tape is known, relative."""
+"""Relative std of the size of a printed board or a tape [1]."""
 
 
 @guarded
@@ -40,184 +40,175 @@ def calibrate(
         float | None, typer.Option(metavar="M", help="Edge of a marker, in m.")
     ] = None,
     dictionary: Annotated[
-        str, typer.Option(metavar="NAME", help="Of the board's markers.")
+        str, typer.Option(metavar="NAME", help="Dictionary of the board's markers.")
     ] = "4X4_50",
     legacy: Annotated[
-        bool, typer.Option("--legacy", help="The board is of OpenCV before 4.6.")
+        bool, typer.Option("--legacy", help="The board was drawn by OpenCV before 4.6.")
     ] = False,
     k3: Annotated[
-        bool, typer.Option("--k3", help="Also k3, for wide lenses whose error stays large.")
+        bool, typer.Option("--k3", help="Also fit k3, for wide lenses whose error stays large.")
     ] = False,
     camera: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Camera file with a known lens.")
     ] = None,
     floor: Annotated[
-        Path | None, typer.Option(metavar="PICTURE", help="Of the board lying on the floor.")
+        Path | None,
+        typer.Option(metavar="PICTURE", help="Picture of the board lying on the floor."),
     ] = None,
     board_height: Annotated[
-        float, typer.Option(metavar="M", help="Of the lying board's face above the floor, in m.")
+        float,
+        typer.Option(metavar="M", help="Height of the lying board's face above the floor, in m."),
     ] = 0.0,
     points: Annotated[
         Path | None, typer.Option(metavar="CSV", help="Measured points: u, v, x, y and maybe z.")
     ] = None,
     size_std: Annotated[
         float | None,
-        typer.Option(metavar="PART", help="How well board or tape are known; 0.001 by default."),
+        typer.Option(
+            metavar="PART", help="Relative std of the board's or tape's size; 0.001 by default."
+        ),
     ] = None,
     metres_per_pixel: Annotated[
-        float | None, typer.Option(metavar="M", help="On the floor, without any calibration.")
+        float | None,
+        typer.Option(metavar="M", help="Size of a pixel on the floor, without any calibration."),
     ] = None,
     lens_height: Annotated[
-        float | None, typer.Option(metavar="M", help="Of the lens, with --metres-per-pixel.")
+        float | None, typer.Option(metavar="M", help="Height of the lens, with --metres-per-pixel.")
     ] = None,
     turn: Annotated[
         float | None,
-        typer.Option(metavar="DEG", help="Of the world's x and y, with --metres-per-pixel."),
+        typer.Option(metavar="DEG", help="Turn of the world's x and y, with --metres-per-pixel."),
     ] = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """An overhead camera from ChArUco pictures: its lens, and its place above the floor.
+    """Calibrate an overhead camera from ChArUco pictures: its lens and its place above the floor.
 
     The lens comes from PICTURE... or --camera, the floor from --floor or --points. The world's
     origin is on the floor below the middle of the lying board, x along its columns, y up its rows,
-    z up; or as the points say. Without any calibration, --metres-per-pixel and --lens-height make
-    a camera that looks straight down: origin in the middle of the picture, x right, y up.
+    z up; or as the points say. Without any calibration, --metres-per-pixel and --lens-height make a
+    camera that looks straight down: origin in the middle of the picture, x right, y up.
 
-    What lies h above the floor, seen from a height H, appears H / (H - h) times as far from the
-    point below the lens as it is: with H = 2.4 m and h = 0.25 m lengths read on the floor would be
-    11.6 % too long. Calibrate on the floor, and give a marker's height where it is read.
+    A point h above the floor, seen from a height H, appears H / (H - h) times as far from the point
+    below the lens as it is: with H = 2.4 m and h = 0.25 m lengths read on the floor would be 11.6 %
+    too long. Calibrate on the floor, and give a marker's height where it is read.
 
-    Exit code 1 where the camera is poor but usable: the file is written, and says why.
+    The exit code is 1 where the camera is poor but usable: the file is written, and says why.
     """
-    words, told = pictures or [], (metres_per_pixel, lens_height, turn)
+    from slipid.camera.calibration.calibrate import (
+        floor_from_board,
+        floor_from_points,
+        lens_from_file,
+        lens_from_pictures,
+    )
+
+    words, described = pictures or [], (metres_per_pixel, lens_height, turn)
     std = SIZE_STD if size_std is None else _positive("--size-std", size_std)
-    if any(value is not None for value in told):
+    if any(value is not None for value in described):
         if any((board, camera, floor, points)) or len(words) != 1:
             raise DataError(
                 "--metres-per-pixel, --lens-height and --turn are without any calibration; "
                 "expected a single picture beside them, and no board, camera, floor or points"
             )
-        return _uncalibrated(Path(words[0]), told, size_std, out, json)
+        return _uncalibrated(Path(words[0]), described, size_std, out, json)
     _refuse_combinations(words, camera, floor, points)
     with Reporter(quiet=quiet) as report:
-        made = None
+        known_board = None
         if words or floor is not None:
-            made = _board(board, (square, marker), dictionary, legacy)
+            known_board = _board(board, (square, marker), dictionary, legacy)
         report.stage("reading pictures")
-        lens = _lens(words, camera, made, k3)
-        place = _floor(lens, made, floor, board_height, points, std)
+        if camera is not None:
+            lens = lens_from_file(camera)
+        else:
+            assert known_board is not None  # there are pictures
+            lens = lens_from_pictures(words, known_board, k3)
+        fit = None
+        if points is not None:
+            fit = floor_from_points(lens, points, std)
+        elif floor is not None and known_board is not None:
+            if not 0 <= board_height < math.inf:
+                raise DataError(
+                    f"--board-height {board_height:g}; expected a height in metres, 0 or more"
+                )
+            fit = floor_from_board(lens, known_board, floor, board_height, std)
         report.stage("writing")
-        return _write(lens, place, out, json)
+        return _write(lens, fit, out, json)
 
 
 def _refuse_combinations(
     words: list[str], camera: Path | None, floor: Path | None, points: Path | None
 ) -> None:
-    """Refuse options that do not go together."""
+    """Raise `DataError` where options contradict each other."""
     if bool(words) == (camera is not None):
         raise DataError("expected either pictures of a board, or --camera FILE with a known lens")
     if floor is not None and points is not None:
-        raise DataError("--floor and --points; expected one of them: each tells the whole place")
+        raise DataError("--floor and --points; expected one of them: each gives the whole place")
     if camera is not None and floor is None and points is None:
         raise DataError(f"--camera {camera} alone; expected --floor PICTURE or --points CSV too")
 
 
 def _positive(option: str, value: float | None) -> float:
+    """Return the value of an option; DataError where it is missing or not above 0."""
     if value is None or not 0 < value < math.inf:
-        found = "is missing" if value is None else f"{value:g}"
-        raise DataError(f"{option} {found}; expected a number above 0")
+        problem = "is missing" if value is None else f"{value:g}"
+        raise DataError(f"{option} {problem}; expected a number above 0")
     return value
 
 
 def _board(
     size: str | None, edges: tuple[float | None, float | None], dictionary: str, legacy: bool
 ) -> "Board":
+    """Return the board of the options; `edges` are those of a square and of a marker [m]."""
     from slipid.camera.calibration.board import board_of
 
     if size is None:
         raise DataError("--board is missing; expected squares along x and y, such as 7x5")
-    square, marker = (
-        _positive(option, edge)
-        for option, edge in zip(("--square", "--marker"), edges, strict=True)
-    )
+    square, marker = map(_positive, ("--square", "--marker"), edges)
     return board_of(size, square, marker, dictionary, legacy)
-
-
-def _lens(words: list[str], camera: Path | None, board: "Board | None", k3: bool) -> "LensFound":
-    from slipid.camera.calibration.calibrate import lens_from_file, lens_from_pictures
-
-    if camera is not None:
-        return lens_from_file(camera)
-    assert board is not None  # there are pictures
-    return lens_from_pictures(words, board, k3)
-
-
-def _floor(
-    lens: "LensFound",
-    board: "Board | None",
-    floor: Path | None,
-    board_height: float,
-    points: Path | None,
-    size_std: float,
-) -> "FloorFound | None":
-    from slipid.camera.calibration.calibrate import floor_from_board, floor_from_points
-
-    if points is not None:
-        return floor_from_points(lens, points, size_std)
-    if floor is None or board is None:
-        return None
-    if not 0 <= board_height < math.inf:
-        raise DataError(f"--board-height {board_height:g}; expected a height in metres, 0 or more")
-    return floor_from_board(lens, board, floor, board_height, size_std)
 
 
 def _uncalibrated(
     picture: Path,
-    told: tuple[float | None, float | None, float | None],
+    described: tuple[float | None, float | None, float | None],
     size_std: float | None,
     out: Path,
     json: str | None,
 ) -> int:
-    """A camera straight above the floor, without a calibration."""
-    from slipid.camera.calibration.calibrate import told as camera_told
+    """Write a camera that looks straight down, by metres per pixel, height [m] and turn [deg]."""
+    from slipid.camera.calibration.calibrate import straight_camera
 
-    per_pixel = _positive("--metres-per-pixel", told[0])
-    height, turn = _positive("--lens-height", told[1]), told[2] or 0.0
+    per_pixel = _positive("--metres-per-pixel", described[0])
+    height, turn = _positive("--lens-height", described[1]), described[2] or 0.0
     if not math.isfinite(turn):
         raise DataError(f"--turn {turn:g}; expected an angle in degrees")
-    camera = camera_told(picture, per_pixel, height, turn, size_std)
+    camera = straight_camera(picture, per_pixel, height, turn, size_std)
     camera.save(out)
     emit(json, camera.to_json(), lambda page: _show(page, camera.report), out.parent, [out.name])
     return 0
 
 
-def _write(lens: "LensFound", place: "FloorFound | None", out: Path, json: str | None) -> int:
-    """Write the camera and its pictures, and say what was found."""
-    from slipid.camera.calibration.calibrate import save_lens
+def _write(lens: "CalibratedLens", fit: "FloorFit | None", out: Path, json: str | None) -> int:
+    """Write the camera and its pictures, and print the report."""
     from slipid.plots.calibration import coverage_picture, floor_picture
-    from slipid.support.files import read_json
+    from slipid.support.files import read_json, write_json
 
     files = [out]
-    if place is None:
-        save_lens(lens, out)
-    else:
-        place.camera.save(out)
-    if lens.fit is not None:
-        files.append(coverage_picture(*lens.fit, out.with_name(f"{out.stem}_coverage.png")))
-    if place is not None:
-        files.append(floor_picture(place.fit, out.with_name(f"{out.stem}_floor.png")))
+    write_json(out, lens.to_json() if fit is None else fit.camera.to_json())
+    if lens.quality is not None:
+        files.append(coverage_picture(lens.quality, out.with_name(f"{out.stem}_coverage.png")))
+    if fit is not None:
+        files.append(floor_picture(fit, out.with_name(f"{out.stem}_floor.png")))
     content = read_json(out, "the camera file that was just written")
-    report, fresh = content["report"], lens.fit is not None
+    report, fresh = content["report"], lens.quality is not None
     emit(
         json, content, lambda page: _show(page, report, fresh), out.parent, [f.name for f in files]
     )
     return 1 if report.get("poor") else 0
 
 
-def _show(page: "Page", report: "Content", lens_too: bool = True) -> None:
-    """Print what was found, and what is not as it should be."""
-    from slipid.camera.calibration.report import described
+def _show(page: "Page", report: Content, lens_too: bool = True) -> None:
+    """Print the report of a camera."""
+    from slipid.camera.calibration.report import report_lines
 
-    for line in described(report, lens_too):
+    for line in report_lines(report, lens_too):
         page.line(line)

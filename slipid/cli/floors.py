@@ -1,4 +1,4 @@
-"""`slipid floors`: which floor was under each wheel."""
+"""`slipid floors`: the floor under each wheel in logged runs."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slipid.cli.common import DataFolder, Json, Out, OutFolder, Quiet, emit, for_robots
+from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
     from slipid.report.page import Page
-    from slipid.support.content import Content
 
 
 MOST_BEYOND = 0.05
-"""Part of the rows in which wheels may be beyond the map."""
+"""Part of the rows in which wheels may be beyond the map, for exit code 0."""
 
 
 @for_robots
@@ -32,10 +32,10 @@ def floors(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Which floor was under each wheel in logged runs, and how far its border was.
+    """Find the floor under each wheel in logged runs, and the distance to its border.
 
-    Poses are corrected by the camera of the fit. Writes a CSV file for each run. Exit code 1 where
-    wheels are often beyond the map.
+    Poses are corrected by the camera of the fit. A CSV file is written for each run. The exit code
+    is 1 where wheels are often beyond the map.
     """
     from slipid.app.floors import floors_under, summary, write_floors
     from slipid.support.jax_setup import setup_jax
@@ -49,8 +49,8 @@ def floors(
     return 0 if content["beyond_the_map"] <= MOST_BEYOND else 1
 
 
-def show(page: "Page", content: "Content") -> None:
-    """Print how much of each run every floor was under every wheel."""
+def show(page: "Page", content: Content) -> None:
+    """Print the share of each run in which each floor was under each wheel."""
     from slipid.report.page import table
 
     shares = table(("run", *content["surfaces"]), "percent of the time under wheel 1, 2, ...")

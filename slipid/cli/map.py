@@ -1,4 +1,4 @@
-"""`slipid map`: which surface lies where, from a picture from above."""
+"""`slipid map`: a map of the surfaces of a floor from a picture from above."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +10,7 @@ from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
-    from slipid.camera.floor.found import FoundMap
+    from slipid.camera.floor.result import PictureMap
     from slipid.report.page import Page
 
 PROPOSAL = "palette.toml"
@@ -28,7 +28,7 @@ def map_(
         typer.Option(metavar="FILE", help="Surfaces by colour or by points, region, masks."),
     ] = None,
     surfaces: Annotated[
-        int | None, typer.Option(metavar="N", min=1, max=40, help="How many to propose.")
+        int | None, typer.Option(metavar="N", min=1, max=40, help="Number of surfaces to propose.")
     ] = None,
     cell: Annotated[
         float | None,
@@ -38,73 +38,74 @@ def map_(
         str, typer.Option(metavar="NAME", help="ArUco dictionary of the robot's marker.")
     ] = "4X4_50",
     robot_radius: Annotated[
-        float, typer.Option(metavar="M", min=0, max=10, help="Around the marker; is masked.")
+        float,
+        typer.Option(metavar="M", min=0, max=10, help="Radius of the robot, which is masked."),
     ] = 0.2,
     marker_height: Annotated[
-        float, typer.Option(metavar="M", min=0, max=10, help="Of the marker above the floor.")
+        float,
+        typer.Option(metavar="M", min=0, max=10, help="Height of the marker above the floor."),
     ] = 0.25,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    r"""Map of the floor from one picture from above: patches of surfaces; needs slipid\[camera].
+    r"""Map the surfaces of a floor from one picture from above; needs slipid\[camera].
 
-    Without a config it proposes surfaces and writes a palette.toml to rename them in and to run
-    again with. Writes map.geojson, which every option for a map takes, and a picture to check it.
-    Exit code 1 where the map is poor.
+    Without a config it proposes surfaces and writes a palette.toml, in which to rename them before
+    the next run. It writes map.geojson, which every option for a map takes, and a picture to check
+    it. The exit code is 1 where the map is poor.
     """
-    from slipid.camera.floor.grid import Robot
-    from slipid.camera.floor.picture import Wish, map_of
+    from slipid.camera.floor.grid import RobotShape
+    from slipid.camera.floor.picture import MapOptions, map_of
     from slipid.camera.overhead import OverheadCamera
-    from slipid.plots.bench import floor_plot
+    from slipid.plots.floor import floor_plot
     from slipid.support.files import write_bytes
     from slipid.support.jax_setup import one_blas_thread
 
     one_blas_thread()  # many small matrices
-    robot = Robot(dictionary, robot_radius, marker_height)
+    robot = RobotShape(dictionary, robot_radius, marker_height)
+    options = MapOptions(config, surfaces, robot, cell)
     with Reporter(quiet=quiet) as report:
-        found = map_of(
-            image, OverheadCamera.load(camera), Wish(config, surfaces, robot, cell), report
-        )
-        if found.proposal is not None and (out / PROPOSAL).exists():
+        result = map_of(image, OverheadCamera.load(camera), options, report)
+        if result.proposal is not None and (out / PROPOSAL).exists():
             raise DataError(
                 f"{out / PROPOSAL}: it is there already and may have been edited, and surfaces are "
                 f"to be proposed; expected --config {out / PROPOSAL} with surfaces in it, or "
                 "another folder"
             )
-        found.vector.save(out / "map.geojson")
-        floor_plot(found.vector, found.floor.colour, found.floor.seen, out / "map.png")
+        result.vector.save(out / "map.geojson")
+        floor_plot(result.vector, result.floor.colour, result.floor.in_view, out / "map.png")
         written = ["map.geojson", "map.png"]
-        if found.proposal is not None:
-            write_bytes(out / PROPOSAL, found.proposal.encode())
+        if result.proposal is not None:
+            write_bytes(out / PROPOSAL, result.proposal.encode())
             written.append(PROPOSAL)
-    emit(json, found.to_json(), lambda page: show(page, found, out), out, written)
-    return 1 if found.poor else 0
+    emit(json, result.to_json(), lambda page: show(page, result, out), out, written)
+    return 1 if result.poor else 0
 
 
-def show(page: "Page", found: "FoundMap", out: Path) -> None:
-    """Print the surfaces, what is doubtful, and what to do next."""
+def show(page: "Page", result: "PictureMap", out: Path) -> None:
+    """Print the surfaces, warnings, and what to do next."""
     from slipid.report.page import table
 
-    content = found.to_json()
+    content = result.to_json()
     columns = ("surface", "colour", "patches", "area [m^2]", "share", "confidence")
     rows = table(columns, right=columns[2:])
     for one in content["surfaces"]:
-        sure = "" if one["confidence"] is None else f"{one['confidence']:.1f}"
+        confidence = "" if one["confidence"] is None else f"{one['confidence']:.1f}"
         share, area = f"{100 * one['share']:.1f} %", f"{one['area_m2']:.3f}"
-        rows.add_row(one["surface"], one["colour"], str(one["patches"]), area, share, sure)
+        rows.add_row(one["surface"], one["colour"], str(one["patches"]), area, share, confidence)
     page.table(rows)
     page.line(
-        "confidence: by how many spreads the next best surface explains the least sure patch worse"
+        "confidence: how much worse, in spreads, the next best surface explains the weakest patch"
     )
-    for robot in found.robots:
+    for robot in result.robots:
         page.line(
             f"robot with marker {robot.marker} masked at x {robot.x:.2f} m, y {robot.y:.2f} m"
         )
     page.notes(content["notes"])
-    for sentence in found.warnings:
+    for sentence in result.warnings:
         page.line(f"warning: {sentence}")
-    for sentence in found.poor:
+    for sentence in result.poor:
         page.line(f"poor: {sentence}")
-    if found.proposal is not None:
+    if result.proposal is not None:
         page.line(f"surfaces are proposed: rename or join them in {out / PROPOSAL}, then add")
         page.line(f"  --config {out / PROPOSAL}")

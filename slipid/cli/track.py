@@ -10,7 +10,7 @@ from slipid.cli.common import Json, Quiet, emit, guarded
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
-    from slipid.camera.tracking.finder import Region
+    from slipid.camera.tracking.detector import Region
     from slipid.report.page import Page
 
 
@@ -30,10 +30,11 @@ def track(
         float | None, typer.Option(metavar="M", help="Edge of the marker's black square, in m.")
     ] = None,
     marker_height: Annotated[
-        float | None, typer.Option(metavar="M", help="Of the marker above the floor, in m.")
+        float | None, typer.Option(metavar="M", help="Height of the marker above the floor, in m.")
     ] = None,
     marker_yaw: Annotated[
-        float, typer.Option(metavar="DEG", help="Of its top edge, counter-clockwise from ahead.")
+        float,
+        typer.Option(metavar="DEG", help="Angle of its top edge, counter-clockwise from ahead."),
     ] = 0.0,
     dictionary: Annotated[
         str, typer.Option(metavar="NAME", help="Dictionary of the marker.")
@@ -55,23 +56,25 @@ def track(
         str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="Only this part, in pixels.")
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(metavar="S", help="How long to watch a device; it needs this.")
+        float | None,
+        typer.Option(metavar="S", help="Duration of a recording from a device, which needs it."),
     ] = None,
     preview: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also draw one frame, to check by eye.")
     ] = None,
     preview_frame: Annotated[
-        int | None, typer.Option(metavar="N", min=0, help="Which; by default the first seen.")
+        int | None,
+        typer.Option(metavar="N", min=0, help="Which frame; by default the first with a pose."),
     ] = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Poses of a robot with a marker, from the video of a calibrated camera above it.
+    """Track a robot with a marker in the video of a calibrated camera above it.
 
-    Every frame has a row with pose and covariance, or with the reason why it has none; nothing is
-    filled. Exit code 1 where the poses should not be used as they are.
+    Every frame has a row with pose and covariance, or with the reason why it was rejected; nothing
+    is interpolated. The exit code is 1 where the poses should not be used as they are.
     """
-    from slipid.camera.frames.source import open_source
+    from slipid.camera.frame_source import open_source
     from slipid.camera.overhead import OverheadCamera
     from slipid.camera.tracking import tracking
     from slipid.camera.tracking.target import read_targets
@@ -81,8 +84,8 @@ def track(
     with Reporter(quiet=quiet) as report:
         part = _region(region)
         frames = open_source(source, fps, times, seconds)
-        tracking.before_long_work(frames, out, preview)
-        above.of_size(frames.image_px, frames.name)
+        tracking.check_outputs(frames, out, preview)
+        above.lens.check_size(frames.image_px, frames.name)
         if targets is not None:
             bodies = read_targets(targets)
         elif marker_size is None or marker_height is None:
@@ -96,24 +99,24 @@ def track(
             lone = tracking.LoneMarker(marker_size, marker_height, id, dictionary, yaw)
             bodies = (lone.target(frames, part),)
         unfinished = out.with_name(f".{out.name}.unfinished")
-        done = tracking.track(frames, above, bodies, unfinished, report, part)
-        written = [path.name for path in done.write(out)]
+        result = tracking.track(frames, above, bodies, unfinished, report, part)
+        written = [path.name for path in result.write(out)]
         if preview is not None:
-            number = tracking.preview(preview, done, above, preview_frame)
+            number = tracking.preview(preview, result, above, preview_frame)
             report.line(f"frame {number} is drawn in {preview}")
 
     def show(page: "Page") -> None:
-        page.notes(done.notes)
-        for doubt in done.doubts:
+        page.notes(result.notes)
+        for doubt in result.doubts:
             page.line(f"DOUBTFUL: {doubt}")
 
-    emit(json, done.to_json(), show, out.parent, written)
-    return 1 if done.doubts else 0
+    emit(json, result.to_json(), show, out.parent, written)
+    return 1 if result.doubts else 0
 
 
 def _region(text: str | None) -> "Region | None":
-    """A part of the picture from four numbers; DataError where they are none."""
-    from slipid.camera.tracking.finder import Region
+    """Return a region of the picture from four numbers; DataError where they are not such."""
+    from slipid.camera.tracking.detector import Region
     from slipid.support.errors import DataError
 
     if text is None:

@@ -1,13 +1,10 @@
-"""`slipid validate`: open-loop prediction of runs."""
+"""`slipid validate`: predict runs open loop."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from slipid.cli.common import DataFolder, Json, OutFolder, Quiet, emit, for_robots
+from slipid.support.content import Content
 from slipid.support.progress import Reporter
-
-if TYPE_CHECKING:
-    from slipid.support.content import Content
 
 
 @for_robots
@@ -21,8 +18,8 @@ def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet =
     return 0
 
 
-def run(out: Path, data: Path, report: Reporter) -> "Content":
-    """Content of the validation file, and pictures; arguments as of `job.validate.validate`."""
+def run(out: Path, data: Path, report: Reporter) -> Content:
+    """Write pictures and return the validation file; as in `slipid.app.compare.validate`."""
     from slipid.app.compare import validate
     from slipid.plots.fit import validate_plots
 

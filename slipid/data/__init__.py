@@ -1,1 +1,1 @@
-"""Recorded runs: readers, signals, windows, floor maps."""
+"""Runs: readers of logs, signals, windows and floor maps."""

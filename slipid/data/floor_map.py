@@ -1,4 +1,4 @@
-"""Floor maps: which surface lies where, from polygons, a picture or a file, or drawn at random."""
+"""Floor maps: the surface at every place, from polygons, a picture or a file, or random."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
 SCHEMA = "slipid.map/1"
 Point = tuple[FiniteFloat, FiniteFloat]
-"""x, y [m]."""
+"""Coordinates x, y [m]."""
 Colour = Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]
 MOST_CELLS = 16_000_000
 """Largest number of cells of one map."""
@@ -24,13 +24,13 @@ MOST_CELLS = 16_000_000
 
 @dataclass(frozen=True, eq=False)
 class FloorMap:
-    """A floor in square cells, each with one surface.
+    """A floor of square cells with one surface each.
 
     Attributes:
-        surfaces: names; `cells` counts them from 0.
+        surfaces: names of the surfaces; `cells` numbers them from 0.
         cells: surface of each cell, the first row at the lowest y.
         corner: x, y of the corner with the lowest coordinates [m].
-        cell: edge of a cell [m].
+        cell: edge length of a cell [m].
     """
 
     surfaces: tuple[str, ...]
@@ -40,13 +40,13 @@ class FloorMap:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Lowest x, lowest y, highest x, highest y [m]."""
+        """Return lowest x, lowest y, highest x and highest y [m]."""
         rows, columns = self.cells.shape
         x, y = self.corner
         return x, y, x + columns * self.cell, y + rows * self.cell
 
     def at(self, xy: Float[np.ndarray, "*batch 2"]) -> Int[np.ndarray, "*batch"]:
-        """Surface at places [m], by number; beyond the edge that of the nearest cell."""
+        """Return the number of the surface at places [m]; outside the map that of its edge."""
         steps = np.floor((np.asarray(xy) - self.corner) / self.cell).astype(np.intp)
         rows, columns = self.cells.shape
         row, column = steps[..., 1].clip(0, rows - 1), steps[..., 0].clip(0, columns - 1)
@@ -54,7 +54,7 @@ class FloorMap:
 
 
 def uniform(surface: str, half: float = 2.0) -> FloorMap:
-    """One surface everywhere."""
+    """Return a map with one surface everywhere."""
     return FloorMap((surface,), np.zeros((1, 1), np.intp), (-half, -half), 2 * half)
 
 
@@ -64,12 +64,12 @@ def from_polygons(
     extent: tuple[float, float, float, float],
     cell: float = 0.005,
 ) -> FloorMap:
-    """Map from patches on a base, later ones on top of earlier ones.
+    """Return the map of patches on a base surface, later patches on top of earlier ones.
 
     Args:
         patches: surface and corners (x, y) [m] of each.
         extent: lowest x, lowest y, highest x, highest y [m].
-        cell: edge of a cell [m].
+        cell: edge length of a cell [m].
 
     Raises:
         ValueError: more than `MOST_CELLS` cells.
@@ -91,13 +91,15 @@ def from_polygons(
 def patchwork(
     surfaces: Sequence[str], seed: int, patch: float = 0.25, half: float = 1.2, cell: float = 0.005
 ) -> FloorMap:
-    """Random site of patches, by default smaller than a Robotino: cells of a jittered grid.
+    """Return a random floor whose patches are cells of a jittered grid.
+
+    By default the patches are smaller than a Robotino.
 
     Args:
         seed: seed of the jitter and of the choice of surfaces.
-        patch: mean distance of neighbouring patches [m].
-        half: half of the site's edge [m].
-        cell: edge of a cell [m].
+        patch: mean distance between neighbouring patches [m].
+        half: half of the floor's edge length [m].
+        cell: edge length of a cell [m].
 
     Raises:
         ValueError: too many cells or patches.
@@ -112,20 +114,20 @@ def patchwork(
     grid = (np.arange(count) - 0.5 * (count - 1)) * patch
     seeds = np.stack(np.meshgrid(grid, grid), -1).reshape(-1, 2)
     seeds = seeds + rng.uniform(-0.35, 0.35, seeds.shape) * patch
-    own = rng.integers(len(surfaces), size=len(seeds))
+    surface = rng.integers(len(surfaces), size=len(seeds))
     x = np.arange(-half + 0.5 * cell, half, cell)
     centres = np.stack(np.meshgrid(x, x), -1)
-    cells = own[KDTree(seeds).query(centres)[1]]
+    cells = surface[KDTree(seeds).query(centres)[1]]
     return FloorMap(tuple(surfaces), cells, (-half, -half), cell)
 
 
 def four_zones(surfaces: Sequence[str], middle: tuple[float, float] = (0.45, -0.2)) -> FloorMap:
-    """Four surfaces that meet in a point, by default the middle of the paper's rectangle.
+    """Return four surfaces that meet in a point, by default the centre of the paper's rectangle.
 
     Args:
-        surfaces: of the quarters with low x and high y, high x and high y, high x and low y, and
-            of the rest.
-        middle: x, y [m]; every zone reaches 1.2 m from there.
+        surfaces: surfaces of the quarters with low x and high y, high x and high y, high x and low
+            y, and low x and low y.
+        middle: the point x, y [m]; every zone reaches 1.2 m from there.
     """
     reach, cell = 1.2, 0.005
     names = tuple(dict.fromkeys(surfaces))
@@ -136,19 +138,23 @@ def four_zones(surfaces: Sequence[str], middle: tuple[float, float] = (0.45, -0.
 
 
 def _few(cells: int) -> None:
+    """Raise `ValueError` if a map would have more than `MOST_CELLS` cells."""
     if cells > MOST_CELLS:
         raise ValueError(f"{cells} cells; expected at most {MOST_CELLS}: a larger cell, less floor")
 
 
 class Patch(Section):
-    """Where a surface covers the base."""
+    """Table of a map file: one surface on top of the base."""
 
     surface: str
     polygon: list[Point] = Field(min_length=3)
 
 
 class Patched(Section):
-    """Patches on a base, later ones on top; `extent_m` is lowest x, y, then highest x, y."""
+    """Map file of patches on a base, later ones on top.
+
+    `extent_m` is lowest x, lowest y, highest x, highest y.
+    """
 
     schema_: Literal["slipid.map/1"] = Field(alias="schema")
     base: str
@@ -158,7 +164,7 @@ class Patched(Section):
 
 
 class Pictured(Section):
-    """A picture seen from above, its lower left corner at `corner_m`."""
+    """Map file with a picture seen from above, whose lower left corner is at `corner_m`."""
 
     schema_: Literal["slipid.map/1"] = Field(alias="schema")
     picture: str
@@ -168,7 +174,7 @@ class Pictured(Section):
 
 
 def read_map(path: Path) -> FloorMap:
-    """Map from a file: TOML or, by its suffix `.geojson`, what `slipid map` wrote.
+    """Return the map in a file: TOML or, with the suffix `.geojson`, a map written by `slipid map`.
 
     TOML has `base`, `extent_m` and `[[patch]]`, or `picture` and `[colours]`.
 
@@ -198,9 +204,9 @@ def read_map(path: Path) -> FloorMap:
 
 
 def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
-    """Write a map as a TOML file and a picture of its name beside it.
+    """Write a map as a TOML file and a picture with the same stem beside it.
 
-    `colours` are those of the surfaces as `#rrggbb`, no two alike.
+    `colours` has a different colour `#rrggbb` for each surface.
     """
     from matplotlib.colors import to_rgb
     from matplotlib.image import imsave
@@ -224,7 +230,7 @@ def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
 
 
 def _pictured(path: Path, given: Pictured) -> FloorMap:
-    """Map of a picture: each pixel has the surface of the nearest colour."""
+    """Return the map of a picture: each pixel has the surface of the nearest colour."""
     from matplotlib.colors import to_rgb
     from matplotlib.image import imread
 
@@ -239,6 +245,6 @@ def _pictured(path: Path, given: Pictured) -> FloorMap:
         raise DataError(f"{path}: picture {source}: expected at most {MOST_CELLS} pixels")
     picture = picture[..., :3] if picture.max() <= 1 else picture[..., :3] / 255
     wanted = np.array([to_rgb(colour) for colour in given.colours.values()])
-    far = np.linalg.norm(picture[:, :, None, :] - wanted, axis=-1)
-    cells = np.argmin(far, axis=-1)[::-1].copy()
+    distance = np.linalg.norm(picture[:, :, None, :] - wanted, axis=-1)
+    cells = np.argmin(distance, axis=-1)[::-1].copy()
     return FloorMap(tuple(given.colours), cells, given.corner_m, given.metres_per_pixel)

@@ -1,6 +1,6 @@
 """Floor maps as polygons in a GeoJSON file, in metres of the floor instead of degrees.
 
-Cells in no polygon are not known: read as a floor map they have the nearest surface.
+Cells in no polygon are unknown; when read as a floor map they get the nearest surface.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from slipid.support.toml_file import Section, checked
 SCHEMA = "slipid.map/2"
 WHAT = "a floor map (slipid.map/2) that `slipid map` wrote"
 DIGITS = 5
-"""Of coordinates after the point: a hundredth of a millimetre."""
+"""Decimal places of coordinates: a hundredth of a millimetre."""
 Place = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
 Ring = Annotated[list[Place], Field(min_length=4)]
 
@@ -30,11 +30,12 @@ class Patch:
     """A connected patch of one surface.
 
     Attributes:
-        rings: corners [m], the first around it, others around holes; the last corner is not the
-            first again.
-        area: less its holes [m^2].
-        confidence: how much worse the next best surface explains its look, in spreads of the
-            looks of one surface; None where there is no other.
+        surface: name of its surface.
+        rings: corners [m], the outer ring first, then rings around holes; the last corner does not
+            repeat the first.
+        area: area without holes [m^2].
+        confidence: distance of the next best surface in the look of the patch, in spreads of the
+            looks of one surface; None where there is no other surface.
     """
 
     surface: str
@@ -45,16 +46,17 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class VectorMap:
-    """Patches of surfaces on a part of the floor.
+    """Patches of surfaces on a region of the floor.
 
     Attributes:
-        colours: of the surfaces, `#rrggbb`, in the order of the floor map.
-        low_x, low_y, high_x, high_y: the part of the floor [m].
-        cell: edge of the cells they were found in [m].
-        base: the surface of most of the floor.
-        picture_sha256: of the file that shows it.
-        unknown: share of the part that no patch covers.
-        notes: what a reader must know.
+        patches: the patches.
+        colours: colour `#rrggbb` of each surface, in the order of the floor map.
+        low_x, low_y, high_x, high_y: bounds of the region [m].
+        cell: edge length of the cells in which patches were detected [m].
+        base: the surface that covers most of the floor.
+        picture_sha256: hash of the file with the picture.
+        unknown: share of the region that no patch covers.
+        notes: remarks for the reader.
     """
 
     patches: tuple[Patch, ...]
@@ -70,11 +72,11 @@ class VectorMap:
     notes: tuple[str, ...]
 
     def save(self, path: Path) -> None:
-        """Write the map; DataError where nothing can be written."""
+        """Write the map; raise `DataError` where the file cannot be written."""
         write_json(path, self.to_json())
 
     def to_json(self) -> Content:
-        """A FeatureCollection, with what is no feature under `slipid`."""
+        """Return a FeatureCollection, with all other data under the key `slipid`."""
         about = {
             "schema": SCHEMA,
             "extent_m": [round(v, DIGITS) for v in self._corners()],
@@ -135,7 +137,7 @@ class _About(Section):
 
 
 class _File(Section):
-    """The file as it stands."""
+    """A GeoJSON map file."""
 
     type: Literal["FeatureCollection"]
     slipid: _About
@@ -143,10 +145,10 @@ class _File(Section):
 
 
 def read_vector_map(path: Path) -> VectorMap:
-    """The polygons of a GeoJSON file.
+    """Return the polygons of a GeoJSON file.
 
     Raises:
-        DataError: absent, no such map, or a map that is none.
+        DataError: the file is absent, is no such map, or has wrong values.
     """
     given = checked(path, read_json(path, WHAT), _File)
     about = given.slipid
@@ -155,9 +157,9 @@ def read_vector_map(path: Path) -> VectorMap:
         raise DataError(
             f"{path}: extent_m {about.extent_m}; expected lowest x, y, then highest x, y"
         )
-    lost = {f.properties.surface for f in given.features} | {about.base}
-    if strange := sorted(lost - set(about.colours)):
-        raise DataError(f"{path}: no colour of {', '.join(strange)}; expected it in slipid.colours")
+    surfaces = {f.properties.surface for f in given.features} | {about.base}
+    if missing := sorted(surfaces - set(about.colours)):
+        raise DataError(f"{path}: no colour of {', '.join(missing)}; expected it in slipid.colours")
     patches = tuple(
         Patch(
             feature.properties.surface,
@@ -179,38 +181,38 @@ def read_vector_map(path: Path) -> VectorMap:
     )
 
 
-def in_cells(path: Path, found: VectorMap) -> FloorMap:
-    """The map in cells, of the nearest surface where none is known.
+def in_cells(path: Path, vector_map: VectorMap) -> FloorMap:
+    """Return the map in cells; unknown cells have the nearest surface.
 
     Raises:
-        DataError: too many cells, or a map whose patches cover none.
+        DataError: too many cells, or patches that cover none of them.
     """
     from scipy.ndimage import distance_transform_edt
 
-    rows = max(1, round((found.high_y - found.low_y) / found.cell))
-    columns = max(1, round((found.high_x - found.low_x) / found.cell))
+    rows = max(1, round((vector_map.high_y - vector_map.low_y) / vector_map.cell))
+    columns = max(1, round((vector_map.high_x - vector_map.low_x) / vector_map.cell))
     if rows * columns > MOST_CELLS:
         raise DataError(f"{path}: {rows * columns} cells; expected at most {MOST_CELLS}")
-    names = tuple(found.colours)
-    corner = (found.low_x, found.low_y)
+    names = tuple(vector_map.colours)
+    corner = (vector_map.low_x, vector_map.low_y)
     cells = np.full((rows, columns), -1, np.intp)
-    for patch in found.patches:
-        rings = [(ring - corner) / found.cell for ring in patch.rings]
+    for patch in vector_map.patches:
+        rings = [(ring - corner) / vector_map.cell for ring in patch.rings]
         cells[covered(rings, rows, columns)] = names.index(patch.surface)
     if (cells < 0).all():
         raise DataError(f"{path}: no polygon lies within extent_m; expected coordinates in metres")
     if (cells < 0).any():
         near = distance_transform_edt(cells < 0, return_distances=False, return_indices=True)
         cells = cells[near[0], near[1]]
-    return FloorMap(names, cells, corner, found.cell)
+    return FloorMap(names, cells, corner, vector_map.cell)
 
 
 def covered(
     rings: list[Float[np.ndarray, "_ 2"]], rows: int, columns: int
 ) -> Bool[np.ndarray, "row column"]:
-    """Cells whose middle lies within an odd number of rings of columns and rows.
+    """Return cells whose centre lies within an odd number of rings, in units of columns and rows.
 
-    In each row every edge turns the cells to its right from outside to inside or back.
+    In each row every edge flips the cells to its right between outside and inside.
     """
     turns = np.zeros((rows, columns + 1), np.intp)
     for ring in rings:
@@ -223,7 +225,7 @@ def covered(
 
 
 def _rows_between(y: float, y2: float, rows: int) -> Int[np.ndarray, " row"]:
-    """Rows whose middle lies between two heights, the lower one included."""
+    """Return the rows whose centre lies between two heights, the lower one included."""
     low, high = sorted((y, y2))
     first, last = np.clip([np.ceil(low - 0.5), np.ceil(high - 0.5)], 0, rows)
     return np.arange(int(first), int(last))

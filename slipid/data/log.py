@@ -1,4 +1,4 @@
-"""One recorded run as a frozen value: SI units, REP-103 axes, named arrays."""
+"""A log: one recorded run as a frozen value with SI units, REP-103 axes and named arrays."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,37 +11,39 @@ from slipid.data.align.clock import Clock
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Log:
-    """One run, every array at `time`, at which some sensor was read.
+    """One run, with every array at the times `time` at which some sensor was read.
 
-    What is of a wheel is of a drive, where several wheels share a motor.
+    A wheel stands for a drive where several wheels share a motor.
 
     Attributes:
         name: path relative to the data root, with forward slashes; `#03` follows where one file
             holds several runs.
         path: the file.
         sha256: hash of the file's bytes.
-        time: [s], strictly increasing; from the first row on where a clock counts from 1970.
-        wheel_angle: [rad] at the wheel, cumulative from the first row, and even between two
-            readings; no columns where a log has
-            only poses.
-        wheel_speed: [rad/s] at the wheel as the robot reported it, or None.
-        wheel_speed_command: [rad/s] at the wheel, or None.
-        twist_command: x [m/s], y [m/s], yaw rate [rad/s], or None.
-        current: [A], or None.
-        current_fresh: False where a current repeats what was read before (or was not read); None
-            where it was read in every row.
+        time: time [s], strictly increasing; relative to the first row where a clock counts from
+            1970.
+        wheel_angle: angle of each wheel [rad], cumulative from the first row and linear between two
+            readings; no columns where a log has only poses.
+        wheel_speed: reported speed of each wheel [rad/s], or None.
+        wheel_speed_command: commanded speed of each wheel [rad/s], or None.
+        twist_command: commanded x [m/s], y [m/s] and yaw rate [rad/s], or None.
+        current: current of each motor [A], or None.
+        current_fresh: False where a current repeats the last reading; None where it was read in
+            every row.
         current_is_signed: False where the log has magnitudes only.
-        voltage: [V] across each motor, or None; `voltage_fresh` as of the current.
-        duty: [1] of each motor's bridge, or None.
-        bus_voltage: [V], or None.
+        voltage: voltage across each motor [V], or None.
+        voltage_fresh: False where a voltage repeats the last reading; None where it was read in
+            every row.
+        duty: duty cycle of each motor's bridge [1], or None.
+        bus_voltage: supply voltage [V], or None.
         gyro: yaw rate [rad/s], or None.
-        pose: x [m], y [m], heading [rad] without wrap-around, in the scale of the logged camera,
-            or None.
+        pose: x [m], y [m], heading [rad] without wrap-around, in the scale of the camera's log, or
+            None.
         pose_fresh: False where the row repeats the last pose.
-        pose_clock: the clock of poses that had one of their own, as it was found from the motion.
+        pose_clock: clock of poses with times of their own, estimated from the motion, or None.
         surface: name of the floor, None where it is unknown.
         load: name of the load set-up.
-        notes: what the reader repaired, one sentence each.
+        notes: repairs made by the reader, one sentence each.
     """
 
     name: str
@@ -69,21 +71,21 @@ class Log:
 
     @property
     def samples(self) -> int:
-        """Number of rows."""
+        """Return the number of rows."""
         return len(self.time)
 
     @property
     def wheels(self) -> int:
-        """Number of wheels, 0 where only poses were logged."""
+        """Return the number of wheels, 0 where only poses were logged."""
         return self.wheel_angle.shape[1]
 
     @property
     def duration(self) -> float:
-        """Time from the first to the last row [s]."""
+        """Return the time from the first to the last row [s]."""
         return float(self.time[-1] - self.time[0])
 
     def __repr__(self) -> str:
-        """Name, size and what was measured, on one line."""
+        """Return name, size and measured channels on one line."""
         names = ("wheel_speed", "current", "voltage", "duty", "bus_voltage", "gyro", "pose")
         has = [name for name in names if getattr(self, name) is not None]
         return (

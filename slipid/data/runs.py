@@ -1,4 +1,4 @@
-"""Many ragged runs as one set of flat arrays."""
+"""Runs of different lengths as one set of flat arrays."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ class Runs:
     Attributes:
         logs: the runs; their arrays are views of the flat ones below, except for raw wheel angles
             where a stall was bridged.
-        offset: sample at which each run starts, and the end of the last.
+        offset: index of the first sample of each run, and the end of the last.
         time: time within the run [s] (sample,).
         wheel_angle: angle of each wheel [rad] (sample, wheel), stalls of the telemetry bridged.
         pose: x [m], y [m], heading [rad], in the scale of the log.
@@ -33,14 +33,14 @@ class Runs:
         live: False in the rows of a stall, whose currents are stale.
         current: motor currents [A], or None.
         voltage: motor voltages [V], or None.
-        current_fresh, voltage_fresh: False where a reading repeats what was read before (sample,
-            wheel); None where none does.
+        current_fresh: False where a current repeats the last reading (sample, wheel), or None.
+        voltage_fresh: False where a voltage repeats the last reading (sample, wheel), or None.
         current_is_signed: False where some log has magnitudes only.
-        session: name of the time in which the marker stayed as it was, for each run.
-        heading: direction of travel that was commanded, for each run [rad]; nan where it turns.
+        session: name of each run's session, in which the marker stayed in place.
+        heading: commanded direction of travel of each run [rad]; nan where it turns on the spot.
         speed: commanded speed of each run [m/s]; nan where no command was logged.
         turn: commanded yaw rate of each run [rad/s]; nan where no command was logged.
-        aside: a line for every run that was read and is not here, because its pose jumps.
+        aside: a line for every run that is left out because its pose jumps.
     """
 
     logs: tuple[Log, ...]
@@ -65,16 +65,16 @@ class Runs:
         return len(self.logs)
 
     def rows(self, run: int) -> slice:
-        """Samples of one run in the flat arrays."""
+        """Return the samples of one run in the flat arrays."""
         return slice(int(self.offset[run]), int(self.offset[run + 1]))
 
     def subset(self, keep: Iterable[int] | np.ndarray) -> "Runs":
-        """Some of the runs, in the order given."""
+        """Return some of the runs, in the order given."""
         index = [int(k) for k in keep]
         return collect([self.logs[i] for i in index], [self.session[i] for i in index])
 
     def __add__(self, other: "Runs") -> "Runs":
-        """Runs of both; DataError where a run is in both, or they do not go together."""
+        """Return the runs of both sets; raise `DataError` where they overlap or do not match."""
         if both := {log.name for log in self.logs} & {log.name for log in other.logs}:
             raise DataError(f"{min(both)}: in both sets of runs; expected it once")
         aside = [*self.aside, *other.aside]
@@ -84,11 +84,11 @@ class Runs:
 def collect(
     logs: Sequence[Log], session: Sequence[str] | None = None, aside: Sequence[str] = ()
 ) -> Runs:
-    """One set of runs that all have wheels and poses.
+    """Return one set of runs that all have wheels and poses.
 
     Args:
-        session: of each run, the time in which the marker stayed as it was; by default surface,
-            load and commanded speed, which is how test grids are driven.
+        session: session of each run, in which the marker stayed in place; by default surface, load
+            set-up and commanded speed, which is how test grids are driven.
         aside: a line for every run that is left out because its pose jumps.
 
     Raises:
@@ -122,10 +122,10 @@ def collect(
         """The run with its arrays in the flat ones; a bridged one keeps its raw wheel angle."""
         raw = bridged[k][0] is not log.wheel_angle
         rows = slice(int(offset[k]), int(offset[k + 1]))
-        mine: dict[str, Any] = {
+        views: dict[str, Any] = {
             n: a[rows] for n, a in flat.items() if not (raw and n == "wheel_angle")
         }
-        return replace(log, **mine)
+        return replace(log, **views)
 
     return Runs(
         logs=tuple(view(k, log) for k, log in enumerate(logs)),
@@ -149,7 +149,7 @@ def collect(
 
 
 def _fresh(logs: Sequence[Log], channel: str) -> Bool[np.ndarray, "sample wheel"] | None:
-    """Where a channel was read anew, of all runs; None where it always was."""
+    """Return whether a channel was read anew in each row of all runs; None where it always was."""
     each = [getattr(log, f"{channel}_fresh") for log in logs]
     if all(fresh is None for fresh in each):
         return None
@@ -160,11 +160,11 @@ def _fresh(logs: Sequence[Log], channel: str) -> Bool[np.ndarray, "sample wheel"
 
 
 def counted_once(logs: Sequence[Log]) -> list[Log]:
-    """The logs, with readings of currents marked that only repeat the one before.
+    """Return the logs with `current_fresh` False where a current only repeats the last reading.
 
-    How often an ammeter is read is told by all runs together: one that is read once a second
-    changes six times in six seconds. Voltages are not looked at: those that a bench or a program
-    sets stay as they are until the next step.
+    The refresh period of an ammeter is estimated from all runs together: one that is read once a
+    second changes six times in six seconds. Voltages are not checked: those that a bench or a
+    program sets stay constant until the next step.
     """
     have = [k for k, log in enumerate(logs) if log.current is not None]
     wheels = max((logs[k].wheels for k in have), default=0)
@@ -182,8 +182,8 @@ def counted_once(logs: Sequence[Log]) -> list[Log]:
         for wheel, period in periods.items():
             one = _read(out[k], wheel)
             fresh[one.rows, wheel] &= read_anew(one.time, one.amps, period)
-        said = ", ".join(sorted({f"{p:.2g}" for p in periods.values()}))
-        note = f"current is read anew every {said} s: between, it repeats and is not counted"
+        listed = ", ".join(sorted({f"{p:.2g}" for p in periods.values()}))
+        note = f"current is read anew every {listed} s: between, it repeats and is not counted"
         out[k] = replace(out[k], current_fresh=fresh, notes=(*out[k].notes, note))
     return out
 
@@ -197,6 +197,7 @@ class _Readings(NamedTuple):
 
 
 def _read(log: Log, wheel: int) -> _Readings:
+    """Return the readings of one ammeter."""
     assert log.current is not None
     fresh = log.current_fresh
     rows = np.arange(log.samples) if fresh is None else np.flatnonzero(fresh[:, wheel])
@@ -204,16 +205,16 @@ def _read(log: Log, wheel: int) -> _Readings:
 
 
 def default_session(log: Log) -> str:
-    """`surface/load/speed`, the speed to 0.01 m/s and left out where nothing was commanded."""
+    """Return `surface/load/speed`, the speed to 0.01 m/s and absent if nothing was commanded."""
     _, speed, _ = _command(log)
     parts = [log.surface or "unknown", log.load] + ([f"{speed:.2f}"] if np.isfinite(speed) else [])
     return "/".join(parts)
 
 
 def _command(log: Log) -> tuple[float, float, float]:
-    """Heading [rad], speed [m/s] and yaw rate [rad/s] of the median command; nan if unknown.
+    """Return heading [rad], speed [m/s] and yaw rate [rad/s] of the median command; nan if unknown.
 
-    It has no heading where the robot is to turn on the spot.
+    The heading is nan where the robot turns on the spot.
     """
     if log.twist_command is None:
         return np.nan, np.nan, np.nan
@@ -223,7 +224,7 @@ def _command(log: Log) -> tuple[float, float, float]:
 
 
 def first_row(data: Runs, run: int, wheel_radius: float) -> int:
-    """Row in which the fastest wheel's rim has moved `MOVED`; DataError if it never does."""
+    """Return the row in which the fastest rim has moved `MOVED`; raise `DataError` if none has."""
     first = first_moved(data.wheel_angle[data.rows(run)], wheel_radius)
     if first is None:
         raise DataError(

@@ -1,4 +1,4 @@
-"""Signals of one run: steps of motion, stalls of the telemetry, the start, swapped wheels."""
+"""Signals of one run: increments of motion, telemetry stalls, first motion, swapped wheels."""
 
 from collections.abc import Iterable
 from itertools import permutations
@@ -7,17 +7,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 MOVED = 0.010
-"""A run counts from where the fastest wheel's rim has moved this far [m]."""
+"""A run starts where the fastest wheel's rim has moved this distance [m]."""
 STALLED = 3
-"""Steps without change from which a stretch can be a stall."""
+"""Least number of steps without change in a stall."""
 DOUBT = 0.05
-"""Relative misfit from which the declared order is doubted; speed loops keep below it."""
+"""Relative misfit of the declared order above which other orders are tried; errors of speed loops
+stay below it."""
 LEAST_CHANGES = 8
-"""Changes of a value from which on its sensor's own period can be told."""
+"""Least number of changes of a value from which its sensor's refresh period is estimated."""
 LEAST_IN_A_RUN = 3
-"""The same, of a run on average."""
+"""Least mean number of changes in a run."""
 BETTER = 0.25
-"""Another order must have less than this share of the declared one's misfit to be believed."""
+"""Another order must have less than this share of the declared one's misfit."""
 
 
 def interpolate(
@@ -25,9 +26,9 @@ def interpolate(
     values: Float[np.ndarray, "time column"],
     at: Float[np.ndarray, " at"],
 ) -> Float[np.ndarray, "at column"]:
-    """Columns at other times [s], linear in between, constant beyond both ends.
+    """Return columns at other times [s], linear in between and constant beyond both ends.
 
-    Angles have to be without wrap-around.
+    Angles must be without wrap-around.
     """
     return np.stack([np.interp(at, time, column) for column in values.T], axis=-1)
 
@@ -35,7 +36,7 @@ def interpolate(
 def integral(
     time: Float[np.ndarray, " time"], rate: Float[np.ndarray, "time column"]
 ) -> Float[np.ndarray, "time column"]:
-    """Integral of each column from the first row on, by trapezoids; the first row is 0."""
+    """Return the integral of each column from the first row on by trapezoids; it starts at 0."""
     areas = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None]
     return np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(areas, axis=0)])
 
@@ -43,9 +44,9 @@ def integral(
 def readings(
     time: Float[np.ndarray, " time"], values: Float[np.ndarray, " time"]
 ) -> Bool[np.ndarray, " time"]:
-    """Rows in which a sensor that may be slower than the rows was read anew.
+    """Return whether a sensor that may be slower than the rows was read anew, for each row.
 
-    All of them where the value also changes from row to row, or hardly ever.
+    It is True everywhere where the value changes in neighbouring rows, or hardly ever.
     """
     period = refresh_period([(time, values)])
     return np.ones(len(time), bool) if period is None else read_anew(time, values, period)
@@ -54,11 +55,11 @@ def readings(
 def refresh_period(
     runs: Iterable[tuple[Float[np.ndarray, " time"], Float[np.ndarray, " time"]]],
 ) -> float | None:
-    """Period of a sensor that is slower than the rows it is logged in [s]; None of one that is not.
+    """Return the refresh period of a sensor slower than its rows [s], or None of one that is not.
 
-    Its value never changes in two rows one after the other, but for one in twenty: a sensor that
-    is read in every row and happens to repeat itself changes in neighbouring rows, too. In a run
-    it changes several times: what changes once is a step of what is measured.
+    The value of a slow sensor never changes in two neighbouring rows, except one time in twenty; a
+    sensor that is read in every row and happens to repeat itself changes in neighbouring rows, too.
+    It changes several times in a run: a single change is a step of the measured quantity.
     """
     rows: list[np.ndarray] = []
     seconds: list[np.ndarray] = []
@@ -78,9 +79,9 @@ def refresh_period(
 def read_anew(
     time: Float[np.ndarray, " time"], values: Float[np.ndarray, " time"], period: float
 ) -> Bool[np.ndarray, " time"]:
-    """Rows in which a sensor of this period was read: where its value changes, or must have been.
+    """Return the rows in which a sensor of this period was read: at changes, or after a period.
 
-    A value that stays for several periods was read several times.
+    A value that stays constant for several periods was read several times.
     """
     out = np.zeros(len(time), dtype=bool)
     out[0] = True
@@ -100,9 +101,9 @@ def read_anew(
 def body_increments(
     before: Float[np.ndarray, "step 3"], after: Float[np.ndarray, "step 3"]
 ) -> Float[np.ndarray, "step 3"]:
-    """Increments ahead [m], to the left [m] and in heading [rad] from poses to others.
+    """Return increments ahead [m], left [m] and of the heading [rad] between poses.
 
-    They are in the body's axes halfway through each step: turned back by the mean heading.
+    They are in the body's axes at the middle of each step, rotated by the mean heading.
     """
     middle = 0.5 * (after[:, 2] + before[:, 2])
     dx, dy, turn = (after - before).T
@@ -112,23 +113,23 @@ def body_increments(
 
 
 def body_steps(pose: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "step 3"]:
-    """Increments from each row of a pose to the next, as `body_increments`."""
+    """Return the `body_increments` from each row of a pose to the next."""
     return body_increments(pose[:-1], pose[1:])
 
 
 def stretches(mask: Bool[np.ndarray, " row"]) -> Int[np.ndarray, "stretch 2"]:
-    """First row of every stretch that is true, and the row behind its last."""
+    """Return the first row of every stretch of True, and the row after its last."""
     return np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]]))).reshape(-1, 2)
 
 
 def bridge_stalls(
     time: Float[np.ndarray, " time"], wheel_angle: Float[np.ndarray, "time wheel"]
 ) -> tuple[Float[np.ndarray, "time wheel"], Bool[np.ndarray, " time"]]:
-    """Wheel angle with stalls of the telemetry bridged, and the rows in which it was stalled.
+    """Return the wheel angle with stalls of the telemetry bridged, and whether each row is stalled.
 
     A stall is a stretch in which no wheel's angle changes and that ends in one step as large as the
-    motion missed: the radio froze, not the wheels. The angle is made linear across it; speeds and
-    currents reported in the marked rows are as stale as the angle was.
+    missed motion: the radio froze, not the wheels. The angle is made linear across it; speeds and
+    currents reported in the stalled rows are as stale as the angle was.
     """
     stalled = np.zeros(len(time), dtype=bool)
     step = np.abs(np.diff(wheel_angle, axis=0)).max(axis=1, initial=0.0)
@@ -152,7 +153,7 @@ def bridge_stalls(
 
 
 def first_moved(wheel_angle: Float[np.ndarray, "time wheel"], radius: float) -> int | None:
-    """First row by which some wheel's rim has moved `MOVED`; None where none ever does."""
+    """Return the first row by which some wheel's rim has moved `MOVED`; None where none does."""
     rim = radius * np.abs(wheel_angle - wheel_angle[:1]).max(axis=1, initial=0.0)
     moved = np.flatnonzero(rim >= MOVED)
     return int(moved[0]) if len(moved) else None
@@ -161,14 +162,14 @@ def first_moved(wheel_angle: Float[np.ndarray, "time wheel"], radius: float) -> 
 def swapped_order(
     measured: Float[np.ndarray, "time wheel"], reference: Float[np.ndarray, "time wheel"]
 ) -> tuple[int, ...] | None:
-    """Where each wheel's motion is found, as (3, -1, 2); None where the declared order is right.
+    """Return the column of each wheel, such as (3, -1, 2); None where the order is right.
 
     Wheels are counted from 1, and negative where they count backwards. It is the order in which the
     measured steps come closest to the reference:
 
         misfit = sum_i |m_order(i) sign_i - ref_i|^2 / sum_i |ref_i|^2
 
-    Only the products of every pair enter, so that all orders of six wheels cost nothing. Steps are
+    Only the products of every pair enter, so that all orders of six wheels take no time. Steps are
     in any measure of wheel motion, such as the angle turned.
     """
     products = measured.T @ reference

@@ -1,4 +1,4 @@
-"""Segments of runs as windows, which a likelihood sums over."""
+"""Runs cut into segments of windows, over which a likelihood sums."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -10,9 +10,9 @@ from slipid.data.wheel_signals import interpolate
 from slipid.support.errors import DataError
 
 NORMAL_STD = 0.6827
-"""Part of a normal distribution that is within one std."""
+"""Probability of a normal variable to be within one std."""
 UNREAD = 1e6
-"""Variance of what was not read, so large that it tells nothing [A^2, V^2]."""
+"""Variance of a mean without any reading, so large that it carries no information [A^2, V^2]."""
 PerWindow = Float[np.ndarray, "window wheel"]
 
 
@@ -21,9 +21,9 @@ class Windows:
     """Segments of K neighbouring windows; a short run is one segment, a long one is cut.
 
     Attributes:
-        run: number of the run that each segment is cut from (segment,).
+        run: index of the run of each segment (segment,).
         surface, load, session: their names for each segment.
-        start: time in its run at which each segment begins [s] (segment,).
+        start: time in its run at which each segment starts [s] (segment,).
         dt: length of each window [s] (segment, window).
         turn: rotation of each wheel in the window [rad] (segment, window, wheel), at lag `lag`.
         speed_change: wheel speed at its end less that at its start [rad/s], so that
@@ -31,12 +31,13 @@ class Windows:
         pose: pose at the edges of the windows (segment, window + 1, 3), as logged.
         current: mean of the signed current or of its magnitude [A]; zeros where not logged.
         voltage: mean voltage [V]; zeros where not logged.
-        current_var: variance of the mean current by the ammeter's own noise [A^2]; `UNREAD`, for
-            which it says nothing, where no current was read in the window.
-        voltage_var: zero, or `UNREAD` where no voltage was read in the window [V^2].
+        current_var: variance of the mean current due to the ammeter's noise [A^2]; `UNREAD` where
+            no current was read in the window.
+        voltage_var: variance of the mean voltage due to missing readings [V^2]; `UNREAD` where no
+            voltage was read in the window.
         has_current, has_voltage: whether they were logged.
         current_is_signed: False where `current` is a mean of magnitudes.
-        lag: lag of the camera behind the encoders that was assumed [s].
+        lag: assumed lag of the camera behind the encoders [s].
     """
 
     run: Int[np.ndarray, " segment"]
@@ -61,7 +62,7 @@ class Windows:
         return len(self.run)
 
     def segments(self, index: Int[np.ndarray, " some"]) -> "Windows":
-        """Some segments, in the order given."""
+        """Return some segments, in the order given."""
         kept = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -72,7 +73,7 @@ class Windows:
         return replace(self, **kept)
 
     def at_lag(self, lag: float) -> "Windows":
-        """The same windows at another lag of the camera, to first order [s]."""
+        """Return the same windows at another lag of the camera [s], to first order."""
         return replace(self, turn=self.turn - (lag - self.lag) * self.speed_change, lag=lag)
 
 
@@ -82,12 +83,12 @@ def windows(
     """Cut every run from where it has moved `MOVED` into segments of `per_segment` windows.
 
     Args:
-        wheel_radius: radius of the wheels [m]; it only tells where motion starts.
+        wheel_radius: radius of the wheels [m]; it only determines where motion starts.
         lag: lag of the camera behind the encoders [s].
-        longest: longest window [s]; a longer run makes more segments.
+        longest: longest window [s]; a longer run has more segments.
 
     Raises:
-        DataError: a run whose wheels never move that far, or too short for its windows.
+        DataError: a run whose wheels never move `MOVED`, or too short for its windows.
     """
     each = [_edges(data, k, wheel_radius, lag, per_segment, longest) for k in range(len(data))]
     run = [k for k, segments in enumerate(each) for _ in segments]
@@ -111,17 +112,17 @@ def windows(
 
 
 def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
-    """Variance of a single reading of every ammeter in every run, from that run alone [A^2].
+    """Return the variance of a single reading of each ammeter in each run [A^2].
 
-    By second differences d_t = x_(t-1) - 2 x_t + x_(t+1), which have six times the variance of
-    white noise and lose what is smooth between readings: of a ripple of n readings a period only
-    (2 - 2 cos(2 pi / n))^2 / 6 is left, 6 % at n = 8. The quantile of |d| that is the std of a
-    normal distribution makes jumps count little.
+    It uses second differences d_t = x_(t-1) - 2 x_t + x_(t+1), which have six times the variance of
+    white noise and suppress smooth signals: of a ripple with a period of n readings only
+    (2 - 2 cos(2 pi / n))^2 / 6 remains, 6 % at n = 8. The quantile of |d| that is the std of a
+    normal distribution gives jumps little weight.
 
-    Limits: ripple that is faster than that, or folded down by slow sampling, cannot be told from
-    noise; readings that are repeated, or noise that a driver has smoothed, make the noise look
-    small; readings in steps that are coarser than the noise make it that of a few steps, and never
-    less than that of rounding; magnitudes of currents near zero have less of it than signed ones.
+    Limits: ripple that is faster than that, or aliased by slow sampling, looks like noise; repeated
+    readings, or noise smoothed by a driver, make the noise look small; readings in steps coarser
+    than the noise give the noise of a few steps, and never less than that of rounding; magnitudes
+    of currents near zero have less noise than signed ones.
     """
     out = np.zeros((len(data), data.wheel_angle.shape[1]))
     if data.current is None:
@@ -138,22 +139,22 @@ def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
 
 
 def _ammeter(amps: Float[np.ndarray, " reading"], live: Bool[np.ndarray, " reading"]) -> float:
-    """Variance of a reading of one ammeter in one run [A^2]."""
-    bent = np.abs(np.diff(amps, 2))[live[:-2] & live[1:-1] & live[2:]]
-    if not len(bent):
+    """Return the variance of a reading of one ammeter in one run [A^2]."""
+    curvature = np.abs(np.diff(amps, 2))[live[:-2] & live[1:-1] & live[2:]]
+    if not len(curvature):
         return 0.0
     step = np.abs(np.diff(amps))
     rounding = float((step[step > 0] ** 2).min(initial=np.inf)) / 12
-    noise = float(np.quantile(bent, NORMAL_STD)) ** 2 / 6
+    noise = float(np.quantile(curvature, NORMAL_STD)) ** 2 / 6
     return max(noise, rounding if np.isfinite(rounding) else 0.0)
 
 
 def _edges(
     data: Runs, run: int, radius: float, lag: float, per_segment: int, longest: float
 ) -> list[np.ndarray]:
-    """Rows at the window edges of each segment of a run.
+    """Return the rows at the window edges of each segment of a run.
 
-    Only rows with a new pose, and those whose pose shows a time at which the wheels were measured.
+    They are rows with a new pose that shows a time at which the wheels were measured.
     """
     first, time = first_row(data, run, radius), data.time[data.rows(run)]
     fresh = np.flatnonzero(data.fresh[data.rows(run)])
@@ -180,7 +181,7 @@ def _edges(
 def _cut(
     data: Runs, run: int, edges: np.ndarray, lag: float, noise: Float[np.ndarray, " wheel"]
 ) -> dict[str, np.ndarray]:
-    """Windows between some rows of a run: the arrays of `Windows` for this segment, by name.
+    """Return the arrays of `Windows` for one segment by name.
 
     The noise is the variance of a single reading of each ammeter.
     """
@@ -193,17 +194,17 @@ def _cut(
     speed = (ahead - behind) / np.maximum(span, 1e-3)[:, None]
     zero = np.zeros((len(edges) - 1, angle.shape[1]))
     live = data.live[rows]
-    mean_current = variance = mean_voltage = unread = zero
+    mean_current = current_var = mean_voltage = voltage_var = zero
     if data.current is not None:
         amps = data.current[rows]
         amps = amps if data.current_is_signed else np.abs(amps)
         fresh = None if data.current_fresh is None else data.current_fresh[rows]
         mean_current, count, missed = _mean(t, amps, live, fresh, at)
-        variance = np.where(count > 0, noise / np.maximum(count, 1) + missed, UNREAD)
+        current_var = np.where(count > 0, noise / np.maximum(count, 1) + missed, UNREAD)
     if data.voltage is not None:
         fresh = None if data.voltage_fresh is None else data.voltage_fresh[rows]
         mean_voltage, count, missed = _mean(t, data.voltage[rows], live, fresh, at)
-        unread = np.where(count > 0, missed, UNREAD)
+        voltage_var = np.where(count > 0, missed, UNREAD)
     return {
         "start": np.asarray(t[edges[0]]),
         "dt": np.diff(t[edges]),
@@ -212,8 +213,8 @@ def _cut(
         "pose": data.pose[rows][edges],
         "current": mean_current,
         "voltage": mean_voltage,
-        "current_var": variance,
-        "voltage_var": unread,
+        "current_var": current_var,
+        "voltage_var": voltage_var,
     }
 
 
@@ -224,14 +225,14 @@ def _mean(
     fresh: Bool[np.ndarray, "row wheel"] | None,
     at: Float[np.ndarray, " edge"],
 ) -> tuple[PerWindow, PerWindow, PerWindow]:
-    """Mean over time between edges, of how many readings it is, and the variance of what it missed.
+    """Return time averages between edges, their counts of readings, and variances by missed ones.
 
     A row stands for the time from halfway to the row before it to halfway to the next. A mean
     over the rows in a window would be as late as its first row lies behind the edge: while a robot
-    speeds up, voltages would read high. What a slower meter did not read in a row is taken to be
-    even between its readings; had it jumped from one reading's value to the next one's at any time
-    in between, the mean over that time would be off by their difference over sqrt(12). Rows that
-    are not live are left out, but where a window has no others.
+    speeds up, voltages would read high. Between the readings of a slower meter the signal counts as
+    linear; had it jumped from one reading's value to the next one's at any time in between, the
+    mean over that time would be off by their difference over sqrt(12). Rows that are not live are
+    left out, except in windows that have no others.
     """
     bounds = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), time[-1:]])
     cell = np.diff(bounds)[:, None]
@@ -241,33 +242,33 @@ def _mean(
         return np.diff(interpolate(bounds, summed, at), axis=0)
 
     read = np.broadcast_to(live[:, None], x.shape)
-    unseen = np.zeros(x.shape)
+    missed = np.zeros(x.shape)
     if fresh is not None:
         read = read & fresh
         each = [_between(time, x[:, k], read[:, k]) for k in range(x.shape[1])]
-        x, unseen = (np.stack(column, axis=-1) for column in zip(*each, strict=True))
-    told = cell * live[:, None]
-    seconds = total(told)
+        x, missed = (np.stack(column, axis=-1) for column in zip(*each, strict=True))
+    weight = cell * live[:, None]
+    seconds = total(weight)
     moving = seconds > 1e-9
     safe = np.where(moving, seconds, 1.0)
-    mean = np.where(moving, total(x * told) / safe, total(x * cell) / total(cell))
+    mean = np.where(moving, total(x * weight) / safe, total(x * cell) / total(cell))
     count = np.where(moving, total(read.astype(float)), 0.0)
-    return mean, count, total(unseen * told) / safe**2
+    return mean, count, total(missed * weight) / safe**2
 
 
 def _between(
     time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], read: Bool[np.ndarray, " row"]
 ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " row"]]:
-    """What was read, even between two readings; and what a jump there would do, by the second.
+    """Return readings interpolated linearly, and the variance rate of a jump between two readings.
 
     The latter is step^2 seconds / 12 in rows from a reading to the next: summed over their time,
-    the variance of the integral of what a meter did not see. It is zero where neighbouring rows
+    the variance of the integral over what the meter missed. It is zero where neighbouring rows
     were read.
     """
     if not read.any():
         return x, np.zeros_like(x)
     at = np.flatnonzero(read)
     rows, seconds = np.diff(at), np.diff(time[at])
-    unseen = np.zeros_like(x)
-    unseen[at[0] : at[-1]] = np.repeat(np.diff(x[at]) ** 2 * seconds / 12 * (rows > 1), rows)
-    return np.interp(time, time[read], x[read]), unseen
+    missed = np.zeros_like(x)
+    missed[at[0] : at[-1]] = np.repeat(np.diff(x[at]) ** 2 * seconds / 12 * (rows > 1), rows)
+    return np.interp(time, time[read], x[read]), missed

@@ -1,4 +1,4 @@
-"""Logs as files: slipid's own columns, and those of the published Robotino logs."""
+"""Logs as files: with slipid's own columns, and with those of the published Robotino logs."""
 
 from collections.abc import Sequence
 from io import StringIO
@@ -16,12 +16,12 @@ OPTIONAL = {
     "bus_voltage": ("V", "%.2f"),
     "gyro": ("rad/s", "%.5f"),
 }
-"""Channels that not every log has, with their unit and the format of their numbers."""
+"""Channels that not every log has, with their unit and number format."""
 _IMAGE = (1920, 1080)
 
 
 def own_columns(wheels: int, more: Sequence[str]) -> Content:
-    """`own_csv`'s columns as a config declares them, of the `OPTIONAL` channels those in `more`."""
+    """Return the columns of `own_csv` as a config declares them, with the channels in `more`."""
     columns: Content = {
         "time": {"column": "time", "unit": "s"},
         "twist_command_x": {"column": "command_x", "unit": "m/s"},
@@ -42,7 +42,7 @@ def own_columns(wheels: int, more: Sequence[str]) -> Content:
 
 
 def own_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> str:
-    """Text of a log with commands, currents and poses in slipid's own columns."""
+    """Return the text of a log with commands, currents and poses in slipid's own columns."""
     assert log.twist_command is not None
     assert log.current is not None
     assert log.pose is not None
@@ -79,9 +79,9 @@ _NAMES_2022 = (
 
 
 def robotino2022_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> str:
-    """Text of a log as the 2022 Robotino logs are laid out; the preset `robotino2022` reads it.
+    """Return the text of a log in the layout of the 2022 Robotino logs, preset `robotino2022`.
 
-    It has three wheels, commands, speeds, currents and poses. The pose's origin is the middle of
+    It has three wheels, commands, speeds, currents and poses. The pose's origin is the centre of
     the image. Projected currents and steps are zeros.
     """
     assert log.twist_command is not None
@@ -113,7 +113,7 @@ def robotino2022_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> 
 
 
 def _csv(header: str, columns: Sequence[tuple[np.ndarray, str]], delimiter: str, end: str) -> str:
-    """Text of columns with the format of their numbers."""
+    """Return the text of columns, each with its number format."""
     forms = [form for values, form in columns for _ in range(values.shape[1])]
     table = np.concatenate([values for values, _ in columns], axis=1)
     text = StringIO()

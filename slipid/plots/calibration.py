@@ -1,4 +1,4 @@
-"""Pictures of a calibrated camera: where corners were, and how points on the floor fit."""
+"""Pictures of a calibrated camera: coverage by corners, and residuals of points on the floor."""
 
 from pathlib import Path
 
@@ -8,27 +8,26 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from slipid.camera.calibration.lens import LensFit
 from slipid.camera.calibration.place import FloorFit
 from slipid.camera.calibration.quality import Quality
 from slipid.camera.overhead import OverheadCamera
 from slipid.plots.drawing import BLUE, GREEN, INK, ORANGE, figure, save
 
 LONGEST = 0.06
-"""Of the picture's width: how long the larger residuals are drawn."""
+"""Length at which the larger residuals are drawn, as a part of the picture's width."""
 STEPS = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0])
-"""Between lines of the floor [m]."""
+"""Possible distances between the drawn lines of the floor [m]."""
 
 
-def coverage_picture(fit: LensFit, quality: Quality, path: Path) -> Path:
-    """Write where corners were in the picture, by how much each was off, and cells without any."""
+def coverage_picture(quality: Quality, path: Path) -> Path:
+    """Write a picture of the corners of a lens fit, their residuals, and cells without any."""
+    fit, covered = quality.fit, quality.coverage
     width, height = fit.lens.image_px
-    covered = quality.coverage
     title = (
         f"Corners in {covered.visited.sum()} of {covered.visited.size} cells; "
         f"rms error {fit.rms_px:.2f} px, {quality.held_out_px:.2f} px on held-out views"
     )
-    made, axes = _frame(title, width, height)
+    drawing, axes = _frame(title, width, height)
     down, across = covered.visited.shape
     size = np.array([width / across, height / down])
     for row, column in np.argwhere(~covered.visited):
@@ -42,36 +41,36 @@ def coverage_picture(fit: LensFit, quality: Quality, path: Path) -> Path:
     pixels = np.concatenate([view.pixels for view in fit.views])
     _arrows(axes, pixels, np.concatenate(fit.residuals), width)
     _legend(axes)
-    return save(made, path)
+    return save(drawing, path)
 
 
 def floor_picture(fit: FloorFit, path: Path) -> Path:
-    """Write the floor's axes and lines as the camera sees them, with the points and residuals."""
+    """Write a picture of the floor's axes and lines as the camera sees them, with residuals."""
     width, height = fit.camera.lens.image_px
     title = f"The floor from {fit.camera.height:.3f} m; rms error of points {fit.rms_px:.2f} px"
-    made, axes = _frame(title, width, height)
+    drawing, axes = _frame(title, width, height)
     step = _floor_lines(axes, fit.camera)
     axes.plot([], [], color="#bbbbbb", lw=0.8, label=f"floor, a line every {step:g} m")
-    for way, colour, name in ((0, GREEN, "x"), (1, "#CC79A7", "y")):
+    for axis, colour, name in ((0, GREEN, "x"), (1, "#CC79A7", "y")):
         ends = np.zeros((30, 3))
-        ends[:, way] = np.linspace(0, 2 * step, 30)
+        ends[:, axis] = np.linspace(0, 2 * step, 30)
         line = fit.camera.pixels(ends)
         axes.plot(*line.T, color=colour, lw=2.5, label=f"world's {name}, {2 * step:g} m")
     _arrows(axes, fit.points.pixels, fit.residuals, width)
     _legend(axes)
-    return save(made, path)
+    return save(drawing, path)
 
 
 def _frame(title: str, width: int, height: int) -> tuple[Figure, Axes]:
-    """A picture's frame, its first row at the top, with room for a legend below."""
-    made = figure(9.0, 8.3 * height / width + 1.2, title)
-    axes = made.add_subplot()
+    """Return axes over a picture, its first row at the top, with room for a legend below."""
+    drawing = figure(9.0, 8.3 * height / width + 1.2, title)
+    axes = drawing.add_subplot()
     axes.set_xlim(-0.5, width - 0.5)
     axes.set_ylim(height - 0.5, -0.5)
     axes.set_aspect("equal")
     axes.set_xlabel("u [pixel]")
     axes.set_ylabel("v [pixel]")
-    return made, axes
+    return drawing, axes
 
 
 def _legend(axes: Axes) -> None:
@@ -84,7 +83,7 @@ def _arrows(
     residuals: Float[np.ndarray, "point 2"],
     width: int,
 ) -> None:
-    """Points with their residuals, enlarged by a round number so that they can be seen."""
+    """Draw points with their residuals, enlarged by a round number to be visible."""
     largest = float(np.quantile(np.hypot(*residuals.T), 0.95))
     wanted = LONGEST * width / max(largest, 1e-6)
     times = 10 ** np.floor(np.log10(wanted))
@@ -96,26 +95,26 @@ def _arrows(
         color=INK,
         lw=0.9,
     )
-    axes.plot([], [], color=INK, lw=0.9, label=f"seen less computed, {times:g} times as long")
+    axes.plot([], [], color=INK, lw=0.9, label=f"measured less computed, {times:g} times as long")
     axes.plot(*pixels.T, "o", color=BLUE, ms=3, label=f"{len(pixels)} corners or points")
 
 
 def _floor_lines(axes: Axes, camera: OverheadCamera) -> float:
-    """Lines of equal x and of equal y; how far apart they are [m]."""
+    """Draw lines of equal x and of equal y, and return their distance [m]."""
     width, height = camera.lens.image_px
     edge = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
-    seen = camera.on_plane(edge, 0.0)
-    far = 4 * camera.height
-    seen = np.clip(np.nan_to_num(seen, nan=far), camera.place[:2] - far, camera.place[:2] + far)
-    low, high = seen.min(0), seen.max(0)
+    farthest = 4 * camera.height
+    floor = np.nan_to_num(camera.on_plane(edge, 0.0), nan=farthest)
+    floor = np.clip(floor, camera.place[:2] - farthest, camera.place[:2] + farthest)
+    low, high = floor.min(0), floor.max(0)
     step = float(STEPS[np.argmin(np.abs(np.log(STEPS / ((high - low).max() / 8))))])
-    for way in (0, 1):
-        for at in np.arange(np.ceil(low[way] / step), high[way] / step + 1e-9) * step:
+    for axis in (0, 1):
+        for at in np.arange(np.ceil(low[axis] / step), high[axis] / step + 1e-9) * step:
             line = np.zeros((60, 3))
-            line[:, way] = at
-            line[:, 1 - way] = np.linspace(low[1 - way], high[1 - way], 60)
-            before = (line - camera.place) @ camera.rotation[2] > 0.05 * camera.height
-            line = line[before]
+            line[:, axis] = at
+            line[:, 1 - axis] = np.linspace(low[1 - axis], high[1 - axis], 60)
+            before_lens = (line - camera.place) @ camera.rotation[2] > 0.05 * camera.height
+            line = line[before_lens]
             if len(line):
                 axes.plot(*camera.pixels(line).T, color="#bbbbbb", lw=0.8, zorder=0)
     return step

@@ -1,1 +1,1 @@
-"""What any program needs and that knows nothing of robots: errors, files, executor, progress."""
+"""Support that knows nothing of robots: errors, files, checkpoints, executors, progress."""

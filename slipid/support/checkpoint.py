@@ -1,4 +1,4 @@
-"""Finished parts of a long piece of work, kept on disk for the same work to go on from."""
+"""Checkpoints: finished parts of a long job on disk, from which the same job continues."""
 
 import hashlib
 import platform
@@ -29,7 +29,7 @@ LIBRARIES = (
 
 
 def versions() -> dict[str, str]:
-    """Version of Python and of every library that numbers depend on, by name."""
+    """Return the version of Python and of every library that numbers depend on, by name."""
     found = {"python": platform.python_version()}
     for name in LIBRARIES:
         try:
@@ -40,7 +40,7 @@ def versions() -> dict[str, str]:
 
 
 def source_hash(*rooms: str) -> bytes:
-    """Hash of the sources of some of slipid's packages and modules, by their paths inside it."""
+    """Return the hash of the sources of some packages and modules of slipid, with their paths."""
     root = Path(__file__).resolve().parents[1]
     files = [path for room in rooms for path in (root / room).rglob("*.py")]
     found = sorted(files + [root / f"{room}.py" for room in rooms if not (root / room).is_dir()])
@@ -48,12 +48,12 @@ def source_hash(*rooms: str) -> bytes:
 
 
 def key_of(*parts: object) -> str:
-    """Hash of everything a piece of work depends on; the versions of libraries are always in it.
+    """Return the hash of everything a job depends on, library versions included.
 
     Args:
-        parts: arrays, bytes, and values whose `repr` says all of them: numbers, strings, plain
-            containers and dataclasses of those. An array inside a container is not seen whole, so
-            every array has to be a part of its own.
+        parts: arrays, bytes, and values whose `repr` is complete: numbers, strings, plain
+            containers and dataclasses of those. The `repr` of an array inside a container is not
+            complete, so every array has to be a part of its own.
     """
     mark = hashlib.sha256()
     for part in (*parts, sorted(versions().items())):
@@ -68,13 +68,13 @@ def key_of(*parts: object) -> str:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Named parts in files of one folder; those of other work are treated as absent.
+    """Named parts in files of one folder; those of other jobs are treated as absent.
 
-    A part is written whole or not at all, and one that is damaged is absent, too: whatever is
-    loaded can be relied on, and whatever is not is made again.
+    A part is written whole or not at all, and a damaged one counts as absent: whatever is loaded is
+    valid, and whatever is not is computed again.
 
     Attributes:
-        folder: where the files lie; it is made with the first part.
+        folder: folder of the files; it is made with the first part.
         key: hash of everything the parts depend on, see `key_of`.
     """
 
@@ -82,13 +82,13 @@ class Checkpoint:
     key: str
 
     def save(self, name: str, arrays: Mapping[str, np.ndarray | float | int | str]) -> None:
-        """Keep arrays under a name, in `<name>.npz`."""
+        """Write arrays under a name to `<name>.npz`."""
         content = {k: np.asarray(v) for k, v in arrays.items()}
         path = self.folder / f"{name}.npz"
         write_arrays(path, content | {"key": np.asarray(self.key)}, compress=False)
 
     def load(self, name: str) -> dict[str, np.ndarray] | None:
-        """Arrays that were kept under a name; None where this very work has left none."""
+        """Return the arrays under a name; None where this very job has left none."""
         try:
             # opened here: numpy leaves a damaged file open
             path = self.folder / f"{name}.npz"
@@ -100,14 +100,14 @@ class Checkpoint:
             return None
 
     def save_json(self, name: str, content: object) -> None:
-        """Keep plain values under a name, in `<name>.json`."""
+        """Write plain values under a name to `<name>.json`."""
         path = self.folder / f"{name}.json"
         write_json(path, {"schema": SCHEMA, "key": self.key, "content": content})
 
     def load_json(self, name: str) -> Any:
-        """Plain values that were kept under a name; None where this very work has left none."""
+        """Return the plain values under a name; None where this very job has left none."""
         try:
-            kept = read_json(self.folder / f"{name}.json", "a part of unfinished work")
+            kept = read_json(self.folder / f"{name}.json", "a checkpoint")
             if kept["schema"] == SCHEMA and kept["key"] == self.key:
                 return kept["content"]
         except (DataError, KeyError, TypeError):
@@ -115,7 +115,7 @@ class Checkpoint:
         return None
 
     def remove(self, pattern: str = "*") -> None:
-        """Take away files by name, of whatever work, and the folder if nothing is left in it."""
+        """Delete files by name, of whatever job, and the folder if it is then empty."""
         for path in self.folder.glob(pattern):
             path.unlink()
         if self.folder.is_dir() and not any(self.folder.iterdir()):

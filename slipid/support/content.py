@@ -1,6 +1,6 @@
-"""Plain values, as JSON and TOML files hold them."""
+"""Type of the plain values in JSON and TOML files."""
 
 from typing import Any
 
 Content = dict[str, Any]
-"""Content of such a file, or of a table in it: numbers, words, lists and tables by name."""
+"""Content of a JSON or TOML file, or of a table in it: numbers, texts, lists and tables by name."""

@@ -1,4 +1,4 @@
-"""The one error that bad input raises, and the one form its messages have."""
+"""The error for bad input, and the common form of its messages."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class DataError(ValueError):
-    """The user's data cannot be read; the message names file, row or column, and the remedy."""
+    """Error about unreadable user data; the message names file, row or column, and the remedy."""
 
 
 def bad_data(
@@ -17,7 +17,7 @@ def bad_data(
     row: int | tuple[int, int] | None = None,
     column: str | None = None,
 ) -> DataError:
-    """Data error in the one form all of them have: `file row 12, column 'x': found; expected ...`.
+    """Return a `DataError` in the common form `file row 12, column 'x': found; expected ...`.
 
     Args:
         row: line number in the file, counted from 1 (in Parquet the record), or first and last.
@@ -34,6 +34,6 @@ def bad_data(
 
 
 def did_you_mean(name: object, choices: Iterable[str]) -> str:
-    """`, did you mean this or that?` where some of the choices are spelled alike, else nothing."""
+    """Return `, did you mean this or that?` where choices are spelled alike, else an empty text."""
     found = get_close_matches(str(name), list(choices), n=2)
     return f", did you mean {' or '.join(found)}?" if found else ""

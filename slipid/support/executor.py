@@ -1,7 +1,7 @@
-"""Work given to an executor: this process, or processes that end with whoever started them.
+"""Executors: this process, or local processes that end with the process that started them.
 
-Who has work to spread takes a `concurrent.futures.Executor`, so that any engine can do it: what is
-called is a function of a module, and what it takes and gives can be pickled.
+Functions with independent jobs take a `concurrent.futures.Executor`, so that any engine can run
+them: the called function is at the top of a module, and its arguments and results can be pickled.
 """
 
 import os
@@ -20,14 +20,14 @@ from slipid.support.progress import Reporter
 
 Given = TypeVar("Given")
 Result = TypeVar("Result")
-Words = ParamSpec("Words")
+Arguments = ParamSpec("Arguments")
 
 
 class InProcess(Executor):
-    """This process, which does the work as it is given."""
+    """Executor that runs each job in this process as it is submitted."""
 
     def submit(
-        self, fn: Callable[Words, Result], /, *args: Words.args, **kwargs: Words.kwargs
+        self, fn: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
     ) -> Future[Result]:
         done: Future[Result] = Future()
         done.set_result(fn(*args, **kwargs))
@@ -35,19 +35,19 @@ class InProcess(Executor):
 
 
 class Processes(ProcessPoolExecutor):
-    """Processes of this machine, started as there is work, which an interrupt or a kill ends.
+    """Processes of this machine, started on demand and ended by an interrupt or a kill.
 
-    Forked processes would inherit the threads of whatever the caller has loaded.
+    They are spawned, since forked processes would inherit the threads of the caller's libraries.
     """
 
     def __init__(self, jobs: int) -> None:
-        super().__init__(jobs, get_context("spawn"), _work_for, (os.getpid(),))
+        super().__init__(jobs, get_context("spawn"), _end_with, (os.getpid(),))
         self._others = set(active_children())
 
     def submit(
-        self, fn: Callable[Words, Result], /, *args: Words.args, **kwargs: Words.kwargs
+        self, fn: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
     ) -> Future[Result]:
-        with _deaf():  # Ctrl-C is for this process, from the start of the others on
+        with _interrupts_ignored():  # Ctrl-C is for this process alone
             return super().submit(fn, *args, **kwargs)
 
     def __exit__(
@@ -56,7 +56,7 @@ class Processes(ProcessPoolExecutor):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Wait for the work, or after an error end it: files come whole, so half is nothing yet."""
+        """Wait for the jobs, or terminate them after an error, since written files are atomic."""
         self.shutdown(wait=error is None, cancel_futures=True)
         for child in set(active_children()) - self._others:
             child.terminate()
@@ -68,12 +68,12 @@ def results(
     todo: Mapping[str, Given],
     report: Reporter,
 ) -> list[Result]:
-    """Results in the order in which they come, each of them reported.
+    """Return results in the order in which they are completed, and report each of them.
 
     Args:
-        executor: that does the work.
-        work: a function of a module.
-        todo: what it is called with, by name.
+        executor: executor of the jobs.
+        work: a function at the top of a module.
+        todo: its arguments by name.
 
     Raises:
         DataError: a process was ended by the system.
@@ -100,8 +100,8 @@ def results(
 
 
 @contextmanager
-def _deaf() -> Iterator[None]:
-    """No interrupts; processes started meanwhile never hear any."""
+def _interrupts_ignored() -> Iterator[None]:
+    """Ignore interrupts; processes started meanwhile ignore them for good."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -112,8 +112,8 @@ def _deaf() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _work_for(parent: int) -> None:
-    """Leave interrupts to the parent, and end when it has been killed."""
+def _end_with(parent: int) -> None:
+    """Leave interrupts to the parent, and exit when it has been killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: atomic writes, strict JSON, arrays without pickle."""
+"""Files that are either complete or absent: atomic writes, strict JSON, arrays without pickle."""
 
 import hashlib
 import io
@@ -16,7 +16,7 @@ from slipid.support.errors import DataError
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file so that a reader, or a crash, sees the old one or the new one, never a part."""
+    """Write a file so that a reader, or a crash, finds the old one or the new one, never a part."""
     partial = path.parent / f".{path.name}.{secrets.token_hex(4)}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -33,23 +33,23 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def writable(folder: Path) -> None:
-    """Make a folder and try to write to it, before hours of work that end there."""
+    """Make a folder and check that it is writable, before hours of work that end there."""
     write_bytes(folder / ".writable", b"")
     (folder / ".writable").unlink()
 
 
 def write_json(path: Path, value: object) -> None:
-    """Write a JSON file; refuses numbers that are not finite."""
+    """Write a JSON file; raise `ValueError` for numbers that are not finite."""
     write_bytes(path, json_text(value).encode())
 
 
 def json_text(value: object) -> str:
-    """JSON of plain values and numpy numbers; ValueError for NaN and infinity."""
+    """Return JSON of plain values and numpy numbers; raise `ValueError` for NaN and infinity."""
     return json.dumps(value, indent=1, allow_nan=False, default=_plain) + "\n"
 
 
 def checksum(content: Mapping[str, object]) -> str:
-    """SHA-256 of JSON with sorted keys and without spaces, as Python writes it."""
+    """Return the SHA-256 of JSON with sorted keys and without spaces, as Python writes it."""
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -63,7 +63,7 @@ def _plain(value: object) -> object:
 
 
 def read_json(path: Path, what: str) -> Any:
-    """JSON of a file that this program wrote; DataError says what was expected there."""
+    """Return the JSON of a file that slipid wrote; `DataError` names the expected file."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -73,7 +73,7 @@ def read_json(path: Path, what: str) -> Any:
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:
-    """Write named arrays to an .npz file, no pickle."""
+    """Write named arrays to an .npz file without pickle."""
     buffer = io.BytesIO()
     save = np.savez_compressed if compress else np.savez
     save(buffer, allow_pickle=False, **arrays)
@@ -81,6 +81,6 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray], compress: bool = Tru
 
 
 def hash_of(runs: Iterable[tuple[str, str]]) -> str:
-    """Hash of a set of runs from their names and file hashes, whatever their order."""
+    """Return the hash of a set of runs from their names and file hashes, whatever their order."""
     lines = "".join(f"{name} {sha}\n" for name, sha in sorted(runs))
     return hashlib.sha256(lines.encode()).hexdigest()

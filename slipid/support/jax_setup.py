@@ -1,4 +1,4 @@
-"""Settings of the machine room: float64, plain loops, a compilation cache that outlives it all."""
+"""JAX setup: float64, plain loops and a persistent compilation cache."""
 
 import os
 import sys
@@ -10,12 +10,11 @@ PLAIN_LOOPS = "--xla_cpu_use_fusion_emitters=false"
 
 
 def plain_loops() -> None:
-    """Have XLA write loops without its fusion emitters, unless XLA_FLAGS says something of them.
+    """Make XLA write loops without its fusion emitters, unless XLA_FLAGS mentions them.
 
     A fit is compiled in three quarters of the time and runs as fast; rollouts of the twin take 0.3
-    to 0.6 of the time. Must come before JAX first computes. XLA ends the process at flags that it
-    does not know, so other versions than those it was measured with are left alone, and so is a
-    file of flags.
+    to 0.6 of the time. It must be called before JAX first computes. XLA ends the process at unknown
+    flags, so only the versions that were measured are changed, and a file of flags is left alone.
     """
     flags = os.environ.get("XLA_FLAGS", "").strip()
     more = "fusion_emitters" not in flags and (not flags or flags.startswith("-"))
@@ -24,7 +23,7 @@ def plain_loops() -> None:
 
 
 def one_blas_thread() -> None:
-    """Have BLAS and LAPACK compute in one thread.
+    """Make BLAS and LAPACK compute in one thread.
 
     The matrices here are small, and threads that wait for each other by spinning make a Cholesky
     factor of 570 rows take 800 ms instead of 3 on two cores on which another job runs.
@@ -36,7 +35,7 @@ def one_blas_thread() -> None:
 
 
 def cache_folder() -> Path:
-    """Where compiled functions are kept: SLIPID_CACHE, else the platform's place for caches."""
+    """Return the folder of compiled functions: SLIPID_CACHE, else the platform's for caches."""
     if given := os.environ.get("SLIPID_CACHE"):
         return Path(given)
     if sys.platform == "win32":
@@ -49,9 +48,9 @@ def cache_folder() -> Path:
 
 
 def setup_jax(quiet: bool = False) -> None:
-    """Switch on all of them and say so on stderr; every command that computes calls this first.
+    """Apply the whole setup and print it on stderr; every command that computes calls this first.
 
-    A cache named by JAX's own variable stays; one that cannot be written costs time, nothing else.
+    A cache named by JAX's own variable is kept; an unwritable one only costs time.
     """
     plain_loops()
     import jax

@@ -1,4 +1,4 @@
-"""Progress of long work on stderr: a bar on a terminal, plain lines elsewhere."""
+"""Progress of long jobs on stderr: a bar on a terminal, plain lines elsewhere."""
 
 import time
 from typing import TYPE_CHECKING
@@ -9,11 +9,11 @@ if TYPE_CHECKING:
 EVERY_S = 2.0
 """Least time between two plain lines of one stage [s]."""
 MEMORY_S = 3600.0
-"""Time over which speed is averaged: a step of a fit may take minutes [s]."""
+"""Time over which speed is averaged, since a step of a fit may take minutes [s]."""
 
 
 class Reporter:
-    """Tells a person how far the work is, or nothing where quiet; use as a context."""
+    """Reporter of progress, silent if quiet; use it as a context."""
 
     def __init__(self, quiet: bool = False):
         # late: every command names a reporter, and `--help` needs none
@@ -34,7 +34,7 @@ class Reporter:
             disable=quiet or not self._console.is_terminal,
         )
         self._task: "TaskID | None" = None
-        self._stage, self._told = "", 0.0
+        self._stage, self._reported = "", 0.0
 
     def __enter__(self) -> "Reporter":
         self._bars.start()
@@ -44,30 +44,30 @@ class Reporter:
         self._bars.stop()
 
     def line(self, text: str) -> None:
-        """One sentence that stays."""
+        """Print one sentence that stays."""
         self._console.print(text, markup=False, soft_wrap=True)
 
     def stage(self, name: str) -> None:
-        """A new part of the work begins."""
+        """Start a new stage of the work."""
         if name == self._stage:
             return
         if self._task is not None:
             self._bars.remove_task(self._task)
         self._task = self._bars.add_task(name, total=None, what="")
-        self._stage, self._told = name, time.monotonic()
+        self._stage, self._reported = name, time.monotonic()
         if self._bars.disable:
             self.line(f"{name} ...")
 
     def note(self, what: str) -> None:
-        """What is going on at this moment; on a bar only."""
+        """Show the current activity, on a bar only."""
         if self._task is not None:
             self._bars.update(self._task, what=what)
 
     def advance(self, done: int | float, total: int | float, what: str | None = None) -> None:
-        """So much of so much is done; away from a terminal a line now and then, and the last one.
+        """Report progress; away from a terminal print a line now and then, and the last one.
 
         Args:
-            done, total: in any unit; the total is the same throughout a stage.
+            done, total: amounts in any unit; the total is constant throughout a stage.
             what: the same in words, `done of total` by default.
         """
         if self._task is None:
@@ -75,8 +75,8 @@ class Reporter:
         what = f"{done} of {total}" if what is None else what
         self._bars.update(self._task, completed=done, total=total, what=what)
         now = time.monotonic()
-        if not self._bars.disable or (now < self._told + EVERY_S and done < total):
+        if not self._bars.disable or (now < self._reported + EVERY_S and done < total):
             return
-        self._told = now
+        self._reported = now
         left = next(task for task in self._bars.tasks if task.id == self._task).time_remaining
         self.line(f"  {what}" + (f", about {left:.0f} s left" if left else ""))

@@ -14,24 +14,24 @@ from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
 
 CLOSED = ConfigDict(extra="forbid")
-"""Of a dataclass that a config declares: other keys are refused."""
+"""Config of dataclasses in a TOML file: unknown keys are refused."""
 Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
 Part = Annotated[float, Field(ge=0, lt=1)]
-"""Of a whole."""
+"""Share of a whole, below 1."""
 Model = TypeVar("Model")
 Step = str | int
-"""Key of a table, or place in a list."""
+"""Key of a table, or index in a list."""
 
 
 class Section(BaseModel):
-    """A table of a config: only the keys it declares, and not to be changed."""
+    """A table of a config: immutable, with only the keys it declares."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def text_of(path: Path, what: str = "a config") -> str:
-    """Text of a file that should be of some kind; DataError where it is unreadable."""
+    """Return the text of a file of some type; raise `DataError` where it is unreadable."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
@@ -41,7 +41,7 @@ def text_of(path: Path, what: str = "a config") -> str:
 
 
 def mapping_of(path: Path, text: str) -> Content:
-    """What TOML text says; DataError where it is no TOML."""
+    """Return the content of TOML text; raise `DataError` where it is no TOML."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -49,7 +49,7 @@ def mapping_of(path: Path, text: str) -> Content:
 
 
 def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
-    """A mapping as a pydantic model or dataclass; DataError with every mistake on a line."""
+    """Return a mapping as a pydantic model or dataclass; `DataError` lists every mistake."""
     try:
         return TypeAdapter(model).validate_python(mapping)
     except ValidationError as error:
@@ -58,7 +58,7 @@ def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
 
 
 def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) -> str:
-    """One mistake as one line: file, key, what was found, what was expected."""
+    """Return one mistake as one line: file, key, what was found, what was expected."""
     kind, given, context = error["type"], error["input"], error.get("ctx", {})
     steps = _steps(mapping, error["loc"])
     where = f"{path}: {_spelled(steps)}" if steps else str(path)
@@ -85,7 +85,7 @@ def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) ->
 
 
 def _steps(mapping: object, loc: Sequence[Step]) -> list[Step]:
-    """The part of pydantic's location that is in the file: without names of union members."""
+    """Return the part of pydantic's location in the file, without names of union members."""
     steps: list[Step] = []
     here = mapping
     for k, part in enumerate(loc):
@@ -100,6 +100,7 @@ def _steps(mapping: object, loc: Sequence[Step]) -> list[Step]:
 
 
 def _spelled(steps: Sequence[Step]) -> str:
+    """Return a location as text, such as `a.b[2]`."""
     out = ""
     for step in steps:
         if isinstance(step, int):
@@ -111,14 +112,14 @@ def _spelled(steps: Sequence[Step]) -> str:
 
 
 def _below(here: object, step: Step) -> object:
-    """What lies one step below; None where nothing does."""
+    """Return the value one step below, or None."""
     if isinstance(here, list) and isinstance(step, int):
         return here[step]
     return here.get(step) if isinstance(here, dict) else None
 
 
 def _kinds_at(mapping: object, root: object, steps: Sequence[Step]) -> list[object]:
-    """Models and dataclasses that may describe a place of the file, by literals in it."""
+    """Return the models and dataclasses that may describe a place of the file, by its literals."""
     found, here = [root], mapping
     for step in steps:
         inner = [t for kind in found for t in _inner(kind, step)]
@@ -128,14 +129,14 @@ def _kinds_at(mapping: object, root: object, steps: Sequence[Step]) -> list[obje
 
 
 def _inner(kind: object, step: Step) -> list[object]:
-    """Types of what lies one step below."""
+    """Return the types of the value one step below."""
     if get_origin(kind) in (list, dict):
         return _members(get_args(kind)[-1])
     return _members(_annotations(kind).get(str(step)))
 
 
 def _members(annotation: object) -> list[object]:
-    """Alternatives of a type."""
+    """Return the alternatives of a type."""
     if get_origin(annotation) in (Union, UnionType):
         return [m for a in get_args(annotation) for m in _members(a)]
     return (
@@ -144,7 +145,7 @@ def _members(annotation: object) -> list[object]:
 
 
 def _annotations(kind: object) -> dict[str, object]:
-    """Types of what a model or a dataclass holds, by key; empty for others."""
+    """Return the types of the keys of a model or a dataclass; empty for others."""
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         return {f.alias or name: f.annotation for name, f in kind.model_fields.items()}
     if isinstance(kind, type) and is_dataclass(kind):
@@ -154,7 +155,7 @@ def _annotations(kind: object) -> dict[str, object]:
 
 
 def _fits(kind: object, here: object) -> bool:
-    """Whether its literals are those of the file."""
+    """Return whether the literals of a type are those of the file."""
     return all(
         here[key] in get_args(annotation)
         for key, annotation in _annotations(kind).items()

@@ -130,7 +130,7 @@ def test_people_are_asked_only_what_the_drive_needs_and_again_where_they_are_wro
 
     known = ask(RobotOptions(), asker)
     assert (known.drive, known.wheelbase_m, known.track_m, known.shared) == ("skid", 0.5, 0.6, True)
-    assert not known.taken
+    assert not known.defaults
     wrong = [text for _, text in said if text]
     assert wrong[0] == (
         "'skidd': no such drive, did you mean skid?; "

@@ -92,8 +92,8 @@ def by_slipid(density):
     x = np.repeat(d.centre[None], plan.walkers, axis=0)
     d.terms(x), d.slope(x)  # compiles
     times = [time.perf_counter()]
-    record = BlockStore(keep=lambda part, block: times.append(time.perf_counter()))
-    blocks = sampler.extended(target, plan, MOTION, record)
+    store = BlockStore(keep=lambda part, block: times.append(time.perf_counter()))
+    blocks = sampler.extended(target, plan, MOTION, store)
     warm = plan.warm_up[-1]
     chain = sampler.chain(blocks, plan)
     found = diagnose(chain, plan)

@@ -1,4 +1,4 @@
-"""What tests of pictures share: a board and what was calibrated by it, a floor and its map."""
+"""Fixtures of tests with pictures: a calibrated board, and a floor with its map."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slipid.camera.calibration.calibrate import lens_from_pictures
-from slipid.camera.floor.found import FoundMap
+from slipid.camera.floor.result import PictureMap
 from tests.helpers import made_boards
 from tests.helpers.calibrated import ABOVE, BOARD, TRUE, WORDS
 from tests.helpers.made_floors import POINTS, MadeFloor, made_floor
@@ -16,7 +16,7 @@ from tests.helpers.shared import invoke
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Pictures of the board, and one of it lying on the floor."""
+    """Return a folder with pictures of the board, one of them with the board on the floor."""
     folder = tmp_path_factory.mktemp("pictures")
     for k, place in enumerate(made_boards.places()):
         made_boards.write(made_boards.photo(TRUE, place, k), folder / "lens" / f"view{k:02d}.png")
@@ -29,17 +29,18 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(folder):
+def calibrated(folder):
+    """Return the lens calibrated by the pictures of the board."""
     return lens_from_pictures([str(folder / "lens")], BOARD, False)
 
 
 @pytest.fixture(scope="module")
 def camera_file(folder):
-    """What the command wrote and said, once for all."""
+    """Return the camera file that the command wrote, and its output."""
     out = folder / "out" / "camera.json"
     floor = ("--floor", folder / "floor.png")
-    said = invoke("calibrate", folder / "lens", *WORDS, *floor, "--out", out, "--quiet")
-    return out, said
+    done = invoke("calibrate", folder / "lens", *WORDS, *floor, "--out", out, "--quiet")
+    return out, done
 
 
 @pytest.fixture(scope="module")
@@ -48,5 +49,5 @@ def made() -> MadeFloor:
 
 
 @pytest.fixture(scope="module")
-def by_points(made, tmp_path_factory) -> FoundMap:
+def by_points(made, tmp_path_factory) -> PictureMap:
     return mapped(made, tmp_path_factory.mktemp("points"), REGION + marked(POINTS))

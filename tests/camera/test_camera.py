@@ -1,4 +1,4 @@
-"""The camera's file, and from pixels to places at a height and back."""
+"""The camera's file, and conversions between pixels and places at a height."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.helpers.made_videos import Stage, lens_of
 STAGE = Stage(lens_of(640, bend=-0.2), tilt=(12.0, -8.0, 70.0))
 
 
-def test_pixels_are_where_the_written_out_lens_sees_places():
+def test_pixels_are_those_of_the_lens_written_out():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.7, 0.7, (50, 2)), rng.uniform(0, 0.5, 50)])
     away = (points - STAGE.place) @ STAGE.rotation.T
@@ -23,11 +23,11 @@ def test_pixels_are_where_the_written_out_lens_sees_places():
 
 
 @pytest.mark.parametrize("height", [0.0, 0.25, -0.1])
-def test_places_on_a_plane_are_found_again(height):
+def test_places_on_a_plane_come_back(height):
     flat = np.random.default_rng(1).uniform(-0.7, 0.7, (6, 5, 2))
     points = np.concatenate([flat, np.full((6, 5, 1), height)], axis=-1)
-    seen = STAGE.camera.on_plane(STAGE.camera.pixels(points), height)
-    np.testing.assert_allclose(seen, flat, atol=1e-6)
+    back = STAGE.camera.on_plane(STAGE.camera.pixels(points), height)
+    np.testing.assert_allclose(back, flat, atol=1e-6)
     assert STAGE.camera.on_plane(np.zeros((0, 2)), height).shape == (0, 2)
     assert STAGE.camera.pixels(np.zeros((0, 3))).shape == (0, 2)
 
@@ -53,9 +53,9 @@ def test_a_file_keeps_all_of_a_camera(tmp_path):
     again = OverheadCamera.load(tmp_path / "camera.json")
     assert again.to_json() == STAGE.camera.to_json()
     assert again.height == 2.2
-    again.of_size((640, 360), "v.avi")
+    again.lens.check_size((640, 360), "v.avi")
     with pytest.raises(DataError, match=r"1280 x 720 pixels, but the camera was calibrated at 640"):
-        again.of_size((1280, 720), "v.avi")
+        again.lens.check_size((1280, 720), "v.avi")
 
 
 def test_a_lens_without_a_floor_is_no_overhead_camera(tmp_path):
@@ -76,8 +76,8 @@ WRONG = {
     "no focal length": ({"matrix": [[0, 0, 1], [0, 1, 1], [0, 0, 1]]}, "expected .*f, 0, x"),
     "short matrix": ({"matrix": [[1, 0, 1], [0, 1, 1]]}, "matrix"),
     "three of distortion": ({"distortion": [0.1, 0.1, 0.1]}, "3 numbers of distortion"),
-    "a mirror": ({"rotation_from_world": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "no rotation"),
-    "stretched": ({"rotation_from_world": [[2, 0, 0], [0, -1, 0], [0, 0, -1]]}, "no rotation"),
+    "a mirror": ({"rotation_from_world": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "not a rotation"),
+    "stretched": ({"rotation_from_world": [[2, 0, 0], [0, -1, 0], [0, 0, -1]]}, "not a rotation"),
     "looks up": ({"rotation_from_world": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}, "looks up"),
     "under the floor": ({"place_m": [0, 0, -1]}, "-1 m high"),
     "a word": ({"place_m": [0, 0, "high"]}, "place_m"),

@@ -193,8 +193,8 @@ def test_noise_of_poses_is_told_from_that_of_steps():
     seen, own = rng.normal(0.0, 2.0, 20001), rng.normal(0.0, 1.0, 20000)
     joined = np.arange(20000) > 0
     noise = StepNoise.of(np.diff(seen) + own, joined)
-    assert noise.seen == pytest.approx(4.0, rel=0.05)
-    assert noise.own == pytest.approx(1.0, rel=0.15)
+    assert noise.shared == pytest.approx(4.0, rel=0.05)
+    assert noise.separate == pytest.approx(1.0, rel=0.15)
 
 
 def test_whitened_noise_has_the_identity_for_its_covariance():
@@ -262,7 +262,9 @@ def test_poses_of_another_run_are_refused_with_what_to_do(tmp_path):
     )
     assert found.logs == ()
     (said,) = found.aside
-    assert re.search(r"set aside: .*run.poses.csv: .*does not tell its clock.*starts, stops", said)
+    assert re.search(
+        r"set aside: .*run.poses.csv: .*does not determine its clock.*starts, stops", said
+    )
 
 
 def test_a_log_that_counts_from_1970_has_its_poses_where_they_belong(tmp_path):

@@ -54,7 +54,7 @@ def test_a_lag_of_seconds_is_found(lag):
     assert found is not None
     assert found.seconds == pytest.approx(lag, abs=0.02)
     if lag:
-        assert found.left < found.left_at_zero
+        assert found.unexplained < found.unexplained_at_zero
 
 
 @pytest.mark.parametrize("rolling", [-0.05, 50.0])

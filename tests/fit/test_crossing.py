@@ -216,8 +216,8 @@ def test_windows_that_do_not_count_say_nothing(fitted):
         assert not np.asarray(r)[~live].any()
         assert np.asarray(r)[live].all()
         v = np.asarray(whole.covariance(k, state.log_variance))
-        piece, row = np.argwhere(~live)[0]
-        np.testing.assert_array_equal(v[piece, row], np.eye(v.shape[1])[row])
+        segment, row = np.argwhere(~live)[0]
+        np.testing.assert_array_equal(v[segment, row], np.eye(v.shape[1])[row])
         np.testing.assert_array_equal(
             np.asarray(whole.noise.blocks[k].count), 3.0 * several.counts.sum(axis=1)
         )
@@ -225,7 +225,7 @@ def test_windows_that_do_not_count_say_nothing(fitted):
 
 @pytest.mark.slow
 def test_pieces_left_out_change_nothing(fitted):
-    """The loss of kept pieces does not know what was measured in the others."""
+    """The loss of kept segments does not know what was measured in the others."""
     true, problem, optimum = fitted
     several = crossed(true, 6, 5)
     keep = np.concatenate([np.ones(len(problem.windows)), np.arange(6) % 2])

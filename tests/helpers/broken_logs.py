@@ -385,7 +385,7 @@ CASES: tuple[Case, ...] = (
             _cell(range(FIRST, _END), "xpos", "900"),
             _cell(range(FIRST, _END), "ypos", "500"),
         ),
-        ("exp07.csv", "column 'xpos'", "constant while a wheel turns", "was the marker seen"),
+        ("exp07.csv", "column 'xpos'", "constant while a wheel turns", "was the marker visible"),
     ),
     Case(
         "encoder that never counts",

@@ -1,4 +1,4 @@
-"""A board, a known lens, and what it sees of both, without drawing pictures."""
+"""A board, a known lens, and projected corners of both, without drawing pictures."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 
 from slipid.camera.calibration.board import Board, Picture, View
-from slipid.camera.calibration.lens import fit_kept
+from slipid.camera.calibration.lens import fit_robustly
 from slipid.camera.calibration.points import FloorPoints
-from slipid.camera.calibration.quality import judged
-from slipid.camera.calibration.views import enough
+from slipid.camera.calibration.quality import quality_of
+from slipid.camera.calibration.views import check_enough
 from slipid.camera.overhead import Lens
 from tests.helpers import made_boards as made
 
@@ -32,7 +32,7 @@ GRID = [(x, y, 0.0) for x in (-0.9, -0.3, 0.4, 1.0) for y in (-0.7, 0.0, 0.6)]
 
 
 def seen_views(places, noise=NOISE, seed=0) -> list[View]:
-    """Corners as a lens sees them, those alone that are inside of the picture."""
+    """Return the corners that a lens sees inside of the picture."""
     rng, views = np.random.default_rng(seed), []
     corners = BOARD.corners_m
     for k, place in enumerate(places):
@@ -45,7 +45,7 @@ def seen_views(places, noise=NOISE, seed=0) -> list[View]:
 
 
 def floor_points(places, camera=(0.1, -0.2, 2.4), tilt=(3.0, -4.0), noise=0.3, seed=0):
-    """Points of the world as the lens sees them, and the rotation of its camera."""
+    """Return points of the world as the lens sees them, and the rotation of its camera."""
     rotation = made.from_world(made.overhead(*tilt, 10.0, camera))
     places = np.asarray(places, float)
     pixels = TRUE.seen((places - np.array(camera)) @ rotation.T)
@@ -54,15 +54,14 @@ def floor_points(places, camera=(0.1, -0.2, 2.4), tilt=(3.0, -4.0), noise=0.3, s
     return FloorPoints(names, pixels, places), rotation
 
 
-def lens_of_views(views):
-    """What a command makes of views."""
-    enough(views)
-    fit = fit_kept(views, SIZE, False).fit
-    return fit, judged(fit, False)
+def quality_of_views(views):
+    """Return a lens fitted to views as the command does, with its quality."""
+    check_enough(views)
+    return quality_of(fit_robustly(views, SIZE, False), False)
 
 
 def log_length(camera) -> float:
-    """Mean logarithm of lengths on the floor along a grid over the middle of the picture."""
+    """Return the mean log length on the floor along a grid over the middle of the picture."""
     rows = [[(u, v) for u in np.linspace(64, 576, 5)] for v in np.linspace(48, 432, 5)]
     floor = camera.on_plane(np.array(rows), 0.0)
     steps = [
@@ -73,11 +72,11 @@ def log_length(camera) -> float:
 
 
 def directions(lens, pixels):
-    """Of the rays of pixels, of length 1."""
+    """Return unit vectors along the rays of pixels."""
     rays = np.concatenate([lens.ideal(pixels), np.ones((*pixels.shape[:-1], 1))], axis=-1)
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
 def picture(path) -> Picture:
-    """A picture as it is read."""
+    """Return a picture as it is read from a file."""
     return Picture(path, cv2.imread(str(path)))

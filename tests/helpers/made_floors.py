@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from slipid.camera.floor.colour import as_light, as_shown
+from slipid.camera.floor.light import to_linear, to_srgb
 from slipid.camera.overhead import Lens, OverheadCamera
 from slipid.data.floor_map import FloorMap, from_polygons
 
@@ -120,7 +120,7 @@ def made_floor(
     light = np.mean([_seen(pixels + part, camera, truth, robot, colours) for part in parts], axis=0)
     light = _worse(light, flaws)
     noise = np.random.default_rng(1).normal(0, flaws.noise, light.shape)
-    shown = np.clip(255 * as_shown(light) + noise, 0, 255).astype(np.uint8)
+    shown = np.clip(255 * to_srgb(light) + noise, 0, 255).astype(np.uint8)
     return MadeFloor(np.ascontiguousarray(shown[..., ::-1]), camera, truth, robot, POINTS)
 
 
@@ -171,4 +171,4 @@ def _worse(light: np.ndarray, flaws: Flaws) -> np.ndarray:
 
 
 def _light(code: str) -> np.ndarray:
-    return as_light(np.array([int(code[k : k + 2], 16) for k in (1, 3, 5)]) / 255)
+    return to_linear(np.array([int(code[k : k + 2], 16) for k in (1, 3, 5)]) / 255)

@@ -1,4 +1,4 @@
-"""Maps of made floors, and how far they are from the truth."""
+"""Maps of made floors, and their distance from the truth."""
 
 from pathlib import Path
 
@@ -6,16 +6,16 @@ import cv2
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from slipid.camera.floor.found import FoundMap
-from slipid.camera.floor.grid import Robot
-from slipid.camera.floor.picture import Wish, map_of
+from slipid.camera.floor.grid import RobotShape
+from slipid.camera.floor.picture import MapOptions, map_of
+from slipid.camera.floor.result import PictureMap
 from slipid.support.progress import Reporter
 from tests.helpers.made_floors import MadeFloor
 
 REGION = "[region]\nat_m = [[-1.1, -0.9], [1.1, -0.9], [1.1, 0.9], [-1.1, 0.9]]\n"
 HEAD = 'schema = "slipid.palette/1"\n'
 IMAGE = Path("floor.png")
-ROBOT = Robot("4X4_50", 0.17, 0.2)
+ROBOT = RobotShape("4X4_50", 0.17, 0.2)
 REFERENCE = Path(__file__).parents[1] / "camera" / "floor" / "test_site_reference.json"
 SITE_POINTS = {
     "tan": [(100, 60), (100, 300)],
@@ -28,11 +28,11 @@ SITE_POINTS = {
     "light_gray": [(500, 700), (70, 970), (960, 130)],
     "brown": [(250, 400), (700, 780), (930, 650)],
 }
-"""By eye, in pixels of the picture of the test site."""
+"""Points on surfaces of the test site, chosen by eye in pixels of its picture."""
 
 
 def marked(points: dict, key: str = "at_m") -> str:
-    """Points as a config has them."""
+    """Return points as text of a config."""
     return "".join(
         f'[[points]]\nsurface = "{name}"\n{key} = {[list(p) for p in places]}\n'
         for name, places in points.items()
@@ -40,35 +40,35 @@ def marked(points: dict, key: str = "at_m") -> str:
 
 
 def mapped(
-    floor: MadeFloor, folder: Path, config: str | None, cell: float = 0.008, **wish
-) -> FoundMap:
-    """The map of a made picture."""
+    floor: MadeFloor, folder: Path, config: str | None, cell: float = 0.008, **options
+) -> PictureMap:
+    """Return the map of a made picture."""
     image, path = folder / "floor.png", None
     cv2.imwrite(str(image), floor.picture)
     if config is not None:
         path = folder / "palette.toml"
         path.write_text(HEAD + config)
-    wish.setdefault("robot", ROBOT)
-    return map_of(image, floor.camera, Wish(path, cell=cell, **wish), Reporter(quiet=True))
+    options.setdefault("robot", ROBOT)
+    return map_of(image, floor.camera, MapOptions(path, cell=cell, **options), Reporter(quiet=True))
 
 
-def truth_of(found: FoundMap, floor: MadeFloor) -> np.ndarray:
-    """True surface of each cell, by number of the found map; -1 where the robot hides it."""
-    names = list(found.vector.colours)
-    centres = found.floor.grid.centres()
+def truth_of(result: PictureMap, floor: MadeFloor) -> np.ndarray:
+    """Return the true surface of each cell, by number of the map; -1 where the robot hides it."""
+    names = list(result.vector.colours)
+    centres = result.floor.grid.centres()
     number = np.array([names.index(name) for name in floor.truth.surfaces])
     return np.where(floor.hides(centres), -1, number[floor.truth.at(centres)])
 
 
-def border_error(found: FoundMap, true: np.ndarray) -> np.ndarray:
-    """How far each found edge between two surfaces is from the nearest true one [m]."""
-    known = (found.labels >= 0) & (true >= 0)
-    far = distance_transform_edt(~_edges(true, known)) * found.floor.grid.cell
-    return far[_edges(found.labels, known)]
+def border_error(result: PictureMap, true: np.ndarray) -> np.ndarray:
+    """Return the distance of each edge between two surfaces from the nearest true edge [m]."""
+    known = (result.labels >= 0) & (true >= 0)
+    far = distance_transform_edt(~_edges(true, known)) * result.floor.grid.cell
+    return far[_edges(result.labels, known)]
 
 
 def _edges(labels: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Cells whose right or upper neighbour is another surface."""
+    """Return the cells whose right or upper neighbour is another surface."""
     out = np.zeros(labels.shape, bool)
     out[:, :-1] |= (labels[:, 1:] != labels[:, :-1]) & known[:, 1:] & known[:, :-1]
     out[:-1] |= (labels[1:] != labels[:-1]) & known[1:] & known[:-1]

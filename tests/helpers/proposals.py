@@ -24,7 +24,7 @@ ROBOT = {
 
 def proposed(path: Path, **told: str):
     proposal = propose(path, RobotOptions(**told))
-    return proposal, new_config(proposal.sketch, "mine.toml")
+    return proposal, new_config(proposal.draft, "mine.toml")
 
 
 def layout_in(config, name: str = "mine"):

@@ -381,7 +381,10 @@ def test_nis_of_fixes_and_of_the_gyro(gyro):
 def test_regions_on_floors_that_are_not_known_are_not_too_narrow():
     """Patches drawn for every run, crossed over and over."""
     whole = deployed(process=1.0, run=1.0, current=1.0)
-    est, commands = Estimator(whole, Settings(alike=MIXED_FLOORS_PENALTY)), path(whole)
+    est, commands = (
+        Estimator(whole, Settings(further_floor_penalty=MIXED_FLOORS_PENALTY)),
+        path(whole),
+    )
 
     def one(key):
         cells = jax.random.bernoulli(jax.random.fold_in(key, 3), 0.5, (5, 5)).astype(int)

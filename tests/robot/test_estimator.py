@@ -28,7 +28,7 @@ from slipid.robot.interface import UNTIMED_S, Measurement, Readings, Settings
 from slipid.robot.trajectory import rectangle
 from slipid.robot.twin import Twin, TwinPlant
 from tests.helpers import small_twin
-from tests.helpers.compiled_pilot import Flat
+from tests.helpers.compiled_loop import Flat
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.stepped import stepped
 
@@ -60,7 +60,7 @@ def robot():
 
 
 @cache
-def pilot(kind):
+def control_loop(kind):
     deployed = robot()
     if kind == "curve":
         gains = Gains.at((2.0, 2.0, 0.2, 0.0, 0.15))
@@ -72,7 +72,7 @@ def pilot(kind):
 
 @cache
 def step(kind):
-    p = pilot(kind)
+    p = control_loop(kind)
     return jax.jit(lambda state, z, dt: p.step(PATH, state, z, dt))
 
 
@@ -83,9 +83,9 @@ def reading(**known):
 
 def sane(kind, state, said, before, dt):
     """Whether everything is finite and the command within its limits, for one robot."""
-    p = pilot(kind)
+    p = control_loop(kind)
     f, order = p.controller.robot, Flat(state)
-    last, now = before.held, state.held
+    last, now = before.controller, state.controller
     # an angle that was never read is NaN
     angle, numbers = order.place("seen.wheels.angle"), order.ravel(state)
     rest = jnp.concatenate([numbers[: angle.start], numbers[angle.stop :]])
@@ -155,7 +155,7 @@ def adversary(key, count, angle):
 )
 def test_adversarial_steps(kind, steps):
     """A hundred robots at once, so that the nightly ones take a million steps."""
-    p, robots = pilot(kind), 100
+    p, robots = control_loop(kind), 100
 
     def one(carry, key):
         state, angle = carry
@@ -181,7 +181,7 @@ def test_adversarial_steps(kind, steps):
 @given(data=st.data())
 def test_any_reading_leaves_a_sound_state(kind, data):
     value = st.one_of(st.sampled_from(BAD), st.floats(), st.floats(-20, 20))
-    state, size = pilot(kind).init(), SENSED.size
+    state, size = control_loop(kind).init(), SENSED.size
     for _ in range(4):
         z = SENSED.unravel(jnp.array(data.draw(st.lists(value, min_size=size, max_size=size))))
         dt = data.draw(st.one_of(st.just(DT), value))
@@ -196,7 +196,7 @@ def test_any_reading_leaves_a_sound_state(kind, data):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_stops_where_a_wheel_falls_silent_and_goes_on_without_a_bump(kind):
-    state, angle, command, rows = pilot(kind).init(), np.zeros(3), np.zeros(3), []
+    state, angle, command, rows = control_loop(kind).init(), np.zeros(3), np.zeros(3), []
     for k in range(160):
         angle = angle + command * DT
         heard = angle.copy()
@@ -217,7 +217,7 @@ def test_it_stops_where_a_wheel_falls_silent_and_goes_on_without_a_bump(kind):
 
 
 def test_a_pilot_that_wakes_on_a_moving_robot_starts_from_its_wheels():
-    state, speed = pilot("contact").init(), np.array([4.0, -3.0, 2.0])
+    state, speed = control_loop("contact").init(), np.array([4.0, -3.0, 2.0])
     state, said = step("contact")(state, reading(wheel_speed=speed), DT)
     assert np.abs(np.asarray(said.command) - speed).max() <= LIMITS.acceleration * DT + 1e-9
 
@@ -226,8 +226,8 @@ def test_a_pilot_that_wakes_on_a_moving_robot_starts_from_its_wheels():
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_state_is_of_one_kind_from_the_start(kind):
     """Else a step is compiled twice."""
-    begin = jax.eval_shape(pilot(kind).init)
-    after, _ = jax.eval_shape(pilot(kind).step, PATH, begin, reading(), jnp.asarray(DT))
+    begin = jax.eval_shape(control_loop(kind).init)
+    after, _ = jax.eval_shape(control_loop(kind).step, PATH, begin, reading(), jnp.asarray(DT))
     for a, b in zip(jax.tree.leaves(begin), jax.tree.leaves(after), strict=True):
         assert (a.shape, a.dtype, a.weak_type) == (b.shape, b.dtype, b.weak_type)
 
@@ -401,7 +401,7 @@ def test_fixes_that_all_come_late_count_for_what_they_say():
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("lost", [(), (20,), (20, 21, 22), tuple(range(3, 60, 4))])
 def test_readings_that_are_lost_do_not_make_the_way_longer(kind, lost):
-    est = pilot(kind).estimator
+    est = control_loop(kind).estimator
     run = stepped(est)
 
     def way(lost, twice=()):
@@ -421,7 +421,7 @@ def test_readings_that_are_lost_do_not_make_the_way_longer(kind, lost):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("dt", [0.0, np.nan, -1.0])
 def test_it_stops_where_the_clock_fails_for_good(kind, dt):
-    p, run = pilot(kind), step(kind)
+    p, run = control_loop(kind), step(kind)
     state, angle = p.init(), np.zeros(3)
     moved = 0.0
     for k in range(100):
@@ -537,7 +537,7 @@ def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_an
     for _ in range(400):
         state, command = step(state, said)
         commands.append(np.asarray(command))
-        helpless.append(bool(state.given_up))
+        helpless.append(bool(state.gave_up))
     rows = np.array(commands)
     end = helpless.index(True)
     assert 14.0 < end * DT < 16.0
@@ -552,7 +552,7 @@ def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_an
     # it has stopped for good, whatever is believed of it afterwards
     for _ in range(20):
         state, command = step(state, estimate(f))
-    assert bool(state.given_up)
+    assert bool(state.gave_up)
     np.testing.assert_allclose(command, 0.0)
 
 
@@ -589,7 +589,7 @@ def test_a_robot_that_nothing_frees_gives_up_and_its_run_ends():
         ControlLoop(Estimator(slick), Controller(slick, Gains())), PATH, plant, start
     )
     assert 15.0 < course.time[-1] < 25.0
-    assert course.own[-1] < 0.5 * PATH.duration
+    assert course.path_time[-1] < 0.5 * PATH.duration
     rolled = DT * float(slick.frame.radius) * np.abs(course.command).max(axis=1).sum()
     assert np.abs(course.pose[:, :2]).max() < 0.02 * rolled
     assert np.abs(course.command[150:300]).max() > 2 * np.abs(course.command[:20]).max()

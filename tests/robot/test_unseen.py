@@ -68,7 +68,7 @@ def test_nothing_is_told_of_them_but_how_far_off_they_are():
     cell = ((0.01, -0.02, 0.3), (0.0, 0.1, 0.0))
     left = ((0.01, 0.02, 0.3), (0.0, 0.1, 0.0))
     told = EffectRecord((0.1,), ((cell,), (cell,)), ((left,), (left,)))
-    known = deploy_known(made, told={made.body.loads[0]: told}).record
+    known = deploy_known(made, effects={made.body.loads[0]: told}).record
     spread = tuple(replace(load, spread=((0.2, 0.4, 0.1),) * 2) for load in known.loads)
     record = with_unseen(replace(known, loads=spread))
     (load,) = record.loads
@@ -83,7 +83,7 @@ def test_nothing_is_told_of_them_but_how_far_off_they_are():
 
 def test_together_they_are_as_rare_as_a_second_floor_under_the_robot():
     known, wider = deployed(), deployed().with_unseen()
-    settings = Settings(alike=2.0)
+    settings = Settings(further_floor_penalty=2.0)
     prior = np.asarray(FloorFilter(wider, settings).prior())
     ways = hypotheses_of(wider)
     before = np.asarray(FloorFilter(known, settings).prior())

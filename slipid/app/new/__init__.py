@@ -1,1 +1,1 @@
-"""A look into log files: what their columns hold, proposed as a config with open questions."""
+"""Write a commented config for a new robot, from answers or from its log files."""

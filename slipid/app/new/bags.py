@@ -1,4 +1,4 @@
-"""A bag looked into: which topics hold what, proposed as a layout."""
+"""Propose a layout for bags from the types and names of their topics."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -27,14 +27,19 @@ _EFFORT = (
 
 
 _BY_NAME = ("current", "voltage", "duty")
-"""Channels that are looked for in messages of unknown types, by what their fields are called."""
+"""Channels that are recognised by field names in messages of unknown types."""
 
 
 @dataclass(frozen=True)
 class _TopicChannel:
-    """A channel, or a group of them, that a topic holds; `wheels` where it has one per wheel.
+    """Channel, or group of channels, in a topic.
 
-    `field` and `unit` where the type of the messages does not tell them.
+    Attributes:
+        channel: name of the channel.
+        topic: topic that has it.
+        wheels: number of wheels with a value each; 0 for a channel of the whole robot.
+        question: question that is left to the user.
+        field, unit: field and unit, where the message type does not imply them.
     """
 
     channel: str
@@ -46,9 +51,9 @@ class _TopicChannel:
 
 
 def bags_in(path: Path) -> list[Path]:
-    """Files that a config names for bags: of a path itself, or below it.
+    """Return the bag files at or below a path, as a config names them.
 
-    That is the metadata.yaml of a rosbag2 folder, whose other files belong to it.
+    A rosbag2 folder is named by its metadata.yaml, and its other files belong to that.
     """
     if path.is_file():
         return [path] if path.suffix in SUFFIXES or path.name == _METADATA else []
@@ -58,23 +63,24 @@ def bags_in(path: Path) -> list[Path]:
 
 
 def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> ConfigProposal:
-    """The config that bags are proposed to have, by the first; DataError where it is unreadable.
+    """Return the config proposed for bags; raise `DataError` where the first is unreadable.
 
     Args:
-        bags: as of `bags_in`; path: of the log or folder that was named.
-        options: what is known of the robot.
+        bags: the files, as from `bags_in`.
+        path: the log or folder that the user named.
+        options: what the user said about the robot.
     """
     bag = bags[0]
     topics = topics_of(bag)
     joints, doubt = _joints(topics)
-    served = list(_best_topics(topics, len(joints)))
+    channels = list(_best_topics(topics, len(joints)))
     wheels = next(
-        (one.wheels for name in _WHEEL_CHANNELS for one in served if one.channel == name), 0
+        (one.wheels for name in _WHEEL_CHANNELS for one in channels if one.channel == name), 0
     )
-    served += _by_field_names(topics, served, wheels)
+    channels += _by_field_names(topics, channels, wheels)
     guessed = guess_robot(options, wheels, ())
     questions = [doubt] if doubt else []
-    if not any(one.channel == "pose" for one in served):
+    if not any(one.channel == "pose" for one in channels):
         questions.append("no topic with a pose was found: a fit needs one")
     if not wheels:
         questions.append("no topic tells how wheels turn: which one does, and in which field?")
@@ -84,30 +90,30 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
     inside = [one for one in inside if len(one.parts) == len(inside[0].parts)]
     layout = BagDraft(
         "mine",
-        _layout_lines(guessed.robot, joints, served),
-        tuple(_topic_lines(served)),
-        _unused(topics, served),
+        _layout_lines(guessed.robot, joints, channels),
+        tuple(_topic_lines(channels)),
+        _unused(topics, channels),
         tuple(questions),
     )
     floor = "on which floor was it driven? Or a topic or table tells: runs, in the layout"
     glob = common_glob(inside)
-    sketch = ConfigDraft(
+    draft = ConfigDraft(
         guessed.robot,
         (),
         (LogsDraft(glob, "mine", floor_of(glob), question=floor),),
-        carries=frozenset(one.channel for one in served if one.question != _EFFORT),
+        preset_channels=frozenset(one.channel for one in channels if one.question != _EFFORT),
         above=(f"Proposed from {bag}.",),
         data=str(root),
         hints=guessed.hints,
         bags=(layout,),
     )
     sentences = [f"{bag}: {len(topics)} topics"]
-    sentences += [f"  {one.topic.name} ({one.topic.type}): {one.channel}" for one in served]
-    return ConfigProposal(sketch, tuple(sentences))
+    sentences += [f"  {one.topic.name} ({one.topic.type}): {one.channel}" for one in channels]
+    return ConfigProposal(draft, tuple(sentences))
 
 
 def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
-    """Names of the wheels' joints in the order of the drives, and what is not sure of them."""
+    """Return the wheels' joint names in the order of the drives, and an open question or ""."""
     names = tuple(dict.fromkeys(name for topic in topics for name in topic.joints))
     labels = {name: meaning_of(f"{name}_velocity") for name in names}
     wheels = [
@@ -124,7 +130,7 @@ def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
 
 
 def _best_topics(topics: Sequence[Topic], joints: int) -> Iterator[_TopicChannel]:
-    """The best topic for every channel: poses that are no odometry come before those that are."""
+    """Yield the best topic for every channel: a pose that is no odometry comes first."""
     order = sorted(topics, key=lambda t: (t.type == _ODOMETRY, t.type == _TRANSFORMS, t.name))
     taken: set[str] = set()
     for topic in order:
@@ -140,10 +146,10 @@ def _best_topics(topics: Sequence[Topic], joints: int) -> Iterator[_TopicChannel
 
 
 def _by_field_names(
-    topics: Sequence[Topic], served: Sequence[_TopicChannel], wheels: int
+    topics: Sequence[Topic], channels: Sequence[_TopicChannel], wheels: int
 ) -> Iterator[_TopicChannel]:
-    """Channels in messages of unknown types: numbers of every wheel in a field of that name."""
-    taken = {one.channel for one in served}
+    """Yield channels in messages of unknown types, from fields with a number for every wheel."""
+    taken = {one.channel for one in channels}
     for topic in (one for one in topics if one.count and not one.serves and not one.joints):
         for field in topic.fields:
             meaning = meaning_of(f"wheel {field.path.replace('.', ' ')}")
@@ -158,11 +164,12 @@ def _by_field_names(
 
 
 def _array_length(topic: Topic) -> int:
-    """How many wheels a message has numbers of."""
+    """Return the number of wheels that a message has numbers for."""
     return max((field.count for field in topic.fields if field.type.endswith("[]")), default=1)
 
 
 def _pose_question(channel: str, topic: Topic) -> str:
+    """Return the question about a topic with a pose; empty where its type leaves none."""
     if channel != "pose":
         return ""
     if topic.type == _ODOMETRY:
@@ -174,19 +181,21 @@ def _pose_question(channel: str, topic: Topic) -> str:
     return ""
 
 
-def _topic_lines(served: Sequence[_TopicChannel]) -> Iterator[ConfigLine]:
-    """A line for each channel."""
-    for one in served:
+def _topic_lines(channels: Sequence[_TopicChannel]) -> Iterator[ConfigLine]:
+    """Yield a config line for each channel."""
+    for one in channels:
         inside = f"topic = {toml(one.topic.name)}"
-        off = one.question == _EFFORT
-        if off:
+        commented_out = one.question == _EFFORT
+        if commented_out:
             inside += ', field = "effort", unit = "A"'
         elif one.field:
             inside += f", field = {toml(one.field)}, unit = {toml(one.unit)}"
         if one.topic.type == _TRANSFORMS and one.topic.frames:
             frame, _, child = one.topic.frames[0].partition(" -> ")
             inside += f", frame = {toml(frame)}, child = {toml(child)}"
-        yield ConfigLine(one.channel, f"{{ {inside} }}", _rate(one.topic), one.question, off)
+        yield ConfigLine(
+            one.channel, f"{{ {inside} }}", _rate(one.topic), one.question, commented_out
+        )
 
 
 def _rate(topic: Topic) -> str:
@@ -196,20 +205,20 @@ def _rate(topic: Topic) -> str:
 
 
 def _layout_lines(
-    robot: RobotAnswers, joints: tuple[str, ...], served: Sequence[_TopicChannel]
+    robot: RobotAnswers, joints: tuple[str, ...], channels: Sequence[_TopicChannel]
 ) -> tuple[ConfigLine, ...]:
-    """Keys of the layout but for its topics."""
+    """Return the keys of the layout except its topics."""
 
     def line(key: str, value: object, question: str = "") -> ConfigLine:
         kind = BagLayout if key in meanings(BagLayout) else Layout
         return ConfigLine(key, toml(value), in_short(kind, key), question)
 
     lines = [ConfigLine("kind", toml("bag"))]
-    have = {one.channel for one in served}
+    have = {one.channel for one in channels}
     lines += [line("joints", list(joints))] if joints else []
     if "wheel_ticks" in have:
         ask = ""
-        if "ticks_per_revolution" in robot.taken:
+        if "ticks_per_revolution" in robot.defaults:
             ask = "how many, of the motor shaft, all edges counted?"
         lines.append(line("ticks_per_revolution", robot.ticks_per_revolution or 1000.0, ask))
     lines.append(ConfigLine("gear_ratio", toml(robot.gear_ratio), "as above"))
@@ -219,9 +228,9 @@ def _layout_lines(
     return tuple(lines)
 
 
-def _unused(topics: Sequence[Topic], served: Sequence[_TopicChannel]) -> tuple[str, ...]:
-    """Other topics, with what their messages hold."""
-    used = {one.topic.name for one in served}
+def _unused(topics: Sequence[Topic], channels: Sequence[_TopicChannel]) -> tuple[str, ...]:
+    """Return a comment for each unused topic, with the fields of its messages."""
+    used = {one.topic.name for one in channels}
     others = [topic for topic in topics if topic.name not in used and topic.count]
     return tuple(f"Not used: {topic.name} ({topic.type}){_field_list(topic)}" for topic in others)
 

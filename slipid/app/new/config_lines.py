@@ -1,7 +1,4 @@
-"""Lines of a config that people read: keys with what they mean, and questions that are open.
-
-A robot as it was understood, drawn in text: wrong orders and frames are seen at once.
-"""
+"""Lines of a config: keys with explanations and open questions; also the robot drawn as text."""
 
 import json
 import math
@@ -13,9 +10,9 @@ import numpy as np
 from slipid.model.geometry import Geometry
 
 QUESTION_MARK = "# ? "
-"""What the line of an open question begins with."""
+"""Start of a line with an open question."""
 _COLUMN = 38
-"""Where comments begin, if the line leaves room."""
+"""Column at which comments begin, if the line leaves room."""
 _WIDTH = 98
 Value = str | bool | int | float | list[int] | list[float] | list[str] | list[list[int]] | object
 
@@ -25,22 +22,23 @@ class ConfigLine:
     """One key of a config.
 
     Attributes:
-        key: its name; value: as TOML.
-        comment: what it means.
-        question: what the reader is to fill in here; nothing where all is known.
-        off: whether it is commented out.
+        key: its name.
+        value: its value as TOML.
+        comment: what the key means.
+        question: what the reader has to fill in here; empty where nothing is open.
+        commented_out: whether the line is only a comment.
     """
 
     key: str
     value: str
     comment: str = ""
     question: str = ""
-    off: bool = False
+    commented_out: bool = False
 
     def text(self) -> str:
-        """The line, below its question."""
+        """Return the line, below its question."""
         asked = _question_lines(self.question)
-        line = f"{'# ' if self.off else ''}{self.key} = {self.value}"
+        line = f"{'# ' if self.commented_out else ''}{self.key} = {self.value}"
         if not self.comment:
             return asked + line
         if len(line) < _COLUMN:
@@ -53,7 +51,15 @@ class ConfigLine:
 
 @dataclass(frozen=True)
 class ConfigBlock:
-    """A table of a config: its header, comments above it, its keys, comments at its end."""
+    """A table of a config.
+
+    Attributes:
+        header: its header line.
+        lines: its keys.
+        above: comments above it.
+        below: comments at its end.
+        questions: open questions about the whole table.
+    """
 
     header: str
     lines: tuple[ConfigLine, ...] = ()
@@ -62,7 +68,7 @@ class ConfigBlock:
     questions: tuple[str, ...] = ()
 
     def text(self) -> str:
-        """Its part of the file."""
+        """Return its part of the file."""
         out = [f"# {part}".rstrip() for text in self.above for part in wrapped(text, _WIDTH - 2)]
         out += [_question_lines(question).rstrip("\n") for question in self.questions]
         out += [self.header] if self.header else []
@@ -72,13 +78,13 @@ class ConfigBlock:
 
     @property
     def asked(self) -> tuple[str, ...]:
-        """Every question in it."""
+        """Every open question of the table."""
         lines = (f"{line.key}: {line.question}" for line in self.lines if line.question)
         return (*self.questions, *lines)
 
 
 def toml(value: Value) -> str:
-    """A plain value as inline TOML; whole floats as people write them."""
+    """Return a plain value as inline TOML, whole floats without a decimal point."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
@@ -89,7 +95,7 @@ def toml(value: Value) -> str:
 
 
 def _question_lines(question: str) -> str:
-    """A question as comment lines, the first of which begins with `QUESTION_MARK`."""
+    """Return a question as comment lines, the first of which begins with `QUESTION_MARK`."""
     if not question:
         return ""
     first, *others = wrapped(question, _WIDTH - len(QUESTION_MARK))
@@ -97,7 +103,7 @@ def _question_lines(question: str) -> str:
 
 
 def wrapped(text: str, width: int) -> list[str]:
-    """Text in lines of at most so many characters; line breaks and drawings stay."""
+    """Return text in lines of at most `width` characters; existing line breaks stay."""
     out: list[str] = []
     for line in text.splitlines() or [""]:
         if len(line) <= width:
@@ -115,27 +121,26 @@ def wrapped(text: str, width: int) -> list[str]:
 
 
 def all_questions(blocks: Iterable[ConfigBlock]) -> tuple[str, ...]:
-    """Every open question of a config, in its order."""
+    """Return every open question of a config, in order."""
     return tuple(question for block in blocks for question in block.asked)
 
 
 _ARROWS = "↑↖←↙↓↘→↗"
-"""Directions from ahead (up) counter-clockwise, an eighth of a turn apart."""
+"""Arrows for directions, from ahead (up) counter-clockwise in steps of 45 degrees."""
 _LINES = r"|\-/"
 """Lines along ahead (up), ahead left, left and back left."""
 _ROWS, _COLUMNS, _LEAST = 5, 13, 3
-"""Rows ahead of the middle and columns left of it that the furthest wheel may use; rows at least
-on either side."""
+"""Most rows ahead of the middle, most columns left of it, and fewest rows on either side."""
 _MARGIN = 12
-"""Columns beyond the wheels, for the axis to the left and the labels."""
+"""Columns beyond the wheels for the y axis and the labels."""
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 LABEL_WIDTH = 3
-"""Characters of a wheel: its number, its arrow, the letter of a drive that it shares."""
+"""Characters of a wheel: its number, its arrow, and the letter of a shared drive."""
 
 
 @dataclass(frozen=True)
 class _DrawnWheel:
-    """A wheel as it is drawn: row 0 is the middle, rows count down, columns to the right."""
+    """Wheel on the drawing; row 0 is the middle, rows count down and columns to the right."""
 
     row: int
     column: int
@@ -143,10 +148,11 @@ class _DrawnWheel:
 
 
 def drawing(robot: Geometry) -> str:
-    """The robot from above, x ahead up and y left, and a line for every wheel.
+    """Return a drawing of the robot from above, x up and y left, and a line for every wheel.
 
-    A wheel is its number in the order of the columns of the logs, an arrow the way it rolls when
-    its speed is positive, and a letter the motor that it shares with others.
+    A wheel is drawn as its number in the order of the log columns, an arrow in the direction in
+    which it rolls at a positive speed, and the letter of the motor that it shares with other
+    wheels.
     """
     lines = ["seen from above, arrows: the way of a positive wheel speed", ""]
     lines += _picture(_grid_wheels(robot))
@@ -159,15 +165,17 @@ def drawing(robot: Geometry) -> str:
 
 
 def direction(degrees: float) -> str:
-    """A direction in words, counter-clockwise from ahead."""
+    """Return a direction in words, counter-clockwise from ahead."""
     names = ("ahead", "ahead left", "left", "back left", "back", "back right", "right")
     return (*names, "ahead right")[round(degrees / 45) % 8]
 
 
 def _grid_wheels(robot: Geometry) -> list[_DrawnWheel]:
-    """Wheels on a grid whose rows are twice as far apart as its columns, none on another."""
+    """Return the wheels on a character grid without overlaps.
+
+    A character is about twice as high as wide, so rows are twice as far apart as columns.
+    """
     place = np.asarray(robot.place) * float(robot.base_radius)
-    # a character is about twice as high as it is wide
     step = max(np.abs(place[:, 0]).max() / _ROWS, np.abs(place[:, 1]).max() / (_COLUMNS / 2), 1e-9)
     taken: set[tuple[int, int]] = {(0, 0)}
     wheels = []
@@ -186,7 +194,7 @@ def _label(robot: Geometry, wheel: int) -> str:
 
 
 def _letter(robot: Geometry, wheel: int) -> str:
-    """Letter of the motor that a wheel shares; nothing where it has its own."""
+    """Return the letter of the motor that a wheel shares; empty where it has its own."""
     if not robot.drive_of or robot.drive_of.count(robot.drive_of[wheel]) == 1:
         return ""
     return _LETTERS[robot.drive_of[wheel] % len(_LETTERS)]
@@ -217,7 +225,7 @@ def _picture(wheels: list[_DrawnWheel]) -> list[str]:
 
 
 def _wheel_line(robot: Geometry, wheel: int) -> str:
-    """Where a wheel stands and what it does, in a line."""
+    """Return a line with the place, direction and rollers of a wheel."""
     x, y = (float(robot.base_radius) * c for c in robot.place[wheel])
     degrees = math.degrees(robot.drive_angle[wheel]) % 360
     way = f"drives {direction(degrees)}" + (f" ({degrees:.0f} deg)" if degrees % 90 else "")
@@ -231,7 +239,7 @@ def _wheel_line(robot: Geometry, wheel: int) -> str:
 
 
 def _tilt(drive: float, roller: float) -> str:
-    """How rollers on top of a wheel lie as one looks down at it, where they are tilted."""
+    """Return how the upper rollers of a wheel lie as seen from above; empty for straight ones."""
     if abs(roller % 180 - 90) < 1:
         return ""
     # on top they lie as a mirror shows those that touch the floor, whose axes are across `free`
@@ -239,14 +247,14 @@ def _tilt(drive: float, roller: float) -> str:
 
 
 def _corner(x: float, y: float) -> str:
-    """Which part of the robot a place is in."""
+    """Return the corner of the robot that a place is in."""
     far = 0.2 * math.hypot(x, y)
     along = "front" if x > far else "rear" if x < -far else ""
     return f"{along} {'left' if y > far else 'right' if y < -far else ''}".strip()
 
 
 def _motor_lines(robot: Geometry) -> list[str]:
-    """Which columns of the logs belong to which wheels, where they are not one for each."""
+    """Return the wheels of each log column, where wheels share motors."""
     if not robot.drive_of:
         return []
     out = []

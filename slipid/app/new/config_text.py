@@ -1,4 +1,4 @@
-"""The text of a new config: every key explained, and read back before it is written."""
+"""Compose the text of a new config, every key explained, and read it back before it is written."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ _ANSWER_OF_KEY = {
     "roller_angles_deg": "rollers_deg",
     "drives": "shared",
 }
-"""Which answer a key of `[robot]` is made of, where it is not called the same."""
+"""Answer that a key of `[robot]` is made from, where the two have different names."""
 _ASK_MEASURED = "taken by default: measure it, or look it up"
 _ASK_PLACES = "taken by default: where do the wheels stand, in the order of the columns?"
 _QUESTIONS = {
@@ -69,41 +69,42 @@ _MORE_FILES = (
 )
 
 
-def blocks_of(sketch: ConfigDraft, robot: Wheels, picture: str, name: str) -> list[ConfigBlock]:
-    """Every part of a config.
+def blocks_of(draft: ConfigDraft, robot: Wheels, picture: str, name: str) -> list[ConfigBlock]:
+    """Return every part of a config.
 
     Args:
-        sketch: what it shall say.
-        robot: made of its answers; picture: of that robot.
-        name: what the file will be called.
+        draft: content of the config.
+        robot: the `[robot]` section made from the draft's answers.
+        picture: drawing of that robot.
+        name: name of the config file.
     """
     return [
-        ConfigBlock("", above=_head(sketch, name)),
-        _robot_block(sketch, robot, picture),
-        *(block for layout in sketch.layouts for block in _layout_blocks(layout)),
-        *(block for bag in sketch.bags for block in _bag_blocks(bag)),
-        *(_logs_block(logs, first=k == 0) for k, logs in enumerate(sketch.logs)),
+        ConfigBlock("", above=_head(draft, name)),
+        _robot_block(draft, robot, picture),
+        *(block for layout in draft.layouts for block in _layout_blocks(layout)),
+        *(block for bag in draft.bags for block in _bag_blocks(bag)),
+        *(_logs_block(logs, first=k == 0) for k, logs in enumerate(draft.logs)),
         _fit_block(),
         _weights_block(geometry(robot).wheels),
-        _parameters_block(sketch.channels),
+        _parameters_block(draft.channels),
     ]
 
 
-def _head(sketch: ConfigDraft, name: str) -> tuple[str, ...]:
+def _head(draft: ConfigDraft, name: str) -> tuple[str, ...]:
     return (
-        *sketch.above,
-        f"  slipid check {name} --data {sketch.data}",
-        f"  slipid identify {name} --data {sketch.data} --out OUT",
+        *draft.above,
+        f"  slipid check {name} --data {draft.data}",
+        f"  slipid identify {name} --data {draft.data} --out OUT",
         "Every number is SI or has its unit in the name of its key. `slipid reference` explains "
         'all keys, channels, units and parameters. A line that begins with "# ?" is to be '
         "answered, and then taken out.",
     )
 
 
-def _robot_block(sketch: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock:
-    """`[robot]` with the drawing in front of it."""
+def _robot_block(draft: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock:
+    """Return `[robot]` below the drawing."""
     lines = [
-        ConfigLine("drive", toml(robot.drive), _ORDER[robot.drive], _open_question(sketch, "drive"))
+        ConfigLine("drive", toml(robot.drive), _ORDER[robot.drive], _open_question(draft, "drive"))
     ]
     given = robot.model_dump(exclude_none=True, exclude={"drive"}, exclude_defaults=False)
     own = {key: value for key, value in given.items() if _is_worth_a_line(robot, key, value)}
@@ -111,25 +112,25 @@ def _robot_block(sketch: ConfigDraft, robot: Wheels, picture: str) -> ConfigBloc
     common = ("wheel_radius_m", "gear_ratio", "mass_kg")
     for key in (*(k for k in own if k not in common), *common):
         comment = in_short(type(robot), key)
-        lines.append(ConfigLine(key, toml(own[key]), comment, _open_question(sketch, key)))
+        lines.append(ConfigLine(key, toml(own[key]), comment, _open_question(draft, key)))
     return ConfigBlock("[robot]", tuple(lines), above=(*picture.splitlines(), "", FRAME))
 
 
 def _is_worth_a_line(robot: Wheels, key: str, value: object) -> bool:
-    """Ordinary omni wheels need no word about their rollers, whose angle has a default."""
+    """Return False for the default roller angle, which ordinary omni wheels need not mention."""
     return key not in ("roller_angle_deg",) or value != type(robot).model_fields[key].default
 
 
-def _open_question(sketch: ConfigDraft, key: str) -> str:
-    """The question about a key that nobody answered."""
-    if _ANSWER_OF_KEY.get(key, key) not in sketch.robot.taken or key == "drives":
+def _open_question(draft: ConfigDraft, key: str) -> str:
+    """Return the question about a key that the user has not answered, else ""."""
+    if _ANSWER_OF_KEY.get(key, key) not in draft.robot.defaults or key == "drives":
         return ""
-    hints = (hint.asks for hint in sketch.hints if hint.key == key and hint.asks)
+    hints = (hint.question for hint in draft.hints if hint.key == key and hint.question)
     return next(hints, _QUESTIONS.get(key, _ASK_MEASURED))
 
 
 def _layout_blocks(layout: LayoutDraft) -> list[ConfigBlock]:
-    """A layout with its columns, and those of the files beside."""
+    """Return a layout with its columns, and the layouts of files beside a run's own."""
     where = f"layouts.{layout.name}"
     below = (*_OTHER_CHANNELS, *_MORE_FILES) if layout.examples else ()
     blocks = _file_blocks(where, layout.file, _COLUMNS_HELP, below)
@@ -150,7 +151,7 @@ def _file_blocks(
 
 
 def _bag_blocks(bag: BagDraft) -> list[ConfigBlock]:
-    """A layout of bags with its topics."""
+    """Return a layout of bags with its topics."""
     above = (
         "Which topic holds what. Known types of messages need neither field nor unit; the frame of "
         "a pose in /tf and what the effort of joints is must be said.",
@@ -162,49 +163,62 @@ def _bag_blocks(bag: BagDraft) -> list[ConfigBlock]:
 
 
 def _logs_block(logs: LogsDraft, first: bool) -> ConfigBlock:
-    """A section of logs; the first one explains its keys."""
+    """Return a section of logs; the first one explains its keys."""
 
-    def line(key: str, value: str, off: bool = False) -> ConfigLine:
-        return ConfigLine(key, toml(value), in_short(LogsSection, key) if first else "", off=off)
+    def line(key: str, value: str, commented_out: bool = False) -> ConfigLine:
+        return ConfigLine(
+            key,
+            toml(value),
+            in_short(LogsSection, key) if first else "",
+            commented_out=commented_out,
+        )
 
     surface = in_short(LogsSection, "surface") + '; "folder": the folder names it'
     lines = [
-        line("glob", logs.glob, logs.off),
-        line("format", logs.format, logs.off),
+        line("glob", logs.glob, logs.commented_out),
+        line("format", logs.format, logs.commented_out),
         ConfigLine(
-            "surface", toml(logs.surface), surface if first else "", logs.question, logs.off
+            "surface",
+            toml(logs.surface),
+            surface if first else "",
+            logs.question,
+            logs.commented_out,
         ),
-        line("load", "as_built", logs.off),
+        line("load", "as_built", logs.commented_out),
     ]
     if logs.session:
-        lines.append(line("session", logs.session, logs.off))
+        lines.append(line("session", logs.session, logs.commented_out))
     if first:
-        lines.append(line("map", "maps/site.toml", off=True))
+        lines.append(line("map", "maps/site.toml", commented_out=True))
     above = logs.above or (("One section per set of logs.",) if first else ())
-    return ConfigBlock("# [[logs]]" if logs.off else "[[logs]]", tuple(lines), above=above)
+    return ConfigBlock(
+        "# [[logs]]" if logs.commented_out else "[[logs]]", tuple(lines), above=above
+    )
 
 
 def _fit_block() -> ConfigBlock:
-    """Whether poses are in true metres, which logs do not tell."""
+    """Return the question whether poses are in true metres, which logs do not show."""
     above = (
         f"Of lengths, {in_short(FitSection, 'lengths_from')}? " + _LENGTHS_HELP,
         "[fit]",
     )
-    return ConfigBlock("", (ConfigLine("lengths_from", toml("poses"), off=True),), above=above)
+    return ConfigBlock(
+        "", (ConfigLine("lengths_from", toml("poses"), commented_out=True),), above=above
+    )
 
 
 def _weights_block(wheels: int) -> ConfigBlock:
     kg = toml([round(10.0 / wheels, 1)] * wheels)
     lines = (
-        ConfigLine("kg", kg, "in the order of the wheels", off=True),
-        ConfigLine("std_kg", "0.05", "standard deviation of each scale", off=True),
+        ConfigLine("kg", kg, "in the order of the wheels", commented_out=True),
+        ConfigLine("std_kg", "0.05", "standard deviation of each scale", commented_out=True),
     )
     above = ("What scales show under each wheel, if you weighed the robot:", "[weights.as_built]")
     return ConfigBlock("", lines, above=above)
 
 
 def _parameters_block(channels: frozenset[str]) -> ConfigBlock:
-    """What is known of the parameters before, of those that these logs can tell."""
+    """Return choices for the parameters that logs with these channels can identify."""
     current = channels & {"current", "motor_torque", "wheel_torque"}
     voltage = "voltage" in channels or {"duty", "bus_voltage"} <= channels
     yaw = '"camera.marker_yaw"'
@@ -232,7 +246,14 @@ def _parameters_block(channels: frozenset[str]) -> ConfigBlock:
 
 @dataclass(frozen=True)
 class NewConfig:
-    """A config that reads: its text, the robot in it, its drawing and what is still open."""
+    """A config that was read back without errors.
+
+    Attributes:
+        text: its text.
+        robot: its robot.
+        drawing: drawing of the robot.
+        questions: its open questions.
+    """
 
     text: str
     robot: Wheels
@@ -240,30 +261,30 @@ class NewConfig:
     questions: tuple[str, ...]
 
     def write(self, out: Path, force: bool = False) -> None:
-        """Write it; DataError where the file exists and shall not be replaced."""
+        """Write the file; raise `DataError` where it exists and may not be replaced."""
         refuse_existing(out, force)
         write_bytes(out, self.text.encode())
 
 
 def refuse_existing(out: Path, force: bool) -> None:
-    """DataError where a file exists and shall not be replaced; said before anything is asked."""
+    """Raise `DataError` where a file exists and may not be replaced; called before any question."""
     if out.exists() and not force:
         raise DataError(f"{out}: exists already; expected a new file, or --force")
 
 
-def new_config(sketch: ConfigDraft, name: str) -> NewConfig:
-    """The config of a sketch, checked as if it had been read.
+def new_config(draft: ConfigDraft, name: str) -> NewConfig:
+    """Return the config of a draft, checked by reading it back.
 
     Args:
-        sketch: what it shall say.
-        name: what the file will be called.
+        draft: content of the config.
+        name: name of the config file.
 
     Raises:
-        DataError: the answers make no robot.
+        DataError: the answers describe no possible robot.
     """
-    robot = robot_of(sketch.robot)
+    robot = robot_of(draft.robot)
     picture = drawing(geometry(robot))
-    blocks = blocks_of(sketch, robot, picture, name)
+    blocks = blocks_of(draft, robot, picture, name)
     text = "\n\n".join(block.text() for block in blocks) + "\n"
     parsed(Path(name), text)
     return NewConfig(text, robot, picture, all_questions(blocks))

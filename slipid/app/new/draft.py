@@ -1,4 +1,4 @@
-"""The content of a new config before it is text; also the one for logs that nobody has shown."""
+"""Drafts of a config and its sections before they become text, and a template without any logs."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,34 +18,42 @@ _LABELS = {
 
 @dataclass(frozen=True)
 class ChannelDraft:
-    """A channel of a layout: columns and unit as of `Channel`, the rest as of `Line`."""
+    """A channel of a layout.
+
+    Attributes:
+        channel, columns, unit: as in `slipid.data.reading.layout.Channel`.
+        comment, question, commented_out: as in `ConfigLine`.
+    """
 
     channel: str
     columns: tuple[str | int, ...]
     unit: str
     comment: str = ""
     question: str = ""
-    off: bool = False
+    commented_out: bool = False
 
     def line(self) -> ConfigLine:
-        """Its line in the config."""
+        """Return its line in the config."""
         several = len(self.columns) > 1
         named = toml(list(self.columns) if several else self.columns[0])
         inside = f"column{'s' if several else ''} = {named}, unit = {toml(self.unit)}"
-        return ConfigLine(self.channel, f"{{ {inside} }}", self.comment, self.question, self.off)
+        return ConfigLine(
+            self.channel, f"{{ {inside} }}", self.comment, self.question, self.commented_out
+        )
 
 
 @dataclass(frozen=True)
 class FileDraft:
-    """One kind of file.
+    """Layout of one kind of file.
 
     Attributes:
-        channels: what its columns hold.
-        delimiter, names_row, units_row, first_data_row: as of `Layout`; a delimiter of "" is that
-            of a file without text (Parquet).
-        settings: other keys of its layout.
-        above: comments on the columns; questions: on the whole file.
-        pattern: name of a file that lies beside a run's own, as of `Layout.beside`; empty for that.
+        channels: channels in its columns.
+        delimiter: text between columns; "" for a file that is not text (Parquet).
+        names_row, units_row, first_data_row: as in `Layout`.
+        settings: other keys of the layout.
+        above: comments on the columns.
+        questions: open questions about the whole file.
+        pattern: name of a file beside a run's own, as in `Layout.beside`; "" for the run's own.
     """
 
     channels: tuple[ChannelDraft, ...]
@@ -59,7 +67,7 @@ class FileDraft:
     pattern: str = ""
 
     def lines(self) -> tuple[ConfigLine, ...]:
-        """Keys of its layout but for the columns."""
+        """Return the keys of the layout except its columns."""
         if not self.delimiter:
             return self.settings
         rows = ("names_row", "units_row") if self.units_row else ("names_row",)
@@ -70,7 +78,14 @@ class FileDraft:
 
 @dataclass(frozen=True)
 class LayoutDraft:
-    """A layout of the config's own; `examples`: whether other ways to log are shown below it."""
+    """Layout of a run's files.
+
+    Attributes:
+        name: name of the layout.
+        file: the run's main file.
+        beside: further files of the run.
+        examples: whether other ways to log are shown below it.
+    """
 
     name: str
     file: FileDraft
@@ -79,14 +94,22 @@ class LayoutDraft:
 
     @property
     def channels(self) -> Iterator[ChannelDraft]:
-        """Every channel that counts, of all its files."""
+        """Every channel in use, from all its files."""
         for file in (self.file, *self.beside):
-            yield from (channel for channel in file.channels if not channel.off)
+            yield from (channel for channel in file.channels if not channel.commented_out)
 
 
 @dataclass(frozen=True)
 class BagDraft:
-    """A layout of bags: its keys, a line for each topic that counts, and what they hold."""
+    """Layout of bags.
+
+    Attributes:
+        name: name of the layout.
+        settings: its keys.
+        topics: a line for each topic in use.
+        above: comments above the topics.
+        questions: open questions about the whole layout.
+    """
 
     name: str
     settings: tuple[ConfigLine, ...]
@@ -97,9 +120,9 @@ class BagDraft:
 
 @dataclass(frozen=True)
 class LogsDraft:
-    """A section of logs; attributes as of `Logs`, and what is said or asked of it.
+    """A `[[logs]]` section; attributes as in `LogsSection`, with comments and questions.
 
-    A session of "" is not written: the default holds.
+    An empty session is not written, so that the default holds.
     """
 
     glob: str
@@ -107,16 +130,16 @@ class LogsDraft:
     surface: str = "folder"
     above: tuple[str, ...] = ()
     question: str = ""
-    off: bool = False
+    commented_out: bool = False
     session: str = ""
 
 
 @dataclass(frozen=True)
 class RobotHint:
-    """What to ask of a key of `[robot]` that nobody answered, instead of the usual words."""
+    """Question about a key of `[robot]` that suits the logs better than the usual one."""
 
     key: str
-    asks: str
+    question: str
 
 
 @dataclass(frozen=True)
@@ -124,19 +147,20 @@ class ConfigDraft:
     """A whole config.
 
     Attributes:
-        robot: answers to the questions.
-        layouts, logs: of the log files; logs that use a preset need no layout.
-        carries: channels of the presets that are used.
-        above: comments at its beginning.
-        data: the data folder, as it is called on the command line.
-        hints: questions about the robot in words that fit its logs.
+        robot: answers about the robot.
+        layouts: layouts of log files; logs in a preset's format need none.
+        logs: sections of logs.
+        preset_channels: channels of the presets in use.
+        above: comments at the beginning.
+        data: data folder, as named on the command line.
+        hints: questions about the robot that suit its logs.
         bags: layouts of bags.
     """
 
     robot: RobotAnswers
     layouts: tuple[LayoutDraft, ...]
     logs: tuple[LogsDraft, ...]
-    carries: frozenset[str] = frozenset()
+    preset_channels: frozenset[str] = frozenset()
     above: tuple[str, ...] = ()
     data: str = "DIR"
     hints: tuple[RobotHint, ...] = ()
@@ -146,57 +170,57 @@ class ConfigDraft:
     def channels(self) -> frozenset[str]:
         """Every channel that is logged."""
         own = (channel.channel for layout in self.layouts for channel in layout.channels)
-        return self.carries | frozenset(own)
+        return self.preset_channels | frozenset(own)
 
 
 @dataclass(frozen=True)
 class ConfigProposal:
-    """A config to be, and what was found in the logs, in sentences."""
+    """Draft of a config, and sentences about what was found in the logs."""
 
-    sketch: ConfigDraft
+    draft: ConfigDraft
     sentences: tuple[str, ...]
 
 
 def layout_line(key: str, value: object, question: str = "", comment: str = "") -> ConfigLine:
-    """A key of a layout with what it means."""
+    """Return a key of a layout with its explanation."""
     return ConfigLine(key, toml(value), comment or in_short(Layout, key), question)
 
 
-def template_draft(known: RobotAnswers) -> ConfigDraft:
-    """Everything that this robot may log, in one file for each run."""
+def template_draft(answers: RobotAnswers) -> ConfigDraft:
+    """Return a draft with everything that this robot may log, in one file for each run."""
     layout = LayoutDraft(
-        "mine", FileDraft(_channels(known), settings=_settings(known)), examples=True
+        "mine", FileDraft(_channels(answers), settings=_settings(answers)), examples=True
     )
-    return ConfigDraft(known, (layout,), (LogsDraft("*/*.csv", "mine"),))
+    return ConfigDraft(answers, (layout,), (LogsDraft("*/*.csv", "mine"),))
 
 
-def _settings(known: RobotAnswers) -> tuple[ConfigLine, ...]:
-    gear = layout_line("gear_ratio", known.gear_ratio, comment="as above")
+def _settings(answers: RobotAnswers) -> tuple[ConfigLine, ...]:
+    gear = layout_line("gear_ratio", answers.gear_ratio, comment="as above")
     signed = layout_line(
         "current_is_signed", True, comment="false where only magnitudes are logged"
     )
-    if not known.ticks_per_revolution:
+    if not answers.ticks_per_revolution:
         return (gear, signed)
     question = ""
-    if "ticks_per_revolution" in known.taken:
+    if "ticks_per_revolution" in answers.defaults:
         question = "taken by default: look it up, of the motor shaft with all edges"
-    ticks = layout_line("ticks_per_revolution", known.ticks_per_revolution, question)
+    ticks = layout_line("ticks_per_revolution", answers.ticks_per_revolution, question)
     increments = layout_line("ticks_are_increments", False)
     return (ticks, increments, gear, signed)
 
 
-def _channels(known: RobotAnswers) -> tuple[ChannelDraft, ...]:
-    labels = _LABELS.get((known.wheels, known.shared))
-    if labels is None or known.drive in ("omni", "general"):
-        labels = tuple(str(k + 1) for k in range(known.wheels))
+def _channels(answers: RobotAnswers) -> tuple[ChannelDraft, ...]:
+    labels = _LABELS.get((answers.wheels, answers.shared))
+    if labels is None or answers.drive in ("omni", "general"):
+        labels = tuple(str(k + 1) for k in range(answers.wheels))
 
     def each(name: str) -> tuple[str, ...]:
         return tuple(f"{name}_{label}" for label in labels)
 
-    ticks = bool(known.ticks_per_revolution)
+    ticks = bool(answers.ticks_per_revolution)
     turns = ChannelDraft("wheel_ticks", each("ticks"), "tick", "or wheel_angle, motor_angle")
     speed = ChannelDraft("wheel_speed", each("speed"), "rad/s", "or motor_speed, before the gear")
-    sideways = known.drive in ("omni", "mecanum", "general")
+    sideways = answers.drive in ("omni", "mecanum", "general")
     twist = [("twist_command_x", "command_x", "m/s"), ("twist_command_y", "command_y", "m/s")]
     twist = twist if sideways else twist[:1]
     commands = [

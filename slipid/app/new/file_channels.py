@@ -1,6 +1,7 @@
-"""Which column of a file holds which channel, by their names and by what the numbers are like.
+"""Recognise the channels in a file's columns, and group the log files of a folder by kind.
 
-Log files of a folder by kind: published formats, globs that find each, which lie together.
+Columns are recognised by their names and by their numbers. Files of one kind have the same layout:
+published formats, globs that find each kind, and files that lie together are recognised.
 """
 
 from collections import Counter
@@ -22,43 +23,43 @@ from slipid.data.reading.table_format import TableFormat, TableNumbers, format_o
 from slipid.support.errors import DataError
 
 _ORDER = ("fl", "fr", "ml", "mr", "rl", "rr", "l", "r")
-"""Wheels as the drives count them."""
+"""Wheel names in the order in which the drives count wheels."""
 _QUATERNION = ("x", "y", "z", "w")
 WHEEL_MOTION = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
-"""Channels that tell how far the wheels turned, the best first."""
+"""Channels of wheel motion, the most informative first."""
 _LEAST_TICKS = 50
-"""Whole numbers up to which a position is no count of ticks."""
+"""Largest whole number of a position that is not taken for a count of ticks."""
 
 
 @dataclass(frozen=True, eq=False)
 class FileChannel:
-    """A channel and where it is.
+    """A channel and its columns.
 
     Attributes:
         channel: its name.
-        at: places of its columns.
-        labels: which wheel each is of, as the names say.
-        values: of the columns, as they are in the file.
-        unit: that names or a row of units say; empty where they say none.
-        doubts: what was assumed, one sentence each.
+        columns: numbers of its columns.
+        labels: wheel of each column, as its name says.
+        values: values of the columns, as in the file.
+        unit: unit given by the names or a row of units; empty where they give none.
+        questions: a question for each assumption.
     """
 
     channel: str
-    at: tuple[int, ...]
+    columns: tuple[int, ...]
     labels: tuple[str, ...]
     values: Float[np.ndarray, "row column"]
     unit: str = ""
-    doubts: tuple[str, ...] = ()
+    questions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class FileChannels:
-    """What is in a file.
+    """The channels of a file.
 
     Attributes:
         found: its channels.
         unused: names of other columns of numbers.
-        notes: what people should know of it.
+        notes: remarks for the user.
     """
 
     found: tuple[FileChannel, ...]
@@ -66,32 +67,32 @@ class FileChannels:
     notes: tuple[str, ...] = ()
 
     def get(self, channel: str) -> FileChannel | None:
-        """A channel, if it is there."""
+        """Return a channel, if the file has it."""
         return next((one for one in self.found if one.channel == channel), None)
 
     def first(self, *channels: str) -> FileChannel | None:
-        """The first of some channels that is there."""
+        """Return the first of some channels that the file has."""
         return next((found for name in channels if (found := self.get(name))), None)
 
     @property
     def turns(self) -> FileChannel | None:
-        """The channel that tells how far the wheels turned."""
+        """The most informative channel of wheel motion."""
         return self.first(*WHEEL_MOTION)
 
     @property
     def wheels(self) -> int:
-        """How many wheels, or drives, have columns."""
-        return len(self.turns.at) if self.turns else 0
+        """Number of wheels, or drives, that have columns."""
+        return len(self.turns.columns) if self.turns else 0
 
     @property
     def has_pose(self) -> bool:
-        """Whether there is a whole pose."""
+        """True where the file has a complete pose."""
         turned = self.get("pose_heading") or self.get("pose_quaternion")
         return bool(self.get("pose_x") and self.get("pose_y") and turned)
 
 
 def channels_in(numbers: TableNumbers) -> FileChannels:
-    """What the named columns of a file hold."""
+    """Return the channels in the named columns of a file."""
     format, meanings = numbers.format, {}
     for at, name in enumerate(format.names):
         if at not in numbers.texts and name and not np.isnan(numbers.values[:, at]).all():
@@ -112,7 +113,7 @@ def channels_in(numbers: TableNumbers) -> FileChannels:
         also
     )
     kept, dropped = _consistent(found)
-    used = {at for one in kept for at in one.at}
+    used = {at for one in kept for at in one.columns}
     unused = [
         name for at, name in enumerate(format.names) if name and at in meanings and at not in used
     ]
@@ -122,7 +123,7 @@ def channels_in(numbers: TableNumbers) -> FileChannels:
 def _file_channel(
     numbers: TableNumbers, meanings: dict[int, ColumnMeaning], channel: str, places: dict[str, int]
 ) -> FileChannel:
-    """A channel with its columns in order."""
+    """Return a channel with its columns in the order of the wheels."""
     labels = sorted(places, key=rank)
     at = tuple(places[label] for label in labels)
     units = Counter(meanings[k].unit for k in at)
@@ -136,7 +137,7 @@ def _file_channel(
 
 
 def rank(label: str) -> tuple[int, int, str]:
-    """Order of wheels: by the drives' convention, else by number."""
+    """Return the sort key of a wheel's name: the order of the drives, else its number."""
     if label in _QUATERNION:
         return (0, _QUATERNION.index(label), label)
     if label in _ORDER:
@@ -145,7 +146,7 @@ def rank(label: str) -> tuple[int, int, str]:
 
 
 def _resolved(found: list[FileChannel]) -> list[FileChannel]:
-    """Positions are ticks where they are whole numbers; v is a speed where no speed is logged."""
+    """Resolve ambiguous names: positions are ticks or angles, and "v" is a voltage or a speed."""
     speeds = {one.labels for one in found if one.channel.endswith("_speed")}
     out = []
     for one in found:
@@ -165,18 +166,19 @@ def _resolved(found: list[FileChannel]) -> list[FileChannel]:
 
 
 def _is_ticks(values: Float[np.ndarray, "row column"]) -> bool:
+    """Return True for whole numbers that are too large for an angle."""
     known = values[~np.isnan(values)]
     return bool((known == np.round(known)).all() and np.abs(known).max(initial=0.0) > _LEAST_TICKS)
 
 
 def _stays_up(values: Float[np.ndarray, "row column"]) -> bool:
-    """Whether numbers keep away from 0, as a battery's voltage does and a speed does not."""
+    """Return True for numbers away from 0, like a battery's voltage and unlike a speed."""
     known = values[~np.isnan(values)]
     return bool(known.size) and float(known.min()) > 0.5 * float(known.max()) > 0.0
 
 
 def _without_duplicates(found: list[FileChannel]) -> list[FileChannel]:
-    """The first of channels that turned out to be the same."""
+    """Return the first of channels with the same name."""
     out: dict[str, FileChannel] = {}
     for one in found:
         out.setdefault(one.channel, one)
@@ -184,17 +186,19 @@ def _without_duplicates(found: list[FileChannel]) -> list[FileChannel]:
 
 
 def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
-    """Channels that go together, and a line for each that is left out."""
+    """Return the channels with the same wheels, and a line for each channel that is left out."""
     turns = [one for name in WHEEL_MOTION for one in found if one.channel == name]
     per_wheel = turns or [one for one in found if one.channel in PER_WHEEL]
-    count = len(per_wheel[0].at) if per_wheel else 0
+    count = len(per_wheel[0].columns) if per_wheel else 0
     labels = set(per_wheel[0].labels) if per_wheel else set()
     kept, dropped = [], []
     for one in found:
-        if one.channel == "pose_quaternion" and len(one.at) != 4:
-            dropped.append(f"{len(one.at)} columns of a quaternion; expected x, y, z and w")
-        elif one.channel in PER_WHEEL and (len(one.at) != count or not _same_wheels(labels, one)):
-            what = f"{len(one.at)} columns of {one.channel}"
+        if one.channel == "pose_quaternion" and len(one.columns) != 4:
+            dropped.append(f"{len(one.columns)} columns of a quaternion; expected x, y, z and w")
+        elif one.channel in PER_WHEEL and (
+            len(one.columns) != count or not _same_wheels(labels, one)
+        ):
+            what = f"{len(one.columns)} columns of {one.channel}"
             dropped.append(f"{what} are left out: {count} wheels have {per_wheel[0].channel}")
         else:
             kept.append(one)
@@ -202,7 +206,7 @@ def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]
 
 
 def _same_wheels(labels: set[str], one: FileChannel) -> bool:
-    """Whether channels name the same wheels, or one names sides and the other numbers."""
+    """Return True where the labels are equal, or where one names sides and the other numbers."""
     numbers = all(label.isdecimal() for label in labels)
     return set(one.labels) == labels or numbers != all(label.isdecimal() for label in one.labels)
 
@@ -215,7 +219,7 @@ def _odometry_note(numbers: TableNumbers, meanings: dict[int, ColumnMeaning]) ->
 
 
 def unnamed_channels(numbers: TableNumbers) -> FileChannels:
-    """What columns without names may hold: time, a pose and whole numbers as ticks."""
+    """Guess the channels of columns without names: time, a pose, and whole numbers as ticks."""
     values = numbers.values
     whole = [k for k in range(values.shape[1]) if _is_ticks(values[:, [k]])]
     time = next((k for k in range(values.shape[1]) if (np.diff(values[:, k]) > 0).all()), None)
@@ -235,13 +239,13 @@ def unnamed_channels(numbers: TableNumbers) -> FileChannels:
     for channel, at in zip(("pose_x", "pose_y", "pose_heading"), others, strict=False):
         if len(others) >= 3:
             put(channel, at)
-    used = {at for one in found for at in one.at}
+    used = {at for one in found for at in one.columns}
     unused = tuple(str(k) for k in range(values.shape[1]) if k not in used)
     return FileChannels(tuple(found), unused)
 
 
 def without(channels: FileChannels, names: frozenset[str]) -> FileChannels:
-    """Channels of a file less some channels, which another file of the run has as well."""
+    """Return the channels of a file except those that another file of the run has as well."""
     kept = tuple(one for one in channels.found if one.channel not in names)
     again = sorted(one.channel for one in channels.found if one.channel in names)
     notes = (f"Also here, but taken from the other file: {', '.join(again)}.",) if again else ()
@@ -249,26 +253,26 @@ def without(channels: FileChannels, names: frozenset[str]) -> FileChannels:
 
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".parquet")
-"""Of files that may be logs."""
+"""Suffixes of files that may be logs."""
 _TELLING_COLUMNS = 8
-"""Named columns from which nobody else will have the same by chance."""
+"""Number of named columns that no unrelated file has by chance."""
 _FILES_TRIED = 3
 """Files that are read to see whether a preset fits."""
 
 
 @dataclass(frozen=True)
 class RejectedFile:
-    """A file that might have been a log, and why it is none."""
+    """A file that is no readable log, and the reason."""
 
     path: Path
-    why: str
+    reason: str
 
 
 def formats_below(folder: Path) -> tuple[list[TableFormat], list[RejectedFile]]:
-    """Every log in a folder and below, and the files that are none.
+    """Return the format of every log in a folder and below, and the files that are none.
 
     Raises:
-        DataError: there is none.
+        DataError: there is no log.
     """
     found, not_logs = [], []
     paths = sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix.lower() in SUFFIXES)
@@ -279,25 +283,25 @@ def formats_below(folder: Path) -> tuple[list[TableFormat], list[RejectedFile]]:
             not_logs.append(RejectedFile(path, str(error)))
     if not found:
         there = f"no log in {len(paths)} files" if paths else "no CSV or Parquet file below it"
-        listed = "".join(f"\n{one.why}" for one in not_logs[:3])
+        listed = "".join(f"\n{one.reason}" for one in not_logs[:3])
         raise DataError(f"{folder}: {there}; expected logs of a robot{listed}")
     return found, not_logs
 
 
 @dataclass(frozen=True)
 class FileKind:
-    """Files that are laid out alike, sorted by path."""
+    """Files with the same layout, sorted by path."""
 
     formats: tuple[TableFormat, ...]
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Where they are."""
+        """Paths of the files."""
         return tuple(one.path for one in self.formats)
 
 
 def file_kinds(formats: Sequence[TableFormat]) -> list[FileKind]:
-    """Files by kind, the kind with most of them first."""
+    """Return files by kind, the most frequent kind first."""
     groups: dict[TableFormat, list[TableFormat]] = {}
     for one in formats:
         groups.setdefault(one.signature, []).append(one)
@@ -305,9 +309,9 @@ def file_kinds(formats: Sequence[TableFormat]) -> list[FileKind]:
 
 
 def globs_of(root: Path, kind: FileKind, others: Sequence[Path]) -> list[str]:
-    """Globs below a folder that find the files of a kind and none of the others.
+    """Return globs below a folder that match the files of a kind and no other file.
 
-    Folders two levels deep have one each: they tell sets of logs apart.
+    Each top folder of files two levels deep has a glob of its own, as it marks a set of logs.
     """
     mine = [path.relative_to(root) for path in kind.paths]
     theirs = [PurePosixPath(path.relative_to(root)) for path in others]
@@ -319,7 +323,7 @@ def globs_of(root: Path, kind: FileKind, others: Sequence[Path]) -> list[str]:
 
 
 def _narrow_globs(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> list[str]:
-    """A glob for some files, narrower ones where it finds others."""
+    """Return a glob for some files, or narrower ones where it matches other files."""
     glob = common_glob(paths)
     if not any(_glob_matches(glob, path) for path in theirs):
         return [glob]
@@ -331,12 +335,12 @@ def _narrow_globs(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> li
 
 
 def common_glob(paths: Sequence[PurePosixPath]) -> str:
-    """A glob that finds paths of the same depth: what they have in common, around stars."""
+    """Return a glob for paths of the same depth: their common parts around stars."""
     return "/".join(_common_name(parts) for parts in zip(*(p.parts for p in paths), strict=True))
 
 
 def floor_of(glob: str) -> str:
-    """Name of a floor by a glob: that of a folder above the runs', or only that it is a floor."""
+    """Return the name of a floor from a glob: the top folder's name, else "floor"."""
     first, *others = glob.split("/")
     return first if len(others) > 1 and "*" not in first else "floor"
 
@@ -349,7 +353,7 @@ def _glob_matches(glob: str, path: PurePosixPath) -> bool:
 
 
 def _common_name(names: tuple[str, ...]) -> str:
-    """One name, or what several have in common around a star."""
+    """Return one name, or the common parts of several names around a star."""
     if len(set(names)) == 1:
         return names[0]
     suffixes = {PurePosixPath(name).suffix for name in names}
@@ -364,9 +368,9 @@ def _common_name(names: tuple[str, ...]) -> str:
 
 
 def pattern_beside(main: FileKind, other: FileKind) -> str | None:
-    """Name of the file beside each of the main ones, as of `Layout.beside`; None if they have none.
+    """Return the name of the file beside each main one, as in `Layout.beside`; None without one.
 
-    Either it is called the same in every folder, or after the main file.
+    The name is the same in every folder, or contains the stem of the main file.
     """
     there = set(other.paths)
     first = main.paths[0]
@@ -385,17 +389,17 @@ def pattern_beside(main: FileKind, other: FileKind) -> str | None:
 
 
 def folder_per_run(kind: FileKind) -> bool:
-    """Whether every file is alone of its kind in its folder: then the folder is a run."""
+    """Return True where every file is alone of its kind in its folder: a folder is a run."""
     return len(kind.paths) > 1 and len({path.parent for path in kind.paths}) == len(kind.paths)
 
 
 @dataclass(frozen=True)
 class PresetMatches:
-    """Presets that a kind of files can be read with.
+    """Presets that can read a kind of files.
 
     Attributes:
-        sure: that which uses most of their columns, if its names are telling.
-        perhaps: others, whose columns anybody could have.
+        sure: preset with the most columns among those with unmistakable names, if any.
+        perhaps: other presets, whose columns any log could have.
     """
 
     sure: str | None
@@ -403,7 +407,7 @@ class PresetMatches:
 
 
 def matching_presets(kind: FileKind) -> PresetMatches:
-    """Presets that read the first files of a kind."""
+    """Return the presets that can read the first files of a kind."""
     fits = [name for name, layout in PRESETS.items() if _matches(kind.formats[0], layout)]
     fits = [name for name in fits if _reads(kind, PRESETS[name])]
     fits.sort(key=lambda name: len(PRESETS[name].columns), reverse=True)
@@ -417,7 +421,7 @@ def _is_telling(layout: Layout) -> bool:
 
 
 def _matches(format: TableFormat, layout: Layout) -> bool:
-    """Whether names and numbers stand where a layout says."""
+    """Return True where names and numbers stand where a layout expects them."""
     rows = (layout.delimiter, layout.names_row, layout.first_data_row)
     if rows != (format.delimiter, format.names_row, format.first_data_row):
         return False

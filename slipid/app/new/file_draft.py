@@ -1,4 +1,4 @@
-"""From files that were looked into to the layout that a config proposes for them."""
+"""Draft the layout of a log file, with units, rates and open questions, from its numbers."""
 
 from dataclasses import replace
 
@@ -44,43 +44,43 @@ _BATTERY_VOLTAGE = (
 )
 
 
-def file_draft(one: FileStudy, known: RunStudy) -> FileDraft:
-    """What a config says of one kind of file."""
-    channels = [channel_draft(one, found, known) for found in one.columns.found]
+def file_draft(one: FileStudy, run: RunStudy) -> FileDraft:
+    """Return the draft of one kind of file."""
+    channels = [channel_draft(one, found, run) for found in one.channels.found]
     format = one.format
-    above = list(one.columns.notes)
-    if one.columns.unused:
-        above.append(f"Not used: {', '.join(one.columns.unused)}.")
+    above = list(one.channels.notes)
+    if one.channels.unused:
+        above.append(f"Not used: {', '.join(one.channels.unused)}.")
     if not format.names_row and format.delimiter:
         above.append("Columns without names, by their places from 0.")
-    main = one is known.main
+    main = one is run.main
     return FileDraft(
         tuple(sorted(channels, key=lambda channel: channel.channel != "time")),
         delimiter=format.delimiter,
         names_row=format.names_row,
         units_row=_units_row(one),
         first_data_row=format.first_data_row,
-        settings=tuple(_row_lines(one, main) + (_layout_settings(known) if main else [])),
+        settings=tuple(_row_lines(one, main) + (_layout_settings(run) if main else [])),
         above=tuple(above),
         questions=_questions(one),
     )
 
 
 def _units_row(one: FileStudy) -> int:
-    """A row of units is checked by the reader, where every column that counts has one there."""
-    used = [at for found in one.columns.found for at in found.at]
+    """Return the row of units, which the reader checks; 0 where a used column has none."""
+    used = [at for found in one.channels.found for at in found.columns]
     return one.format.units_row if all(one.format.units[at] for at in used) else 0
 
 
 def _questions(one: FileStudy) -> tuple[str, ...]:
-    if not one.columns.found:
+    if not one.channels.found:
         names = ", ".join(name for name in one.format.names if name) or "none have a name"
         return (f"which column holds what? There are: {names}",)
     return ()
 
 
 def _row_lines(one: FileStudy, main: bool) -> list[ConfigLine]:
-    """Keys about the rows: runs in one file, rows that repeat, gaps, no time at all."""
+    """Return keys about rows: several runs in one file, repeated rows, gaps, or no time at all."""
     if one.clock is None:
         ask = "no column of time: how long is a row [s]?"
         return [layout_line("row_period", 0.05, ask)]
@@ -101,21 +101,21 @@ def _row_lines(one: FileStudy, main: bool) -> list[ConfigLine]:
     return lines
 
 
-def _layout_settings(known: RunStudy) -> list[ConfigLine]:
-    """Keys about encoders and currents, of the layout of all files of a run."""
+def _layout_settings(run: RunStudy) -> list[ConfigLine]:
+    """Return keys about encoders and currents, which hold for all files of a run."""
     lines = []
-    robot, ticks = known.robot, known.find("wheel_ticks")
+    robot, ticks = run.robot, run.find("wheel_ticks")
     if ticks is not None:
         ask = ""
-        if "ticks_per_revolution" in robot.taken:
-            ask = "how many, of the motor shaft, all edges counted?" + _ticks_by_speed(known, ticks)
+        if "ticks_per_revolution" in robot.defaults:
+            ask = "how many, of the motor shaft, all edges counted?" + _ticks_by_speed(run, ticks)
         lines.append(layout_line("ticks_per_revolution", robot.ticks_per_revolution or 1000.0, ask))
-        step = ticks_are_increments(ticks, known.main, known.moved)
+        step = ticks_are_increments(ticks, run.main, run.by_pose)
         ask = "do ticks add up, or does each row have those since the last?" if step is None else ""
         lines.append(layout_line("ticks_are_increments", bool(step), ask))
     lines.append(layout_line("gear_ratio", robot.gear_ratio, comment="as above"))
-    if known.find(*CURRENTS) is not None and not known.of_supply:
-        sign = known.has_sign
+    if run.find(*CURRENTS) is not None and not run.of_supply:
+        sign = run.has_sign
         ask = "the logs do not tell: do currents have a sign, or are they magnitudes?"
         lines.append(
             layout_line(
@@ -128,13 +128,13 @@ def _layout_settings(known: RunStudy) -> list[ConfigLine]:
     return lines
 
 
-def _ticks_by_speed(known: RunStudy, ticks: FileChannel) -> str:
-    """How many ticks a turn has by the reported speeds, if both are in one file."""
-    speed = known.main.columns.first(*reversed(SPEEDS))
-    if speed is None or not speed.unit or known.main.clock is None:
+def _ticks_by_speed(run: RunStudy, ticks: FileChannel) -> str:
+    """Return a remark about ticks per turn from the reported speeds, if one file has both."""
+    speed = run.main.channels.first(*reversed(SPEEDS))
+    if speed is None or not speed.unit or run.main.clock is None:
         return ""
-    time, rates = known.main.time, np.nan_to_num(speed.values) * factor(speed.unit, "rad/s")
-    if len(speed.at) != len(ticks.at):
+    time, rates = run.main.time, np.nan_to_num(speed.values) * factor(speed.unit, "rad/s")
+    if len(speed.columns) != len(ticks.columns):
         return ""
     turned = float((np.abs(rates[1:]) * np.diff(time)[:, None]).sum()) / (2 * np.pi)
     counted = float(np.abs(np.diff(np.nan_to_num(ticks.values), axis=0)).sum())
@@ -144,12 +144,12 @@ def _ticks_by_speed(known: RunStudy, ticks: FileChannel) -> str:
     )
 
 
-def radius_hint(known: RunStudy) -> tuple[RobotHint, ...]:
-    """What the poses say of the wheel radius, of wheels that all point aformat."""
-    speed, ratio = known.find("wheel_speed"), known.pose_over_wheel_speed
-    if ratio is None or speed is None or len(speed.at) > 2:
+def radius_hint(run: RunStudy) -> tuple[RobotHint, ...]:
+    """Return a question with the wheel radius by the poses, if all wheels point ahead."""
+    speed, ratio = run.find("wheel_speed"), run.pose_over_wheel_speed
+    if ratio is None or speed is None or len(speed.columns) > 2:
         return ()
-    unit = speed.unit or unit_of(known.main, speed, known).unit
+    unit = speed.unit or unit_of(run.main, speed, run).unit
     radius = ratio / factor(unit, "rad/s")
     if not RADII[0] <= radius <= RADII[1]:
         return ()
@@ -160,63 +160,67 @@ def radius_hint(known: RunStudy) -> tuple[RobotHint, ...]:
     )
 
 
-def channel_draft(one: FileStudy, found: FileChannel, known: RunStudy) -> ChannelDraft:
-    """A channel with its unit, rate, and what is not known of it."""
-    columns = tuple(one.format.column(at) for at in found.at)
-    unit = UnitGuess(found.unit) if found.unit else unit_of(one, found, known)
-    comments = [reading_rate(one, found) if found.channel != "time" else "", unit.why]
-    questions = list(dict.fromkeys(found.doubts)) + [unit.doubt] * bool(unit.doubt)
-    sketch = ChannelDraft(
+def channel_draft(one: FileStudy, found: FileChannel, run: RunStudy) -> ChannelDraft:
+    """Return a channel with its unit, its rate and its open questions."""
+    columns = tuple(one.format.column(at) for at in found.columns)
+    unit = UnitGuess(found.unit) if found.unit else unit_of(one, found, run)
+    comments = [reading_rate(one, found) if found.channel != "time" else "", unit.reason]
+    questions = list(dict.fromkeys(found.questions)) + [unit.doubt] * bool(unit.doubt)
+    draft = ChannelDraft(
         found.channel, columns, unit.unit, "; ".join(filter(None, comments)), " ".join(questions)
     )
-    return _unused_draft(sketch, found, known)
+    return _unused_draft(draft, found, run)
 
 
-def _unused_draft(sketch: ChannelDraft, found: FileChannel, known: RunStudy) -> ChannelDraft:
-    """Channels that are better not used before something was answered."""
-    speed = known.find(*SPEEDS)
+def _unused_draft(draft: ChannelDraft, found: FileChannel, run: RunStudy) -> ChannelDraft:
+    """Comment out a channel that must not be used before a question about it is answered."""
+    speed = run.find(*SPEEDS)
     if found.channel.endswith("torque") and found.unit != "N*m":
-        return replace(sketch, off=True, question=ASK_EFFORT)
+        return replace(draft, commented_out=True, question=ASK_EFFORT)
     if found.channel.endswith("torque"):
-        return replace(sketch, off=True, question="give torque_constant [N m/A] in the layout")
-    if found.channel == "current" and known.of_supply:
-        return replace(sketch, off=True, comment=_SUPPLY_CURRENT)
-    runs = (run.find(found.channel) for run in known.runs)
+        return replace(
+            draft, commented_out=True, question="give torque_constant [N m/A] in the layout"
+        )
+    if found.channel == "current" and run.of_supply:
+        return replace(draft, commented_out=True, comment=_SUPPLY_CURRENT)
+    runs = (run.find(found.channel) for run in run.runs)
     if found.channel == "voltage" and is_battery_voltage([one for one in runs if one], speed):
-        return replace(sketch, off=True, comment=_BATTERY_VOLTAGE)
-    if found.channel == "bus_voltage" and known.find("duty") is None:
-        return replace(sketch, off=True, comment="of use beside a duty cycle alone")
-    if found.channel.startswith("pose_") and not any(s.columns.has_pose for s in known.all):
-        return replace(sketch, off=True, comment="a pose in parts is none: x, y and a heading")
-    if found.channel.startswith("pose_") and known.moved.place.unit in PIXELS:
+        return replace(draft, commented_out=True, comment=_BATTERY_VOLTAGE)
+    if found.channel == "bus_voltage" and run.find("duty") is None:
+        return replace(draft, commented_out=True, comment="of use beside a duty cycle alone")
+    if found.channel.startswith("pose_") and not any(s.channels.has_pose for s in run.all):
+        return replace(
+            draft, commented_out=True, comment="a pose in parts is none: x, y and a heading"
+        )
+    if found.channel.startswith("pose_") and run.by_pose.unit.unit in PIXELS:
         ask = "give metres_per_pixel in the layout" if found.channel == "pose_x" else ""
-        return replace(sketch, off=True, question=ask)
-    return sketch
+        return replace(draft, commented_out=True, question=ask)
+    return draft
 
 
-def unit_of(one: FileStudy, found: FileChannel, known: RunStudy) -> UnitGuess:
-    """Unit of a channel whose name says none."""
+def unit_of(one: FileStudy, found: FileChannel, run: RunStudy) -> UnitGuess:
+    """Return the unit of a channel whose name gives none."""
     channel = found.channel
     most = float(np.nanmax(np.abs(found.values)))
     if channel == "time":
         return one.clock or UnitGuess("s")
     if channel in ("pose_x", "pose_y"):
         # asked once is enough
-        place = known.moved.place
+        place = run.by_pose.unit
         return place if channel == "pose_x" else UnitGuess(place.unit)
     if channel == "pose_heading":
-        farthest = max(known.runs, key=_pose_heading_range)
+        farthest = max(run.runs, key=_pose_heading_range)
         turning = farthest.find(channel) or found
         return heading_unit(turning.values[:, 0], _heading_range(farthest))
     if channel in (*SPEEDS, *ANGLES):
-        ratio = known.pose_over_wheel_speed
+        ratio = run.pose_over_wheel_speed
         if channel.startswith("motor") and ratio is not None:
-            unknown = "gear_ratio" in known.robot.taken
-            ratio = None if unknown else ratio * known.robot.gear_ratio
+            unknown = "gear_ratio" in run.robot.defaults
+            ratio = None if unknown else ratio * run.robot.gear_ratio
         unit = speed_unit if channel in SPEEDS else angle_unit
-        return unit(ratio, known.radius)
+        return unit(ratio, run.radius)
     if channel.endswith("speed_command"):
-        speed = known.find(channel.removesuffix("_command"))
+        speed = run.find(channel.removesuffix("_command"))
         if speed is None:
             return UnitGuess("rad/s", doubt="in which unit?")
         return UnitGuess(speed.unit or "rad/s", "as the speeds")
@@ -232,14 +236,15 @@ def unit_of(one: FileStudy, found: FileChannel, known: RunStudy) -> UnitGuess:
 
 
 def _pose_heading_range(run: RunStudy) -> float:
+    """Return the range of the logged heading, in its own unit."""
     found = run.find("pose_heading")
     return 0.0 if found is None else float(np.nanmax(found.values) - np.nanmin(found.values))
 
 
 def _heading_range(run: RunStudy) -> float:
-    """Range of the heading by the gyro or by the commands of a run [rad]; 0 without."""
+    """Return the range of the heading by a run's gyro or commands [rad]; 0 without them."""
     for one in run.all:
-        reading_rate = one.columns.first("gyro", "twist_command_yaw")
+        reading_rate = one.channels.first("gyro", "twist_command_yaw")
         if reading_rate is None or one.clock is None:
             continue
         unit = (
@@ -251,4 +256,5 @@ def _heading_range(run: RunStudy) -> float:
 
 
 def _turn_rate_unit(most: float) -> UnitGuess:
+    """Return the unit of a turn rate from its largest value."""
     return UnitGuess("rad/s") if most < 20 else UnitGuess("deg/s", f"up to {most:.4g}")

@@ -1,4 +1,4 @@
-"""A file looked into: its channels, clock and signals, and what files of a run tell together."""
+"""Study a log file: its channels, its clock, and what the files of a run show together."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,9 +16,9 @@ from slipid.data.wheel_signals import refresh_period
 
 METRES = UnitGuess("m")
 _ALIGNED_DRIVES = 2
-"""Drives up to which all wheels point ahead."""
+"""Largest number of drives whose wheels all point ahead."""
 _SPARSE = 0.02
-"""Share of empty cells from which a channel is said to be slower than the rows."""
+"""Share of empty cells from which a channel counts as slower than the rows."""
 CURRENTS = ("current", "motor_torque", "wheel_torque")
 SPEEDS = ("wheel_speed", "motor_speed")
 ANGLES = ("wheel_angle", "motor_angle")
@@ -26,35 +26,35 @@ ANGLES = ("wheel_angle", "motor_angle")
 
 @dataclass(frozen=True, eq=False)
 class FileStudy:
-    """A file of one kind.
+    """One file and what its numbers show.
 
     Attributes:
-        numbers: what is in it.
-        columns: what its columns hold.
-        time: of every row [s], counted from 0 in rows where there is none.
-        clock: unit of the time, or None without one.
+        numbers: its numbers.
+        channels: its channels.
+        time: time of every row [s]; the row's number where no time is logged.
+        clock: unit of the time; None where no time is logged.
     """
 
     numbers: TableNumbers
-    columns: FileChannels
+    channels: FileChannels
     time: Float[np.ndarray, " row"]
     clock: UnitGuess | None
 
     @property
     def format(self) -> TableFormat:
-        """Where things stand in the file."""
+        """Layout of the file's rows and columns."""
         return self.numbers.format
 
     @property
     def usual_step(self) -> float:
-        """Time between rows [s]."""
+        """Median time between rows [s]."""
         steps = np.diff(self.time)
         steps = steps[steps > 0]
         return float(np.median(steps)) if len(steps) else 1.0
 
 
 def study_file(format: TableFormat) -> FileStudy:
-    """A file looked into; DataError where its numbers cannot be read."""
+    """Return the study of a file; raise `DataError` where its numbers cannot be read."""
     numbers = numbers_of(format)
     columns = channels_in(numbers) if any(format.names) else unnamed_channels(numbers)
     found = columns.get("time")
@@ -66,7 +66,7 @@ def study_file(format: TableFormat) -> FileStudy:
 
 
 def reading_rate(one: FileStudy, found: FileChannel) -> str:
-    """How often a channel is read, in words: by empty cells, by repeats, else by rows."""
+    """Return the rate of a channel in words, from empty cells, repeated values or else rows."""
     values, time = found.values[:, 0], one.time
     there = ~np.isnan(values) & ~np.isnan(time)
     if there.sum() < 3 or one.clock is None:
@@ -88,17 +88,18 @@ def _rate_text(period: float) -> str:
 
 @dataclass(frozen=True)
 class PoseMotion:
-    """How the robot moves by its pose.
+    """Motion of the robot by its logged pose.
 
     Attributes:
-        speed: a high speed [m/s], None where there is no pose.
-        place: unit of x and y.
-        time, x, y: when poses came [s], and where they were [m].
-        steps: how far each is from the last [m].
+        speed: 90 % quantile of the speed [m/s]; None where there is no pose.
+        unit: unit of x and y.
+        time: times of the poses [s].
+        x, y: positions [m].
+        steps: distance of each pose from the last one [m].
     """
 
     speed: float | None = None
-    place: UnitGuess = METRES
+    unit: UnitGuess = METRES
     time: Float[np.ndarray, " pose"] | None = None
     x: Float[np.ndarray, " pose"] | None = None
     y: Float[np.ndarray, " pose"] | None = None
@@ -106,10 +107,10 @@ class PoseMotion:
 
 
 def pose_motion(one: FileStudy | None) -> PoseMotion:
-    """How the robot moves by the pose in a file; nothing where it has none."""
-    if one is None or not one.columns.has_pose:
+    """Return the motion by the pose in a file; empty where the file has none."""
+    if one is None or not one.channels.has_pose:
         return PoseMotion()
-    x, y = one.columns.get("pose_x"), one.columns.get("pose_y")
+    x, y = one.channels.get("pose_x"), one.channels.get("pose_y")
     assert x is not None
     assert y is not None
     px, py = x.values[:, 0], y.values[:, 0]
@@ -120,7 +121,7 @@ def pose_motion(one: FileStudy | None) -> PoseMotion:
     else:
         place = position_unit(one.time, px, py)
     if place.unit in ("pixel", "pixels", "pix", "px") or one.clock is None:
-        return PoseMotion(place=place)
+        return PoseMotion(unit=place)
     scale = factor(place.unit, "m")
     there = ~(np.isnan(px) | np.isnan(py) | np.isnan(one.time))
     time, px, py = one.time[there], px[there] * scale, py[there] * scale
@@ -128,18 +129,18 @@ def pose_motion(one: FileStudy | None) -> PoseMotion:
     return PoseMotion(speed_of(time, px, py), place, time, px, py, steps)
 
 
-def ticks_are_increments(found: FileChannel, one: FileStudy, moved: PoseMotion) -> bool | None:
-    """Whether ticks are those since the last row and not a sum; None where nothing tells.
+def ticks_are_increments(found: FileChannel, one: FileStudy, by_pose: PoseMotion) -> bool | None:
+    """Return whether ticks are counted anew in each row; None where the file does not show it.
 
-    The way of the pose goes along with the ticks of each row, or with their changes.
+    Path length by the pose correlates with the ticks of each row, or with their changes.
     """
     values = np.nan_to_num(found.values)
     of_rows, of_changes = (
         np.abs(values).sum(axis=1)[1:],
         np.abs(np.diff(values, axis=0)).sum(axis=1),
     )
-    if moved.time is not None and moved.steps is not None and len(moved.time) > 20:
-        way = np.interp(one.time, moved.time, np.cumsum(moved.steps))
+    if by_pose.time is not None and by_pose.steps is not None and len(by_pose.time) > 20:
+        way = np.interp(one.time, by_pose.time, np.cumsum(by_pose.steps))
         width = max(1, len(way) // 60)
         sums = [_block_sums(row, width) for row in (of_rows, of_changes, np.abs(np.diff(way)))]
         if all(float(np.std(part)) > 0 for part in sums):
@@ -154,18 +155,18 @@ def ticks_are_increments(found: FileChannel, one: FileStudy, moved: PoseMotion) 
 
 
 def _block_sums(values: Float[np.ndarray, " row"], width: int) -> Float[np.ndarray, " part"]:
-    """Sums over stretches of so many rows: one row alone is noise."""
+    """Return sums over blocks of `width` rows: single rows are too noisy."""
     count = len(values) // width
     return values[: count * width].reshape(count, width).sum(axis=1)
 
 
-def pose_over_wheel_speed(one: FileStudy, speed: FileChannel, moved: PoseMotion) -> float | None:
-    """Speed of the pose over that of the wheels, of seconds in which they turn; None without both.
+def pose_over_wheel_speed(one: FileStudy, speed: FileChannel, by_pose: PoseMotion) -> float | None:
+    """Return the ratio of body speed to wheel speed while wheels turn; None without both.
 
-    It is the radius of wheels that all point ahead, if their speeds are in rad/s, and near it
-    for others.
+    With wheel speeds in rad/s it is the wheel radius [m] where all wheels point ahead, and near
+    that for other robots.
     """
-    if moved.time is None or moved.x is None or moved.y is None or one.clock is None:
+    if by_pose.time is None or by_pose.x is None or by_pose.y is None or one.clock is None:
         return None
     # two wheels point ahead: their mean has the sign of the way; of others the sizes are as good
     ahead = speed.values.shape[1] <= _ALIGNED_DRIVES
@@ -175,13 +176,13 @@ def pose_over_wheel_speed(one: FileStudy, speed: FileChannel, moved: PoseMotion)
     if len(time) < 3:
         return None
     turned = np.append(0.0, np.cumsum(0.5 * (rows[1:] + rows[:-1]) * np.diff(time)))
-    start, end = max(time[0], moved.time[0]), min(time[-1], moved.time[-1])
+    start, end = max(time[0], by_pose.time[0]), min(time[-1], by_pose.time[-1])
     if end <= start:
         return None
     edges = np.linspace(start, end, max(2, int(end - start)))
     by_wheels = np.abs(np.diff(np.interp(edges, time, turned)))
     # chords and not the way along all poses, which noise makes longer
-    x, y = (np.interp(edges, moved.time, part) for part in (moved.x, moved.y))
+    x, y = (np.interp(edges, by_pose.time, part) for part in (by_pose.x, by_pose.y))
     way = np.hypot(np.diff(x), np.diff(y))
     good = by_wheels > 0.3 * by_wheels.max(initial=0.0)
     ratio = float(np.median(way[good] / by_wheels[good])) if good.any() else 0.0
@@ -189,7 +190,7 @@ def pose_over_wheel_speed(one: FileStudy, speed: FileChannel, moved: PoseMotion)
 
 
 def has_sign(current: FileChannel, speed: FileChannel | None) -> bool | None:
-    """Whether currents have a sign; None where nothing drove backwards and nothing tells."""
+    """Return whether currents have a sign; None where nothing drove backwards to show it."""
     values = current.values[~np.isnan(current.values)]
     most = float(np.abs(values).max(initial=0.0))
     if float(values.min(initial=0.0)) < -0.02 * most:
@@ -198,9 +199,9 @@ def has_sign(current: FileChannel, speed: FileChannel | None) -> bool | None:
 
 
 def has_magnitudes(current: FileChannel, speed: FileChannel | None) -> bool:
-    """Whether currents are positive where wheels drive backwards, as magnitudes are.
+    """Return True where currents are positive while wheels drive backwards, as magnitudes are.
 
-    Two files with rows of their own do not tell.
+    Files with different rows do not show it.
     """
     if speed is None or speed.values.shape != current.values.shape:
         return False
@@ -211,10 +212,10 @@ def has_magnitudes(current: FileChannel, speed: FileChannel | None) -> bool:
 
 
 def is_battery_voltage(voltages: Sequence[FileChannel], speed: FileChannel | None) -> bool:
-    """Whether the voltage of some runs stays up whatever the wheels do, as a battery's does.
+    """Return True where voltages stay up whatever the wheels do, as a battery's voltage does.
 
-    Every run is measured by what is high in it: batteries of other robots, or other charges, are
-    no sign of a motor.
+    Every run is scaled by its own high quantile: another battery, or another charge, must not look
+    like the changing voltage of a motor.
     """
     runs = [one.values[~np.isnan(one.values)] for one in voltages]
     high = [float(np.quantile(np.abs(run), 0.95)) if run.size else 0.0 for run in runs]
@@ -226,18 +227,19 @@ def is_battery_voltage(voltages: Sequence[FileChannel], speed: FileChannel | Non
 
 
 def file_with_pose(studies: tuple[FileStudy, ...]) -> FileStudy | None:
-    """The file that has the pose."""
-    return next((one for one in studies if one.columns.has_pose), None)
+    """Return the file that has the pose."""
+    return next((one for one in studies if one.channels.has_pose), None)
 
 
 @dataclass(frozen=True, eq=False)
 class RunStudy:
-    """What files of a run tell of each other.
+    """The files of a run together.
 
     Attributes:
-        robot: its sizes, as far as they are known.
-        main: the file that has the wheels; `all`: every file of the run.
-        others: the same of further runs, for what a single run may not show.
+        robot: answers about the robot, as far as they are known.
+        main: the file with the wheels.
+        all: every file of the run.
+        others: further runs, for what a single run may not show.
     """
 
     robot: RobotAnswers
@@ -246,37 +248,37 @@ class RunStudy:
     others: tuple["RunStudy", ...] = ()
 
     @cached_property
-    def moved(self) -> PoseMotion:
+    def by_pose(self) -> PoseMotion:
         """Motion by the pose."""
         return pose_motion(file_with_pose(self.all))
 
     def find(self, *channels: str) -> FileChannel | None:
-        """The first of some channels, in any of the files."""
-        found = (one.columns.get(name) for name in channels for one in self.all)
+        """Return the first of some channels in any of the files."""
+        found = (one.channels.get(name) for name in channels for one in self.all)
         return next((one for one in found if one is not None), None)
 
     @property
     def runs(self) -> tuple["RunStudy", ...]:
-        """This run, and the others."""
+        """This run and the others."""
         return (self, *self.others)
 
     @cached_property
     def pose_over_wheel_speed(self) -> float | None:
-        """Speed of the pose over that of the wheels, the middle one of all runs."""
+        """Median over all runs of the ratio of body speed to wheel speed."""
         found = []
         for run in self.runs:
-            speed = run.main.columns.first(*SPEEDS)
-            angle = run.main.columns.first(*ANGLES)
+            speed = run.main.channels.first(*SPEEDS)
+            angle = run.main.channels.first(*ANGLES)
             if speed is None and angle is not None and run.main.clock is not None:
                 rates = np.gradient(angle.values, run.main.time, axis=0)
                 speed = replace(angle, values=rates)
-            ratio = None if speed is None else pose_over_wheel_speed(run.main, speed, run.moved)
+            ratio = None if speed is None else pose_over_wheel_speed(run.main, speed, run.by_pose)
             found += [ratio] if ratio is not None else []
         return float(np.median(found)) if found else None
 
     @property
     def has_sign(self) -> bool | None:
-        """Whether currents have a sign in any of the runs; None where none tells."""
+        """Whether currents have a sign in any of the runs; None where none shows it."""
         signs = [
             has_sign(current, run.find(*SPEEDS))
             for run in self.runs
@@ -286,7 +288,7 @@ class RunStudy:
 
     @property
     def of_supply(self) -> bool:
-        """Whether currents are what the battery gives: positive both ways, negative at times."""
+        """True where currents are the battery's: positive in both directions, negative at times."""
         currents = [(run.find(*CURRENTS), run.find(*SPEEDS)) for run in self.runs]
         known = [(current, speed) for current, speed in currents if current is not None]
         both_ways = any(has_magnitudes(current, speed) for current, speed in known)
@@ -294,6 +296,6 @@ class RunStudy:
 
     @property
     def radius(self) -> float | None:
-        """Wheel radius, where somebody said it [m]."""
-        taken = "wheel_radius_m" in self.robot.taken
+        """Wheel radius [m], where the user gave it."""
+        taken = "wheel_radius_m" in self.robot.defaults
         return None if taken else self.robot.wheel_radius_m

@@ -1,6 +1,7 @@
-"""Which robot logs can be of: its drive by the number of wheels, and whether it goes sideways.
+"""Guess the robot behind logs, and sort log files into runs.
 
-Log files sorted into runs: published formats, and files that belong together.
+The drive follows from the number of wheels and from sideways motion. Files of published formats are
+recognised, and files that belong to one run are put together.
 """
 
 from dataclasses import dataclass, replace
@@ -26,19 +27,19 @@ from slipid.data.wheel_signals import body_steps
 from slipid.support.errors import DataError
 
 _SIDEWAYS = 0.3
-"""Share of the way that is sideways, from which a robot can drive so."""
+"""Share of sideways motion in the path length from which a robot can drive sideways."""
 
 
 @dataclass(frozen=True)
 class RobotGuess:
-    """A robot, with what is to be asked of it in words that fit the logs."""
+    """A robot, and questions about it that suit the logs."""
 
     robot: RobotAnswers
     hints: tuple[RobotHint, ...]
 
 
 def guess_robot(options: RobotOptions, wheels: int, files: tuple[FileStudy, ...]) -> RobotGuess:
-    """The robot of the options, the rest as the logs have it; DataError as of `ask`."""
+    """Return the robot of the options, completed from the logs; raise `DataError` as in `ask`."""
     drive, hint = _likely_drive(wheels, drives_sideways(files))
     drive = options.drive or drive
     if wheels == 2 and drive in ("mecanum", "skid") and options.shared is None:
@@ -52,7 +53,7 @@ def guess_robot(options: RobotOptions, wheels: int, files: tuple[FileStudy, ...]
 
 
 def _likely_drive(wheels: int, aside: bool | None) -> tuple[str, str]:
-    """The likeliest drive, and the question that remains."""
+    """Return the likeliest drive and the question that remains."""
     if wheels == 2:
         return (
             "differential",
@@ -73,17 +74,17 @@ def _likely_drive(wheels: int, aside: bool | None) -> tuple[str, str]:
 
 
 def drives_sideways(files: tuple[FileStudy, ...]) -> bool | None:
-    """Whether the robot was told to drive sideways, or did; None where nothing says."""
+    """Return whether commands or poses show sideways motion; None where neither is known."""
     for one in files:
-        command = one.columns.get("twist_command_y")
+        command = one.channels.get("twist_command_y")
         if command is not None and np.nanmax(np.abs(command.values)) > 0:
             return True
     posed = file_with_pose(files)
-    if posed is None or (turned := posed.columns.get("pose_heading")) is None:
+    if posed is None or (turned := posed.channels.get("pose_heading")) is None:
         return None
     if not turned.unit:
         return None
-    x, y = posed.columns.get("pose_x"), posed.columns.get("pose_y")
+    x, y = posed.channels.get("pose_x"), posed.channels.get("pose_y")
     assert x is not None
     assert y is not None
     heading = turned.values[:, 0] * factor(turned.unit, "rad")
@@ -94,7 +95,7 @@ def drives_sideways(files: tuple[FileStudy, ...]) -> bool | None:
 
 
 def _two_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
-    """Wheels in two rows, left and right, as a place to start from; in one where they are odd."""
+    """Place wheels in a left and a right row, with an odd one at the back, as a first guess."""
     pairs = wheels // 2
     places = [
         (0.2 - 0.4 * k / max(pairs - 1, 1), side) for k in range(pairs) for side in (0.15, -0.15)
@@ -112,18 +113,18 @@ def _two_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
 
 
 _MORE_RUNS = 4
-"""Runs beside the first that are looked into."""
+"""Number of further runs that are studied beside the first."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunFiles:
-    """Files of a run: those of one kind with the wheels, and others beside them.
+    """Files of a run: the kind with the wheels, and other files beside it.
 
     Attributes:
         kind: the files with the wheels.
-        main: the first of them, looked into.
-        beside: name of each other file, as of `Layout.beside`, and the first of them looked into.
-        others: the same of further runs.
+        main: study of the first of them.
+        beside: name of each other file, as in `Layout.beside`, with the study of the first.
+        others: the same for further runs.
     """
 
     kind: FileKind
@@ -138,30 +139,37 @@ class RunFiles:
 
     @property
     def complete(self) -> bool:
-        """Whether it has wheels and a pose."""
-        return any(one.columns.wheels for one in self.all) and any(
-            one.columns.has_pose for one in self.all
+        """True where the run has wheels and a pose."""
+        return any(one.channels.wheels for one in self.all) and any(
+            one.channels.has_pose for one in self.all
         )
 
 
 @dataclass(frozen=True, eq=False)
 class SortedFiles:
-    """All files that were found: those of published formats, and others by run.
+    """All files that were found.
 
-    `sentences` are lines about what was found and left out.
+    Attributes:
+        root: folder of the files.
+        presets: kinds in a published format, with its name.
+        groups: other kinds as runs.
+        other_kinds: all kinds that are in no published format.
+        hints: comments about published formats that might fit.
+        sentences: lines about files found and left out.
+        no_logs: files that are no logs.
     """
 
     root: Path
     presets: tuple[tuple[FileKind, str], ...]
     groups: tuple[RunFiles, ...]
-    also: tuple[FileKind, ...]
+    other_kinds: tuple[FileKind, ...]
     hints: tuple[str, ...]
     sentences: tuple[str, ...]
     no_logs: tuple[Path, ...]
 
 
 def sort_files(path: Path) -> SortedFiles:
-    """All files that belong to what was named."""
+    """Return all files that belong to the file or folder that the user named."""
     if path.is_dir():
         formats, no_logs = formats_below(path)
         root, kinds = path, file_kinds(formats)
@@ -187,7 +195,7 @@ def sort_files(path: Path) -> SortedFiles:
         f"{len(kind.paths)} of format {name}: {kind.paths[0]} ..." for kind, name in presets
     ]
     sentences += [_sentence(group) for group in groups]
-    sentences += [f"left out: {line}" for line in (*left_out, *(one.why for one in no_logs[:3]))]
+    sentences += [f"left out: {line}" for line in (*left_out, *(one.reason for one in no_logs[:3]))]
     sentences += [f"left out: {len(no_logs) - 3} more that are no logs"] * (len(no_logs) > 3)
     paths = tuple(one.path for one in no_logs)
     also = tuple(kind for kind, _ in others)
@@ -197,7 +205,7 @@ def sort_files(path: Path) -> SortedFiles:
 
 
 def _siblings(path: Path, kind: FileKind) -> list[tuple[FileKind, FileStudy]]:
-    """Files beside one that lacks something."""
+    """Return files of other kinds beside one that lacks wheels or a pose."""
     near = [p for p in sorted(path.parent.iterdir()) if p.is_file() and p.suffix in SUFFIXES]
     out = []
     for other in near:
@@ -211,12 +219,12 @@ def _siblings(path: Path, kind: FileKind) -> list[tuple[FileKind, FileStudy]]:
 
 
 def _is_complete(one: FileStudy) -> bool:
-    return one.columns.wheels > 0 and one.columns.has_pose
+    return one.channels.wheels > 0 and one.channels.has_pose
 
 
 def _run_files(kinds: list[tuple[FileKind, FileStudy]]) -> tuple[list[RunFiles], list[str]]:
-    """Runs: kinds that have wheels, and with each the kinds that lie beside it."""
-    mains = [pair for pair in kinds if pair[1].columns.wheels] or kinds[:1]
+    """Return a run for each kind with wheels and the kinds beside it, and lines about the rest."""
+    mains = [pair for pair in kinds if pair[1].channels.wheels] or kinds[:1]
     rest = [pair for pair in kinds if pair not in mains]
     if len(mains) > 1 and not any(_is_complete(one) for _, one in mains):
         # the same wheels in two files: the one with the better channel leads
@@ -225,11 +233,11 @@ def _run_files(kinds: list[tuple[FileKind, FileStudy]]) -> tuple[list[RunFiles],
     groups, used = [], []
     for kind, main in mains:
         beside: list[tuple[str, FileStudy]] = []
-        have = frozenset(one.channel for one in main.columns.found) - {"time"}
+        have = frozenset(one.channel for one in main.channels.found) - {"time"}
         for other, one in rest:
             pattern = pattern_beside(kind, other)
-            one = replace(one, columns=without(one.columns, have))
-            fresh = {found.channel for found in one.columns.found} - {"time"}
+            one = replace(one, channels=without(one.channels, have))
+            fresh = {found.channel for found in one.channels.found} - {"time"}
             if pattern is None or not fresh or one.clock is None or main.clock is None:
                 continue
             if not _overlap(main, one):
@@ -247,7 +255,7 @@ def _run_files(kinds: list[tuple[FileKind, FileStudy]]) -> tuple[list[RunFiles],
 
 
 def _more_runs(group: RunFiles) -> tuple[RunFiles, ...]:
-    """Some more runs of a kind, spread over all of them."""
+    """Return further runs of a kind, spread evenly over all of them."""
     count = len(group.kind.formats)
     chosen = sorted({k * count // (_MORE_RUNS + 1) for k in range(1, _MORE_RUNS + 1)} - {0})
     out = []
@@ -265,13 +273,13 @@ def _more_runs(group: RunFiles) -> tuple[RunFiles, ...]:
 
 
 def _overlap(one: FileStudy, other: FileStudy) -> bool:
-    """Whether two files cover the same time: then they are of one run."""
+    """Return True where two files cover the same time and so belong to one run."""
     return bool(max(one.time[0], other.time[0]) < min(one.time[-1], other.time[-1]))
 
 
 def _sentence(group: RunFiles) -> str:
-    """What a group of files holds, in a sentence."""
-    listed = [", ".join(found.channel for found in one.columns.found) for one in group.all]
+    """Return a sentence with the channels of a run's files."""
+    listed = [", ".join(found.channel for found in one.channels.found) for one in group.all]
     more = [
         f"; beside it {name}: {channels}"
         for (name, _), channels in zip(group.beside, listed[1:], strict=True)

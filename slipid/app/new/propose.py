@@ -1,4 +1,4 @@
-"""From logs to the config that is proposed for them."""
+"""Propose a config for a log or a folder of logs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from slipid.app.new.guess import RunFiles, SortedFiles, guess_robot, sort_files
 from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, robot_of
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
-from slipid.data.reading.bag.runs import PAUSE_S, parts_between_pauses
+from slipid.data.reading.bag.runs import PAUSE_S, runs_between_pauses
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.motor_layout import motor_layout
 from slipid.data.reading.presets import PRESETS
@@ -29,18 +29,18 @@ _FLOOR = "on which floor was {} driven? Its name, or folder where folders are ca
 
 
 def propose(path: Path, options: RobotOptions) -> ConfigProposal:
-    """The config that a log, or a folder of logs, is proposed to have.
+    """Return the config proposed for a log or a folder of logs.
 
     Raises:
-        DataError: there is no log, or an option is no answer.
+        DataError: there is no log, or an option is not valid.
     """
     if not path.exists():
         raise DataError(f"{path}: no such file or folder; expected a log, or a folder of logs")
     if bags := bags_in(path):
         proposed = propose_bags(bags, path, options)
-        return replace(proposed, sketch=_bags_checked(proposed.sketch, bags[0]))
+        return replace(proposed, draft=_bags_checked(proposed.draft, bags[0]))
     found = sort_files(path)
-    wheels = max((group.main.columns.wheels for group in found.groups), default=0)
+    wheels = max((group.main.channels.wheels for group in found.groups), default=0)
     for _, name in found.presets:
         wheels = max(wheels, _wheels_of(PRESETS[name]))
     files = tuple(one for group in found.groups for one in group.all)
@@ -49,28 +49,28 @@ def propose(path: Path, options: RobotOptions) -> ConfigProposal:
     robot = _with_preset_gear(guessed.robot, found)
     known = [_run_study(group, robot) for group in found.groups]
     logs = _logs(found)
-    used = {one.format for one in logs if not one.off}
+    used = {one.format for one in logs if not one.commented_out}
     presets = [PRESETS[name] for _, name in found.presets if name in used]
-    sketch = ConfigDraft(
+    draft = ConfigDraft(
         robot,
         tuple(
             _layout(group, one, k)
             for k, (group, one) in enumerate(zip(found.groups, known, strict=True))
         ),
         tuple(logs),
-        carries=frozenset(channel for layout in presets for channel in layout.channels),
+        preset_channels=frozenset(channel for layout in presets for channel in layout.channels),
         above=(f"Proposed from {path}.", *found.hints),
         data=str(found.root),
         hints=(*guessed.hints, *(hint for one in known for hint in radius_hint(one))),
     )
     return ConfigProposal(
-        _checked_by_reader(sketch, found, wheels), (*found.sentences, *found.hints)
+        _checked_by_reader(draft, found, wheels), (*found.sentences, *found.hints)
     )
 
 
 def _refuse_bench(path: Path, found: SortedFiles, wheels: int, files: Sequence[FileStudy]) -> None:
-    """DataError where a log is of a motor on a bench, which another command is for."""
-    if found.presets or wheels > 1 or not files or any(one.columns.has_pose for one in files):
+    """Raise `DataError` for the log of a motor on a bench, which `slipid motor` reads."""
+    if found.presets or wheels > 1 or not files or any(one.channels.has_pose for one in files):
         return
     first = files[0].format.path
     try:
@@ -92,11 +92,11 @@ def _wheels_of(layout: Layout) -> int:
 
 
 def _with_preset_gear(robot: RobotAnswers, found: SortedFiles) -> RobotAnswers:
-    """The gear ratio that a published format has, unless an option gives another."""
+    """Return the robot with the gear ratio of a published format, unless an option gives one."""
     gears = {PRESETS[name].gear_ratio for _, name in found.presets}
-    if len(gears) != 1 or "gear_ratio" not in robot.taken:
+    if len(gears) != 1 or "gear_ratio" not in robot.defaults:
         return robot
-    return replace(robot, gear_ratio=gears.pop(), taken=robot.taken - {"gear_ratio"})
+    return replace(robot, gear_ratio=gears.pop(), defaults=robot.defaults - {"gear_ratio"})
 
 
 def _run_study(group: RunFiles, robot: RobotAnswers) -> RunStudy:
@@ -106,7 +106,7 @@ def _run_study(group: RunFiles, robot: RobotAnswers) -> RunStudy:
 
 def _layout(group: RunFiles, known: RunStudy, number: int) -> LayoutDraft:
     file = file_draft(group.main, known)
-    if not any(one.columns.has_pose for one in group.all):
+    if not any(one.channels.has_pose for one in group.all):
         ask = "no pose was found (x, y, and a heading or a quaternion): a fit needs one"
         file = replace(file, questions=(*file.questions, ask))
     beside = tuple(replace(file_draft(one, known), pattern=name) for name, one in group.beside)
@@ -118,11 +118,11 @@ def _name(number: int) -> str:
 
 
 def _logs(found: SortedFiles) -> list[LogsDraft]:
-    """A section for each glob; those of files that lack wheels or a pose are commented out."""
+    """Return a section for each glob; sections without wheels or pose are commented out."""
     named = [(kind, name) for kind, name in found.presets]
     named += [(group.kind, _name(k)) for k, group in enumerate(found.groups)]
     every = {path for kind, _ in named for path in kind.paths}
-    every |= {path for one in found.also for path in one.paths} | set(found.no_logs)
+    every |= {path for one in found.other_kinds for path in one.paths} | set(found.no_logs)
     whole = {name for name in PRESETS if {"pose_x"} <= PRESETS[name].channels.keys()}
     whole -= {name for name in PRESETS if not _wheels_of(PRESETS[name])}
     whole |= {_name(k) for k, group in enumerate(found.groups) if group.complete}
@@ -130,60 +130,66 @@ def _logs(found: SortedFiles) -> list[LogsDraft]:
     for kind, name in named:
         for glob in globs_of(found.root, kind, sorted(every - set(kind.paths))):
             floors = glob.count("/") > 0 and not folder_per_run(kind)
-            off = name not in whole
+            commented_out = name not in whole
             surface, ask = ("folder", "") if floors else (floor_of(glob), _FLOOR.format(glob))
-            above = ("Without wheels or without a pose, so nothing to fit:",) if off else ()
-            out.append(LogsDraft(glob, name, surface, above, "" if off else ask, off))
-    if all(one.off for one in out):  # a config has one section at least; the layout asks for a pose
-        return [replace(one, off=False, above=()) for one in out]
-    return sorted(out, key=lambda one: one.off)
+            above = (
+                ("Without wheels or without a pose, so nothing to fit:",) if commented_out else ()
+            )
+            out.append(
+                LogsDraft(glob, name, surface, above, "" if commented_out else ask, commented_out)
+            )
+    if all(
+        one.commented_out for one in out
+    ):  # a config has one section at least; the layout asks for a pose
+        return [replace(one, commented_out=False, above=()) for one in out]
+    return sorted(out, key=lambda one: one.commented_out)
 
 
-def _checked_by_reader(sketch: ConfigDraft, found: SortedFiles, wheels: int) -> ConfigDraft:
-    """The sketch with what the reader says of the first file of each layout, if it refuses it."""
-    drives = geometry(robot_of(sketch.robot)).drives
+def _checked_by_reader(draft: ConfigDraft, found: SortedFiles, wheels: int) -> ConfigDraft:
+    """Return the draft with the reader's error about the first file of each layout, if any."""
+    drives = geometry(robot_of(draft.robot)).drives
     layouts = []
-    for layout, group in zip(sketch.layouts, found.groups, strict=True):
+    for layout, group in zip(draft.layouts, found.groups, strict=True):
         questions = list(layout.file.questions)
         if wheels and drives != wheels:
             questions.append(f"[robot] has {drives} drives, but {wheels} have columns here: which?")
-        if problem := _read_first(sketch, layout.name, group.kind.paths[0]).problem:
+        if problem := _read_first(draft, layout.name, group.kind.paths[0]).problem:
             questions.append(f"the reader says: {problem}")
         layouts.append(replace(layout, file=replace(layout.file, questions=tuple(questions))))
-    return replace(sketch, layouts=tuple(layouts))
+    return replace(draft, layouts=tuple(layouts))
 
 
-def _bags_checked(sketch: ConfigDraft, first: Path) -> ConfigDraft:
-    """The sketch with what the reader says of the first bag, if it refuses it.
+def _bags_checked(draft: ConfigDraft, first: Path) -> ConfigDraft:
+    """Return the draft with the reader's error about the first bag, if there is one.
 
-    A bag that is one long drive with pauses is cut at them: its runs share a session.
+    A bag with one long drive and pauses is cut at the pauses, and its runs share a session.
     """
-    (bag,) = sketch.bags
-    tried = _read_first(sketch, bag.name, first)
+    (bag,) = draft.bags
+    tried = _read_first(draft, bag.name, first)
     if tried.problem:
         questions = (*bag.questions, f"the reader says: {tried.problem}")
-        return replace(sketch, bags=(replace(bag, questions=questions),))
-    count = max((parts_between_pauses(log, PAUSE_S) for log in tried.logs), default=1)
+        return replace(draft, bags=(replace(bag, questions=questions),))
+    count = max((runs_between_pauses(log, PAUSE_S) for log in tried.logs), default=1)
     if count < 2:
-        return sketch
+        return draft
     comment = f"cut where no wheel moves for longer: {count} runs in the first bag"
     cut = ConfigLine("runs", f"{{ pause_s = {PAUSE_S:g} }}", comment)
-    logs = tuple(replace(one, session="file") for one in sketch.logs)
-    return replace(sketch, bags=(replace(bag, settings=(*bag.settings, cut)),), logs=logs)
+    logs = tuple(replace(one, session="file") for one in draft.logs)
+    return replace(draft, bags=(replace(bag, settings=(*bag.settings, cut)),), logs=logs)
 
 
 @dataclass(frozen=True)
 class _ReadResult:
-    """What the reader made of a file: its runs, or why it refused it."""
+    """Runs that the reader made of a file, or the reason why it refused it."""
 
     logs: tuple[Log, ...] = ()
     problem: str = ""
 
 
-def _read_first(sketch: ConfigDraft, name: str, path: Path) -> _ReadResult:
-    """The first file of a layout as the reader reads it by the sketch."""
+def _read_first(draft: ConfigDraft, name: str, path: Path) -> _ReadResult:
+    """Read the first file of a layout with the draft's config."""
     try:
-        config = parsed(Path("robot.toml"), new_config(sketch, "robot.toml").text)
+        config = parsed(Path("robot.toml"), new_config(draft, "robot.toml").text)
         section = next((one for one in config.content.logs if one.format == name), None)
         if section is None:
             return _ReadResult()

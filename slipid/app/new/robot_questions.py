@@ -1,4 +1,4 @@
-"""What is asked about a robot, its drive first, and how texts are read as answers."""
+"""Questions about a robot, its drive first, and the parsing of their answers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
@@ -15,13 +15,15 @@ from slipid.app.config import (
 from slipid.support.errors import DataError, did_you_mean
 
 Asker = Callable[[str, str, str], str]
-"""Asks people: what is asked, what stands there if they say nothing, and what was wrong with the
-last answer; returns their answer, or the default."""
+"""Asks the user. Arguments: question, default, and what was wrong with the last answer.
+
+Returns the answer, or the default.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotOptions:
-    """Options that describe a robot beforehand, as text; None where they are not given."""
+    """Command-line options that describe a robot, as text; None where they are not given."""
 
     drive: str | None = None
     wheels: str | None = None
@@ -41,7 +43,7 @@ class RobotOptions:
 
 @dataclass(frozen=True)
 class RobotAnswers:
-    """What is known of a robot, said or taken by default."""
+    """Answers about a robot, given by the user or taken by default."""
 
     drive: str = "omni"
     wheels: int = 3
@@ -57,12 +59,12 @@ class RobotAnswers:
     gear_ratio: float = 1.0
     mass_kg: float = 10.0
     ticks_per_revolution: float = 1000.0
-    taken: frozenset[str] = field(default_factory=frozenset)
+    defaults: frozenset[str] = field(default_factory=frozenset)
     """What nobody said: a default stands there."""
 
 
 def positive(text: str, _: RobotAnswers) -> float:
-    """A number above 0; this and the others: ValueError where the text is something else."""
+    """Return a number above 0; like all parsers below it raises `ValueError` for any other text."""
     value = number(text)
     if not 0 < value < float("inf"):
         raise ValueError("expected a number above 0")
@@ -70,7 +72,7 @@ def positive(text: str, _: RobotAnswers) -> float:
 
 
 def not_negative(text: str, _: RobotAnswers) -> float:
-    """A number above 0, or 0."""
+    """Return a number that is 0 or more."""
     value = number(text)
     if not 0 <= value < float("inf"):
         raise ValueError("expected a number above 0, or 0 where there is none")
@@ -78,7 +80,7 @@ def not_negative(text: str, _: RobotAnswers) -> float:
 
 
 def number(text: str) -> float:
-    """Any number."""
+    """Return any number."""
     try:
         return float(text.strip().replace("_", "?"))
     except ValueError:
@@ -87,64 +89,64 @@ def number(text: str) -> float:
 
 
 def count(text: str, _: RobotAnswers) -> int:
-    """A number of wheels."""
+    """Return a number of wheels."""
     if not text.strip().isdecimal() or not 3 <= int(text) <= 12:
         raise ValueError("expected a whole number from 3 to 12")
     return int(text)
 
 
 def yes(text: str, _: RobotAnswers) -> bool:
-    """Yes or no."""
+    """Return True for yes and False for no."""
     word = text.strip().lower()
     if word not in ("y", "yes", "true", "n", "no", "false"):
         raise ValueError("expected yes or no")
     return word in ("y", "yes", "true")
 
 
-def angles(text: str, known: RobotAnswers) -> tuple[float, ...]:
-    """An angle for every wheel [deg]."""
+def angles(text: str, answers: RobotAnswers) -> tuple[float, ...]:
+    """Return an angle for every wheel [deg]."""
     found = tuple(number(part) for part in text.replace(";", ",").split(","))
-    if len(found) != known.wheels:
-        raise ValueError(f"{len(found)} angles; expected {known.wheels}, one per wheel")
+    if len(found) != answers.wheels:
+        raise ValueError(f"{len(found)} angles; expected {answers.wheels}, one per wheel")
     return found
 
 
 def places(text: str, _: RobotAnswers) -> tuple[tuple[float, ...], ...]:
-    """Places of at least two wheels [m]."""
+    """Return the places of at least two wheels [m]."""
     found = tuple(tuple(number(c) for c in part.split(",")) for part in text.split(";"))
     if len(found) < 2 or any(len(place) != 2 for place in found):
         raise ValueError("expected x, y of each wheel, as in: 0.2, 0.1; 0.2, -0.1; -0.2, 0")
     return found
 
 
-def rollers(text: str, known: RobotAnswers) -> tuple[float | None, ...]:
-    """Angle of the rollers of every wheel [deg], None of those without."""
+def rollers(text: str, answers: RobotAnswers) -> tuple[float | None, ...]:
+    """Return the roller angle of every wheel [deg], None for a wheel without rollers."""
     words = [part.strip().lower() for part in text.replace(";", ",").split(",")]
-    if len(words) != known.wheels:
-        raise ValueError(f"{len(words)} rollers; expected {known.wheels}, one per wheel")
+    if len(words) != answers.wheels:
+        raise ValueError(f"{len(words)} rollers; expected {answers.wheels}, one per wheel")
     return tuple(None if word == "none" else number(word) for word in words)
 
 
 @dataclass(frozen=True)
 class RobotQuestion:
-    """One thing to know.
+    """One question about a robot.
 
     Attributes:
-        about: attribute of `Told` and `Answers`.
-        asks: what people are asked.
-        default: answer if nobody gives another, perhaps by what is known so far.
-        read: from a text to the value; ValueError says what was expected.
+        name: attribute of `RobotOptions` and `RobotAnswers` that it fills.
+        text: the question.
+        default: default answer, which may depend on earlier answers.
+        read: parses an answer; its `ValueError` says what is expected.
     """
 
-    about: str
-    asks: str
+    name: str
+    text: str
     default: str | Callable[[RobotAnswers], str]
     read: Callable[[str, RobotAnswers], Any]
 
     @property
     def option(self) -> str:
-        """How it is said on the command line."""
-        return "--" + self.about.replace("_", "-")
+        """Command-line option that answers it."""
+        return "--" + self.name.replace("_", "-")
 
 
 def _drive(text: str, _: RobotAnswers) -> str:
@@ -158,13 +160,13 @@ def _drive(text: str, _: RobotAnswers) -> str:
     return word
 
 
-def _even_azimuths(known: RobotAnswers) -> str:
-    """Azimuths of wheels evenly around, none straight ahead."""
-    return ", ".join(f"{(k + 0.5) * 360 / known.wheels:g}" for k in range(known.wheels))
+def _even_azimuths(answers: RobotAnswers) -> str:
+    """Return azimuths of evenly spread wheels, none of them straight ahead."""
+    return ", ".join(f"{(k + 0.5) * 360 / answers.wheels:g}" for k in range(answers.wheels))
 
 
 def _per_wheel(text: str) -> Callable[[RobotAnswers], str]:
-    return lambda known: ", ".join([text] * known.wheels)
+    return lambda answers: ", ".join([text] * answers.wheels)
 
 
 DRIVE = RobotQuestion(
@@ -225,40 +227,44 @@ DRIVES: dict[str, tuple[RobotQuestion, ...]] = {
     "differential": (_TRACK,),
     "general": (_PLACES, _DIRECTIONS, _ROLLERS),
 }
-"""What each drive needs to be asked, in this order; COMMON comes after it."""
+"""Questions of each drive in order; those in `COMMON` come after them."""
 
 
 def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> RobotAnswers:
-    """Everything the drive needs: from an option, else asked for, else a default.
+    """Return all answers that a drive needs: from an option, else from the user, else a default.
 
     Args:
-        options: what needs no question.
-        asker: asks people, again where an answer is wrong; None takes defaults.
-        drive: taken where nobody says which.
+        options: answers given beforehand.
+        asker: asks the user, again after a wrong answer; None takes defaults.
+        drive: default drive.
 
     Raises:
-        DataError: an option is no answer to its question, or belongs to another drive.
+        DataError: an option is no valid answer, or belongs to another drive.
     """
-    known = _with_question(RobotAnswers(drive=drive), replace(DRIVE, default=drive), options, asker)
-    questions = (*DRIVES[known.drive], *COMMON)
-    _refuse_other_drives(options, known.drive, questions)
+    answers = _with_question(
+        RobotAnswers(drive=drive), replace(DRIVE, default=drive), options, asker
+    )
+    questions = (*DRIVES[answers.drive], *COMMON)
+    _refuse_other_drives(options, answers.drive, questions)
     for question in questions:
         if question is _WHEELS and options.azimuths_deg is not None and options.wheels is None:
-            known = replace(known, wheels=len(options.azimuths_deg.replace(";", ",").split(",")))
+            answers = replace(
+                answers, wheels=len(options.azimuths_deg.replace(";", ",").split(","))
+            )
             continue
-        known = _with_question(known, question, options, asker)
+        answers = _with_question(answers, question, options, asker)
         if question is _PLACES:
-            known = replace(known, wheels=len(known.places_m))
-    if known.drive in ("mecanum", "skid"):
-        known = replace(known, wheels=4)
-    return replace(known, wheels=2) if known.drive == "differential" else known
+            answers = replace(answers, wheels=len(answers.places_m))
+    if answers.drive in ("mecanum", "skid"):
+        answers = replace(answers, wheels=4)
+    return replace(answers, wheels=2) if answers.drive == "differential" else answers
 
 
 def _refuse_other_drives(
     options: RobotOptions, drive: str, questions: tuple[RobotQuestion, ...]
 ) -> None:
-    """Refuse what this drive is not asked for: it would be lost without a word."""
-    wanted = {"drive", *(question.about for question in questions)}
+    """Raise `DataError` for an option that this drive would silently ignore."""
+    wanted = {"drive", *(question.name for question in questions)}
     for one in fields(options):
         if getattr(options, one.name) is not None and one.name not in wanted:
             expected = ", ".join(question.option for question in questions)
@@ -268,64 +274,64 @@ def _refuse_other_drives(
 
 
 def _with_question(
-    known: RobotAnswers, question: RobotQuestion, options: RobotOptions, asker: Asker | None
+    answers: RobotAnswers, question: RobotQuestion, options: RobotOptions, asker: Asker | None
 ) -> RobotAnswers:
-    """What is known with the answer to one more question."""
-    text = getattr(options, question.about)
+    """Return the answers with the answer to one more question."""
+    text = getattr(options, question.name)
     if text is not None:
         try:
-            return _with_answer(known, question, text)
+            return _with_answer(answers, question, text)
         except ValueError as error:
             raise DataError(f"{question.option} '{text}': {error}") from None
-    default = question.default if isinstance(question.default, str) else question.default(known)
+    default = question.default if isinstance(question.default, str) else question.default(answers)
     if asker is None:
-        known = replace(known, taken=known.taken | {question.about})
-        return _with_answer(known, question, default)
+        answers = replace(answers, defaults=answers.defaults | {question.name})
+        return _with_answer(answers, question, default)
     wrong = ""
     while True:
-        text = asker(question.asks, default, wrong)
+        text = asker(question.text, default, wrong)
         try:
-            return _with_answer(known, question, text)
+            return _with_answer(answers, question, text)
         except ValueError as error:
             wrong = f"'{text}': {error}"
 
 
-def _with_answer(known: RobotAnswers, question: RobotQuestion, text: str) -> RobotAnswers:
-    """What is known with a text as the answer to a question; ValueError where it is none."""
-    more: dict[str, Any] = {question.about: question.read(text, known)}
-    return replace(known, **more)
+def _with_answer(answers: RobotAnswers, question: RobotQuestion, text: str) -> RobotAnswers:
+    """Return the answers with one parsed from a text; raise `ValueError` where it is not valid."""
+    more: dict[str, Any] = {question.name: question.read(text, answers)}
+    return replace(answers, **more)
 
 
-def robot_of(known: RobotAnswers) -> Wheels:
-    """The `[robot]` section; DataError where the answers make no robot."""
+def robot_of(answers: RobotAnswers) -> Wheels:
+    """Return the `[robot]` section; raise `DataError` where the answers make no robot."""
     sizes = {
-        "drive": known.drive,
-        "wheel_radius_m": known.wheel_radius_m,
-        "gear_ratio": known.gear_ratio,
-        "mass_kg": known.mass_kg,
+        "drive": answers.drive,
+        "wheel_radius_m": answers.wheel_radius_m,
+        "gear_ratio": answers.gear_ratio,
+        "mass_kg": answers.mass_kg,
     }
     try:
-        robot = _section(known, sizes)
+        robot = _section(answers, sizes)
         geometry(robot)
     except ValueError as error:
-        raise DataError(f"drive {known.drive}: {error}") from None
+        raise DataError(f"drive {answers.drive}: {error}") from None
     return robot
 
 
-def _section(known: RobotAnswers, sizes: dict[str, object]) -> Wheels:
-    if known.drive == "omni":
-        azimuths = list(known.azimuths_deg)
-        own = {"wheel_azimuths_deg": azimuths, "base_radius_m": known.base_radius_m}
+def _section(answers: RobotAnswers, sizes: dict[str, object]) -> Wheels:
+    if answers.drive == "omni":
+        azimuths = list(answers.azimuths_deg)
+        own = {"wheel_azimuths_deg": azimuths, "base_radius_m": answers.base_radius_m}
         return OmniDrive.model_validate({**sizes, **own})
-    if known.drive == "differential":
-        return DifferentialDrive.model_validate({**sizes, "track_m": known.track_m})
-    if known.drive == "general":
-        rollers = ["none" if angle is None else angle for angle in known.rollers_deg]
+    if answers.drive == "differential":
+        return DifferentialDrive.model_validate({**sizes, "track_m": answers.track_m})
+    if answers.drive == "general":
+        rollers = ["none" if angle is None else angle for angle in answers.rollers_deg]
         own = {
-            "wheel_places_m": [list(place) for place in known.places_m],
-            "drive_directions_deg": list(known.directions_deg),
+            "wheel_places_m": [list(place) for place in answers.places_m],
+            "drive_directions_deg": list(answers.directions_deg),
         }
         return GeneralDrive.model_validate({**sizes, **own, "roller_angles_deg": rollers})
-    half = {"half_length_m": known.wheelbase_m / 2, "half_width_m": known.track_m / 2}
-    shared = {"drives": [[1, 3], [2, 4]]} if known.shared else {}
+    half = {"half_length_m": answers.wheelbase_m / 2, "half_width_m": answers.track_m / 2}
+    shared = {"drives": [[1, 3], [2, 4]]} if answers.shared else {}
     return FourWheelDrive.model_validate({**sizes, **half, **shared})

@@ -1,4 +1,4 @@
-"""Units that no name says, from what robots do: how often they log, how fast they are."""
+"""Guess units that no name gives, from how often robots log and how fast they move."""
 
 from dataclasses import dataclass
 
@@ -9,29 +9,29 @@ from slipid.data.reading.layout import CHANNELS
 from slipid.data.reading.units import factor
 
 _SECONDS = (1e9, 4e9)
-"""Seconds since 1970 that stamps of robots show."""
+"""Plausible range of time stamps of robots [s since 1970]."""
 _CLOCKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _STEPS = (2e-4, 2.5)
-"""Time between rows of logs, within which a unit is believed [s]."""
+"""Plausible time between rows of a log [s]."""
 FAST = 12.0
-"""Speed that no such robot has [m/s]."""
+"""Speed above which a unit is not plausible [m/s]."""
 RADII = (0.012, 0.6)
-"""Wheels of robots [m]."""
+"""Plausible range of wheel radii [m]."""
 _TURNED, _NEAR_TURN = 0.5, 5.0
-"""Turn by a turn rate that tells the unit of a heading [rad], and a factor by which it may err."""
+"""Least turn [rad] from which a turn rate decides a heading's unit, and its error factor."""
 
 
 @dataclass(frozen=True)
 class UnitGuess:
-    """A unit, and what was assumed to tell it; `doubt` is for people to answer."""
+    """A unit, the reason for it, and the question that remains."""
 
     unit: str
-    why: str = ""
+    reason: str = ""
     doubt: str = ""
 
 
 def time_unit(values: Float[np.ndarray, " row"]) -> UnitGuess:
-    """Unit of time, from stamps since 1970 or else from the steps."""
+    """Return the unit of time, from stamps since 1970 or else from the steps."""
     first = float(np.nanmin(np.abs(values)))
     for unit, per in _CLOCKS.items():
         if _SECONDS[0] < first / per < _SECONDS[1]:
@@ -51,7 +51,7 @@ def time_unit(values: Float[np.ndarray, " row"]) -> UnitGuess:
 def position_unit(
     time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]
 ) -> UnitGuess:
-    """Unit of a place, from the speed that it would be [time in s]."""
+    """Return the unit of a position, from the speed that it implies; `time` is in s."""
     speed, size = speed_of(time, x, y), float(np.nanmax(np.abs([x, y])))
     if speed < FAST and size < 200:
         return UnitGuess("m", f"at most {speed:.2g} m/s")
@@ -66,7 +66,7 @@ def position_unit(
 def speed_of(
     time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]
 ) -> float:
-    """A high speed of a place: 9 of 10 seconds have less. Over shorter times it would be noise."""
+    """Return the 90 % quantile of the speed over steps of one second, which averages noise."""
     there = ~(np.isnan(x) | np.isnan(y) | np.isnan(time))
     time, x, y = time[there], x[there], y[there]
     if len(time) < 3:
@@ -81,10 +81,10 @@ def speed_of(
 
 
 def heading_unit(values: Float[np.ndarray, " row"], turned: float = 0.0) -> UnitGuess:
-    """Unit of a heading, from its jumps at a full turn, else from its size.
+    """Return the unit of a heading, from its jumps at a full turn, else from its size.
 
     Args:
-        turned: range of the heading by a gyro or by commands [rad], 0 where there are none.
+        turned: range of the heading by a gyro or by commands [rad]; 0 where there are none.
     """
     known = values[~np.isnan(values)]
     jump, most = float(np.abs(np.diff(known)).max(initial=0.0)), float(np.abs(known).max(initial=0))
@@ -108,11 +108,11 @@ def heading_unit(values: Float[np.ndarray, " row"], turned: float = 0.0) -> Unit
 
 
 def speed_unit(ratio: float | None, radius: float | None) -> UnitGuess:
-    """Unit of wheel speeds, from the way of the pose, if there is one, and a radius, if it is said.
+    """Return the unit of wheel speeds, from the motion of the pose and a given radius, if known.
 
     Args:
-        ratio: speed of the pose over that of the wheels, [m/s] over their unit.
-        radius: of the wheels [m], over the gear ratio for speeds of the motor.
+        ratio: speed of the pose over that of the wheels [m/s over their unit].
+        radius: wheel radius [m], divided by the gear ratio for motor speeds.
     """
     options = "rad/s, rpm or deg/s; or m/s at the rim: then divide by the radius with scale"
     if ratio is None:
@@ -134,7 +134,7 @@ def speed_unit(ratio: float | None, radius: float | None) -> UnitGuess:
 
 
 def angle_unit(ratio: float | None, radius: float | None) -> UnitGuess:
-    """Unit of wheel angles; arguments as of `speed_unit`."""
+    """Return the unit of wheel angles; arguments as in `speed_unit`."""
     if ratio is None:
         return UnitGuess("rad", doubt="radians, degrees, turns or ticks?")
     low, high = RADII if radius is None else (radius / 2, radius * 2)
@@ -145,19 +145,19 @@ def angle_unit(ratio: float | None, radius: float | None) -> UnitGuess:
 
 
 def usual_unit(channel: str) -> UnitGuess:
-    """Unit of what is logged in SI but for rare cases."""
+    """Return the unit of channels that are almost always logged in SI."""
     return UnitGuess({"wheel_ticks": "tick"}.get(channel, CHANNELS[channel]))
 
 
 def current_unit(most: float) -> UnitGuess:
-    """Unit of currents from their largest."""
+    """Return the unit of currents from their largest value."""
     if most > 120:
         return UnitGuess("mA", f"up to {most:.4g}")
     return UnitGuess("A", f"up to {most:.3g}")
 
 
 def duty_unit(most: float) -> UnitGuess:
-    """Unit of duty cycles from their largest."""
+    """Return the unit of duty cycles from their largest value."""
     if most <= 1.05:
         return UnitGuess("1", f"up to {most:.3g}")
     if most <= 105:

@@ -1,8 +1,7 @@
-"""What a key means: the line about it in the docstring of the class that declares it.
+"""Explain config keys and parameters in words, from the code that checks them.
 
-Every parameter of a robot: its unit, what it means, and what is believed of it beforehand.
-
-Types of keys in words: what a value of a config may look like.
+The meaning of a key is its line in the docstring of the class that declares it, and its possible
+values follow from the type. A parameter has its unit, meaning and default prior.
 """
 
 import inspect
@@ -34,7 +33,7 @@ _NEXT_ATTRIBUTE = re.compile(r"; (?=[a-z_0-9]+: )")
 
 @lru_cache(maxsize=64)
 def meanings(kind: type) -> dict[str, str]:
-    """Meaning of each key of a model or a dataclass, also those that it inherits."""
+    """Return the meaning of each key of a model or a dataclass, inherited ones included."""
     found: dict[str, str] = {}
     for one in reversed(kind.__mro__):
         if one.__doc__ and (issubclass(one, BaseModel) or is_dataclass(one)):
@@ -43,7 +42,7 @@ def meanings(kind: type) -> dict[str, str]:
 
 
 def meaning(kind: type, key: str) -> str:
-    """Meaning of one key; KeyError where its class does not say it."""
+    """Return the meaning of one key; raise `KeyError` where its class does not explain it."""
     found = meanings(kind)
     if key not in found:
         raise KeyError(f"the docstring of {kind.__name__} has no attribute line for '{key}'")
@@ -51,25 +50,25 @@ def meaning(kind: type, key: str) -> str:
 
 
 def in_short(kind: type, key: str) -> str:
-    """The same up to its first full stop, colon or semicolon, for a comment beside a value."""
+    """Return the meaning up to its first full stop, colon or semicolon, for a short comment."""
     return re.split(r"[.:;](?= |$)", meaning(kind, key))[0]
 
 
 def purpose(kind: type) -> str:
-    """What the class says of itself before it comes to its attributes."""
+    """Return the docstring of a class before its attributes."""
     text = inspect.cleandoc(kind.__doc__ or "").split("\n\nAttributes:")[0]
     return " ".join(text.split())
 
 
 def keys(kind: type) -> tuple[str, ...]:
-    """Keys in the order of declaration, as a config spells them."""
+    """Return the keys in the order of declaration, as a config spells them."""
     if issubclass(kind, BaseModel):
         return tuple(field.alias or name for name, field in kind.model_fields.items())
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()
 
 
 def _attributes(docstring: str) -> dict[str, str]:
-    """Lines `key: text` below `Attributes:`, continued by lines that stand further in."""
+    """Return lines `key: text` below `Attributes:`, with their indented continuations."""
     _, _, block = inspect.cleandoc(docstring).partition("Attributes:\n")
     found: dict[str, str] = {}
     names: tuple[str, ...] = ()
@@ -89,7 +88,7 @@ def _attributes(docstring: str) -> dict[str, str]:
 
 
 def _split_line(key: str, text: str) -> list[tuple[str, str]]:
-    """Attributes that share a line: `mean: its centre; std: its width`."""
+    """Return the attributes of a shared line: `mean: its centre; std: its width`."""
     first, *others = _NEXT_ATTRIBUTE.split(text)
     pairs = [(key, first)]
     for other in others:
@@ -99,21 +98,22 @@ def _split_line(key: str, text: str) -> list[tuple[str, str]]:
 
 
 FLOOR, SESSION = "FLOOR", "SESSION"
-"""What stands for names that only the logs tell."""
+"""Placeholders for names that only the logs give."""
 
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """A parameter in words.
+    """Description of a parameter in words.
 
     Attributes:
-        path: its name; size: how many numbers it has.
-        symbol: in the equations.
-        unit: of it.
-        means: what it is.
-        start: what it is where nothing else is known.
-        prior: what is believed of it by default, or that it is not fitted.
-        here: what the config says instead.
+        path: its path name.
+        size: how many numbers it has.
+        symbol: its symbol in the equations.
+        unit: its unit.
+        means: its meaning.
+        start: its start value where nothing else is known.
+        prior: its default prior, or that it is not fitted.
+        here: the config's choice for it.
     """
 
     path: str
@@ -127,7 +127,7 @@ class ParameterRow:
 
 
 def parameter_rows(config: Config | None = None) -> list[ParameterRow]:
-    """The parameters of a config's robot, or of one with three omni wheels."""
+    """Return the parameters of a config's robot, or of a robot with three omni wheels."""
     if config is None:
         whole = Robot.of(omni([60.0, 180.0, 300.0], 0.125, 0.04)).on((FLOOR,), sessions=(SESSION,))
         return [_row(entry, whole, {}) for entry in entries(whole)]
@@ -161,7 +161,7 @@ def _row(
 
 
 def prior(one: Declaration) -> str:
-    """The default prior in words: its width where it is fitted, else what it would be."""
+    """Return the default prior in words: its width where it is fitted, else what it would be."""
     if one.shares:
         width = f"shares around an even load, log-std {one.spread:g}"
     elif one.deviation:
@@ -177,7 +177,7 @@ def prior(one: Declaration) -> str:
 
 
 def _setting_text(choice: ParameterSection) -> str:
-    """What a config wants of a parameter."""
+    """Return a config's choice for a parameter in words."""
     if choice.fixed is not None:
         return f"fixed = {choice.fixed}"
     said = [] if choice.start is None else [f"start = {choice.start}"]
@@ -201,7 +201,7 @@ _PLAIN = {
 
 @dataclass(frozen=True)
 class ConfigKey:
-    """A key of a config: its name, what its value may be, its default in words, its meaning."""
+    """A key of a config: its name, possible values, default and meaning in words."""
 
     name: str
     kind: str
@@ -210,7 +210,7 @@ class ConfigKey:
 
 
 def keys_of(kind: type, hidden: tuple[str, ...] = ()) -> list[ConfigKey]:
-    """Every key of a model or a dataclass."""
+    """Return every key of a model or a dataclass."""
     hints = get_type_hints(kind, include_extras=True)
     named = {_declared(kind, key): key for key in keys(kind) if key not in hidden}
     return [
@@ -225,24 +225,24 @@ def keys_of(kind: type, hidden: tuple[str, ...] = ()) -> list[ConfigKey]:
 
 
 def _declared(kind: type, key: str) -> str:
-    """Name of the attribute that a key is read into."""
+    """Return the name of the attribute that a key is read into."""
     if not issubclass(kind, BaseModel):
         return key
     return next(name for name, field in kind.model_fields.items() if (field.alias or name) == key)
 
 
 def _field_limits(kind: type, name: str) -> tuple[object, ...]:
-    """Limits that a field of a model has beside its type."""
+    """Return the limits of a model's field beside its type."""
     return tuple(kind.model_fields[name].metadata) if issubclass(kind, BaseModel) else ()
 
 
 def _key_meaning(kind: type, key: str, hint: object) -> str:
-    """What a key means; of one that has few values only, these are said by its type."""
+    """Return the meaning of a key; empty for a drive, whose type lists its few values."""
     return "" if key == "drive" and get_origin(hint) is Literal else meaning(kind, key)
 
 
 def in_words(hint: object, limits: tuple[object, ...] = ()) -> str:
-    """A type as people say it."""
+    """Return a type in words."""
     origin, inside = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return in_words(inside[0], (*limits, *inside[1:]))
@@ -263,7 +263,7 @@ def in_words(hint: object, limits: tuple[object, ...] = ()) -> str:
 
 
 def _list(inside: tuple[object, ...], limits: tuple[object, ...]) -> str:
-    """A list, of a number of members where it has one."""
+    """Return a list type in words, with the number of members where it is fixed."""
     members = [one for one in inside if one is not Ellipsis]
     element = in_words(members[0])
     # one alone may be written without the list
@@ -294,12 +294,12 @@ def _limits(limits: tuple[object, ...]) -> str:
 
 
 def _unpacked(limits: tuple[object, ...]) -> list[object]:
-    """What pydantic keeps of `Field(...)` as well as what stands alone."""
+    """Return limits in `Field(...)` together with those that stand alone."""
     return [m for one in limits for m in (one.metadata if isinstance(one, FieldInfo) else [one])]
 
 
 def _default(kind: type, name: str) -> str:
-    """The default in words; "required" where there is none."""
+    """Return the default in words; "required" where there is none."""
     if issubclass(kind, BaseModel):
         field = kind.model_fields[name]
         made = field.get_default(call_default_factory=True)
@@ -312,7 +312,7 @@ def _default(kind: type, name: str) -> str:
 
 
 def _toml_text(value: object) -> str:
-    """A value as a config has it."""
+    """Return a value as a config spells it."""
     if value is None or value in ({}, [], ()) or isinstance(value, BaseModel):
         return "none"
     if isinstance(value, bool):

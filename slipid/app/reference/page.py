@@ -1,4 +1,4 @@
-"""The reference of configs as Markdown, made from what checks them."""
+"""Write the reference of configs as Markdown, from the models that check configs."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _DRIVES: tuple[tuple[type[c.Wheels], str, dict[str, object]], ...] = (
     ),
     (c.DifferentialDrive, "differential", {"track_m": 0.3}),
 )
-"""Drives with a robot to draw."""
+"""Drives with an example robot to draw."""
 _SECTIONS: tuple[tuple[str, type], ...] = (
     ("[[logs]]", c.LogsSection),
     ("[camera]", c.CameraSection),
@@ -37,17 +37,17 @@ _SECTIONS: tuple[tuple[str, type], ...] = (
 
 @dataclass(frozen=True)
 class Chapter:
-    """A part of the reference that can be asked for by its name."""
+    """Part of the reference that can be requested by its name."""
 
     name: str
     text: Callable[["c.Config | None"], str]
 
 
 def reference(what: str | None = None, config: "c.Config | None" = None) -> str:
-    """The reference, or a part of it; for the robot of a config, where one is given.
+    """Return the reference, or a part of it; for a config's robot, where one is given.
 
     Raises:
-        DataError: no part is called so.
+        DataError: no part has this name.
     """
     names = [chapter.name for chapter in CHAPTERS]
     if what is None:

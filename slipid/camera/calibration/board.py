@@ -1,28 +1,24 @@
-"""Which pictures a user named: files, folders and globs.
-
-A printed ChArUco board, and its corners in pictures.
-"""
+"""A printed ChArUco board and its corners in pictures, which a user names as files or globs."""
 
 import glob
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.opencv import marker_dictionary, opencv, read_picture
+from slipid.camera.opencv import marker_dictionary, opencv, size_of
 from slipid.support.errors import DataError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-"""Names of pictures in a folder; a file that is named itself may have any."""
+"""Suffixes of pictures in a folder; a file that is named itself may have any."""
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture and where it came from."""
+    """A picture, and the file that it was read from."""
 
     path: Path
     image: np.ndarray
@@ -30,25 +26,19 @@ class Picture:
     @property
     def image_px(self) -> tuple[int, int]:
         """Width and height [pixel]."""
-        return int(self.image.shape[1]), int(self.image.shape[0])
-
-
-def read_named(path: Path) -> Picture:
-    """A picture of a file.
-
-    Raises:
-        DataError: the file is absent, empty or no picture.
-    """
-    return Picture(path, read_picture(path))
+        return size_of(self.image)
 
 
 def named_pictures(words: Sequence[str]) -> list[Path]:
-    """Files of pictures that words name, each once, in their order.
+    """Return the picture files named by words, each once, in their order.
+
+    Args:
+        words: files, folders and glob patterns.
 
     Raises:
-        DataError: a word names none.
+        DataError: a word names no picture.
     """
-    found: dict[Path, None] = {}
+    named: dict[Path, None] = {}
     for word in words:
         path = Path(word)
         if path.is_dir():
@@ -63,28 +53,14 @@ def named_pictures(words: Sequence[str]) -> list[Path]:
             files = sorted(Path(p) for p in glob.glob(word, recursive=True) if Path(p).is_file())
             if not files:
                 raise DataError(f"{word}: no file has such a name; expected pictures")
-        found.update(dict.fromkeys(files))
-    return list(found)
-
-
-def same_size(first: Picture, other: Picture) -> None:
-    """Refuse two pictures that differ in size.
-
-    Raises:
-        DataError: they do, and it names both.
-    """
-    if first.image_px != other.image_px:
-        (w, h), (width, height) = first.image_px, other.image_px
-        raise DataError(
-            f"{other.path}: {width} x {height} pixels, but {first.path} has {w} x {h}; expected "
-            "pictures of one camera at one resolution"
-        )
+        named.update(dict.fromkeys(files))
+    return list(named)
 
 
 LARGEST_M = 1.0
-"""Of a square; where it is more, millimetres were meant."""
+"""Largest edge of a square [m]; a larger number was probably meant in millimetres."""
 LEAST_CORNERS = 6
-"""Of a view: the board's place has six numbers, and each corner tells two."""
+"""Smallest number of corners in a view: a pose has six numbers, and each corner gives two."""
 
 
 @dataclass(frozen=True)
@@ -94,10 +70,10 @@ class Board:
     Its own axes start at the upper left corner of its first square: x right, y down.
 
     Attributes:
-        columns, rows: squares along x and along y.
+        columns, rows: number of squares along x and along y.
         square_m, marker_m: edges of a square and of a marker [m].
-        dictionary: of its markers, such as `4X4_50`.
-        legacy: whether it was made by OpenCV before 4.6, which began boards of an even number of
+        dictionary: dictionary of its markers, such as `4X4_50`.
+        legacy: whether it was drawn by OpenCV before 4.6, which began boards of an even number of
             rows with a white square.
     """
 
@@ -117,16 +93,16 @@ class Board:
                 f"squares of {self.square_m:g} m and markers of {self.marker_m:g} m; expected "
                 f"markers smaller than squares, both in metres and of {LARGEST_M:g} m at most"
             )
-        there, needed = marker_count(self.dictionary), self.columns * self.rows // 2
-        if needed > there:
+        available, needed = marker_count(self.dictionary), self.columns * self.rows // 2
+        if needed > available:
             raise DataError(
                 f"a board of {self.size} squares has {needed} markers, but dictionary "
-                f"{self.dictionary} has {there}; expected a larger one, such as 4X4_250"
+                f"{self.dictionary} has {available}; expected a larger one, such as 4X4_250"
             )
 
     @property
     def size(self) -> str:
-        """Columns and rows as a user writes them."""
+        """Columns and rows as a user writes them, such as `7x5`."""
         return f"{self.columns}x{self.rows}"
 
     def __str__(self) -> str:
@@ -138,13 +114,12 @@ class Board:
 
     @cached_property
     def pattern(self) -> object:
-        """OpenCV's board."""
-        size = (self.columns, self.rows)
-        words = marker_dictionary(self.dictionary)
-        made = opencv().aruco.CharucoBoard(size, self.square_m, self.marker_m, words)
+        """The board as an object of OpenCV."""
+        size, dictionary = (self.columns, self.rows), marker_dictionary(self.dictionary)
+        board = opencv().aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
         if self.legacy:
-            made.setLegacyPattern(True)
-        return made
+            board.setLegacyPattern(True)
+        return board
 
     @cached_property
     def corners_m(self) -> Float[np.ndarray, "corner 2"]:
@@ -155,12 +130,13 @@ class Board:
     def on_floor(
         self, board_m: Float[np.ndarray, "corner 2"], height_m: float
     ) -> Float[np.ndarray, "corner 3"]:
-        """Places of its corners in a world whose origin is on the floor below its middle.
+        """Return places of corners in a world whose origin is the floor below the board's middle.
 
         x runs along its columns, to the right, y up its rows, z up from the floor.
 
         Args:
-            height_m: of its printed face above the floor.
+            board_m: corners in the board's own axes [m].
+            height_m: height of its printed face above the floor.
         """
         middle = 0.5 * self.square_m * np.array([self.columns, self.rows])
         x, y = ((board_m - middle) * [1, -1]).T
@@ -169,12 +145,12 @@ class Board:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Corners of a board that one picture shows.
+    """Corners of a board detected in one picture.
 
     Attributes:
-        name: of the picture.
-        pixels: where they are seen.
-        board_m: where they are on the board [m].
+        name: name of the picture.
+        pixels: their places in the picture.
+        board_m: their places on the board [m].
     """
 
     name: str
@@ -182,12 +158,12 @@ class View:
     board_m: Float[np.ndarray, "corner 2"]
 
     def only(self, kept: np.ndarray) -> "View":
-        """Some of its corners, by a mask or by numbers."""
+        """Return a view of some of the corners, by a mask or by indices."""
         return View(self.name, self.pixels[kept], self.board_m[kept])
 
     @property
     def flat(self) -> bool:
-        """Whether its corners are too few, or all near one line, for the board's place."""
+        """Whether its corners do not determine the board's pose: too few, or all near one line."""
         if len(self.pixels) < LEAST_CORNERS:
             return True
         steps = np.unique(np.round(np.diff(np.unique(self.board_m)), 9))
@@ -196,10 +172,10 @@ class View:
 
 
 def board_of(size: str, square_m: float, marker_m: float, dictionary: str, legacy: bool) -> Board:
-    """A board whose size is written as `7x5`: columns and rows of squares.
+    """Return a board whose size is written as `7x5`: columns and rows of squares.
 
     Raises:
-        DataError: there is no such board.
+        DataError: the size is not written so, or no such board is possible.
     """
     columns, by, rows = size.lower().partition("x")
     if not (by and columns.strip().isdecimal() and rows.strip().isdecimal()):
@@ -208,13 +184,12 @@ def board_of(size: str, square_m: float, marker_m: float, dictionary: str, legac
 
 
 def marker_count(dictionary: str) -> int:
-    """How many markers a dictionary has."""
-    words: Any = marker_dictionary(dictionary)
-    return len(words.bytesList)
+    """Return the number of markers in a dictionary."""
+    return len(marker_dictionary(dictionary).bytesList)
 
 
 def view_of(board: Board, picture: Picture) -> View:
-    """Corners of the board in a picture; none where it is not seen."""
+    """Return the corners of the board in a picture; none where it is not detected."""
     detector = opencv().aruco.CharucoDetector(board.pattern)
     pixels, numbers = detector.detectBoard(picture.image)[:2]
     if numbers is None:

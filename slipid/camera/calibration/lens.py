@@ -1,27 +1,36 @@
-"""The lens from views of the board, and how well each of its numbers is known.
+"""The lens fitted to views of the board, with the covariance of its parameters.
 
-Views and corners that do not fit the others are left out, and named.
+Views and corners that do not fit the others are left out and named.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from slipid.camera.calibration.board import View
-from slipid.camera.calibration.views import enough
+from slipid.camera.calibration.views import check_enough
 from slipid.camera.opencv import opencv
 from slipid.camera.overhead import Lens
 from slipid.support.errors import DataError
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-"""Numbers of a lens, in the order of its covariance; k3 where it was asked for."""
+"""Parameters of a lens, in the order of its covariance; k3 only where it is fitted."""
+ROUNDS = 30
+WORSE = 3.0
+"""Ratio to the usual residual above which a view is left out."""
+FAR = 6.0
+"""Ratio to the usual residual above which a corner is left out: by noise alone, one in 10^7."""
+LEAST_PX = 0.3
+"""Residual below which nothing is left out: it does no harm [pixel]."""
+MOST = 0.25
+"""Part of the views that may be left out; beyond it, it is not clear which are right."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """From the axes of an object to the camera's: x right, y down, z away.
+    """Pose of an object in the camera's axes: x right, y down, z away.
 
     Attributes:
         turn: rotation vector [rad].
@@ -33,197 +42,170 @@ class Pose:
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """The same as a matrix."""
+        """Its rotation as a matrix."""
         return np.asarray(opencv().Rodrigues(self.turn)[0])
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """Where points are seen, and how that moves with the numbers.
+class Projection:
+    """Pixels of points, and their derivatives.
 
     Attributes:
-        pixels: of the points.
-        of_pose: with turn and shift.
-        of_lens: with the numbers of the lens.
+        pixels: pixels of the points.
+        by_pose: derivatives by turn and shift.
+        by_lens: derivatives by the parameters of the lens.
     """
 
     pixels: Float[np.ndarray, "point 2"]
-    of_pose: Float[np.ndarray, "residual 6"]
-    of_lens: Float[np.ndarray, "residual number"]
+    by_pose: Float[np.ndarray, "residual 6"]
+    by_lens: Float[np.ndarray, "residual parameter"]
 
 
 @dataclass(frozen=True, eq=False)
 class LensFit:
-    """A lens, and what it was fitted to.
+    """A lens, and the views that it was fitted to.
 
     Attributes:
         lens: the lens.
-        covariance: of its numbers, in the order of NAMES.
+        covariance: covariance of its parameters, in the order of NAMES.
         views: the corners it was fitted to.
-        poses: of the board, by view.
-        residuals: seen less computed, by view [pixel].
+        poses: pose of the board in each view.
+        residuals: measured less computed, by view [pixel].
+        left_out: sentences about views and corners that were left out.
     """
 
     lens: Lens
-    covariance: Float[np.ndarray, "number number"]
+    covariance: Float[np.ndarray, "parameter parameter"]
     views: list[View]
     poses: list[Pose]
     residuals: list[Float[np.ndarray, "_ 2"]]
+    left_out: tuple[str, ...] = ()
 
     @property
     def rms_px(self) -> float:
-        """Root mean square of the residuals' lengths."""
+        """Root mean square of the residuals' lengths [pixel]."""
         return rms(np.concatenate(self.residuals))
 
     @property
-    def numbers(self) -> Float[np.ndarray, " number"]:
-        """Of the lens, in the order of NAMES."""
-        return numbers_of(self.lens)
+    def parameters(self) -> Float[np.ndarray, " parameter"]:
+        """Parameters of the lens, in the order of NAMES."""
+        return parameters_of(self.lens)
 
     @property
-    def std(self) -> Float[np.ndarray, " number"]:
-        """Standard deviation of each number."""
+    def std(self) -> Float[np.ndarray, " parameter"]:
+        """Standard deviation of each parameter."""
         return np.sqrt(np.diag(self.covariance))
 
 
-def numbers_of(lens: Lens) -> Float[np.ndarray, " number"]:
-    """Of a lens, in the order of NAMES."""
+def parameters_of(lens: Lens) -> Float[np.ndarray, " parameter"]:
+    """Return the parameters of a lens, in the order of NAMES."""
     m = lens.matrix
     return np.concatenate([[m[0, 0], m[1, 1], m[0, 2], m[1, 2]], lens.distortion])
 
 
-def lens_of(lens: Lens, numbers: Float[np.ndarray, " number"]) -> Lens:
-    """A lens like another with other numbers."""
-    fx, fy, cx, cy = numbers[:4]
-    return Lens(lens.image_px, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), numbers[4:])
+def lens_of(lens: Lens, parameters: Float[np.ndarray, " parameter"]) -> Lens:
+    """Return a lens like another with other parameters."""
+    fx, fy, cx, cy = parameters[:4]
+    return Lens(lens.image_px, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), parameters[4:])
 
 
 def rms(residuals: Float[np.ndarray, "point 2"]) -> float:
-    """Root mean square of their lengths."""
+    """Return the root mean square of the residuals' lengths."""
     return float(np.sqrt((residuals**2).sum(1).mean()))
 
 
-def seen(lens: Lens, pose: Pose, points: Float[np.ndarray, "point 3"]) -> Seen:
-    """Where a lens sees points of an object [m], with derivatives."""
-    found = opencv().projectPoints(
-        np.ascontiguousarray(points).reshape(-1, 1, 3),
-        pose.turn,
-        pose.shift,
-        lens.matrix,
-        lens.distortion,
-    )
-    slope = np.asarray(found[1])
-    return Seen(np.asarray(found[0]).reshape(-1, 2), slope[:, :6], slope[:, 6:])
+def project(lens: Lens, pose: Pose, points: Float[np.ndarray, "point 3"]) -> Projection:
+    """Return the pixels at which points of an object [m] appear, with derivatives."""
+    flat = np.ascontiguousarray(points).reshape(-1, 1, 3)
+    given = (flat, pose.turn, pose.shift, lens.matrix, lens.distortion)
+    pixels, slope = (np.asarray(one) for one in opencv().projectPoints(*given)[:2])
+    return Projection(pixels.reshape(-1, 2), slope[:, :6], slope[:, 6:])
 
 
 def fit_lens(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> LensFit:
-    """The lens that explains views best, by least squares.
+    """Return the lens that explains views best, by least squares.
 
     Raises:
         DataError: they do not determine one.
     """
     cv2 = opencv()
-    points = [_solid(view).astype(np.float32) for view in views]
+    points = [solid(view).astype(np.float32).reshape(-1, 1, 3) for view in views]
     pixels = [view.pixels.astype(np.float32).reshape(-1, 1, 2) for view in views]
     flags = 0 if k3 else cv2.CALIB_FIX_K3
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
     try:
-        found = cv2.calibrateCamera(
-            [p.reshape(-1, 1, 3) for p in points],
-            pixels,
-            image_px,
-            None,
-            None,
-            None,
-            None,
-            flags,
-            until,
-        )
+        fit = cv2.calibrateCamera(points, pixels, image_px, *[None] * 4, flags, until)
     except cv2.error as error:
-        raise alike(f"OpenCV finds no lens ({error.err})") from error
-    lens = Lens(image_px, np.asarray(found[1]), np.ravel(found[2])[: 5 if k3 else 4])
-    poses = [Pose(np.ravel(r), np.ravel(t)) for r, t in zip(found[3], found[4], strict=True)]
-    if not (np.isfinite(numbers_of(lens)).all() and all(np.isfinite(p.shift).all() for p in poses)):
-        raise alike("the fit of the lens does not end at numbers")
-    return _with_spread(lens, list(views), poses)
+        raise indeterminate(f"OpenCV finds no lens ({error.err})") from error
+    lens = Lens(image_px, np.asarray(fit[1]), np.ravel(fit[2])[: 5 if k3 else 4])
+    poses = [Pose(np.ravel(r), np.ravel(t)) for r, t in zip(fit[3], fit[4], strict=True)]
+    finite = np.isfinite(np.concatenate([parameters_of(lens), *(pose.shift for pose in poses)]))
+    if not finite.all():
+        raise indeterminate("the fit of the lens does not end at numbers")
+    return _with_covariance(lens, list(views), poses)
 
 
-def alike(found: str) -> DataError:
-    """What to say where views do not tell a lens."""
+def indeterminate(problem: str) -> DataError:
+    """Return the error to raise where views do not determine a lens."""
     return DataError(
-        f"{found}: these views do not determine the lens, most often because the board lies "
+        f"{problem}: these views do not determine the lens, most often because the board lies "
         "parallel to the sensor in all of them; expected some that are tilted by 20 to 40 degrees "
         "to the left, right, front and back"
     )
 
 
-def _solid(view: View) -> Float[np.ndarray, "corner 3"]:
+def solid(view: View) -> Float[np.ndarray, "corner 3"]:
+    """Return the corners on the board with z = 0 [m]."""
     return np.concatenate([view.board_m, np.zeros((len(view.board_m), 1))], axis=1)
 
 
-def _with_spread(lens: Lens, views: list[View], poses: list[Pose]) -> LensFit:
-    """A fit with the covariance of its lens; the poses' numbers are eliminated view by view."""
-    known, residuals = np.zeros((len(numbers_of(lens)),) * 2), []
+def _with_covariance(lens: Lens, views: list[View], poses: list[Pose]) -> LensFit:
+    """Return a fit with the covariance of its lens; poses are eliminated view by view."""
+    information, residuals = np.zeros((len(parameters_of(lens)),) * 2), []
     for view, pose in zip(views, poses, strict=True):
-        now = seen(lens, pose, _solid(view))
+        now = project(lens, pose, solid(view))
         residuals.append(view.pixels - now.pixels)
-        cross = now.of_pose.T @ now.of_lens
-        own = now.of_pose.T @ now.of_pose
-        known += now.of_lens.T @ now.of_lens - cross.T @ np.linalg.solve(own, cross)
+        cross = now.by_pose.T @ now.by_lens
+        own = now.by_pose.T @ now.by_pose
+        information += now.by_lens.T @ now.by_lens - cross.T @ np.linalg.solve(own, cross)
     every = np.concatenate(residuals)
-    free = every.size - 6 * len(views) - len(known)
+    free = every.size - 6 * len(views) - len(information)
     try:
-        covariance = (every**2).sum() / max(free, 1) * np.linalg.inv(known)
+        covariance = (every**2).sum() / max(free, 1) * np.linalg.inv(information)
     except np.linalg.LinAlgError as error:
-        raise alike("the numbers of the lens cannot be told apart") from error
+        raise indeterminate("the parameters of the lens cannot be separated") from error
     if not (np.diag(covariance) > 0).all():
-        raise alike("the numbers of the lens cannot be told apart")
+        raise indeterminate("the parameters of the lens cannot be separated")
     return LensFit(lens, covariance, views, poses, residuals)
 
 
 def pose_of(lens: Lens, view: View) -> Pose:
-    """Where a board is, seen through a known lens."""
+    """Return the pose of a board seen through a known lens."""
     cv2 = opencv()
-    points, pixels = _solid(view).reshape(-1, 1, 3), view.pixels.reshape(-1, 1, 2)
+    points, pixels = solid(view).reshape(-1, 1, 3), view.pixels.reshape(-1, 1, 2)
     given = (points, pixels, lens.matrix, lens.distortion)
-    found = cv2.solvePnPGeneric(*given, flags=cv2.SOLVEPNP_IPPE)
-    turn, shift = cv2.solvePnPRefineLM(*given, found[1][0], found[2][0])
+    starts = cv2.solvePnPGeneric(*given, flags=cv2.SOLVEPNP_IPPE)
+    turn, shift = cv2.solvePnPRefineLM(*given, starts[1][0], starts[2][0])
     return Pose(np.ravel(turn), np.ravel(shift))
 
 
-ROUNDS = 30
-WORSE = 3.0
-"""Times the usual residual, from which on a view is out."""
-FAR = 6.0
-"""Times the usual residual, from which on a corner is out: with noise alone, one in 10^7."""
-LEAST_PX = 0.3
-"""Nothing is out by less: such residuals harm nobody."""
-MOST = 0.25
-"""Of the views may be left out; more, and it is not known which are right."""
+def fit_robustly(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> LensFit:
+    """Return a lens fitted without the views and corners that do not fit the others.
 
-
-@dataclass(frozen=True, eq=False)
-class Kept:
-    """The fit to what was kept, and sentences about what was not."""
-
-    fit: LensFit
-    dropped: list[str]
-
-
-def fit_kept(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> Kept:
-    """Fit a lens, leave out what does not fit, and fit again until nothing is left out.
+    The fit is repeated until nothing more is left out.
 
     Raises:
-        DataError: more would go than may.
+        DataError: more would be left out than may, or too few views remain.
     """
-    now, dropped, first = list(views), [], len(views)
+    now, left_out, first = list(views), [], len(views)
     for _ in range(ROUNDS):
         fit = fit_lens(now, image_px, k3)
-        usual = [float(np.median(np.hypot(*r.T))) for r in fit.residuals]
+        off = [np.hypot(*residual.T) for residual in fit.residuals]
+        usual = [float(np.median(one)) for one in off]
         level = max(float(np.median(usual)), LEAST_PX / WORSE)
         worst = int(np.argmax(usual))
         if usual[worst] > WORSE * level:
-            dropped.append(
+            left_out.append(
                 f"view {now[worst].name} left out: its corners are off by {usual[worst]:.2f} "
                 f"pixels, those of the other views by {level:.2f}"
             )
@@ -234,23 +216,19 @@ def fit_kept(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> Kept
                     "does); expected a flat board of known size, sharp pictures, and one camera "
                     "whose focus and zoom stayed"
                 )
-            enough(now)
+            check_enough(now)
             continue
-        bad = [_worst(np.hypot(*r.T), max(FAR * level, LEAST_PX)) for r in fit.residuals]
+        # only the corner that is off most: it may have drawn others with it
+        limit = max(FAR * level, LEAST_PX)
+        bad = [(one > limit) & (one == one.max()) for one in off]
         if not any(b.any() for b in bad):
             break
-        dropped += [
-            f"view {v.name}: one of {len(b)} corners left out, off by "
-            f"{np.hypot(*r.T).max():.2f} pixels"
-            for v, b, r in zip(now, bad, fit.residuals, strict=True)
+        left_out += [
+            f"view {v.name}: one of {len(b)} corners left out, off by {one.max():.2f} pixels"
+            for v, b, one in zip(now, bad, off, strict=True)
             if b.any()
         ]
         now = [v.only(~b) for v, b in zip(now, bad, strict=True)]
         now = [v for v in now if not v.flat]
-        enough(now)
-    return Kept(fit, dropped)
-
-
-def _worst(off: Float[np.ndarray, " corner"], limit: float) -> Bool[np.ndarray, " corner"]:
-    """The corner that is off most, if by more than a limit: it may have drawn others with it."""
-    return (off > limit) & (off == off.max())
+        check_enough(now)
+    return replace(fit, left_out=tuple(left_out))

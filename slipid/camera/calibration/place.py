@@ -1,15 +1,12 @@
-"""Where a camera with a known lens hangs above a floor, from places that it sees.
-
-How well a camera's place is known, and lengths on the floor with it.
-"""
+"""The place of a camera with a known lens above a floor, fitted to points, and its uncertainty."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.calibration.lens import Pose, lens_of, numbers_of, rms, seen
+from slipid.camera.calibration.lens import Pose, lens_of, parameters_of, project, rms
 from slipid.camera.calibration.points import FloorPoints
 from slipid.camera.opencv import opencv
 from slipid.camera.overhead import Lens, OverheadCamera
@@ -17,29 +14,36 @@ from slipid.support.errors import DataError
 
 FLAT_M = 1e-9
 AGREES = 0.3
-"""Part of the residual that the fit without a point has left, where that point was the only bad."""
+"""Part of the residual that remains without a point, below which that point was the only bad."""
 LEAST_BAD_PX = 1.5
 LEAST_TO_DROP = 6
-LEAST_TO_TELL = 5
-"""Points below which nobody knows which of them is bad."""
+LEAST_TO_TEST = 5
+"""Number of points below which it cannot be determined which of them is bad."""
 MOST = 0.25
-"""Of the points may be left out."""
+"""Part of the points that may be left out."""
 TWIN_RATIO = 2.0
-"""Of the errors of two poses, below which the points hardly tell them apart."""
+"""Ratio of the errors of two poses below which the points hardly distinguish them."""
+LEAST_PX = 0.03
+"""Smallest residual assumed [pixel]: few points may fit by chance better than any corner can."""
+STEP = 0.01
+"""Step of numerical derivatives, in standard deviations."""
+GRID = 5
+INSIDE = 0.8
+"""Part of the picture's width and height over which lengths on the floor are compared."""
 
 
 @dataclass(frozen=True, eq=False)
 class FloorFit:
-    """A camera's place, and what it was fitted to.
+    """A camera's place, and the points that it was fitted to.
 
     Attributes:
         camera: the lens in its place.
-        pose: the same as numbers, from the world to the camera.
-        points: to which it was fitted.
-        residuals: seen less computed [pixel].
-        off_mm: the same on the floor: seen less true place, x and y [mm].
-        twin_px: error of the mirrored pose that looks down, too; None where there is none.
-        told: sentences about points that do not fit.
+        pose: pose of the world in the camera's axes.
+        points: points to which it was fitted.
+        residuals: measured less computed [pixel].
+        off_mm: the same on the floor: measured less true place, x and y [mm].
+        twin_px: error of another pose that looks down as well; None where there is none.
+        left_out: sentences about points that do not fit.
         disputed: whether points that do not fit are still among those it was fitted to.
     """
 
@@ -49,26 +53,26 @@ class FloorFit:
     residuals: Float[np.ndarray, "point 2"]
     off_mm: Float[np.ndarray, "point 2"]
     twin_px: float | None
-    told: list[str]
-    disputed: bool
+    left_out: tuple[str, ...] = ()
+    disputed: bool = False
 
     @property
     def rms_px(self) -> float:
-        """Root mean square of the residuals' lengths."""
+        """Root mean square of the residuals' lengths [pixel]."""
         return rms(self.residuals)
 
 
 def camera_of(lens: Lens, pose: Pose) -> OverheadCamera:
-    """A lens in a place."""
+    """Return the camera with a lens, given the pose of the world in its axes."""
     rotation = pose.rotation
     return OverheadCamera(lens, rotation, -rotation.T @ pose.shift)
 
 
-def placed(source: str, lens: Lens, points: FloorPoints) -> FloorFit:
-    """Where the camera is, from points of which none is left out.
+def fit_place(source: str, lens: Lens, points: FloorPoints) -> FloorFit:
+    """Return the place of the camera by all points.
 
     Raises:
-        DataError: no camera above the floor sees these points so.
+        DataError: no camera above the floor sees the points so.
     """
     fit = _fitted(lens, points)
     if fit is None:
@@ -80,45 +84,46 @@ def placed(source: str, lens: Lens, points: FloorPoints) -> FloorFit:
     return fit
 
 
-def placed_robustly(source: str, lens: Lens, points: FloorPoints) -> FloorFit:
-    """Where the camera is; a point that is far off is left out where the others can tell.
+def fit_place_robustly(source: str, lens: Lens, points: FloorPoints) -> FloorFit:
+    """Return the place of the camera, without points that clearly contradict the others.
 
     Raises:
-        DataError: no camera above the floor sees these points so.
+        DataError: no camera above the floor sees the points so.
     """
-    told: list[str] = []
+    left_out: tuple[str, ...] = ()
     first = len(points.names)
-    while len(points.names) >= LEAST_TO_TELL:
+    while len(points.names) >= LEAST_TO_TEST:
         bad = _bad_point(lens, points)
         if bad is None:
-            return _with(placed(source, lens, points), told, False)
+            return replace(fit_place(source, lens, points), left_out=left_out)
         few = len(points.names) < LEAST_TO_DROP or first - len(points.names) >= int(MOST * first)
         if few:
-            told.append(f"{bad}; it was NOT left out, for the points are too few: measure again")
+            doubt = f"{bad}; it was NOT left out, for the points are too few: measure again"
             fit = _fitted(lens, points)
             if fit is None:
-                raise DataError(f"{source}: {told[-1]}")
-            return _with(fit, told, True)
-        told.append(f"{bad}: left out")
+                raise DataError(f"{source}: {doubt}")
+            return replace(fit, left_out=(*left_out, doubt), disputed=True)
+        left_out = (*left_out, f"{bad}: left out")
         points = points.without(bad.index)
-    fit = placed(source, lens, points)
+    fit = fit_place(source, lens, points)
     vague = fit.rms_px > LEAST_BAD_PX
     if vague:
-        told.append(
+        left_out = (
+            *left_out,
             f"the points are off by {fit.rms_px:.1f} pixels; with {len(points.names)} points "
-            "nobody can tell which is bad: measure again, better 8 points"
+            "nobody can tell which is bad: measure again, better 8 points",
         )
-    return _with(fit, told, vague)
+    return replace(fit, left_out=left_out, disputed=vague)
 
 
 @dataclass(frozen=True)
-class _Bad:
+class _BadPoint:
     """A point that does not fit the others.
 
     Attributes:
-        index: of the point.
-        name: of the point.
-        off_px, off_mm: how far it is from where the others put it.
+        index: index of the point.
+        name: name of the point.
+        off_px, off_mm: its distance from the place that the others imply.
         others_px: error of the others without it.
     """
 
@@ -135,8 +140,8 @@ class _Bad:
         )
 
 
-def _bad_point(lens: Lens, points: FloorPoints) -> _Bad | None:
-    """The point without which the others agree far better, where there is one."""
+def _bad_point(lens: Lens, points: FloorPoints) -> _BadPoint | None:
+    """Return the point without which the others agree far better; None where there is none."""
     fit = _fitted(lens, points)
     without = [_fitted(lens, points.without(k)) for k in range(len(points.names))]
     agreed = [(rest.rms_px, k, rest) for k, rest in enumerate(without) if rest is not None]
@@ -145,14 +150,16 @@ def _bad_point(lens: Lens, points: FloorPoints) -> _Bad | None:
     error, index, rest = min(agreed, key=lambda one: one[:2])
     # one bad point may be so far off that no camera at all sees the points so
     limit = LEAST_BAD_PX if fit is None else AGREES * fit.rms_px
-    off_px, off_mm = _distance(rest, points, index)
+    one = points.only([index])
+    off_px = float(np.hypot(*(one.pixels - rest.camera.pixels(one.places))[0]))
     if not (error < limit and off_px > LEAST_BAD_PX):
         return None
-    return _Bad(index, points.names[index], off_px, off_mm, error)
+    off_mm = float(np.hypot(*_off_mm(rest.camera, one)[0]))
+    return _BadPoint(index, points.names[index], off_px, off_mm, error)
 
 
 def _fitted(lens: Lens, points: FloorPoints) -> FloorFit | None:
-    """The best place above the floor; None where there is none that explains the points."""
+    """Return the best place above the floor; None where there is none that explains the points."""
     poses = sorted(_candidates(lens, points), key=lambda p: _error(lens, p, points))
     above = [pose for pose in poses if _looks_down(camera_of(lens, pose))]
     if not above:
@@ -162,92 +169,62 @@ def _fitted(lens: Lens, points: FloorPoints) -> FloorFit | None:
     if _error(lens, best, points) > bearable:
         return None
     camera = camera_of(lens, best)
-    twins = [_error(lens, pose, points) for pose in above[1:] if _apart(pose, best)]
-    return FloorFit(
-        camera,
-        best,
-        points,
-        points.pixels - seen(lens, best, points.places).pixels,
-        _off_mm(camera, points),
-        min(twins, default=None),
-        [],
-        False,
-    )
-
-
-def _with(fit: FloorFit, told: list[str], disputed: bool) -> FloorFit:
-    return FloorFit(
-        *(fit.camera, fit.pose, fit.points, fit.residuals, fit.off_mm, fit.twin_px), told, disputed
-    )
-
-
-def _distance(fit: FloorFit, points: FloorPoints, index: int) -> tuple[float, float]:
-    """How far a point is off that was not fitted [pixel] and [mm]."""
-    there = points.places[index : index + 1]
-    off = points.pixels[index] - fit.camera.pixels(there)[0]
-    one = FloorPoints(points.names[index : index + 1], points.pixels[index : index + 1], there)
-    return float(np.hypot(*off)), float(np.hypot(*_off_mm(fit.camera, one)[0]))
+    twins = [_error(lens, pose, points) for pose in above[1:] if _differ(pose, best)]
+    residuals = points.pixels - project(lens, best, points.places).pixels
+    off_mm = _off_mm(camera, points)
+    return FloorFit(camera, best, points, residuals, off_mm, min(twins, default=None))
 
 
 def _candidates(lens: Lens, points: FloorPoints) -> list[Pose]:
-    """Poses that explain the points at least locally: of a plane there are two."""
+    """Return poses that explain the points at least locally; of points in a plane, two do."""
     cv2 = opencv()
     middle = points.places.mean(0)
-    # OpenCV takes a plane for one where its z is 0, and numbers near 0 are kept best
+    # OpenCV recognises a plane only where its z is 0, and numbers near 0 are most precise
     places = np.ascontiguousarray(points.places - middle).reshape(-1, 1, 3)
     pixels = np.ascontiguousarray(points.pixels).reshape(-1, 1, 2)
     given = (places, pixels, lens.matrix, lens.distortion)
     flat = np.ptp(points.places[:, 2]) < FLAT_M
-    flag = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
-    found = cv2.solvePnPGeneric(*given, flags=flag)
+    starts = cv2.solvePnPGeneric(*given, flags=cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP)
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
     poses = []
-    for start in zip(found[1], found[2], strict=True):
+    for start in zip(starts[1], starts[2], strict=True):
         turn, shift = (np.ravel(x) for x in cv2.solvePnPRefineLM(*given, *start, until))
         poses.append(Pose(turn, shift - Pose(turn, shift).rotation @ middle))
     return [pose for pose in poses if np.isfinite([*pose.turn, *pose.shift]).all()]
 
 
 def _error(lens: Lens, pose: Pose, points: FloorPoints) -> float:
-    return rms(points.pixels - seen(lens, pose, points.places).pixels)
+    return rms(points.pixels - project(lens, pose, points.places).pixels)
 
 
 def _looks_down(camera: OverheadCamera) -> bool:
     return bool(camera.place[2] > 0 and camera.rotation[2, 2] < 0)
 
 
-def _apart(pose: Pose, other: Pose) -> bool:
-    """Whether two poses are turned against each other by more than a degree."""
+def _differ(pose: Pose, other: Pose) -> bool:
+    """Return whether two poses are turned against each other by more than a degree."""
     cosine = 0.5 * (np.trace(pose.rotation.T @ other.rotation) - 1)
     return bool(np.degrees(np.arccos(np.clip(cosine, -1, 1))) > 1)
 
 
 def _off_mm(camera: OverheadCamera, points: FloorPoints) -> Float[np.ndarray, "point 2"]:
-    found = [
+    """Return the measured less the true places of points at their heights [mm]."""
+    off = [
         camera.on_plane(pixel, float(place[2])) - place[:2]
         for pixel, place in zip(points.pixels, points.places, strict=True)
     ]
-    return 1000 * np.array(found)
-
-
-LEAST_PX = 0.03
-"""Residuals of few points may be small by chance; no corner is seen better than this."""
-STEP = 0.01
-"""Of a standard deviation, by which numbers are moved to see what that does."""
-GRID = 5
-INSIDE = 0.8
-"""Of the picture's width and height, over which lengths on the floor are compared."""
+    return 1000 * np.array(off)
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
+class PlaceUncertainty:
     """Uncertainty of a camera's place.
 
     Attributes:
-        pose: covariance of turn [rad] and shift [m], the lens' own part in it.
-        place_std_m: of the lens' place in the world.
-        tilt_std_deg: of the angle between its axis and straight down.
-        scale_std: of lengths on the floor, relative [1], without the part of the board's size.
+        pose: covariance of turn [rad] and shift [m], with the contribution of the lens.
+        place_std_m: std of the lens' place in the world.
+        tilt_std_deg: std of the angle between its axis and straight down.
+        scale_std: relative std of lengths on the floor [1], without that of the board's size.
     """
 
     pose: Float[np.ndarray, "6 6"]
@@ -257,24 +234,31 @@ class Spread:
 
 
 def tilt_deg(camera: OverheadCamera) -> float:
-    """Angle between a camera's axis and straight down."""
+    """Return the angle between a camera's axis and straight down."""
     return float(np.degrees(np.arccos(min(-camera.rotation[2, 2], 1.0))))
 
 
-def spread(fit: FloorFit, of_lens: Float[np.ndarray, "number number"] | None) -> Spread:
-    """Uncertainty of a camera's place from its residuals and the lens' covariance, where known."""
+def uncertainty(
+    fit: FloorFit, of_lens: Float[np.ndarray, "parameter parameter"] | None
+) -> PlaceUncertainty:
+    """Return the uncertainty of a camera's place.
+
+    Args:
+        fit: the fit of the place; its residuals give the noise.
+        of_lens: covariance of the lens, None where it is not known.
+    """
     lens = fit.camera.lens
-    at = np.concatenate([fit.pose.turn, fit.pose.shift, numbers_of(lens)])
+    at = np.concatenate([fit.pose.turn, fit.pose.shift, parameters_of(lens)])
     joint = _joint(fit, of_lens)
 
-    def camera(numbers: np.ndarray) -> OverheadCamera:
-        return camera_of(lens_of(lens, numbers[6:]), Pose(numbers[:3], numbers[3:6]))
+    def camera(values: np.ndarray) -> OverheadCamera:
+        return camera_of(lens_of(lens, values[6:]), Pose(values[:3], values[3:6]))
 
-    place = _carried(lambda n: camera(n).place, at, joint)
+    place = _propagated(lambda v: camera(v).place, at, joint)
     # of the axis itself: the angle has a kink at straight down
-    axis = _carried(lambda n: camera(n).rotation[2, :2], at, joint)
-    scale = _carried(lambda n: np.array([_log_length(camera(n))]), at, joint)
-    return Spread(
+    axis = _propagated(lambda v: camera(v).rotation[2, :2], at, joint)
+    scale = _propagated(lambda v: np.array([_log_length(camera(v))]), at, joint)
+    return PlaceUncertainty(
         joint[:6, :6],
         np.sqrt(np.diag(place)),
         float(np.degrees(np.sqrt(np.linalg.eigvalsh(axis)[-1]))),
@@ -283,38 +267,37 @@ def spread(fit: FloorFit, of_lens: Float[np.ndarray, "number number"] | None) ->
 
 
 def _joint(
-    fit: FloorFit, of_lens: Float[np.ndarray, "number number"] | None
+    fit: FloorFit, of_lens: Float[np.ndarray, "parameter parameter"] | None
 ) -> Float[np.ndarray, "all all"]:
-    """Covariance of pose and lens: a lens that is off moves the pose that is fitted through it."""
-    now = seen(fit.camera.lens, fit.pose, fit.points.places)
+    """Return the covariance of pose and lens: an error of the lens moves the pose fitted by it."""
+    now = project(fit.camera.lens, fit.pose, fit.points.places)
     free = max(fit.residuals.size - 6, 1)
     variance = max((fit.residuals**2).sum() / free, LEAST_PX**2)
-    own = np.linalg.inv(now.of_pose.T @ now.of_pose)
-    count = now.of_lens.shape[1]
+    own = np.linalg.inv(now.by_pose.T @ now.by_pose)
+    count = now.by_lens.shape[1]
     lens = np.zeros((count, count)) if of_lens is None else of_lens
-    follows = -own @ now.of_pose.T @ now.of_lens
+    follows = -own @ now.by_pose.T @ now.by_lens
     cross = follows @ lens
     return np.block([[variance * own + cross @ follows.T, cross], [cross.T, lens]])
 
 
-def _carried(
+def _propagated(
     function: Callable[[np.ndarray], np.ndarray],
     at: Float[np.ndarray, " all"],
     joint: Float[np.ndarray, "all all"],
 ) -> np.ndarray:
-    """Covariance of a function of numbers, to first order."""
-    std = np.sqrt(np.diag(joint))
+    """Return the covariance of a function of uncertain values, to first order."""
     slope = []
-    for k, width in enumerate(std):
+    for k, std in enumerate(np.sqrt(np.diag(joint))):
         step = np.zeros(len(at))
-        step[k] = max(STEP * width, 1e-9)
+        step[k] = max(STEP * std, 1e-9)
         slope.append((function(at + step) - function(at - step)) / (2 * step[k]))
     columns = np.stack(slope, axis=1)
     return columns @ joint @ columns.T
 
 
 def _log_length(camera: OverheadCamera) -> float:
-    """Logarithm of the usual length on the floor between neighbours of a grid in the picture."""
+    """Return the mean log length on the floor between neighbours of a grid in the picture."""
     width, height = camera.lens.image_px
     part = np.linspace(0.5 - 0.5 * INSIDE, 0.5 + 0.5 * INSIDE, GRID)
     grid = np.stack(np.meshgrid(part * (width - 1), part * (height - 1)), axis=-1)

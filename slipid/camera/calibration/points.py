@@ -1,4 +1,4 @@
-"""Points on the floor that a person measured: a CSV file of where they are and are seen."""
+"""Measured points on the floor: a CSV file of their places in the world and in the picture."""
 
 import csv
 import io
@@ -14,19 +14,19 @@ from slipid.support.errors import DataError, bad_data, did_you_mean
 COLUMNS = ("u", "v", "x", "y")
 LEAST_POINTS = 4
 LINE = 0.02
-"""Points whose spread across is less than this part of the spread along lie on a line."""
+"""Ratio of the spread across to that along, below which points lie on one line."""
 
 
 @dataclass(frozen=True, eq=False)
 class FloorPoints:
-    """Places in the world and where they are seen.
+    """Places in the world, and the pixels at which they appear.
 
     The world is right-handed with z up: seen from above, y lies to the left of x.
 
     Attributes:
-        names: what to call each.
-        pixels: where they are seen.
-        places: x, y, z [m].
+        names: name of each point.
+        pixels: their places in the picture.
+        places: x, y, z in the world [m].
     """
 
     names: tuple[str, ...]
@@ -34,17 +34,20 @@ class FloorPoints:
     places: Float[np.ndarray, "point 3"]
 
     def without(self, index: int) -> "FloorPoints":
-        """All but one."""
-        kept = [k for k in range(len(self.names)) if k != index]
+        """Return all points but one."""
+        return self.only([k for k in range(len(self.names)) if k != index])
+
+    def only(self, kept: list[int]) -> "FloorPoints":
+        """Return some of the points, by their indices."""
         return FloorPoints(tuple(self.names[k] for k in kept), self.pixels[kept], self.places[kept])
 
 
 def read_points(path: Path, image_px: tuple[int, int]) -> FloorPoints:
-    """Points of a CSV file with columns u, v [pixel], x, y and perhaps z [m].
+    """Return the points of a CSV file with columns u, v [pixel], x, y and perhaps z [m].
 
     Raises:
-        DataError: absent, without these columns, a cell is no number, or a pixel outside the
-            picture; or points that do not determine the camera's place.
+        DataError: the file is absent, lacks a column, has a cell that is not a number or a pixel
+            outside the picture; or the points do not determine the camera's place.
     """
     header, rows = _table(path)
     names = (*COLUMNS, "z") if "z" in header else COLUMNS
@@ -54,40 +57,39 @@ def read_points(path: Path, image_px: tuple[int, int]) -> FloorPoints:
             f"{path}: no column {', '.join(missing)}{hint}; the first line has {', '.join(header)}"
             "; expected u, v (pixels), x, y (metres) and perhaps z"
         )
-    where = {name: header.index(name) for name in names}
     values = np.array(
-        [[_number(path, line, row, name, where[name]) for name in names] for line, row in rows]
+        [[_number(path, line, row, name, header) for name in names] for line, row in rows]
     ).reshape(-1, len(names))
     _inside(path, [line for line, _ in rows], values[:, :2], image_px)
     height = values[:, 4:] if "z" in names else np.zeros((len(values), 1))
-    called = tuple(f"row {line}" for line, _ in rows)
-    points = FloorPoints(called, values[:, :2], np.concatenate([values[:, 2:4], height], axis=1))
-    spread_out(path, points)
+    places = np.concatenate([values[:, 2:4], height], axis=1)
+    points = FloorPoints(tuple(f"row {line}" for line, _ in rows), values[:, :2], places)
+    check_spread(path, points)
     return points
 
 
-def spread_out(source: Path, points: FloorPoints) -> None:
-    """Refuse points that are too few or on a line.
+def check_spread(source: Path, points: FloorPoints) -> None:
+    """Check that points determine a place.
 
     Raises:
-        DataError: they are.
+        DataError: they are too few, or lie on one line.
     """
     if len(points.names) < LEAST_POINTS:
         raise DataError(
             f"{source}: {len(points.names)} points; expected {LEAST_POINTS} or more, better 8, all "
             "over the floor"
         )
-    for what, at in (("on the floor", points.places), ("in the picture", points.pixels)):
+    for where, at in (("on the floor", points.places), ("in the picture", points.pixels)):
         spread = np.linalg.svd(at - at.mean(0), compute_uv=False)
         if spread[1] <= LINE * spread[0]:
             raise DataError(
-                f"{source}: all {len(points.names)} points lie on one line {what}; expected some "
+                f"{source}: all {len(points.names)} points lie on one line {where}; expected some "
                 "well beside it"
             )
 
 
 def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Names of the columns, and the rows with the numbers of their lines."""
+    """Return the names of the columns, and the rows with the numbers of their lines."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -104,22 +106,24 @@ def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     return [name.lower() for name in rows[0][1]] if rows else [], rows[1:]
 
 
-def _number(path: Path, line: int, row: list[str], name: str, index: int) -> float:
-    found = row[index] if index < len(row) else ""
+def _number(path: Path, line: int, row: list[str], name: str, header: list[str]) -> float:
+    """Return the number in one cell; DataError where there is none."""
+    index = header.index(name)
+    text = row[index] if index < len(row) else ""
     try:
-        value = float(found)
+        value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise bad_data(
-            path, f"'{found}'" if found else "nothing", "a number", row=line, column=name
-        )
+        shown = f"'{text}'" if text else "nothing"
+        raise bad_data(path, shown, "a number", row=line, column=name)
     return value
 
 
 def _inside(
     path: Path, lines: list[int], pixels: Float[np.ndarray, "point 2"], image_px: tuple[int, int]
 ) -> None:
+    """Check that pixels lie inside the picture."""
     for line, (u, v) in zip(lines, pixels, strict=True):
         if not (-1 <= u <= image_px[0] and -1 <= v <= image_px[1]):
             raise bad_data(

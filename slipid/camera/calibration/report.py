@@ -1,37 +1,38 @@
-"""What a calibration found, as plain values for the camera file and for people.
-
-The report of a calibration as lines of text.
-"""
+"""The report of a calibration: plain values for the camera file, and lines of text for people."""
 
 import math
 from collections.abc import Iterator
 
 import numpy as np
 
-from slipid.camera.calibration.lens import NAMES, LensFit, rms
-from slipid.camera.calibration.place import TWIN_RATIO, FloorFit, Spread, tilt_deg
+from slipid.camera.calibration.lens import NAMES, rms
+from slipid.camera.calibration.place import TWIN_RATIO, FloorFit, PlaceUncertainty, tilt_deg
 from slipid.camera.calibration.quality import Quality
 from slipid.camera.overhead import OverheadCamera
 from slipid.support.content import Content
 
 POOR_SCALE = 0.005
 POOR_FLOOR_PX = 1.5
+"""Relative std of lengths, and error of points [pixel], above which a camera is poor."""
+SHOWN = 12
+"""Number of points that are listed, those that are furthest off; the file has all."""
+UNITS = {"fx": " px", "fy": " px", "cx": " px", "cy": " px"}
 
 
-def lens_report(fit: LensFit, quality: Quality, dropped: list[str]) -> Content:
-    """Of a lens."""
-    covered = quality.coverage
+def lens_report(quality: Quality, left_out: list[str]) -> Content:
+    """Return the report of a lens; `left_out` are sentences about unusable views."""
+    fit, covered = quality.fit, quality.coverage
     views = [
         {"name": v.name, "corners": len(v.pixels), "rms_px": rms(r), "tilt_deg": t}
         for v, r, t in zip(fit.views, fit.residuals, quality.tilts_deg.tolist(), strict=True)
     ]
     numbers = {
         name: {"value": float(value), "std": float(std)}
-        for name, value, std in zip(NAMES, fit.numbers, fit.std, strict=False)
+        for name, value, std in zip(NAMES, fit.parameters, fit.std, strict=False)
     }
     return {
         "views": views,
-        "left_out": dropped,
+        "left_out": [*left_out, *fit.left_out],
         "rms_px": fit.rms_px,
         "held_out_rms_px": quality.held_out_px,
         "numbers": numbers,
@@ -45,39 +46,32 @@ def lens_report(fit: LensFit, quality: Quality, dropped: list[str]) -> Content:
     }
 
 
-def floor_report(source: str, fit: FloorFit, found: Spread, size_std: float) -> Content:
-    """Of a camera's place above the floor, with what a person can check by tape."""
-    points = [
-        {
-            "name": name,
-            "pixel": pixel.tolist(),
-            "place_m": place.tolist(),
-            "off_px": off.tolist(),
-            "off_mm": mm.tolist(),
-        }
-        for name, pixel, place, off, mm in zip(
-            fit.points.names,
-            fit.points.pixels,
-            fit.points.places,
-            fit.residuals,
-            fit.off_mm,
-            strict=True,
-        )
-    ]
-    scale = scale_std(found, size_std)
+def floor_report(source: str, fit: FloorFit, spread: PlaceUncertainty, size_std: float) -> Content:
+    """Return the report of a camera's place above the floor, with lengths to check by tape.
+
+    Args:
+        source: description of the points.
+        fit: the fit of the place.
+        spread: its uncertainty.
+        size_std: relative std of the board's or tape's size [1].
+    """
+    keys = ("name", "pixel", "place_m", "off_px", "off_mm")
+    columns = (fit.points.pixels, fit.points.places, fit.residuals, fit.off_mm)
+    rows = zip(fit.points.names, *(column.tolist() for column in columns), strict=True)
+    scale = scale_std(spread, size_std)
     return {
         "source": source,
         "rms_px": fit.rms_px,
-        "points": points,
-        "left_out": fit.told,
+        "points": [dict(zip(keys, row, strict=True)) for row in rows],
+        "left_out": list(fit.left_out),
         "height_m": fit.camera.height,
-        "height_std_m": float(np.hypot(found.place_std_m[2], size_std * fit.camera.height)),
+        "height_std_m": float(np.hypot(spread.place_std_m[2], size_std * fit.camera.height)),
         "place_m": fit.camera.place.tolist(),
-        "place_std_m": found.place_std_m.tolist(),
+        "place_std_m": spread.place_std_m.tolist(),
         "tilt_deg": tilt_deg(fit.camera),
-        "tilt_std_deg": found.tilt_std_deg,
+        "tilt_std_deg": spread.tilt_std_deg,
         "mm_per_pixel": mm_per_pixel(fit.camera),
-        "pose_covariance": found.pose.tolist(),
+        "pose_covariance": spread.pose.tolist(),
         "size_std": size_std,
         "scale_std": scale,
         "poor": _poor(fit, scale),
@@ -85,9 +79,9 @@ def floor_report(source: str, fit: FloorFit, found: Spread, size_std: float) -> 
 
 
 def straight_report(camera: OverheadCamera) -> Content:
-    """Of a camera that nobody calibrated."""
+    """Return the report of a camera that was described by the user instead of calibrated."""
     return {
-        "source": "told: straight down, no distortion",
+        "source": "described by the user: straight down, no distortion",
         "height_m": camera.height,
         "tilt_deg": 0.0,
         "mm_per_pixel": mm_per_pixel(camera),
@@ -96,24 +90,24 @@ def straight_report(camera: OverheadCamera) -> Content:
     }
 
 
-def scale_std(found: Spread, size_std: float) -> float:
-    """Of lengths on the floor, relative: the pose's part and that of the known lengths' size."""
-    return float(np.hypot(found.scale_std, size_std))
+def scale_std(spread: PlaceUncertainty, size_std: float) -> float:
+    """Return the relative std of lengths on the floor: by the pose and by the known size [1]."""
+    return float(np.hypot(spread.scale_std, size_std))
 
 
 def mm_per_pixel(camera: OverheadCamera) -> float:
-    """Distance on the floor between neighbouring pixels where the lens' axis meets it."""
+    """Return the size of a pixel on the floor where the lens' axis meets it [mm]."""
     u, v = camera.lens.matrix[:2, 2]
     ends = camera.on_plane(np.array([[u - 0.5, v], [u + 0.5, v]]), 0.0)
     return float(1000 * np.linalg.norm(ends[1] - ends[0]))
 
 
 def marker_height(height_m: float) -> str:
-    """What a marker's height does to lengths, for a camera at a height."""
+    """Return a sentence on the effect of a marker's height on lengths, for a camera at a height."""
     marker = 0.25 if height_m >= 1.5 else round(0.1 * height_m, 3)
     factor = height_m / (height_m - marker)
     return (
-        f"what lies h above the floor appears H / (H - h) times as far from the point below the "
+        f"a point h above the floor appears H / (H - h) times as far from the point below the "
         f"lens as it is: with H = {height_m:.3g} m and a marker {marker:g} m up, lengths would "
         f"come out {100 * (factor - 1):.1f} % too long if it were read on the floor: read it with "
         "its height, and correct nothing twice"
@@ -121,35 +115,31 @@ def marker_height(height_m: float) -> str:
 
 
 def _poor(fit: FloorFit, scale: float) -> list[str]:
-    found = list(fit.told) if fit.disputed else []
-    if fit.rms_px > POOR_FLOOR_PX and not found:
-        found.append(
+    """Return sentences about shortcomings of a camera's place."""
+    poor = list(fit.left_out) if fit.disputed else []
+    if fit.rms_px > POOR_FLOOR_PX and not poor:
+        poor.append(
             f"points on the floor are off by {fit.rms_px:.1f} pixels; expected {POOR_FLOOR_PX:g} "
             "or less: is the floor flat, is this lens that of the picture, are sizes right?"
         )
     if scale > POOR_SCALE:
-        found.append(
+        poor.append(
             f"lengths on the floor are known to {100 * scale:.2f} %; expected {100 * POOR_SCALE:g} "
             "% or better: measure more points all over the floor, or lay down a larger board"
         )
     if fit.twin_px is not None and fit.twin_px < TWIN_RATIO * fit.rms_px:
-        found.append(
+        poor.append(
             f"a second place of the camera explains the points nearly as well ({fit.twin_px:.2f} "
             f"pixels, this one {fit.rms_px:.2f}): measure points that lie further apart"
         )
-    return found
+    return poor
 
 
-SHOWN = 12
-"""Points that are listed, those that are furthest off; the file has all."""
-UNITS = {"fx": " px", "fy": " px", "cx": " px", "cy": " px"}
-
-
-def described(report: Content, lens_too: bool = True) -> list[str]:
-    """What a camera file's report says, for people; of the lens where it is news."""
+def report_lines(report: Content, lens_too: bool = True) -> list[str]:
+    """Return a camera file's report as lines of text, with that of the lens only on request."""
     lens, floor, poor = report.get("lens"), report.get("floor"), report.get("poor", [])
-    lines = [*_lens(lens)] if lens and lens_too else []
-    lines += [*_floor(floor)] if floor else []
+    lines = list(_lens(lens)) if lens and lens_too else []
+    lines += _floor(floor) if floor else []
     lines += [f"POOR: {sentence}" for sentence in poor]
     if not poor and (lens or (floor and "points" in floor)):
         lines.append("verdict: good")
@@ -157,6 +147,7 @@ def described(report: Content, lens_too: bool = True) -> list[str]:
 
 
 def _lens(lens: Content) -> Iterator[str]:
+    """Yield the report of a lens line by line."""
     views, covered = lens["views"], lens["coverage"]
     corners = sum(view["corners"] for view in views)
     tilts = [view["tilt_deg"] for view in views]
@@ -182,6 +173,7 @@ def _lens(lens: Content) -> Iterator[str]:
 
 
 def _floor(floor: Content) -> Iterator[str]:
+    """Yield the report of a camera's place line by line."""
     yield f"place above the floor: {floor['source']}"
     points = floor.get("points", [])
     shown = sorted(points, key=lambda p: -math.hypot(*p["off_px"]))[:SHOWN]

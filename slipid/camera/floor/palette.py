@@ -1,4 +1,4 @@
-"""The config of a map: surfaces by colour or by marked points, the region, and what lies on it."""
+"""The config of a map: surfaces by colour or by marked points, the region, and masks on it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,18 +28,14 @@ class Places(Section):
             raise ValueError("expected either at_px or at_m: [[x, y], ...]")
         return self
 
-    @property
-    def count(self) -> int:
-        return len(self.at_px or self.at_m or [])
-
 
 class Polygon(Places):
-    """A polygon."""
+    """A polygon, by its corners."""
 
     @model_validator(mode="after")
     def _corners(self) -> "Polygon":
-        if self.count < 3:
-            raise ValueError(f"{self.count} corners; expected a polygon of 3 or more")
+        if (count := len(self.at_px or self.at_m or [])) < 3:
+            raise ValueError(f"{count} corners; expected a polygon of 3 or more")
         return self
 
 
@@ -50,7 +46,7 @@ class Marked(Places):
 
 
 class Palette(Section):
-    """What is told of a floor before its picture is looked at."""
+    """The user's knowledge of a floor: colours or points of its surfaces, region and masks."""
 
     schema_: Literal["slipid.palette/1"] = Field(alias="schema")
     palette: dict[Name, Colour] = Field(default_factory=dict)
@@ -60,36 +56,37 @@ class Palette(Section):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Surfaces, in the order of the config."""
+        """Names of the surfaces, in the order of the config."""
         return tuple(dict.fromkeys([*self.palette, *(one.surface for one in self.points)]))
 
 
 def read_palette(path: Path) -> Palette:
-    """A config of surfaces, checked.
+    """Return the config in a TOML file, checked.
 
     Raises:
         DataError: unreadable, unknown or missing keys, wrong values, two surfaces of one colour.
     """
-    found = checked(path, mapping_of(path, text_of(path, "a palette of surfaces")), Palette)
+    palette = checked(path, mapping_of(path, text_of(path, "a palette of surfaces")), Palette)
     first: dict[str, str] = {}
-    for name, colour in found.palette.items():
+    for name, colour in palette.palette.items():
         same = first.setdefault(colour.lower(), name)
         if same != name:
             raise DataError(
                 f"{path}: palette.{name}: '{colour}', the colour of {same}; expected another: "
-                "surfaces are told apart by it"
+                "surfaces are distinguished by it"
             )
-    return found
+    return palette
 
 
 @dataclass(frozen=True)
 class ProposedSurface:
-    """A surface that was found, by points on it.
+    """A surface proposed without a config, and points on it.
 
     Attributes:
+        name: name for the config.
         colour: `#rrggbb`.
-        share: of the floor that was looked at.
-        points: pixels.
+        share: part of the mapped floor that it covers [1].
+        points: places on it [pixel].
     """
 
     name: str
@@ -98,12 +95,18 @@ class ProposedSurface:
     points: tuple[tuple[float, float], ...]
 
 
-def palette_text(found: Sequence[ProposedSurface], image: str, before: Palette) -> str:
-    """A config that finds the same surfaces again, to be edited."""
+def palette_text(surfaces: Sequence[ProposedSurface], image: str, before: Palette) -> str:
+    """Return a config that finds the same surfaces again, to be edited.
+
+    Args:
+        surfaces: the proposed surfaces.
+        image: name of the picture.
+        before: config without surfaces, whose region and masks are kept.
+    """
     lines = [
-        f"# Surfaces that `slipid map` found by itself in {image}.",
+        f"# Surfaces that `slipid map` proposed for {image}.",
         "# Rename them. Two with the same name become one surface: where the light differs much,",
-        "# one surface is often proposed as two. A surface that is missing: add points on it.",
+        "# one surface is often proposed as two. If a surface is missing, add points on it.",
         "# Then: slipid map IMAGE --config this file, with the other options as before.",
         f'schema = "{SCHEMA}"',
         "",
@@ -111,10 +114,10 @@ def palette_text(found: Sequence[ProposedSurface], image: str, before: Palette) 
     lines += _polygon("[region]", before.region) if before.region else _EXAMPLE
     for one in before.mask:
         lines += _polygon("[[mask]]", one)
-    for surface in found:
+    for surface in surfaces:
         points = ", ".join(f"[{x:.0f}, {y:.0f}]" for x, y in surface.points)
         lines += [
-            f"[[points]]  # {surface.colour}, {100 * surface.share:.1f} % of what was looked at",
+            f"[[points]]  # {surface.colour}, {100 * surface.share:.1f} % of the mapped floor",
             f'surface = "{surface.name}"',
             f"at_px = [{points}]",
             "",
@@ -123,7 +126,7 @@ def palette_text(found: Sequence[ProposedSurface], image: str, before: Palette) 
 
 
 _EXAMPLE = [
-    "# Only what lies in a region is mapped; objects on the floor can be masked:",
+    "# Only the floor in a region is mapped; objects on the floor can be masked:",
     "# [region]",
     "# at_px = [[100, 100], [900, 100], [900, 700], [100, 700]]",
     "# [[mask]]",

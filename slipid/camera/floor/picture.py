@@ -1,19 +1,27 @@
-"""From one picture from above to a map of the floor."""
+"""A map of the floor from one picture from above."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Int
 
-from slipid.camera.floor.asked import AROUND, Asked, Source, around, asked, seeds
-from slipid.camera.floor.colour import UNKNOWN, Features, features, settled, tidy
-from slipid.camera.floor.found import FoundMap, Told, made, text_of_proposal
-from slipid.camera.floor.grid import Robot
-from slipid.camera.floor.palette import SCHEMA, Palette, read_palette
-from slipid.camera.floor.proposal import Proposal, matched, proposed
-from slipid.camera.floor.surfaces import STRANGE, Seeds, learnt
-from slipid.camera.frames.still import still
+from slipid.camera.floor.grid import RobotShape
+from slipid.camera.floor.light import Features, features_of
+from slipid.camera.floor.palette import SCHEMA, Palette, ProposedSurface, palette_text, read_palette
+from slipid.camera.floor.proposal import matched, proposed
+from slipid.camera.floor.region import FloorPicture, FloorRegion, requested_region, seeds_of
+from slipid.camera.floor.result import PictureMap, Segmentation, map_from
+from slipid.camera.floor.surfaces import (
+    AROUND,
+    UNKNOWN,
+    MarkedCells,
+    Seeds,
+    labelled,
+    learnt,
+    without_small_patches,
+)
+from slipid.camera.frame_source import still
+from slipid.camera.opencv import Labels
 from slipid.camera.overhead import OverheadCamera
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -23,108 +31,101 @@ NARROW = 7
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What is asked for.
+class MapOptions:
+    """Options of a map.
 
     Attributes:
-        config: a palette; None lets the picture propose one.
-        surfaces: how many to propose; None chooses.
+        config: file of a palette; None proposes surfaces by the picture.
+        surfaces: number of surfaces to propose; None chooses it.
+        robot: shape of robots in the picture, which are masked.
         cell: edge of a cell [m]; None takes that of a pixel.
     """
 
     config: Path | None = None
     surfaces: int | None = None
-    robot: Robot = field(default_factory=Robot)
+    robot: RobotShape = field(default_factory=RobotShape)
     cell: float | None = None
 
 
-def map_of(path: Path, camera: OverheadCamera, wish: Wish, report: Reporter) -> FoundMap:
-    """The map of a picture.
+def map_of(path: Path, camera: OverheadCamera, options: MapOptions, report: Reporter) -> PictureMap:
+    """Return the map of a picture.
 
     Raises:
         DataError: no picture, another resolution than the camera's, or a config that does not fit.
     """
     report.stage("laying the picture onto the floor")
     picture = still(path)
-    palette = Palette(schema=SCHEMA) if wish.config is None else read_palette(wish.config)
-    source = Source(path, wish.config or path, picture, camera)
-    if palette.names and wish.surfaces is not None:
+    palette = Palette(schema=SCHEMA) if options.config is None else read_palette(options.config)
+    source = FloorPicture(path, options.config or path, picture, camera)
+    if palette.names and options.surfaces is not None:
         raise DataError(
-            f"{wish.config}: it names {len(palette.names)} surfaces; expected no --surfaces with it"
+            f"{options.config}: it names {len(palette.names)} surfaces; expected no --surfaces "
+            "with it"
         )
-    ask = asked(source, palette, wish.robot, wish.cell)
-    found = features(ask.floor.colour)
-    report.stage("telling surfaces apart")
-    points = None if palette.names else proposed(found, ask.known, wish.surfaces)
-    if points is None:
-        start = _by_colour(seeds(source, found, ask, palette), found, ask.known)
+    region = requested_region(source, palette, options.robot, options.cell)
+    features = features_of(region.floor.colour)
+    report.stage("separating surfaces")
+    if palette.names:
+        points, names = None, palette.names
+        seeds = _with_matches(seeds_of(source, features, region, palette), features, region)
     else:
-        start = _proposed(points, found, ask)
-    names = palette.names or tuple(f"surface_{k + 1}" for k in range(len(start.colours)))
-    told = _told(found, ask, start)
+        points = proposed(features, region.visible, options.surfaces)
+        seeds = _seeds_around(points, features, region)
+        names = tuple(f"surface_{k + 1}" for k in range(len(seeds.colours)))
+    segmentation = _segmented(features, region, seeds)
     if points is None:
-        all_found(source, names, told.labels)
+        check_all_present(source, names, segmentation.labels)
     report.stage("drawing outlines")
-    drawn = made(source, ask, found, names, palette, told)
+    result = map_from(source, region, features, names, palette, segmentation)
     if points is None:
-        return drawn
-    return replace(drawn, proposal=text_of_proposal(path, palette, drawn, points))
+        return result
+    return replace(result, proposal=_config_of(path, palette, result, points))
 
 
-def _told(found: Features, ask: Asked, start: Seeds) -> Told:
-    """The surface of each cell; what looks like none of them is unknown."""
-    surfaces = learnt(found, ask.known, start)
-    costs = surfaces.costs(found.look)
-    strange = np.full((1, *ask.known.shape), STRANGE, np.float32)
-    labels = settled(np.concatenate([costs, strange]), ask.known)
-    labels = tidy(labels, ask.known, NARROW)
-    return Told(np.where(labels == len(costs), UNKNOWN, labels), costs, surfaces)
+def _segmented(features: Features, region: FloorRegion, seeds: Seeds) -> Segmentation:
+    """Return the surface of each cell; cells that resemble none of them are unknown."""
+    surfaces = learnt(features, region.visible, seeds)
+    costs = surfaces.costs(features.appearance)
+    labels = labelled(costs, region.visible)
+    labels = without_small_patches(labels, region.visible, NARROW)
+    return Segmentation(np.where(labels == len(costs), UNKNOWN, labels), costs, surfaces)
 
 
-def _by_colour(start: Seeds, found: Features, known: Bool[np.ndarray, "row column"]) -> Seeds:
-    """The same, and marked cells on patches that match surfaces with one marked point or none."""
-    count = np.bincount(start.surface, minlength=len(start.colours))
+def _with_matches(seeds: Seeds, features: Features, region: FloorRegion) -> Seeds:
+    """Return seeds with cells on matching patches for surfaces with at most one marked point."""
+    count = np.bincount(seeds.marked.surface, minlength=len(seeds.colours))
     few = count <= (AROUND + 1) ** 2  # cells around a point
     if not few.any():
-        return start
-    match = matched(found, known, start.colours)
-    new = few[match.surface]
-    more = Proposal(match.row[new], match.column[new], match.surface[new])
-    cells, own = _around(more, known)
-    return replace(
-        start,
-        row=np.concatenate([start.row, cells[:, 0]]),
-        column=np.concatenate([start.column, cells[:, 1]]),
-        surface=np.concatenate([start.surface, own]),
-    )
+        return seeds
+    match = matched(features, region.visible, seeds.colours)
+    more = match.only(few[match.surface]).surroundings(region.visible)
+    return replace(seeds, marked=seeds.marked.joined(more))
 
 
-def _proposed(points: Proposal, found: Features, ask: Asked) -> Seeds:
-    """Marked cells around proposed points."""
-    cells, surface = _around(points, ask.known)
-    row, column = cells.T
-    light = found.light[row, column]
-    colours = [np.median(light[surface == k], axis=0) for k in range(surface.max() + 1)]
-    return Seeds(np.array(colours, float), row, column, surface)
+def _seeds_around(points: MarkedCells, features: Features, region: FloorRegion) -> Seeds:
+    """Return the cells around proposed points as marked cells, with their colours."""
+    cells = points.surroundings(region.visible)
+    rgb, own = features.rgb[cells.row, cells.column], cells.surface
+    colours = [np.median(rgb[own == k], axis=0) for k in range(own.max() + 1)]
+    return Seeds(np.array(colours, float), cells)
 
 
-def _around(
-    points: Proposal, known: Bool[np.ndarray, "row column"]
-) -> tuple[Int[np.ndarray, "cell 2"], Int[np.ndarray, " cell"]]:
-    """Known cells around points, and the surface of each."""
-    middles = np.column_stack([points.row, points.column])
-    near = [around(one[None], known) for one in middles]
-    own = np.repeat(points.surface, [len(one) for one in near])
-    return np.concatenate([np.zeros((0, 2), int), *near]), own
-
-
-def all_found(
-    source: Source, names: tuple[str, ...], labels: Int[np.ndarray, "row column"]
-) -> None:
-    """Refuse a surface of a config that no cell has."""
-    lost = [name for k, name in enumerate(names) if not (labels == k).any()]
-    if lost:
+def check_all_present(source: FloorPicture, names: tuple[str, ...], labels: Labels) -> None:
+    """Raise `DataError` where no cell has one of the surfaces of a config."""
+    absent = [name for k, name in enumerate(names) if not (labels == k).any()]
+    if absent:
         raise DataError(
-            f"{source.config}: nothing in the picture looks most like {', '.join(lost)}; expected "
-            "a colour or points of a surface that is there and differs from the others"
+            f"{source.config}: nothing in the picture looks most like {', '.join(absent)}; "
+            "expected a colour or points of a surface that is there and differs from the others"
         )
+
+
+def _config_of(path: Path, palette: Palette, result: PictureMap, points: MarkedCells) -> str:
+    """Return a config that marks the proposed surfaces by points in pixels."""
+    pixels = result.floor.pixels[points.row, points.column]
+    surfaces = []
+    for k, (name, colour) in enumerate(result.vector.colours.items()):
+        own = points.surface == int(name.removeprefix("surface_")) - 1
+        places = tuple((float(x), float(y)) for x, y in pixels[own])
+        surfaces.append(ProposedSurface(name, colour, result.share(k), places))
+    return palette_text(surfaces, path.name, palette)

@@ -1,205 +1,302 @@
-"""What each surface looks like, learnt together with the light from a few marked places or colours.
+"""Appearance of each surface, learnt with the illumination from a few marked cells or colours.
 
-In turn: every cell gets the surface it looks like under the light so far; the cells that are told
-clearly say what colours, spreads and light there are.
+In turn, every cell gets the surface that it resembles most under the illumination so far, and the
+cells that are clear give better colours, spreads and illumination. A cell's neighbours count as
+well, so that surfaces form patches with clean edges.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 
-from slipid.camera.floor.colour import Features, lab_of, settled
-from slipid.camera.floor.shading import Light, Lit, Samples, lit
-from slipid.camera.opencv import opencv
+from slipid.camera.floor.light import (
+    ColourSamples,
+    Features,
+    Illumination,
+    LitColours,
+    fit_illumination,
+    lab_of,
+)
+from slipid.camera.opencv import Labels, Mask, opencv
 
 ROUNDS = 10
 STEADY = 3e-4
-"""Share of cells that change their surface in a round, below which it is the last."""
+"""Share of cells that change their surface in a round, below which learning ends."""
 COARSE = 25_000
-"""About so many cells are learnt from."""
+"""Approximate number of cells of the thinned picture from which surfaces are learnt."""
 SAMPLES = 5_000
-"""Largest number of cells that light and colours are fitted to."""
+"""Largest number of cells to which illumination and colours are fitted."""
 LEAST_SPREAD = np.array([2.0, 1.5, 1.5, 0.25])
 MOST_SPREAD = np.array([6.0, 4.0, 4.0, 0.7])
-"""Of L, a, b and texture within a surface."""
-STRANGE = 60.0
-"""A cell that costs more with every surface is of none [squared spreads]."""
+"""Limits of the spread of L, a, b and texture within a surface."""
+OUTLIER = 60.0
+"""Cost above which a cell belongs to none of the surfaces [squared spreads]."""
 CLEAR = 16.0
-"""A cell that costs less is of its surface [squared spreads]."""
+"""Cost below which a cell clearly belongs to its surface [squared spreads]."""
+Costs = Float32[np.ndarray, "surface row column"]
+"""Cost of every surface in every cell [squared spreads]."""
+UNKNOWN = -1
+"""Label of cells without a surface."""
+COUPLING = 3.0
+"""Cost of a cell whose neighbours all have another surface [squared spreads]."""
+REACH = 1.5
+"""Std of the Gaussian that weights a cell's neighbours [cells]."""
+FIELD_ROUNDS = 5
+"""Number of mean-field iterations over neighbouring cells."""
+SMALL = 150
+"""Number of cells below which a patch is merged with its surroundings."""
+AROUND = 4
+"""Distance around a marked point over which its surface is taken to reach [cells]."""
+
+
+@dataclass(frozen=True, eq=False)
+class MarkedCells:
+    """Cells by row and column, and the number of the surface of each."""
+
+    row: Int[np.ndarray, " cell"]
+    column: Int[np.ndarray, " cell"]
+    surface: Int[np.ndarray, " cell"]
+
+    def only(self, kept: np.ndarray) -> "MarkedCells":
+        """Return some of the cells, by a mask or by indices."""
+        return MarkedCells(self.row[kept], self.column[kept], self.surface[kept])
+
+    def joined(self, other: "MarkedCells") -> "MarkedCells":
+        """Return these cells followed by others."""
+        return MarkedCells(
+            np.concatenate([self.row, other.row]),
+            np.concatenate([self.column, other.column]),
+            np.concatenate([self.surface, other.surface]),
+        )
+
+    def surroundings(self, visible: Mask) -> "MarkedCells":
+        """Return the visible cells around each of these, with its surface."""
+        steps = np.arange(-AROUND, AROUND + 1, 2)
+        down, across = (step.ravel() for step in np.meshgrid(steps, steps))
+        row = (self.row[:, None] + down).ravel()
+        column = (self.column[:, None] + across).ravel()
+        cells = MarkedCells(row, column, np.repeat(self.surface, len(down)))
+        rows, columns = visible.shape
+        cells = cells.only((row >= 0) & (row < rows) & (column >= 0) & (column < columns))
+        return cells.only(visible[cells.row, cells.column])
 
 
 @dataclass(frozen=True, eq=False)
 class Seeds:
-    """What is known of surfaces before the picture is looked at.
-
-    Attributes:
-        colours: of every surface, in amounts of light.
-        row, column: cells that are marked; surface: of each.
-    """
+    """Prior knowledge of the surfaces: a colour of each [linear RGB], and marked cells."""
 
     colours: Float[np.ndarray, "surface 3"]
-    row: Int[np.ndarray, " seed"]
-    column: Int[np.ndarray, " seed"]
-    surface: Int[np.ndarray, " seed"]
+    marked: MarkedCells
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """What every surface looks like.
+    """Learnt appearance of every surface.
 
     Attributes:
-        lit: colours and the light on them.
-        texture: of each.
-        spread: of L, a, b and texture within each.
+        lit: colours and the illumination.
+        texture: texture of each surface.
+        spread: spread of L, a, b and texture within each surface.
     """
 
-    lit: Lit
+    lit: LitColours
     texture: Float[np.ndarray, " surface"]
     spread: Float[np.ndarray, "surface 4"]
 
-    def looks(self, shape: tuple[int, int]) -> Float32[np.ndarray, "surface row column 4"]:
-        """L, a, b and texture that each would have in every cell."""
+    def appearances(self, shape: tuple[int, int]) -> Float32[np.ndarray, "surface row column 4"]:
+        """Return the L, a, b and texture that each surface would have in every cell."""
         cv2 = opencv()
         rows, columns = min(shape[0], 48), min(shape[1], 48)
-        seen = lab_of(self.lit.light.seen(self.lit.colours, places((rows, columns))))
-        out = np.empty((len(seen), *shape, 4), np.float32)
+        at = positions((rows, columns))
+        coarse = lab_of(self.lit.illumination.rgb_of(self.lit.colours, at))
+        out = np.empty((len(coarse), *shape, 4), np.float32)
         size = (shape[1], shape[0])
-        for k, one in enumerate(seen.reshape(-1, rows, columns, 3).astype(np.float32)):
-            out[k, ..., :3] = cv2.resize(one, size, interpolation=cv2.INTER_LINEAR)
+        for k, lab in enumerate(coarse.reshape(-1, rows, columns, 3).astype(np.float32)):
+            out[k, ..., :3] = cv2.resize(lab, size, interpolation=cv2.INTER_LINEAR)
             out[k, ..., 3] = self.texture[k]
         return out
 
-    def costs(
-        self, look: Float[np.ndarray, "row column 4"]
-    ) -> Float32[np.ndarray, "surface row column"]:
-        """How badly each cell looks like each surface [squared spreads], at most a little strange.
+    def costs(self, appearance: Float[np.ndarray, "row column 4"]) -> Costs:
+        """Return how badly each surface explains each cell [squared spreads], limited above.
 
-        The spread counts as well: a surface that may look like anything is no good explanation.
+        A wide spread costs as well: a surface that may have any appearance explains nothing.
         """
-        out = np.empty((len(self.spread), *look.shape[:2]), np.float32)
-        for k, expected in enumerate(self.looks(look.shape[:2])):
-            off = (look - expected) / self.spread[k].astype(np.float32)
+        out = np.empty((len(self.spread), *appearance.shape[:2]), np.float32)
+        for k, expected in enumerate(self.appearances(appearance.shape[:2])):
+            off = (appearance - expected) / self.spread[k].astype(np.float32)
             wide = 2 * np.log(self.spread[k] / LEAST_SPREAD).sum()
             rough = np.minimum(off[..., 3] ** 2, 6.0)  # edges and dirt are rough as well
             out[k] = (off[..., :3] ** 2).sum(axis=-1) + rough + wide
-        return np.minimum(out, 1.5 * STRANGE)
+        return np.minimum(out, 1.5 * OUTLIER)
 
 
-def places(shape: tuple[int, int]) -> Float[np.ndarray, "place 2"]:
-    """X and y of all cells, row by row, from -1 to 1."""
+def positions(shape: tuple[int, int]) -> Float[np.ndarray, "place 2"]:
+    """Return x and y of all cells, row by row, from -1 to 1."""
     y, x = np.mgrid[: shape[0], : shape[1]]
     size = np.maximum(np.array([shape[1], shape[0]]) - 1, 1)
     return 2 * np.stack([x.ravel(), y.ravel()], axis=-1) / size - 1
 
 
-def labelled(
-    surfaces: Surfaces,
-    look: Float[np.ndarray, "row column 4"],
-    known: Bool[np.ndarray, "row column"],
-) -> Int[np.ndarray, "row column"]:
-    """Surface of each cell; one more than the last is what looks like none of them."""
-    costs = surfaces.costs(look)
-    strange = np.full((1, *look.shape[:2]), STRANGE, np.float32)
-    return settled(np.concatenate([costs, strange]), known)
-
-
-def learnt(found: Features, known: Bool[np.ndarray, "row column"], seeds: Seeds) -> Surfaces:
-    """What surfaces look like in this picture."""
-    step = max(1, round(np.sqrt(known.size / COARSE)))
-    few, some = thinned(found, step), known[step // 2 :: step, step // 2 :: step]
-    shape = few.look.shape[:2]
-    at = np.stack([np.minimum(seeds.row // step, shape[0] - 1) * shape[1], seeds.column // step])
-    marked = at[0] + np.minimum(at[1], shape[1] - 1)
+def learnt(features: Features, visible: Mask, seeds: Seeds) -> Surfaces:
+    """Return the appearance of the surfaces in a picture."""
+    step = max(1, round(np.sqrt(visible.size / COARSE)))
+    few, some = thinned(features, step), visible[step // 2 :: step, step // 2 :: step]
+    shape = few.appearance.shape[:2]
+    row, column = seeds.marked.row // step, seeds.marked.column // step
+    marked = np.minimum(row, shape[0] - 1) * shape[1] + np.minimum(column, shape[1] - 1)
     surfaces = _start(few, marked, seeds)
-    steady = _steady(few.look) & some
+    flat = _flat(few.appearance) & some
     before = np.full(shape, -1)
     for _ in range(ROUNDS):
-        labels = labelled(surfaces, few.look, some)
+        costs = surfaces.costs(few.appearance)
+        labels = labelled(costs, some)
         if np.mean(labels != before) < STEADY:
             break
         before = labels
-        costs = np.concatenate([surfaces.costs(few.look), np.full((1, *shape), np.inf)])
-        mine = np.take_along_axis(costs, np.maximum(labels, 0)[None], axis=0)[0]
-        clear = (mine < CLEAR) & steady & (labels < len(seeds.colours)) & (labels >= 0)
-        surfaces = _again(surfaces, few, np.where(clear, labels, -1).ravel(), marked, seeds)
+        costs = np.concatenate([costs, np.full((1, *shape), np.inf)])
+        own = np.take_along_axis(costs, np.maximum(labels, 0)[None], axis=0)[0]
+        clear = (own < CLEAR) & flat & (labels < len(seeds.colours)) & (labels >= 0)
+        surfaces = _updated(surfaces, few, np.where(clear, labels, -1).ravel(), marked, seeds)
     return surfaces
 
 
-def thinned(found: Features, step: int) -> Features:
-    """Every so many cells, smoothed over them."""
+def thinned(features: Features, step: int) -> Features:
+    """Return the features of every `step`-th cell, smoothed over that many."""
     if step == 1:
-        return found
+        return features
     cv2 = opencv()
     cut = slice(step // 2, None, step)
-    look = cv2.GaussianBlur(found.look, (0, 0), 0.4 * step)[cut, cut]
-    return Features(look, cv2.GaussianBlur(found.light, (0, 0), 0.4 * step)[cut, cut])
+    appearance, rgb = (
+        cv2.GaussianBlur(one, (0, 0), 0.4 * step)[cut, cut]
+        for one in (features.appearance, features.rgb)
+    )
+    return Features(appearance, rgb)
 
 
-def _steady(look: Float[np.ndarray, "row column 4"]) -> Bool[np.ndarray, "row column"]:
-    """Cells whose neighbours look about the same: no edge, whose colours are mixed."""
+def _flat(appearance: Float[np.ndarray, "row column 4"]) -> Mask:
+    """Return cells whose neighbours look about the same; colours along edges are mixed."""
     cv2 = opencv()
-    lab = np.ascontiguousarray(look[..., :3])
+    lab = np.ascontiguousarray(appearance[..., :3])
     kernel = np.ones((3, 3), np.uint8)
     change = (cv2.dilate(lab, kernel) - cv2.erode(lab, kernel)).max(axis=-1)
     return np.asarray(change < max(8.0, 1.5 * float(np.median(change))))
 
 
 def _start(few: Features, marked: Int[np.ndarray, " seed"], seeds: Seeds) -> Surfaces:
-    """From the seeds alone."""
-    begin = Lit(Light.even(), seeds.colours)
-    texture = np.full(len(seeds.colours), float(np.median(few.look[..., 3])))
+    """Return the appearance of the surfaces by the seeds alone."""
+    start = LitColours(Illumination.uniform(), seeds.colours)
+    texture = np.full(len(seeds.colours), float(np.median(few.appearance[..., 3])))
     spread = np.tile(MOST_SPREAD, (len(seeds.colours), 1))
+    spread[:, 3] = 100.0  # a colour alone says nothing about texture
     if not len(marked):
-        spread[:, 3] = 100.0  # colours say nothing of texture
-        return Surfaces(begin, texture, spread)
-    light, rough = few.light.reshape(-1, 3)[marked].astype(float), few.look[..., 3].ravel()[marked]
-    at = places(few.look.shape[:2])[marked]
-    found = lit(Samples(at, light, seeds.surface, np.ones(len(at))), begin)
-    for k in np.unique(seeds.surface):
-        texture[k] = np.median(rough[seeds.surface == k])
-    spread[:, 3] = np.where(np.isin(np.arange(len(spread)), seeds.surface), spread[:, 3], 100.0)
-    return Surfaces(found, texture, spread)
+        return Surfaces(start, texture, spread)
+    rgb, rough = (
+        few.rgb.reshape(-1, 3)[marked].astype(float),
+        few.appearance[..., 3].ravel()[marked],
+    )
+    at, own = positions(few.appearance.shape[:2])[marked], seeds.marked.surface
+    for k in np.unique(own):
+        texture[k], spread[k, 3] = np.median(rough[own == k]), MOST_SPREAD[3]
+    fit = fit_illumination(ColourSamples(at, rgb, own, np.ones(len(at))), start)
+    return Surfaces(fit, texture, spread)
 
 
-def _again(
+def _updated(
     surfaces: Surfaces,
     few: Features,
     labels: Int[np.ndarray, " cell"],
     marked: Int[np.ndarray, " seed"],
     seeds: Seeds,
 ) -> Surfaces:
-    """Colours, spreads and light from cells with a label, and from the marked ones."""
+    """Return the appearance of the surfaces by the labelled cells and by the marked ones."""
     cells = np.flatnonzero(labels >= 0)
     cells = cells[:: 1 + len(cells) // SAMPLES]
     if not len(cells):
         return surfaces
-    own = np.concatenate([labels[cells], seeds.surface])
+    own = np.concatenate([labels[cells], seeds.marked.surface])
     cells = np.concatenate([cells, marked])
     count = np.bincount(own, minlength=len(seeds.colours))
-    # every surface has a say in the light, however small it is
+    # every surface contributes to the illumination, however small it is
     weight = 1 / np.sqrt(count[own])
     weight[len(weight) - len(marked) :] *= 3
-    at = places(few.look.shape[:2])[cells]
-    samples = Samples(at, few.light.reshape(-1, 3)[cells].astype(float), own, weight)
-    found = replace(surfaces, lit=lit(samples, surfaces.lit))
-    return _spread(found, few, cells, own)
-
-
-def _spread(
-    surfaces: Surfaces,
-    few: Features,
-    cells: Int[np.ndarray, " cell"],
-    own: Int[np.ndarray, " cell"],
-) -> Surfaces:
-    """Texture and spreads around what is expected, robustly."""
-    look = few.look.reshape(-1, 4)[cells]
-    at = places(few.look.shape[:2])[cells]
+    at, appearance = (
+        positions(few.appearance.shape[:2])[cells],
+        few.appearance.reshape(-1, 4)[cells],
+    )
+    samples = ColourSamples(at, few.rgb.reshape(-1, 3)[cells].astype(float), own, weight)
+    fit = fit_illumination(samples, surfaces.lit)
     texture, spread = surfaces.texture.copy(), surfaces.spread.copy()
-    for k in np.unique(own):
+    for k in np.unique(own):  # robustly, around the expected appearance
         mine = own == k
-        texture[k] = np.median(look[mine, 3])
-        expected = lab_of(surfaces.lit.light.seen(surfaces.lit.colours[k : k + 1], at[mine])[0])
-        off = np.abs(look[mine] - np.column_stack([expected, np.full(mine.sum(), texture[k])]))
+        texture[k] = np.median(appearance[mine, 3])
+        expected = lab_of(fit.illumination.rgb_of(fit.colours[k : k + 1], at[mine])[0])
+        off = np.abs(
+            appearance[mine] - np.column_stack([expected, np.full(mine.sum(), texture[k])])
+        )
         spread[k] = np.clip(1.5 * np.median(off, axis=0), LEAST_SPREAD, MOST_SPREAD)
-    return replace(surfaces, texture=texture, spread=spread)
+    return Surfaces(fit, texture, spread)
+
+
+def labelled(costs: Costs, visible: Mask) -> Labels:
+    """Return the surface of each cell; a number above the last marks cells that fit none."""
+    outlier = np.full((1, *visible.shape), OUTLIER, np.float32)
+    return smoothed(np.concatenate([costs, outlier]), visible)
+
+
+def smoothed(costs: Costs, visible: Mask) -> Labels:
+    """Return labels of low cost that agree with their neighbours.
+
+    Mean field of a Potts model: each cell holds a share of every surface and is drawn towards the
+    shares of its neighbours. Cells that are not visible take no part and are `UNKNOWN`.
+    """
+    cv2 = opencv()
+    weight = visible.astype(np.float32)
+    around = np.maximum(cv2.GaussianBlur(weight, (0, 0), REACH), 1e-3)
+    total = costs
+    for _ in range(FIELD_ROUNDS):
+        share = np.exp(-0.5 * (total - total.min(axis=0)))
+        share *= weight / share.sum(axis=0)
+        neighbours = np.stack([cv2.GaussianBlur(one, (0, 0), REACH) for one in share])
+        total = costs - 2 * COUPLING * neighbours / around
+    return np.where(visible, np.argmin(total, axis=0), UNKNOWN)
+
+
+def without_small_patches(labels: Labels, visible: Mask, width: int) -> Labels:
+    """Return labels in which small or narrow patches became part of the nearest other patch.
+
+    Along an edge of two surfaces their mixed colour may look like a third: a narrow line of it.
+
+    Args:
+        labels: surface of each cell.
+        visible: cells that may have a surface.
+        width: width of the narrowest patch that is kept [cells].
+    """
+    cv2 = opencv()
+    size = 2 * (width // 2) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    kept = np.zeros(labels.shape, bool)
+    for surface in np.unique(labels):
+        mine = (labels == surface).astype(np.uint8)
+        # a hidden cell may be any surface, so the edge of the picture narrows nothing
+        opened = cv2.morphologyEx(mine | (~visible).astype(np.uint8), cv2.MORPH_OPEN, disc)
+        kept |= (opened > 0) & (mine > 0)
+    labels = np.where(visible, _nearest(labels, kept & visible), UNKNOWN)
+    large = np.zeros(labels.shape, bool)
+    for surface in np.unique(labels[visible]):
+        mine = (labels == surface).astype(np.uint8)
+        _, parts, stats, _ = cv2.connectedComponentsWithStats(mine, connectivity=4)
+        big = stats[:, cv2.CC_STAT_AREA] >= SMALL
+        big[0] = False  # the background
+        large |= big[parts]
+    return np.where(visible, _nearest(labels, large & visible), UNKNOWN)
+
+
+def _nearest(labels: Labels, kept: Mask) -> Labels:
+    """Return, in every cell, the label of the nearest kept cell; unchanged where none is kept."""
+    from scipy.ndimage import distance_transform_edt
+
+    if kept.all() or not kept.any():
+        return labels
+    rows, columns = distance_transform_edt(~kept, return_distances=False, return_indices=True)
+    return np.asarray(labels[rows, columns])

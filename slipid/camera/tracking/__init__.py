@@ -1,1 +1,1 @@
-"""From the video of an overhead camera to poses of what carries a marker."""
+"""Poses of bodies with markers from the video of an overhead camera."""

@@ -1,17 +1,17 @@
-"""From the corners of markers to the pose of the body on the floor, with its covariance.
+"""The pose of a body on the floor, with its covariance, from the corners of its markers.
 
-Every corner is a ray, met by the plane at the corner's height. There the corners of a body at x, y
-with heading theta, whose markers look s times as large as they are, lie at
+Every corner is a ray that meets the plane at the corner's height. There the corners of a body at
+x, y with heading theta, whose markers look s times as large as they are, lie at
 
     place_i = (x, y) + R(theta) (middle_i + s own_i)                                         (1)
 
-with the middle of the corner's marker on the body and, from there, the corner's own place. What is
-left over, turned into pixels by the local derivative of the ray's place, is least. The factor s is
-fitted because the edge between black and white is found a little within or beside where it is, in
-all corners alike: it takes that up, and tells a wrong height of the markers. It does not stretch
-the way from the body's origin to a marker: that was measured with a ruler.
-With corners that err by sigma pixels each, independently, the covariance of (x, y, theta) is that
-part of sigma^2 (J^T J)^-1.
+with the middle of the corner's marker on the body and the vector from there to the corner. The fit
+minimises the residuals in pixels, converted by the local derivative of the ray's place. The factor
+s is fitted because the edge between black and white is detected slightly inside or outside its true
+place, in all corners alike: s absorbs that, and reveals a wrong height of the markers. It does not
+stretch the vector from the body's origin to a marker, which was measured with a ruler. If corners
+err by sigma pixels each, independently, the covariance of (x, y, theta) is that part of
+sigma^2 (J^T J)^-1.
 """
 
 from dataclasses import dataclass
@@ -23,21 +23,22 @@ from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.target import Target
 
 ROUNDS = 3
-"""Of Gauss-Newton: the first guess is exact but for the tilt of the camera."""
+"""Number of Gauss-Newton steps: the start is exact except for the tilt of the camera."""
 STEP = 0.5
 """Step of the derivative of a ray's place [pixel]."""
 
 
 @dataclass(frozen=True, eq=False)
-class Poses:
-    """Poses of a body, NaN where it was not seen.
+class FittedPoses:
+    """Poses of a body, NaN where too few of its corners were detected.
 
     Attributes:
         pose: x, y [m], heading [rad] between -pi and pi.
-        unit_covariance: of the pose where corners err by one pixel [m, rad per pixel, squared].
-        size: how large the markers look over what they are, at their height [1].
-        squares: sum of the squares left over [pixel^2].
-        free: how many numbers were left over for it: two a corner less four.
+        unit_covariance: covariance of the pose where corners err by one pixel
+            [m, rad per pixel, squared].
+        size: apparent over true size of the markers, at their height [1].
+        squares: sum of the squared residuals [pixel^2].
+        free: degrees of freedom of that sum: two for each corner, less four.
     """
 
     pose: Float[np.ndarray, "frame 3"]
@@ -48,13 +49,13 @@ class Poses:
 
 
 @dataclass(frozen=True, eq=False)
-class _Body:
+class _Corners:
     """All corners of a target.
 
     Attributes:
-        middle: of the corner's marker, ahead and left on the body [m].
-        own: from there to the corner [m].
-        height: above the floor [m].
+        middle: middle of the corner's marker, ahead and left on the body [m].
+        own: vector from there to the corner [m].
+        height: height above the floor [m].
     """
 
     middle: Float[np.ndarray, "corner 2"]
@@ -62,7 +63,7 @@ class _Body:
     height: Float[np.ndarray, " corner"]
 
     @classmethod
-    def of(cls, target: Target) -> "_Body":
+    def of(cls, target: Target) -> "_Corners":
         corners = np.stack([marker.corners for marker in target.markers])
         middle = np.repeat(corners[..., :2].mean(axis=1), 4, axis=0)
         flat = corners.reshape(-1, 3)
@@ -71,39 +72,39 @@ class _Body:
 
 def poses_of(
     camera: OverheadCamera, target: Target, corners: Float[np.ndarray, "frame marker 4 2"]
-) -> Poses:
-    """Poses of a body from where the corners of its markers are seen.
+) -> FittedPoses:
+    """Return the poses of a body by the detected corners of its markers.
 
     Args:
-        camera: with its place above the floor.
-        target: the body; markers in this order.
-        corners: x, y [pixel], NaN where a marker is not seen.
+        camera: camera with its place above the floor.
+        target: the body; its markers in the order of `corners`.
+        corners: x, y [pixel], NaN where a marker was not detected.
     """
     frames = len(corners)
-    body = _Body.of(target)
+    body = _Corners.of(target)
     pixels = corners.reshape(frames, len(body.height), 2)
     place, per_pixel = _on_planes(camera, pixels, body.height)
-    seen = np.isfinite(place).all(axis=-1) & np.isfinite(per_pixel).all(axis=(-1, -2))
-    seen &= seen.sum(axis=1, keepdims=True) >= 3
-    some = seen.any(axis=1)
-    out = Poses(*(np.full((frames, *shape), np.nan) for shape in ((3,), (3, 3), (), (), ())))
+    valid = np.isfinite(place).all(axis=-1) & np.isfinite(per_pixel).all(axis=(-1, -2))
+    valid &= valid.sum(axis=1, keepdims=True) >= 3
+    some = valid.any(axis=1)
+    out = FittedPoses(*(np.full((frames, *shape), np.nan) for shape in ((3,), (3, 3), (), (), ())))
     if not some.any():  # another body than those in view
         return out
-    place, per_pixel, used = place[some], per_pixel[some], seen[some]
+    place, per_pixel, used = place[some], per_pixel[some], valid[some]
     place = np.where(used[..., None], place, 0.0)
     into_pixels = np.linalg.inv(np.where(used[..., None, None], per_pixel, np.eye(2)))
     fitted = _similarity(place, body.middle + body.own, used)
     for _ in range(ROUNDS):
-        left, slope = _left_over(fitted, place, into_pixels, body, used)
+        residual, slope = _residuals(fitted, place, into_pixels, body, used)
         normal = np.swapaxes(slope, 1, 2) @ slope
-        step = np.linalg.solve(normal, np.swapaxes(slope, 1, 2) @ left[..., None])
+        step = np.linalg.solve(normal, np.swapaxes(slope, 1, 2) @ residual[..., None])
         fitted = fitted - step[..., 0]
-    left, slope = _left_over(fitted, place, into_pixels, body, used)
-    unit = np.linalg.inv(np.swapaxes(slope, 1, 2) @ slope)[:, :3, :3]
-    turned = np.angle(np.exp(1j * fitted[:, 2]))
-    out.pose[some] = np.column_stack([fitted[:, :2], turned])
-    out.unit_covariance[some], out.size[some] = unit, fitted[:, 3]
-    out.squares[some], out.free[some] = (left**2).sum(axis=1), 2.0 * used.sum(axis=1) - 4.0
+    residual, slope = _residuals(fitted, place, into_pixels, body, used)
+    out.unit_covariance[some] = np.linalg.inv(np.swapaxes(slope, 1, 2) @ slope)[:, :3, :3]
+    heading = np.angle(np.exp(1j * fitted[:, 2]))
+    out.pose[some] = np.column_stack([fitted[:, :2], heading])
+    out.size[some] = fitted[:, 3]
+    out.squares[some], out.free[some] = (residual**2).sum(axis=1), 2.0 * used.sum(axis=1) - 4.0
     return out
 
 
@@ -112,19 +113,15 @@ def _on_planes(
     pixels: Float[np.ndarray, "frame corner 2"],
     heights: Float[np.ndarray, " corner"],
 ) -> tuple[Float[np.ndarray, "frame corner 2"], Float[np.ndarray, "frame corner 2 2"]]:
-    """Places [m] of corners at their heights, and how they move with their pixels [m/pixel]."""
+    """Return places [m] of corners at their heights, and their derivative by pixels [m/pixel]."""
     place = np.full(pixels.shape, np.nan)
     slope = np.full((*pixels.shape, 2), np.nan)
     for height in np.unique(heights):
         at = heights == height
-        some = pixels[:, at]
-        place[:, at] = camera.on_plane(some, float(height))
+        some, z = pixels[:, at], float(height)
+        place[:, at] = camera.on_plane(some, z)
         moved = [
-            (
-                camera.on_plane(some + step, float(height))
-                - camera.on_plane(some - step, float(height))
-            )
-            / (2 * STEP)
+            (camera.on_plane(some + step, z) - camera.on_plane(some - step, z)) / (2 * STEP)
             for step in STEP * np.eye(2)
         ]
         slope[:, at] = np.stack(moved, axis=-1)
@@ -136,7 +133,7 @@ def _similarity(
     body: Float[np.ndarray, "corner 2"],
     used: Bool[np.ndarray, "frame corner"],
 ) -> Float[np.ndarray, "frame 4"]:
-    """x, y, heading and size by least squares in metres, in closed form."""
+    """Return x, y, heading and size by least squares in metres, in closed form."""
     weight = used / used.sum(axis=1, keepdims=True)
     z, c = place[..., 0] + 1j * place[..., 1], body[:, 0] + 1j * body[:, 1]
     middle, own = (weight * z).sum(axis=1), (weight * c).sum(axis=1)
@@ -147,23 +144,26 @@ def _similarity(
     return np.column_stack([origin.real, origin.imag, np.angle(turn), np.abs(turn)])
 
 
-def _left_over(
+def _residuals(
     fitted: Float[np.ndarray, "frame 4"],
     place: Float[np.ndarray, "frame corner 2"],
     into_pixels: Float[np.ndarray, "frame corner 2 2"],
-    body: _Body,
+    body: _Corners,
     used: Bool[np.ndarray, "frame corner"],
 ) -> tuple[Float[np.ndarray, "frame number"], Float[np.ndarray, "frame number 4"]]:
-    """Equation (1) less what was seen [pixel], and its derivative by x, y, heading and size."""
+    """Return equation (1) less the measured places [pixel], and its derivative.
+
+    The derivative is by x, y, heading and size; unused corners have zeros in both.
+    """
     own, size = _turned(body.own, fitted[:, 2]), fitted[:, 3, None, None]
     turned = _turned(body.middle, fitted[:, 2]) + size * own
     across = np.stack([-turned[..., 1], turned[..., 0]], axis=-1)
     gap = fitted[:, None, :2] + turned - place
-    moved = np.broadcast_to(np.eye(2), (*place.shape[:2], 2, 2))
-    slope = np.concatenate([moved, across[..., None], own[..., None]], axis=-1)
-    left = np.where(used[..., None], np.einsum("fcij,fcj->fci", into_pixels, gap), 0.0)
-    bent = np.where(used[..., None, None], into_pixels @ slope, 0.0)
-    return left.reshape(len(left), -1), bent.reshape(len(bent), -1, 4)
+    shift = np.broadcast_to(np.eye(2), (*place.shape[:2], 2, 2))
+    slope = np.concatenate([shift, across[..., None], own[..., None]], axis=-1)
+    residual = np.where(used[..., None], np.einsum("fcij,fcj->fci", into_pixels, gap), 0.0)
+    slope = np.where(used[..., None, None], into_pixels @ slope, 0.0)
+    return residual.reshape(len(residual), -1), slope.reshape(len(slope), -1, 4)
 
 
 def _turned(

@@ -1,8 +1,8 @@
-"""What is tracked: markers that stand still on one body, by dictionary, number, size and place.
+"""Targets to track: bodies and the markers fixed to them, by dictionary, number, size and place.
 
-A marker alone lies in the middle of the body, and its top edge is ahead: the heading is the
-direction from its bottom edge to its top edge as the dictionary draws it. A file places several,
-or boards, anywhere on the body:
+A single marker lies in the middle of the body with its top edge ahead: the heading is the direction
+from its bottom edge to its top edge as the dictionary draws it. A file places several markers, or
+boards of markers, anywhere on a body:
 
     [[target]]
     name = "robot"
@@ -47,7 +47,7 @@ class Marker:
     Attributes:
         id: its number in the dictionary.
         size: length of an edge of its black square [m].
-        corners: x ahead, y left, height above the floor [m] of its corners as OpenCV counts them:
+        corners: x ahead, y left and height above the floor [m] of its corners in OpenCV's order:
             top left, top right, bottom right, bottom left.
     """
 
@@ -64,7 +64,7 @@ class Marker:
         place: tuple[float, float] = (0.0, 0.0),
         yaw: float = 0.0,
     ) -> "Marker":
-        """A marker at a place on the body [m], its top edge turned by a yaw [rad] from ahead."""
+        """Return a marker at a place on the body [m], its top edge turned by a yaw [rad]."""
         ahead_left = 0.5 * size * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
         c, s = np.cos(yaw), np.sin(yaw)
         flat = ahead_left @ np.array([[c, s], [-s, c]]) + np.asarray(place)
@@ -73,7 +73,7 @@ class Marker:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A body and its markers, all of one dictionary; no two of them have the same number."""
+    """A body and its markers, all of one dictionary and with different numbers."""
 
     name: str
     dictionary: str
@@ -90,7 +90,11 @@ class Target:
         return float(np.mean([marker.corners[:, 2] for marker in self.markers]))
 
     def below(self, camera_m: float) -> None:
-        """DataError where a marker is as high as the camera [m], which does not see it then."""
+        """Check that the camera, at a height `camera_m` [m], can see the markers.
+
+        Raises:
+            DataError: a marker is as high as the camera, or higher.
+        """
         for marker in self.markers:
             if (height := float(marker.corners[:, 2].max())) >= camera_m:
                 raise DataError(
@@ -100,7 +104,7 @@ class Target:
 
 
 class _Placed(Section):
-    """Where something lies on the body."""
+    """Size and place of a marker or a board on the body."""
 
     size_m: Positive
     height_m: FiniteFloat
@@ -109,11 +113,13 @@ class _Placed(Section):
 
 
 class _Single(_Placed):
+    """A single marker."""
+
     id: Id
 
 
 class _Board(_Placed):
-    """A grid of markers; its middle is at its place, its first row is ahead."""
+    """A grid of markers around its place, its first row ahead."""
 
     first_id: Id
     columns: Annotated[int, Field(ge=1, le=100)]
@@ -121,7 +127,7 @@ class _Board(_Placed):
     gap_m: Positive
 
     def markers(self) -> list[Marker]:
-        """Its markers, from the one ahead on the left on, row by row."""
+        """Return its markers row by row, beginning with the one ahead on the left."""
         pitch, yaw = self.size_m + self.gap_m, np.radians(self.yaw_deg)
         c, s = np.cos(yaw), np.sin(yaw)
         out = []
@@ -138,26 +144,30 @@ class _Board(_Placed):
 
 
 class _Target(Section):
+    """A body and its markers."""
+
     name: Annotated[str, Field(pattern="^[A-Za-z0-9_-]+$")] = "robot"
     dictionary: str = "4X4_50"
     marker: list[_Single] = Field(default_factory=list)
     board: list[_Board] = Field(default_factory=list)
 
 
-class _File(Section):
+class _TargetsFile(Section):
+    """A file of targets as it stands."""
+
     schema_: Literal["slipid.targets/1"] = Field("slipid.targets/1", alias="schema")
     target: list[_Target] = Field(min_length=1)
 
 
 def read_targets(path: Path) -> tuple[Target, ...]:
-    """What a TOML file says is to be tracked.
+    """Return the targets in a TOML file.
 
     Raises:
-        DataError: unreadable or wrong; no marker, or the same number twice in a dictionary.
+        DataError: unreadable or wrong; no marker, or one number or name twice.
     """
-    given = checked(path, mapping_of(path, text_of(path, "targets to track")), _File)
+    given = checked(path, mapping_of(path, text_of(path, "targets to track")), _TargetsFile)
     targets = tuple(_target(one, f"{path}: target '{one.name}'") for one in given.target)
-    _told_apart(targets, str(path))
+    _check_distinct(targets, str(path))
     return targets
 
 
@@ -178,15 +188,13 @@ def _target(given: _Target, where: str) -> Target:
     return Target(given.name, given.dictionary, tuple(markers))
 
 
-def _told_apart(targets: Sequence[Target], where: str) -> None:
-    """DataError where a number or a name is there twice, or dictionaries differ."""
+def _check_distinct(targets: Sequence[Target], where: str) -> None:
+    """Raise `DataError` where a number or a name occurs twice, or dictionaries differ."""
     if len({target.name for target in targets}) < len(targets):
         raise DataError(f"{where}: two targets with one name; expected names of their own")
     if len({target.dictionary for target in targets}) > 1:
         raise DataError(f"{where}: targets in several dictionaries; expected one for all")
-    seen: set[int] = set()
-    for target in targets:
-        for marker in target.markers:
-            if marker.id in seen:
-                raise DataError(f"{where}: marker {marker.id} twice; expected every number once")
-            seen.add(marker.id)
+    ids = [marker.id for target in targets for marker in target.markers]
+    for k, number in enumerate(ids):
+        if number in ids[:k]:
+            raise DataError(f"{where}: marker {number} twice; expected every number once")

@@ -6,16 +6,20 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.camera.frames.frame import Source, ahead, cut_off, uneven
-from slipid.camera.frames.video import Device
+from slipid.camera.frame import FrameSource, cut_off, read_ahead, uneven
+from slipid.camera.frame_source import Device
 from slipid.camera.opencv import marker_dictionary, opencv
 from slipid.camera.overhead import OverheadCamera
-from slipid.camera.tracking.finder import Finder, MarkerDetector, Region
-from slipid.camera.tracking.poses_file import can_write, write_poses
-from slipid.camera.tracking.preview import can_draw, write_preview
-from slipid.camera.tracking.sightings import look_through, only_marker
+from slipid.camera.tracking.detections import detect_all, only_marker
+from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region
+from slipid.camera.tracking.outputs import (
+    check_drawable,
+    check_writable,
+    write_poses,
+    write_preview,
+)
 from slipid.camera.tracking.target import Marker, Target
-from slipid.camera.tracking.track import Flag, Track, summary, track_of
+from slipid.camera.tracking.track import Flag, TrackedPoses, track_of
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.content import Content
 from slipid.support.errors import DataError
@@ -25,35 +29,35 @@ SCHEMA = "slipid.track/1"
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
-    """What a video told.
+class TrackingResult:
+    """Tracked poses of all bodies in a video.
 
     Attributes:
-        source: what was looked at.
-        tracks: of every body.
-        notes: what a person should know, a sentence each.
-        doubts: why the poses should not be used as they are; empty where nothing speaks against.
-        kept: what was found, to be found again should the poses not be written.
+        source: the frames.
+        tracks: tracked poses of every body.
+        notes: sentences that the user should know.
+        doubts: sentences on why the poses should not be used as they are; none if all is well.
+        checkpoint: the detections, kept until the poses are written.
     """
 
-    source: Source
-    tracks: tuple[Track, ...]
+    source: FrameSource
+    tracks: tuple[TrackedPoses, ...]
     notes: tuple[str, ...]
     doubts: tuple[str, ...]
-    kept: Checkpoint
+    checkpoint: Checkpoint
 
     def write(self, path: Path) -> list[Path]:
-        """Write the poses: one body to this file, of several each to one with its name added."""
+        """Write the poses: one body to this file, several to one file each with its name added."""
         names = [path]
         if len(self.tracks) > 1:
             names = [path.with_stem(f"{path.stem}_{t.target.name}") for t in self.tracks]
         for name, track in zip(names, self.tracks, strict=True):
             write_poses(name, track)
-        self.kept.remove()
+        self.checkpoint.remove()
         return names
 
     def to_json(self) -> Content:
-        """What programs read of it; the poses themselves are in files of their own."""
+        """Return the results for programs; the poses themselves are in files of their own."""
         return {
             "schema": SCHEMA,
             "source": self.source.name,
@@ -64,79 +68,85 @@ class Tracked:
         }
 
 
-def _content(track: Track) -> Content:
+def _content(track: TrackedPoses) -> Content:
     good = track.good.any()
     return {
         "poses": int(track.good.sum()),
         "flags": {flag.word: track.count(flag) for flag in Flag},
         "corner_std_px": track.corner_std,
-        "size": track.usual_size if good else None,
+        "size": track.median_size if good else None,
         "height_m": track.target.height,
-        "height_told_m": track.height_told if good else None,
+        "height_told_m": track.apparent_height if good else None,
     }
 
 
 def track(
-    source: Source,
+    source: FrameSource,
     camera: OverheadCamera,
     targets: tuple[Target, ...],
     checkpoint: Path,
     report: Reporter,
     region: Region | None = None,
-) -> Tracked:
-    """Poses of marked bodies in every frame of a source.
+) -> TrackingResult:
+    """Return the poses of marked bodies in every frame of a source.
 
     Args:
-        source: where the frames come from, see `open_source`.
-        camera: calibrated, with its place above the floor.
+        source: the frames, see `open_source`.
+        camera: calibrated camera with its place above the floor.
         targets: the bodies and their markers, all of one dictionary.
-        checkpoint: folder for what is done, from which it goes on after an interrupt; it is taken
-            away once the poses are written.
-        report: is told how far it is.
-        region: the part of the picture that counts.
+        checkpoint: folder of the checkpoint from which an interrupted job resumes; it is removed
+            once the poses are written.
+        report: receives the progress.
+        region: region of the picture to which detections are limited.
 
     Raises:
         DataError: frames of another size than the camera was calibrated at, no marker in any frame,
             times that do not increase.
     """
-    camera.of_size(source.image_px, source.name)
+    camera.lens.check_size(source.image_px, source.name)
     for target in targets:
         target.below(camera.height)
     ids = frozenset(number for target in targets for number in target.ids)
     if region is not None and region.within(Region(0, 0, *camera.lens.image_px)).empty:
         width, height = camera.lens.image_px
         raise DataError(f"--region lies outside; expected a part of 0,0,{width},{height}")
-    finder = Finder(MarkerDetector(targets[0].dictionary), ids, region)
+    dictionary = targets[0].dictionary
     kept = Checkpoint(
         checkpoint,
         key_of(
-            *(source.identity, targets[0].dictionary, sorted(ids), region),
+            *(source.identity, dictionary, sorted(ids), region),
             *(source_hash("camera"), opencv().__version__),
         ),
     )
-    seen = look_through(source, finder, kept, report)
-    tracks = tuple(track_of(camera, target, seen) for target in targets)
-    notes = [sentence for sentence in (uneven(seen.time),) if sentence]
-    short = cut_off(source, len(seen.frame))
-    doubts = [*([short] if short else []), *(d for t in tracks for d in t.doubts())]
-    return Tracked(source, tracks, (*notes, *summary(tracks)), tuple(doubts), kept)
+    tracker = MarkerTracker(MarkerDetector(dictionary), ids, region)
+    detections = detect_all(source, tracker, kept, report)
+    tracks = tuple(track_of(camera, target, detections) for target in targets)
+    notes = [note for note in (uneven(detections.time),) if note]
+    doubts = [doubt for doubt in (cut_off(source, len(detections.frame)),) if doubt]
+    return TrackingResult(
+        source,
+        tracks,
+        (*notes, *(track.summary() for track in tracks)),
+        (*doubts, *(doubt for track in tracks for doubt in track.doubts())),
+        kept,
+    )
 
 
-def before_long_work(source: Source, out: Path, drawn: Path | None) -> None:
-    """Try what comes after it.
+def check_outputs(source: FrameSource, out: Path, preview: Path | None) -> None:
+    """Check, before the long work, that its results can be written.
 
     Raises:
-        DataError: nothing can be written there, or a device should be drawn: what it showed is
-            gone by then.
+        DataError: nothing can be written there, or a preview of a device is requested, whose frames
+            are gone by then.
     """
-    can_write(out)
-    if drawn is not None:
+    check_writable(out)
+    if preview is not None:
         if isinstance(source, Device):
             raise DataError(
                 f"{source.name}: --preview of a device, whose frames are not kept; expected a "
                 "video or a folder of pictures"
             )
-        can_draw(drawn)
+        check_drawable(preview)
 
 
 @dataclass(frozen=True)
@@ -145,9 +155,10 @@ class LoneMarker:
 
     Attributes:
         size: edge of its black square [m].
-        height: above the floor [m].
+        height: height above the floor [m].
         id: its number; None for the only one that is in view.
-        yaw: of its top edge, counter-clockwise from ahead [rad].
+        dictionary: its dictionary.
+        yaw: angle of its top edge, counter-clockwise from ahead [rad].
     """
 
     size: float
@@ -169,8 +180,8 @@ class LoneMarker:
         if self.id is not None and self.id > most:
             raise DataError(f"--id {self.id}; expected 0 to {most} in {self.dictionary}")
 
-    def target(self, source: Source, region: Region | None = None) -> Target:
-        """The body; its marker is looked for, in a part of the picture, where it has no number.
+    def target(self, source: FrameSource, region: Region | None = None) -> Target:
+        """Return the body; a marker without a number is searched in a region of the picture.
 
         Raises:
             DataError: no marker in view, or several.
@@ -182,24 +193,27 @@ class LoneMarker:
         return Target("robot", self.dictionary, (marker,))
 
 
-def preview(path: Path, tracked: Tracked, camera: OverheadCamera, number: int | None) -> int:
-    """Draw what was found in one frame; the number of that frame.
+def preview(path: Path, result: TrackingResult, camera: OverheadCamera, number: int | None) -> int:
+    """Draw the tracked poses into one frame, and return the number of that frame.
 
     Args:
-        number: of the frame; by default the first one in which every body has a pose.
+        path: the picture to write.
+        result: tracked poses.
+        camera: the camera that took the video.
+        number: number of the frame; by default the first in which every body has a pose.
 
     Raises:
         DataError: there is no frame of that number, or nothing can be written there.
     """
-    tracks = tracked.tracks
+    tracks = result.tracks
     if number is None:
-        all_seen = np.logical_and.reduce([track.good for track in tracks])
-        number = int(tracks[0].frame[int(np.argmax(all_seen))])
+        complete = np.logical_and.reduce([track.good for track in tracks])
+        number = int(tracks[0].frame[int(np.argmax(complete))])
     rows = np.flatnonzero(tracks[0].frame == number)
     if not len(rows):
         raise DataError(
-            f"{tracked.source.name}: no frame {number}; expected 0 to {tracks[0].frame[-1]}"
+            f"{result.source.name}: no frame {number}; expected 0 to {tracks[0].frame[-1]}"
         )
-    with closing(ahead(tracked.source.frames(number))) as frames:
+    with closing(read_ahead(result.source.frames(number))) as frames:
         write_preview(path, next(frames).grey, camera, tracks, int(rows[0]))
     return number

@@ -1,12 +1,13 @@
-"""How the clock of poses goes against that of the robot, from the motion itself.
+"""Clock offset and drift between a run's poses and its robot, estimated from the motion itself.
 
 A camera and a robot that were started by hand have clocks of their own. The motion of the body is
 regressed on what turned (`regression`) at
 
     s = t + offset + drift (t - middle)
 
-with t on the clock of the poses, s on that of the robot. The sizes of both parts of the noise come
-from the residuals, the interval from how far parts of the run disagree.
+where t is the time of a pose on its own clock and s the time on the robot's clock. The noise
+variances are estimated from the residuals, the interval from the disagreement between blocks of
+the run.
 """
 
 from collections.abc import Iterable
@@ -28,36 +29,39 @@ from slipid.data.align.regression import (
 )
 
 COARSE, SEARCHED = 0.05, 0.1
-"""Step of the search for the offset, and least length of the steps that are compared in it [s]."""
+"""Step of the search for the offset, and shortest increment that the search compares [s]."""
 FINE, REACH = 0.01, 0.2
-"""Step and half the width of the search around that [s], with a noise model."""
+"""Step and half width of the second search, with a noise model, around the first one's offset
+[s]."""
 LEAST_SHARED = 1.0
-"""Time that both clocks must share [s]."""
+"""Least overlap of the two clocks that an offset must leave [s]."""
 DRIFT_STD, OTHER_RATE = 1e-4, 1e-2
-"""Prior stds of the drift [1]: quartz errs less; the other where the motion contradicts that, as a
-wrong frame rate does."""
+"""Prior stds of the drift [1]: the first is above the error of any quartz; the second replaces it
+where the motion contradicts the first, for example because the frame rate is wrong."""
 BLOCKS = 10
-"""Parts of a run that are compared for the interval."""
+"""Number of blocks of a run whose disagreement gives the interval."""
 ROUNDS, SETTLED = 20, 6
-"""Rounds of Gauss-Newton, and the first of them, in which the noise is estimated anew."""
+"""Most Gauss-Newton rounds, and the number of first rounds that estimate the noise anew."""
 MOST_LEFT = 0.5
-"""Part of the motion that the best offset may leave unexplained [1]."""
+"""Largest part of the motion that the best offset may leave unexplained [1]."""
 GOOD_STD = 0.03
-"""Largest std of an offset that is used [s]."""
+"""Largest std of an offset that is used at all [s]."""
 SURE_STD = 0.005
-"""Largest std of one that needs no other pair of the run [s]."""
+"""Std of an offset below which no other motion pair of the run is evaluated [s]."""
 
 
 @dataclass(frozen=True)
 class Clock:
-    """The clock of a run's poses: robot's time = t + offset + drift (t - middle).
+    """Clock of a run's poses, with robot's time = t + offset + drift (t - middle).
 
     Attributes:
-        offset: of the robot's clock ahead of the poses', at `middle` [s]; `offset_std` its std.
-        drift: of the robot's clock against the poses' [1]; `drift_std` its std.
-        middle: time on the poses' clock to which the offset belongs [s].
-        left: part of the motion that is not explained [1].
-        source: what turned.
+        offset: the robot's clock minus the poses' clock at `middle` [s].
+        offset_std: its std [s].
+        drift: rate of the robot's clock relative to the poses' clock, less one [1].
+        drift_std: its std [1].
+        middle: time on the poses' clock at which the offset holds [s].
+        unexplained: part of the motion that the regression leaves unexplained [1].
+        source: sensor that the poses were compared with.
     """
 
     offset: float
@@ -65,24 +69,25 @@ class Clock:
     drift: float
     drift_std: float
     middle: float
-    left: float
+    unexplained: float
     source: Literal["wheels", "gyro"]
 
     @property
     def offset_interval90(self) -> tuple[float, float]:
-        """Interval that holds the offset with 90 % [s]."""
+        """Return the 90 % interval of the offset [s]."""
         wide = 1.645 * self.offset_std
         return self.offset - wide, self.offset + wide
 
     def robot_time(self, time: Float[np.ndarray, " pose"]) -> Float[np.ndarray, " pose"]:
-        """Times of poses on the robot's clock [s]."""
+        """Return the times of poses on the robot's clock [s]."""
         return time + self.offset + self.drift * (time - self.middle)
 
 
 def best_clock(pairs: Iterable[MotionPair]) -> Clock | None:
-    """The first clock that is sure, of several pairs of a run, else the surest; None without any.
+    """Return the first certain clock from several motion pairs of a run, else the most certain one.
 
-    Pairs behind the first that is sure are not asked for.
+    The result is None where no pair determines a clock. Pairs after the first certain one are not
+    evaluated.
     """
     found = []
     for pair in pairs:
@@ -94,7 +99,7 @@ def best_clock(pairs: Iterable[MotionPair]) -> Clock | None:
 
 
 def clock_of_poses(pair: MotionPair) -> Clock | None:
-    """The clock of a run's poses; None where its motion does not determine it."""
+    """Return the clock of a run's poses, or None where the motion does not determine it."""
     if len(pair.pose_time) < LEAST_STEPS or len(pair.time) < LEAST_STEPS:
         return None
     steps = pair.increments(pair.step)
@@ -105,28 +110,28 @@ def clock_of_poses(pair: MotionPair) -> Clock | None:
 
 
 def _searched(pair: MotionPair) -> float | None:
-    """Offset at which least of the motion is unexplained, if no other one does about as well."""
+    """Return the offset that explains the motion best, or None if it is not clearly the best."""
     low = pair.time[0] + LEAST_SHARED - pair.pose_time[-1]
     high = pair.time[-1] - LEAST_SHARED - pair.pose_time[0]
     if not high > low:
         return None
     offsets = np.arange(low, high + COARSE, COARSE)
-    left = unexplained([pair], offsets, SEARCHED)
-    best = clear_best(offsets, left)
-    return None if best is None or not left[best] < MOST_LEFT else float(offsets[best])
+    rest = unexplained([pair], offsets, SEARCHED)
+    best = clear_best(offsets, rest)
+    return None if best is None or not rest[best] < MOST_LEFT else float(offsets[best])
 
 
 def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | None:
-    """Gauss-Newton for offset and drift, B profiled out; the interval by blocks."""
+    """Return the clock after Gauss-Newton steps in offset and drift, with B profiled out."""
     middle = 0.5 * float(steps.first[0] + steps.last[-1])
     grid = offset + np.arange(-REACH, REACH + FINE, FINE)
     at, noise = np.array([offset, 0.0]), tuple(StepNoise(0.0, 1.0) for _ in pair.components)
     for _ in range(2):  # the second time with the noise of the first
         every = [linearised(pair, steps, np.array([o, 0.0]), middle, noise) for o in grid]
-        left = [(near.squares, k, near.noise) for k, near in enumerate(every) if near is not None]
-        if not left:
+        fits = [(near.squares, k, near.noise) for k, near in enumerate(every) if near is not None]
+        if not fits:
             return None
-        _, k, noise = min(left)
+        _, k, noise = min(fits)
         at[0] = grid[k]
     quartz, change = True, np.full(2, np.inf)
     for k in range(ROUNDS):
@@ -142,8 +147,8 @@ def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | 
             quartz, settled = False, False
         if settled:
             return _clock(pair, now, at, np.linalg.inv(normal), middle)
-        pull = np.einsum("kci,kc->i", now.slope, now.left) + prior @ at
-        change = np.linalg.solve(normal, pull)
+        gradient = np.einsum("kci,kc->i", now.slope, now.residual) + prior @ at
+        change = np.linalg.solve(normal, gradient)
         at = at - np.clip(change, -COARSE, COARSE)
         noise = now.noise if k < SETTLED else noise
     return None
@@ -156,7 +161,7 @@ def _clock(
     inverse: Float[np.ndarray, "2 2"],
     middle: float,
 ) -> Clock | None:
-    """The clock at an optimum; None where its offset is too uncertain to be used."""
+    """Return the clock at an optimum, or None where its offset is too uncertain to be used."""
     std = _spread(near, inverse)
     std[0] = np.hypot(std[0], pair.body_std)
     if not std[0] < GOOD_STD:
@@ -167,14 +172,14 @@ def _clock(
         drift=float(at[1]),
         drift_std=float(std[1]),
         middle=middle,
-        left=near.share,
+        unexplained=near.share,
         source=pair.source,
     )
 
 
 def _spread(near: Linearised, inverse: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2"]:
-    """Stds of offset and drift: as parts of the run disagree, but no less than by the noise."""
-    blocks = np.array_split(np.arange(len(near.left)), BLOCKS)
-    scores = np.stack([np.einsum("kci,kc->i", near.slope[b], near.left[b]) for b in blocks])
+    """Return the stds of offset and drift from block scores, at least those of the model."""
+    blocks = np.array_split(np.arange(len(near.residual)), BLOCKS)
+    scores = np.stack([np.einsum("kci,kc->i", near.slope[b], near.residual[b]) for b in blocks])
     sandwich = inverse @ (scores.T @ scores) @ inverse * BLOCKS / (BLOCKS - 1)
     return np.asarray(np.sqrt(np.maximum(np.diag(sandwich), np.diag(inverse))))

@@ -1,13 +1,11 @@
-"""One motion, measured twice: by a robot's wheels or gyro, and as poses with times of their own.
-
-Least squares of pose increments on what wheels or a gyro turned, as a function of an offset.
+"""Regression of pose increments on the turns of wheels or gyro, as a function of a time offset.
 
     moved_k = B (turned(last_k + offset) - turned(first_k + offset)) + e_k
 
 It needs no sizes, signs or order of the wheels, but changes of speed: steady motion looks the same
-at any offset. A search compares offsets by what is left over; near the best one `linearised` has
-the derivatives by offset and drift, with a noise model: in e is what the camera errs, which
-neighbouring steps share, and what slip does to each step of its own.
+at any offset. A search compares offsets by the unexplained part of the motion; near the best one
+`linearised` gives the derivatives by offset and drift under a noise model, in which e is the sum of
+pose noise, which neighbouring steps share, and slip, which is independent in each step.
 """
 
 from collections.abc import Sequence
@@ -25,9 +23,11 @@ from slipid.data.wheel_signals import body_steps, integral
 
 @dataclass(frozen=True, eq=False)
 class PoseIncrements:
-    """Begin and end of each step by the times of the poses [s], and how the pose changed.
+    """Increments of the pose over steps.
 
-    The components of `moved` are those of the pair: ahead [m], left [m], yaw [rad].
+    Attributes:
+        first, last: begin and end of each step on the clock of the poses [s].
+        moved: increments of the components of the pair: ahead [m], left [m], yaw [rad].
     """
 
     first: Float[np.ndarray, " step"]
@@ -37,19 +37,20 @@ class PoseIncrements:
 
 @dataclass(frozen=True, eq=False)
 class MotionPair:
-    """Motion of a run by its robot and by its poses.
+    """Motion of a run, measured by the robot's own sensors and by its poses.
 
     Attributes:
-        time, turned: of the robot [s], and angles of its wheels [rad] or what else grows with its
-            motion.
-        pose_time, pose: of the body [s], x, y [m], heading [rad] without wrap-around.
-        source: what turned.
-        step: least length of the steps that are compared [s].
-        collinear: directions of `turned` below this share of the largest are not fitted: on a
-            straight path all wheels say the same.
-        body_std: std of the time by which the body follows what turned [s].
-        components: those of the pose increments that are compared.
-        goes_on: whether the robot moved before and after its record as at its ends; else it stood.
+        time: times of the robot's samples [s].
+        turned: angles of the wheels [rad], or other integrals that grow with the motion.
+        pose_time: times of the poses on their own clock [s].
+        pose: x, y [m], heading [rad] without wrap-around.
+        source: sensor that measured `turned`.
+        step: shortest increment that is compared [s].
+        collinear: singular values of `turned` below this share of the largest are dropped: on a
+            straight path all wheels turn alike.
+        body_std: std of the delay between what turned and the body [s].
+        components: components of the pose increments that are compared.
+        goes_on: True where the motion continues beyond the record as at its ends, else it stops.
     """
 
     time: Float[np.ndarray, " row"]
@@ -71,10 +72,11 @@ class MotionPair:
         pose_time: Float[np.ndarray, " pose"],
         pose: Float[np.ndarray, "pose 3"],
     ) -> "MotionPair":
-        """The pair of wheels and poses. Steps are longer than a roller takes to pass under a wheel.
+        """Return the pair of wheels and poses.
 
-        While a robot accelerates its wheels slip more, and a soft floor gives way: nothing tells
-        that from a body that comes late, by some 10 ms where the floor is firm and more on carpets.
+        Steps are longer than a roller takes to pass under a wheel. While a robot accelerates its
+        wheels slip more, and a soft floor gives way; the data cannot distinguish this from a body
+        that comes late, by some 10 ms where the floor is firm and more on carpets.
         """
         robot = time, angle, pose_time, pose
         return cls(*robot, "wheels", step=0.1, collinear=0.1, body_std=0.015)
@@ -87,12 +89,12 @@ class MotionPair:
         pose_time: Float[np.ndarray, " pose"],
         pose: Float[np.ndarray, "pose 3"],
     ) -> "MotionPair":
-        """The pair of headings and a gyro [rad/s] with a scale and a bias of its own."""
+        """Return the pair of headings and a gyro [rad/s] with a scale and a bias of its own."""
         turned = np.column_stack([integral(time, gyro[:, None]), time])
         return cls(time, turned, pose_time, pose, "gyro", step=0.02, collinear=0.0, components=(2,))
 
     def increments(self, least: float) -> PoseIncrements:
-        """Increments over steps of at least some length [s], none across a gap of the poses."""
+        """Return increments over steps of at least `least` [s], none across a gap in the poses."""
         t = self.pose_time
         usual = max(float(np.median(np.diff(t))), 1e-6)
         stride = max(1, int(np.ceil(least / usual - 1e-6)))
@@ -103,7 +105,7 @@ class MotionPair:
         return PoseIncrements(first[whole], last[whole], moved[whole])
 
     def turned_at(self, at: Float[np.ndarray, " at"]) -> Float[np.ndarray, "at column"]:
-        """Interpolate what had turned at times of the robot."""
+        """Interpolate `turned` at times on the robot's clock."""
         inside = np.clip(at, self.time[0], self.time[-1])
         turned = np.asarray(self._spline(inside))
         if self.goes_on:
@@ -112,7 +114,7 @@ class MotionPair:
         return turned
 
     def rate_at(self, at: Float[np.ndarray, " at"]) -> Float[np.ndarray, "at column"]:
-        """Rate at which it turned then, over a step."""
+        """Return the mean rate of `turned` over one step around each time."""
         half = 0.5 * self.step
         return (self.turned_at(at + half) - self.turned_at(at - half)) / self.step
 
@@ -122,25 +124,25 @@ class MotionPair:
 
     @cached_property
     def _end_rates(self) -> Float[np.ndarray, "2 column"]:
-        """Rates in the first and in the last step of the record."""
+        """Return the mean rates in the first and in the last step of the record."""
         ends = self.time[[0, -1]]
         within = np.clip(ends + self.step * np.array([1.0, -1.0]), *ends)
         return np.asarray((self._spline(within) - self._spline(ends)) / (within - ends)[:, None])
 
 
 LEAST_STEPS = 20
-"""Steps that offset and drift are fitted to."""
+"""Least number of steps that offset and drift are fitted to."""
 LEAST_PER_COLUMN = 3
-"""Steps that a search needs for every column of what turned."""
+"""Least number of steps of a search for every column of `turned`."""
 ELSEWHERE, BETTER = 0.5, 0.02
-"""Other offsets, further away than this [s], must leave more of the motion unexplained, by so much
-of it [1]: steady motion, or the same again and again, determines no offset."""
+"""Offsets further than `ELSEWHERE` [s] from the best one must leave at least `BETTER` more of the
+motion unexplained [1]: steady or periodic motion determines no offset."""
 
 
 def unexplained(
     pairs: Sequence[MotionPair], offsets: Float[np.ndarray, " offset"], step: float
 ) -> Float[np.ndarray, " offset"]:
-    """Part of the motion of all pairs that one B leaves unexplained at each offset.
+    """Return the part of the motion of all pairs that one common B cannot explain, for each offset.
 
     It is the geometric mean of the parts of each component: the profile likelihood, where each
     component has noise of its own size. So units do not matter, and a component that nothing
@@ -151,7 +153,7 @@ def unexplained(
     whole = (moved**2).sum(axis=0)
     moves = whole > 0
 
-    def left(offset: float) -> float:
+    def share(offset: float) -> float:
         turned = np.concatenate(
             [
                 pair.turned_at(one.last + offset) - pair.turned_at(one.first + offset)
@@ -161,70 +163,75 @@ def unexplained(
         if len(turned) < LEAST_PER_COLUMN * turned.shape[1]:
             return 1.0
         rest = moved - turned @ np.linalg.lstsq(turned, moved, rcond=pairs[0].collinear)[0]
-        share = np.where(moves, (rest**2).sum(axis=0) / np.where(moves, whole, 1.0), 1.0)
-        return float(np.exp(np.log(share.clip(1e-12)).mean()))
+        shares = np.where(moves, (rest**2).sum(axis=0) / np.where(moves, whole, 1.0), 1.0)
+        return float(np.exp(np.log(shares.clip(1e-12)).mean()))
 
-    return np.array([left(float(offset)) for offset in offsets])
+    return np.array([share(float(offset)) for offset in offsets])
 
 
 def clear_best(
-    offsets: Float[np.ndarray, " offset"], left: Float[np.ndarray, " offset"]
+    offsets: Float[np.ndarray, " offset"], rest: Float[np.ndarray, " offset"]
 ) -> int | None:
-    """Number of the offset that leaves least; None where one elsewhere does about as well."""
-    best = int(np.argmin(left))
-    others = left[np.abs(offsets - offsets[best]) > ELSEWHERE]
-    return best if others.min(initial=np.inf) > left[best] + BETTER else None
+    """Return the index of the best offset, or None where a distant one is about as good."""
+    best = int(np.argmin(rest))
+    others = rest[np.abs(offsets - offsets[best]) > ELSEWHERE]
+    return best if others.min(initial=np.inf) > rest[best] + BETTER else None
 
 
 @dataclass(frozen=True, eq=False)
 class StepNoise:
-    """Noise in the steps of one component.
+    """Noise in the increments of one component.
 
     Attributes:
-        seen: variance of where the body was seen, which two neighbouring steps share.
-        own: variance of each step of its own, as of slip.
+        shared: variance of a pose, which two neighbouring increments share.
+        separate: variance that is independent in each increment, such as slip.
     """
 
-    seen: float
-    own: float
+    shared: float
+    separate: float
 
     @classmethod
-    def of(cls, left: Float[np.ndarray, " step"], joined: Bool[np.ndarray, " step"]) -> "StepNoise":
-        """Estimate from residuals of steps; those that are `joined` begin where the last ended."""
-        whole = max(float((left**2).mean()), 1e-12)
-        neighbours = (left[1:] * left[:-1])[joined[1:]]
-        seen = float(np.clip(-neighbours.mean(), 0.0, 0.499 * whole)) if len(neighbours) else 0.0
-        return cls(seen, whole - 2.0 * seen)
+    def of(cls, rest: Float[np.ndarray, " step"], joined: Bool[np.ndarray, " step"]) -> "StepNoise":
+        """Estimate the noise from residuals; `joined` steps begin where the previous one ended."""
+        whole = max(float((rest**2).mean()), 1e-12)
+        neighbours = (rest[1:] * rest[:-1])[joined[1:]]
+        shared = float(np.clip(-neighbours.mean(), 0.0, 0.499 * whole)) if len(neighbours) else 0.0
+        return cls(shared, whole - 2.0 * shared)
 
     def whitened(
         self, rows: Float[np.ndarray, "step column"], joined: Bool[np.ndarray, " step"]
     ) -> Float[np.ndarray, "step column"]:
-        """Columns times the inverse root of the covariance: 2 seen + own, and -seen beside it."""
-        beside = np.where(joined[1:], -self.seen, 0.0)
-        band = np.stack([np.full(len(rows), 2.0 * self.seen + self.own), np.append(beside, 0.0)])
+        """Return columns times the inverse root of the covariance.
+
+        The covariance is 2 shared + separate on the diagonal and -shared beside it.
+        """
+        beside = np.where(joined[1:], -self.shared, 0.0)
+        band = np.stack(
+            [np.full(len(rows), 2.0 * self.shared + self.separate), np.append(beside, 0.0)]
+        )
         return np.asarray(solve_banded((1, 0), cholesky_banded(band, lower=True), rows))
 
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """The regression near an offset and a drift, whitened.
+    """The whitened regression, linearised at an offset and a drift.
 
     Attributes:
-        left: weighted residuals.
-        slope: their derivatives by offset and drift, less what another B makes of them.
-        share: part of the motion that is left over.
-        noise: of each component.
+        residual: weighted residuals.
+        slope: their derivatives by offset and drift, with B profiled out.
+        share: part of the motion that is unexplained.
+        noise: noise of each component, estimated from the residuals.
     """
 
-    left: Float[np.ndarray, "step component"]
+    residual: Float[np.ndarray, "step component"]
     slope: Float[np.ndarray, "step component 2"]
     share: float
     noise: tuple[StepNoise, ...]
 
     @property
     def squares(self) -> float:
-        """Sum of the squared weighted residuals."""
-        return float((self.left**2).sum())
+        """Return the sum of the squared weighted residuals."""
+        return float((self.residual**2).sum())
 
 
 def linearised(
@@ -234,11 +241,11 @@ def linearised(
     middle: float,
     noise: Sequence[StepNoise],
 ) -> Linearised | None:
-    """The regression at an offset and a drift about `middle`; None where too few steps are shared.
+    """Return the regression at an offset and a drift, or None where too few steps overlap.
 
     Args:
-        at: offset [s] and drift [1].
-        noise: by which each component is whitened.
+        at: offset at `middle` [s] and drift [1].
+        noise: noise model that whitens each component.
     """
     first, last = (t + at[0] + at[1] * (t - middle) for t in (steps.first, steps.last))
     inside = (first > pair.time[0] + pair.step) & (last < pair.time[-1] - pair.step)
@@ -250,16 +257,16 @@ def linearised(
     begins, ends = pair.rate_at(first), pair.rate_at(last)
     since = np.stack([steps.first[inside], steps.last[inside]]) - middle
     by_drift = ends * since[1][:, None] - begins * since[0][:, None]
-    left, slope, rest, found = [], [], 0.0, []
+    residuals, slopes, squares, found = [], [], 0.0, []
     for y, one in zip(moved.T, noise, strict=True):
         white = one.whitened(np.column_stack([y, turned, ends - begins, by_drift]), joined)
         x, *derivatives = np.split(white[:, 1:], 3, axis=1)
         b = np.linalg.lstsq(x, white[:, 0], rcond=pair.collinear)[0]
         by = np.column_stack([derivative @ b for derivative in derivatives])
-        left.append(x @ b - white[:, 0])
-        slope.append(by - x @ np.linalg.lstsq(x, by, rcond=pair.collinear)[0])
+        residuals.append(x @ b - white[:, 0])
+        slopes.append(by - x @ np.linalg.lstsq(x, by, rcond=pair.collinear)[0])
         residual = turned @ b - y
-        rest += float((residual**2).sum())
+        squares += float((residual**2).sum())
         found.append(StepNoise.of(residual, joined))
-    share = rest / max(float((moved**2).sum()), 1e-12)
-    return Linearised(np.stack(left, 1), np.stack(slope, 1), share, tuple(found))
+    share = squares / max(float((moved**2).sum()), 1e-12)
+    return Linearised(np.stack(residuals, 1), np.stack(slopes, 1), share, tuple(found))

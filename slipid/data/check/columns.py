@@ -1,109 +1,48 @@
-"""Findings of the check: what is wrong or could not be checked, and the remedy.
+"""Findings about the columns of the wheels' channels: wheel speeds, currents and voltages.
 
-Findings from the channels of the wheels alone, without poses or a geometry.
-
-Columns are in another order in one channel than in another; one run is enough for that. Or those of
-commanded and reported wheel speeds are exchanged: a command comes before the motion, and holds
-still in between, so what is called the command then changes later than what is called the measured
-speed, and in more rows.
+Columns of commanded or reported speeds may be in another order than those of the encoders; one run
+is enough to find that. The columns of commanded and reported speeds may be exchanged: a command
+comes before the motion and is constant in between, so the channel that is called the command then
+changes later than the one that is called the measured speed, and in more rows. The sign and order
+of currents and voltages follow from the work that they do, their units from what robots draw.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Iterator, Sequence
+from itertools import permutations
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from slipid.data.check.findings import Finding
+from slipid.data.check.interpretation import Interpretation, columns
 from slipid.data.check.joined import JoinedChannel, JoinedRuns
 from slipid.data.log import Log
 from slipid.data.wheel_signals import integral, interpolate, swapped_order
-from slipid.support.content import Content
 from slipid.support.errors import DataError
 
-Severity = Literal["wrong", "suspicious", "note"]
-"""Wrong: do not fit before it is put right. Suspicious: look. Note: what could not be checked."""
-ORDER: tuple[Severity, ...] = ("wrong", "suspicious", "note")
-NAMED = 4
-"""Runs that a sentence names before it counts the others."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that the check found in runs.
-
-    Attributes:
-        kind: its name, such as `wheel_sign`; the rooms' files list them.
-        found: what is wrong, with numbers.
-        remedy: which key to change, and to what; or None.
-        severity: how bad it is.
-        runs: names of the runs concerned; empty where all are.
-    """
-
-    kind: str
-    found: str
-    remedy: str | None
-    severity: Severity = "wrong"
-    runs: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        where = f" (in {listed(self.runs)})" if self.runs else ""
-        return self.found + where + (f"; {self.remedy}" if self.remedy else "")
-
-    def explained(self, how: str, others: Iterable["Finding"] = ()) -> "Finding":
-        """The finding with how it explains the logs, and the remedies of others that do as well."""
-        more = "".join(f"; or, which explains these logs as well: {o.remedy}" for o in others)
-        return replace(self, found=f"{self.found}: {how}", remedy=f"{self.remedy}{more}")
-
-    def to_json(self) -> Content:
-        """Its part of check.json."""
-        return {
-            "kind": self.kind,
-            "severity": self.severity,
-            "found": self.found,
-            "remedy": self.remedy,
-            "runs": list(self.runs),
-        }
-
-
-def listed(names: Sequence[str]) -> str:
-    """The first few names, and how many more there are."""
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
-def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Findings with those first that forbid a fit."""
-    return tuple(sorted(findings, key=lambda f: ORDER.index(f.severity)))
-
-
-def wrong(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Findings that forbid a fit."""
-    return tuple(f for f in findings if f.severity == "wrong")
-
-
 SAME = ("wheel_sign", "wheel_order", "command_sign", "command_order")
-"""Findings from the poses of all runs together, which say it better."""
+"""Findings from the poses of all runs that make a finding about wheel columns redundant."""
 BROUGHT = ("wheel_scale", "wheel_speed_unit")
-"""Findings that columns in another order may bring about; they come again once it is right."""
+"""Findings that a wrong order of columns may cause; they come back if they remain in the right
+order."""
 STEP_S = 0.5
-"""Length of a step [s]: delays and jitter do not matter."""
+"""Length of a compared step [s]; delays and jitter are small beside it."""
 CHANNELS = ("wheel_speed_command", "wheel_speed")
 """Channels that are compared with the encoders."""
 LONGEST_S = 1.0
-"""Lags between command and motion that are looked at, either way [s]."""
+"""Largest lag of either sign between command and motion that is searched [s]."""
 MOST_SHIFTS = 50
-"""The same in rows, for time in a wrong unit."""
+"""Largest lag in rows, which limits the search where time is in a wrong unit."""
 MOST_ROWS = 20_000
-"""Rows that are looked at."""
+"""Most rows that are compared."""
 ALIKE = 0.3
-"""Correlation from which a lag is believed."""
+"""Least correlation for which a lag is used."""
 BUSIER = 1.5
-"""Times as many rows in which a measured speed changes as in a command."""
+"""Least ratio between the numbers of rows in which the two speeds change."""
 
 
 def misordered(logs: Sequence[Log]) -> Iterator[Finding]:
-    """A finding for every channel and every order in which its columns are those of the wheels."""
+    """Yield a finding for every channel whose columns fit the encoders only in another order."""
     found: dict[tuple[str, tuple[int, ...]], list[str]] = {}
     for log in logs:
         for name, order in _orders(log):
@@ -121,13 +60,13 @@ def misordered(logs: Sequence[Log]) -> Iterator[Finding]:
 
 
 def refuse_misordered(logs: Sequence[Log]) -> None:
-    """DataError with all findings, for commands that look for no other mistakes."""
+    """Raise `DataError` with all findings, for commands that check for no other mistakes."""
     if listed := "\n".join(f"not used: {finding}" for finding in misordered(logs)):
         raise DataError(listed)
 
 
 def _orders(log: Log) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Channels of a run whose columns are those of the wheels in another order, and that order."""
+    """Yield the channels of a run that fit the encoders only in another order, with that order."""
     edges = np.linspace(log.time[0], log.time[-1], max(2, int(log.duration / STEP_S) + 1))
     measured: Float[np.ndarray, "step wheel"] | None = None
     for name in CHANNELS:
@@ -142,7 +81,7 @@ def _orders(log: Log) -> Iterator[tuple[str, tuple[int, ...]]]:
 
 
 def exchanged(data: JoinedRuns) -> Iterator[Finding]:
-    """The finding, if columns are exchanged."""
+    """Yield the finding that commanded and measured wheel speeds are exchanged, if they are."""
     if data.commanded is None or data.reported is None:
         return
     row = float(np.median(data.row))
@@ -155,10 +94,10 @@ def exchanged(data: JoinedRuns) -> Iterator[Finding]:
         return
     most = min(int(LONGEST_S / row), MOST_SHIFTS)
     shifts = np.arange(-most, most + 1)
-    alike = np.array([_correlation(command, speed, int(k)) for k in shifts])
-    best = int(np.argmax(alike))
+    correlation = np.array([_correlation(command, speed, int(k)) for k in shifts])
+    best = int(np.argmax(correlation))
     busy = [float((np.abs(x) > 1e-3 * np.abs(x).max()).mean()) for x in (command, speed)]
-    if alike[best] > ALIKE and shifts[best] < 0 and busy[0] > BUSIER * busy[1]:
+    if correlation[best] > ALIKE and shifts[best] < 0 and busy[0] > BUSIER * busy[1]:
         yield Finding(
             "command_exchanged",
             f"what is called the commanded wheel speed comes {-shifts[best] * row:.2g} s after the "
@@ -175,15 +114,210 @@ def _changes(
     row: float,
     inside: Bool[np.ndarray, " at"],
 ) -> Float[np.ndarray, "change wheel"]:
-    """Change of a speed from row to row [rad/s], zero across the ends of runs."""
+    """Return the change of a speed from row to row [rad/s], zero across the ends of runs."""
     speed = (channel.at(when + row) - channel.at(when)) / row
     speed[~inside] = np.nan
     return np.nan_to_num(np.diff(speed, axis=0))
 
 
 def _correlation(command: np.ndarray, speed: np.ndarray, shift: int) -> float:
-    """Of a command with the speed so many rows later."""
+    """Return the correlation of a command with the speed `shift` rows later."""
     n = len(command) - abs(shift)
     first, second = (command[:n], speed[-n:]) if shift >= 0 else (command[-n:], speed[:n])
     size = np.sqrt((first**2).sum() * (second**2).sum())
     return float((first * second).sum() / size) if size > 0 else 0.0
+
+
+BACKWARDS = -0.25
+"""A sign is wrong where work over the sum of its magnitudes is below this [1]."""
+ORDERED = 0.4
+"""Another order of the columns must give every wheel a larger share of work than this, and a sum
+that exceeds the best sum with other signs by as much [1]."""
+MOST_ORDERED = 6
+"""Most wheels for which every order is tried."""
+SIDED = 0.1
+"""A current has the sign of the power where its share of work exceeds this forwards and is below
+its negative backwards [1]."""
+MOST_A_PER_KG = 2.5
+"""Continuous current of one motor per mass of the robot, which no wheeled robot draws [A/kg]."""
+MOST_A = 8.0
+"""Current that is plausible in addition, whatever the mass [A]."""
+MOST_UNWEIGHED_A = 200.0
+"""Implausible current where the mass is not known [A]."""
+LEAST_A = 0.005
+"""Current of a driving motor below which the unit is wrong [A]."""
+MOST_V, LEAST_V = 200.0, 0.2
+"""Largest and smallest plausible voltages of the motors of such robots [V]."""
+POWER = (0.003, 60.0)
+"""Range of electrical power over mass, gravity and speed of any robot that rolls or climbs [1]."""
+GRAVITY = 9.81
+
+
+def electric(
+    data: JoinedRuns, meant: Interpretation, radius: float, mass_kg: float | None, by_power: bool
+) -> Iterator[Finding]:
+    """Yield findings about currents and voltages.
+
+    Args:
+        meant: the right order and signs of the wheels.
+        radius: radius of the wheels [m].
+        mass_kg: mass of the robot, or None where it is not known.
+        by_power: whether the speeds are right, so that the power can be compared with them.
+    """
+    declared = _speeds(data)
+    speed = declared @ columns(meant, data.wheels).T
+    driving = np.abs(speed).max(axis=1, initial=0.0) > 0.2 * np.nanquantile(np.abs(speed), 0.95)
+    for channel, name in ((data.current, "current"), (data.voltage, "voltage")):
+        if channel is None or (name == "current" and not data.current_is_signed):
+            continue
+        yield from _sign_findings(channel.value[driving], speed[driving], declared[driving], name)
+    current = None if data.current is None else np.abs(data.current.value[driving])
+    volts = data.bus if data.voltage is None else data.voltage
+    voltage = None if volts is None else np.abs(volts.value[driving])
+    power = None
+    if by_power and current is not None and voltage is not None and mass_kg is not None:
+        watts = float(np.nanmean((current * voltage).sum(axis=1)))
+        rim = float(np.nanmean(np.abs(speed[driving]).mean(axis=1))) * radius
+        power = watts / max(mass_kg * GRAVITY * rim, 1e-9)
+    sizes = [*_size_of_voltage(voltage), *_size_of_current(current, mass_kg)]
+    if not sizes and power is not None and not POWER[0] <= power <= POWER[1]:
+        yield Finding(
+            "current_unit",
+            f"the motors take {power:.3g} times the power of lifting the robot at its speed",
+            "correct the unit of current (mA?) or voltage (mV?), or mass_kg in [robot]",
+        )
+    yield from sizes
+
+
+def _speeds(data: JoinedRuns) -> Float[np.ndarray, "row wheel"]:
+    """Return the speed of each column's wheel [rad/s], zero between runs."""
+    step = np.diff(data.angle.time)
+    speed = np.diff(data.angle.value, axis=0) / step[:, None]
+    run = data.runs_of(data.angle.time)
+    speed[np.diff(run) > 0] = 0.0
+    return np.concatenate([speed, speed[-1:]])
+
+
+def _sign_findings(
+    values: Float[np.ndarray, "row wheel"],
+    speed: Float[np.ndarray, "row wheel"],
+    declared: Float[np.ndarray, "row wheel"],
+    name: str,
+) -> Iterator[Finding]:
+    """Yield findings about signs and order: motors must do positive work, so sum value x speed > 0.
+
+    Args:
+        speed: wheel speeds in the right order and with the right signs.
+        declared: wheel speeds as declared.
+        name: name of the channel.
+    """
+    work = np.nan_to_num(values * speed)
+    forwards, backwards = (_share(work[turns]) for turns in (speed > 0, speed < 0))
+    if name == "current" and forwards > SIDED and backwards < -SIDED:
+        both = "currents are positive in both directions of the wheels"
+        if np.nanmin(values) < 0.0:
+            yield Finding(
+                "current_of_supply",
+                f"{both}, and negative at times: they are currents of the supply, with the sign of "
+                "the power, not of the torque",
+                "take the current out of the layout, or log that of each motor",
+                "note",
+            )
+        else:
+            yield Finding(
+                "current_of_supply",
+                f"{both}: they are magnitudes, which do not distinguish driving from braking",
+                "set current_is_signed = false in the layout",
+                "note",
+            )
+        return
+    if order := _other_order(values, speed, declared):
+        listed = ", ".join(str(k + 1) for k in order)
+        yield Finding(
+            f"{name}_order",
+            f"the columns of the {name} are in another order than the wheels: number {listed} "
+            f"go with wheels 1 to {len(order)}",
+            f"name the columns of the channel {name} in the order {listed}",
+        )
+        return
+    share = np.array([_share(column) for column in work.T])
+    turned = np.flatnonzero(share < BACKWARDS)
+    if not len(turned):
+        return
+    every = len(turned) == len(share)
+    which = "every wheel" if every else "wheel " + " and ".join(str(k + 1) for k in turned)
+    yield Finding(
+        f"{name}_sign",
+        f"the {name} of {which} brakes where the motor should drive: its product with the wheel's "
+        f"speed sums to {share[turned].min():+.2f} of its magnitude",
+        f"set scale = -1 for {'the channel' if every else 'its column of the channel'} {name}, "
+        "if it is 1 (else turn its sign)",
+    )
+
+
+def _other_order(
+    values: Float[np.ndarray, "row wheel"],
+    speed: Float[np.ndarray, "row wheel"],
+    declared: Float[np.ndarray, "row wheel"],
+) -> tuple[int, ...] | None:
+    """Return the column of each wheel, where another order explains more than other signs do.
+
+    Columns in the declared order of the encoders are right, even where that is not the wheels'.
+    """
+    wheels = range(speed.shape[1])
+    if len(wheels) > MOST_ORDERED:
+        return None
+    share, as_declared = (_shares(values, one) for one in (speed, declared))
+    best = max(permutations(wheels), key=lambda order: float(share[list(order), wheels].sum()))
+    ordered = share[list(best), wheels]
+    signs = max(float(np.abs(np.diagonal(one)).sum()) for one in (share, as_declared))
+    return best if ordered.min() > ORDERED and ordered.sum() > signs + ORDERED else None
+
+
+def _shares(
+    values: Float[np.ndarray, "row wheel"], speed: Float[np.ndarray, "row wheel"]
+) -> Float[np.ndarray, "wheel wheel"]:
+    """Return the `_share` of every column with every wheel's speed."""
+    return np.array([[_share(np.nan_to_num(v * w)) for w in speed.T] for v in values.T])
+
+
+def _share(work: np.ndarray) -> float:
+    """Return the work over the sum of its magnitudes, 0 where there is none."""
+    total = float(np.abs(work).sum())
+    return float(work.sum()) / total if total > 0 else 0.0
+
+
+def _size_of_current(amps: np.ndarray | None, mass_kg: float | None) -> Iterator[Finding]:
+    """Yield a finding where currents are not what such a robot draws."""
+    if amps is None or not np.nanmax(amps, initial=0.0) > 0:
+        return
+    high = float(np.nanquantile(amps, 0.95))
+    most = MOST_UNWEIGHED_A if mass_kg is None else MOST_A + MOST_A_PER_KG * mass_kg
+    weighs = "" if mass_kg is None else f" for a robot of {mass_kg:g} kg"
+    if high > most:
+        yield Finding(
+            "current_unit",
+            f"the motors draw {high:.4g} A{weighs}, where at most {most:.3g} A are to be expected",
+            "set unit = 'mA' for the channel current (scale = 0.001)",
+        )
+    elif high < LEAST_A:
+        yield Finding(
+            "current_unit",
+            f"the motors draw no more than {high:.2g} A while they drive",
+            "set unit = 'A' for the channel current, if it is declared in mA (scale = 1000)",
+        )
+
+
+def _size_of_voltage(volts: np.ndarray | None) -> Iterator[Finding]:
+    """Yield a finding where voltages are not what such a robot has."""
+    if volts is None or not np.nanmax(volts, initial=0.0) > 0:
+        return
+    high = float(np.nanquantile(volts, 0.95))
+    if LEAST_V <= high <= MOST_V:
+        return
+    unit, scale = ("mV", "0.001") if high > MOST_V else ("V", "1000")
+    yield Finding(
+        "voltage_unit",
+        f"the motors see {high:.4g} V while they drive",
+        f"set unit = '{unit}' for the channel voltage or bus_voltage (scale = {scale})",
+    )

@@ -1,13 +1,13 @@
-"""An interpretation of the logs: which column is which wheel, which sign each has, how axes lie.
+"""Interpretations of the logs: which column is which wheel, with which sign, and how axes lie.
 
-The declared interpretation has no mistake; each candidate differs from it by one. How badly
-one fits is the sum of what it leaves unexplained, each a share of 0 to 1 and each blind to lengths,
-so that slip does not count against the true one:
+The declared interpretation has no mistake; each candidate differs from it by one. The misfit of an
+interpretation is a sum of unexplained shares, each from 0 to 1 and each independent of lengths, so
+that slip does not count against the true one:
 
-    pose, and commanded twist   steps of the body along each axis, by those that wheels predict
+    pose, and commanded twist   increments of the body along each axis, by those that wheels predict
     wheels                      turns that no motion of a rigid body makes (beyond three wheels)
-    commanded wheel speeds      turns, by those that were commanded
-    gyro                        turns of the heading, by those of the gyro
+    commanded wheel speeds      turns, by the commanded ones
+    gyro                        increments of the heading, by those of the gyro
 """
 
 from collections.abc import Mapping
@@ -30,21 +30,22 @@ from slipid.data.check.joined import (
 from slipid.model.geometry import Geometry
 
 STILL = 1e-3
-"""Share of the wheels' predicted motion along an axis below which the axis is not looked at."""
+"""Share of the predicted motion along an axis below which the axis is not compared."""
 
 
 @dataclass(frozen=True)
 class Interpretation:
-    """One meant of the columns.
+    """One interpretation of the columns.
 
     Attributes:
-        order: column that each wheel is found in, counted from 0; empty for the declared order.
-        sign: of each wheel's column; empty where all are as declared.
-        azimuth: to be added to the declared directions of all wheels [deg].
-        convention: how the pose is meant.
-        command_order, command_sign: as `order` and `sign`, of the commanded wheel speeds.
-        twist_sign: of the commanded x, y and yaw rate.
-        gyro_sign: of the gyro.
+        order: column of each wheel, counted from 0; empty for the declared order.
+        sign: sign of each wheel's column; empty where all are as declared.
+        azimuth: correction to the declared directions of all wheels [deg].
+        convention: convention of the poses.
+        command_order: `order` for the commanded wheel speeds.
+        command_sign: `sign` for the commanded wheel speeds.
+        twist_sign: signs of the commanded x, y and yaw rate.
+        gyro_sign: sign of the gyro.
     """
 
     order: tuple[int, ...] = ()
@@ -59,27 +60,40 @@ class Interpretation:
 
 @dataclass(frozen=True, eq=False)
 class Commanded:
-    """Products of turns with commanded turns (wheel, wheel), and both sums of squares [rad^2]."""
+    """Products of measured and commanded turns.
+
+    Attributes:
+        across: sums of products of turns and commanded turns (wheel, wheel) [rad^2].
+        turns: sum of squared turns [rad^2].
+        commanded: sum of squared commanded turns [rad^2].
+    """
 
     across: Float[np.ndarray, "wheel wheel"]
     turns: float
     commanded: float
 
+    def product(self, meant: Interpretation) -> float:
+        """Return the product of turns and commanded turns under an interpretation [rad^2]."""
+        wheels = len(self.across)
+        turned, command = (
+            columns(meant, wheels),
+            Interpretation(meant.command_order, meant.command_sign),
+        )
+        return float(np.trace(turned @ self.across @ columns(command, wheels).T))
+
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Products that interpretations are compared with.
+    """Products from which the misfit of every interpretation is computed.
 
     Attributes:
-        rolling: J / r, turns of each wheel per step of the body, heading in metres at the base
-            radius (wheel, 3) [rad/m].
+        rolling: J / r, turns of each wheel per increment of the body (wheel, 3) [rad/m]; the
+            heading counts in metres at the base radius.
         base: base radius [m].
-        pose: products of the declared turns with the body's steps, for each bare convention.
+        pose: products of the declared turns with the body's increments, for each bare convention.
         twist: the same with the commanded twist, or None.
-        command: products of the declared turns with the commanded ones (wheel, wheel), and the sums
-            of squares of both, or None.
-        gyro: covariance of gyro and heading over the product of their spreads, for each bare
-            convention, or None where neither turns.
+        command: products of the declared turns with the commanded ones, or None.
+        gyro: correlation of gyro and heading for each bare convention, or None where neither turns.
     """
 
     rolling: Float[np.ndarray, "wheel 3"]
@@ -91,17 +105,17 @@ class Evidence:
 
     @property
     def wheels(self) -> int:
-        """Number of wheels."""
+        """Return the number of wheels."""
         return len(self.rolling)
 
     @property
     def free(self) -> bool:
-        """Whether the wheels fix all three parts of the twist."""
+        """Return whether the wheels determine all three components of the twist."""
         return bool(np.linalg.matrix_rank(self.rolling, tol=1e-6) == 3)
 
 
 def gather(geometry: Geometry, at: StepEdges, moved: ChannelIncrements) -> Evidence:
-    """Products of all channels, for a robot of the declared geometry."""
+    """Return the products of all channels, for a robot of the declared geometry."""
     base = float(geometry.base_radius)
     rolling = np.asarray(geometry.forward()) / float(geometry.wheel_radius) / [1.0, 1.0, base]
     pose: dict[PoseConvention, Products] = {}
@@ -117,19 +131,20 @@ def gather(geometry: Geometry, at: StepEdges, moved: ChannelIncrements) -> Evide
     twist = None if moved.twist is None else products(moved.wheels, moved.twist, base, rounds=0)
     if twist is not None and not np.trace(twist.body) > 0:
         twist = None
-    alike = gyro if any(gyro.values()) else None
-    return Evidence(rolling, base, pose, twist, _commanded(moved), alike)
+    turns = gyro if any(gyro.values()) else None
+    return Evidence(rolling, base, pose, twist, _commanded(moved), turns)
 
 
 def _correlation_with_gyro(gyro: np.ndarray, body: np.ndarray, found: Products) -> float:
-    """Covariance of gyro and heading over the product of their spreads; 0 where none turns."""
+    """Return the correlation of gyro and heading, 0 where one of them never turns."""
     turned = np.stack([gyro[found.known, 0], body[found.known, 2]])
-    (own, both), (_, other) = (turned * found.weight) @ turned.T
-    return float(both / np.sqrt(own * other)) if own * other > 0 else 0.0
+    (gyro_square, both), (_, pose_square) = (turned * found.weight) @ turned.T
+    size = np.sqrt(gyro_square * pose_square)
+    return float(both / size) if size > 0 else 0.0
 
 
 def _commanded(moved: ChannelIncrements) -> Commanded | None:
-    """Products of turns with commanded ones."""
+    """Return the products of turns and commanded turns, or None where none were commanded."""
     if moved.commanded is None:
         return None
     known = usable(moved.wheels, moved.commanded)
@@ -140,12 +155,12 @@ def _commanded(moved: ChannelIncrements) -> Commanded | None:
 
 
 def misfit(evidence: Evidence, meant: Interpretation) -> float:
-    """Sum of the unexplained shares of an interpretation."""
+    """Return the sum of the unexplained shares of an interpretation."""
     return sum(misfits(evidence, meant).values())
 
 
 def misfits(evidence: Evidence, meant: Interpretation) -> dict[str, float]:
-    """Unexplained share of each thing that interpretations are compared with."""
+    """Return the unexplained share of each compared channel by its name."""
     convention = meant.convention
     bare = convention.bare
     pose = evidence.pose.get(bare)
@@ -166,7 +181,7 @@ def misfits(evidence: Evidence, meant: Interpretation) -> dict[str, float]:
 
 
 def columns(meant: Interpretation, wheels: int) -> Float[np.ndarray, "wheel wheel"]:
-    """Turns of the true wheels from the declared columns: a permutation with signs."""
+    """Return the signed permutation that takes the declared columns to the true wheels."""
     order, sign = meant.order or tuple(range(wheels)), meant.sign or (1,) * wheels
     out = np.zeros((wheels, wheels))
     out[np.arange(wheels), list(order)] = sign
@@ -174,7 +189,7 @@ def columns(meant: Interpretation, wheels: int) -> Float[np.ndarray, "wheel whee
 
 
 def to_body(evidence: Evidence, meant: Interpretation) -> Float[np.ndarray, "3 wheel"]:
-    """Steps of the body from the declared columns, by wheels that roll without slip."""
+    """Return the map from declared columns to increments of the body, for wheels without slip."""
     inverse = np.linalg.pinv(evidence.rolling, rcond=1e-6)
     turned = rotation(meant.azimuth) @ inverse
     return np.asarray(turned @ columns(meant, evidence.wheels))
@@ -186,32 +201,32 @@ def _unexplained(
     axes: Float[np.ndarray, "3 3"],
     free: bool,
 ) -> float:
-    """Share of the body's motion that the predicted one does not explain, at a factor per axis.
+    """Return the share of the body's motion that the prediction, with a factor per axis, leaves.
 
-    Sideways and turning motion count by the mean of their shares in what is predicted and in what
-    the poses have: lengths in a wrong unit must not hide either. Wheels that do not fix the twist
+    Sideways and turning motion count by the mean of their shares in the prediction and in the
+    poses: lengths in a wrong unit must not hide either. Wheels that do not determine the twist
     (not `free`) determine one direction, which has one factor.
     """
     predicted = np.einsum("aw,wv,av->a", predict, of.turns, predict)
     both = np.einsum("aw,wa->a", predict, of.across @ axes.T)
-    own = np.diag(axes @ of.body @ axes.T)
+    measured = np.diag(axes @ of.body @ axes.T)
     total = predicted.sum()
-    if not total > 0 or not own.sum() > 0:
+    if not total > 0 or not measured.sum() > 0:
         return 1.0
     moves = predicted > STILL * total
     explained = np.where(moves, both.clip(0) ** 2 / np.where(moves, predicted, 1.0), 0.0)
     if not free and moves[:2].any():  # wheels that roll in one direction only: no factor per axis
         explained[:2] = 0.5 * max(both[:2].sum(), 0.0) ** 2 / predicted[:2].sum()
-    along = 1.0 - explained[:2].sum() / max(own[:2].sum(), 1e-300)
-    about = 1.0 - explained[2] / max(own[2], 1e-300)
-    share = 0.5 * (predicted[2] / total + own[2] / own.sum())
+    along = 1.0 - explained[:2].sum() / max(measured[:2].sum(), 1e-300)
+    about = 1.0 - explained[2] / max(measured[2], 1e-300)
+    share = 0.5 * (predicted[2] / total + measured[2] / measured.sum())
     return float((1 - share) * along + share * about)
 
 
 def _beyond_rigid(
     of: Products, rolling: Float[np.ndarray, "wheel 3"], wheels: Float[np.ndarray, "wheel wheel"]
 ) -> float:
-    """Share of the turns that no motion of a rigid body makes without slip."""
+    """Return the share of the turns that no motion of a rigid body makes without slip."""
     basis, values, _ = np.linalg.svd(rolling, full_matrices=False)
     basis = basis[:, values > 1e-6 * values[0]]
     turns = wheels @ of.turns @ wheels.T
@@ -220,9 +235,5 @@ def _beyond_rigid(
 
 
 def _uncommanded(of: Commanded, meant: Interpretation) -> float:
-    """Share of the turns that the commanded ones do not explain, at one factor."""
-    wheels = len(of.across)
-    mine = columns(meant, wheels)
-    theirs = Interpretation(meant.command_order, meant.command_sign)
-    both = float(np.trace(mine @ of.across @ columns(theirs, wheels).T))
-    return 1.0 - max(both, 0.0) ** 2 / max(of.turns * of.commanded, 1e-300)
+    """Return the share of the turns that the commanded ones, times one factor, do not explain."""
+    return 1.0 - max(of.product(meant), 0.0) ** 2 / max(of.turns * of.commanded, 1e-300)

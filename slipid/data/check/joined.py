@@ -1,14 +1,14 @@
-"""The channels of all runs on one clock, and their increments over the same steps.
+"""Channels of all runs on one clock, and their increments over the same steps.
 
-Conventions by which a logged pose may be meant, and the body's steps under each.
+It also has the conventions by which a logged pose may be meant, with the body's increments under
+each, and the products of increments from which interpretations are compared.
 
-Products of increments of wheels, commands and poses, by which interpretations are compared.
-
-A robust fit of the body's steps on the wheels' turns finds outliers, whatever wheels and axes mean:
+A robust fit of the body's increments on the wheels' turns finds outliers, whatever wheels and axes
+mean:
 
     body = K turn,    weight = (1 + (|residual| / s)^2)^-2,    s = 2 median |residual|
 
-since a linear map of turns swallows order, signs, radius, azimuths and heading offset alike.
+since a linear map of turns absorbs order, signs, radius, azimuths and heading offset alike.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from slipid.data.wheel_signals import body_increments, integral, interpolate
 STEP_S = 0.4
 """Length of a step [s]: long beside jitter and rounding, short beside a turn of the robot."""
 MOST_STEPS = 20_000
-"""Steps beyond which they are made longer; that happens where time is in the wrong unit."""
+"""Most steps; where there are more, as with time in a wrong unit, steps are longer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class JoinedChannel:
     """One channel of all runs, end to end on the clock of `JoinedRuns`.
 
     Attributes:
-        time: on that clock [s], increasing.
+        time: times of the rows, increasing [s].
         value: one column per wheel or axis; nan in runs that lack the channel.
     """
 
@@ -41,27 +41,27 @@ class JoinedChannel:
     value: Float[np.ndarray, "row column"]
 
     def at(self, when: Float[np.ndarray, " at"]) -> Float[np.ndarray, "at column"]:
-        """Values at other times of the clock [s], linear in between."""
+        """Return values at other times of the clock [s], linear in between."""
         return interpolate(self.time, self.value, when)
 
 
 @dataclass(frozen=True, eq=False)
 class JoinedRuns:
-    """The channels of all runs, run after run on one clock with pauses in between.
+    """Channels of all runs, run after run on one clock with pauses in between.
 
     Attributes:
-        names: of the runs.
-        begin: when each run's poses and encoders begin (run,) [s].
-        end: when they end (run,) [s].
-        row: usual time between rows of each run (run,) [s].
+        names: names of the runs.
+        begin: time at which each run's poses and encoders begin (run,) [s].
+        end: time at which they end (run,) [s].
+        row: median time between rows of each run (run,) [s].
         angle: angle of each wheel [rad].
         pose: x [m], y [m], heading [rad] where it is fresh.
         reported: integral of the reported wheel speeds [rad], or None.
         commanded: integral of the commanded wheel speeds [rad], or None.
         twist: integral of the commanded twist in the body's axes [m, m, rad], or None.
         gyro: integral of the yaw rate [rad], or None.
-        current: of each motor [A], or None.
-        voltage: of each motor [V], or None.
+        current: current of each motor [A], or None.
+        voltage: voltage of each motor [V], or None.
         bus: voltage of the battery [V], or None.
         current_is_signed: False where some run has magnitudes only.
     """
@@ -83,22 +83,24 @@ class JoinedRuns:
 
     @property
     def wheels(self) -> int:
-        """Number of wheels."""
+        """Return the number of wheels."""
         return self.angle.value.shape[1]
 
     def runs_of(self, when: Float[np.ndarray, " at"]) -> Int[np.ndarray, " at"]:
-        """Run that each time of the clock belongs to."""
+        """Return the index of the run at each time of the clock."""
         return np.searchsorted(self.begin, when + 1e-9, side="right") - 1
 
 
 @dataclass(frozen=True, eq=False)
 class StepEdges:
-    """Times between which motion is compared, and where the poses were then.
+    """Steps over which motion is compared, with the poses at their ends.
 
     Attributes:
-        before, after: begin and end of each step on the clock of `JoinedRuns` (step,) [s].
-        run: that each step belongs to (step,).
-        pose_before, pose_after: poses then (step, 3), as logged.
+        before: begin of each step on the clock of `JoinedRuns` (step,) [s].
+        after: end of each step (step,) [s].
+        run: index of the run of each step (step,).
+        pose_before: pose at the begin, as logged (step, 3).
+        pose_after: pose at the end, as logged (step, 3).
     """
 
     before: Float[np.ndarray, " step"]
@@ -113,10 +115,10 @@ class ChannelIncrements:
     """Increments of the robot's own channels over the same steps.
 
     Attributes:
-        wheels: rotation of each wheel [rad]; nan where it was not recorded for the whole step.
-        commanded: rotation of each wheel that was commanded [rad], or None.
-        twist: step of the body that was commanded, in its axes [m, m, rad], or None.
-        gyro: turn by the gyro [rad], or None.
+        wheels: rotation of each wheel [rad]; nan where it was not logged for the whole step.
+        commanded: commanded rotation of each wheel [rad], or None.
+        twist: commanded increment of the body in its axes [m, m, rad], or None.
+        gyro: rotation measured by the gyro [rad], or None.
     """
 
     wheels: Float[np.ndarray, "step wheel"]
@@ -126,7 +128,7 @@ class ChannelIncrements:
 
 
 def joined(data: Runs) -> JoinedRuns:
-    """Channels of runs on one clock; with a second between them."""
+    """Return the channels of runs on one clock, with a second between runs."""
     first = np.array([log.time[0] for log in data.logs])
     length = np.array([log.duration for log in data.logs])
     starts = np.concatenate([[0.0], np.cumsum(length + 1.0)])[:-1]
@@ -166,7 +168,7 @@ def joined(data: Runs) -> JoinedRuns:
 
 
 def _columns(log: Log, values: np.ndarray | None, summed: bool) -> np.ndarray | None:
-    """Columns of a channel of a run, or their integrals."""
+    """Return the columns of a channel of a run, or their integrals."""
     if values is None:
         return None
     columns = values.reshape(log.samples, -1)
@@ -174,7 +176,7 @@ def _columns(log: Log, values: np.ndarray | None, summed: bool) -> np.ndarray | 
 
 
 def edges(data: JoinedRuns) -> StepEdges:
-    """Steps of about `STEP_S` of every run, from its first pose to its last."""
+    """Return steps of about `STEP_S` of every run, from its first pose to its last."""
     length = data.end - data.begin
     step = max(min(STEP_S, float(np.median(length)) / 8), float(np.median(data.row)))
     step = max(step, float(length.sum()) / MOST_STEPS)
@@ -188,7 +190,7 @@ def edges(data: JoinedRuns) -> StepEdges:
 
 
 def increments(data: JoinedRuns, at: StepEdges, lag: float) -> ChannelIncrements:
-    """Increments of the robot's channels, `lag` [s] before the steps of the poses."""
+    """Return increments of the robot's channels, `lag` [s] before the steps of the poses."""
     slack, before, after = data.row[at.run], at.before - lag, at.after - lag
     outside = (before < data.begin[at.run] - slack) | (after > data.end[at.run] + slack)
 
@@ -206,8 +208,8 @@ def increments(data: JoinedRuns, at: StepEdges, lag: float) -> ChannelIncrements
 
 
 Heading = Literal["as_logged", "turned_round", "degrees", "radians", "half_sine"]
-"""What the logged heading is: the heading [rad]; its negative; degrees that were taken for radians;
-radians that were taken for degrees; sin(heading / 2), the z of a quaternion."""
+"""Meaning of the logged heading: the heading [rad]; its negative; degrees that were read as
+radians; radians that were read as degrees; sin(heading / 2), the z of a quaternion."""
 
 
 @dataclass(frozen=True)
@@ -215,9 +217,9 @@ class PoseConvention:
     """Convention by which a logged pose is meant.
 
     Attributes:
-        heading: what the logged heading is.
+        heading: meaning of the logged heading.
         y_down: whether y has the opposite sign.
-        offset: to be added to the heading, in steps of whole degrees [deg].
+        offset: correction to the heading in whole degrees [deg].
     """
 
     heading: Heading = "as_logged"
@@ -226,26 +228,26 @@ class PoseConvention:
 
     @property
     def bare(self) -> "PoseConvention":
-        """The convention without its offset."""
+        """Return the convention without its offset."""
         return replace(self, offset=0)
 
 
 CONVENTIONS = tuple(
     PoseConvention(heading, down) for heading in get_args(Heading) for down in (False, True)
 )
-"""Every convention whose steps of the body differ by more than a rotation."""
+"""Every convention whose body increments differ by more than a rotation."""
 
 
 def rotation(degrees: int) -> Float[np.ndarray, "3 3"]:
-    """Rotation of a step of the body about the vertical."""
+    """Return the rotation matrix of a body increment about the vertical."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, "step 3"]:
-    """Steps ahead [m], to the left [m] and in heading [rad] under a convention without its offset.
+    """Return increments ahead [m], left [m] and of the heading [rad] under a bare convention.
 
-    nan where a heading cannot be what the convention says.
+    They are nan where a heading is impossible under the convention.
     """
     flip = [1.0, -1.0 if convention.y_down else 1.0, 1.0]
     before, after = at.pose_before * flip, at.pose_after * flip
@@ -258,7 +260,7 @@ def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, 
 
 
 def _heading(logged: Float[np.ndarray, " step"], meaning: Heading) -> Float[np.ndarray, " step"]:
-    """Heading [rad] that was meant."""
+    """Return the heading [rad] that a logged value means."""
     if meaning == "turned_round":
         return -logged
     if meaning == "degrees":
@@ -272,9 +274,9 @@ def _heading(logged: Float[np.ndarray, " step"], meaning: Heading) -> Float[np.n
 
 
 ROUNDS = 8
-"""Rounds of reweighting."""
+"""Number of rounds of reweighting."""
 RIDGE = 1e-4
-"""Ridge over the mean product of turns: wheels of one side turn alike."""
+"""Ridge over the mean squared turn: wheels of one side turn alike."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,11 +284,12 @@ class Products:
     """Weighted sums of products over steps.
 
     Attributes:
-        turns: of turns with turns (wheel, wheel) [rad^2].
-        across: of turns with steps of the body (wheel, 3); heading in metres at the base radius.
-        body: of steps of the body with each other (3, 3) [m^2].
-        known: steps in which wheels and body are known (every step,).
-        weight: of these (step,).
+        turns: products of turns with turns (wheel, wheel) [rad^2].
+        across: products of turns with body increments (wheel, 3) [rad m]; the heading counts in
+            metres at the base radius.
+        body: products of body increments with each other (3, 3) [m^2].
+        known: whether wheels and body are known in each step (every,).
+        weight: weight of each known step (step,).
     """
 
     turns: Float[np.ndarray, "wheel wheel"]
@@ -297,7 +300,7 @@ class Products:
 
 
 def usable(*parts: Float[np.ndarray, "step _"]) -> Bool[np.ndarray, " step"]:
-    """Steps in which all parts are known."""
+    """Return whether all parts are known, for each step."""
     return np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
 
 
@@ -307,11 +310,11 @@ def products(
     base: float,
     rounds: int = ROUNDS,
 ) -> Products | None:
-    """Products of steps that are known; None where these are fewer than twice the wheels.
+    """Return products over known steps, or None where these are fewer than twice the wheels.
 
     Args:
         base: base radius, at which headings become metres [m].
-        rounds: of reweighting; none for commands, which have no outliers.
+        rounds: rounds of reweighting; 0 for commands, which have no outliers.
     """
     known = usable(turns, body)
     if known.sum() < 2 * turns.shape[1]:
@@ -322,12 +325,12 @@ def products(
         off = np.linalg.norm(body - turns @ _linear(turns, body, weight), axis=1)
         weight = (1 + (off / (2 * float(np.median(off)) + 1e-12)) ** 2) ** -2
     weighted = turns * weight[:, None]
-    own = (body * weight[:, None]).T @ body
-    return Products(weighted.T @ turns, weighted.T @ body, own, known, weight)
+    squares = (body * weight[:, None]).T @ body
+    return Products(weighted.T @ turns, weighted.T @ body, squares, known, weight)
 
 
 def _linear(turns: np.ndarray, body: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Map from turns to steps of the body (wheel, 3), by least squares with a little ridge."""
+    """Return the map from turns to body increments (wheel, 3) by least squares with a ridge."""
     weighted = turns * weight[:, None]
     gram = weighted.T @ turns
     ridge = RIDGE * np.trace(gram) / len(gram) + 1e-300

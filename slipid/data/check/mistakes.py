@@ -10,19 +10,20 @@ from slipid.data.check.interpretation import Evidence, Interpretation, misfit, m
 from slipid.data.check.joined import PoseConvention
 
 MISTAKES = 3
-"""Mistakes that are looked for, one after the other."""
+"""Most mistakes that are found, one after the other."""
 GAIN = 0.05
-"""A mistake is believed where its interpretation leaves so much less unexplained,"""
+"""A mistake is accepted where its interpretation reduces the misfit by `GAIN` plus `SHARE` times
+the remaining misfit."""
 SHARE = 0.3
-"""and this part of what it still leaves; no real log comes near it without a mistake."""
+"""Relative part of that reduction; no real log without a mistake comes near it."""
 EXPLAINED = 0.4
-"""Part of the poses' motion that another convention of theirs may leave unexplained."""
+"""Part of the poses' motion that another convention may leave unexplained."""
 ALIKE = 0.02
-"""Interpretations that differ by less are named as other explanations."""
+"""Interpretations whose misfits differ by less are named as alternatives."""
 TURN_DEG = 15
-"""Grid on which rotations of axes and azimuths are looked for [deg]."""
+"""Grid of the searched rotations of axes and azimuths [deg]."""
 MANY = 6
-"""Wheels beyond which only pairs of columns are exchanged, not all orders tried."""
+"""Wheels above which only exchanges of two columns are tried, not all orders."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Candidate:
     Attributes:
         kind: name of the mistake.
         meant: the interpretation.
-        cost: small; of candidates that fit alike that with the least is believed.
+        cost: small number; of candidates that fit alike the one with the least cost is accepted.
     """
 
     kind: str
@@ -45,8 +46,9 @@ class Mistake:
     """A mistake that explains the logs.
 
     Attributes:
-        found: the interpretation that is right.
-        before: what is left unexplained without it; `after`: with it.
+        found: the right interpretation.
+        before: misfit without it.
+        after: misfit with it.
         others: other kinds of mistake that explain the logs as well.
     """
 
@@ -57,10 +59,10 @@ class Mistake:
 
 
 def mistakes(evidence: Evidence) -> tuple[Interpretation, tuple[Mistake, ...]]:
-    """The right interpretation, as far as single mistakes explain the logs, and the mistakes."""
+    """Return the right interpretation and the single mistakes that lead to it."""
     meant, found = Interpretation(), []
     for _ in range(MISTAKES):
-        one = _one(evidence, meant)
+        one = _next_mistake(evidence, meant)
         if one is None:
             break
         found.append(one)
@@ -68,8 +70,8 @@ def mistakes(evidence: Evidence) -> tuple[Interpretation, tuple[Mistake, ...]]:
     return meant, tuple(found)
 
 
-def _one(evidence: Evidence, of: Interpretation) -> Mistake | None:
-    """The simplest mistake that explains decisively better, or None."""
+def _next_mistake(evidence: Evidence, of: Interpretation) -> Mistake | None:
+    """Return the simplest mistake that explains the logs decisively better, or None."""
     before = misfit(evidence, of)
     tried = [(misfit(evidence, c.meant), c) for c in candidates(evidence, of)]
     # poses of another convention must then follow the wheels
@@ -81,15 +83,15 @@ def _one(evidence: Evidence, of: Interpretation) -> Mistake | None:
     after, best = min(tried, key=lambda pair: pair[0] + pair[1].cost)
     if before - after < GAIN + SHARE * after:
         return None
-    alike: dict[str, Candidate] = {}
+    alternatives: dict[str, Candidate] = {}
     for left, other in sorted(tried, key=lambda pair: pair[0] + pair[1].cost):
         if other.kind != best.kind and left < after + ALIKE:
-            alike.setdefault(other.kind, other)
-    return Mistake(best, before, after, tuple(alike.values()))
+            alternatives.setdefault(other.kind, other)
+    return Mistake(best, before, after, tuple(alternatives.values()))
 
 
 def candidates(evidence: Evidence, of: Interpretation) -> Iterator[Candidate]:
-    """Interpretations that are one mistake away."""
+    """Yield the interpretations that are one mistake away."""
     wheels = evidence.wheels
     for sign, cost in _signs(wheels, evidence.rolling):
         yield Candidate("wheel_sign", replace(of, sign=sign), cost)
@@ -116,7 +118,7 @@ def candidates(evidence: Evidence, of: Interpretation) -> Iterator[Candidate]:
 
 
 def _conventions(of: Interpretation) -> Iterator[Candidate]:
-    """Other conventions of the pose."""
+    """Yield candidates with other conventions of the pose."""
     found: list[tuple[str, float, PoseConvention]] = []
     for quarter in (0, 90, 180, -90):
         more = 0.0 if quarter == 0 else 0.02
@@ -141,7 +143,7 @@ def _conventions(of: Interpretation) -> Iterator[Candidate]:
 
 
 def _signs(wheels: int, rolling: np.ndarray) -> Iterator[tuple[tuple[int, ...], float]]:
-    """Signs of wheels, with what they cost: one wheel, all, one side, then any."""
+    """Yield signs of wheels and their costs: one wheel, all, one side, then any."""
     sides = {tuple(np.flatnonzero(side)) for side in (rolling[:, 2] > 0, rolling[:, 2] < 0)}
     for count in range(1, wheels + 1):
         for turned in combinations(range(wheels), count):
@@ -151,7 +153,7 @@ def _signs(wheels: int, rolling: np.ndarray) -> Iterator[tuple[tuple[int, ...], 
 
 
 def _orders(wheels: int) -> Iterator[tuple[tuple[int, ...], float]]:
-    """Other orders of the wheels' columns, with what they cost: less for an exchange of two."""
+    """Yield other orders of the wheels' columns and their costs, least for an exchange of two."""
     declared = tuple(range(wheels))
     for order in permutations(declared) if wheels <= MANY else _exchanges(declared):
         moved = sum(k != at for at, k in enumerate(order))
@@ -160,6 +162,6 @@ def _orders(wheels: int) -> Iterator[tuple[tuple[int, ...], float]]:
 
 
 def _exchanges(declared: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
-    """Orders in which two columns are exchanged."""
+    """Yield orders in which two columns are exchanged."""
     for a, b in combinations(declared, 2):
         yield tuple({a: b, b: a}.get(k, k) for k in declared)

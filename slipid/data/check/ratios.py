@@ -1,4 +1,4 @@
-"""How far different channels have the robot go, as ratios, and what of that is natural.
+"""Ratios of the motion in different channels, their natural ranges, and wrong factors behind them.
 
 travel      body over wheels, along        pose / (r / J turns): less than 1 where wheels slip
 turning     body over wheels, heading      the same in heading
@@ -8,15 +8,14 @@ command     commanded over measured wheel speeds
 report      reported speeds over encoders
 gyro        gyro over heading of the poses
 
-Which single wrong factor explains ratios that are not natural.
-
-A cause multiplies each ratio by a power of its factor. With the logarithms of ratios and of the
-ends of their ranges, a cause fits where one factor brings all of them into their ranges:
+A cause, such as a wrong unit, multiplies each ratio by a power of its factor. With the logarithms
+of ratios and of the ends of their ranges, a cause fits where one factor brings all of them into
+their ranges:
 
     max_i  log(ratio_i / high_i) / e_i   <=   log factor   <=   min_i  log(ratio_i / low_i) / e_i
 
-(ends exchanged where e_i < 0). Of causes that fit, one with a factor that people do get wrong is
-believed: 1000, 2 pi, 57.3, the gear ratio.
+(ends exchanged where e_i < 0). Of the causes that fit, one with a common error is preferred: 1000,
+2 pi, 57.3, the gear ratio.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +25,7 @@ from math import exp, inf, log, pi
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.check.interpretation import Evidence, Interpretation, columns, to_body
+from slipid.data.check.interpretation import Evidence, Interpretation, to_body
 from slipid.data.check.joined import (
     ChannelIncrements,
     JoinedRuns,
@@ -38,20 +37,20 @@ from slipid.data.check.joined import (
 )
 
 TURNS = 0.01
-"""Share of the predicted motion that must be turning, for the heading to be compared."""
+"""Least share of turning in the predicted motion for which headings are compared."""
 FORWARD = 0.02
-"""Share that must be along, for lengths to be compared."""
+"""Least share of translation for which lengths are compared."""
 RIGID = 1e-6
-"""Relative difference of angle and integrated speed below which one was made of the other."""
+"""Relative difference of angle and integrated speed below which one was computed from the other."""
 
 _Range = tuple[float, float, float]
-"""Least, usual and most."""
+"""Least, usual and largest value of a ratio."""
 _WIDE: Mapping[str, _Range] = {
-    # A carpet may hold a robot in place, so below is no end where commands vouch for the wheels; a
-    # camera's scale may be off by an eighth.
+    # A carpet may hold a robot in place, so the lower end is low where commands confirm wheels;
+    # a camera's scale may be off by an eighth.
     "travel": (0.012, 0.8, 1.35),
     "turning": (0.35, 0.8, 1.35),
-    # Commands lead, and end where brakes or limits take over.
+    # Commands precede the motion, and exceed it where brakes or limits act.
     "drive": (0.65, 1.1, 1.75),
     "steer": (0.65, 1.1, 1.75),
     "command": (0.7, 1.1, 1.75),
@@ -59,14 +58,15 @@ _WIDE: Mapping[str, _Range] = {
     "gyro": (0.75, 1.0, 1.33),
 }
 _UNVOUCHED: _Range = (0.3, 0.8, 1.35)
-"""Of `travel` where no command was logged."""
+"""Range of `travel` where no command was logged."""
 _SCRUBBING: Mapping[str, _Range] = {"turning": (0.25, 0.55, 1.15), "steer": (0.4, 1.3, 3.2)}
-"""Robots whose wheels cannot roll sideways turn less than their track says, and command more."""
+"""Ranges of robots whose wheels cannot roll sideways: they turn less than their track says, and
+command more."""
 
 
 @dataclass(frozen=True)
 class ScaleRatio:
-    """One ratio, the range in which it is natural, and what is usual."""
+    """One ratio with the range in which it is natural, and its usual value."""
 
     value: float
     low: float
@@ -75,7 +75,7 @@ class ScaleRatio:
 
     @property
     def natural(self) -> bool:
-        """Whether nothing is wrong with it."""
+        """Return whether the ratio is in its range."""
         return self.low <= self.value <= self.high
 
 
@@ -84,7 +84,7 @@ class ScaleRatios:
     """Ratios of a set of runs.
 
     Attributes:
-        known: by name.
+        known: ratios by name.
         speed_is_angle: whether the wheels' angle is the integral of the reported speeds.
     """
 
@@ -99,7 +99,7 @@ def ratios(
     evidence: Evidence,
     meant: Interpretation,
 ) -> ScaleRatios:
-    """Ratios under an interpretation: order, signs and axes are put right before."""
+    """Return the ratios under an interpretation in which order, signs and axes are right."""
     values: dict[str, float | None] = {}
     predict = to_body(evidence, meant)
     pose = evidence.pose.get(meant.convention.bare)
@@ -114,10 +114,7 @@ def ratios(
         )
         values["drive"], values["steer"] = _along(signed, predict, 0)
     if evidence.command is not None:
-        mine = columns(meant, evidence.wheels)
-        theirs = columns(Interpretation(meant.command_order, meant.command_sign), evidence.wheels)
-        both = float(np.trace(mine @ evidence.command.across @ theirs.T))
-        values["command"] = both / evidence.command.turns
+        values["command"] = evidence.command.product(meant) / evidence.command.turns
     values["report"], same = _reported(data)
     if same:
         values["report"] = None
@@ -133,15 +130,15 @@ def ratios(
 def _along(
     of: Products, predict: Float[np.ndarray, "3 wheel"], offset: int
 ) -> tuple[float | None, float | None]:
-    """Ratios of the body's motion to the predicted one along and in heading, by least squares."""
+    """Return least-squares ratios of the body's to the predicted motion, along and in heading."""
     predicted = np.einsum("aw,wv,av->a", predict, of.turns, predict)
     both = np.einsum("aw,wa->a", predict, of.across @ rotation(-offset).T)
     total = predicted.sum()
     if not total > 0:
         return None, None
-    far, about = predicted[:2].sum(), predicted[2]
-    along = float(both[:2].sum() / far) if far > FORWARD * total else None
-    # what wheels hardly turn says nothing beside what slip turns
+    ahead, about = predicted[:2].sum(), predicted[2]
+    along = float(both[:2].sum() / ahead) if ahead > FORWARD * total else None
+    # small predicted turns are hidden by the turns that slip causes
     turns = about > TURNS * total and both[2] ** 2 > 0.25 * about * of.body[2, 2]
     return along, float(both[2] / about) if turns else None
 
@@ -149,23 +146,23 @@ def _along(
 def _gyro(
     at: StepEdges, moved: ChannelIncrements, pose: Products, meant: Interpretation
 ) -> float | None:
-    """Turn of the gyro over that of the heading, where both are alike."""
+    """Return the turn of the gyro over that of the heading, or None where they do not correlate."""
     if moved.gyro is None:
         return None
     body = body_motion(at, meant.convention.bare)[pose.known, 2]
     gyro = meant.gyro_sign * moved.gyro[pose.known, 0]
     known = np.isfinite(gyro)
     weight, body, gyro = pose.weight[known], body[known], gyro[known]
-    own, both, other = (
+    gyro_square, both, pose_square = (
         (weight * a * b).sum() for a, b in ((gyro, gyro), (gyro, body), (body, body))
     )
-    if not own * other > 0 or both < 0.5 * np.sqrt(own * other):
+    if not gyro_square * pose_square > 0 or both < 0.5 * np.sqrt(gyro_square * pose_square):
         return None
-    return float(np.sqrt(own / other))
+    return float(np.sqrt(gyro_square / pose_square))
 
 
 def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
-    """Ratio of reported speeds to encoders, whole runs; and whether they are the same thing."""
+    """Return the ratio of reported speeds to encoders, and whether they are the same data."""
     if data.reported is None:
         return None, False
     edges = [data.begin, 0.5 * (data.begin + data.end), data.end]
@@ -184,9 +181,9 @@ def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
 
 
 NEAR = 0.02
-"""A range that ends this near a factor (in its logarithm) still holds it."""
+"""Tolerance of a range about a common factor (in the logarithm)."""
 ROWS_S = (0.001, 1.5)
-"""Times between rows that are natural [s]."""
+"""Plausible times between rows [s]."""
 
 _COMMON = {
     "time": (1000.0, 1e6, 1e9, 60.0),
@@ -204,17 +201,17 @@ _COMMON = {
 }
 _BY_GEAR = ("wheel_gear", "wheel_turns", "command_wheels", "report")
 _OF_RATES = (30 / pi, 180 / pi, 2 * pi, 1000.0, 60.0)
-"""Of turns that are integrated from speeds."""
+"""Common errors of turns that are integrated from speeds."""
 
 
 @dataclass(frozen=True)
 class ScaleCause:
-    """A cause that fits.
+    """A wrong factor that explains the ratios.
 
     Attributes:
-        name: of the cause.
+        name: name of the cause.
         factor: divisor of the declared number, or factor of the values of its channels.
-        common: whether it is one that people do get wrong.
+        common: whether people often make this error.
     """
 
     name: str
@@ -223,10 +220,9 @@ class ScaleCause:
 
 
 def causes(speed_is_angle: bool) -> Mapping[str, Mapping[str, float]]:
-    """Everything that may be wrong by a factor, the likeliest first.
+    """Return the power of each cause's factor in every ratio that it changes, the likeliest first.
 
-    Each has the power of its factor in every ratio that it changes. A factor above 1 stands for
-    channels that are too large: turns, lengths, angles, time.
+    A factor above 1 means that channels are too large: turns, lengths, angles, time.
     """
     rates = {"drive": 1.0, "steer": 1.0, "command": 1.0, "gyro": 1.0, "report": 1.0}
     integrated = {"travel": -1.0, "turning": -1.0, "gyro": 1.0}
@@ -247,30 +243,30 @@ def causes(speed_is_angle: bool) -> Mapping[str, Mapping[str, float]]:
     }
 
 
-def explained(
-    seen: ScaleRatios, row_s: float, gear_ratio: float
+def single_causes(
+    scales: ScaleRatios, row_s: float, gear_ratio: float
 ) -> tuple[tuple[ScaleCause, ...], bool]:
-    """Causes that fit, the likeliest first, and whether single ones do.
+    """Return the causes that fit, the likeliest first, and whether single ones do.
 
-    Where no single cause fits, the first pair that does is returned. Nothing where every ratio is
-    natural, or no pair of causes fits.
+    Where no single cause fits, the first pair that does is returned. The result is empty where
+    every ratio is natural, or no pair of causes fits.
     """
-    if all(r.natural for r in seen.known.values()):
+    if all(r.natural for r in scales.known.values()):
         return (), True
-    open_ = dict(causes(seen.speed_is_angle))
+    possible = dict(causes(scales.speed_is_angle))
     if ROWS_S[0] <= row_s <= ROWS_S[1]:
-        del open_["time"]
-    common = _common(gear_ratio, seen.speed_is_angle)
-    single = _singles(seen.known, open_, common)
+        del possible["time"]
+    common = _common(gear_ratio, scales.speed_is_angle)
+    single = _singles(scales.known, possible, common)
     if single:
         return tuple(sorted(single, key=lambda e: not e.common)), True
-    for first, power in open_.items():
+    for first, power in possible.items():
         for factor in common[first]:
             left = {
                 name: replace(r, value=r.value / factor ** power.get(name, 0.0))
-                for name, r in seen.known.items()
+                for name, r in scales.known.items()
             }
-            rest = {name: other for name, other in open_.items() if name != first}
+            rest = {name: other for name, other in possible.items() if name != first}
             second = [e for e in _singles(left, rest, common) if e.common]
             if second:
                 return (ScaleCause(first, factor, True), second[0]), False
@@ -279,12 +275,12 @@ def explained(
 
 def _singles(
     known: Mapping[str, ScaleRatio],
-    open_: Mapping[str, Mapping[str, float]],
+    possible: Mapping[str, Mapping[str, float]],
     common: Mapping[str, Sequence[float]],
 ) -> list[ScaleCause]:
-    """Causes that fit alone."""
+    """Return the causes that fit alone."""
     found = []
-    for name, power in open_.items():
+    for name, power in possible.items():
         low, high = _range(known, power)
         if low > high:
             continue
@@ -296,7 +292,7 @@ def _singles(
 
 
 def _range(known: Mapping[str, ScaleRatio], powers: Mapping[str, float]) -> tuple[float, float]:
-    """Logarithms of the factors that bring every ratio into its range; empty where none does."""
+    """Return log factors that bring every ratio into its range; they are empty where none does."""
     low, high = -inf, inf
     for name, ratio in known.items():
         power = powers.get(name, 0.0)
@@ -310,7 +306,7 @@ def _range(known: Mapping[str, ScaleRatio], powers: Mapping[str, float]) -> tupl
 
 
 def _middle(known: Mapping[str, ScaleRatio], powers: Mapping[str, float]) -> float:
-    """Logarithm of the factor by usual ratios; narrow ranges count most."""
+    """Return the log factor that brings ratios to their usual values; narrow ranges count most."""
     total = weights = 0.0
     for name, ratio in known.items():
         if power := powers.get(name, 0.0):
@@ -321,10 +317,10 @@ def _middle(known: Mapping[str, ScaleRatio], powers: Mapping[str, float]) -> flo
 
 
 def _common(gear_ratio: float, speed_is_angle: bool) -> Mapping[str, Sequence[float]]:
-    """Factors that people get wrong by name of the cause, with their inverses."""
+    """Return common errors by name of the cause, with their inverses."""
     named = dict(_COMMON)
     if speed_is_angle:
         named["wheel_gear"] = _OF_RATES
     if gear_ratio > 1.5:
         named |= {name: (gear_ratio, *named[name]) for name in _BY_GEAR}
-    return {name: [f for one in all_ for f in (one, 1 / one)] for name, all_ in named.items()}
+    return {name: [f for one in factors for f in (one, 1 / one)] for name, factors in named.items()}

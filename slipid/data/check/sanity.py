@@ -15,8 +15,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slipid.data.align.lag import PoseLag, pose_lag
-from slipid.data.check.columns import BROUGHT, SAME, Finding, exchanged, misordered, worst_first
-from slipid.data.check.electric import electric
+from slipid.data.check.columns import BROUGHT, SAME, electric, exchanged, misordered
+from slipid.data.check.findings import (
+    Finding,
+    cause_findings,
+    mistake_finding,
+    ratio_sentence,
+    worst_first,
+)
 from slipid.data.check.interpretation import Evidence, Interpretation, gather, misfits, to_body
 from slipid.data.check.joined import (
     ChannelIncrements,
@@ -29,26 +35,27 @@ from slipid.data.check.joined import (
     usable,
 )
 from slipid.data.check.mistakes import mistakes
-from slipid.data.check.ratios import FORWARD, TURNS, ScaleRatios, explained, ratios
+from slipid.data.check.ratios import FORWARD, TURNS, ScaleRatios, ratios, single_causes
 from slipid.data.check.single_runs import agreement, single_runs, standing
-from slipid.data.check.words import of_causes, of_mistake, of_ratios
 from slipid.data.runs import Runs
 from slipid.model.geometry import Geometry
 
 FEW = 20
-"""Steps below which nothing is compared."""
+"""Least number of steps for a comparison."""
 FOREIGN = 0.4
-"""Share of the poses' motion, left unexplained in any interpretation, that is a finding."""
+"""Unexplained share of the poses' motion, in the best interpretation, that is a finding."""
 LATE_S = 1.0
 """Lag of the poses that is a finding [s]."""
 TOO_LATE_S = 1.9
-"""Lag beyond which a fit of it would not be near enough at its start [s]."""
+"""Lag beyond which a fit would not start near enough [s]."""
 SLOW_M_S, SLOW_ROW_S = 0.01, 2.0
-"""Rim speeds below and times between rows above which time is in a smaller unit than declared."""
+"""Rim speeds below it and times between rows above it mean that time is in a smaller unit than
+declared."""
 FAST_M_S, FAST_ROW_S = 50.0, 1e-3
-"""The reverse."""
+"""Rim speeds above it and times between rows below it mean the reverse."""
 SHORT = 0.62
-"""Body over wheels below which, without commands to vouch for the wheels, there is a finding."""
+"""Path length of the body over the wheels' below which there is a finding, where no command
+confirms the wheels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +63,11 @@ class _Compared:
     """Comparison of poses and wheels.
 
     Attributes:
-        findings: about lag, order, signs, axes and single runs.
+        findings: findings about lag, order, signs, axes and single runs.
         moved: increments of the robot's channels at the lag of the poses.
         evidence: products of these.
-        meant: the interpretation that is right.
-        poses: whether the poses can be compared any further.
+        meant: the right interpretation.
+        poses: whether the poses are usable for further comparisons.
     """
 
     findings: tuple[Finding, ...]
@@ -75,8 +82,8 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
 
     Args:
         data: runs.
-        geometry: as it was declared.
-        mass_kg: of the robot, None where it is not known.
+        geometry: declared geometry.
+        mass_kg: mass of the robot, or None where it is not known.
     """
     channels = joined(data)
     found = tuple(_all(channels, edges(channels), geometry, mass_kg, pose_lag(data)))
@@ -93,7 +100,7 @@ def _all(
     mass_kg: float | None,
     lag: PoseLag | None,
 ) -> Iterator[Finding]:
-    """Findings in no order."""
+    """Yield all findings in no order."""
     found = _compared(data, at, geometry, lag)
     if found is None:
         yield _not_checked(f"the runs are too short: {len(at.run)} steps, {FEW} are needed")
@@ -116,7 +123,7 @@ def _all(
 def _compared(
     data: JoinedRuns, at: StepEdges, geometry: Geometry, lag: PoseLag | None
 ) -> _Compared | None:
-    """Comparison of poses and wheels; None where there are too few steps."""
+    """Return the comparison of poses and wheels, or None where there are too few steps."""
     lag = lag if lag is not None and lag.decisive else PoseLag(0.0, 1.0, 1.0)
     moved = increments(data, at, lag.seconds)
     if usable(moved.wheels).sum() < FEW:
@@ -133,19 +140,19 @@ def _compared(
     half_sine = meant.convention.heading == "half_sine"
     agreeing = agreement(data, at, moved, evidence, meant)
     alone = () if half_sine else tuple(single_runs(data, agreeing))
-    listed = (*_of_lag(lag), *map(of_mistake, found), *alone)
+    listed = (*_of_lag(lag), *map(mistake_finding, found), *alone)
     return _Compared(listed, moved, evidence, meant, True)
 
 
 def _of_lag(lag: PoseLag) -> Iterator[Finding]:
-    """Poses that come much later or earlier than encoders."""
+    """Yield the finding about poses that come much later or earlier than the encoders."""
     if abs(lag.seconds) < LATE_S:
         return
     late = "after" if lag.seconds > 0 else "before"
     yield Finding(
         "lag",
-        f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: so {lag.left:.2f} of "
-        f"the motion is left unexplained, without {lag.left_at_zero:.2f}",
+        f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: so {lag.unexplained:.2f} of "
+        f"the motion is left unexplained, without {lag.unexplained_at_zero:.2f}",
         f"shift the poses' times by {-lag.seconds:+.1f} s, or start 'camera.lag' in [parameters] "
         f"at {lag.seconds:.1f}",
         "wrong" if abs(lag.seconds) > TOO_LATE_S else "suspicious",
@@ -153,6 +160,7 @@ def _of_lag(lag: PoseLag) -> Iterator[Finding]:
 
 
 def _foreign(left: float) -> Finding:
+    """Return the finding that poses and wheels do not belong together."""
     return Finding(
         "pose_unexplained",
         f"the poses do not follow the wheels: {left:.2f} of their motion is left unexplained, in "
@@ -163,14 +171,14 @@ def _foreign(left: float) -> Finding:
 
 
 def _factors(scales: ScaleRatios, row_s: float, gear_ratio: float) -> Iterator[Finding]:
-    """Units and sizes that are wrong."""
-    fitting, single = explained(scales, row_s, gear_ratio)
-    yield from of_causes(fitting, single, of_ratios(scales), gear_ratio)
+    """Yield findings about wrong units and sizes."""
+    fitting, single = single_causes(scales, row_s, gear_ratio)
+    yield from cause_findings(fitting, single, ratio_sentence(scales), gear_ratio)
     if not fitting and not all(r.natural for r in scales.known.values()):
         yield Finding(
             "scales",
-            "the channels disagree about how far the robot went, and no single number explains "
-            f"it: {of_ratios(scales)}",
+            "the channels disagree about the robot's path length, and no single number explains "
+            f"it: {ratio_sentence(scales)}",
             "check the units of all channels, gear_ratio, wheel_radius_m and base_radius_m",
         )
 
@@ -178,7 +186,7 @@ def _factors(scales: ScaleRatios, row_s: float, gear_ratio: float) -> Iterator[F
 def _of_time(
     data: JoinedRuns, moved: ChannelIncrements, at: StepEdges, radius: float
 ) -> Iterator[Finding]:
-    """Time in another unit, where only its size shows it."""
+    """Yield the finding about time in another unit, where only its size shows it."""
     row = float(np.median(data.row))
     speed = np.abs(moved.wheels) / (at.after - at.before)[:, None] * radius
     top = float(np.nanquantile(speed, 0.95))
@@ -192,15 +200,15 @@ def _of_time(
 
 
 def _suspicious(scales: ScaleRatios) -> Iterator[Finding]:
-    """Wheels that go much further than the body, with nothing to vouch for them."""
+    """Yield the finding about wheels that go much further than body and commands show."""
     travel = scales.known.get("travel")
     if travel is None or "drive" in scales.known or "command" in scales.known:
         return
     if travel.natural and travel.value < SHORT:
         yield Finding(
             "travel",
-            f"the body moves {travel.value:.2f} times as far as the wheels say, and no command is "
-            "logged that could vouch for the wheels",
+            f"the body's path length is {travel.value:.2f} times the wheels', and no command "
+            "is logged that could confirm the wheels",
             "check wheel_radius_m, gear_ratio, ticks_per_revolution and the unit of the poses, "
             "unless the wheels slip so much",
             "suspicious",
@@ -208,12 +216,11 @@ def _suspicious(scales: ScaleRatios) -> Iterator[Finding]:
 
 
 def _notes(data: JoinedRuns, evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
-    """A note for everything that the runs leave open."""
+    """Yield notes about what could not be checked."""
     yield from _unmoved(evidence, meant)
     if evidence.twist is None and evidence.command is None:
         yield _not_checked(
-            "no command is logged: wheels that are said to turn too far cannot be told from wheels "
-            "that slip"
+            "no command is logged: wheel turns that are logged too large look like wheels that slip"
         )
     if data.current is not None and not data.current_is_signed:
         yield _not_checked("currents are magnitudes: their signs cannot be checked")
@@ -222,12 +229,12 @@ def _notes(data: JoinedRuns, evidence: Evidence, meant: Interpretation) -> Itera
 
 
 def _not_checked(what: str) -> Finding:
-    """The note that something was not checked."""
+    """Return the note that something was not checked."""
     return Finding("not_checked", what, None, "note")
 
 
 def _unmoved(evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
-    """Directions in which no run moves."""
+    """Yield notes about directions in which no run moves."""
     pose = next(iter(evidence.pose.values()), None)
     if pose is None:
         return
@@ -243,5 +250,5 @@ def _unmoved(evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
 
 
 def _constant(channel: JoinedChannel | None) -> bool:
-    """Whether a channel never changes."""
+    """Return whether a channel never changes."""
     return channel is not None and not np.nanmax(np.abs(np.diff(channel.value, axis=0))) > 0

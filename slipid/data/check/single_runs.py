@@ -1,4 +1,4 @@
-"""Runs that do not go with the others: poses of another run, poses that stand still."""
+"""Runs whose poses do not belong to them: poses of another run, and poses that do not move."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from slipid.data.check.columns import Finding
+from slipid.data.check.findings import Finding
 from slipid.data.check.interpretation import Evidence, Interpretation, to_body
 from slipid.data.check.joined import (
     ChannelIncrements,
@@ -18,18 +18,18 @@ from slipid.data.check.joined import (
 )
 
 MOVED_M = 0.2
-"""Path length of the wheels from which a run must move its poses [m]."""
+"""Path length of the wheels from which the poses must move as well [m]."""
 STILL_M = 1e-6
-"""Path length of poses that do not change, but for rounding [m]."""
+"""Path length of poses that do not change but for rounding [m]."""
 ROWS = 20
-"""Rows below which a run says nothing alone."""
+"""Least number of rows of a run that is judged alone."""
 ODD, TIMES, USUAL = 0.3, 10.0, 0.9
-"""Distance from full agreement from which a run is odd, and the multiple of the median one's from
-which it is, where that one agrees at least so well."""
+"""A run is odd where its disagreement, 1 - cosine, exceeds `ODD` and `TIMES` that of the median
+run; the cosine of that one must be at least `USUAL`."""
 CLIPPED = 4.0
-"""Steps of the body beyond so many usual ones are shortened to that."""
+"""Increments of the body above this multiple of the median one are shortened to it."""
 ALL = 0.5
-"""Part of the runs from which a finding is about all of them."""
+"""Share of the runs from which a finding concerns all of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +38,8 @@ class RunAgreement:
 
     Attributes:
         wheels_m: path length by the wheels (run,) [m].
-        poses_m: path length of the poses, headings counted at the base radius (run,) [m].
-        cosine: between the steps of poses and those predicted by wheels (run,).
+        poses_m: path length of the poses, with headings at the base radius (run,) [m].
+        cosine: cosine between the increments of the poses and those predicted by wheels (run,).
     """
 
     wheels_m: Float[np.ndarray, " run"]
@@ -54,19 +54,19 @@ def agreement(
     evidence: Evidence,
     meant: Interpretation,
 ) -> RunAgreement:
-    """Agreement of every run under an interpretation; commands stand in for nothing."""
+    """Return the agreement of every run under an interpretation, from wheels and poses alone."""
     convention = meant.convention
     body = body_motion(at, convention.bare) * [1.0, 1.0, evidence.base]
     body = body @ rotation(-convention.offset).T
     predicted = moved.wheels @ to_body(evidence, meant).T
     known = usable(body, predicted)
     body, predicted, run = body[known], predicted[known], at.run[known]
-    far = np.linalg.norm(body, axis=1)
-    most = CLIPPED * float(np.median(far[far > 0])) if (far > 0).any() else 1.0
-    body = body * np.minimum(1.0, most / np.maximum(far, 1e-300))[:, None]
+    length = np.linalg.norm(body, axis=1)
+    most = CLIPPED * float(np.median(length[length > 0])) if (length > 0).any() else 1.0
+    body = body * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
     # slip shortens each axis by its own factor
-    own = (predicted**2).sum(axis=0)
-    factor = (predicted * body).sum(axis=0) / np.where(own > 0, own, 1.0)
+    squares = (predicted**2).sum(axis=0)
+    factor = (predicted * body).sum(axis=0) / np.where(squares > 0, squares, 1.0)
     scaled = predicted * np.where(factor > 0, factor, 0.0)
 
     def total(values: np.ndarray) -> np.ndarray:
@@ -82,12 +82,12 @@ def agreement(
 
 
 def standing(data: JoinedRuns, of: RunAgreement) -> Bool[np.ndarray, " run"]:
-    """Runs whose poses do not change while wheels turn."""
+    """Return whether the poses of each run do not change while its wheels turn."""
     return (of.poses_m < STILL_M) & (of.wheels_m > MOVED_M) & (_rows(data) >= ROWS)
 
 
 def single_runs(data: JoinedRuns, of: RunAgreement) -> Iterator[Finding]:
-    """Findings about runs that do not go with the others."""
+    """Yield findings about runs that do not agree with the others."""
     still = standing(data, of)
     if still.any():
         every = bool(still.mean() >= ALL)
@@ -95,7 +95,7 @@ def single_runs(data: JoinedRuns, of: RunAgreement) -> Iterator[Finding]:
             "pose_constant",
             f"the poses do not change in {still.sum()} of {len(still)} runs while the wheels "
             f"travel {np.median(of.wheels_m[still]):.2g} m",
-            "check the columns of pose_x, pose_y and pose_heading, and whether the marker was seen"
+            "check the columns of pose_x, pose_y and pose_heading, and the marker's visibility"
             if every
             else "leave these runs out of the globs of [[logs]]",
             runs=() if every else _names(data, still),

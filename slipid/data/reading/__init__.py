@@ -1,1 +1,1 @@
-"""Files of any layout to logs in SI units, checked at the door."""
+"""Reading of files of any layout as logs in SI units, with all checks."""

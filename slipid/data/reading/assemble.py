@@ -1,8 +1,8 @@
-"""From the signals of one run to its log: one clock, and on it what every sensor said when.
+"""Assembly of the signals of one run into its log: one clock, and the latest value of each sensor.
 
-The clock has every time at which something was measured. Wheels move on evenly between two readings
-of their own; what else was not measured at a time is what was measured last, and marked as stale:
-nothing counts twice, and nothing is invented.
+The clock has every time at which something was measured. Wheel angles are linear between two
+readings of their own; every other channel holds its last reading, which is marked as stale, so that
+no reading counts twice.
 """
 
 from collections.abc import Iterator, Mapping
@@ -15,21 +15,19 @@ from jaxtyping import Bool, Float
 from slipid.data.align.clock import Clock, best_clock
 from slipid.data.align.regression import MotionPair
 from slipid.data.log import Log
-from slipid.data.reading.checks import Unsteady
-from slipid.data.reading.layout import SensorLayout
+from slipid.data.reading.checks import UnusablePose
+from slipid.data.reading.layout import TURNS, SensorLayout
 from slipid.data.reading.signal import Signal, clock_of
 from slipid.data.wheel_signals import integral, readings
 from slipid.support.errors import bad_data
 
 EPOCH = 1e6
-"""Time from which on it is taken to count from 1970 and not from the start of the robot [s]."""
-TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
-"""Channels that tell how far the wheels turned, the first that is there counts."""
+"""Time from which on a clock counts from 1970 and not from the start of the robot [s]."""
 
 
 @dataclass(frozen=True)
 class Identity:
-    """What a run is called and where it comes from; attributes as of `Log`."""
+    """Name and origin of a run; the attributes are those of `Log`."""
 
     name: str
     path: Path
@@ -45,7 +43,7 @@ def assembled(
     identity: Identity,
     notes: tuple[str, ...] = (),
 ) -> Log:
-    """The log of one run from its signals, by the names of their channels.
+    """Return the log of one run from its signals by channel.
 
     Raises:
         DataError: the wheels were not measured for a while, or a channel has no value at all.
@@ -60,9 +58,9 @@ def assembled(
         inside = (clock >= first) & (clock <= last)
         clock = clock if inside.all() else clock[inside]
         _check_gaps(signals[turns], layout)
-    said = list(notes)
+    remarks = list(notes)
     held = {name: _held(signal, clock) for name, signal in signals.items()}
-    angle = _angle(turns, signals, layout, clock, said)
+    angle = _angle(turns, signals, layout, clock, remarks)
     pose, fresh = _pose(signals, clock)
     start = clock[0] if clock[0] > EPOCH else 0.0
     return Log(
@@ -82,12 +80,12 @@ def assembled(
         gyro=held["gyro"][:, 0] if "gyro" in held else None,
         pose=pose,
         pose_fresh=fresh,
-        notes=tuple(said),
+        notes=tuple(remarks),
     )
 
 
 def _check_gaps(signal: Signal, layout: SensorLayout) -> None:
-    """Refuse wheels that were not measured for a while: nobody knows how they turned then."""
+    """Raise `DataError` where wheels were not measured for too long, as their motion is lost."""
     for column in range(signal.values.shape[1]):
         there = np.flatnonzero(~np.isnan(signal.values[:, column]))
         steps = np.diff(signal.time[there])
@@ -106,7 +104,7 @@ def _check_gaps(signal: Signal, layout: SensorLayout) -> None:
 
 
 def _held(signal: Signal, clock: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time column"]:
-    """What was measured last at every time; before the first reading that one."""
+    """Return the latest reading at every time; before the first reading, that one."""
     if signal.time is clock and not np.isnan(signal.values).any():
         return signal.values.copy()
     out = np.empty((len(clock), signal.values.shape[1]))
@@ -122,7 +120,7 @@ def _held(signal: Signal, clock: Float[np.ndarray, " time"]) -> Float[np.ndarray
 def _fresh(
     signals: Mapping[str, Signal], clock: Float[np.ndarray, " time"], names: tuple[str, ...]
 ) -> Bool[np.ndarray, "time column"] | None:
-    """Where the first of some channels that is there was measured; None where it always was."""
+    """Return where the first available channel was measured; None where it always was."""
     name = next((name for name in names if name in signals), None)
     if name is None:
         return None
@@ -143,7 +141,7 @@ def _angle(
     clock: Float[np.ndarray, " time"],
     notes: list[str],
 ) -> Float[np.ndarray, "time wheel"]:
-    """Cumulative angle at the wheel: from ticks, else angles, else the integral of the speed."""
+    """Return the cumulative wheel angle, from ticks, else angles, else integrated speeds."""
     if name is None:
         return np.zeros((len(clock), 0))
     signal, columns, slow = signals[name], [], 0
@@ -167,7 +165,7 @@ def _angle(
 
 
 def _per_wheel(name: str, layout: SensorLayout) -> float:
-    """Angle of a wheel per tick, or per angle of what was measured."""
+    """Return the angle of a wheel per tick, or per unit of the measured angle."""
     if name == "wheel_ticks":
         return 2.0 * np.pi / (float(layout.ticks_per_revolution or 1.0) * layout.gear_ratio)
     return 1.0 / layout.gear_ratio if name.startswith("motor") else 1.0
@@ -176,20 +174,21 @@ def _per_wheel(name: str, layout: SensorLayout) -> float:
 def _ticks(
     ticks: Float[np.ndarray, " sample"], layout: SensorLayout, notes: list[str]
 ) -> Float[np.ndarray, " sample"]:
-    """Cumulative ticks, without the wrap-around of a counter of `tick_bits` bits."""
+    """Return cumulative ticks, without the wrap-around of a counter of `tick_bits` bits."""
     if layout.ticks_are_increments:
         return np.cumsum(ticks)
     period = 2.0**layout.tick_bits
     steps = np.diff(ticks)
     if np.abs(steps).max(initial=0.0) <= 0.5 * period:
         return ticks
-    said = f"tick counter wrapped around at {layout.tick_bits} bits and was continued"
-    if said not in notes:
-        notes.append(said)
+    note = f"tick counter wrapped around at {layout.tick_bits} bits and was continued"
+    if note not in notes:
+        notes.append(note)
     return ticks - period * np.concatenate([[0.0], np.cumsum(np.round(steps / period))])
 
 
 def _at_wheel(held: Mapping[str, np.ndarray], layout: SensorLayout, what: str) -> np.ndarray | None:
+    """Return a measured or commanded speed at the wheel, from either side of the gear."""
     if f"wheel_{what}" in held:
         return held[f"wheel_{what}"]
     if f"motor_{what}" in held:
@@ -198,7 +197,7 @@ def _at_wheel(held: Mapping[str, np.ndarray], layout: SensorLayout, what: str) -
 
 
 def _current(held: Mapping[str, np.ndarray], layout: SensorLayout) -> np.ndarray | None:
-    """As logged, else the torque that a driver reports over its constant."""
+    """Return the logged current, else the reported torque divided by the torque constant."""
     if "current" in held:
         return held["current"]
     for name, ratio in (("motor_torque", 1.0), ("wheel_torque", layout.gear_ratio)):
@@ -208,13 +207,14 @@ def _current(held: Mapping[str, np.ndarray], layout: SensorLayout) -> np.ndarray
 
 
 def _voltage(held: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """As logged, else the duty cycle of the bus voltage where both were."""
+    """Return the logged voltage, else duty cycle times bus voltage where both are logged."""
     if "voltage" not in held and {"duty", "bus_voltage"} <= held.keys():
         return held["duty"] * held["bus_voltage"]
     return held.get("voltage")
 
 
 def _twist(held: Mapping[str, np.ndarray], rows: int) -> np.ndarray | None:
+    """Return the commanded twist with zeros for absent axes; None where no axis is logged."""
     names = [f"twist_command_{axis}" for axis in ("x", "y", "yaw")]
     if not held.keys() & set(names):
         return None
@@ -224,7 +224,7 @@ def _twist(held: Mapping[str, np.ndarray], rows: int) -> np.ndarray | None:
 def _pose(
     signals: Mapping[str, Signal], clock: Float[np.ndarray, " time"]
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Pose with the heading unwrapped, and at which times it is a new one."""
+    """Return the pose with the heading unwrapped, and whether each row has a new one."""
     if "pose_x" not in signals:
         return None, None
     turned = heading(signals)
@@ -250,7 +250,7 @@ def _pose(
 
 
 def heading(signals: Mapping[str, Signal]) -> Signal:
-    """Heading [rad]: as logged, else that of a quaternion x, y, z, w."""
+    """Return the heading [rad] as logged, else from a quaternion x, y, z, w."""
     if "pose_heading" in signals:
         return signals["pose_heading"]
     turned = signals["pose_quaternion"]
@@ -273,14 +273,14 @@ def clock_against(
     identity: Identity,
     poses: Mapping[str, Signal],
 ) -> Clock:
-    """The clock of poses against that of the robot's signals, from the motion that both saw.
+    """Return the clock of poses relative to the robot's signals, from the motion of both.
 
     Args:
-        robot: what the robot itself logged, by channel; layout and identity are of its file.
-        poses: signals of a pose, by channel, on their own clock.
+        robot: signals of the robot's own file by channel; layout and identity belong to it.
+        poses: signals of a pose by channel, on their own clock.
 
     Raises:
-        Unsteady: the motion does not tell how far the clocks are apart.
+        UnusablePose: the motion does not determine the offset between the clocks.
     """
     log = assembled(robot, layout, identity)
     parts = (poses["pose_x"], poses["pose_y"], heading(poses))
@@ -288,23 +288,23 @@ def clock_against(
     columns = [np.interp(time, part.time, part.values[:, 0]) for part in parts[:2]]
     turned = np.unwrap(parts[2].values[:, 0])
     pose = np.column_stack([*columns, np.interp(time, parts[2].time, turned)])
-    clock = best_clock(_views(log, time, pose))
+    clock = best_clock(_motion_pairs(log, time, pose))
     if clock is None:
-        raise Unsteady(
-            f"{parts[0].source.path}: the motion does not tell its clock from that of {log.name}; "
-            "expected poses of this very run, with starts, stops and turns that both saw, and the "
-            "frame rate that the video has"
+        raise UnusablePose(
+            f"{parts[0].source.path}: the motion does not determine its clock against that of "
+            f"{log.name}; expected poses of the same run, with starts, stops and turns in both, "
+            "and the video's frame rate"
         )
-    # a log that counts from 1970 was made to begin at zero
+    # the log of a clock that counts from 1970 starts at zero
     turns = next(name for name in TURNS if name in robot)
-    began = float(robot[turns].time[0] - log.time[0])
-    return replace(clock, offset=clock.offset + began)
+    start = float(robot[turns].time[0] - log.time[0])
+    return replace(clock, offset=clock.offset + start)
 
 
-def _views(
+def _motion_pairs(
     robot: Log, time: Float[np.ndarray, " pose"], pose: Float[np.ndarray, "pose 3"]
 ) -> Iterator[MotionPair]:
-    """By the gyro where there is one, which turns with the body itself; by the wheels."""
+    """Yield the motion pair of the gyro, which turns with the body, then that of the wheels."""
     if robot.gyro is not None:
         yield MotionPair.of_gyro(robot.time, robot.gyro, time, pose)
     yield MotionPair.of_wheels(robot.time, robot.wheel_angle, time, pose)

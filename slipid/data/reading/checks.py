@@ -1,4 +1,4 @@
-"""Checks every log passes once, at the door; each failure names file, row and what was expected."""
+"""Checks that every log passes once; each error names file, row and what was expected."""
 
 from collections.abc import Mapping
 
@@ -6,29 +6,29 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.layout import Layout, SensorLayout
+from slipid.data.reading.layout import TURNS, Layout, SensorLayout
 from slipid.data.reading.signal import Signal
 from slipid.data.reading.table import Table
 from slipid.data.wheel_signals import integral
 from slipid.support.errors import DataError, bad_data
 
 MIN_ROWS = 2
-"""Rows below which there is no motion to speak of."""
+"""Least number of rows of a run with motion."""
 
-# What no wheeled robot does, so that the unit or the sensor must be wrong.
+# Magnitudes above these are impossible for wheeled robots: the unit or the sensor must be wrong.
 _LIMITS = {
     "wheel_speed": (1000.0, "rad/s"),
     "wheel_speed_command": (1000.0, "rad/s"),
     "current": (1000.0, "A"),
     "bus_voltage": (1000.0, "V"),
     "duty": (1.5, "(a share of 1)"),
-    "voltage": (1000.0, "V"),  # may be the product of both: they are named first
+    "voltage": (1000.0, "V"),  # possibly the product of both, which are checked first
     "gyro": (100.0, "rad/s"),
 }
 
 
 def check_time(table: Table, layout: Layout, time: Float[np.ndarray, " row"]) -> None:
-    """Refuse time that is missing, repeats, goes backwards or jumps."""
+    """Raise `DataError` if time is missing, repeats, goes backwards or jumps."""
     column = str(layout.channels["time"].columns[0]) if "time" in layout.channels else None
 
     def fail(at: int, found: str, expected: str) -> None:
@@ -58,12 +58,12 @@ def check_time(table: Table, layout: Layout, time: Float[np.ndarray, " row"]) ->
         fail(1, f"rows {usual:.3g} s apart", "10 us to 60 s; is the unit of time right?")
 
 
-class Unsteady(DataError):
-    """The pose of a run jumps: it is to be set aside, and the others can be read."""
+class UnusablePose(DataError):
+    """Error about a run whose pose jumps or has no determined clock; other runs stay readable."""
 
 
 def check_log(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:
-    """Refuse what no robot does: absurd magnitudes, signs, jumps, and channels that stand still."""
+    """Raise `DataError` for impossible magnitudes, signs or jumps, and for stuck channels."""
     for name, (limit, unit) in _LIMITS.items():
         values = getattr(log, name)
         if values is not None and np.abs(values).max(initial=0.0) > limit:
@@ -83,12 +83,12 @@ def check_log(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> 
 
 
 def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:
-    """Refuse angles no wheel can make, and a wheel that stands still when commanded."""
+    """Raise `DataError` for angles no wheel can make, or a commanded wheel that does not turn."""
     if not log.wheels:
         return
     rates = np.abs(np.diff(log.wheel_angle, axis=0)) / np.diff(log.time)[:, None]
-    # Telemetry that stalls and catches up makes tenfold rates in sound logs; a counter that starts
-    # anew makes hundredfold ones.
+    # Telemetry that stalls and catches up causes tenfold rates in sound logs; a counter that
+    # restarts causes hundredfold ones.
     limit = max(30.0, 20.0 * float(np.quantile(rates, 0.99)))
     if rates.max() > limit:
         i, j = _first(rates > limit)
@@ -100,7 +100,7 @@ def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: SensorLayout)
     command = log.wheel_speed_command
     if command is None:
         return
-    # Half a second and a radian of commanded motion that the wheel answers with none at all.
+    # A radian of commanded motion without any measured motion of the wheel.
     commanded = np.abs(integral(log.time, command)[-1])
     still = np.ptp(log.wheel_angle, axis=0) == 0
     dead = np.flatnonzero(still & (commanded > 1.0))
@@ -111,7 +111,7 @@ def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: SensorLayout)
 
 
 def _check_pose(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:
-    """Refuse a pose that stands still while wheels turn; set a run aside whose pose jumps."""
+    """Raise `DataError` for a pose that is stuck while wheels turn, `UnusablePose` for a jump."""
     assert log.pose is not None
     assert log.pose_fresh is not None
     rows = np.flatnonzero(log.pose_fresh)
@@ -126,28 +126,29 @@ def _check_pose(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -
             i = int(np.argmax(jumps > limit))
             found = f"the {what} jumps by {jumps[i]:.3g} {unit}"
             expected = f"at most {limit:.3g} {unit} between poses; another marker, or a wrong unit?"
-            raise Unsteady(str(_at(log, signals, column, int(rows[i + 1]), 0, found, expected)))
+            raise UnusablePose(str(_at(log, signals, column, int(rows[i + 1]), 0, found, expected)))
     turned = np.ptp(log.wheel_angle, axis=0).max(initial=0.0)
     if turned > 2.0 and np.ptp(pose, axis=0).max() == 0:
         found = f"the pose is constant while a wheel turns {turned:.3g} rad"
-        expected = "a pose that changes: was the marker seen?"
+        expected = "a pose that changes: was the marker visible?"
         raise _at(log, signals, "pose_x", None, 0, found, expected)
 
 
 def _first(mask: np.ndarray) -> tuple[int, int]:
+    """Return row and column of the first True."""
     at = np.argwhere(mask)[0]
     return int(at[0]), int(at[1]) if len(at) > 1 else 0
 
 
 _NAMES = {
-    "wheel": ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed"),
+    "wheel": TURNS,
     "wheel_speed": ("wheel_speed", "motor_speed"),
     "wheel_speed_command": ("wheel_speed_command", "motor_speed_command"),
     "current": ("current", "motor_torque", "wheel_torque"),
     "voltage": ("voltage", "duty"),
     "pose_heading": ("pose_heading", "pose_quaternion"),
 }
-"""Channels that what a log holds may come from."""
+"""Channels of a file from which each channel of a log may come."""
 
 
 def _at(
@@ -159,7 +160,7 @@ def _at(
     found: str,
     expected: str,
 ) -> DataError:
-    """The error at time i of the log, in the j-th column of the channel that `name` comes from."""
+    """Return the error at row i of the log, in column j of the channel that `name` comes from."""
     signal = next((signals[n] for n in _NAMES.get(name, (name,)) if n in signals), None)
     if signal is None:
         return bad_data(log.path, found, expected)

@@ -1,4 +1,4 @@
-"""Names of columns and topics as people write them, and the channel and unit that each says."""
+"""Dictionary of column and topic names, and the channel and unit that a name stands for."""
 
 import re
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from slipid.data.reading.layout import CHANNELS
 from slipid.data.reading.units import converts
 
 _TABLE: dict[str, str] = {
-    # which wheel
+    # name of the wheel
     "side l": "left l lt lh links",
     "side r": "right r rt rh rechts",
     "end f": "front fore forward f",
@@ -21,7 +21,7 @@ _TABLE: dict[str, str] = {
     "corner rr": "rr br",
     "kind motor": "motor motors m mot engine",
     "kind wheel": "wheel wheels whl joint joints tyre tire track",
-    # what is measured
+    # measured quantity
     "what time": "t time stamp timestamp times tstamp seconds elapsed clock zeit",
     "what ticks": "tick ticks enc encoder encoders count counts counter pulse pulses cnt",
     "what position": "pos position positions pose place loc location translation p",
@@ -45,13 +45,13 @@ _TABLE: dict[str, str] = {
     "what orientation": "orientation quaternion quat q attitude",
     "what quaternion": "qx qy qz qw",
     "what axis": "x y z",
-    # of no use to slipid, but to be known
+    # known, but of no use to slipid
     "not odometry": "odom odometry odo",
     "not wanted": (
         "delta diff d dt dx dy dtheta accel acc acceleration mag temp temperature std cov "
         "covariance error err sum mean row index seq id flag status roll pitch lat lon rssi step"
     ),
-    # says nothing
+    # without meaning
     "noise": (
         "data field fields msg value values actual measured meas feedback fb state states link "
         "robot base body global world map camera cam mocap vicon optitrack tag marker tracker "
@@ -59,7 +59,7 @@ _TABLE: dict[str, str] = {
         "log sensor drive shaft nsec sec secs ros"
     ),
 }
-"""Roles, and the words that play them: the dictionary of all names."""
+"""Roles and their words: the dictionary of all names."""
 _ROLES: dict[str, tuple[str, str]] = {
     word: (role.partition(" ")[0], role.partition(" ")[2])
     for role, words in _TABLE.items()
@@ -67,9 +67,9 @@ _ROLES: dict[str, tuple[str, str]] = {
 }
 _LONG = [word for word in _ROLES if len(word) >= 4]
 _NEAR = 0.82
-"""Likeness from which a word is taken for a misspelled one."""
+"""Similarity from which a word counts as a misspelled one."""
 _LETTERS = 3
-"""Longest word that may be made of single letters alone, as wl or u1l."""
+"""Longest word that may consist of single letters alone, such as wl or u1l."""
 _SUFFIXES = {
     **{"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us"},
     **{"usec": "us", "ns": "ns", "nsec": "ns", "m": "m", "mm": "mm", "cm": "cm"},
@@ -80,22 +80,22 @@ _SUFFIXES = {
     **{"a": "A", "amps": "A", "ma": "mA", "v": "V", "mv": "mV", "nm": "N*m"},
     **{"%": "%", "percent": "percent", "pct": "percent"},
 }
-"""Ends of names that say a unit."""
+"""Ends of names that are units."""
 _BY_UNIT = {"tick": "ticks", "A": "current", "V": "voltage", "N*m": "torque", "rad/s": "speed"}
 _SHORT = ("v", "a", "s", "m")
-"""Ends of names that mean a unit only where the rest of the name is not understood with them."""
+"""Ends of names that are units only where the name with them is not understood."""
 
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """What the name of a column says.
+    """Meaning of a column's name.
 
     Attributes:
-        channel: of `CHANNELS`, or `wheel_position` and `wheel_v` where numbers must tell between
-            two (also `motor_`); empty where the name says nothing.
-        label: which wheel, or which part of a quaternion.
-        unit: that the name says, else empty.
-        doubt: what was assumed, else empty.
+        channel: one of `CHANNELS`, or `wheel_position` or `wheel_v` (also `motor_`) where only the
+            numbers can decide between two channels; empty where the name has no meaning.
+        label: name of the wheel, or component of a quaternion.
+        unit: unit in the name, else empty.
+        doubt: assumption about the name, else empty.
     """
 
     channel: str = ""
@@ -105,15 +105,15 @@ class ColumnMeaning:
 
 
 def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMeaning:
-    """Return what a column or a topic's field of this name holds.
+    """Return the meaning of a column or of a topic's field by its name.
 
     Args:
-        name: of the column.
-        unit: by a row of units, if there is one.
-        of_motor: whether the log is of motors alone, whose columns need not name a wheel or motor.
+        name: name of the column.
+        unit: unit in a row of units, if there is one.
+        of_motor: whether the log has motors alone, so that columns need not name a wheel or motor.
     """
-    bare, own = without_unit(name)
-    unit = unit_in(unit) or unit or own
+    bare, suffix = without_unit(name)
+    unit = unit_in(unit) or unit or suffix
     texts = [bare] if "[" in name or "(" in name or "," in name else [bare, name]
     if name[len(bare) :].lower()[1:] in _SHORT:  # v may be a speed, a and s other things
         texts.reverse()
@@ -131,19 +131,19 @@ def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMe
 
 @lru_cache(maxsize=4096)
 def is_unit(text: str) -> bool:
-    """Whether a text is a unit of something that is logged."""
+    """Return whether a text is a unit of some channel."""
     return bool(text.strip()) and any(
         converts(text, target) for target in {*CHANNELS.values(), "pixel"}
     )
 
 
 def unit_in(text: str) -> str:
-    """The unit that a text of its own is, such as V or ma; empty where it is none."""
+    """Return the unit that a text consists of, such as V or ma; empty where it is none."""
     return text if is_unit(text) else _SUFFIXES.get(text.lower(), "")
 
 
 def without_unit(name: str) -> tuple[str, str]:
-    """A name less the unit in it, and that unit: brackets, after a comma, or the end of it."""
+    """Return a name without its unit, and the unit: in brackets, after a comma, or as a suffix."""
     if inside := re.match(r"^(.*\S)\s*[\[(]([^\])]*)[\])]\s*$", name):
         if inside[2].isdecimal():
             return name, ""
@@ -159,7 +159,7 @@ def without_unit(name: str) -> tuple[str, str]:
 
 
 def _fits(channel: str, unit: str) -> bool:
-    """Whether a unit can be that of a channel."""
+    """Return whether a unit is possible for a channel."""
     targets = {
         "position": ("rad", "tick"),
         "v": ("V", "rad/s", "m/s"),
@@ -172,13 +172,13 @@ def _fits(channel: str, unit: str) -> bool:
 
 @dataclass(frozen=True)
 class NameParts:
-    """A column's name taken apart.
+    """Words of a column's name by role.
 
     Attributes:
-        roles: what its words say, such as ("what", "speed"), with the word itself at the end.
-        numbers: digits in it.
-        unknown: words that say nothing to anybody.
-        mended: words that were taken for others: written as `headng -> heading`.
+        roles: role, value and word of each known word, such as ("what", "speed", "vel").
+        numbers: digits in the name.
+        unknown: words that are not in the dictionary.
+        mended: corrected words, written as `headng -> heading`.
     """
 
     roles: tuple[tuple[str, str, str], ...]
@@ -187,20 +187,20 @@ class NameParts:
     mended: tuple[str, ...]
 
     def has(self, role: str, *values: str) -> bool:
-        """Whether a word plays a role (with one of these values)."""
+        """Return whether a word has a role, with one of these values if there are any."""
         return any(r == role and (not values or v in values) for r, v, _ in self.roles)
 
     def of(self, role: str) -> list[str]:
-        """Values of a role, in the order of the words."""
+        """Return the values of a role, in the order of the words."""
         return [v for r, v, _ in self.roles if r == role]
 
     def words(self, *values: str) -> list[str]:
-        """The words of what is measured that have one of these values."""
+        """Return the words of the measured quantity that have one of these values."""
         return [w for r, v, w in self.roles if r == "what" and v in values]
 
 
 def name_parts(name: str) -> NameParts:
-    """A column's name taken apart, misspelled words mended."""
+    """Return a column's name split into words, misspelled ones corrected."""
     roles, numbers, unknown, mended = [], [], [], []
     for part in _split(name):
         if part.isdecimal():
@@ -219,7 +219,7 @@ def name_parts(name: str) -> NameParts:
 
 
 def _split(name: str) -> list[str]:
-    """Lower-case words and numbers: at capitals, digits and signs, `1st` as 1."""
+    """Return lower-case words and numbers, split at capitals, digits and signs; `1st` becomes 1."""
     name = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Za-z])(?=\d)", "_", name)
     name = re.sub(r"(\d)(?:st|nd|rd|th)\b", r"\1", name.lower())
     name = re.sub(r"(?<=\d)(?=[a-z])", "_", name)
@@ -227,7 +227,7 @@ def _split(name: str) -> list[str]:
 
 
 def _apart(word: str) -> list[str]:
-    """A word made of others, such as setvel or wl, in as few as there can be; else itself."""
+    """Return the fewest words that form a compound such as setvel or wl, else the word itself."""
     best: list[list[str] | None] = [[]] + [None] * len(word)
     for end in range(1, len(word) + 1):
         for start in range(end):
@@ -246,16 +246,16 @@ def _apart(word: str) -> list[str]:
 
 
 def _doubt(parts: NameParts, channel: str) -> str:
-    """What was assumed about a name."""
+    """Return an assumption about a name, else an empty text."""
     if channel.startswith("twist") and not parts.has("what", "command"):
-        return "is it what was commanded? Measured speeds do not belong here"
+        return "is it a command? Measured speeds do not belong here"
     if parts.mended:
         return "misspelled? " + ", ".join(parts.mended)
     return f"{', '.join(parts.unknown)} in its name is not known" if parts.unknown else ""
 
 
 def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
-    """Channel and label of a name; None where it says none."""
+    """Return channel and label of a name, or None where it has no meaning."""
     if parts.has("not"):
         return ("odometry", "") if parts.has("not", "odometry") else None
     label = _label(parts)
@@ -273,7 +273,7 @@ def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
 
 
 def _motor_channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
-    """Channel and label of a name in a log of motors alone; None where it says none."""
+    """Return channel and label of a name in a log of motors alone, or None if it has none."""
     if parts.has("not"):
         return None
     single = _single(parts)
@@ -285,7 +285,7 @@ def _motor_channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
 
 
 def _label(parts: NameParts) -> str:
-    """Which wheel a name is of: fl, r, 2; empty for none."""
+    """Return the wheel in a name, such as fl, r or 2; empty for none."""
     if parts.has("corner"):
         return parts.of("corner")[0]
     side = parts.of("side")[:1]
@@ -296,7 +296,7 @@ def _label(parts: NameParts) -> str:
 
 
 def _measured(parts: NameParts, unit: str) -> str | None:
-    """What of a wheel is measured: the end of the channel's name."""
+    """Return the measured quantity of a wheel: the end of the channel's name."""
     if parts.has("what", "command"):
         return "speed_command" if not parts.has("what", "current", "torque", "voltage") else None
     if parts.has("what", "rpm"):
@@ -315,7 +315,7 @@ def _measured(parts: NameParts, unit: str) -> str | None:
 
 
 def _single(parts: NameParts) -> tuple[str, str] | None:
-    """Channel of the whole robot, and which part of a quaternion."""
+    """Return the channel of the whole robot, and the component of a quaternion."""
     what = set(parts.of("what"))
     axis = parts.words("axis")
     if what and what <= {"time"}:
@@ -342,7 +342,7 @@ def _single(parts: NameParts) -> tuple[str, str] | None:
 
 
 def _twist(what: set[str], axis: list[str]) -> tuple[str, str] | None:
-    """Which part of a commanded twist."""
+    """Return the component of a commanded twist."""
     turning = what & {"w", "yaw", "angular", "angle"}
     if turning and axis in ([], ["z"]):
         return "twist_command_yaw", ""

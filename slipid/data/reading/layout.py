@@ -1,4 +1,4 @@
-"""What a log file's layout is: which column holds which channel, in which unit."""
+"""Layout of a log file: the columns and unit of each channel."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import field
@@ -45,15 +45,17 @@ SINGLE = {
     "pose_heading": "rad",
 }
 SEVERAL = {"pose_quaternion": "1"}
-"""Channels with a number of columns of their own: x, y, z and w of a quaternion."""
+"""Channels with a fixed number of columns: x, y, z and w of a quaternion."""
 CHANNELS: dict[str, str] = {**SINGLE, **SEVERAL, **PER_WHEEL}
-"""Every channel a layout may name, with the unit it is turned into."""
+"""Every channel that a layout may name, with its SI unit."""
+TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
+"""Channels from which the wheels' turns are known; the first available one counts."""
 
 Count = Annotated[int, Field(ge=0, strict=True)]
 
 
 def several(value: object) -> object:
-    """One value of a config, or a list of them, as a tuple."""
+    """Return one value of a config, or a list of values, as a tuple."""
     return tuple(value) if isinstance(value, list | tuple) else (value,)
 
 
@@ -64,7 +66,7 @@ class Channel:
     Attributes:
         columns: their names, one per wheel where the channel has one; positions counted from 0 in
             a file without names.
-        unit: the unit in the file; `pixel` is turned into metres by the layout.
+        unit: the unit in the file; `pixel` is converted to metres by the layout.
         scale: a sign or a correction, one number for all columns or one for each.
         offset: added after the scale, in `unit`.
     """
@@ -87,7 +89,7 @@ class Channel:
 
 @dataclass(frozen=True, config=CLOSED, kw_only=True)
 class SensorLayout:
-    """What a layout says of the robot's sensors, whatever the files are.
+    """Properties of the robot's sensors that do not depend on the type of its files.
 
     Attributes:
         ticks_per_revolution: ticks of the encoder in one turn of the *motor* shaft.
@@ -96,9 +98,9 @@ class SensorLayout:
         tick_bits: width of the tick counter, at which it wraps around.
         current_is_signed: False where currents are magnitudes.
         torque_constant: torque per current of the *motor* [N m/A], where a driver reports torques.
-        max_gap: longest time between samples of a wheel [s]; a longer one is called a clock jump.
-        max_pose_jump: longest way between two poses [m]; a run with a longer one is set aside.
-        max_heading_jump: largest turn between two poses [rad]; the same.
+        max_gap: longest time between samples of a wheel [s]; a longer one is refused.
+        max_pose_jump: longest path between two poses [m]; a run with a longer one is left out.
+        max_heading_jump: largest turn between two poses [rad]; a run with a larger one is left out.
     """
 
     ticks_per_revolution: Positive | None = None
@@ -112,7 +114,7 @@ class SensorLayout:
     max_heading_jump: Positive = 1.6
 
     def lacks(self, channels: Collection[str]) -> str | None:
-        """Return what some channels need of the layout and do not have; None where nothing."""
+        """Return the setting that channels need and the layout lacks, or None."""
         if "wheel_ticks" in channels and self.ticks_per_revolution is None:
             return "wheel_ticks without ticks_per_revolution; expected ticks per turn of the motor"
         if {"motor_torque", "wheel_torque"} & {*channels} and self.torque_constant is None:
@@ -122,7 +124,7 @@ class SensorLayout:
 
 
 def _pair(value: object) -> object:
-    """Scales along x and y; one number counts for both."""
+    """Return scales along x and y; one number counts for both."""
     if isinstance(value, list | tuple):
         return tuple(value)
     return None if value is None else (value, value)
@@ -130,24 +132,24 @@ def _pair(value: object) -> object:
 
 @dataclass(frozen=True, config=CLOSED)
 class Layout(SensorLayout):
-    """How one kind of log file is laid out.
+    """Layout of one type of log file.
 
     Attributes:
-        name: what messages call it.
-        channels: which columns hold which channel.
+        name: name in messages.
+        channels: columns of each channel.
         delimiter: character between cells; not used for Parquet.
-        names_row: line that holds the column names, counted from 1; 0 where there is none.
-        units_row: line that holds the units, which are then checked; 0 where there is none.
-        first_data_row: line on which the numbers start.
+        names_row: line with the column names, counted from 1; 0 where there is none.
+        units_row: line with the units, which are then checked; 0 where there is none.
+        first_data_row: line of the first numbers.
         row_period: time between rows of a file without a time column [s].
         metres_per_pixel: scale of the camera along its x and its y [m].
-        new_run: what tells that the next run starts inside the file.
+        new_run: event that starts the next run inside the file.
         drop_repeated_time: whether to keep the last of rows with the same time; else such rows are
             refused.
-        clock: "own" of a file of poses beside a run's own whose times are not the robot's: how far
-            they are apart, and drift, is then found from the motion.
-        beside: layouts of files that lie beside a run's own and hold more of its channels, by their
-            names; `{stem}` stands for that of the run's own file without its suffix.
+        clock: "own" for a file of poses beside a run's own whose clock is not the robot's; its
+            offset and drift are then found from the motion.
+        beside: layouts of files beside a run's own that hold more of its channels, by their names;
+            `{stem}` stands for the name of the run's own file without its suffix.
     """
 
     name: str
@@ -165,18 +167,18 @@ class Layout(SensorLayout):
 
     @property
     def columns(self) -> tuple[str | int, ...]:
-        """Every column the layout uses, each once."""
+        """Return every column that the layout uses, each once."""
         used = (column for channel in self.channels.values() for column in channel.columns)
         return tuple(dict.fromkeys(used))
 
     @property
     def holds(self) -> frozenset[str]:
-        """Every channel of a run, those in files beside its own included."""
+        """Return every channel of a run, those in files beside its own included."""
         beside = (name for other in self.beside.values() for name in other.channels)
         return frozenset((*self.channels, *beside))
 
     def to_si(self, channel: str) -> float:
-        """Factor from the channel's unit to that of `CHANNELS`, for pixels the camera's scale.
+        """Return the factor from the channel's unit to SI; for pixels it has the camera's scale.
 
         Raises:
             ValueError: the unit does not convert, or the scale of the camera is not given.
@@ -191,6 +193,6 @@ class Layout(SensorLayout):
 
 
 def unknown(what: str, name: object, choices: Iterable[str]) -> str:
-    """Message about a name that is none of the choices: the nearest of them, then all."""
+    """Return a message about a name that is not among the choices: similar ones, then all."""
     names = list(choices)
     return f"no {what} '{name}'{did_you_mean(name, names)}; expected one of {', '.join(names)}"

@@ -1,4 +1,4 @@
-"""Layout of a log of motors alone: columns that a person named, and the rest by their names."""
+"""Layout of a log of motors alone: given columns, and others by their names."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from slipid.data.reading.units import converts
 from slipid.support.errors import DataError, bad_data, did_you_mean
 
 SHAFT = 10.0
-"""Times by which a motor's shaft may turn faster than any wheel, whose speed the reader checks."""
+"""Gear ratio of such a layout: a shaft may turn so much faster than a wheel's speed limit."""
 _CHANNELS = ("time", "voltage", "current", "motor_speed", "motor_angle", "duty", "bus_voltage")
 _INSTEAD = {"motor_speed": "motor_angle", "motor_angle": "motor_speed"}
 """Channels of which one is enough."""
@@ -26,7 +26,7 @@ class GivenColumns:
 
 
 def given_columns(text: str, channel: str) -> GivenColumns:
-    """`NAME`, `NAME:UNIT`, or several names by commas for several motors."""
+    """Return the columns in `NAME`, `NAME:UNIT`, or several names by commas for several motors."""
     names, colon, unit = text.rpartition(":")
     if colon and converts(unit, CHANNELS[channel]):
         return GivenColumns(tuple(n.strip() for n in names.split(",")), unit)
@@ -34,15 +34,15 @@ def given_columns(text: str, channel: str) -> GivenColumns:
 
 
 def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed: bool) -> Layout:
-    """Layout of a log of motors: the named columns, and for other channels those called so.
+    """Return the layout of a log of motors: given columns, and others named like channels.
 
     Args:
-        format: where names and numbers stand in the file.
+        format: position of names and numbers in the file.
         given: columns that a person named, by channel.
         signed: whether currents have a sign.
 
     Raises:
-        DataError: a column is not there, or there is none of time, current or speed.
+        DataError: a column is absent, or there is none of time, current or speed.
     """
     names = [name for name in format.names if name]
     if not names:
@@ -83,9 +83,9 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
 
 
 def _called(channel: str, meanings: Mapping[str, ColumnMeaning]) -> tuple[str, ...]:
-    """Columns called after a channel, one where a channel has one.
+    """Return the columns named after a channel, one where the channel has one column.
 
-    Sure names come before doubtful ones, and names that count motors before those that do not.
+    Certain names come before doubtful ones, and names with a motor's number before those without.
     """
     found = {name: one for name, one in meanings.items() if one.channel == channel}
     names = [name for name, one in found.items() if not one.doubt] or list(found)
@@ -96,7 +96,7 @@ def _called(channel: str, meanings: Mapping[str, ColumnMeaning]) -> tuple[str, .
 def _channel(
     channel: str, columns: tuple[str, ...], format: TableFormat, unit: str | None = None
 ) -> Channel:
-    """Columns with their unit: a given one, that of a row of units or of their names, the usual."""
+    """Return columns with their unit: given, or in a row of units or a name, or the usual one."""
     usual, name = CHANNELS[channel], columns[0]
     row = format.units[format.names.index(name)]
     own = (meaning_of(name, row, of_motor=True).unit, unit_in(row), without_unit(name)[1])
@@ -105,7 +105,7 @@ def _channel(
 
 
 def _check_whole(path: Path, channels: Mapping[str, Channel], names: list[str]) -> None:
-    """DataError where something is missing, or motors differ in number."""
+    """Raise `DataError` where a channel is missing, or where the numbers of motors differ."""
     have = f"it has {', '.join(names)}"
     for wanted, option in (
         (("time",), "--time"),

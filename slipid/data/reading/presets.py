@@ -13,7 +13,7 @@ from slipid.support.toml_file import checked
 
 
 def preset(name: str) -> Layout:
-    """Layout of a known kind of log file; DataError with the choices if there is none."""
+    """Return the layout of a known type of log file; raise `DataError` if it is unknown."""
     if name not in PRESETS:
         raise DataError(f"preset: {unknown('format', name, PRESETS)}")
     return PRESETS[name]
@@ -38,8 +38,8 @@ def _camera(x: str, y: str, angle: str, unit: str = "pixel") -> dict[str, Channe
     }
 
 
-# As its owners calibrated it, per axis. That motion seen so is too short by about 1.117 is for a
-# fit to find, not for a reader to know.
+# As its owners calibrated it, per axis. Motion in this scale is too short by a factor of about
+# 1.117, which a fit estimates; the reader does not correct it.
 _METRES_PER_PIXEL = (1.8404619693756104e-3, 1.8371639251708984e-3)
 _ROBOTINO = Layout(
     name="robotino",
@@ -86,9 +86,9 @@ _LAYOUTS = (
     # Wheels in the air, speed steps. The tick columns are left out on purpose: they do not
     # accumulate in these files, so the angle comes from the reported speed.
     replace(_ROBOTINO_2022, name="robotino2022_motor", channels=_MOTORS_2022),
-    # Means of 13 samples each, 204 runs a file, told apart by the encoders that start again from 0.
-    # There is no time: ticks over reported speed (which reads 1.3 % high) say 0.45 s a row. Angles
-    # near the wrap are means of 0 and 360, hence wrong; so no jump of the heading is refused.
+    # Means of 13 samples each, 204 runs a file, separated by encoders that restart from 0. There is
+    # no time: ticks over reported speed (which reads 1.3 % high) give 0.45 s a row. Angles near the
+    # wrap are means of 0 and 360, hence wrong; so no jump of the heading is refused.
     replace(
         _ROBOTINO,
         name="robotino2021",
@@ -108,7 +108,7 @@ _LAYOUTS = (
         channels=_DRIVE_2021 | {"time": _one("Time, ms", "ms"), "gyro": _one("Z gyro", "deg/s")},
     ),
     # Speeds at the motor shaft; currents are magnitudes here as well. Where the reference steps,
-    # the row is there twice, before and after the step.
+    # the row occurs twice, before and after the step.
     Layout(
         name="robotino2021_motor",
         drop_repeated_time=True,
@@ -143,7 +143,7 @@ _LAYOUTS = (
             "wheel_ticks": Channel((4, 5, 6), "tick", scale=(-1.0,)),
         },
     ),
-    # What `slipid track` writes of a video that somebody started by hand.
+    # Files that `slipid track` writes for a video that was started by hand.
     Layout(
         name="tracked",
         clock="own",
@@ -156,13 +156,13 @@ _LAYOUTS = (
     ),
 )
 POSES = ("pose_x", "pose_y", "pose_heading", "pose_quaternion")
-"""Channels of a camera, whose clock may be its own."""
+"""Channels of a camera, which may have a clock of its own."""
 PRESETS = {layout.name: layout for layout in _LAYOUTS}
 _SETTINGS = [f.name for f in fields(Layout) if f.name not in ("name", "channels", "beside")]
 
 
 def layout(table: Mapping[str, object]) -> Layout:
-    """How log files are laid out, as `[layouts.NAME]` of a config says it, for `read_runs`.
+    """Return a layout for `read_runs`, from what `[layouts.NAME]` of a config contains.
 
     Raises:
         DataError: unknown key, channel, unit or format, wrong dimension, wrong type.
@@ -171,12 +171,14 @@ def layout(table: Mapping[str, object]) -> Layout:
 
 
 def declared_layout(table: Mapping[str, object], where: str) -> Layout:
-    """Layout declared in a config: `format` names a preset, the rest overrides it.
+    """Return the layout in a config: `format` names a preset, the other keys override it.
 
     `columns` maps each channel to `{columns = [...] or column = ..., unit, scale, offset}`; `false`
-    takes a channel of the preset away. `beside` has a layout for each further file of a run.
+    removes a channel of the preset. `beside` has a layout for each further file of a run.
 
-    Messages call the section `where`, such as `robotino.toml [layout]`.
+    Args:
+        table: content of the section.
+        where: name of the section in messages, such as `robotino.toml [layout]`.
 
     Raises:
         DataError: unknown key, channel, unit or format, wrong dimension, wrong type.
@@ -196,7 +198,7 @@ def declared_layout(table: Mapping[str, object], where: str) -> Layout:
 
 
 def _declared_file(table: Mapping[str, object], where: str) -> Layout:
-    """Layout of a single file."""
+    """Return the layout of a single file."""
     given = dict(table)
     name, columns = given.pop("format", None), given.pop("columns", {})
     if name is not None and name not in PRESETS:
@@ -227,7 +229,7 @@ def _declared_file(table: Mapping[str, object], where: str) -> Layout:
 
 
 def _file_problem(layout: Layout) -> str | None:
-    """What does not belong together in a file."""
+    """Return a contradiction within the layout of a file, or None."""
     have = layout.channels
     single = {name: len(c.columns) for name, c in have.items() if name in SINGLE}
     if not have:
@@ -247,7 +249,7 @@ def _file_problem(layout: Layout) -> str | None:
 
 
 def _problem(layout: Layout) -> str | None:
-    """What does not belong together in all files of a run."""
+    """Return a contradiction between the layouts of all files of a run, or None."""
     files = [layout, *layout.beside.values()]
     names = [name for one in files for name in one.channels if name != "time"]
     if twice := [name for name in names if names.count(name) > 1]:

@@ -1,4 +1,4 @@
-"""Read logs: from files and their layout to runs in SI units, checked once, here."""
+"""Reader of logs: from files and their layout to checked runs in SI units."""
 
 import hashlib
 import re
@@ -15,7 +15,7 @@ from slipid.data.log import Log
 from slipid.data.reading.assemble import Identity, assembled, clock_against
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.topics import read_bag
-from slipid.data.reading.checks import MIN_ROWS, Unsteady, check_log, check_time
+from slipid.data.reading.checks import MIN_ROWS, UnusablePose, check_log, check_time
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import preset
 from slipid.data.reading.signal import Signal, SignalSource
@@ -24,9 +24,9 @@ from slipid.data.runs import Runs, collect, counted_once, default_session
 from slipid.support.errors import DataError
 
 AnyLayout = Layout | BagLayout
-"""How files of rows, or bags, are laid out."""
+"""Layout of a file of rows or of a bag."""
 Session = Literal["surface/load/speed", "folder", "file"]
-"""What runs have in common between which the camera's marker stayed as it was."""
+"""Property that runs of a session share; within a session the camera's marker stayed in place."""
 
 
 def read_runs(
@@ -38,18 +38,18 @@ def read_runs(
     load: str = "as_built",
     session: Session = "surface/load/speed",
 ) -> Runs:
-    """Every run of the files that match a glob.
+    """Return every run of the files that match a glob.
 
     Runs of another load set-up are read by another call and added: `as_built + moved`.
 
     Args:
         folder: data folder, which the names of the runs are relative to.
         pattern: glob below the folder, such as `one_surface/*/*.csv`.
-        layout: how the files are laid out, or the name of a preset.
+        layout: layout of the files, or the name of a preset.
         surface: name of the floor, `folder` for that of the folder each file lies in, or None where
             it is unknown.
         load: name of the load set-up.
-        session: what runs have in common between which the camera's marker stayed as it was.
+        session: property that runs of a session share.
 
     Raises:
         DataError: no file matches, or one is wrong; the message names the file and the row.
@@ -68,7 +68,7 @@ def read_runs(
 
 
 def session_of(log: Log, session: Session) -> str:
-    """Name of the session of a run: its file, the folder of its file, or how it was driven.
+    """Return the session of a run: its file, the folder of its file, or its floor, load and speed.
 
     The runs that one file holds share it.
     """
@@ -81,7 +81,7 @@ def session_of(log: Log, session: Session) -> str:
 
 @dataclass(frozen=True)
 class FileRuns:
-    """The runs in a file, and a line for each that is set aside because its pose jumps."""
+    """Runs in a file, and a line for each run that is left out because its pose jumps."""
 
     logs: tuple[Log, ...]
     aside: tuple[str, ...]
@@ -90,25 +90,28 @@ class FileRuns:
 def read_logs(
     path: Path, layout: AnyLayout, root: Path, surface: str | None, load: str
 ) -> FileRuns:
-    """Every run in a CSV or Parquet file or in a bag, and a line for each whose pose jumps.
+    """Return every run in a CSV or Parquet file or in a bag, and a line for each run left out.
 
-    So is a run whose poses have a clock of their own that its motion does not tell.
-    `layout.new_run` tells the runs of a file of rows apart, `layout.runs` those of a bag. Parts of
-    a file of a single row hold no motion and are left out. A run whose pose jumps is set aside by
-    its name: the marker was taken for another, or the matching of scans failed, and what lies
-    between is not to be fitted.
+    A run is left out where its pose jumps, because the marker was confused with another one or the
+    matching of scans failed, or where its poses have a clock that the motion does not determine.
+    `layout.new_run` separates the runs of a file of rows, `layout.runs` those of a bag. Parts of a
+    file with a single row hold no motion and are dropped.
 
     Args:
         root: data folder above the file, which the names of the runs are relative to.
-        surface: name of the floor; `folder` stands for that of the file's folder less `_surface`.
-            A bag, or the table of its runs, may name another.
-        load: name of the load set-up, likewise.
+        surface: name of the floor; `folder` stands for the name of the file's folder without
+            `_surface`. A bag, or the table of its runs, may name another.
+        load: name of the load set-up; a bag may name another.
     """
     surface = path.parent.name.removesuffix("_surface") if surface == "folder" else surface
     known = Identity(path.relative_to(root).as_posix(), path, "", surface, load)
     try:
-        raw = _of_bag(known, layout) if isinstance(layout, BagLayout) else _of_rows(known, layout)
-    except Unsteady as error:
+        raw = (
+            _bag_runs(known, layout)
+            if isinstance(layout, BagLayout)
+            else _table_runs(known, layout)
+        )
+    except UnusablePose as error:
         return FileRuns((), (f"set aside: {error}",))
     logs: list[Log] = []
     aside: list[str] = []
@@ -116,7 +119,7 @@ def read_logs(
         log = assembled(signals, layout, identity, notes)
         try:
             check_log(log, signals, layout)
-        except Unsteady as error:
+        except UnusablePose as error:
             aside.append(f"set aside: {error}")
             continue
         logs.append(log)
@@ -124,14 +127,15 @@ def read_logs(
 
 
 class _RawRun(NamedTuple):
-    """A run that was read and not put together yet."""
+    """A run that was read and is not assembled yet."""
 
     identity: Identity
     signals: dict[str, Signal]
     notes: tuple[str, ...]
 
 
-def _of_bag(known: Identity, layout: BagLayout) -> list[_RawRun]:
+def _bag_runs(known: Identity, layout: BagLayout) -> list[_RawRun]:
+    """Return the runs of a bag."""
     return [
         _RawRun(
             Identity(
@@ -148,14 +152,16 @@ def _of_bag(known: Identity, layout: BagLayout) -> list[_RawRun]:
     ]
 
 
-def _of_rows(known: Identity, layout: Layout) -> list[_RawRun]:
+def _table_runs(known: Identity, layout: Layout) -> list[_RawRun]:
+    """Return the runs of a file of rows, with the channels of the files beside it."""
     table = read_table(known.path, layout)
     if layout.drop_repeated_time:
         table = table.rows(np.append(np.diff(_time(table, layout)) != 0, True))
     beside = {
         pattern: _beside(known.path, pattern, other) for pattern, other in layout.beside.items()
     }
-    sha256 = sha256_of([table.sha256, *(other.sha256 for other in beside.values())])
+    parts = [table.sha256, *(other.sha256 for other in beside.values())]
+    sha256 = hashlib.sha256("\n".join(parts).encode()).hexdigest() if beside else table.sha256
     out = []
     for part, suffix in _parts(table, layout):
         notes: list[str] = []
@@ -172,13 +178,8 @@ def _of_rows(known: Identity, layout: Layout) -> list[_RawRun]:
     return out
 
 
-def sha256_of(parts: Sequence[str]) -> str:
-    """Hash of one file, or of the hashes of several."""
-    return parts[0] if len(parts) == 1 else hashlib.sha256("\n".join(parts).encode()).hexdigest()
-
-
 def _parts(table: Table, layout: Layout) -> list[tuple[Table, str]]:
-    """The runs of a table, and what is appended to the name of each."""
+    """Return the runs of a table, and the suffix of each run's name."""
     starts = _run_starts(table, layout)
     if len(starts) == 1:
         return [(table, "")]
@@ -188,7 +189,7 @@ def _parts(table: Table, layout: Layout) -> list[tuple[Table, str]]:
 
 
 def _beside(path: Path, pattern: str, layout: Layout) -> Table:
-    """The file that lies beside a run's own and has the rest of its channels."""
+    """Return the table of a file that lies beside a run's own and has more of its channels."""
     other = path.parent / pattern.replace("{stem}", path.stem)
     if not other.is_file():
         there = sorted(p.name for p in path.parent.iterdir() if p.is_file() and p != path)
@@ -201,7 +202,7 @@ def _beside(path: Path, pattern: str, layout: Layout) -> Table:
 
 
 def find_logs(root: Path, pattern: str) -> list[Path]:
-    """Files under `root` that match a glob, sorted by name; DataError where there are none."""
+    """Return files under `root` that match a glob, sorted by name; `DataError` if none do."""
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; expected the folder of the logs")
     found = sorted(p for p in root.glob(pattern) if p.is_file() or (p / "metadata.yaml").is_file())
@@ -221,7 +222,7 @@ def find_logs(root: Path, pattern: str) -> list[Path]:
 
 
 def without_beside(paths: Sequence[Path], layout: AnyLayout) -> list[Path]:
-    """Files without those that lie beside another of them and hold more of its channels.
+    """Return the files that do not lie beside another of them as a part of its run.
 
     A glob such as `*.csv` finds both; where the layout puts nothing beside, all are kept.
     """
@@ -236,20 +237,21 @@ def without_beside(paths: Sequence[Path], layout: AnyLayout) -> list[Path]:
 
 
 def _run_starts(table: Table, layout: Layout) -> list[int]:
+    """Return the first row of every run."""
     if layout.new_run == "time_restarts":
         time = table.stacked(layout.channels["time"])[:, 0]
         return [0, *(np.flatnonzero(np.diff(time) <= 0) + 1).tolist()]
     if layout.new_run == "ticks_restart":
         # A run that only drives away from its start counts up in magnitude on its fastest wheel.
-        far = np.abs(table.stacked(layout.channels["wheel_ticks"])).max(axis=1)
-        return [0, *(np.flatnonzero(far[1:] < far[:-1]) + 1).tolist()]
+        count = np.abs(table.stacked(layout.channels["wheel_ticks"])).max(axis=1)
+        return [0, *(np.flatnonzero(np.diff(count) < 0) + 1).tolist()]
     return [0]
 
 
 def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Signal]:
-    """The channels of a table in SI units, each at the times at which it has a value.
+    """Return the channels of a table in SI units, each at the times at which it has a value.
 
-    Appends what is special of them to the notes.
+    Remarks about empty cells are appended to the notes.
     """
     time = _time(table, layout)
     check_time(table, layout, time)
@@ -266,7 +268,7 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
         for j in np.flatnonzero(missing.any(axis=0)).tolist():
             if missing[:, j].all():
                 raise source.error("no value in any row", "numbers", column=j)
-            notes.append(f"column '{columns[j]}' has empty cells: it is taken at its own times")
+            notes.append(f"column '{columns[j]}' has empty cells: it counts at its own times")
         values = (cells * channel.scale + channel.offset) * layout.to_si(name)
         signal, there = Signal(time, values, source), ~missing.all(axis=1)
         out[name] = signal if there.all() else signal.part(there)
@@ -274,6 +276,7 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
 
 
 def _time(table: Table, layout: Layout) -> Float[np.ndarray, " row"]:
+    """Return the times of the rows [s]."""
     if "time" not in layout.channels:
         return np.arange(len(table.values)) * float(layout.row_period or 1.0)
     channel = layout.channels["time"]

@@ -1,4 +1,4 @@
-"""What one sensor recorded, at its own times: what files and bags are read into."""
+"""Samples of one sensor at its own times: the common form of files and bags."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,12 +12,13 @@ from slipid.support.errors import DataError, bad_data
 
 @dataclass(frozen=True, eq=False)
 class SignalSource:
-    """Where the samples of a signal come from, for messages.
+    """Origin of the samples of a signal, for messages.
 
     Attributes:
-        path: the file; `topic`: of a bag, None for a file of rows.
+        path: the file.
         columns: name of each column of the values, as the file or the message has it.
         lines: row in the file of every sample, or number of the message in its topic, from 1.
+        topic: topic of a bag, None for a file of rows.
     """
 
     path: Path
@@ -28,7 +29,7 @@ class SignalSource:
     def error(
         self, found: str, expected: str, sample: int | None = None, column: int | None = None
     ) -> DataError:
-        """The error about a sample (counted from 0), or about all of them."""
+        """Return the error about a sample (counted from 0), or about all of them."""
         row = None if sample is None else int(self.lines[sample])
         name = None if column is None or not self.columns else self.columns[column]
         if self.topic is None:
@@ -38,19 +39,19 @@ class SignalSource:
         return bad_data(where, found, expected, column=name)
 
     def part(self, which: slice | np.ndarray) -> "SignalSource":
-        """The same for some of the samples."""
+        """Return the source of some of the samples."""
         return SignalSource(self.path, self.columns, self.lines[which], self.topic)
 
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """Samples of one channel, at the times of its own sensor.
+    """Samples of one channel at the times of its own sensor.
 
     Attributes:
-        time: when each sample was taken, increasing, on the clock that all signals of a run share
-            [s]. It may count from 1970.
-        values: in the unit of `CHANNELS` (SI), wheels or drives in the columns.
-        source: where the samples come from.
+        time: increasing times on the clock that all signals of a run share [s]; they may count from
+            1970.
+        values: values in the unit of `CHANNELS` (SI), wheels or drives in the columns.
+        source: origin of the samples.
     """
 
     time: Float[np.ndarray, " sample"]
@@ -58,12 +59,12 @@ class Signal:
     source: SignalSource
 
     def part(self, which: slice | np.ndarray) -> "Signal":
-        """Some of the samples."""
+        """Return some of the samples."""
         return Signal(self.time[which], self.values[which], self.source.part(which))
 
 
 def clock_of(signals: Sequence[Signal]) -> Float[np.ndarray, " time"]:
-    """Every time at which one of some signals was sampled, each once [s]."""
+    """Return every time at which one of some signals was sampled, each once [s]."""
     first = signals[0].time
     if all(signal.time is first for signal in signals) and (np.diff(first) > 0).all():
         return first

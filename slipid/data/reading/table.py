@@ -1,4 +1,4 @@
-"""From the bytes of a CSV or Parquet file to columns of numbers, or to the cell that is wrong."""
+"""Numbers of a CSV or Parquet file, or an error about the wrong cell."""
 
 import hashlib
 import re
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pyarrow import Table as ParquetTable
 
 MISSING = {"", "nan", "na", "n/a", "null", "none"}
-"""Cells that hold no number."""
+"""Cells without a number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,19 +44,19 @@ class Table:
         return self.values[:, self.names.index(name)]
 
     def stacked(self, channel: Channel) -> Float[np.ndarray, "row column"]:
-        """Cells of a channel's columns, side by side."""
+        """Return the cells of a channel's columns, side by side."""
         return self.values[:, [self.names.index(c) for c in channel.columns]]
 
     def rows(self, which: slice | np.ndarray) -> "Table":
-        """The table with some of its rows."""
+        """Return the table with some of its rows."""
         return replace(self, values=self.values[which], lines=self.lines[which])
 
 
 def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Table:
-    """Numbers of a CSV or Parquet file, each cell checked.
+    """Return the numbers of a CSV or Parquet file, each cell checked.
 
     Args:
-        layout: where names and numbers are, and which columns are wanted.
+        layout: positions of names and numbers, and the wanted columns.
         all_columns: read every column of the file and not only those the layout uses.
 
     Raises:
@@ -86,7 +86,7 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
 
 
 def bytes_of(path: Path, limit: int = -1) -> bytes:
-    """Bytes of a file, or its first ones; DataError where it cannot be read or is empty."""
+    """Return the bytes of a file, or its first ones; `DataError` if unreadable or empty."""
     if path.is_dir():
         raise bad_data(path, "a folder", "a CSV or Parquet file")
     try:
@@ -100,7 +100,7 @@ def bytes_of(path: Path, limit: int = -1) -> bytes:
 
 
 def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
-    """The table in the bytes of a Parquet file; DataError where it is none, or has no rows."""
+    """Return the table in the bytes of a Parquet file; `DataError` if it is none or empty."""
     try:
         import pyarrow
         import pyarrow.parquet as parquet
@@ -119,6 +119,7 @@ def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
 def _parquet(
     path: Path, raw: bytes, layout: Layout, all_columns: bool
 ) -> tuple[tuple[str | int, ...], Float[np.ndarray, "row column"]]:
+    """Return names and numbers of the wanted columns of a Parquet file."""
     import pyarrow
 
     table = parquet_of(path, raw)
@@ -136,7 +137,7 @@ def _parquet(
 
 
 def text_lines(path: Path, raw: bytes) -> list[str]:
-    """Lines of a file in UTF-8, with or without a byte order mark, whatever ends its lines."""
+    """Return the lines of a UTF-8 file, with or without a byte order mark, with any line ends."""
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise bad_data(path, "text in UTF-16", "UTF-8", row=1)
     if b"\0" in raw:
@@ -156,12 +157,12 @@ def text_lines(path: Path, raw: bytes) -> list[str]:
 
 
 def cells_of(line: str, delimiter: str) -> list[str]:
-    """Cells of a line, without blanks and quotes around them."""
+    """Return the cells of a line, without blanks and quotes around them."""
     return [cell.strip().strip("\"'").strip() for cell in line.split(delimiter)]
 
 
 def number_in(cell: str) -> float | None:
-    """The number in a cell; None where it holds something else."""
+    """Return the number in a cell, or None where it holds something else."""
     try:
         # Python would read 1_000 as a thousand; no logger writes that on purpose.
         return float(cell) if "_" not in cell else None
@@ -170,7 +171,7 @@ def number_in(cell: str) -> float | None:
 
 
 def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
-    """Names of the columns, empty ones included; without a names row as many empty ones."""
+    """Return the names of the columns, empty ones included; all are empty without a names row."""
     row = layout.names_row or layout.first_data_row
     if len(lines) < row:
         expected = f"column names in row {row}" if layout.names_row else f"numbers from row {row}"
@@ -219,7 +220,7 @@ def wanted_names(
 
 
 def check_fields(path: Path, body: list[str], header: list[str], layout: Layout) -> None:
-    """Refuse rows with more or fewer cells than there are names; one trailing delimiter is fine."""
+    """Raise `DataError` for rows with a wrong number of cells; one trailing delimiter is fine."""
     counts = np.array([line.count(layout.delimiter) for line in body]) + 1
     expected = len(header)
     if (counts == expected).all():
@@ -245,7 +246,7 @@ def check_fields(path: Path, body: list[str], header: list[str], layout: Layout)
 
 
 def check_units(path: Path, line: str, header: list[str], layout: Layout) -> None:
-    """Refuse a units row that says another unit than the layout declares."""
+    """Raise `DataError` where the units row has another unit than the layout declares."""
     units = cells_of(line, layout.delimiter)
     for channel in layout.channels.values():
         for column in channel.columns:
@@ -261,7 +262,7 @@ def check_units(path: Path, line: str, header: list[str], layout: Layout) -> Non
 def cell_by_cell(
     path: Path, body: list[str], names: tuple[str | int, ...], where: list[int], layout: Layout
 ) -> Float[np.ndarray, "row column"]:
-    """The slow way, taken when the fast one fails: accepts empty cells, names the first bad one."""
+    """Return numbers where the fast parser fails: empty cells are NaN, wrong ones an error."""
     values = np.empty((len(body), len(where)))
     for i, line in enumerate(body):
         cells = cells_of(line, layout.delimiter)

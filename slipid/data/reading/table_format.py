@@ -1,4 +1,4 @@
-"""Where names, units and numbers stand in a table that nobody described, and its numbers."""
+"""Format of a table without a layout: position of names, units and numbers, and the numbers."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -12,26 +12,28 @@ from slipid.data.reading.table import MISSING, bytes_of, cells_of, number_in, pa
 from slipid.support.errors import bad_data
 
 ROWS = 50_000
-"""Rows that are looked at for what the numbers are like."""
+"""Most rows that are read to judge the numbers."""
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _HEAD = 60
-"""Lines that are looked at for the header."""
+"""Lines that are searched for the header."""
 _FEW = 10
-"""Rows of numbers from which a file can be a log: settings have fewer."""
+"""Least number of rows of numbers in a log; files of settings have fewer."""
 _BEGINNING = 200_000
-"""Bytes of a file that are read to see what kind it is."""
+"""Bytes of a file that are read to find its format."""
 
 
 @dataclass(frozen=True)
 class TableFormat:
-    """Where things stand in a file of rows.
+    """Format of a file of rows.
 
     Attributes:
         path: the file.
-        delimiter: between its cells; empty for Parquet.
-        names_row, units_row, first_data_row: as of `Layout`.
-        names: of its columns, empty ones where it has none.
-        units: of its columns as a row of units says, empty ones where there is none.
+        delimiter: character between its cells; empty for Parquet.
+        names_row: line with the column names, counted from 1; 0 where there is none.
+        units_row: line with the units; 0 where there is none.
+        first_data_row: line of the first numbers.
+        names: names of its columns, empty ones where it has none.
+        units: units of its columns in a row of units, empty ones where there is none.
     """
 
     path: Path
@@ -44,19 +46,22 @@ class TableFormat:
 
     @property
     def signature(self) -> "TableFormat":
-        """The format without its path: files of one kind have it in common."""
+        """Return the format without its path; files of one type have it in common."""
         return replace(self, path=Path())
 
     def column(self, at: int) -> str | int:
-        """Name of a column in a layout, or its position."""
+        """Return the name of a column in a layout, or its position."""
         return self.names[at] if self.names_row else at
 
 
 @dataclass(frozen=True, eq=False)
 class TableNumbers:
-    """Cells of a file of rows, NaN where they are empty or no number.
+    """Numbers of a file of rows.
 
-    `texts` are the columns that hold something else than numbers.
+    Attributes:
+        format: format of the file.
+        values: its cells, NaN where they are empty or no number.
+        texts: columns that hold something else than numbers.
     """
 
     format: TableFormat
@@ -65,11 +70,11 @@ class TableNumbers:
 
 
 def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
-    """Where things stand in a CSV or Parquet file.
+    """Return the format of a CSV or Parquet file.
 
     Args:
         path: the file.
-        delimiter: between its cells; None where it is to be found.
+        delimiter: character between its cells; None where it is unknown.
 
     Raises:
         DataError: it cannot be read, is empty, or is no log of rows of numbers.
@@ -99,7 +104,7 @@ def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
 
 
 def numbers_of(format: TableFormat) -> TableNumbers:
-    """The numbers of a file, its first `ROWS` rows."""
+    """Return the numbers in the first `ROWS` rows of a file."""
     if not format.delimiter:
         return _parquet_numbers(format)
     lines = _lines(format.path)
@@ -113,7 +118,7 @@ def numbers_of(format: TableFormat) -> TableNumbers:
 
 
 def _cell_by_cell(format: TableFormat, body: list[str]) -> TableNumbers:
-    """The slow way: accepts empty cells and texts."""
+    """Return the numbers where the fast parser fails, with empty cells and texts."""
     width = len(format.names)
     values = np.full((len(body), width), np.nan)
     wrong = np.zeros(width, dtype=int)
@@ -129,6 +134,7 @@ def _cell_by_cell(format: TableFormat, body: list[str]) -> TableNumbers:
 
 
 def _parquet_numbers(format: TableFormat) -> TableNumbers:
+    """Return the numbers of a Parquet file."""
     import pyarrow
 
     table = parquet_of(format.path, bytes_of(format.path))
@@ -144,7 +150,7 @@ def _parquet_numbers(format: TableFormat) -> TableNumbers:
 
 
 def _lines(path: Path, limit: int = -1) -> list[str]:
-    """Lines of a text file, or of its beginning, the last one whole."""
+    """Return the lines of a text file, or whole lines of its beginning."""
     raw = bytes_of(path, limit)
     if len(raw) == limit and b"\n" in raw:
         raw = raw[: raw.rindex(b"\n")]
@@ -152,7 +158,7 @@ def _lines(path: Path, limit: int = -1) -> list[str]:
 
 
 def _delimiter_of(lines: list[str]) -> str:
-    """The character that is in most lines the same number of times; most times, if several are."""
+    """Return the character with the most constant count per line; of several, the most frequent."""
 
     def score(delimiter: str) -> tuple[float, int]:
         counts = Counter(line.count(delimiter) for line in lines[:_HEAD] if line.strip())
@@ -166,7 +172,7 @@ def _delimiter_of(lines: list[str]) -> str:
 
 
 def _first_numbers(rows: list[list[str]]) -> int | None:
-    """Place of the first row that holds numbers and nothing else, or nearly."""
+    """Return the index of the first row that holds mostly numbers."""
     usual = Counter(len(row) for row in rows).most_common(1)[0][0]
     for k, row in enumerate(rows):
         filled = [cell for cell in row if cell.lower() not in MISSING]
@@ -177,7 +183,7 @@ def _first_numbers(rows: list[list[str]]) -> int | None:
 
 
 def _header_rows(rows: list[list[str]], width: int) -> tuple[int, int]:
-    """Rows of names and of units, counted from 1, 0 where there is none."""
+    """Return the rows of names and of units, counted from 1, 0 where there is none."""
     names = units = 0
     for k, row in enumerate(rows, start=1):
         filled = [cell for cell in row if cell]
@@ -198,7 +204,7 @@ def _header_rows(rows: list[list[str]], width: int) -> tuple[int, int]:
 
 
 def _refuse_commas(path: Path, body: list[list[str]], delimiter: str, first: int) -> None:
-    """Refuse decimal commas here already: no layout could read them."""
+    """Raise `DataError` for decimal commas, since no layout could read them."""
     if delimiter == ",":
         return
     for k, cells in enumerate(body[:_HEAD]):

@@ -1,4 +1,4 @@
-"""Units of log columns: from the unit a column is declared in to SI, dimension checked."""
+"""Units of log columns: conversion from a declared unit to SI, with the dimension checked."""
 
 from contextlib import suppress
 from functools import lru_cache
@@ -9,8 +9,8 @@ from slipid.support.errors import did_you_mean
 if TYPE_CHECKING:
     import pint
 
-# The registry is our own, and small, for one reason: here an angle is a dimension. With an angle as
-# a pure number, as SI has it, "Hz" would silently pass as rad/s and a duty cycle as an angle.
+# The registry has its own units for one reason: here an angle is a dimension. With an angle as a
+# pure number, as in SI, "Hz" would silently pass as rad/s and a duty cycle as an angle.
 _PREFIXES = (
     "nano- = 1e-9 = n-",
     "micro- = 1e-6 = u- = µ-",
@@ -47,6 +47,7 @@ KNOWN = (
 @lru_cache(maxsize=1)
 def _registry() -> "pint.UnitRegistry[Any]":
     # Late: importing pint takes as long as importing numpy, and most commands read no log.
+    """Return the registry of units."""
     import pint
 
     registry: pint.UnitRegistry[Any] = pint.UnitRegistry(None)
@@ -57,10 +58,10 @@ def _registry() -> "pint.UnitRegistry[Any]":
 
 @lru_cache(maxsize=256)
 def factor(unit: str, target: str) -> float:
-    """Factor from a unit as people write it ("rpm", "mm/s", "%") to one of the same dimension.
+    """Return the factor from a unit ("rpm", "mm/s", "%") to one of the same dimension.
 
     Raises:
-        ValueError: where the unit is unknown, or of another dimension.
+        ValueError: the unit is unknown, or of another dimension.
     """
     registry = _registry()
     wanted = registry.parse_units(_ALIASES.get(target, target))
@@ -75,14 +76,14 @@ def factor(unit: str, target: str) -> float:
 
 
 def converts(unit: str, target: str) -> bool:
-    """Whether a unit is known and of the dimension of another."""
+    """Return whether a unit is known and has the dimension of another."""
     with suppress(ValueError):
         return factor(unit, target) > 0
     return False
 
 
 def same_unit(one: str, other: str) -> bool:
-    """Whether two texts mean the same unit, as "pix" and "pixel" do; False where unreadable."""
+    """Return whether two texts mean the same unit, as "pix" and "pixel"; False where unreadable."""
     with suppress(ValueError):
         return abs(factor(one, other) - 1.0) < 1e-9
     return False

@@ -1,4 +1,4 @@
-"""What is sampled and when it stops; blocks of a chain, some steps at a time, and as arrays."""
+"""Log density and plan of a sampler, and blocks of its chain with their arrays in files."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,17 +16,22 @@ from slipid.infer.posterior.transport_map import (
 )
 
 FORMAT = 5
-"""Version of the block files; bump it when their content or the way they are made changes."""
+"""Version of the block files; it must change with their content or the algorithm."""
 Chain = Float[np.ndarray, "ensemble step walker size"]
 
 
 @dataclass(frozen=True, eq=False)
 class LogDensity:
-    """A log density, and what is known of it beforehand.
+    """A log density with a Gaussian (Laplace) approximation of it.
 
-    Terms of vectors (walker, size) are (walker, group + 1), the shared one last; the slope is that
-    of their sum. Coordinates have a group, -1 where groups share them; centre and covariance are of
-    a Gaussian near it (Laplace). The map is what it is seen through; None for x itself.
+    Attributes:
+        terms: function from vectors (walker, size) to terms (walker, group + 1), the shared one
+            last.
+        slope: gradient of the sum of the terms.
+        group: group of each coordinate, -1 for one that groups share.
+        centre: mean of the Gaussian.
+        covariance: covariance of the Gaussian.
+        map: map of the coordinates that the density is given in; None for x itself.
     """
 
     terms: Callable[[Matrix], Matrix]
@@ -37,16 +42,16 @@ class LogDensity:
     map: Transport | None = None
 
     def log_prob(self, x: Matrix) -> Matrix:
-        """Log density and, as blobs, its terms."""
+        """Return the log density followed by its terms, which emcee keeps as blobs."""
         terms = self.terms(x)
         return np.concatenate([terms.sum(axis=1, keepdims=True), terms], axis=1)
 
     def laplace(self) -> Transport:
-        """Map of the Gaussian near it."""
+        """Return the map of the Gaussian approximation."""
         return gaussian(self.centre, self.covariance, self.group)
 
-    def seen_by(self, map: Transport) -> "LogDensity":
-        """The same distribution in other coordinates; centre and covariance are left alone."""
+    def in_coordinates(self, map: Transport) -> "LogDensity":
+        """Return the distribution in mapped coordinates; centre and covariance stay those of x."""
         count = int(self.group.max()) + 1
         onto = np.eye(count + 1)[np.where(self.group < 0, count, self.group)]
 
@@ -55,26 +60,28 @@ class LogDensity:
             return np.asarray(self.terms(x) + log @ onto)
 
         def slope(u: Matrix) -> Matrix:
-            return map.pull(u, self.slope)
+            return map.pulled_back(u, self.slope)
 
         return replace(self, terms=terms, slope=slope, map=map)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How to sample and when to stop.
+    """Settings of the sampler, and its criteria of convergence.
 
     Attributes:
-        ensembles, walkers: independent ensembles, and walkers of each.
-        block: steps in a block.
-        warm_up: numbers of blocks after which proposals are learnt; the last ends the warm-up, and
-            leaves some blocks for the step of Hamiltonian moves to suit the last proposals.
-        most: blocks after which sampling ends without having converged.
-        spread: how far from the fit the widest walker starts, in stds; the first starts at a
-            quarter of it. Wide starts find modes that the fit has not seen.
-        r_hat: R-hat over ensembles that every coordinate must be below to have converged.
-        steps_per_tau: steps per autocorrelation time that every coordinate must be above.
-        least_draws: effective draws that every coordinate must be above.
+        ensembles: number of independent ensembles.
+        walkers: number of walkers of each.
+        block: number of steps in a block.
+        warm_up: counts of blocks after which proposals are learnt; the last ends the warm-up and
+            leaves blocks in which the step of Hamiltonian moves adapts to the last proposals.
+        most: number of blocks after which sampling ends without convergence.
+        spread: distance of the widest walker's start from the fit [std]; the first walker starts
+            at a quarter of it. Wide starts find modes away from the fit.
+        r_hat: upper limit of R-hat over ensembles for every coordinate.
+        steps_per_tau: lower limit of steps per autocorrelation time for every coordinate.
+        least_draws: lower limit of effective draws for every coordinate.
+        seed: seed of all random numbers.
     """
 
     ensembles: int = 4
@@ -96,14 +103,15 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class ChainBlock:
-    """Some steps of all ensembles, and all that is needed to go on.
+    """Some steps of all ensembles, with the state that the next block starts from.
 
     Attributes:
-        number: of the block; the first is 0.
-        chain, log_prob: positions of all walkers, and their log density.
-        random: Mersenne twister keys, and (place, has Gaussian, Gaussian) of each.
-        accepted: part of the moves that moved something, for each ensemble.
-        map: map to the coordinates in which the next block is made.
+        number: number of the block; the first is 0.
+        chain: positions of all walkers.
+        log_prob: log density at these positions.
+        random: Mersenne twister keys, and (position, has Gaussian, Gaussian) of each.
+        accepted: share of the moves that changed a coordinate, for each ensemble.
+        map: map to the coordinates of the next block.
         angle: step of the Hamiltonian moves of every family in the next block [rad].
     """
 
@@ -118,19 +126,21 @@ class ChainBlock:
 
 @dataclass(frozen=True)
 class BlockStore:
-    """Where blocks of an earlier call are found and where new ones go.
+    """Storage of blocks, by default none.
 
-    `done` gives the blocks of a part that are there already. `tell` is called with the part and the
-    number of steps of a block that are done.
+    Attributes:
+        done: function that returns the stored blocks of a part.
+        keep: function that stores a block of a part.
+        progress: function that is called with the part and the number of steps of its block.
     """
 
     done: Callable[[str], Sequence[ChainBlock]] = lambda part: ()
     keep: Callable[[str, ChainBlock], None] = lambda part, block: None
-    tell: Callable[[str, int], None] = lambda part, steps: None
+    progress: Callable[[str, int], None] = lambda part, steps: None
 
 
 def packed(block: ChainBlock) -> dict[str, np.ndarray]:
-    """Arrays of a block under their names in a file."""
+    """Return the arrays of a block under their names in a file."""
     out = {
         "number": np.asarray(block.number),
         "chain": block.chain,
@@ -142,31 +152,31 @@ def packed(block: ChainBlock) -> dict[str, np.ndarray]:
         "mean": block.map.mean,
         "last": np.stack(list(vars(block.map.last).values())),
     }
-    for k, stair in enumerate(block.map.stairs):
-        out |= {f"{k}/{name}": getattr(stair, name) for name in _OF_STAIR}
-        if stair.bend:
-            out |= {f"{k}/bend/{name}": value for name, value in vars(stair.bend).items()}
+    for k, stage in enumerate(block.map.stages):
+        out |= {f"{k}/{name}": getattr(stage, name) for name in _STAGE_FIELDS}
+        if stage.bend:
+            out |= {f"{k}/bend/{name}": value for name, value in vars(stage.bend).items()}
     return out
 
 
 def unpacked(arrays: Mapping[str, np.ndarray]) -> ChainBlock:
-    """Block from the arrays that `packed` gave."""
-    stairs = []
-    while f"{len(stairs)}/own" in arrays:
-        k = len(stairs)
-        bend = {n: arrays[f"{k}/bend/{n}"] for n in _OF_BEND if f"{k}/bend/{n}" in arrays}
-        fields = {n: arrays[f"{k}/{n}"] for n in _OF_STAIR}
-        stairs.append(Stage(**fields, bend=Polynomials(**bend) if bend else None))
+    """Return the block from the arrays that `packed` returned."""
+    stages = []
+    while f"{len(stages)}/own" in arrays:
+        k = len(stages)
+        bend = {n: arrays[f"{k}/bend/{n}"] for n in _POLYNOMIAL_FIELDS if f"{k}/bend/{n}" in arrays}
+        fields = {n: arrays[f"{k}/{n}"] for n in _STAGE_FIELDS}
+        stages.append(Stage(**fields, bend=Polynomials(**bend) if bend else None))
     return ChainBlock(
         number=int(arrays["number"]),
         chain=arrays["chain"],
         log_prob=arrays["log_prob"],
         random=(arrays["random_key"], arrays["random_rest"]),
         accepted=arrays["accepted"],
-        map=Transport(arrays["mean"], tuple(stairs), Warp(*arrays["last"])),
+        map=Transport(arrays["mean"], tuple(stages), Warp(*arrays["last"])),
         angle=arrays["angle"],
     )
 
 
-_OF_STAIR = ("own", "given", "slope", "root")
-_OF_BEND = ("factors", "shift", "scale")
+_STAGE_FIELDS = ("own", "given", "slope", "root")
+_POLYNOMIAL_FIELDS = ("factors", "shift", "scale")

@@ -1,4 +1,4 @@
-"""Which numbers of a problem a density is over, and what it holds of the data and of the fit."""
+"""Coordinates of a density, and the data and fitted values that it is anchored at."""
 
 from dataclasses import dataclass
 
@@ -19,15 +19,18 @@ from slipid.model.robot import Robot
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
 """Parts of a posterior that a density can be of."""
 _TURNS = 3
-"""Of the weights of runs and of what runs share, at the fit."""
+"""Alternations between weights of runs and shared effects at the fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Where a fit ended.
+    """End of a fit.
 
-    The Laplace covariance has what runs share marginalised; where currents were logged it is that
-    of p(electric | motion, data) p(motion | motion data).
+    Attributes:
+        z: search vector.
+        log_variance: log variances in the order of the problem's components.
+        covariance: Laplace covariance with shared effects marginalised; if currents were logged,
+            that of p(electric | motion, data) p(motion | motion data).
     """
 
     z: np.ndarray
@@ -36,16 +39,19 @@ class Fitted:
 
     @classmethod
     def of(cls, fit: Fit) -> "Fitted":
-        """The end of a fit, with the variances in the order of its problem."""
+        """Return the end of a fit, with the variances in the order of its problem."""
         names = required(fit.problem).noise.names
         return cls(fit.z, np.log([fit.variance[name] for name in names]), fit.covariance)
 
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """Which coordinates a density has: places in the search vector.
+    """Coordinates of a density.
 
-    The group is the floor of each coordinate, -1 where several share it.
+    Attributes:
+        names: name of each coordinate.
+        structure: index of each coordinate in the search vector.
+        group: floor of each coordinate, -1 for one that several floors share.
     """
 
     names: tuple[str, ...]
@@ -54,7 +60,7 @@ class Coordinates:
 
     @staticmethod
     def of(problem: Problem, fitted: Fitted, part: str) -> "Coordinates":
-        """Coordinates of a part; the floors that each touches are those of the fit's Jacobian."""
+        """Return the coordinates of a part; the fit's Jacobian shows which floors each affects."""
         _, jacobian = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
         blocks = {
             MOTION: ["motion"],
@@ -76,34 +82,37 @@ class Coordinates:
 
 
 def _groups(touched: Bool[np.ndarray, "size floor"]) -> Int[np.ndarray, " size"]:
-    """The one floor that a coordinate touches, else -1; a single floor is a single group."""
+    """Return the one floor that a coordinate affects, else -1; a single floor is one group."""
     alone = (touched.sum(axis=1) == 1) | (touched.shape[1] == 1)
     return np.where(alone, touched.argmax(axis=1), -1)
 
 
-def effects_at(problem: Problem, residual: Blocks, log_v: Vector) -> Float[np.ndarray, "piece 3"]:
-    """Effects that runs share at a fit, in turns with the weights of runs that they leave."""
+def effects_at(problem: Problem, residual: Blocks, log_v: Vector) -> Float[np.ndarray, "segment 3"]:
+    """Return the shared effects at a fit, alternating with the weights of runs given them."""
     keep = np.ones(len(problem.windows))
     effect = np.zeros((len(keep), 3))
     for _ in range(_TURNS):
-        seen = problem.weighed(residual, log_v, keep, effect)
-        root = seen.whitening.root["motion"]
-        effect = np.asarray(effects_given(seen.effects, root, residual["motion"]))
+        weighed = problem.weighed(residual, log_v, keep, effect)
+        root = weighed.whitening.root["motion"]
+        effect = np.asarray(effects_given(weighed.effects, root, residual["motion"]))
     return effect
 
 
 class Anchor(eqx.Module):
-    """Windows and the fit that a density is anchored at; an argument of what is compiled.
+    """Windows and fitted values that a density is anchored at; an argument of compiled functions.
 
     Attributes:
         batch: the windows.
-        z: search vector of the fit; prior_std: of every coordinate.
-        root: whitens every block by the noise of the fit; scale: root of the weight of each piece
-            in it, that of an outlier being small.
-        log_det: log determinant of each piece's noise.
-        shared, tied: what runs share, given residuals whitened by root and scale.
-        twist, twist_slope: at the fit, and by the search vector.
-        electric: what voltages are predicted with, but for the resistance.
+        z: search vector of the fit.
+        prior_std: prior std of every coordinate.
+        root: whitening matrices of every block, by the noise of the fit.
+        scale: root of the weight of each segment, small for an outlier.
+        log_det: log determinant of each segment's noise covariance.
+        shared: shared effects by floor.
+        tied: posterior of shared effects given residuals whitened by root and scale.
+        twist: twist of every window at the fit.
+        twist_slope: its derivative by the search vector.
+        electric: noise of the voltage prediction, at the fitted resistance.
     """
 
     batch: lk.Batch
@@ -114,27 +123,27 @@ class Anchor(eqx.Module):
     log_det: dict[str, Array]
     shared: tuple[SharedEffects, ...]
     tied: tuple[EffectPosterior, ...]
-    twist: Float[Array, "piece window 3"]
-    twist_slope: Float[Array, "piece window 3 free"]
+    twist: Float[Array, "segment window 3"]
+    twist_slope: Float[Array, "segment window 3 free"]
     electric: lk.ElectricNoise
 
     @staticmethod
     def at(problem: Problem, fitted: Fitted) -> "Anchor":
-        """Anchor at a fit.
+        """Return the anchor at a fit.
 
-        Weights are those at the fit, less what a Student t tells less of its centre than a
-        Gaussian: the information is then the one that Laplace's covariance has.
+        Weights are those at the fit, times the information of a Student t on its centre over that
+        of a Gaussian, so that the information equals that of the Laplace covariance.
         """
         log_v, keep = jnp.asarray(fitted.log_variance), np.ones(len(problem.windows))
         electric = problem.electric(fitted.z, log_v)
         residual, _ = problem.linear(fitted.z, electric)
         effect = effects_at(problem, residual, log_v)
         part = {k: expected(r.shape[-1]) for k, r in residual.items()}
-        seen = problem.weighed(residual, log_v, keep * part["motion"], effect)
+        weighed = problem.weighed(residual, log_v, keep * part["motion"], effect)
         plain = {k: inverse_root(c.covariance(log_v)) for k, c in problem.noise.blocks.items()}
         diagonal = {k: jnp.diagonal(r, axis1=-2, axis2=-1) for k, r in plain.items()}
         twist, slope = twists(problem.space, problem.batch, fitted.z)
-        weight = seen.whitening.weight
+        weight = weighed.whitening.weight
         return Anchor(
             batch=problem.batch,
             z=jnp.asarray(fitted.z),
@@ -143,14 +152,14 @@ class Anchor(eqx.Module):
             scale={k: jnp.sqrt(w * part[k] / part["motion"]) for k, w in weight.items()},
             log_det={k: -2 * jnp.sum(jnp.log(d), axis=-1) for k, d in diagonal.items()},
             shared=problem.objective.shared,
-            tied=seen.effects,
+            tied=weighed.effects,
             twist=twist,
             twist_slope=slope,
             electric=electric,
         )
 
     def predict(self, robot: Robot, z: Array) -> lk.Predicted:
-        """What the robot predicts, searched from twists at the fit and, if that fails, afresh."""
+        """Return a robot's prediction, solved from the fit's twists or, if that fails, anew."""
         b = self.batch
         start = self.twist + self.twist_slope @ (z - self.z)
         p = lk.predict(robot, b, jax.lax.stop_gradient(start))
@@ -158,16 +167,19 @@ class Anchor(eqx.Module):
         return jax.lax.cond(arrived, lambda: p, lambda: lk.predict(robot, b))
 
     def noise(self, robot: Robot) -> lk.ElectricNoise:
-        """What voltages are predicted with at the resistance of a robot."""
+        """Return the noise of the voltage prediction at a robot's resistance."""
         held = self.electric
         return lk.ElectricNoise(held.voltage_std, held.scatter, robot.motor.resistance)
 
-    def white(self, k: str, r: Float[Array, "piece m"]) -> Float[Array, "piece m"]:
-        """Residuals of a block, whitened and weighed."""
+    def white(self, k: str, r: Float[Array, "segment m"]) -> Float[Array, "segment m"]:
+        """Return the residuals of a block, whitened and weighted."""
         return jnp.einsum("nij,nj->ni", self.root[k], r) * self.scale[k][:, None]
 
-    def log_student(self, k: str, r: Float[Array, "piece m"]) -> Float[Array, " piece"]:
-        """Log density of residuals of block `k` of every piece, a Student t with scale matrix V."""
+    def log_student(self, k: str, r: Float[Array, "segment m"]) -> Float[Array, " segment"]:
+        """Return the Student t log density of every segment's residuals of block `k`.
+
+        The scale matrix is V, the covariance that `root` whitens.
+        """
         m = r.shape[1]
         q = jnp.sum(jnp.einsum("nij,nj->ni", self.root[k], r) ** 2, axis=1)
         constant = gammaln(0.5 * (DEGREES + m)) - gammaln(0.5 * DEGREES)

@@ -1,25 +1,23 @@
-"""Log posterior of many walkers at a time, for samplers: what the fit maximises, as a density.
+"""Log posterior of many walkers at a time, for samplers: the objective of the fit as a density.
 
-A coordinate is a free number of the search space. Variances and the weights of runs are held as
-the fit found them, and what runs share is marginalised, so that the density is that of nonlinear
-least squares,
+A coordinate is a free number of the search space. Variances and the weights of runs keep their
+fitted values, and shared effects are marginalised, so that the density is that of nonlinear least
+squares,
 
     log p(x | data) = -1/2 |y(x)|^2 - 1/2 |(x - mean) / std|^2 + f log |d residuals / d data|
 
-with |y|^2 that of `slipid.fit.shared_effects.marginal_residuals`, and f what a Student t tells of
-its centre over what a Gaussian does, as it is in y. Floors share some coordinates and have the
-others to themselves, so that the log posterior is a sum
+with y from `slipid.fit.shared_effects.marginal_residuals`, and f the information of a Student t on
+its centre over that of a Gaussian, as in y. Floors share some coordinates and have others of their
+own, so that the log posterior is a sum
 
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
 
 and numbers of several floors can be moved, and accepted or not, in one evaluation.
 
-A draw of the electric numbers for every draw of the motion.
-
-Given the motion their most likely values are found by Gauss-Newton steps, and proposals are drawn
-from a Student t there, whose tails reach where a skewed density does. Each is accepted or not by
-the exact density (Metropolis-Hastings with independent proposals; Tierney 1994, Annals of
-Statistics 22(4)).
+Electric numbers are drawn for every draw of the motion. Gauss-Newton steps find their most likely
+values given the motion, and proposals come from a Student t around them, whose tails cover those
+of a skewed density. Each is accepted or not by the exact density (Metropolis-Hastings with
+independent proposals; Tierney 1994, Annals of Statistics 22(4)).
 """
 
 from collections.abc import Callable
@@ -43,24 +41,29 @@ Result = TypeVar("Result")
 
 
 class HeldMotion(NamedTuple):
-    """What the electric part holds of the motion of each walker: search vector and traction."""
+    """Motion of each walker that its electric numbers are conditioned on.
+
+    Attributes:
+        z: search vector.
+        motor_force: contact forces that the motors bear.
+    """
 
     z: Float[Array, "*walker free"]
-    motor_force: Float[Array, "*walker piece window wheel 2"]
+    motor_force: Float[Array, "*walker segment window wheel 2"]
 
 
 class _Residuals(NamedTuple):
-    """Blocks of residuals (piece, m), and the robot they are of."""
+    """Blocks of residuals (segment, m), and the robot that predicts them."""
 
     residuals: dict[str, Array]
     robot: Robot
 
 
 class Density:
-    """Log posterior of a part of a problem's numbers, the others held.
+    """Log posterior of a part of a problem's numbers around a fit, with the others held.
 
-    The fit is what a chain starts around. Where currents do not inform motion, the part EVERYTHING
-    is no posterior, but has the likelihoods.
+    If currents do not inform the motion, the part EVERYTHING has the likelihoods of all residuals,
+    but is no posterior.
     """
 
     def __init__(self, problem: Problem, fitted: Fitted, part: str):
@@ -85,24 +88,24 @@ class Density:
         return len(self.names)
 
     def full(self, anchor: Anchor, x: Array) -> Array:
-        """Search vector of chain coordinates, the others as at the fit."""
+        """Return the search vector with chain coordinates x and all others as fitted."""
         return anchor.z.at[self.coordinates.structure].set(x)
 
     def of_all(
         self, of: Callable[..., Result], x: np.ndarray | Array, held: HeldMotion | None = None
     ) -> Result:
-        """A method of one vector for many, by the density of this form that compiles for all."""
+        """Apply a method for one vector to many, compiled once for all densities of this form."""
         return self.mapped(of, (jnp.asarray(x), held))
 
     def mapped(self, of: Callable[..., Result], many: tuple[Any, ...]) -> Result:
-        """The same of a function of the density, its anchor and one of each of many."""
+        """Apply a function of the density, its anchor and one element to every element of many."""
         form = self._form
         if of not in form._each:
 
             def each(anchor: Anchor, many: tuple[Any, ...]) -> Result:
                 return jax.lax.map(lambda one: of(form, anchor, *one), many)
 
-            # belongs to the density: one that JAX held by its arguments would never be forgotten
+            # kept by the density: in JAX's own cache of arguments it would never be freed
             form._each[of] = jax.jit(each)
         compiled: Callable[..., Result] = form._each[of]
         return compiled(self.anchor, many)
@@ -110,9 +113,9 @@ class Density:
     def terms(
         self, x: Float[np.ndarray, "walker size"], held: HeldMotion | None = None
     ) -> Float[np.ndarray, "walker term"]:
-        """Terms of the log posterior of every walker: one per floor, then what floors share.
+        """Return terms of the log posterior of every walker: one per floor, then the shared one.
 
-        The electric part needs what it holds of the motion of each walker, as `hold` gives it.
+        The electric part needs the motion of each walker, as `hold` returns it.
         """
         out = np.array(self.of_all(Density.sums, x, held))
         out[~np.isfinite(out)] = -np.inf
@@ -121,24 +124,24 @@ class Density:
     def slope(
         self, x: Float[np.ndarray, "walker size"], held: HeldMotion | None = None
     ) -> Float[np.ndarray, "walker size"]:
-        """Derivative of the log posterior of every walker; the arguments are those of `terms`."""
+        """Return the gradient of every walker's log posterior; the arguments are as in `terms`."""
         return np.array(self.of_all(Density._gradient, x, held))
 
     def _gradient(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
         return jax.grad(lambda x: jnp.sum(self.sums(anchor, x, held)))(x)
 
     def sums(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
-        """Terms of one vector."""
-        seen, count, b = self._residuals(anchor, x, held), len(self.floors), anchor.batch
+        """Return the terms of one vector."""
+        found, count, b = self._residuals(anchor, x, held), len(self.floors), anchor.batch
         out = jnp.zeros(count + 1)
-        camera, spread = lk.log_jacobians(seen.robot, b, anchor.noise(seen.robot))
-        for k, r in seen.residuals.items():
+        camera, spread = lk.log_jacobians(found.robot, b, anchor.noise(found.robot))
+        for k, r in found.residuals.items():
             white, more = anchor.white(k, r), jnp.zeros(len(r))
-            less = expected(r.shape[-1])  # residuals weigh less by as much, or the summit moves
+            less = expected(r.shape[-1])  # the factor of the residuals, or the mode would move
             if k == "motion":
                 more = less * camera
-                for floor, tie in enumerate(anchor.tied):
-                    out = out.at[floor].add(0.5 * _explained(tie, white))
+                for floor, posterior in enumerate(anchor.tied):
+                    out = out.at[floor].add(0.5 * _explained(posterior, white))
             elif k == "voltage":
                 more = less * spread
             out = out.at[b.surface].add(more - 0.5 * jnp.sum(white**2, axis=1))
@@ -147,20 +150,20 @@ class Density:
         return out.at[np.where(at.group < 0, count, at.group)].add(-0.5 * pull**2)
 
     def whitened(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
-        """Whitened residuals of the electric part and of the prior, of one vector."""
-        seen, at = self._residuals(anchor, x, held), self.coordinates.structure
+        """Return whitened residuals of the electric part and of the prior, for one vector."""
+        found, at = self._residuals(anchor, x, held), self.coordinates.structure
         pull = (x - self.problem.space.prior_mean[at]) / anchor.prior_std[at]
         return jnp.concatenate(
-            [*(anchor.white(k, r).ravel() for k, r in seen.residuals.items()), pull]
+            [*(anchor.white(k, r).ravel() for k, r in found.residuals.items()), pull]
         )
 
     def pointwise(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
-        """Log likelihood of every piece given what runs share, by block of residuals."""
-        return self.of_all(Density._pieces, x)
+        """Return log likelihoods of every segment given the shared effects, by residual block."""
+        return self.of_all(Density._pointwise, x)
 
-    def _pieces(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> dict[str, Array]:
-        left, robot = self.left(anchor, x, held)
-        out = {k: anchor.log_student(k, r) for k, r in left.items()}
+    def _pointwise(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> dict[str, Array]:
+        rest, robot = self.without_effects(anchor, x, held)
+        out = {k: anchor.log_student(k, r) for k, r in rest.items()}
         camera, spread = lk.log_jacobians(robot, anchor.batch, anchor.noise(robot))
         if "motion" in out:
             out["motion"] += camera
@@ -169,28 +172,30 @@ class Density:
         return out
 
     def residuals(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
-        """Blocks of residuals less what runs share, of many vectors (draw, piece, m)."""
-        return self.of_all(Density._rest, x)
+        """Return residuals without shared effects, for many vectors (draw, segment, m)."""
+        return self.of_all(Density._residual_blocks, x)
 
-    def _rest(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> dict[str, Array]:
-        return self.left(anchor, x, held).residuals
+    def _residual_blocks(
+        self, anchor: Anchor, x: Array, held: HeldMotion | None
+    ) -> dict[str, Array]:
+        return self.without_effects(anchor, x, held).residuals
 
-    def left(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> _Residuals:
-        """Residuals less what runs share at its conditional mean, of one vector."""
-        seen = self._residuals(anchor, x, held)
-        if "motion" not in seen.residuals:
-            return seen
-        motion = seen.residuals["motion"]
+    def without_effects(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> _Residuals:
+        """Return residuals less the conditional mean of shared effects, for one vector."""
+        found = self._residuals(anchor, x, held)
+        if "motion" not in found.residuals:
+            return found
+        motion = found.residuals["motion"]
         effect = mean_effects(anchor.tied, anchor.white("motion", motion))
         for of in anchor.shared:
             off = jnp.einsum("nma,na->nm", of.effect, effect[of.segments])
             motion = motion.at[of.segments].add(-off)
-        return _Residuals(seen.residuals | {"motion": motion}, seen.robot)
+        return _Residuals(found.residuals | {"motion": motion}, found.robot)
 
     def _residuals(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> _Residuals:
         b, at = anchor.batch, self.coordinates
         if self.part == ELECTRIC:
-            assert held is not None, "what the electric part holds of the motion"
+            assert held is not None, "the electric part needs the motion of each walker"
             robot = self.problem.space.tree(held.z.at[at.structure].set(x))
             return _Residuals(
                 lk.electric_residuals(robot, b, held.motor_force, anchor.noise(robot)), robot
@@ -201,11 +206,11 @@ class Density:
         out = {"motion": lk.motion_residual(robot, b, p)}
         if self.part == EVERYTHING:
             out |= lk.electric_residuals(robot, b, p.motor_force, anchor.noise(robot))
-        # or the root finder is computed again for every consumer
+        # without the barrier XLA repeats the root finder for every consumer
         return _Residuals(jax.lax.optimization_barrier(out), robot)
 
     def hold(self, x: Float[np.ndarray, "walker size"]) -> HeldMotion:
-        """What the electric part holds of walkers of the motion part."""
+        """Return the motion of walkers of the motion part, for the electric part."""
         return self.of_all(Density._held, x)
 
     def _held(self, anchor: Anchor, x: Array, _: None) -> HeldMotion:
@@ -213,15 +218,15 @@ class Density:
         return HeldMotion(z, anchor.predict(self.problem.space.tree(z), z).motor_force)
 
 
-def _explained(tie: EffectPosterior, white: Float[Array, "piece m"]) -> Array:
-    """How much smaller |y|^2 is than that of whitened residuals, by shared effects of a floor."""
-    told = jnp.einsum("nma,nm->an", tie.span, white[tie.segments])
-    along = jnp.einsum("anq,an->aq", tie.root, told).ravel()
-    return jnp.sum(solve_triangular(tie.factor, along, lower=True) ** 2)
+def _explained(posterior: EffectPosterior, white: Float[Array, "segment m"]) -> Array:
+    """Return by how much a floor's shared effects reduce the sum of squared residuals."""
+    projected = jnp.einsum("nma,nm->an", posterior.span, white[posterior.segments])
+    along = jnp.einsum("anq,an->aq", posterior.root, projected).ravel()
+    return jnp.sum(solve_triangular(posterior.factor, along, lower=True) ** 2)
 
 
 _STEPS, _PROPOSALS = 4, 16
-"""Gauss-Newton steps, and proposals of every draw."""
+"""Numbers of Gauss-Newton steps and of proposals for every draw."""
 _DEGREES = 5.0
 """Degrees of freedom of proposals."""
 _WIDER = 1.15
@@ -230,9 +235,12 @@ _WIDER = 1.15
 
 @dataclass(frozen=True, eq=False)
 class ElectricDraws:
-    """Electric numbers for every draw of the motion, and how they were found.
+    """Electric numbers for every draw of the motion.
 
-    Accepted is the part of the proposals that were, still that of draws that never moved.
+    Attributes:
+        x: the draws.
+        accepted: share of the proposals that were accepted.
+        still: share of the draws without any accepted proposal.
     """
 
     x: Float[np.ndarray, "ensemble draw size"]
@@ -247,10 +255,15 @@ def electric_given_motion(
     x: Float[np.ndarray, "ensemble draw size"],
     seed: int,
 ) -> ElectricDraws:
-    """Draws of the second density given draws of the first.
+    """Draw electric numbers from the second density for every draw of the first.
 
-    The covariance is Laplace's of the search vector: its regression of electric numbers on those of
-    the motion is where Gauss-Newton steps start.
+    Args:
+        first: density of the motion.
+        second: density of the electric numbers given the motion.
+        covariance: Laplace covariance of the search vector; Gauss-Newton steps start at its
+            regression of electric numbers on those of the motion.
+        x: draws of the motion.
+        seed: seed of the proposals.
     """
     motion, electric = first.coordinates.structure, second.coordinates.structure
     slope = np.linalg.solve(
@@ -275,7 +288,7 @@ def electric_given_motion(
 def _draw(
     density: Density, anchor: Anchor, held: HeldMotion, start: Array, student: Array, chance: Array
 ) -> tuple[Array, Array]:
-    """The last of the proposals that were accepted, and which were."""
+    """Return the last accepted proposal, and which proposals were accepted."""
 
     def log_prob(x: Array) -> Array:
         return jnp.sum(density.sums(anchor, x, held))
@@ -288,7 +301,7 @@ def _draw(
         return x + jnp.linalg.solve(information(x), jax.grad(log_prob)(x)), None
 
     found, _ = jax.lax.scan(step, start, None, length=_STEPS)
-    # steps that run away end in nan; proposals from the start are poor, and seen to be by `still`
+    # divergent steps end in nan; proposals around the start are poor, which `still` shows
     centre = jnp.where(jnp.all(jnp.isfinite(found)), found, start)
     root = jnp.linalg.cholesky(jnp.linalg.inv(information(centre)))
     at = centre + _WIDER * student @ root.T

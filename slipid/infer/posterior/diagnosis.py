@@ -1,6 +1,6 @@
-"""Draws of a posterior, what they say of a robot, and whether its chains may be believed.
+"""Draws of a posterior, the estimates from them, and the convergence of its chains.
 
-Needs nothing that samples; what shows, deploys or writes a posterior is loaded by its methods.
+The module needs no sampler; modules that show, deploy or write a posterior are loaded by methods.
 """
 
 from dataclasses import dataclass, replace
@@ -31,11 +31,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Whether chains may be believed, per coordinate; the worst is furthest from the plan's bars.
+    """Convergence of chains, per coordinate.
 
-    R-hat is rank-normalised and split, over ensembles (Vehtari et al. 2021), tau the integrated
-    autocorrelation time [steps], ess the effective draws, the fewer of bulk and tails. Steps are
-    those of every walker after the warm-up.
+    Attributes:
+        r_hat: rank-normalised split R-hat over ensembles (Vehtari et al. 2021).
+        tau: integrated autocorrelation time [step].
+        ess: effective draws, the smaller of bulk and tails.
+        steps: steps of every walker after the warm-up.
+        converged: True if every coordinate meets the criteria of the plan.
+        worst: index of the coordinate that is furthest from the criteria.
+        reason: its figure in words.
     """
 
     r_hat: Float[np.ndarray, " size"]
@@ -51,12 +56,16 @@ class Diagnosis:
 class Posterior:
     """Posterior of a fit; `print` shows its numbers and whether the chains agree.
 
-    Log density, names and diagnosis are of the numbers that are sampled first; accepted is the part
-    of the moves that moved something, by stage.
-
     Attributes:
-        fit: that was sampled around.
-        z, log_variance: draws of the search vector and of the noise.
+        fit: fit that the chains started around.
+        z: draws of the search vector.
+        log_variance: draws of the log variances.
+        log_prob: log density of the numbers that are sampled first.
+        names: names of these numbers.
+        diagnosis: convergence of their chains.
+        accepted: share of accepted moves, by part.
+        converged: True if the chains converged and the electric draws moved.
+        reason: worst criterion in words.
     """
 
     fit: Fit
@@ -77,25 +86,25 @@ class Posterior:
 
     @cached_property
     def parameters(self) -> dict[str, verdicts.Estimate]:
-        """Every number by path, with mean, interval and verdict from the draws."""
+        """Numbers by path, with mean, interval and verdict from the draws."""
         return estimates(self.fit, self.z)
 
     @property
     def flat(self) -> Float[np.ndarray, "draw free"]:
-        """The draws of all ensembles."""
+        """Draws of all ensembles in one array."""
         return self.z.reshape(-1, self.fit.space.size)
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """What a reader of the numbers must know, one sentence each."""
-        doubt = f"the posterior did not converge: {self.reason}"
-        return self.fit.messages + (() if self.converged else (doubt,))
+        """Warnings about the numbers, one sentence each."""
+        warning = f"the posterior did not converge: {self.reason}"
+        return self.fit.messages + (() if self.converged else (warning,))
 
     def draws(self, path: str) -> Float[np.ndarray, "ensemble draw *number"]:
-        """Draws of a free number [SI], a row per ensemble, early steps first.
+        """Return draws of a free number [SI], a row per ensemble, early steps first.
 
         Raises:
-            KeyError: no such number, or fixed; names those there are.
+            KeyError: the number does not exist or is fixed; the message lists all.
         """
         space = self.fit.space
         if path not in space.slices:
@@ -106,19 +115,19 @@ class Posterior:
 
     @cached_property
     def tree(self) -> "DataTree":
-        """Draws, likelihoods and replicated data as an ArviZ DataTree."""
+        """ArviZ DataTree of draws, likelihoods and replicated data."""
         from slipid.infer.posterior import sample as netcdf
 
         return netcdf.tree(self)
 
     def plot(self, name: str = "intervals") -> "Figure":
-        """One of the posterior's pictures.
+        """Draw one of the posterior's pictures.
 
         Args:
-            name: `intervals` of every number, or `pairs` that are bent the most.
+            name: `intervals` of every number, or `pairs` with the most curved dependence.
 
         Raises:
-            ValueError: no such picture.
+            ValueError: the picture does not exist.
         """
         from slipid.plots.posterior import PICTURES
 
@@ -127,7 +136,7 @@ class Posterior:
         return PICTURES[name](self)
 
     def deploy(self) -> "DeployedRobot":
-        """What runs on the robot, with the intervals of the draws.
+        """Return the model for the robot, with the intervals of the draws.
 
         Raises:
             ValueError: the wheels' kinematics have rank below 3.
@@ -144,7 +153,7 @@ class Posterior:
 
 
 def diagnose(chain: Chain, plan: Plan) -> Diagnosis:
-    """Diagnosis of chains without their warm-up; ImportError where arviz-stats is missing."""
+    """Return the convergence of chains without their warm-up; requires arviz-stats."""
     from arviz_stats.base import array_stats
 
     ensembles, steps, walkers, size = chain.shape
@@ -156,23 +165,23 @@ def diagnose(chain: Chain, plan: Plan) -> Diagnosis:
         array_stats.ess(by_walker, chain_axis=0, draw_axis=1, method="bulk"),
         array_stats.ess(by_walker, chain_axis=0, draw_axis=1, method="tail", prob=(0.05, 0.95)),
     )
-    bars = [
+    criteria = [
         (np.nan_to_num(r_hat - 1, nan=np.inf) / (plan.r_hat - 1), r_hat, "R-hat {:.4f}"),
         (plan.steps_per_tau * tau / steps, steps / tau, "{:.0f} steps per autocorrelation time"),
         (plan.least_draws / ess, ess, "{:.0f} effective draws"),
     ]
-    short, values, said = max(bars, key=lambda bar: float(np.max(bar[0])))
-    worst = int(np.argmax(short))
-    converged = bool(short[worst] < 1)
-    reason = said.format(values[worst])
+    excess, values, text = max(criteria, key=lambda criterion: float(np.max(criterion[0])))
+    worst = int(np.argmax(excess))
+    converged = bool(excess[worst] < 1)
+    reason = text.format(values[worst])
     return Diagnosis(np.asarray(r_hat), tau, np.asarray(ess), steps, converged, worst, reason)
 
 
 def autocorrelation_time(chain: Chain) -> Float[np.ndarray, " size"]:
-    """Integrated autocorrelation time of every coordinate [steps].
+    """Return the integrated autocorrelation time of every coordinate [step].
 
-    Autocovariances are about the mean of all walkers, so that one that stands still counts as what
-    it is; the window is the first with M >= 5 tau (Sokal 1996).
+    Autocovariances are about the mean of all walkers, so that a walker at rest lengthens the time;
+    the window is the first with M >= 5 tau (Sokal 1996).
     """
     steps = chain.shape[1]
     about = chain - chain.mean(axis=(0, 1, 2))
@@ -189,25 +198,25 @@ def autocorrelation_time(chain: Chain) -> Float[np.ndarray, " size"]:
 def estimates(
     fit: Fit, draws: Float[np.ndarray, "ensemble draw free"]
 ) -> dict[str, verdicts.Estimate]:
-    """Every number with mean, interval and verdict from the draws of a posterior.
+    """Return every number with mean, interval and verdict from the draws of a posterior.
 
     Means are taken in the search space, so that shares sum to one and positive numbers have their
-    geometric mean. Directions that the fit found open stay so.
+    geometric mean. Flat directions of the fit stay flat.
     """
-    flat, open_ = draws.reshape(-1, fit.space.size), members(fit.flat)
+    every, flat = draws.reshape(-1, fit.space.size), members(fit.flat)
     out, prior_std = dict(fit.parameters), fit.verdict_space.prior_std
     for e in fit.space.free:
         at, d, old = fit.space.slices[e.path], e.declaration, fit.parameters[e.path]
-        z = flat[:, at]
+        z = every[:, at]
         values = np.asarray(jax.vmap(d.to_si)(jnp.asarray(z)))
         low, high = np.quantile(values, [0.05, 0.95], axis=0)
         scaled = np.cov((z / prior_std[at]).T).reshape(e.coordinates, e.coordinates)
         ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
         pairs = tuple(zip(low.tolist(), high.tolist(), strict=True))
-        unsaid = e.path in verdicts.NEEDS_VOLTAGE and not fit.channels.voltage
-        forced = old.verdict if unsaid or old.verdict == "at_bound" else None
+        no_scale = e.path in verdicts.NEEDS_VOLTAGE and not fit.channels.voltage
+        forced = old.verdict if no_scale or old.verdict == "at_bound" else None
         from_zero = verdicts.from_zero(d, z.std(axis=0))
-        verdict, provenance = verdicts.verdict_of(ratio, from_zero, forced, e.path in open_)
+        verdict, provenance = verdicts.verdict_of(ratio, from_zero, forced, e.path in flat)
         pull = (z.mean(axis=0) - fit.space.prior_mean[at]) / prior_std[at]
         out[e.path] = replace(
             old,
@@ -224,7 +233,7 @@ def estimates(
 
 
 def identified(found: Posterior) -> Content:
-    """Content of identified.json with what the posterior says."""
+    """Return the content of identified.json with the numbers of the posterior."""
     fit, flat = found.fit, found.flat
     content = identified_json(fit)
     for path, e in found.parameters.items():
@@ -237,7 +246,7 @@ def identified(found: Posterior) -> Content:
 
 
 def _drawn(ratio: verdicts.Estimate, fit: Fit, flat: np.ndarray) -> verdicts.Estimate:
-    """A quotient with the interval and the std of its draws."""
+    """Return a quotient with the interval and the std of its draws."""
     over, under = (fit.space.slices[path] for path in ratio.path.rsplit("/", 1))
     draws = np.exp(flat[:, over] - flat[:, under])
     low, high = np.quantile(draws, [0.05, 0.95]).tolist()

@@ -1,9 +1,9 @@
-"""Several independent emcee ensembles, in blocks that can be kept and gone on from.
+"""Several independent emcee ensembles, sampled in blocks that can be stored and continued.
 
-Walkers of one ensemble know of each other, so that whether the chains agree is asked of ensembles.
-During the warm-up, which is thrown away, proposals are learnt from all of them; after it nothing
-changes any more. What a block holds and when sampling stops depend on blocks before it only, so
-that a chain that was interrupted goes on as if it had not been.
+Walkers of one ensemble depend on each other, so that convergence is judged between ensembles.
+During the warm-up, which is discarded, proposals are learnt from all ensembles; after it they stay
+fixed. The content of a block and the end of sampling depend on earlier blocks only, so that a
+continued chain equals an uninterrupted one.
 """
 
 import os
@@ -25,29 +25,30 @@ RandomState = tuple[str, np.ndarray, int, int, float]
 """State of a Mersenne twister as numpy gives it."""
 
 ACCEPTED = 0.8
-"""Part of Hamiltonian moves that shall be accepted; their step is adapted in the warm-up."""
+"""Target share of accepted Hamiltonian moves; their step is adapted in the warm-up."""
 FIRST_ANGLE, LEAST_ANGLE = 0.3, 0.03
 """First and smallest step of Hamiltonian moves [rad]."""
 DRAWS_PER_EFFECTIVE = 20.0
-"""Draws of the warm-up that tell as much as an independent one, about."""
+"""Approximate number of warm-up draws that are worth one independent draw."""
 
 
 def extended(
     target: LogDensity,
     plan: Plan,
     part: str,
-    record: BlockStore,
+    store: BlockStore,
     done: Sequence[ChainBlock] | None = None,
 ) -> list[ChainBlock]:
-    """Blocks of a part until `diagnose` finds them good or the plan's most, each kept when made.
+    """Sample blocks of a part until `diagnose` finds convergence or the plan's limit is reached.
 
-    Goes on from the blocks that are done, by default those of the record.
+    Sampling continues after the blocks that are done, by default those in the store; each new
+    block is stored.
     """
-    blocks = list(record.done(part) if done is None else done)
+    blocks = list(store.done(part) if done is None else done)
     while not _ended(blocks, plan):
-        block = _block(target, plan, blocks, lambda steps: record.tell(part, steps))
+        block = _block(target, plan, blocks, lambda steps: store.progress(part, steps))
         blocks.append(block)
-        record.keep(part, block)
+        store.keep(part, block)
     return blocks
 
 
@@ -55,25 +56,25 @@ def _ended(blocks: list[ChainBlock], plan: Plan) -> bool:
     after = len(blocks) - plan.warm_up[-1]
     if len(blocks) >= plan.most:
         return True
-    # looked at every fourth block at first, then less often: looking costs, too
+    # the check takes time as well: every fourth block at first, then less often
     if after < 4 or after % max(4, 2 ** int(np.log2(after) - 3)):
         return False
     return diagnosis.diagnose(chain(blocks, plan), plan).converged
 
 
 def chain(blocks: Sequence[ChainBlock], plan: Plan) -> Chain:
-    """Positions after the warm-up."""
+    """Return the positions after the warm-up."""
     return np.concatenate([b.chain for b in blocks[plan.warm_up[-1] :]], axis=1)
 
 
 def _block(
-    target: LogDensity, plan: Plan, blocks: list[ChainBlock], tell: Callable[[int], None]
+    target: LogDensity, plan: Plan, blocks: list[ChainBlock], progress: Callable[[int], None]
 ) -> ChainBlock:
     states, map, angle = _begin(target, plan, blocks)
-    stop, told = threading.Event(), [0] * plan.ensembles
+    stop, steps = threading.Event(), [0] * plan.ensembles
 
     def ensemble(k: int) -> tuple[np.ndarray, np.ndarray, State, float, list[list[float]]]:
-        inner = target.seen_by(map)
+        inner = target.in_coordinates(map)
         made = moves(inner, angle)
         sampler = emcee.EnsembleSampler(
             plan.walkers,
@@ -94,8 +95,8 @@ def _block(
             log_probs.append(state.log_prob.copy())
             moved += float((state.coords != before).any(axis=1).mean()) / plan.block
             before = places[-1]
-            told[k] += 1
-            tell(min(told))
+            steps[k] += 1
+            progress(min(steps))
         turns = [move.accepted for move, _ in made if isinstance(move, Hamiltonian)]
         return np.stack(places), np.stack(log_probs), state, moved, turns
 
@@ -103,7 +104,7 @@ def _block(
         try:
             found = list(pool.map(ensemble, range(plan.ensembles)))
         finally:
-            stop.set()  # an interrupt of the caller ends the others at their next step
+            stop.set()  # after an interrupt of the caller the others end at their next step
     ends = [f[2] for f in found]
     places = np.stack([f[0] for f in found])
     x, log = map.placed(places.reshape(-1, places.shape[-1]))
@@ -126,7 +127,7 @@ def _block(
 def _begin(
     target: LogDensity, plan: Plan, blocks: list[ChainBlock]
 ) -> tuple[list[State], Transport, np.ndarray]:
-    """State of every ensemble in mapped coordinates, the map, and the angle."""
+    """Return the state of every ensemble in mapped coordinates, the map, and the angles."""
     if not blocks:
         map = target.laplace()
         starts = [_start(target, plan, k) for k in range(plan.ensembles)]
@@ -140,7 +141,7 @@ def _begin(
 
 
 def _start(target: LogDensity, plan: Plan, ensemble: int) -> tuple[np.ndarray, RandomState]:
-    """Walkers spread wider than the fit's own uncertainty, at places with a density."""
+    """Return walkers spread wider than the fit's uncertainty, where the density is positive."""
     root = np.linalg.cholesky(target.covariance)
     wide = plan.spread * np.geomspace(0.25, 1.0, plan.walkers)[:, None]
     seeds = np.random.SeedSequence((plan.seed, ensemble))
@@ -148,7 +149,7 @@ def _start(target: LogDensity, plan: Plan, ensemble: int) -> tuple[np.ndarray, R
     x = np.empty((plan.walkers, len(root)))
     lost = np.ones(plan.walkers, bool)
     for shrink in 0.7 ** np.arange(30):
-        # all are drawn, so that what is compiled has one shape
+        # all walkers are drawn each time, so that one compiled shape serves
         tried = target.centre + shrink * wide * random.standard_normal(x.shape) @ root.T
         found = np.isfinite(target.terms(tried)).all(axis=1)
         x[lost & found] = tried[lost & found]
@@ -167,7 +168,7 @@ def _with_learnt(
     blocks: list[ChainBlock],
     turns: list[list[float]],
 ) -> ChainBlock:
-    """The block with what the warm-up has learnt for the next."""
+    """Return the block with the map and angles that the warm-up has learnt for the next one."""
     count = block.number + 1
     if count > plan.warm_up[-1]:
         return block

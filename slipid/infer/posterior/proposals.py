@@ -1,10 +1,11 @@
-"""Moves of an ensemble of walkers in coordinates in which its target is nearly a Gaussian.
+"""Moves of an ensemble of walkers in coordinates in which its target is nearly Gaussian.
 
 A target's log density is a sum of one term per group of coordinates, given those that groups share,
-and a term of the shared ones. In the coordinates of `transport_map` independence moves and
-differential evolution move all groups in one evaluation, each accepted or not by its own term, or
-the shared ones, which groups then follow. So do Hamiltonian moves, which take them far along the
-gradient where the density still bends; walks along a single coordinate cross its plateaus.
+and a term of the shared ones. In the coordinates of `transport_map`, independence moves and
+differential evolution change all groups in one evaluation, each accepted or not by its own term,
+or the shared coordinates, with the groups fixed relative to them. Hamiltonian moves do the same,
+and go far along the gradient where the map is not exact; walks along single coordinates cross
+plateaus of the density.
 """
 
 from dataclasses import dataclass
@@ -21,36 +22,41 @@ from slipid.infer.posterior.blocks import LogDensity
 from slipid.infer.posterior.transport_map import Matrix
 
 STUDENT = 0.2
-"""Part of independent draws that come from a Student t, so that no tail is left out."""
+"""Share of independent draws from a Student t, which cover the tails."""
 DEGREES = 8.0
 """Degrees of freedom of that Student t."""
 QUARTER_TURN = 0.5 * np.pi
-"""Length of a Hamiltonian move [rad]: a quarter turn leads to an independent draw of a Gaussian."""
+"""Length of a Hamiltonian move [rad]; for a Gaussian it ends at an independent draw."""
 MOST_STEPS, SHORTEST = 12, 0.2
-"""Steps of a Hamiltonian move at most, and the shortest over the longest that is made."""
+"""Largest number of steps of a Hamiltonian move, and ratio of its shortest to its longest step."""
 ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 1.2, 0.1, 0.8
-"""How often, relatively, moves of each kind are made.
+"""Relative frequencies of the kinds of moves.
 
-A Hamiltonian one takes six times longer, but is what frees walkers from where the map is wrong.
+A Hamiltonian move takes six times longer, but it moves walkers away from where the map is wrong.
 """
 ALONE = 0.5
-"""Part of walks along a coordinate that no other one of x follows."""
+"""Share of coordinate walks that leave all other coordinates of x unchanged."""
 _FINITE = 1e100
-"""Bound of slopes whose squares are summed."""
+"""Bound of slopes, so that their squares stay finite."""
 STEEPEST = 50.0
-"""Kicks are bounded by this many times the step, so that walkers far out are not thrown away."""
+"""Bound of a kick over its step, which keeps walkers in the tails from being thrown out."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """Coordinates that are moved together: those of each group, or the shared ones alone (None)."""
+    """Coordinates that are moved together.
+
+    Attributes:
+        places: indices of the coordinates, one array per group.
+        groups: groups that they belong to, None for the coordinates that groups share.
+    """
 
     places: tuple[Int[np.ndarray, " _"], ...]
     groups: tuple[int, ...] | None
 
 
 def families(target: LogDensity) -> list[Family]:
-    """Coordinates of all groups, and those that they share."""
+    """Return the family of all groups, and that of the coordinates that they share."""
     groups = tuple(int(g) for g in np.unique(target.group) if g >= 0)
     places = tuple(np.flatnonzero(target.group == g) for g in groups)
     shared = np.flatnonzero(target.group < 0)
@@ -59,14 +65,14 @@ def families(target: LogDensity) -> list[Family]:
 
 
 Jump = tuple[Matrix, Float[np.ndarray, " walker"]]
-"""New coordinates of some places, and log q(old | new) - log q(new | old)."""
+"""New coordinates, and log q(old | new) - log q(new | old)."""
 
 
 class FamilyMove(Move):
-    """Metropolis-Hastings of a family."""
+    """Metropolis-Hastings move of a family of coordinates."""
 
     halves = 1
-    """2 where a proposal needs walkers that stand still."""
+    """Number of subsets moved in turn; 2 if a proposal needs walkers that stay fixed."""
 
     def __init__(self, family: Family):
         self.family = family
@@ -75,7 +81,7 @@ class FamilyMove(Move):
         raise NotImplementedError
 
     def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
-        """New vectors, and the log factor of each group's part or of the shared one."""
+        """Return new vectors, and the log proposal ratio of each group or of the shared part."""
         new, factor = x.copy(), np.empty((len(x), len(self.family.places)))
         for k, own in enumerate(self.family.places):
             new[:, own], factor[:, k] = self.jump(x[:, own], still[:, own], random)
@@ -108,7 +114,7 @@ class FamilyMove(Move):
 
 
 class Independence(FamilyMove):
-    """Draws that do not depend on where a walker is: Gaussian, or Student t of as many degrees."""
+    """Draws that do not depend on a walker's position: Gaussian, or Student t."""
 
     def jump(self, old: Matrix, still: Matrix, random: RandomState) -> Jump:
         count = len(old)
@@ -119,7 +125,7 @@ class Independence(FamilyMove):
 
 
 def _log_density(u: Matrix) -> Float[np.ndarray, " walker"]:
-    """Log density of the mixture that independence moves draw from, up to a constant."""
+    """Return the log density of the mixture of independence moves, up to a constant."""
     size, q = u.shape[1], (u**2).sum(axis=1)
     of_t = gammaln(0.5 * (DEGREES + size)) - gammaln(0.5 * DEGREES)
     of_t -= 0.5 * size * np.log(DEGREES / 2)  # less the Gaussian's 2 pi
@@ -128,7 +134,7 @@ def _log_density(u: Matrix) -> Float[np.ndarray, " walker"]:
 
 
 class DifferentialEvolution(FamilyMove):
-    """Differential evolution: differences of walkers that stand still, at times whole ones.
+    """Differential evolution: steps along scaled, at times whole, differences of fixed walkers.
 
     Source: ter Braak 2006, Statistics and Computing 16; whole differences lead from mode to mode.
     """
@@ -147,15 +153,15 @@ class DifferentialEvolution(FamilyMove):
 
 
 class CoordinateWalk(FamilyMove):
-    """Random walk of x of one coordinate of each group, or of a shared one.
+    """Random walk of one coordinate of x in each group, or of a shared one.
 
-    Where data say no more than that a number is small, its logarithm may be anything: a plateau
-    that no map of the whole has straight, but along which this walks far. The others of u are held,
-    so that those of x follow as the map says, or else the others of x.
+    If data only show that a number is small, the density of its logarithm has a plateau, which no
+    map of all coordinates straightens, but which this walk crosses. Either the other coordinates
+    of u are held, so that those of x follow by the map, or the other coordinates of x.
     """
 
     def __init__(self, target: LogDensity, groups: tuple[int, ...] | None):
-        assert target.map, "a target that is seen by a map"
+        assert target.map, "the target needs mapped coordinates"
         everything = np.arange(len(target.group))
         of_group = [np.flatnonzero(target.group == g) for g in groups or ()]
         super().__init__(Family(tuple(of_group or [everything]), groups))
@@ -179,15 +185,15 @@ class CoordinateWalk(FamilyMove):
 
 
 class Hamiltonian(FamilyMove):
-    """Turns of position and momentum that suit a Gaussian, kicked by what it does not know.
+    """Rotations of position and momentum, exact for a Gaussian, with kicks by the remainder.
 
     With momentum p and the log density l, steps of
 
         turn (u, p) by h/2;    p += h (dl/du + u);    turn (u, p) by h/2
 
-    Groups do not feel each other while the shared coordinates are held, so that each has a way of
-    its own, accepted or not by itself. A walker whose slope is lost on the way stays where it was
-    with all its groups: a slope that is no number may be so for any of them.
+    Groups are independent while the shared coordinates are held, so that each has a trajectory of
+    its own, accepted or not by itself. A walker with a non-finite slope on its trajectory stays at
+    its start with all groups, as any of them may be the cause.
 
     Source: Beskos et al. 2011, Stochastic Processes and their Applications 121, section 4.
     """
@@ -199,7 +205,7 @@ class Hamiltonian(FamilyMove):
 
     def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
         count, places = len(x), self.family.places
-        # shorter steps, now and then, and more of them, for walkers where the density is steep
+        # sometimes shorter and more steps, for walkers where the density is steep
         h = self.angle * SHORTEST ** (random.uniform() ** 3)
         steps = int(np.clip(random.uniform(0.7, 1.3) * QUARTER_TURN / h + 0.5, 1, MOST_STEPS))
         h *= random.uniform(0.8, 1.0, (count, 1))
@@ -224,13 +230,13 @@ class Hamiltonian(FamilyMove):
 
 
 def _bounded(kick: Matrix) -> Matrix:
-    """Kicks of coordinates of one group, so long at most that they are not thrown far away."""
+    """Return kicks of one group's coordinates with bounded length."""
     most = np.linalg.norm(np.clip(kick, -_FINITE, _FINITE), axis=1, keepdims=True) / STEEPEST
     return kick / np.maximum(most, 1.0)
 
 
 def _energy(p: Matrix) -> Float[np.ndarray, " walker"]:
-    """Kinetic energy of momenta of one group."""
+    """Return the kinetic energy of one group's momenta."""
     return np.asarray(0.5 * (p**2).sum(axis=1))
 
 
@@ -240,9 +246,9 @@ def _turn(u: Matrix, p: Matrix, angle: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def moves(target: LogDensity, angles: Float[np.ndarray, " family"]) -> list[tuple[Move, float]]:
-    """Moves in the target's coordinates, and how often each is made.
+    """Return moves in the target's coordinates with their relative frequencies.
 
-    Angles are the steps of Hamiltonian moves of every family.
+    Angles are the steps of the Hamiltonian moves of every family [rad].
     """
     of_family = families(target)
     found: list[tuple[Move, float]] = []

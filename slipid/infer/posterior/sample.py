@@ -1,11 +1,9 @@
-"""Posterior of a fit by sampling: motion first, then electric numbers given each draw of it.
+"""Posterior of a fit by sampling, and its file posterior.nc in the layout of ArviZ.
 
-Where currents were logged the posterior is p(motion | motion data) p(electric | motion,
-data), which no single density describes: its normaliser depends on the motion. Given the motion the
-electric numbers are nearly linear with Gaussian noise, so that they are drawn by
-Metropolis-Hastings steps with proposals around their most likely values.
-
-posterior.nc: draws in the layout of ArviZ, with names for everything.
+Where currents were logged the posterior is p(motion | motion data) p(electric | motion, data). No
+single density describes it, since the normaliser of the second factor depends on the motion. So the
+motion is sampled first. Given the motion the electric numbers are nearly linear with Gaussian
+noise, so that Metropolis-Hastings steps with proposals around their most likely values draw them.
 """
 
 import importlib
@@ -45,34 +43,34 @@ from slipid.support.files import write_bytes
 from slipid.support.progress import Reporter
 
 for _module in ("arviz_base", "arviz_stats", "h5netcdf"):
-    importlib.import_module(_module)  # they are used after hours of work: what is missing shows now
+    importlib.import_module(_module)  # used after hours of sampling: missing ones must show now
 
 STILL = 0.01
-"""Part of the draws whose electric numbers may never have moved."""
+"""Largest share of draws whose electric numbers never moved."""
 
 
 def sampled(
-    fit: Fit, plan: Plan, draws: int, kept: Checkpoint | None, report: Reporter
+    fit: Fit, plan: Plan, draws: int, checkpoint: Checkpoint | None, report: Reporter
 ) -> Posterior:
-    """Posterior of a fit by the likelihood it was made of, with progress.
+    """Sample the posterior of a fit with progress, and store its blocks in a checkpoint.
 
-    It goes on from the blocks that an earlier call has kept, and keeps new ones.
+    Sampling continues after the blocks that an earlier call has stored.
     """
 
     def done(part: str) -> list[ChainBlock]:
         blocks: list[ChainBlock] = []
-        if kept is None:
+        if checkpoint is None:
             return blocks
-        while (arrays := kept.load(f"{part}-{len(blocks):04d}")) is not None:
+        while (arrays := checkpoint.load(f"{part}-{len(blocks):04d}")) is not None:
             blocks.append(unpacked(arrays))
         if blocks:
-            report.line(f"going on from block {len(blocks)} ({part}) of {kept.folder}")
+            report.line(f"going on from block {len(blocks)} ({part}) of {checkpoint.folder}")
         return blocks
 
     def keep(part: str, block: ChainBlock) -> None:
-        if kept is not None:
-            kept.save(f"{part}-{block.number:04d}", packed(block))
-        _tell(block, plan, report)
+        if checkpoint is not None:
+            checkpoint.save(f"{part}-{block.number:04d}", packed(block))
+        _show_progress(block, plan, report)
 
     def steps(part: str, count: int) -> None:
         report.stage(f"sampling {part}")
@@ -80,8 +78,8 @@ def sampled(
     return sample(fit, plan, draws, BlockStore(done, keep, steps))
 
 
-def _tell(block: ChainBlock, plan: Plan, report: Reporter) -> None:
-    """Progress of a chain; the time left is what it takes at most."""
+def _show_progress(block: ChainBlock, plan: Plan, report: Reporter) -> None:
+    """Show the progress of a chain; the time left is that of the plan's limit."""
     count = block.number + 1
     warm = "warm-up, " if count <= plan.warm_up[-1] else ""
     what = (
@@ -92,16 +90,16 @@ def _tell(block: ChainBlock, plan: Plan, report: Reporter) -> None:
     report.advance(count, plan.most, what)
 
 
-def sample(fit: Fit, plan: Plan, draws: int = 400, record: BlockStore | None = None) -> Posterior:
-    """Posterior around a fit, so many draws of each ensemble."""
+def sample(fit: Fit, plan: Plan, draws: int = 400, store: BlockStore | None = None) -> Posterior:
+    """Sample the posterior around a fit, with `draws` draws from each ensemble."""
     problem, fitted = required(fit.problem), Fitted.of(fit)
     assert problem.multi_floor is None, "runs on one floor each"
-    record = record or BlockStore()
+    store = store or BlockStore()
     parts = (EVERYTHING,) if problem.objective.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
     at = first.coordinates
     target = LogDensity(first.terms, first.slope, at.group, first.centre, first.covariance)
-    blocks = ensemble.extended(target, plan, parts[0], record)
+    blocks = ensemble.extended(target, plan, parts[0], store)
     chain = ensemble.chain(blocks, plan)
     found = diagnosis.diagnose(chain, plan)
     x, log_prob = thinned(chain, blocks[plan.warm_up[-1] :], draws)
@@ -113,7 +111,7 @@ def sample(fit: Fit, plan: Plan, draws: int = 400, record: BlockStore | None = N
     if len(parts) > 1:
         second = Density(problem, fitted, ELECTRIC)
         if second.size:
-            record.tell(ELECTRIC, 0)
+            store.progress(ELECTRIC, 0)
             later = electric_given_motion(first, second, fitted.covariance, x, plan.seed)
             out[..., second.coordinates.structure] = later.x
             accepted[ELECTRIC], still = later.accepted, later.still
@@ -137,7 +135,7 @@ def sample(fit: Fit, plan: Plan, draws: int = 400, record: BlockStore | None = N
 def thinned(
     chain: Chain, blocks: Sequence[ChainBlock], draws: int
 ) -> tuple[Float[np.ndarray, "ensemble draw size"], Float[np.ndarray, "ensemble draw"]]:
-    """Draws spread evenly over steps and walkers; some repeat where there are too few."""
+    """Return draws spread evenly over steps and walkers; they repeat if there are too few."""
     log_prob = np.concatenate([b.log_prob for b in blocks], axis=1)
     _, steps, walkers, _ = chain.shape
     step = ((np.arange(draws) + 0.5) / draws * steps).astype(int)
@@ -148,10 +146,10 @@ def thinned(
 def drawn_variances(
     problem: Problem, fitted: Fitted, shape: tuple[int, int], seed: int
 ) -> Float[np.ndarray, "ensemble draw variance"]:
-    """Log variances from the Gaussian with their information at the fit.
+    """Return draws of log variances from the Gaussian with their information at the fit.
 
-    They hardly depend on the numbers of the model, which the chains hold them for. That of the load
-    biases of floors, of which there are few, is drawn by how likely each of a grid is.
+    They hardly depend on the numbers of the model, so that the chains hold them fixed. The variance
+    of the floors' load biases, which are few, is drawn from its likelihood on a grid.
     """
     log_v, keep = fitted.log_variance, np.ones(len(problem.windows))
     electric = problem.electric(fitted.z, log_v)
@@ -160,44 +158,40 @@ def drawn_variances(
     effect = effects_at(problem, residual, log_v)
     weight = problem.weighed(residual, log_v, keep, effect).whitening.weight["motion"]
     motion = residual["motion"], jacobian["motion"]
-    told = np.array(information(problem.noise.blocks, log_v, keep, through))
+    precision = np.array(information(problem.noise.blocks, log_v, keep, through))
     of_blocks = np.asarray(problem.objective.scored)
-    told *= of_blocks[:, None] & of_blocks
-    told += effect_information(problem.objective, motion, weight, fitted.covariance, log_v)
-    told[np.diag_indices_from(told)] += np.where(of_blocks, 0.0, 1 / VARIANCE_SPREAD**2)
-    root = np.linalg.cholesky(np.linalg.inv(told))
+    precision *= of_blocks[:, None] & of_blocks
+    precision += effect_information(problem.objective, motion, weight, fitted.covariance, log_v)
+    precision[np.diag_indices_from(precision)] += np.where(of_blocks, 0.0, 1 / VARIANCE_SPREAD**2)
+    root = np.linalg.cholesky(np.linalg.inv(precision))
     rng = np.random.default_rng([seed, 1])
     out = log_v + rng.standard_normal((*shape, len(log_v))) @ root.T
-    precision = np.linalg.inv(fitted.covariance)
-    pooled = pooled_stds(precision, fitted.z, problem.objective, log_v)
+    pooled = pooled_stds(np.linalg.inv(fitted.covariance), fitted.z, problem.objective, log_v)
     out[..., problem.objective.pooled] = 2 * np.log(rng.choice(pooled.std, shape, p=pooled.weight))
     return np.asarray(out)
 
 
 SCHEMA = "slipid.posterior/1"
 REPLICATES = 50
-"""Replicated data sets of each ensemble."""
+"""Number of replicated data sets of each ensemble."""
 _AXES = ("x", "y", "yaw")
 
 
 def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
-    """All groups of the file, with these attributes of the whole beside schema and data."""
+    """Return all groups of the file, with further attributes of the file in `about`."""
     fit, problem = found.fit, required(found.fit.problem)
     w, robot, runs = problem.windows, problem.robot, [name for name, _ in fit.runs]
     values, dims, units = _numbers(problem.space, found)
     noise, noise_dims = _noise(problem, found)
-    means = found.z.mean(axis=(0, 1))
-    middle = replace(Fitted.of(fit), z=means)
-    density = Density(problem, middle, EVERYTHING)
     x = found.z
-    of_piece = density.pointwise(x.reshape(-1, x.shape[-1]))
-    per_piece = {k: np.asarray(v).reshape(*x.shape[:2], -1) for k, v in of_piece.items()}
+    density = Density(problem, replace(Fitted.of(fit), z=x.mean(axis=(0, 1))), EVERYTHING)
+    of_segment = density.pointwise(x.reshape(-1, x.shape[-1]))
+    per_segment = {k: np.asarray(v).reshape(*x.shape[:2], -1) for k, v in of_segment.items()}
     run = np.unique(w.run)
     onto = (np.asarray(w.run)[:, None] == run).astype(float)
     measured, predicted, data_dims = _data(
         problem, found, _replicates(density, x, found.log_variance)
     )
-    unconstrained = {"z": found.z, "log_variance": found.log_variance}
     coords = {
         "surface": list(robot.surfaces.labels),
         "load": list(robot.body.loads),
@@ -214,17 +208,17 @@ def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
         {
             "posterior": values | noise,
             "sample_stats": {"lp": found.log_prob},
-            "log_likelihood": {k: v @ onto for k, v in per_piece.items()},
+            "log_likelihood": {k: v @ onto for k, v in per_segment.items()},
             "posterior_predictive": predicted,
             "observed_data": measured,
-            "unconstrained_posterior": unconstrained,
+            "unconstrained_posterior": {"z": x, "log_variance": found.log_variance},
         },
         coords=coords,
         dims=dims
         | noise_dims
         | data_dims
         | {"z": ["coordinate"], "log_variance": ["component"]}
-        | {k: ["run"] for k in per_piece},
+        | {k: ["run"] for k in per_segment},
     )
     for name, unit in units.items():
         made["posterior"][name].attrs["units"] = unit
@@ -234,7 +228,7 @@ def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
 
 
 def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
-    """Draws of every leaf with a free number, its dimensions and units."""
+    """Return the draws of every leaf with a free number, its dimensions and units."""
     shape = found.z.shape[:2]
     robots = jax.vmap(space.tree)(jnp.asarray(found.z.reshape(-1, space.size)))
     values, dims, units = {}, {}, {}
@@ -249,7 +243,7 @@ def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
 
 
 def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
-    """Std of every noise component, floors side by side."""
+    """Return the draws of every noise component's std, floors side by side, and dimensions."""
     rows = np.moveaxis(np.exp(0.5 * found.log_variance), -1, 0)
     labels = problem.robot.surfaces.labels
     stds: dict[str, np.ndarray] = {}
@@ -259,7 +253,7 @@ def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
         if component.floor is None:
             stds[name], dims[name] = std, []
             continue
-        # sessions share nothing on a floor that was driven on in one of them only
+        # a floor with runs of a single session has no component of sessions
         whole = stds.setdefault(name, np.zeros((*std.shape, len(labels))))
         whole[..., labels.index(component.floor)], dims[name] = std, ["surface"]
     return stds, dims
@@ -268,9 +262,10 @@ def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
 def _data(
     problem: Problem, found: Posterior, new: dict[str, np.ndarray]
 ) -> tuple[dict, dict, dict]:
-    """What was measured of every window, and replicates of it, given less what was measured.
+    """Return the measurements of every window, their replicates, and dimensions.
 
-    Marker increments are in metres corrected by the fitted camera.
+    The replicates `new` are given less the measurements. Marker increments are in metres corrected
+    by the fitted camera.
     """
     w = problem.windows
     middle = problem.space.tree(jnp.asarray(found.z.mean(axis=(0, 1))))
@@ -278,16 +273,19 @@ def _data(
         "increment": np.asarray(jax.jit(lk.measured_increments)(middle, problem.batch.pose))
     }
     dims = {"increment": ["piece", "window", "direction"]}
-    gaps = {"increment": new["motion"]}
+    differences = {"increment": new["motion"]}
     if w.has_current:
         measured["current"], dims["current"] = np.asarray(w.current), ["piece", "window", "drive"]
-        gaps["current"] = new["current"]
-    predicted = {k: gaps[k].reshape(*gaps[k].shape[:2], *y.shape) + y for k, y in measured.items()}
+        differences["current"] = new["current"]
+    predicted = {
+        k: differences[k].reshape(*differences[k].shape[:2], *y.shape) + y
+        for k, y in measured.items()
+    }
     return measured, predicted, dims
 
 
 def write(made: DataTree, path: Path) -> None:
-    """Write the file, whole or not at all."""
+    """Write the file atomically."""
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / path.name
         made.to_netcdf(whole, engine="h5netcdf")
@@ -299,9 +297,9 @@ def _replicates(
     x: Float[np.ndarray, "ensemble draw size"],
     log_variance: Float[np.ndarray, "ensemble draw variance"],
 ) -> dict[str, Float[np.ndarray, "ensemble replicate piece m"]]:
-    """Replicated less measured data of every piece, from some draws of each ensemble.
+    """Return replicated less measured data of every segment, from some draws of each ensemble.
 
-    What the model says, less what was measured, plus noise of the draw's own variances.
+    They are predicted less measured data, plus noise with the draw's own variances.
     """
     picked = np.linspace(0, x.shape[1] - 1, REPLICATES).astype(int)
     some, noise = x[:, picked], log_variance[:, picked].reshape(-1, log_variance.shape[-1])

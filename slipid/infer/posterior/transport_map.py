@@ -1,8 +1,6 @@
-"""What a transport map is made of: warps of single coordinates, bends by others.
+"""Transport map: coordinates in which a posterior is nearly a standard Gaussian, learnt from draws.
 
-Coordinates in which a posterior is nearly a standard Gaussian, learnt from draws of it.
-
-A triangular map (Knothe-Rosenblatt) from coordinates x to u:
+It is a triangular map (Knothe-Rosenblatt) from coordinates x to u:
 
     shared ones       v = L^-1 (x - m)
     those of a group  w = L^-1 (x - m - B s), widest first
@@ -13,9 +11,9 @@ Biometrika 96, eq. 2) of every coordinate from v to u,
 
     sinh(tail arcsinh((v - place) / scale) - skew)
 
-Groups follow the shared coordinates and are bent by themselves, so that groups that are independent
-given the shared ones stay so. It is one of the maps of Marzouk et al. 2016 (Sampling via measure
-transport, section 3).
+Groups depend on the shared coordinates and on their own polynomials, so that groups that are
+independent given the shared coordinates stay so. It is one of the maps of Marzouk et al. 2016
+(Sampling via measure transport, section 3).
 """
 
 from collections.abc import Callable
@@ -33,17 +31,17 @@ from scipy.optimize import minimize
 Matrix = Float[np.ndarray, "_ _"]
 Vector = Float[np.ndarray, " _"]
 Leaf = Array | np.ndarray
-"""An array of numpy while a map is learnt, of jax where the way back is computed."""
+"""A numpy array while a map is learnt, a jax array in the inverse map."""
 A = TypeVar("A", Array, np.ndarray)
-"""Either of them; what comes out is what went in."""
+"""Either kind of array; the result has the kind of the argument."""
 FAR = 4.0
-"""Polynomials stay what they are beyond this many stds."""
+"""Distance beyond which polynomials stay constant [std]."""
 SQUARED = 5
-"""Coordinates of a group, the widest first, whose squares and products are monomials."""
+"""Number of the widest coordinates of a group whose squares and products are monomials."""
 CUBED = 3
-"""Coordinates of a group, the widest first, whose cubes are monomials."""
+"""Number of the widest coordinates of a group whose cubes are monomials."""
 WORTH = 3.0
-"""Gain in log likelihood [nats] that a monomial must bring to be taken in."""
+"""Smallest gain in log likelihood for which a monomial is included [nat]."""
 MOST_MONOMIALS = 12
 """Largest number of monomials in the mean and in the log std of a coordinate."""
 
@@ -51,9 +49,13 @@ MOST_MONOMIALS = 12
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """Sinh-arcsinh map of every coordinate: middle, width, lean (skew), lightness of tails.
+    """Sinh-arcsinh map of every coordinate; skew 0 and tail 1 make it linear.
 
-    Skew 0 and tail 1 make a straight line.
+    Attributes:
+        place: location.
+        scale: width.
+        skew: asymmetry.
+        tail: lightness of the tails.
     """
 
     place: Leaf
@@ -62,17 +64,17 @@ class Warp:
     tail: Leaf
 
     def forward(self, v: Matrix) -> Matrix:
-        """The way from v to u."""
+        """Return u of v."""
         inner = self.tail * np.arcsinh((v - self.place) / self.scale)
         return np.asarray(np.sinh(inner - self.skew))
 
     def back(self, u: Leaf) -> Array:
-        """The way from u to v."""
+        """Return v of u."""
         inner = (jnp.arcsinh(u) + self.skew) / self.tail
         return jnp.asarray(self.place + self.scale * jnp.sinh(inner))
 
     def log_slope(self, u: A) -> A:
-        """Log dv/du of every coordinate."""
+        """Return log dv/du of every coordinate."""
         xp = u.__array_namespace__()
         inner = xp.abs((xp.asinh(u) + self.skew) / self.tail)
         cosh = inner + xp.log1p(xp.exp(-2 * inner)) - np.log(2)  # without overflow
@@ -80,13 +82,13 @@ class Warp:
 
     @staticmethod
     def none(size: int) -> "Warp":
-        """A map that changes nothing."""
+        """Return the identity map."""
         one, zero = np.ones(size), np.zeros(size)
         return Warp(zero, one, zero, one)
 
     @staticmethod
     def learnt(draws: Matrix) -> "Warp":
-        """Map by maximum likelihood, column by column."""
+        """Return the map of maximum likelihood, column by column."""
         return Warp(*np.array([_sinh_arcsinh(column) for column in draws.T]).T)
 
 
@@ -108,9 +110,12 @@ def _sinh_arcsinh(x: Vector) -> tuple[float, float, float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Polynomials:
-    """Polynomials a (shift) and b (scale) of a group's coordinates.
+    """Polynomials a and b of a group's coordinates.
 
-    Factors are the columns whose product each monomial is, from (w, 1).
+    Attributes:
+        factors: columns of (w, 1) whose product each monomial is.
+        shift: coefficients of a.
+        scale: coefficients of b.
     """
 
     factors: Int[np.ndarray, "monomial 3"]
@@ -118,18 +123,18 @@ class Polynomials:
     scale: Float[np.ndarray, "coordinate monomial"]
 
     def monomials(self, w: Matrix) -> Matrix:
-        """Products of columns (row, monomial)."""
+        """Return the values of the monomials (row, monomial)."""
         columns = np.concatenate([np.clip(w, -FAR, FAR), np.ones((len(w), 1))], axis=1)
         return np.asarray(columns[:, self.factors].prod(axis=2))
 
     def forward(self, w: Matrix) -> Matrix:
-        """The way from w to v."""
+        """Return v of w."""
         f = self.monomials(w)
         return np.asarray((w - f @ self.shift.T) * np.exp(-f @ self.scale.T))
 
     @staticmethod
     def none(size: int) -> "Polynomials":
-        """No bend, with all monomials that there can be."""
+        """Return polynomials that are zero, with all possible monomials."""
         one = size  # the column of ones
         factors = [(one, one, one)] + [(k, one, one) for k in range(size)]
         squared, cubed = range(min(SQUARED, size - 1)), range(min(CUBED, size - 1))
@@ -140,7 +145,7 @@ class Polynomials:
 
     @staticmethod
     def learnt(w: Matrix, effective: float) -> "Polynomials":
-        """Polynomials for draws that are worth so many independent ones."""
+        """Return polynomials learnt from draws that are worth `effective` independent ones."""
         size = w.shape[1]
         bend = Polynomials.none(size)
         f = bend.monomials(w)
@@ -152,10 +157,10 @@ class Polynomials:
 
 
 def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]:
-    """Coefficients of the mean and of the log std of a Gaussian, most of them zero.
+    """Return coefficients of the mean and of the log std of a Gaussian, most of them zero.
 
-    Monomials are taken in one by one, the one with the largest score statistic first, as long as
-    one is worth more than `WORTH` nats to so many independent rows.
+    Monomials are included one by one, the one with the largest score statistic first, as long as
+    it gains more than `WORTH` nats for the effective number of independent rows.
     """
     shift, scale, means, spreads = np.zeros(f.shape[1]), np.zeros(f.shape[1]), [0], [0]
     share = effective / len(w)
@@ -179,12 +184,12 @@ def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]
     return shift, scale
 
 
-def _scores(f: Matrix, taken: list[int], left: Vector) -> Vector:
-    """Squared length of what is left along each column, less what columns taken say of it."""
+def _scores(f: Matrix, taken: list[int], residual: Vector) -> Vector:
+    """Return the squared residual along each column, orthogonal to the columns taken."""
     others = f - f[:, taken] @ np.linalg.lstsq(f[:, taken], f, rcond=None)[0]
     square = (others**2).sum(axis=0)
-    known = square < 1e-6 * (f**2).sum(axis=0)
-    return np.where(known, 0.0, (others.T @ left) ** 2 / np.where(known, 1.0, square))
+    dependent = square < 1e-6 * (f**2).sum(axis=0)
+    return np.where(dependent, 0.0, (others.T @ residual) ** 2 / np.where(dependent, 1.0, square))
 
 
 MOST_DRAWS = 4000
@@ -193,10 +198,14 @@ MOST_DRAWS = 4000
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """Some coordinates, by their places, after those they follow.
+    """Map of some coordinates given others.
 
-    Slope is the derivative of own ones by given ones, root the Cholesky factor of the
-    covariance of what is left, bend the bend of that, None for shared coordinates.
+    Attributes:
+        own: indices of the mapped coordinates.
+        given: indices of the coordinates that they depend on.
+        slope: derivative of the own by the given coordinates.
+        root: Cholesky factor of the conditional covariance.
+        bend: polynomials of the whitened residuals, None for shared coordinates.
     """
 
     own: Int[np.ndarray, " own"]
@@ -205,62 +214,69 @@ class Stage:
     root: Float[np.ndarray, "own own"]
     bend: Polynomials | None
 
-    def left(self, about: Matrix) -> Matrix:
-        """What others do not say of own coordinates, by the root.
-
-        From all coordinates less their means.
-        """
-        left = about[:, self.own] - about[:, self.given] @ self.slope
-        return np.asarray(np.linalg.solve(self.root, left.T).T)
+    def whitened(self, about: Matrix) -> Matrix:
+        """Return w, the whitened residuals of own coordinates, from all of x - m."""
+        residual = about[:, self.own] - about[:, self.given] @ self.slope
+        return np.asarray(np.linalg.solve(self.root, residual.T).T)
 
 
 @dataclass(frozen=True, eq=False)
 class Transport:
-    """The whole map, of vectors x (row, size) to and from u (row, size).
+    """Map of vectors x (row, size) to u (row, size), and its inverse.
 
-    Stairs lead from x to v, every coordinate is in one of them, and the last warp from v to u.
+    Attributes:
+        mean: m.
+        stages: maps from x to v, each coordinate in one of them.
+        last: map from v to u.
     """
 
     mean: Vector
-    stairs: tuple[Stage, ...]
+    stages: tuple[Stage, ...]
     last: Warp
 
     def forward(self, x: Matrix) -> Matrix:
-        """The way from x to u."""
+        """Return u of x."""
         about = x - self.mean
         v = np.empty_like(about)
-        for s in self.stairs:
-            w = s.left(about)
+        for s in self.stages:
+            w = s.whitened(about)
             v[:, s.own] = s.bend.forward(w) if s.bend else w
         return self.last.forward(v)
 
     def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
-        """x, and the part of every coordinate in log |dx/du| (row, size)."""
+        """Return x of u, and the summands of log |dx/du| by coordinate (row, size)."""
         x, log = _placed(self._back, u)
         return np.array(x), np.array(log)
 
-    def pull(self, u: Matrix, slope: Callable[[Matrix], Matrix]) -> Matrix:
-        """Derivative by u of log |dx/du| plus a function of x that has the derivative slope(x)."""
+    def pulled_back(self, u: Matrix, slope: Callable[[Matrix], Matrix]) -> Matrix:
+        """Return the gradient by u of log |dx/du| + f(x), given the gradient `slope` of f."""
         return np.array(_pulled(self._back, u, slope(self.placed(u)[0])))
 
     @cached_property
     def _back(self) -> "InverseSteps":
-        with jax.ensure_compile_time_eval():  # kept, so never a tracer's
+        with jax.ensure_compile_time_eval():  # the property is cached, so it must hold no tracer
             return _steps(self)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class InverseSteps:
-    """The way from u to x, a coordinate at a time, in arrays whose shapes nothing learnt changes.
+    """Inverse map from u to x, one coordinate per step, in arrays of fixed shapes.
 
-    XLA compiles it once so, though stairs and monomials are others after every look at the draws.
-    With columns of all w and of all x - m, zeros until their turn, and of ones:
+    So XLA compiles it once, although stages and monomials change with every map learnt. With
+    columns of all w and of all x - m, zeros until their step, and of ones:
 
         w_i = f_i . shift_i + exp(f_i . scale_i) v_i,   x_i - m_i = columns . slope_i
 
-    Order is the coordinate of each step, root its log dx/dw, factors the columns whose product each
-    monomial f is (step, term, 3).
+    Attributes:
+        mean: m.
+        last: map from v to u.
+        order: coordinate of each step.
+        slope: weights of the columns in x_i - m_i.
+        root: log dx/dw of each step.
+        factors: columns whose product each monomial is (step, term, 3).
+        shift: coefficients of the mean of w_i.
+        scale: coefficients of the log std of w_i.
     """
 
     mean: Array
@@ -279,7 +295,7 @@ def _steps(map: Transport) -> InverseSteps:
     factors = np.full((size, MOST_MONOMIALS + 1, 3), 2 * size)
     shift, scale = np.zeros((2, size, MOST_MONOMIALS + 1))
     k = 0
-    for s in map.stairs:
+    for s in map.stages:
         columns = np.append(s.own, 2 * size)
         for i in range(len(s.own)):
             slope[k, s.own], slope[k, size + s.given] = s.root[i], s.slope[:, i]
@@ -290,8 +306,8 @@ def _steps(map: Transport) -> InverseSteps:
                 shift[k, : len(own)] = s.bend.shift[i, own]
                 scale[k, : len(own)] = s.bend.scale[i, own]
             k += 1
-    order = np.concatenate([s.own for s in map.stairs])
-    # on the device once, not in every call
+    order = np.concatenate([s.own for s in map.stages])
+    # copied to the device once, not in every call
     arrays = (map.mean, map.last, order, slope, root, factors, shift, scale)
     return InverseSteps(*jax.device_put(arrays))
 
@@ -328,49 +344,46 @@ def _pulled(map: InverseSteps, u: Array, slope: Array) -> Array:
 
 
 def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray) -> Transport:
-    """Map of a Gaussian.
+    """Return the map of a Gaussian; `group` is each coordinate's group, -1 for a shared one."""
+    return Transport(mean, _stages(covariance, group, covariance), Warp.none(len(mean)))
 
-    Groups are those of each coordinate, -1 where groups share it.
+
+def _stages(covariance: Matrix, group: np.ndarray, at_mode: Matrix) -> tuple[Stage, ...]:
+    """Return the stages of a Gaussian, shared coordinates first, then group by group.
+
+    Coordinates that are widest at the mode come first in a stage: the direction of a curved valley
+    shows at the mode, whereas draws are wide across it as well.
     """
-    return Transport(mean, _stairs(covariance, group, covariance), Warp.none(len(mean)))
-
-
-def _stairs(covariance: Matrix, group: np.ndarray, at_mode: Matrix) -> tuple[Stage, ...]:
-    """Stairs of a Gaussian, shared coordinates first, then group by group.
-
-    Coordinates that are widest at the mode come first in a stair: a valley has its direction at the
-    mode, where draws are as wide across as they are bent.
-    """
-    stairs, shared = [], np.flatnonzero(group < 0)
+    stages, shared = [], np.flatnonzero(group < 0)
     for g in range(-1, int(group.max()) + 1):
         own, given = np.flatnonzero(group == g), shared if g >= 0 else shared[:0]
         if not len(own):
             continue
         own = own[np.argsort(-np.diag(_given(at_mode, own, given)[1]))]
-        slope, left = _given(covariance, own, given)
+        slope, conditional = _given(covariance, own, given)
         bend = Polynomials.none(len(own)) if g >= 0 else None
-        stairs.append(Stage(own, given, slope, np.linalg.cholesky(left), bend))
-    return tuple(stairs)
+        stages.append(Stage(own, given, slope, np.linalg.cholesky(conditional), bend))
+    return tuple(stages)
 
 
 def _given(covariance: Matrix, own: np.ndarray, given: np.ndarray) -> tuple[Matrix, Matrix]:
-    """Slope of own coordinates by given ones, and the covariance of what is left."""
+    """Return the slope of own coordinates by given ones, and their conditional covariance."""
     cross = covariance[np.ix_(given, own)]
     slope = np.linalg.solve(covariance[np.ix_(given, given)], cross)
     return slope, covariance[np.ix_(own, own)] - cross.T @ slope
 
 
 def learnt(draws: Matrix, effective: float, covariance: Matrix, group: np.ndarray) -> Transport:
-    """Map learnt from draws (draw, size) that are worth so many independent ones, about.
+    """Return the map learnt from draws (draw, size) worth about `effective` independent ones.
 
-    The Laplace covariance counts as many draws as there are coordinates.
+    The Laplace covariance has the weight of as many draws as there are coordinates.
     """
     some = draws[:: max(1, len(draws) // MOST_DRAWS)]
     size, mean = some.shape[1], some.mean(axis=0)
-    about, stairs = some - mean, []
+    about, stages = some - mean, []
     both = (effective * np.cov(about.T) + size * covariance) / (effective + size)
-    for s in _stairs(both, group, covariance):
-        bend = Polynomials.learnt(s.left(about), effective) if s.bend else None
-        stairs.append(replace(s, bend=bend))
-    found = Transport(mean, tuple(stairs), Warp.none(size))
+    for s in _stages(both, group, covariance):
+        bend = Polynomials.learnt(s.whitened(about), effective) if s.bend else None
+        stages.append(replace(s, bend=bend))
+    found = Transport(mean, tuple(stages), Warp.none(size))
     return replace(found, last=Warp.learnt(found.forward(some)))

@@ -52,7 +52,7 @@ def messages(pose: str = POSE, effort: bool = False, more: tuple[str, ...] = ())
 
 def proposed(path: Path, **told: str):
     proposal = propose(path, RobotOptions(**told))
-    return new_config(proposal.sketch, "mine.toml")
+    return new_config(proposal.draft, "mine.toml")
 
 
 SKID = {

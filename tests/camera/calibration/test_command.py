@@ -1,4 +1,4 @@
-"""`slipid calibrate`: what it writes, and one message for each bad input."""
+"""`slipid calibrate`: the files it writes, and one message for each bad input."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_another_board_is_named(folder, change, message):
     assert f"looked for {other}" in str(caught.value)
 
 
-def test_legacy_boards_are_told_apart(tmp_path):
+def test_legacy_boards_are_distinguished(tmp_path):
     print_ = made.drawing(7, 6, legacy=True)
     image = made.photo(TRUE, made.held(10, 5, 3, (0, 0, 0.5)), 0, print_=print_)
     picture = Picture(tmp_path / "old.png", image)
@@ -65,13 +65,13 @@ def test_legacy_boards_are_told_apart(tmp_path):
 
 
 def test_command_writes_camera_and_pictures(camera_file, folder):
-    out, said = camera_file
-    assert said.exit_code == 0, said.output
+    out, done = camera_file
+    assert done.exit_code == 0, done.output
     camera = OverheadCamera.load(out)
     assert np.abs(camera.place - CAMERA).max() < 0.002
     for text in ("held out of the fit", "verdict: good", "check by tape: the lens hangs 0.60"):
-        assert text in said.output
-    assert "H / (H - h)" in said.output
+        assert text in done.output
+    assert "H / (H - h)" in done.output
     assert camera.scale_std is not None
     for name in ("camera_coverage.png", "camera_floor.png"):
         assert cv2.imread(str(out.with_name(name))).std() > 5
@@ -83,11 +83,11 @@ def test_command_takes_a_known_lens(camera_file, tmp_path):
     rows = np.c_[points.pixels, points.places[:, :2]]
     np.savetxt(path, rows, delimiter=",", header="u,v,x,y", comments="")
     given = ("calibrate", "--camera", camera_file[0], "--points", path, "--out", out)
-    said = invoke(*given, "--json", "-", "--quiet")
-    assert said.exit_code == 0, said.output
+    done = invoke(*given, "--json", "-", "--quiet")
+    assert done.exit_code == 0, done.output
     camera = OverheadCamera.load(out)
     assert np.abs(camera.place - [0.1, -0.2, 2.4]).max() < 0.02
-    assert json.loads(said.stdout)["place_m"] == camera.place.tolist()
+    assert json.loads(done.stdout)["place_m"] == camera.place.tolist()
     assert len(camera.report["lens"]["views"]) == 14
     known, first = lens_from_file(out), lens_from_file(camera_file[0])
     assert known.covariance.shape == (8, 8)
@@ -103,10 +103,10 @@ def test_command_takes_a_known_lens(camera_file, tmp_path):
 
 def test_command_makes_a_camera_without_calibration(folder, tmp_path):
     out = tmp_path / "camera.json"
-    told = ("--metres-per-pixel", 0.004, "--lens-height", 2.4, "--turn", 180, "--out", out)
-    said = invoke("calibrate", folder / "empty.png", *told)
-    assert said.exit_code == 0
-    assert "100 pixels are 0.4000 m" in said.output
+    described = ("--metres-per-pixel", 0.004, "--lens-height", 2.4, "--turn", 180, "--out", out)
+    done = invoke("calibrate", folder / "empty.png", *described)
+    assert done.exit_code == 0
+    assert "100 pixels are 0.4000 m" in done.output
     camera = OverheadCamera.load(out)
     assert camera.lens.image_px == SIZE
     np.testing.assert_allclose(camera.pixels(np.array([0.4, 0, 0])), [219.5, 239.5], atol=1e-9)
@@ -115,9 +115,9 @@ def test_command_makes_a_camera_without_calibration(folder, tmp_path):
 def test_a_poor_lens_is_written_with_exit_code_1(folder, tmp_path):
     out = tmp_path / "camera.json"
     pictures = [folder / "lens" / f"view{k:02d}.png" for k in (0, 1, 2, 3, 4, 5, 6, 8)]
-    said = invoke("calibrate", *pictures, *WORDS, "--out", out, "--quiet")
-    assert said.exit_code == 1
-    assert "POOR: 8 views; expected 10" in said.output
+    done = invoke("calibrate", *pictures, *WORDS, "--out", out, "--quiet")
+    assert done.exit_code == 1
+    assert "POOR: 8 views; expected 10" in done.output
     assert np.abs(lens_from_file(out).lens.matrix[0, 0] - TRUE.fx) < 5
     with pytest.raises(DataError, match="without a floor"):
         OverheadCamera.load(out)
@@ -147,7 +147,7 @@ def test_a_poor_lens_is_written_with_exit_code_1(folder, tmp_path):
 def test_bad_input_is_one_message(folder, camera_file, monkeypatch, words, message):
     monkeypatch.chdir(folder)
     (folder / "c.json").write_bytes(camera_file[0].read_bytes())
-    said = invoke("calibrate", *words, "--quiet", "--out", "unwritten.json")
-    assert said.exit_code == 2
-    assert re.search(message, said.stderr), said.stderr
+    done = invoke("calibrate", *words, "--quiet", "--out", "unwritten.json")
+    assert done.exit_code == 2
+    assert re.search(message, done.stderr), done.stderr
     assert not (folder / "unwritten.json").exists()

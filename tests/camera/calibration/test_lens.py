@@ -1,4 +1,4 @@
-"""The lens of a camera, from pictures of a board: found, and judged as it deserves."""
+"""The lens of a camera from pictures of a board, and its quality."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from slipid.camera.calibration.lens import fit_kept, fit_lens, numbers_of
-from slipid.camera.calibration.quality import held_out_px, judged, refuse
-from slipid.camera.calibration.views import coverage
+from slipid.camera.calibration.lens import fit_lens, fit_robustly, parameters_of
+from slipid.camera.calibration.quality import check_usable, coverage, held_out_px, quality_of
 from slipid.support.errors import DataError
 from tests.helpers import made_boards as made
 from tests.helpers.calibrated import (
@@ -20,31 +19,40 @@ from tests.helpers.calibrated import (
     SIZE,
     TRUE,
     directions,
-    lens_of_views,
+    quality_of_views,
     seen_views,
 )
 
 
-def test_lens_is_found_within_what_it_states(found):
-    off = numbers_of(found.lens) - NUMBERS
-    std = np.sqrt(np.diag(found.covariance))
+def test_lens_is_within_its_stated_std(calibrated):
+    off = parameters_of(calibrated.lens) - NUMBERS
+    std = np.sqrt(np.diag(calibrated.covariance))
     assert (np.abs(off) < 3 * std).all()
     assert (np.abs(off[:4] / NUMBERS[:4]) < 0.004).all()
-    assert (std[:4] < 1.0).all()  # stated, and not so wide that anything were within
-    assert set(found.report["lens"]["numbers"]) == {"fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"}
+    assert (std[:4] < 1.0).all()  # and the std is not so wide that anything were within
+    assert set(calibrated.report["lens"]["numbers"]) == {
+        "fx",
+        "fy",
+        "cx",
+        "cy",
+        "k1",
+        "k2",
+        "p1",
+        "p2",
+    }
 
 
-def test_distortion_is_right_all_over_thepicture(found):
+def test_distortion_is_right_all_over_the_picture(calibrated):
     u, v = np.meshgrid(np.linspace(0, 639, 9), np.linspace(0, 479, 7))
     pixels = np.stack([u, v], -1)
-    here, there = (directions(lens, pixels) for lens in (found.lens, LENS))
+    here, there = (directions(lens, pixels) for lens in (calibrated.lens, LENS))
     # a lens is known up to how the camera is turned, which any pose makes up for
     left, _, right = np.linalg.svd(here.reshape(-1, 3).T @ there.reshape(-1, 3))
     assert np.abs(TRUE.seen(here @ left @ right) - pixels).max() < 0.5
 
 
-def test_held_out_error_is_that_of_a_corner(found):
-    report = found.report["lens"]
+def test_held_out_error_is_that_of_a_corner(calibrated):
+    report = calibrated.report["lens"]
     assert report["rms_px"] < report["held_out_rms_px"] < 1.3 * report["rms_px"] < 0.1
     views = seen_views(made.places(30))
     held, fitted = held_out_px(views, SIZE, False), fit_lens(views, SIZE, False).rms_px
@@ -58,7 +66,7 @@ def test_stated_covariance_is_that_of_repetitions():
     off = []
     for seed in range(16):
         fit = fit_lens(seen_views(made.places(10), seed=seed), SIZE, False)
-        off.append((fit.numbers - NUMBERS) / fit.std)
+        off.append((fit.parameters - NUMBERS) / fit.std)
     assert 0.75 < np.sqrt(np.mean(np.square(off))) < 1.3
 
 
@@ -69,8 +77,8 @@ def test_stated_std_is_that_of_opencv():
     pixels = [v.pixels.astype(np.float32)[:, None] for v in views]
     there = cv2.calibrateCameraExtended(points, pixels, SIZE, None, None)
     np.testing.assert_allclose(fit.std, there[5].ravel()[:9], rtol=0.01)
-    np.testing.assert_allclose(fit.numbers[4:], there[2].ravel()[:5], rtol=0.02)
-    assert len(fit_lens(views, SIZE, False).numbers) == 8
+    np.testing.assert_allclose(fit.parameters[4:], there[2].ravel()[:5], rtol=0.02)
+    assert len(fit_lens(views, SIZE, False).parameters) == 8
 
 
 def test_a_view_that_does_not_fit_is_named_and_left_out():
@@ -78,20 +86,20 @@ def test_a_view_that_does_not_fit_is_named_and_left_out():
     clean = fit_lens([*views[:4], *views[5:]], SIZE, False)
     bent = views[4].pixels + 6.0 * np.sin(40 * views[4].board_m)
     views[4] = replace(views[4], pixels=bent)
-    kept = fit_kept(views, SIZE, False)
-    assert len(kept.dropped) == 1
-    assert kept.dropped[0].startswith("view view4 left out")
-    np.testing.assert_allclose(kept.fit.numbers, clean.numbers, rtol=1e-3, atol=1e-3)
+    fit = fit_robustly(views, SIZE, False)
+    assert len(fit.left_out) == 1
+    assert fit.left_out[0].startswith("view view4 left out")
+    np.testing.assert_allclose(fit.parameters, clean.parameters, rtol=1e-3, atol=1e-3)
 
 
 def test_a_corner_that_does_not_fit_is_left_out_alone():
     views = seen_views(made.places(12))
     views[4].pixels[3] += [7.0, -5.0]
-    kept = fit_kept(views, SIZE, False)
-    assert len(kept.dropped) == 1
-    assert kept.dropped[0].startswith("view view4: one of")
-    assert [len(v.pixels) for v in kept.fit.views][4] == len(views[4].pixels) - 1
-    assert fit_kept(seen_views(made.places(12)), SIZE, False).dropped == []
+    fit = fit_robustly(views, SIZE, False)
+    assert len(fit.left_out) == 1
+    assert fit.left_out[0].startswith("view view4: one of")
+    assert [len(v.pixels) for v in fit.views][4] == len(views[4].pixels) - 1
+    assert fit_robustly(seen_views(made.places(12)), SIZE, False).left_out == ()
 
 
 def test_many_bad_views_are_refused():
@@ -100,7 +108,7 @@ def test_many_bad_views_are_refused():
         shift = sign * (6 + k) * np.sin(40 * views[k].board_m + k)
         views[k] = replace(views[k], pixels=views[k].pixels + shift)
     with pytest.raises(DataError, match="4 of 12 views do not fit"):
-        fit_kept(views, SIZE, False)
+        fit_robustly(views, SIZE, False)
 
 
 FLAT = [
@@ -122,40 +130,40 @@ FLAT = [
     ],
     ids=["few", "same", "parallel", "parallel everywhere", "in the middle alone"],
 )  # fmt: skip
-def test_views_that_tell_no_lens_are_refused(views, message):
+def test_views_that_determine_no_lens_are_refused(views, message):
     with pytest.raises(DataError, match=message):
-        lens_of_views(views)
+        quality_of_views(views)
 
 
 def test_each_reason_to_refuse_a_lens_is_one():
     fit = fit_lens(seen_views(made.places(12)), SIZE, False)
     whole = coverage(np.concatenate([v.pixels for v in fit.views]), SIZE)
     tilts = np.full(12, 20.0)
-    refuse(fit, whole, tilts)
+    check_usable(fit, whole, tilts)
     with pytest.raises(DataError, match="2 of 12 views are tilted by more than 12 degrees"):
-        refuse(fit, whole, np.where(np.arange(12) < 2, 20.0, 5.0))
-    spread_out = np.diag([(0.025 * fit.numbers[0]) ** 2, *np.diag(fit.covariance)[1:]])
+        check_usable(fit, whole, np.where(np.arange(12) < 2, 20.0, 5.0))
+    spread_out = np.diag([(0.025 * fit.parameters[0]) ** 2, *np.diag(fit.covariance)[1:]])
     vague = replace(fit, covariance=spread_out)
-    with pytest.raises(DataError, match=r"the focal length is known to 2\.5 % alone"):
-        refuse(vague, whole, tilts)
+    with pytest.raises(DataError, match=r"the focal length is known only to 2\.5 %"):
+        check_usable(vague, whole, tilts)
     with pytest.raises(DataError, match=r"corners in 2 % of the picture's 48 cells"):
-        refuse(fit, coverage(np.full((9, 2), 200.0), SIZE), tilts)
+        check_usable(fit, coverage(np.full((9, 2), 200.0), SIZE), tilts)
 
 
 @pytest.mark.slow
 def test_a_poor_lens_says_why():
-    poor = " ".join(lens_of_views(seen_views(made.places(7), noise=0.4))[1].poor)
+    poor = " ".join(quality_of_views(seen_views(made.places(7), noise=0.4)).poor)
     assert "7 views; expected 10" in poor
     assert "focal length known to 1." in poor
-    poor = lens_of_views(seen_views(made.places(40), noise=0.8))[1].poor
+    poor = quality_of_views(seen_views(made.places(40), noise=0.8)).poor
     assert poor[-1].startswith("error of 1.")
-    assert lens_of_views(seen_views(made.places(20)))[1].poor == []
+    assert quality_of_views(seen_views(made.places(20))).poor == []
 
 
 def test_tilts_and_coverage_are_those_of_the_views():
     places = [made.held(20.0, 0, 0, (0.0, 0.0, 0.5)), *made.places(11)]
     fit = fit_lens(seen_views(places), SIZE, False)
-    assert judged(fit, False).tilts_deg[0] == pytest.approx(20, abs=0.5)
+    assert quality_of(fit, False).tilts_deg[0] == pytest.approx(20, abs=0.5)
     covered = coverage(np.array([[1.0, 1.0], [639.0, 1.0], [1.0, 479.0], [400.0, 470.0]]), SIZE)
     assert covered.visited.sum() == 4
     assert covered.visited[0, 0]

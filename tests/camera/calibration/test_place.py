@@ -1,4 +1,4 @@
-"""Where a camera hangs above the floor: by a lying board, by measured points, or straight down."""
+"""The place of a camera above the floor: by a board, by measured points, or straight down."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from slipid.camera.calibration.board import view_of
-from slipid.camera.calibration.calibrate import LensFound, floor_from_board
-from slipid.camera.calibration.place import placed, placed_robustly, spread
+from slipid.camera.calibration.calibrate import CalibratedLens, floor_from_board
+from slipid.camera.calibration.place import fit_place, fit_place_robustly, uncertainty
 from slipid.camera.calibration.points import read_points
 from slipid.camera.calibration.report import marker_height, mm_per_pixel
 from slipid.camera.overhead import Lens, OverheadCamera
@@ -30,8 +30,8 @@ from tests.helpers.calibrated import (
 )
 
 
-def test_floor_is_found_from_the_lying_board(found, folder):
-    camera = floor_from_board(found, BOARD, folder / "floor.png", 0.0, 0.001).camera
+def test_the_lying_board_gives_the_place(calibrated, folder):
+    camera = floor_from_board(calibrated, BOARD, folder / "floor.png", 0.0, 0.001).camera
     assert np.abs(camera.place - CAMERA).max() < 0.002
     assert np.abs(camera.rotation - made.from_world(ABOVE)).max() < 0.004
     floor = camera.report["floor"]
@@ -43,23 +43,23 @@ def test_floor_is_found_from_the_lying_board(found, folder):
     assert camera.scale_std == floor["scale_std"] >= 0.001
 
 
-def test_a_board_above_the_floor_is_taken_as_such(found, folder):
-    low = floor_from_board(found, BOARD, folder / "floor.png", 0.0, 0.001).camera
-    high = floor_from_board(found, BOARD, folder / "floor.png", 0.02, 0.001).camera
+def test_a_board_above_the_floor_is_taken_as_such(calibrated, folder):
+    low = floor_from_board(calibrated, BOARD, folder / "floor.png", 0.0, 0.001).camera
+    high = floor_from_board(calibrated, BOARD, folder / "floor.png", 0.02, 0.001).camera
     assert high.height - low.height == pytest.approx(0.02, abs=1e-6)
     assert mm_per_pixel(high) > 1.02 * mm_per_pixel(low)
 
 
-def test_uncertainty_of_the_lens_reaches_the_floor(found, folder):
+def test_uncertainty_of_the_lens_reaches_the_floor(calibrated, folder):
     given = (BOARD, folder / "floor.png", 0.0, 0.001)
-    known = LensFound(found.lens, {})
+    known = CalibratedLens(calibrated.lens, {})
     stds = [
         floor_from_board(lens, *given).camera.report["floor"]["height_std_m"]
-        for lens in (known, found)
+        for lens in (known, calibrated)
     ]
     assert stds[1] > 1.1 * stds[0]
     # height goes as the focal length: its own part of the camera's height at the least
-    focal = found.report["lens"]["numbers"]["fx"]
+    focal = calibrated.report["lens"]["numbers"]["fx"]
     assert stds[1] > 0.6 * focal["std"] / focal["value"] * CAMERA[2]
 
 
@@ -68,11 +68,11 @@ def test_stated_place_is_that_of_repetitions():
     off, lengths, stated = [], [], []
     for seed in range(24):
         points, rotation = floor_points(GRID, seed=seed)
-        fit = placed("here", LENS, points)
-        told = spread(fit, None)
-        off.append((fit.camera.place - [0.1, -0.2, 2.4]) / told.place_std_m)
+        fit = fit_place("here", LENS, points)
+        spread = uncertainty(fit, None)
+        off.append((fit.camera.place - [0.1, -0.2, 2.4]) / spread.place_std_m)
         lengths.append(log_length(fit.camera))
-        stated.append(told.scale_std)
+        stated.append(spread.scale_std)
         assert np.abs(fit.camera.rotation - rotation).max() < 0.02
     assert 0.75 < np.sqrt(np.mean(np.square(off))) < 1.3
     assert np.std(lengths) == pytest.approx(np.mean(stated), rel=0.35)
@@ -86,45 +86,45 @@ def test_a_lens_that_is_off_moves_the_place_as_stated():
     for _ in range(60):
         fx, fy, cx, cy, *bend = rng.multivariate_normal(NUMBERS, covariance)
         off = Lens(SIZE, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(bend))
-        camera = placed("here", off, points).camera
+        camera = fit_place("here", off, points).camera
         places.append(camera.place)
         lengths.append(log_length(camera))
-    told = spread(placed("here", LENS, points), covariance)
-    np.testing.assert_allclose(np.std(places, axis=0), told.place_std_m, rtol=0.35)
+    spread = uncertainty(fit_place("here", LENS, points), covariance)
+    np.testing.assert_allclose(np.std(places, axis=0), spread.place_std_m, rtol=0.35)
     # the height follows the focal length, so that lengths hardly do
-    assert np.std(lengths) == pytest.approx(told.scale_std, rel=0.3)
-    assert told.scale_std < 0.5 * 3.0 / TRUE.fx
+    assert np.std(lengths) == pytest.approx(spread.scale_std, rel=0.3)
+    assert spread.scale_std < 0.5 * 3.0 / TRUE.fx
 
 
-def test_a_bad_point_is_left_out_or_told():
+def test_a_bad_point_is_left_out_or_reported():
     points, _ = floor_points(GRID)
     points.pixels[5] += [12.0, -9.0]
-    fit = placed_robustly("here", LENS, points)
-    assert len(fit.told) == 1
-    assert fit.told[0].startswith("point row 7 is off by 1")
-    assert fit.told[0].endswith("left out")
+    fit = fit_place_robustly("here", LENS, points)
+    assert len(fit.left_out) == 1
+    assert fit.left_out[0].startswith("point row 7 is off by 1")
+    assert fit.left_out[0].endswith("left out")
     assert "row 7" not in fit.points.names
     assert np.abs(fit.camera.place - [0.1, -0.2, 2.4]).max() < 0.02
     assert not fit.disputed
-    assert placed_robustly("here", LENS, floor_points(GRID)[0]).told == []
+    assert fit_place_robustly("here", LENS, floor_points(GRID)[0]).left_out == ()
 
 
 def test_a_point_that_is_anywhere_is_left_out():
     for index in range(6):
         points, _ = floor_points(GRID[1:3] + GRID[6:8] + GRID[9::2], seed=4)
         points.pixels[index] = [330.0 - 50 * index, 20.0 + 80 * index]
-        fit = placed_robustly("here", LENS, points)
-        assert fit.told[0].startswith(f"point row {index + 2} is off")
+        fit = fit_place_robustly("here", LENS, points)
+        assert fit.left_out[0].startswith(f"point row {index + 2} is off")
         assert np.abs(fit.camera.place - [0.1, -0.2, 2.4]).max() < 0.05
 
 
-@pytest.mark.parametrize(("count", "said"), [(5, "NOT left out"), (4, "nobody can tell")])
-def test_with_few_points_a_bad_one_is_told(count, said):
+@pytest.mark.parametrize(("count", "message"), [(5, "NOT left out"), (4, "nobody can tell")])
+def test_with_few_points_a_bad_one_is_reported(count, message):
     places = [(-0.9, -0.7, 0), (1.0, -0.6, 0), (0.9, 0.6, 0), (-0.8, 0.6, 0), (0.1, 0.2, 0)]
     points, _ = floor_points(places[:count])
     points.pixels[2] += [25.0, 14.0]
-    fit = placed_robustly("here", LENS, points)
-    assert said in fit.told[0]
+    fit = fit_place_robustly("here", LENS, points)
+    assert message in fit.left_out[0]
     assert fit.disputed
     assert len(fit.points.names) == count
 
@@ -133,15 +133,15 @@ def test_points_at_different_heights_and_far_from_the_origin():
     origin = np.array([30.0, -20.0, 0])
     places = origin + np.array([*GRID, (0.2, 0.3, 0.4), (-0.5, -0.3, 0.2)])
     points, rotation = floor_points(places, camera=(30.1, -20.2, 2.4), noise=0.0)
-    fit = placed("here", LENS, points)
+    fit = fit_place("here", LENS, points)
     np.testing.assert_allclose(fit.camera.place, [30.1, -20.2, 2.4], atol=1e-5)
     np.testing.assert_allclose(fit.camera.rotation, rotation, atol=1e-6)
     np.testing.assert_allclose(fit.off_mm, 0, atol=0.01)
 
 
-def test_residuals_are_also_told_on_the_floor():
+def test_residuals_are_also_given_on_the_floor():
     points, _ = floor_points(GRID, tilt=(0.0, 0.0))
-    fit = placed("here", LENS, points)
+    fit = fit_place("here", LENS, points)
     mm = 2400 / TRUE.fx
     np.testing.assert_allclose(
         np.hypot(*fit.off_mm.T), mm * np.hypot(*fit.residuals.T), rtol=0.35, atol=0.02
@@ -155,23 +155,23 @@ def test_a_camera_that_looks_up_is_refused():
     depths = (points.places - [0.0, 0.0, 1.0]) @ rotation[2]
     assert (depths > 0).all()  # they are seen, beside an axis that points at the sky
     with pytest.raises(DataError, match="looks down"):
-        placed("here", LENS, points)
+        fit_place("here", LENS, points)
 
 
 def test_points_of_a_left_handed_world_are_refused():
     points, _ = floor_points(GRID)
     mirrored = replace(points, places=points.places * [1, -1, 1])
     with pytest.raises(DataError, match="right-handed"):
-        placed("here", LENS, mirrored)
+        fit_place("here", LENS, mirrored)
 
 
 def test_a_place_that_has_a_twin_says_so():
     places = 0.06 * np.array(GRID)
     points, _ = floor_points(places, tilt=(25.0, 0.0), camera=(0.0, 1.1, 2.4), noise=0.3, seed=1)
-    fit = placed("here", LENS, points)
+    fit = fit_place("here", LENS, points)
     assert fit.twin_px is not None
     assert fit.twin_px >= fit.rms_px
-    assert placed("here", LENS, floor_points(GRID)[0]).twin_px is None
+    assert fit_place("here", LENS, floor_points(GRID)[0]).twin_px is None
 
 
 @pytest.mark.parametrize("turn", [0.0, 90.0, 180.0, 200.0])

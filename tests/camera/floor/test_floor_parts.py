@@ -3,17 +3,20 @@
 import numpy as np
 import pytest
 
-from slipid.camera.floor.colour import (
-    as_light,
-    as_shown,
-    code_of_light,
-    light_of_code,
-    settled,
-    tidy,
-)
 from slipid.camera.floor.grid import Extent, grid_over, rectified, view_of
-from slipid.camera.floor.outline import area, outlined
-from slipid.camera.floor.shading import Light, Lit, Samples, lit, shapes
+from slipid.camera.floor.light import (
+    ColourSamples,
+    Illumination,
+    LitColours,
+    basis_at,
+    code_of_linear,
+    fit_illumination,
+    linear_of_code,
+    to_linear,
+    to_srgb,
+)
+from slipid.camera.floor.outline import outlines_of, signed_area
+from slipid.camera.floor.surfaces import smoothed, without_small_patches
 from slipid.camera.overhead import OverheadCamera
 from tests.helpers.made_floors import COLOURS, aslant
 from tests.helpers.mapped_floors import IMAGE
@@ -26,14 +29,14 @@ def test_a_camera_that_sees_the_horizon_maps_the_floor_below_it():
     grid = grid_over(view, 0.05, IMAGE)
     picture = np.full((120, 160, 3), 200, np.uint8)
     floor = rectified(picture, camera, grid)
-    assert 0.1 < floor.seen.mean() < 1
+    assert 0.1 < floor.in_view.mean() < 1
     behind = floor.grid.centres()[..., 1] < camera.place[1] - 2 * camera.height
-    assert not floor.seen[behind].any()
-    assert (floor.colour[floor.seen] == 200).all()
-    assert (floor.colour[~floor.seen] == 0).all()
+    assert not floor.in_view[behind].any()
+    assert (floor.colour[floor.in_view] == 200).all()
+    assert (floor.colour[~floor.in_view] == 0).all()
 
 
-def test_what_lies_beside_the_view_of_a_bent_lens_is_not_seen():
+def test_places_beside_the_view_of_a_bent_lens_are_not_in_view():
     camera = aslant(160, 120)
     camera = OverheadCamera(
         type(camera.lens)((160, 120), camera.lens.matrix, np.array([-0.15, 0.0, 0.0, 0.0])),
@@ -43,7 +46,7 @@ def test_what_lies_beside_the_view_of_a_bent_lens_is_not_seen():
     grid = grid_over(Extent(-5.0, -5.0, 5.0, 5.0), 0.1, IMAGE)
     floor = rectified(np.full((120, 160, 3), 200, np.uint8), camera, grid)
     view = view_of(camera)
-    x, y = np.moveaxis(grid.centres()[floor.seen], -1, 0)
+    x, y = np.moveaxis(grid.centres()[floor.in_view], -1, 0)
     assert view.low_x - 0.2 < x.min() < x.max() < view.high_x + 0.2
     assert view.low_y - 0.2 < y.min() < y.max() < view.high_y + 0.2
 
@@ -53,26 +56,27 @@ def test_a_straight_view_is_laid_onto_the_floor_pixel_by_pixel():
     camera = OverheadCamera.straight_down((40, 30), 0.01, 1.0)
     view = view_of(camera)
     floor = rectified(picture, camera, grid_over(view, 0.01, IMAGE))
-    assert floor.seen.all()
+    assert floor.in_view.all()
     np.testing.assert_array_equal(floor.colour[::-1], picture)
 
 
-def test_gain_and_veil_are_found_with_the_colours():
+def test_gain_and_veil_are_fitted_with_the_colours():
     rng = np.random.default_rng(0)
-    colours = np.array([light_of_code(code) for code in COLOURS.values()])
+    colours = np.array([linear_of_code(code) for code in COLOURS.values()])
     at = rng.uniform(-1, 1, (3000, 2))
-    basis = shapes(at).shape[1]
-    true = Light(0.1 * rng.normal(size=basis) / 3, 0.02 * rng.normal(size=(basis, 3)) / 3)
+    basis = basis_at(at).shape[1]
+    true = Illumination(0.1 * rng.normal(size=basis) / 3, 0.02 * rng.normal(size=(basis, 3)) / 3)
     own = rng.integers(0, len(colours), len(at))
-    seen = true.seen(colours, at)[own, np.arange(len(at))]
-    seen *= rng.normal(1, 0.02, seen.shape)
-    seen[:150] = 0.9  # what is no surface
-    found = lit(Samples(at, seen, own, np.ones(len(at))), Lit(Light.even(), colours * 0.8))
-    fitted = found.light.seen(found.colours, at)[own, np.arange(len(at))]
-    plain = true.seen(colours, at)[own, np.arange(len(at))]
+    rgb = true.rgb_of(colours, at)[own, np.arange(len(at))]
+    rgb *= rng.normal(1, 0.02, rgb.shape)
+    rgb[:150] = 0.9  # samples of no surface
+    start = LitColours(Illumination.uniform(), colours * 0.8)
+    fit = fit_illumination(ColourSamples(at, rgb, own, np.ones(len(at))), start)
+    fitted = fit.illumination.rgb_of(fit.colours, at)[own, np.arange(len(at))]
+    plain = true.rgb_of(colours, at)[own, np.arange(len(at))]
     assert np.abs(fitted / plain - 1)[150:].mean() < 0.02
-    back = found.light.undone(fitted, at)
-    np.testing.assert_allclose(back, found.colours[own], atol=0.02)
+    back = fit.illumination.true_colours(fitted, at)
+    np.testing.assert_allclose(back, fit.colours[own], atol=0.02)
 
 
 def test_single_cells_follow_their_neighbours_and_strong_ones_do_not():
@@ -82,7 +86,7 @@ def test_single_cells_follow_their_neighbours_and_strong_ones_do_not():
     costs[:, 10:15, 5:10] = np.array([25.0, 0.0])[:, None, None]
     known = np.ones((21, 30), bool)
     known[:, -2:] = False
-    labels = settled(costs, known)
+    labels = smoothed(costs, known)
     assert labels[5, 5] == 0
     assert (labels[11:14, 6:9] == 1).all()
     assert (labels[:8, :15] == 0).all()
@@ -90,7 +94,7 @@ def test_single_cells_follow_their_neighbours_and_strong_ones_do_not():
     assert (labels[:, 28:] == -1).all()
 
 
-def test_narrow_lines_and_small_islands_become_what_is_around_them():
+def test_narrow_lines_and_small_islands_are_merged_with_their_surroundings():
     labels = np.zeros((60, 80), int)
     labels[:, 40:] = 1
     labels[:, 38:41] = 2  # the mixed colour of an edge
@@ -99,7 +103,7 @@ def test_narrow_lines_and_small_islands_become_what_is_around_them():
     labels[:, :4] = 2  # the rest of a patch at the edge of the picture
     known = np.ones(labels.shape, bool)
     known[55:] = False
-    clean = tidy(labels, known, 7)
+    clean = without_small_patches(labels, known, 7)
     assert set(np.unique(clean[:28, 4:])) == {0, 1}
     assert abs(int((clean[20, 4:] == 0).sum()) - 35) <= 1
     assert (clean[32:48, 62:] == 2).all()
@@ -112,12 +116,16 @@ def test_outlines_share_their_borders_and_keep_holes():
     labels[18:22, 22:26] = 0
     labels[:8, 40:] = 2
     labels[35:, :5] = -1
-    patches = outlined(labels, 0.6)
+    patches = outlines_of(labels, 0.6)
     assert [one.label for one in patches] == [0, 1, 2, 0]
     assert [len(one.rings) for one in patches] == [2, 2, 1, 1]
     for one in patches:
         size = sum(
-            area(r) if k == 0 and area(r) > 0 else -abs(area(r)) if k else abs(area(r))
+            signed_area(r)
+            if k == 0 and signed_area(r) > 0
+            else -abs(signed_area(r))
+            if k
+            else abs(signed_area(r))
             for k, r in enumerate(one.rings)
         )
         assert size == pytest.approx(one.cells.sum(), abs=1e-9)
@@ -133,7 +141,7 @@ def test_cells_that_touch_at_a_corner_are_outlined():
     labels = np.full((6, 6), -1)
     labels[1:3, 1:3] = 0
     labels[3:5, 3:5] = 0
-    (one,) = outlined(labels, 0.1)
+    (one,) = outlines_of(labels, 0.1)
     assert one.cells.sum() == 8
     assert len(one.rings) == 1
     assert [one.rings[0].min(), one.rings[0].max()] == [1.0, 5.0]
@@ -142,16 +150,16 @@ def test_cells_that_touch_at_a_corner_are_outlined():
 def test_slanted_borders_become_lines():
     y, x = np.mgrid[:100, :120]
     labels = (x > 30 + 0.37 * y).astype(int)
-    found = {one.label: one.rings[0] for one in outlined(labels, 0.6)}
+    found = {one.label: one.rings[0] for one in outlines_of(labels, 0.6)}
     assert len(found[0]) < 20
     lowest, highest = found[0][found[0][:, 1] == 0], found[0][found[0][:, 1] == 100]
     assert lowest[:, 0].max() == pytest.approx(31, abs=1.0)
     assert highest[:, 0].max() == pytest.approx(31 + 37, abs=1.0)
 
 
-def test_light_and_what_is_shown_are_inverse():
+def test_linear_and_srgb_are_inverse():
     shown = np.linspace(0, 1, 50)[:, None] * [1.0, 0.5, 0.1]
-    np.testing.assert_allclose(as_shown(as_light(shown)), shown, atol=1e-6)
-    assert code_of_light(light_of_code("#3e7a4c")) == "#3e7a4c"
-    assert light_of_code("#ffffff") == pytest.approx([1, 1, 1])
-    assert light_of_code("#808080")[0] == pytest.approx(0.2158, abs=1e-3)
+    np.testing.assert_allclose(to_srgb(to_linear(shown)), shown, atol=1e-6)
+    assert code_of_linear(linear_of_code("#3e7a4c")) == "#3e7a4c"
+    assert linear_of_code("#ffffff") == pytest.approx([1, 1, 1])
+    assert linear_of_code("#808080")[0] == pytest.approx(0.2158, abs=1e-3)

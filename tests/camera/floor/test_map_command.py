@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from slipid.camera.floor.asked import Source
-from slipid.camera.floor.grid import Robot
-from slipid.camera.floor.picture import Wish, all_found, map_of
+from slipid.camera.floor.grid import RobotShape
+from slipid.camera.floor.picture import MapOptions, check_all_present, map_of
+from slipid.camera.floor.region import FloorPicture
 from slipid.camera.overhead import OverheadCamera
 from slipid.cli.main import app
 from slipid.data.floor_map import read_map
@@ -33,9 +33,9 @@ POINT = '[[points]]\nsurface = "wood"\n'
         (POINT + "at_px = [[1, 1]]\nat_m = [[0, 0]]\n", "either at_px or at_m"),
         (POINT + "at_px = []\n", r"points\[1\].at_px: \[\]; expected"),
         (POINT + "at_px = [[480, 10]]\n", r"\[480, 10\] is outside the picture of 480 x 400"),
-        (POINT + "at_m = [[5.0, 0.0]]\n", r"points\[1\]: \[5, 0\] is not seen, outside the reg"),
+        (POINT + "at_m = [[5.0, 0.0]]\n", r"points\[1\]: \[5, 0\] is not visible, outside the reg"),
         (POINT + "at_m = [[-0.75, 0.55]]\n", "on a mask or on a robot; expected a point on"),
-        (POINT + "at_px = [[1, 399]]\n" + REGION, "not seen, outside the region"),
+        (POINT + "at_px = [[1, 399]]\n" + REGION, "not visible, outside the region"),
         ("[region]\nat_m = [[0, 0], [1, 1]]\n", "region: 2 corners; expected a polygon of 3"),
         ("[region]\nat_m = [[9, 9], [9, 8], [8, 8]]\n", "region: no floor that the camera sees"),
         ("[region]\nat_px = [[9, 9], [9, 8], [8, 8]]\n", "expected 400 or more"),
@@ -45,34 +45,34 @@ POINT = '[[points]]\nsurface = "wood"\n'
         ("[region\n", "no valid TOML"),
     ],
 )
-def test_what_is_wrong_with_a_palette_is_said(made, tmp_path, config, match):
+def test_errors_in_a_palette_are_reported(made, tmp_path, config, match):
     with pytest.raises(DataError, match=match) as error:
         mapped(made, tmp_path, config)
     assert "palette.toml" in str(error.value) or "floor.png" in str(error.value)
 
 
 def test_a_surface_that_no_cell_has_is_refused(made):
-    source = Source(IMAGE, Path("p.toml"), made.picture, made.camera)
+    source = FloorPicture(IMAGE, Path("p.toml"), made.picture, made.camera)
     labels = np.array([[0, 2], [-1, 2]])
     with pytest.raises(DataError, match=r"p\.toml: nothing in the picture looks most like b; exp"):
-        all_found(source, ("a", "b", "c"), labels)
-    all_found(source, ("a",), labels)
+        check_all_present(source, ("a", "b", "c"), labels)
+    check_all_present(source, ("a",), labels)
 
 
 def test_pictures_and_cameras_that_do_not_fit_are_refused(made, tmp_path):
     image = tmp_path / "floor.png"
     with pytest.raises(DataError, match=r"floor\.png: No such file.*expected a picture"):
-        map_of(image, made.camera, Wish(), Reporter(quiet=True))
+        map_of(image, made.camera, MapOptions(), Reporter(quiet=True))
     image.write_bytes(b"")
     with pytest.raises(DataError, match=r"floor\.png: the file is empty"):
-        map_of(image, made.camera, Wish(), Reporter(quiet=True))
+        map_of(image, made.camera, MapOptions(), Reporter(quiet=True))
     image.write_bytes(b"no picture at all")
     with pytest.raises(DataError, match="no picture that OpenCV reads"):
-        map_of(image, made.camera, Wish(), Reporter(quiet=True))
+        map_of(image, made.camera, MapOptions(), Reporter(quiet=True))
     with pytest.raises(DataError, match="480 x 400 pixels, but the camera was calibrated at 640"):
         mapped(MadeFloor(made.picture, aslant(640), made.truth, None), tmp_path, None)
     with pytest.raises(DataError, match="no marker dictionary '4X4_51', did you mean 4X4_50"):
-        mapped(made, tmp_path, REGION, robot=Robot("4X4_51"))
+        mapped(made, tmp_path, REGION, robot=RobotShape("4X4_51"))
     with pytest.raises(DataError, match="expected at most 4000000 in all: a larger --cell"):
         mapped(made, tmp_path, REGION, cell=0.0005)
     with pytest.raises(DataError, match="expected 400 or more: a smaller --cell"):
@@ -83,8 +83,8 @@ def test_pictures_and_cameras_that_do_not_fit_are_refused(made, tmp_path):
         mapped(made, tmp_path, REGION, surfaces=30)
 
 
-def said(*words: object) -> tuple[int, str]:
-    """Exit code and output of a command."""
+def invoked(*words: object) -> tuple[int, str]:
+    """Return exit code and output of a command."""
     done = CliRunner().invoke(app, [str(word) for word in words])
     return done.exit_code, done.output
 
@@ -97,7 +97,9 @@ def test_the_command_writes_a_map_that_others_read(made, tmp_path):
     (tmp_path / "p.toml").write_text(HEAD + REGION + marked(POINTS))
     common = ("map", image, "--camera", camera, "--robot-radius", 0.17, "--marker-height", 0.2)
     common = (*common, "--cell", 0.01, "--quiet")
-    code, text = said(*common, "--config", tmp_path / "p.toml", "--out", out, "--json", out / "j")
+    code, text = invoked(
+        *common, "--config", tmp_path / "p.toml", "--out", out, "--json", out / "j"
+    )
     assert code == 0, text
     assert "robot with marker 7 masked at x -0.75 m, y 0.55 m" in text
     assert cv2.imread(str(out / "map.png")).shape[1] == 1430
@@ -121,16 +123,16 @@ def test_the_command_without_a_config_writes_one_and_keeps_an_edited_one(tmp_pat
     cv2.imwrite(str(image), picture)
     OverheadCamera.straight_down((160, 120), 0.01, 2.0).save(tmp_path / "camera.json")
     common = ("map", image, "--camera", tmp_path / "camera.json", "--out", out, "--quiet")
-    code, text = said(*common)
+    code, text = invoked(*common)
     assert code == 0, text
-    assert "no marker of a robot was found" in text
+    assert "no marker of a robot was detected" in text
     assert f"--config {out / 'palette.toml'}" in text
-    code, text = said(*common)
+    code, text = invoked(*common)
     assert code == 2
     assert "it is there already and may have been edited" in text
     config = (out / "palette.toml").read_text()
     (out / "palette.toml").write_text(config.replace("surface_1", "lawn"))
-    code, text = said(*common, "--config", out / "palette.toml")
+    code, text = invoked(*common, "--config", out / "palette.toml")
     assert code == 0, text
     assert "lawn" in read_map(out / "map.geojson").surfaces
 
@@ -144,18 +146,18 @@ def test_a_poor_map_is_written_and_ends_with_1(tmp_path):
     both = {"lawn": [(30, 30), (30, 90)], "moss": [(120, 30), (120, 90)]}
     (tmp_path / "p.toml").write_text(HEAD + marked(both, "at_px"))
     words = ("--camera", camera, "--config", tmp_path / "p.toml", "--out", out, "--quiet")
-    code, text = said("map", image, *words)
+    code, text = invoked("map", image, *words)
     assert code == 1, text
-    assert "not told apart" in text
+    assert "cannot be distinguished" in text
     assert (out / "map.geojson").is_file()
 
 
 def test_the_command_needs_a_camera_of_these_pictures(tmp_path):
     image, camera = tmp_path / "floor.png", tmp_path / "camera.json"
     cv2.imwrite(str(image), np.full((120, 160, 3), (60, 120, 60), np.uint8))
-    code, text = said("map", image, "--out", tmp_path / "out")
+    code, text = invoked("map", image, "--out", tmp_path / "out")
     assert (code, "--camera" in text) == (2, True)
     OverheadCamera.straight_down((320, 240), 0.01, 2.0).save(camera)
-    code, text = said("map", image, "--out", tmp_path / "out", "--camera", camera)
+    code, text = invoked("map", image, "--out", tmp_path / "out", "--camera", camera)
     assert (code, "calibrated at 320 x 240" in text) == (2, True)
     assert not (tmp_path / "out").exists()

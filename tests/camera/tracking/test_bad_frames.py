@@ -1,4 +1,4 @@
-"""Frames that are wrong are flagged, not filled; those that are right are not."""
+"""Bad frames are flagged and not interpolated; good ones are not flagged."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from slipid.camera.tracking.outliers import jumps
-from slipid.camera.tracking.track import Flag
+from slipid.camera.tracking.track import Flag, jumps
 from tests.helpers.made_drives import round_trip, starts_and_stops
 from tests.helpers.made_videos import Body
 from tests.helpers.tracked import STAGE, errors, tracked
@@ -22,12 +21,12 @@ AT = 45
 
 @cache
 def stop_and_go() -> tuple[np.ndarray, ...]:
-    """Starts and stops of 1 m/s^2 and 90 deg/s; no good frame of these may be flagged."""
+    """Return frames of starts and stops of 1 m/s^2 and 90 deg/s; none of these may be flagged."""
     return tuple(STAGE.film([Body(starts_and_stops)], COUNT))
 
 
 def beside(frame: int, shift=(0.3, 0.25, 1.0), both: bool = False) -> np.ndarray:
-    """The robot seen elsewhere, or there as well."""
+    """Return a frame with the robot elsewhere, or with another one there as well."""
     other = Body(lambda t: starts_and_stops(t) + np.array(shift))
     return STAGE.frame(frame / 30, [Body(starts_and_stops), other] if both else [other])
 
@@ -76,8 +75,8 @@ def test_bad_frames_are_flagged_and_good_ones_are_not(kind, tmp_path):
     assert {Flag(flag) for flag in track.flag[sorted(bad)]} <= EXPECTED[kind]
     assert np.isnan(track.pose[sorted(bad)]).all()
     assert np.isnan(track.covariance[sorted(bad)]).all()
-    told = np.isfinite(track.rejected[sorted(bad)]).all(axis=1)
-    assert told.tolist() == [Flag(f) in (Flag.JUMP, Flag.SHAPE) for f in track.flag[sorted(bad)]]
+    kept = np.isfinite(track.rejected[sorted(bad)]).all(axis=1)
+    assert kept.tolist() == [Flag(f) in (Flag.JUMP, Flag.SHAPE) for f in track.flag[sorted(bad)]]
     off = errors(track, Body(starts_and_stops))
     assert np.nanmax(np.abs(off[:, :2])) < 1e-3
     assert np.degrees(np.nanmax(np.abs(off[:, 2]))) < 0.6
@@ -93,7 +92,7 @@ def test_frozen_frames_are_flagged(tmp_path):
 
 
 def test_a_second_marker_of_the_number_never_leads_astray(tmp_path):
-    """It is noticed at the next look at a whole frame; until then the right one is followed."""
+    """It is noticed at the next search of a whole frame; until then the right one is followed."""
     pictures = list(stop_and_go()[:90])
     for k in range(20, 80):
         pictures[k] = beside(k, (0.3, 0.2, 1.0), both=True)
@@ -102,7 +101,7 @@ def test_a_second_marker_of_the_number_never_leads_astray(tmp_path):
     assert (track.flag[30:80] == Flag.AMBIGUOUS).all()
     assert track.good[:30].all()
     assert track.good[80:].all()
-    assert "seen twice" in " ".join(track.doubts())
+    assert "detected twice" in " ".join(track.doubts())
 
 
 @pytest.mark.parametrize("noise", [1.0, 0.05])
@@ -119,17 +118,17 @@ def test_no_false_alarms_in_a_minute_of_sharp_driving(noise):
 
 
 @pytest.mark.parametrize("fps", [5.0, 10.0, 30.0])
-def test_hard_braking_is_believed(fps):
+def test_hard_braking_is_accepted(fps):
     """2.5 m/s^2 from 1 m/s on, almost without noise."""
     time = np.arange(int(4 * fps)) / fps
     braking = np.clip(time - 2.0, 0.0, 0.4)
-    way = np.minimum(time, 2.0) + braking - 1.25 * braking**2
-    pose = np.column_stack([way, 0.1 * way, np.zeros(len(time))])
+    path = np.minimum(time, 2.0) + braking - 1.25 * braking**2
+    pose = np.column_stack([path, 0.1 * path, np.zeros(len(time))])
     assert not jumps(time, pose, np.full(pose.shape, 1e-5)).any()
 
 
 def test_many_wrong_poses_among_good_ones():
-    """A fifth of the frames is anywhere: what is believed is the robot's way."""
+    """A fifth of the poses is anywhere: exactly those are rejected."""
     rng = np.random.default_rng(4)
     time = np.arange(900) / 30
     std = np.broadcast_to([5e-4, 5e-4, 2e-3], (len(time), 3))
@@ -140,7 +139,7 @@ def test_many_wrong_poses_among_good_ones():
     assert np.array_equal(jumps(time, pose, std), wrong)
 
 
-def test_a_long_mistake_is_left_out_whole():
+def test_a_long_mistake_is_rejected_as_a_whole():
     time = np.arange(300) / 30
     std = np.broadcast_to([5e-4, 5e-4, 2e-3], (len(time), 3))
     pose = np.array([round_trip()(t) for t in time])
@@ -150,15 +149,15 @@ def test_a_long_mistake_is_left_out_whole():
         assert np.flatnonzero(jumps(time, moved, std)).tolist() == list(range(first, last))
 
 
-def test_of_a_small_mistake_nothing_is_believed():
-    """40 frames lie 6 cm aside; where they end one good frame may go with them."""
+def test_a_small_mistake_is_rejected():
+    """40 frames lie 6 cm aside; where they end one good frame may be rejected with them."""
     time = np.arange(240) / 30
     std = np.broadcast_to([4e-4, 4e-4, 3e-3], (len(time), 3))
     pose = np.array([starts_and_stops(t) for t in time])
     pose[100:140, 0] += 0.06
-    left_out = set(np.flatnonzero(jumps(time, pose, std)).tolist())
-    assert left_out >= set(range(100, 140))
-    assert len(left_out) <= 41
+    rejected = set(np.flatnonzero(jumps(time, pose, std)).tolist())
+    assert rejected >= set(range(100, 140))
+    assert len(rejected) <= 41
 
 
 def test_few_poses_are_left_alone():

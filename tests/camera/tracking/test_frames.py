@@ -1,4 +1,4 @@
-"""Frames and their times: videos, folders of pictures, devices, and what is wrong with them."""
+"""Frames and their times: videos, folders of pictures, devices, and errors in them."""
 
 from __future__ import annotations
 
@@ -10,17 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from slipid.camera.frames.frame import (
-    DEPTH,
-    ahead,
-    cut_off,
-    even_times,
-    grey_of,
-    read_times,
-    uneven,
-)
-from slipid.camera.frames.source import open_source
-from slipid.camera.frames.video import Capture, Device
+from slipid.camera.frame import DEPTH, cut_off, even_times, grey_of, read_ahead, read_times, uneven
+from slipid.camera.frame_source import Capture, Device, open_source
 from slipid.support.errors import DataError
 from tests.helpers.made_sources import InMemory, write_video
 
@@ -28,7 +19,7 @@ COUNT = 12
 
 
 def pictures(count: int = COUNT) -> list[np.ndarray]:
-    """Grey pictures that tell their number."""
+    """Return grey pictures whose level encodes their number."""
     return [np.full((48, 64), 15 * (k % 17), np.uint8) for k in range(count)]
 
 
@@ -42,7 +33,7 @@ def write_times(path, rows):
 
 
 def write_uneven(path, ticks):
-    """A video whose frames have times of their own, in milliseconds."""
+    """Write a video whose frames have times of their own, in milliseconds."""
     with av.open(str(path), "w") as file:
         stream = file.add_stream("mpeg4", rate=30)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
@@ -62,10 +53,10 @@ def test_a_video_gives_its_frames_and_times(tmp_path):
     video = open_source(str(write_video(tmp_path / "a.avi", pictures(), 25.0)))
     assert (video.image_px, video.count) == ((64, 48), COUNT)
     assert numbers(video) == list(range(COUNT))
-    found = list(video.frames())
-    assert [frame.index for frame in found] == list(range(COUNT))
-    np.testing.assert_allclose([frame.time for frame in found], np.arange(COUNT) / 25, atol=1e-6)
-    assert uneven([frame.time for frame in found]) is None
+    frames = list(video.frames())
+    assert [frame.index for frame in frames] == list(range(COUNT))
+    np.testing.assert_allclose([frame.time for frame in frames], np.arange(COUNT) / 25, atol=1e-6)
+    assert uneven([frame.time for frame in frames]) is None
     assert cut_off(video, COUNT) is None
 
 
@@ -100,7 +91,7 @@ def test_times_too_few_or_too_many(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["avi", "mp4", "mkv"])
-def test_uneven_times_are_kept_and_said(tmp_path, kind):
+def test_uneven_times_are_kept_and_reported(tmp_path, kind):
     ticks = [0, 33, 66, 100, 180, 213, 246, 280, 313, 400]
     video = open_source(str(write_uneven(tmp_path / f"a.{kind}", ticks)))
     times = [frame.time for frame in video.frames()]
@@ -113,19 +104,19 @@ def test_uneven_times_are_kept_and_said(tmp_path, kind):
 
 def test_a_video_without_times_is_refused(tmp_path, monkeypatch):
     path = write_video(tmp_path / "a.avi", pictures())
-    monkeypatch.setattr(Capture, "value", lambda self, what: 0.0)
+    monkeypatch.setattr(Capture, "value", lambda self, property_id: 0.0)
     with pytest.raises(DataError, match=r"frame 1 has time 0\.0000 s after 0\.0000 s.*--fps"):
         numbers(open_source(str(path)))
     assert numbers(open_source(str(path), fps=30.0)) == list(range(COUNT))
 
 
-def test_a_video_that_was_cut_off_gives_what_is_there(tmp_path):
+def test_a_video_that_was_cut_off_gives_its_first_frames(tmp_path):
     data = write_video(tmp_path / "a.avi", pictures(60)).read_bytes()
     (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
     video = open_source(str(tmp_path / "cut.avi"))
-    found = list(video.frames())
-    assert 10 < len(found) < 50
-    assert f"ends after frame {len(found)} of 60" in cut_off(video, len(found))
+    frames = list(video.frames())
+    assert 10 < len(frames) < 50
+    assert f"ends after frame {len(frames)} of 60" in cut_off(video, len(frames))
 
 
 def test_formats_that_estimate_their_length_are_not_cut_off():
@@ -206,12 +197,12 @@ def test_a_device_needs_an_end_and_has_its_own_times():
 def test_a_device_gives_frames_with_times_from_zero_on(tmp_path):
     """A video in its place: what matters is the clock."""
     device = Device.at(str(write_video(tmp_path / "a.avi", pictures())), 100.0)
-    found = list(device.frames())
-    assert [frame.index for frame in found] == list(range(COUNT))
-    assert found[0].time == 0.0
-    assert np.all(np.diff([frame.time for frame in found]) > 0)
+    frames = list(device.frames())
+    assert [frame.index for frame in frames] == list(range(COUNT))
+    assert frames[0].time == 0.0
+    assert np.all(np.diff([frame.time for frame in frames]) > 0)
     assert device.image_px == (64, 48)
-    assert device.identity != device.identity
+    assert device.identity != Device.at(device.place, 100.0).identity
     assert len(list(replace(device, seconds=0.0).frames())) == 1
 
 
@@ -261,16 +252,16 @@ def test_uneven_says_nothing_of_jitter():
 
 def test_frames_decoded_ahead_are_the_same_and_errors_arrive():
     source = InMemory.even(pictures())
-    assert [frame.index for frame in ahead(source.frames())] == list(range(COUNT))
+    assert [frame.index for frame in read_ahead(source.frames())] == list(range(COUNT))
 
     def breaking():
         yield from source.frames()
         raise DataError("torn off")
 
-    found = []
+    frames = []
     with pytest.raises(DataError, match="torn off"):
-        found.extend(ahead(breaking()))
-    assert len(found) == 0 or len(found) == COUNT
+        frames.extend(read_ahead(breaking()))
+    assert len(frames) == 0 or len(frames) == COUNT
 
 
 def test_nobody_decodes_on_when_frames_are_no_longer_wanted():
@@ -281,7 +272,7 @@ def test_nobody_decodes_on_when_frames_are_no_longer_wanted():
             taken.append(0)
             yield from InMemory.even(pictures(1)).frames()
 
-    frames = ahead(endless())
+    frames = read_ahead(endless())
     next(frames)
     frames.close()
     assert len(taken) <= DEPTH + 3

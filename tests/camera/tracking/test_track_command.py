@@ -1,4 +1,4 @@
-"""`slipid track`: what it writes, and where it ends with doubts."""
+"""`slipid track`: the files it writes, and its doubts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from slipid.camera.tracking.poses_file import write_poses
+from slipid.camera.tracking.outputs import write_poses
 from slipid.camera.tracking.target import read_targets
 from tests.helpers.made_drives import round_trip
 from tests.helpers.made_sources import write_video
@@ -34,13 +34,13 @@ def made(tmp_path_factory) -> Made:
     return made_in(tmp_path_factory.mktemp("videos"))
 
 
-# what is written --------------------------------------------------------------------------------
+# files --------------------------------------------------------------------------------
 
 
 def test_poses_are_written_as_csv_and_parquet(made, tmp_path):
     video, picture = made.video("robot", ROBOT), tmp_path / "look.png"
-    told = tmp_path / "told.json"
-    words = (*LONE, "--preview", picture, "--json", told)
+    shown = tmp_path / "shown.json"
+    words = (*LONE, "--preview", picture, "--json", shown)
     done = track(made, video, tmp_path / "poses.csv", *words)
     assert done.exit_code == 0, done.stderr
     assert "20 of 20 frames have a pose" in done.stdout
@@ -53,7 +53,7 @@ def test_poses_are_written_as_csv_and_parquet(made, tmp_path):
     assert table["var_x"].between(1e-9, 1e-6).all()
     assert table[["rejected_x", "rejected_y", "rejected_heading"]].isna().all(axis=None)
     assert cv2.imread(str(picture)).shape == (270, 480, 3)
-    content = json.loads(told.read_text(encoding="utf-8"))
+    content = json.loads(shown.read_text(encoding="utf-8"))
     assert (content["schema"], content["frames"]) == ("slipid.track/1", COUNT)
     assert content["targets"]["robot"]["flags"]["ok"] == COUNT
     assert content["targets"]["robot"]["height_told_m"] == pytest.approx(0.25, abs=0.02)
@@ -62,7 +62,7 @@ def test_poses_are_written_as_csv_and_parquet(made, tmp_path):
     assert list(other.columns) == list(table.columns)
     pd.testing.assert_frame_equal(other, table, check_dtype=False, rtol=1e-3, atol=1e-6)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(
-        ["look.png", "poses.csv", "poses.parquet", "told.json"]
+        ["look.png", "poses.csv", "poses.parquet", "shown.json"]
     )
 
 
@@ -139,7 +139,7 @@ def test_a_board_lies_row_by_row_from_ahead_on_the_left(tmp_path):
 # doubts -----------------------------------------------------------------------------------------
 
 
-def test_wrong_height_is_said_and_ends_with_one(made, tmp_path):
+def test_wrong_height_is_reported_and_ends_with_one(made, tmp_path):
     words = ("--marker-size", 0.131, "--marker-height", 0.0, "--quiet")
     done = track(made, made.video("robot", ROBOT), tmp_path / "p.csv", *words)
     assert done.exit_code == 1

@@ -13,9 +13,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from slipid.camera.frames.source import open_source
-from slipid.camera.tracking import sightings, tracking
-from slipid.camera.tracking.finder import Finder
+from slipid.camera.frame_source import open_source
+from slipid.camera.tracking import detections, tracking
+from slipid.camera.tracking.detector import MarkerTracker
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.helpers.made_sources import write_video
@@ -34,21 +34,21 @@ def made(tmp_path_factory) -> Made:
 def run_through(
     made: Made, out: Path, monkeypatch, *words: object, stop: int | None = None
 ) -> list[int]:
-    """Track; the numbers of the frames that were looked at, interrupted in one of them."""
-    looked: list[int] = []
-    find = Finder.find
+    """Track, and return the numbers of the searched frames, interrupted in one of them."""
+    searched: list[int] = []
+    detect = MarkerTracker.detect
 
     def watched(self, grey, number):
         if number == stop:
             raise KeyboardInterrupt
-        looked.append(number)
-        return find(self, grey, number)
+        searched.append(number)
+        return detect(self, grey, number)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Finder, "find", watched)
+        patch.setattr(MarkerTracker, "detect", watched)
         done = track(made, made.video("robot", ROBOT), out, *LONE, "--id", 0, *words)
     assert done.exit_code == (0 if stop is None else 130)
-    return looked
+    return searched
 
 
 def test_an_interrupted_run_goes_on_and_gives_the_same(made, tmp_path, monkeypatch):
@@ -64,7 +64,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same(made, tmp_path, monkeypat
     np.testing.assert_allclose(other["heading"], one["heading"], atol=2e-4)
 
 
-def test_what_was_kept_of_other_work_is_not_used(made, tmp_path, monkeypatch):
+def test_checkpoints_of_other_work_are_not_used(made, tmp_path, monkeypatch):
     out = tmp_path / "p.csv"
     run_through(made, out, monkeypatch, stop=12)
     kept = tmp_path / ".p.csv.unfinished" / "sightings.npz"
@@ -104,7 +104,7 @@ def test_a_freeze_is_noticed_across_an_interrupt(made, tmp_path, monkeypatch):
 def test_poses_that_cannot_be_written_are_kept(made, tmp_path, monkeypatch):
     source = open_source(str(made.video("robot", ROBOT)))
     target = tracking.LoneMarker(0.131, 0.25, 0).target(source)
-    monkeypatch.setattr(sightings, "KEPT_S", 0.0)
+    monkeypatch.setattr(detections, "KEPT_S", 0.0)
     done = tracking.track(source, STAGE.camera, (target,), tmp_path / "kept", KeptMessages())
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(DataError, match="cannot be written"):
@@ -114,24 +114,24 @@ def test_poses_that_cannot_be_written_are_kept(made, tmp_path, monkeypatch):
     assert not (tmp_path / "kept").exists()
 
 
-def test_a_marker_that_comes_late_is_found_among_others(tmp_path):
-    """Another marker lies in view from the start on; that is said, and is no reason to stop."""
+def test_a_marker_that_comes_late_is_detected_among_others(tmp_path):
+    """Another marker lies in view from the start on; that is reported, and no reason to stop."""
     late = Body(lambda t: np.array([9.0, 0, 0]) if t < 3.5 else ROBOT.pose_at(t), (Printed(id=1),))
     still = STAGE.film([OTHER], 1)
     video = write_video(tmp_path / "a.avi", [*still * 104, *STAGE.film([OTHER, late], 110)[104:]])
-    source, said = open_source(str(video)), KeptMessages()
+    source, messages = open_source(str(video)), KeptMessages()
     target = tracking.LoneMarker(0.131, 0.25, 1).target(source)
-    done = tracking.track(source, STAGE.camera, (target,), tmp_path / "kept", said)
+    done = tracking.track(source, STAGE.camera, (target,), tmp_path / "kept", messages)
     assert done.tracks[0].good[106:].all()
-    assert any("marker 1 is in no frame so far, but marker 7" in line for line in said.lines)
+    assert any("marker 1 is in no frame so far, but marker 7" in line for line in messages.lines)
 
 
 @pytest.mark.slow
 def test_killed_in_the_middle_it_goes_on(made, tmp_path):
-    """A process of its own, killed after it has kept something, then started again."""
+    """A process of its own, killed after its first checkpoint, then started again."""
     video = made.video("long", ROBOT, count=400)
     code = (
-        "from slipid.camera.tracking import sightings; sightings.KEPT_S = 0.05\n"
+        "from slipid.camera.tracking import detections; detections.KEPT_S = 0.05\n"
         "from slipid.cli.main import main; main()"
     )
     words = ["track", video, "--camera", made.camera, "--out", tmp_path / "p.csv", *LONE]

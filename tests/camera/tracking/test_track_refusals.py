@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from slipid.camera.tracking.finder import Finder
+from slipid.camera.tracking.detector import MarkerTracker
 from tests.helpers.made_sources import write_video
 from tests.helpers.track_command import (
     FIVE,
@@ -30,7 +30,7 @@ def made(tmp_path_factory) -> Made:
 
 
 def refusal(made, source, *words, out=None) -> str:
-    """The one message of a command that ends with 2."""
+    """Return the one message of a command that ends with exit code 2."""
     done = track(made, source, out or made.folder / "never.csv", *words)
     assert done.exit_code == 2, done.stdout + done.stderr
     assert done.stdout == ""
@@ -40,7 +40,7 @@ def refusal(made, source, *words, out=None) -> str:
 
 
 @pytest.mark.slow
-def test_markers_that_are_not_those_asked_for(made):
+def test_other_markers_than_the_requested_ones(made):
     assert "no marker of any dictionary" in refusal(made, made.video("empty", count=3), *LONE)
     words = refusal(made, made.video("empty", count=3), *LONE, "--id", 4)
     assert "marker 4 in none of 3 frames" in words
@@ -129,11 +129,11 @@ def test_cameras_that_do_not_fit(made, tmp_path):
     assert "No such file" in refusal(Made(tmp_path), video, *LONE)
 
 
-def test_what_cannot_be_written_is_said_before_the_work(made, tmp_path, monkeypatch):
+def test_unwritable_files_are_reported_before_the_work(made, tmp_path, monkeypatch):
     def never(*_):
         raise AssertionError("the work began")
 
-    monkeypatch.setattr(Finder, "find", never)
+    monkeypatch.setattr(MarkerTracker, "detect", never)
     video = made.video("robot", ROBOT)
     (tmp_path / "file").write_text("", encoding="utf-8")
     words = (*LONE, "--id", 0)
@@ -164,5 +164,5 @@ WRONG_TARGETS = {
 def test_wrong_targets(made, tmp_path, text):
     (tmp_path / "targets.toml").write_text(text, encoding="utf-8")
     words = ("--targets", tmp_path / "targets.toml", "--quiet")
-    said = refusal(made, made.video("robot", ROBOT), *words)
-    assert WRONG_TARGETS[text] in said
+    message = refusal(made, made.video("robot", ROBOT), *words)
+    assert WRONG_TARGETS[text] in message

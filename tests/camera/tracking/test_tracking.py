@@ -1,4 +1,4 @@
-"""From frames to poses: accuracy, stated covariance, several markers, how they are found."""
+"""From frames to poses: accuracy, stated covariance, several markers, and their detection."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.camera.frames.frame import grey_of
+from slipid.camera.frame import grey_of
 from slipid.camera.opencv import read_picture
 from slipid.camera.overhead import OverheadCamera
-from slipid.camera.tracking.finder import Finder, MarkerDetector, Region
+from slipid.camera.tracking.detections import Detections
+from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region
 from slipid.camera.tracking.pose import poses_of
-from slipid.camera.tracking.sightings import Sightings
 from slipid.camera.tracking.target import Marker, Target
 from slipid.camera.tracking.track import Flag, track_of
 from tests.helpers.made_drives import round_trip, starts_and_stops
@@ -28,11 +28,13 @@ def test_frames_of_the_authors_have_their_poses(real_data, name):
     """Their convention: corners shrunk by 0.895 towards the middle (960, 540), in pixels."""
     folder = real_data / "aruco_frames"
     theirs = json.loads((folder / "frame_coordinate.json").read_text(encoding="utf-8"))[name]
-    (seen,) = MarkerDetector("4X4_50").find(grey_of(read_picture(folder / name)))
+    (detection,) = MarkerDetector("4X4_50").detect(grey_of(read_picture(folder / name)))
     camera = OverheadCamera.straight_down((1920, 1080), 1.0, 1.0)  # middle at (959.5, 539.5)
-    edge = np.linalg.norm(seen.corners - np.roll(seen.corners, 1, axis=0), axis=1).mean()
-    target = Target("robot", "4X4_50", (Marker.at(seen.id, 0.895 * edge, 0.105),))
-    x, y, heading = poses_of(camera, target, seen.corners[None, None]).pose[0]
+    edge = np.linalg.norm(
+        np.diff(detection.corners, axis=0, append=detection.corners[:1]), axis=1
+    ).mean()
+    target = Target("robot", "4X4_50", (Marker.at(detection.id, 0.895 * edge, 0.105),))
+    x, y, heading = poses_of(camera, target, detection.corners[None, None]).pose[0]
     assert abs(959.5 + x - theirs["x"]) <= 1.5
     assert abs(539.5 - y - theirs["y"]) <= 1.5
     gap = np.degrees(heading) - 90 - theirs["ang"]
@@ -42,10 +44,10 @@ def test_frames_of_the_authors_have_their_poses(real_data, name):
 @pytest.mark.parametrize(
     "name", ["robotino2021/test_site.jpg", "robotino2022/two_surfaces/green_table/top_view.jpg"]
 )
-def test_markers_in_pictures_of_test_sites_are_found(real_data, name):
-    seen = MarkerDetector("4X4_50").find(grey_of(read_picture(real_data / name)))
-    assert [one.id for one in seen] == [0]
-    edges = np.linalg.norm(seen[0].corners - np.roll(seen[0].corners, 1, axis=0), axis=1)
+def test_markers_in_pictures_of_test_sites_are_detected(real_data, name):
+    (one,) = MarkerDetector("4X4_50").detect(grey_of(read_picture(real_data / name)))
+    assert one.id == 0
+    edges = np.linalg.norm(one.corners - np.roll(one.corners, 1, axis=0), axis=1)
     assert 60 < edges.min() <= edges.max() < 1.08 * edges.min()
 
 
@@ -78,7 +80,7 @@ def test_poses_are_accurate_and_their_covariance_holds(name, tmp_path):
     squares = nees(track, off)
     assert squares.mean() < 3.0
     assert (squares < 6.25).mean() >= 0.9  # the 90 % region of three numbers
-    assert abs(track.usual_size - 1) < 2e-3
+    assert abs(track.median_size - 1) < 2e-3
 
 
 @pytest.mark.slow
@@ -104,15 +106,15 @@ def test_covariance_is_that_of_corners_with_known_noise(count):
         corners += [STAGE.camera.pixels(m.corners @ turn + (x, y, 0.0)) for m in target.markers]
     noisy = np.array(corners) + rng.normal(0, 0.4, (len(rows), 4, 2))
     never = np.zeros(frames, bool)
-    seen = Sightings(np.arange(frames), np.arange(frames) / 30, never, rows, ids, noisy)
-    track = track_of(STAGE.camera, target, seen)
+    detections = Detections(np.arange(frames), np.arange(frames) / 30, never, rows, ids, noisy)
+    track = track_of(STAGE.camera, target, detections)
     assert track.good.all()
     assert track.corner_std == pytest.approx(0.4, rel=0.06)
     assert 2.4 < nees(track, errors(track, body)).mean() < 3.3
 
 
 @pytest.mark.slow
-def test_full_resolution_meets_what_is_wanted(tmp_path):
+def test_full_resolution_meets_the_requirements(tmp_path):
     stage, body = Stage(lens_of(1920)), Body(round_trip())
     (track,) = tracked(stage, stage.film([body], 25), tmp_path)
     off = errors(track, body)
@@ -121,16 +123,16 @@ def test_full_resolution_meets_what_is_wanted(tmp_path):
     assert np.degrees(np.abs(off[:, 2]).max()) < 0.1
 
 
-def test_wrong_height_is_told(tmp_path):
+def test_wrong_height_is_reported(tmp_path):
     stage, body = STAGE, Body(round_trip())
     pictures = stage.film([body], 12)
     (right,) = tracked(stage, pictures, tmp_path / "a")
     assert right.doubts() == []
-    assert right.height_told == pytest.approx(0.25, abs=0.01)
+    assert right.apparent_height == pytest.approx(0.25, abs=0.01)
     flat = target_of((Printed(height=0.0),))
     (wrong,) = tracked(stage, pictures, tmp_path / "b", flat)
-    assert wrong.usual_size == pytest.approx(2.2 / 1.95, rel=0.01)
-    assert wrong.height_told == pytest.approx(0.25, abs=0.01)
+    assert wrong.median_size == pytest.approx(2.2 / 1.95, rel=0.01)
+    assert wrong.apparent_height == pytest.approx(0.25, abs=0.01)
     assert "larger than they are, at 0 m above the floor" in wrong.doubts()[0]
 
 
@@ -154,10 +156,10 @@ def test_markers_of_a_body_at_several_heights_give_one_pose(tmp_path):
     (alone,) = tracked(stage, pictures, tmp_path / "alone", target_of(markers[:1]))
     assert rms_mm(errors(alone, body)) < 0.6
     ratio = alone.covariance[:, 2, 2] / track.covariance[:, 2, 2]
-    assert ratio.min() > 2  # a wide base tells the heading better
+    assert ratio.min() > 2  # a wide base determines the heading better
 
 
-def test_size_does_not_stretch_the_way_to_a_marker():
+def test_size_does_not_stretch_the_vector_to_a_marker():
     """A marker that is printed 1 % too large, 30 cm ahead of the body's middle."""
     camera = OverheadCamera.straight_down((1920, 1080), 0.002, 2.2)
     place, heading = np.array([0.2, -0.1]), 0.5
@@ -165,13 +167,13 @@ def test_size_does_not_stretch_the_way_to_a_marker():
     large = Marker.at(0, 0.101, 0.25, (0.3, 0.0)).corners
     world = np.column_stack([large[:, :2] @ turn.T + place, large[:, 2]])
     target = Target("robot", "4X4_50", (Marker.at(0, 0.1, 0.25, (0.3, 0.0)),))
-    found = poses_of(camera, target, camera.pixels(world)[None, None])
-    np.testing.assert_allclose(found.pose[0], [*place, heading], atol=1e-9)
-    assert found.size[0] == pytest.approx(1.01)
+    fit = poses_of(camera, target, camera.pixels(world)[None, None])
+    np.testing.assert_allclose(fit.pose[0], [*place, heading], atol=1e-9)
+    assert fit.size[0] == pytest.approx(1.01)
 
 
 def test_two_robots_one_of_them_covered_for_a_frame(tmp_path):
-    """The other is followed meanwhile, and the first is found again in the very next frame."""
+    """The other is followed meanwhile, and the first is detected again in the very next frame."""
     one = Body(round_trip(), (Printed(id=4),))
     other = Body(lambda t: np.array([-0.5 + 0.1 * t, 0.35, 2.0]), (Printed(id=7),))
     stage = STAGE
@@ -187,7 +189,7 @@ def test_two_robots_one_of_them_covered_for_a_frame(tmp_path):
     assert rms_mm(errors(second, other)) < 0.5
 
 
-def test_a_marker_touching_the_border_is_left_out_not_misread(tmp_path):
+def test_a_marker_touching_the_border_is_missing_not_misread(tmp_path):
     body = Body(lambda t: np.array([1.45 + 0.5 * t, 0.0, 0.2]))
     stage = STAGE
     (track,) = tracked(stage, stage.film([body], 40), tmp_path)
@@ -196,7 +198,7 @@ def test_a_marker_touching_the_border_is_left_out_not_misread(tmp_path):
     assert rms_mm(errors(track, body)) < 0.5
 
 
-# finding ----------------------------------------------------------------------------------------
+# detection ----------------------------------------------------------------------------------------
 
 
 def test_near_and_whole_give_the_same_corners():
@@ -204,36 +206,36 @@ def test_near_and_whole_give_the_same_corners():
     detector = MarkerDetector("4X4_50")
     for k in range(4):
         grey = stage.frame(k / 7, [body])
-        (whole,) = detector.find(grey)
+        (whole,) = detector.detect(grey)
         x, y = whole.middle.astype(int).tolist()
-        (near,) = detector.find(grey, Region(x - 41, y - 37, x + 40, y + 44))
+        (near,) = detector.detect(grey, Region(x - 41, y - 37, x + 40, y + 44))
         np.testing.assert_allclose(near.corners, whole.corners, atol=0.03)
 
 
-def test_most_frames_are_looked_at_near_the_last_place_only(monkeypatch):
-    looked = []
-    find = MarkerDetector.find
+def test_most_frames_are_searched_near_the_last_place_only(monkeypatch):
+    searched = []
+    detect = MarkerDetector.detect
 
     def watched(self, grey, region=None):
-        looked.append(region)
-        return find(self, grey, region)
+        searched.append(region)
+        return detect(self, grey, region)
 
-    monkeypatch.setattr(MarkerDetector, "find", watched)
-    finder = Finder(MarkerDetector("4X4_50"), frozenset([0]))
+    monkeypatch.setattr(MarkerDetector, "detect", watched)
+    tracker = MarkerTracker(MarkerDetector("4X4_50"), frozenset([0]))
     for k, grey in enumerate(STAGE.film([Body(starts_and_stops)], 62)):
-        assert len(finder.find(grey, k)) == 1
-    assert finder.whole == 3
-    assert [k for k, region in enumerate(looked) if region is None] == [0, 30, 60]
+        assert len(tracker.detect(grey, k)) == 1
+    assert tracker.whole == 3
+    assert [k for k, region in enumerate(searched) if region is None] == [0, 30, 60]
 
 
 def test_region_keeps_to_a_part_of_the_picture():
     other = Body(lambda t: starts_and_stops(t) + np.array([0.4, 0.2, 0.0]))
     grey = STAGE.frame(0.0, [Body(starts_and_stops), other])
     detector = MarkerDetector("4X4_50")
-    left = min(detector.find(grey), key=lambda seen: seen.middle[0])
+    left = min(detector.detect(grey), key=lambda one: one.middle[0])
     x = int(left.corners[:, 0].max()) + 12
-    finder = Finder(detector, frozenset([0]), Region(0, 0, x, 360))
-    (only,) = finder.find(grey, 0)
+    tracker = MarkerTracker(detector, frozenset([0]), Region(0, 0, x, 360))
+    (only,) = tracker.detect(grey, 0)
     np.testing.assert_allclose(only.middle, left.middle, atol=0.05)
     assert Region(0, 0, 5, 5).within(Region(7, 7, 9, 9)).empty
-    assert detector.find(grey, Region(700, 0, 900, 100)) == []
+    assert detector.detect(grey, Region(700, 0, 900, 100)) == []

@@ -7,7 +7,7 @@ from math import pi
 
 import pytest
 
-from slipid.data.check.ratios import ScaleRatio, ScaleRatios, explained
+from slipid.data.check.ratios import ScaleRatio, ScaleRatios, single_causes
 from slipid.data.check.sanity import findings
 from tests.helpers.mistakes import MISTAKES
 from tests.helpers.plain_robot import DRIVES, Drive, as_runs, drive
@@ -138,6 +138,6 @@ def test_a_heading_in_another_unit_makes_a_gyro_look_too_small():
         },
         speed_is_angle=False,
     )
-    found, alone = explained(seen, 0.05, 16.0)
+    found, alone = single_causes(seen, 0.05, 16.0)
     assert alone
     assert [(e.name, e.factor) for e in found] == [("heading", pytest.approx(deg))]

@@ -268,7 +268,7 @@ def test_empty_cells_leave_a_pose_stale_and_are_noted(root):
         lines[row] = ",".join(cells)
     path.write_text("\n".join(lines))
     log = generic(root)
-    assert log.notes == ("column 'x' has empty cells: it is taken at its own times",)
+    assert log.notes == ("column 'x' has empty cells: it counts at its own times",)
     there = np.delete(np.arange(len(good.pose)), [49, 50])
     np.testing.assert_allclose(log.pose[there], good.pose[there], atol=1e-12)
     np.testing.assert_array_equal(log.pose[49:51], good.pose[[48, 48]])

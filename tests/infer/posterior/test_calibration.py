@@ -47,7 +47,7 @@ def test_it_goes_on_from_any_block_as_if_it_had_not_ended(whole, count):
     """Electric numbers and variances too, though they are drawn after the last block."""
     fit, plan, blocks, found = whole
     again = posterior.sample(
-        fit, plan, draws=10, record=BlockStore(done=lambda part: blocks[part][:count])
+        fit, plan, draws=10, store=BlockStore(done=lambda part: blocks[part][:count])
     )
     np.testing.assert_array_equal(again.z, found.z)
     np.testing.assert_array_equal(again.log_variance, found.log_variance)
@@ -61,7 +61,7 @@ def test_electric_numbers_are_drawn_anew_for_a_longer_chain(whole):
     longer = replace(plan, most=plan.most + 1)
     anew = posterior.sample(fit, longer, draws=10)
     again = posterior.sample(
-        fit, longer, draws=10, record=BlockStore(done=lambda part: blocks[part])
+        fit, longer, draws=10, store=BlockStore(done=lambda part: blocks[part])
     )
     np.testing.assert_array_equal(again.z, anew.z)
     electric = fit.space.electric
@@ -77,13 +77,13 @@ def test_electric_draws_that_never_moved_are_not_believed(whole, monkeypatch):
         "diagnose",
         lambda chain, plan: replace(diagnose(chain, plan), converged=True),
     )
-    record = BlockStore(done=lambda part: blocks[part])
-    assert posterior.sample(fit, plan, draws=10, record=record).converged
+    store = BlockStore(done=lambda part: blocks[part])
+    assert posterior.sample(fit, plan, draws=10, store=store).converged
     drawn = posterior.electric_given_motion
     monkeypatch.setattr(
         posterior, "electric_given_motion", lambda *given: replace(drawn(*given), still=0.5)
     )
-    found = posterior.sample(fit, plan, draws=10, record=record)
+    found = posterior.sample(fit, plan, draws=10, store=store)
     assert not found.converged
     assert found.reason == "50.0 % of the electric draws, which never moved"
 
@@ -98,7 +98,7 @@ def whole():
         fit,
         plan,
         draws=10,
-        record=BlockStore(keep=lambda part, block: blocks[part].append(block)),
+        store=BlockStore(keep=lambda part, block: blocks[part].append(block)),
     )
     assert {part: len(made) for part, made in blocks.items()} == {MOTION: 4}
     return fit, plan, blocks, found

@@ -21,7 +21,7 @@ def test_a_short_chain(golden):
         fit,
         PLAN,
         draws=10,
-        record=BlockStore(keep=lambda part, block: blocks.append((part, block))),
+        store=BlockStore(keep=lambda part, block: blocks.append((part, block))),
     )
     rows = []
     for part, block in blocks:

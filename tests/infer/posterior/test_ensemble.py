@@ -213,7 +213,7 @@ def exact():
     target, mean, _ = gaussian()
     target = replace(target, centre=mean, covariance=target.covariance / 0.6)
     u = np.random.RandomState(1).standard_normal((4000, 8))
-    return target.seen_by(target.laplace()), u
+    return target.in_coordinates(target.laplace()), u
 
 
 def test_independence_accepts_nearly_everything_where_laplace_is_exact(exact):
@@ -287,7 +287,7 @@ def two_widths():
         return np.stack([each[:, group == g].sum(axis=1) for g in (0, 1, -1)], axis=1)
 
     target = LogDensity(terms, lambda x: -precision * x, group, np.zeros(5), np.eye(5))
-    return target.seen_by(target.laplace()), precision
+    return target.in_coordinates(target.laplace()), precision
 
 
 @pytest.mark.slow

@@ -38,13 +38,13 @@ def test_a_map_is_undone_and_has_the_slopes_that_it_says(bent):
     )
     np.testing.assert_allclose(log.sum(axis=1), np.linalg.slogdet(jacobian)[1], atol=1e-7)
     numeric = np.stack([(value(u + s) - value(u - s)) / 2e-6 for s in step], axis=1)
-    np.testing.assert_allclose(map.pull(u, np.negative), numeric, atol=1e-7)
+    np.testing.assert_allclose(map.pulled_back(u, np.negative), numeric, atol=1e-7)
 
 
 def test_maps_that_have_learnt_different_things_are_compiled_once(bent):
     map, x = bent
     other = learnt(np.flip(x, axis=1), 500.0, np.eye(9), np.repeat([-1, 0, 0], 3))
-    assert len(other.stairs) != len(map.stairs)
+    assert len(other.stages) != len(map.stages)
     u = np.random.default_rng(5).normal(size=(5, 9))
     map.placed(u)
     before = _placed._cache_size()
@@ -61,7 +61,7 @@ def test_a_map_is_kept_whole(bent, tmp_path):
     np.savez(tmp_path / "block.npz", **packed(block))
     with np.load(tmp_path / "block.npz", allow_pickle=False) as kept:
         again = unpacked(dict(kept))
-    assert any(stair.bend for stair in again.map.stairs)
+    assert any(stage.bend for stage in again.map.stages)
     u = np.random.default_rng(4).normal(size=(6, 9))
     for one, other in zip(map.placed(u), again.map.placed(u), strict=True):
         np.testing.assert_array_equal(one, other)

@@ -77,7 +77,7 @@ def test_what_is_called_flat_is_and_nothing_is_left_out(seed):
             fewer = picked[:k] + picked[k + 1 :]
             if fewer and len(picked) > 1:
                 lowest = np.linalg.eigvalsh(p[np.ix_(fewer, fewer)])[0]
-                assert lowest >= flat_module._UNSEEN
+                assert lowest >= flat_module._NO_EFFECT
         pivots.append(picked[int(np.argmax(np.abs(u) > 0.9 * np.abs(u).max()))])
     rest = [k for k in range(8) if k not in pivots]
     assert np.linalg.eigvalsh(p[np.ix_(rest, rest)])[0] >= NOTICED

@@ -1,4 +1,4 @@
-"""Types of messages: resolved to numbers and texts, from the bag, .msg files or the standard."""
+"""Definitions of message types as numbers and texts, from bag, .msg files or ROS itself."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     import rosbags.interfaces
     import rosbags.interfaces.typing
 
-Kind = Union["NumberType", "Text", "Many", "Message"]
-"""Of a field: one number, one text, several of a kind, or a message of its own."""
+FieldType = Union["NumberType", "TextType", "ArrayType", "MessageType"]
+"""Type of a field: one number, one text, several of a type, or another message."""
 _DTYPES = {
     **{f"int{8 * size}": f"i{size}" for size in (1, 2, 4, 8)},
     **{f"uint{8 * size}": f"u{size}" for size in (1, 2, 4, 8)},
@@ -25,26 +25,26 @@ _SEPARATOR = "=" * 80 + "\n"
 
 @dataclass(frozen=True)
 class NumberType:
-    """A number: its numpy type without byte order, such as `f8`."""
+    """A number; its numpy type has no byte order, such as `f8`."""
 
     dtype: str
 
     @property
     def size(self) -> int:
-        """Bytes that it takes."""
+        """Return the number of bytes."""
         return int(self.dtype[1:])
 
 
 @dataclass(frozen=True)
-class Text:
+class TextType:
     """A text in UTF-8."""
 
 
 @dataclass(frozen=True)
-class Many:
-    """Several of a kind: `count` of them, or None where each message says how many."""
+class ArrayType:
+    """Several elements of a type: `count` of them, or None where messages differ in length."""
 
-    element: Kind
+    element: FieldType
     count: int | None
 
 
@@ -53,32 +53,37 @@ class MessageField:
     """A field of a message by name."""
 
     name: str
-    kind: Kind
+    kind: FieldType
 
 
 @dataclass(frozen=True)
-class Message:
-    """A type of message: its name, as `sensor_msgs/msg/Imu`, and its fields in order."""
+class MessageType:
+    """A type of message.
+
+    Attributes:
+        name: such as `sensor_msgs/msg/Imu`.
+        fields: its fields in order.
+    """
 
     name: str
     fields: tuple[MessageField, ...]
 
     @property
     def paths(self) -> dict[str, str]:
-        """Dotted path of every number and text in it, and what is there: `float64[]`, `text`."""
+        """Return the type of every number and text by its dotted path: `float64[]`, `text`."""
         return dict(_below(self, ""))
 
 
-def _below(kind: Kind, path: str) -> Iterator[tuple[str, str]]:
-    """Paths at and below a field."""
+def _below(kind: FieldType, path: str) -> Iterator[tuple[str, str]]:
+    """Yield the paths at and below a field, with their types."""
     if isinstance(kind, NumberType):
         yield path, _NAMES.get(kind.dtype, kind.dtype)
-    elif isinstance(kind, Text):
+    elif isinstance(kind, TextType):
         yield path, "text"
-    elif isinstance(kind, Many):
+    elif isinstance(kind, ArrayType):
         count = "" if kind.count is None else str(kind.count)
         for below, what in _below(kind.element, path):
-            # arrays in messages of an array: the brackets stand behind the name of the number
+            # an array inside messages of an array: the brackets follow the name of the number
             yield below, f"{what}[{count}]"
     else:
         for field in kind.fields:
@@ -86,30 +91,31 @@ def _below(kind: Kind, path: str) -> Iterator[tuple[str, str]]:
 
 
 class NoDefinition(ValueError):
-    """A type that is defined nowhere; its argument is the name."""
+    """Error about a type without definition; its argument is the name."""
 
 
 @dataclass(frozen=True, eq=False)
 class Definitions:
-    """Where the definitions of a bag's message types are looked up, nearest first.
+    """Definitions of a bag's message types.
 
     Attributes:
         own: types that the bag itself defines, as rosbags parsed them.
-        folder: folder of .msg files, or None.
+        folder: folder of .msg files, or None; it is searched after `own`.
     """
 
     own: "rosbags.interfaces.typing.Typesdict"
     folder: Path | None
 
-    def message(self, name: str) -> Message:
-        """A message type with everything in it resolved; NoDefinition where something is not."""
+    def message(self, name: str) -> MessageType:
+        """Return a message type with all fields resolved; raise `NoDefinition` where one is not."""
         fields = self.own.get(name) or _from_folder(self.folder, name) or _standard().get(name)
         if fields is None:
             raise NoDefinition(name)
         found = (MessageField(key, self._kind(description)) for key, description in fields[1])
-        return Message(name, tuple(found))
+        return MessageType(name, tuple(found))
 
-    def _kind(self, description: "rosbags.interfaces.typing.FieldDesc") -> Kind:
+    def _kind(self, description: "rosbags.interfaces.typing.FieldDesc") -> FieldType:
+        """Return the type of a field from its description."""
         from rosbags.interfaces import Nodetype
 
         what = description[0]
@@ -118,13 +124,13 @@ class Definitions:
         if what == Nodetype.BASE:
             return _plain(str(description[1][0]))
         element, count = cast("tuple[rosbags.interfaces.typing.FieldDesc, int]", description[1])
-        return Many(self._kind(element), count if what == Nodetype.ARRAY else None)
+        return ArrayType(self._kind(element), count if what == Nodetype.ARRAY else None)
 
 
-def _plain(base: str) -> NumberType | Text:
-    """A number or a text by the name of its type."""
+def _plain(base: str) -> NumberType | TextType:
+    """Return a number or a text by the name of its type."""
     if base == "string":
-        return Text()
+        return TextType()
     if base not in _DTYPES:
         raise NoDefinition(base)
     return NumberType(_DTYPES[base])
@@ -136,15 +142,15 @@ def definition_of(
     name: str,
     carried: "rosbags.interfaces.MessageDefinition",
     folder: Path | None,
-) -> Message:
-    """Definition of a topic's message type.
+) -> MessageType:
+    """Return the definition of a topic's message type.
 
     Args:
         path: the bag, for messages.
         topic: the topic, for messages.
-        name: of the type, as `robotino_msgs/msg/MotorReadings`.
-        carried: what the bag says of the type, perhaps nothing.
-        folder: folder of .msg files that are asked where the bag says nothing, or None.
+        name: name of the type, such as `robotino_msgs/msg/MotorReadings`.
+        carried: definition in the bag, perhaps empty.
+        folder: folder of .msg files that are used where the bag has no definition, or None.
 
     Raises:
         DataError: it is defined nowhere, or the definition cannot be read.
@@ -165,7 +171,7 @@ def definition_of(
         ) from None
     except DataError:
         raise
-    except Exception as error:  # the parser meets any bytes, and fails on them in many ways
+    except Exception as error:  # the parser fails in many ways on arbitrary bytes
         found = f"the definition of {name} cannot be read ({error})"
         expected = "the text of a .msg file; is the bag damaged?"
         raise bad_data(where, found, expected) from error
@@ -174,7 +180,7 @@ def definition_of(
 def _parsed(
     name: str, carried: "rosbags.interfaces.MessageDefinition"
 ) -> "rosbags.interfaces.typing.Typesdict":
-    """Types in the text of a definition; empty where the bag carries none."""
+    """Return the types in the text of a definition; empty where the bag carries none."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
@@ -193,7 +199,7 @@ def _parsed(
 def _from_folder(
     folder: Path | None, name: str
 ) -> "tuple[rosbags.interfaces.typing.Constdefs, rosbags.interfaces.typing.Fielddefs] | None":
-    """Definition by a .msg file, rather one below a folder of the package's name; None without."""
+    """Return the definition in a .msg file, preferably below a folder of its package, or None."""
     if folder is None:
         return None
     from rosbags.typesys import get_types_from_msg
@@ -209,7 +215,7 @@ def _from_folder(
 
 @lru_cache(maxsize=1)
 def _standard() -> "rosbags.interfaces.typing.Typesdict":
-    """Standard types as ROS 2 Humble has them: bags of Iron and later carry their own."""
+    """Return the standard types of ROS 2 Humble; bags of Iron and later carry their own."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE).fielddefs

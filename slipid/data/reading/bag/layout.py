@@ -1,4 +1,4 @@
-"""What a bag's layout is: which topic holds which channel, and what tells its runs apart."""
+"""Layout of a bag: the topic of each channel, and the rule that separates its runs."""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -9,7 +9,7 @@ from pydantic import AliasChoices, BeforeValidator, Field, StrictBool, StrictFlo
 from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.bag.shape import steps_of
-from slipid.data.reading.layout import CHANNELS, PER_WHEEL, SensorLayout, several, unknown
+from slipid.data.reading.layout import CHANNELS, PER_WHEEL, TURNS, SensorLayout, several, unknown
 from slipid.data.reading.units import factor
 from slipid.support.errors import DataError
 from slipid.support.toml_file import CLOSED, NotNegative, Positive, checked
@@ -18,11 +18,9 @@ GROUPS = {
     "pose": ("pose_x", "pose_y", "pose_heading"),
     "twist_command": ("twist_command_x", "twist_command_y", "twist_command_yaw"),
 }
-"""Channels that one message holds together, by the name that a layout gives them."""
-TURNS = ("wheel_angle", "wheel_ticks", "motor_angle", "wheel_speed", "motor_speed")
-"""Channels that tell whether a wheel moves, the best first."""
+"""Channels that one message holds together, by their common name in a layout."""
 EFFORT = '"A" (current), "N*m" (motor_torque or wheel_torque), "V" (voltage) or "1" (duty)'
-"""What drivers put into the effort of a JointState."""
+"""Units that drivers use for the effort of a JointState."""
 
 
 Texts = Annotated[tuple[StrictStr, ...], BeforeValidator(several)]
@@ -30,18 +28,18 @@ Texts = Annotated[tuple[StrictStr, ...], BeforeValidator(several)]
 
 @dataclass(frozen=True, config=CLOSED)
 class TopicChannel:
-    """Where one channel lies in a bag: value = (scale x number + offset), in `unit`.
+    """Position of one channel in a bag: value = (scale x number + offset), in `unit`.
 
     Attributes:
         topics: the topic; several where each holds some of the wheels.
         fields: paths of the numbers in a message, such as `motors[0].current`; an array without an
-            index counts with all its elements. Of a pose or a twist the field that holds it. Known
+            index counts with all its elements. For a pose or a twist the field that holds it. Known
             message types need none.
-        unit: of the numbers; known message types need none, but for the effort of joints.
+        unit: unit of the numbers; known message types need none, except for the effort of joints.
         scale: a sign or a correction, one number for all columns or one for each.
         offset: added after the scale, in `unit`.
-        frame: in which a pose is looked up in transforms (`/tf`).
-        child: the frame whose pose that is.
+        frame: frame in which a pose is expressed, if it is looked up in transforms (`/tf`).
+        child: frame whose pose is looked up.
     """
 
     topics: Annotated[Texts, Field(min_length=1, validation_alias=AliasChoices("topics", "topic"))]
@@ -63,16 +61,16 @@ class TopicChannel:
 
 @dataclass(frozen=True, config=CLOSED)
 class RunRule:
-    """What tells the runs of a bag apart: a topic, pauses or a table.
+    """Rule that separates the runs of a bag: a topic, pauses or a table.
 
     Attributes:
-        topic: whose value marks a run: true, or one value as long as it stays.
+        topic: topic whose value marks a run: true, or one value while it stays.
         field: path of that value.
         between: values between runs.
         surface, load: path of the field that names the floor, or the load set-up.
-        pause_s: runs are cut where no wheel moves for longer [s].
-        table: CSV file with columns start and end [s], perhaps surface, load, name and bag, named
-            from the folder of the bag.
+        pause_s: time without motion of any wheel after which a new run starts [s].
+        table: CSV file with columns start and end [s], perhaps surface, load, name and bag,
+            relative to the folder of the bag.
         from_start: whether its times count from the first sample of the bag; else as stamps do.
     """
 
@@ -95,17 +93,17 @@ class RunRule:
 
 @dataclass(frozen=True, config=CLOSED)
 class BagLayout(SensorLayout):
-    """How the bags of one robot are laid out.
+    """Layout of the bags of one robot.
 
     Attributes:
-        name: what messages call it.
-        topics: where each channel, or group of channels, lies.
+        name: name in messages.
+        topics: position of each channel, or group of channels.
         joints: names of the drives' joints, in the order of the drives.
-        runs: what tells runs apart; without it a bag is one run.
-        stamp: which time counts: that in the messages (of those that have one), or when the
-            recorder received them.
-        max_disorder: messages of a topic that are late by no more are sorted [s].
-        drop_nan: whether messages with numbers that are none (NaN) are left out; else refused.
+        runs: rule that separates runs; without it a bag is one run.
+        stamp: time that counts: the one in the messages (where they have one), or the one at which
+            the recorder received them.
+        max_disorder: largest delay of messages of a topic that are sorted [s].
+        drop_nan: whether messages with NaN are left out; else they are refused.
         definitions: folder of .msg files, for message types whose definition the bag lacks.
     """
 
@@ -120,7 +118,7 @@ class BagLayout(SensorLayout):
 
     @property
     def holds(self) -> frozenset[str]:
-        """Every channel of a run."""
+        """Return every channel of a run."""
         return frozenset(inner for name in self.topics for inner in GROUPS.get(name, (name,)))
 
 
@@ -131,12 +129,12 @@ _NAMES = [*GROUPS, *(name for name in CHANNELS if name not in ("time", "pose_qua
 def declared_bag_layout(
     table: Mapping[str, object], where: str, folder: Path = Path()
 ) -> BagLayout:
-    """Layout of bags declared in a config: the table of which `kind = "bag"`.
+    """Return the layout of bags in a config: a table with `kind = "bag"`.
 
     Args:
-        table: what the config says.
-        where: what messages call the section, such as `robot.toml [layouts.mine]`.
-        folder: which a relative `definitions` counts from.
+        table: content of the section.
+        where: name of the section in messages, such as `robot.toml [layouts.mine]`.
+        folder: folder to which a relative `definitions` refers.
 
     Raises:
         DataError: unknown key, channel or unit, wrong dimension, wrong type.
@@ -166,7 +164,7 @@ def declared_bag_layout(
 
 
 def _channel_problem(name: str, channel: TopicChannel) -> str | None:
-    """What does not belong together in one channel."""
+    """Return a contradiction within one channel, or None."""
     if channel.frame is not None and name != "pose":
         return "frame and child, which belong to a pose; expected neither"
     if name in GROUPS:
@@ -188,7 +186,7 @@ def _channel_problem(name: str, channel: TopicChannel) -> str | None:
 
 
 def _problem(layout: BagLayout) -> str | None:
-    """What does not belong together."""
+    """Return a contradiction within the layout, or None."""
     have = set(layout.topics)
     for group, inner in GROUPS.items():
         if group in have and (twice := have & set(inner)):

@@ -1,9 +1,9 @@
-"""What the messages of known types mean for a channel: which fields, in which unit."""
+"""Fields and units of known message types for each channel."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from slipid.data.reading.bag.definitions import Message
+from slipid.data.reading.bag.definitions import MessageType
 from slipid.data.reading.bag.layout import EFFORT, TopicChannel
 from slipid.data.reading.bag.shape import FieldPick, JointPick, Pick, steps_of
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL
@@ -17,13 +17,13 @@ _JOINT_ARRAYS = {"position": "rad", "velocity": "rad/s", "effort": None}
 
 @dataclass(frozen=True)
 class _KnownField:
-    """A field whose meaning is known: its path, and the unit of its numbers."""
+    """Path of a known field, and the unit of its numbers."""
 
     path: str
     unit: str
 
 
-# By the name of the type; without a package where several packages have their own copy of it.
+# Fields by the name of the type; without a package where several packages have a copy of it.
 _KNOWN: dict[str, dict[str, _KnownField]] = {
     "sensor_msgs/msg/Imu": {"gyro": _KnownField("angular_velocity.z", "rad/s")},
     "sensor_msgs/msg/BatteryState": {
@@ -53,8 +53,13 @@ _FITTING = {
 }
 
 
-class Unfit(ValueError):
-    """A message type does not serve a channel: what was found, and what was expected."""
+class UnsuitableType(ValueError):
+    """Error about a message type that does not fit a channel.
+
+    Attributes:
+        found: type or field in the bag.
+        expected: types or settings that would fit.
+    """
 
     def __init__(self, found: str, expected: str) -> None:
         super().__init__(found, expected)
@@ -62,15 +67,15 @@ class Unfit(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Meaning:
-    """Which numbers of a message make a channel, in which unit; SI for poses and twists."""
+class PickedNumbers:
+    """Numbers of a message that form a channel, with their unit; SI for poses and twists."""
 
     pick: Pick
     unit: str
 
 
-def fits(channel: str, message: Message) -> bool:
-    """Whether messages of a type serve a channel without more said than their topic."""
+def fits(channel: str, message: MessageType) -> bool:
+    """Return whether messages of a type form a channel without any setting but their topic."""
     if channel == "pose":
         return is_transforms(message) or bool(_group_paths(channel, message, ""))
     if channel == "twist_command":
@@ -80,35 +85,37 @@ def fits(channel: str, message: Message) -> bool:
     return channel in _known(message)
 
 
-def is_transforms(message: Message) -> bool:
-    """Whether messages hold transforms between frames, as those of `/tf` do."""
+def is_transforms(message: MessageType) -> bool:
+    """Return whether messages hold transforms between frames, as those of `/tf` do."""
     return "transforms.transform.translation.x" in message.paths
 
 
-def group_meaning(channel: str, spec: TopicChannel, message: Message) -> Meaning:
-    """Of a pose (x, y, quaternion; or x, y, heading) or a twist (x, y, yaw rate).
+def group_meaning(channel: str, spec: TopicChannel, message: MessageType) -> PickedNumbers:
+    """Return the numbers of a pose (x, y, quaternion or heading) or a twist (x, y, yaw rate).
 
     Raises:
-        Unfit: the type holds none.
+        UnsuitableType: the type holds none.
     """
     if channel == "twist_command" and message.name == _ODOMETRY:
-        raise Unfit("nav_msgs/Odometry, which holds the measured twist", "the commanded twist")
+        raise UnsuitableType(
+            "nav_msgs/Odometry, which holds the measured twist", "the commanded twist"
+        )
     prefix = spec.fields[0] if spec.fields else ""
     paths = _group_paths(channel, message, prefix)
     if not paths:
         where = f" in field '{prefix}'" if prefix else ""
         expected = f"{_FITTING[channel]}; or field = the field that holds it ({_listed(message)})"
-        raise Unfit(f"no {channel}{where} of type {message.name}", expected)
-    return Meaning(FieldPick(paths), "")
+        raise UnsuitableType(f"no {channel}{where} of type {message.name}", expected)
+    return PickedNumbers(FieldPick(paths), "")
 
 
 def channel_meaning(
-    channel: str, spec: TopicChannel, message: Message, joints: tuple[str, ...]
-) -> Meaning:
-    """Of any other channel.
+    channel: str, spec: TopicChannel, message: MessageType, joints: tuple[str, ...]
+) -> PickedNumbers:
+    """Return the numbers of any other channel.
 
     Raises:
-        Unfit: the type does not serve it, or a field or a unit must be said.
+        UnsuitableType: the type does not fit, or a field or a unit must be given.
     """
     if message.name == JOINT_STATE and not any("[" in path for path in spec.fields):
         return _joint_meaning(channel, spec, joints)
@@ -119,41 +126,48 @@ def channel_meaning(
     if not paths:
         fitting = f"{_FITTING[channel]}, or " if channel in _FITTING else ""
         expected = f"{fitting}field = one of its numbers ({_listed(message)}), with its unit"
-        raise Unfit(f"{message.name}, which does not tell where in it {channel} is", expected)
+        raise UnsuitableType(
+            f"{message.name}, in which the field of {channel} is unknown", expected
+        )
     for path in paths:
         _check_number(path, message)
-    said = [one.unit for one in known.values() if one.path == paths[0].split("[")[0]]
-    unit = spec.unit or (said[0] if said else None)
+    units = (one.unit for one in known.values() if one.path == paths[0].split("[")[0])
+    unit = spec.unit or next(units, None)
     if unit is None:
         expected = f'unit = the unit of its numbers, such as "{CHANNELS[channel]}"'
-        raise Unfit(f"{channel} without a unit", expected)
+        raise UnsuitableType(f"{channel} without a unit", expected)
     _check_unit(channel, paths[0], unit)
-    return Meaning(FieldPick(tuple(paths)), unit)
+    return PickedNumbers(FieldPick(tuple(paths)), unit)
 
 
-def _joint_meaning(channel: str, spec: TopicChannel, joints: tuple[str, ...]) -> Meaning:
-    """Of a channel that is an array of JointState."""
+def _joint_meaning(channel: str, spec: TopicChannel, joints: tuple[str, ...]) -> PickedNumbers:
+    """Return the numbers of a channel that is an array of JointState."""
     array = spec.fields[0] if spec.fields else _array_of(channel)
     if array not in _JOINT_ARRAYS or len(spec.fields) > 1:
         found = f"no array '{array}' in {JOINT_STATE}{did_you_mean(array, _JOINT_ARRAYS)}"
-        raise Unfit(found, f"one of {', '.join(_JOINT_ARRAYS)}")
+        raise UnsuitableType(found, f"one of {', '.join(_JOINT_ARRAYS)}")
     unit = spec.unit or _JOINT_ARRAYS[array]
     if unit is None:
-        raise Unfit("effort without a unit, and drivers disagree on it", f"unit = {EFFORT}")
+        raise UnsuitableType(
+            "effort without a unit, and drivers disagree on it", f"unit = {EFFORT}"
+        )
     _check_unit(channel, array, unit)
     if not joints:
-        raise Unfit("no joints are named", "joints = their names, in the order of the drives")
-    return Meaning(JointPick(joints, array), unit)
+        raise UnsuitableType(
+            "no joints are named", "joints = their names, in the order of the drives"
+        )
+    return PickedNumbers(JointPick(joints, array), unit)
 
 
 def _array_of(channel: str) -> str:
-    """Array of JointState that a channel is likely to be."""
+    """Return the most likely array of JointState for a channel."""
     if channel.endswith("_angle"):
         return "position"
     return "velocity" if "_speed" in channel else "effort"
 
 
 def _check_unit(channel: str, path: str, unit: str) -> None:
+    """Raise `UnsuitableType` if a unit does not fit the channel."""
     try:
         factor(unit, CHANNELS[channel])
     except ValueError as error:
@@ -163,28 +177,29 @@ def _check_unit(channel: str, path: str, unit: str) -> None:
             if name not in ("time", channel) and converts(unit, wanted)
         ]
         other = f"; numbers in {unit} belong to {' or '.join(fitting)}" if fitting else ""
-        raise Unfit(f"field '{path}': {error}", f"a field of {channel}{other}") from error
+        raise UnsuitableType(f"field '{path}': {error}", f"a field of {channel}{other}") from error
 
 
-def _check_number(path: str, message: Message) -> None:
+def _check_number(path: str, message: MessageType) -> None:
+    """Raise `UnsuitableType` if a path does not lead to a number."""
     plain = ".".join(step.name for step in steps_of(path))
     found = message.paths.get(plain)
     if found is None:
         known = list(message.paths)
-        raise Unfit(
+        raise UnsuitableType(
             f"no field '{path}' in {message.name}{did_you_mean(plain, known)}", _listed(message)
         )
     if found.startswith("text"):
-        raise Unfit(f"field '{path}' of {message.name} is a text", "a field with numbers")
+        raise UnsuitableType(f"field '{path}' of {message.name} is a text", "a field with numbers")
 
 
-def _known(message: Message) -> dict[str, _KnownField]:
-    """What is known of a type: by its whole name, else by its name without the package."""
+def _known(message: MessageType) -> dict[str, _KnownField]:
+    """Return the known fields of a type, by its whole name, else without the package."""
     return _KNOWN.get(message.name) or _KNOWN.get(message.name.rsplit("/", 1)[-1], {})
 
 
-def _group_paths(channel: str, message: Message, prefix: str) -> tuple[str, ...]:
-    """Paths of the numbers of a pose or a twist at or below a field, none where there is none."""
+def _group_paths(channel: str, message: MessageType, prefix: str) -> tuple[str, ...]:
+    """Return the paths of the numbers of a pose or a twist at or below a field."""
     for inner in _TWISTS if channel == "twist_command" else _POSES:
         at = ".".join(part for part in (prefix, inner) if part)
         dot = f"{at}." if at else ""
@@ -197,7 +212,7 @@ def _group_paths(channel: str, message: Message, prefix: str) -> tuple[str, ...]
 
 
 def _forms(channel: str) -> tuple[tuple[str, ...], ...]:
-    """How messages spell a pose or a twist."""
+    """Return the names of the numbers of a pose or a twist in messages."""
     if channel == "twist_command":
         return (("linear.x", "linear.y", "angular.z"),)
     axes = ("x", "y", "z", "w")
@@ -208,11 +223,14 @@ def _forms(channel: str) -> tuple[tuple[str, ...], ...]:
     )
 
 
-def _listed(message: Message) -> str:
-    return listed([path for path, what in message.paths.items() if not what.startswith("text")])
+def _listed(message: MessageType) -> str:
+    """Return the paths of the numbers in a type, for error messages."""
+    return first_names(
+        [path for path, what in message.paths.items() if not what.startswith("text")]
+    )
 
 
-def listed(names: Iterable[str]) -> str:
-    """Names in a message, the first dozen of them."""
+def first_names(names: Iterable[str]) -> str:
+    """Return the first dozen names, for error messages."""
     every = list(names)
     return ", ".join(every[:12] + ["..."] * (len(every) > 12)) or "none"

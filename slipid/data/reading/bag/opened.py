@@ -1,4 +1,4 @@
-"""A bag opened for reading: its topics, their messages, and one error for all that is broken."""
+"""An open bag: its topics, their messages, and one type of error for all damage."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
-from slipid.data.reading.bag.storage import BagFiles, MendedMcap, files_of, mended
+from slipid.data.reading.bag.storage import BagFiles, RepairedMcap, files_of, repaired
 from slipid.support.errors import DataError, bad_data
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ _REMEDY = {
 _METADATA = "copy the folder again, or run: ros2 bag reindex {file}"
 
 
-class Raw(NamedTuple):
-    """A message as it is stored: its topic, when it was received [ns], its bytes."""
+class RawMessage(NamedTuple):
+    """A stored message: its topic, time of receipt [ns] and bytes."""
 
     topic: str
     received: int
@@ -35,11 +35,11 @@ class Raw(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MessageBatch:
-    """Messages of one topic that follow each other in it.
+    """Consecutive messages of one topic.
 
     Attributes:
-        topic: its name.
-        received: when the recorder had each of them [ns].
+        topic: name of the topic.
+        received: time at which the recorder received each of them [ns].
         data: their bytes.
     """
 
@@ -53,10 +53,11 @@ class StoredTopic:
     """A topic of a bag.
 
     Attributes:
-        name: of the topic.
-        type: of its messages, as `sensor_msgs/msg/Imu`; where they are of several, all of them.
-        count: how many messages.
-        carried: definition of the type as the bag carries it, perhaps none.
+        name: name of the topic.
+        type: type of its messages, such as `sensor_msgs/msg/Imu`; all types where there are
+            several.
+        count: number of messages.
+        carried: definition of the type in the bag, perhaps empty.
     """
 
     name: str
@@ -70,9 +71,9 @@ class OpenBag:
     """A bag while it is open.
 
     Attributes:
-        files: what it is made of.
-        readers: rosbags' readers, one for each part that is read for itself.
-        notes: what was amiss and could be helped, one sentence each.
+        files: its files.
+        readers: rosbags' readers, one for each separately read part.
+        notes: defects that were repaired, one sentence each.
     """
 
     files: BagFiles
@@ -81,17 +82,17 @@ class OpenBag:
 
     @property
     def path(self) -> Path:
-        """What the bag is called in messages."""
+        """Return the name of the bag in messages."""
         return self.files.path
 
     @property
     def cdr(self) -> bool:
-        """Whether messages are serialised as in ROS 2."""
+        """Return whether messages are serialised as in ROS 2."""
         return self.files.storage != "rosbag1"
 
     @cached_property
     def topics(self) -> dict[str, StoredTopic]:
-        """Every topic by name."""
+        """Return every topic by name."""
         found: dict[str, list[rosbags.interfaces.Connection]] = {}
         for reader in self.readers:
             for connection in reader.connections:
@@ -100,15 +101,15 @@ class OpenBag:
 
     @property
     def end(self) -> int:
-        """Time of the last message [ns]."""
+        """Return the time of the last message [ns]."""
         return max(reader.end_time for reader in self.readers)
 
-    def messages(self, topics: Sequence[str], start: int | None = None) -> Iterator[Raw]:
-        """Messages of some topics in the order in which they were received.
+    def messages(self, topics: Sequence[str], start: int | None = None) -> Iterator[RawMessage]:
+        """Yield messages of some topics in the order in which they were received.
 
         Args:
             topics: their names.
-            start: leave out what was received before [ns].
+            start: first time of receipt [ns]; earlier messages are left out.
 
         Raises:
             DataError: the bag is damaged.
@@ -121,14 +122,14 @@ class OpenBag:
                 for connection, received, data in _source(reader)(wanted, start):
                     if data.__class__ is not bytes:
                         raise TypeError(f"a message of type {type(data).__name__}")
-                    yield Raw(connection.topic, received, data)
+                    yield RawMessage(connection.topic, received, data)
             except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
-                raise damaged(self.files, error) from error
+                raise damage_error(self.files, error) from error
 
     def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
-        """The same messages topic by topic, about a megabyte at a time.
+        """Yield the same messages topic by topic, about a megabyte at a time.
 
-        What is done for each message is done here, in one loop: on a big bag that is the work.
+        All work for each single message is in this one loop, which takes most time of a big bag.
 
         Raises:
             DataError: the bag is damaged.
@@ -150,15 +151,15 @@ class OpenBag:
                         yield batch
                         waiting[topic], room[topic] = MessageBatch(topic, [], []), _BATCH_BYTES
             except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
-                raise damaged(self.files, error) from error
+                raise damage_error(self.files, error) from error
         yield from (batch for batch in waiting.values() if batch.data)
 
 
 def _source(reader: "Reader") -> Callable[..., Iterator[Any]]:
-    """The function that iterates over messages.
+    """Return the function that iterates over messages.
 
-    Where an MCAP file has no index, rosbags refuses messages out of order, which we sort ourselves:
-    its scan underneath is asked.
+    Where an MCAP file has no index, rosbags refuses messages out of order, which slipid sorts
+    itself: the scan below it is used.
     """
     storage = getattr(reader, "storage", None)
     if storage is not None and getattr(storage, "chunks", None) == []:
@@ -171,16 +172,16 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     """Open a bag for reading, and close it.
 
     Raises:
-        DataError: there is none, or it is damaged; the message says how to mend it.
+        DataError: there is none, or it is damaged; the message says how to repair it.
     """
     files = files_of(path)
     with ExitStack() as stack:
-        readers, notes = _opened(files, stack)
+        readers, notes = _readers(files, stack)
         yield OpenBag(files, tuple(readers), tuple(notes))
 
 
-def _opened(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str]]":
-    """Readers of a bag, entered into a stack, and notes on what is amiss with it."""
+def _readers(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str]]":
+    """Return open readers of a bag, which a stack closes, and notes on its defects."""
     notes = [
         f"{part.name}-wal lies beside the bag: messages in it are not read; "
         f"to add them run: sqlite3 {part} 'PRAGMA wal_checkpoint'"
@@ -189,7 +190,7 @@ def _opened(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str]
     ]
     if files.metadata is not None:
         try:
-            return [_entered(files.path, files, stack)], notes
+            return [_reader(files.path, files, stack)], notes
         except DataError as error:
             if any(part.suffix == ".zstd" for part in files.parts) or files.storage != "mcap":
                 raise
@@ -204,12 +205,12 @@ def _opened(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str]
     readers = []
     for part in files.parts:
         try:
-            readers.append(_entered(part, files, stack))
+            readers.append(_reader(part, files, stack))
         except DataError:
-            whole = mended(part) if files.storage == "mcap" else None
+            whole = repaired(part) if files.storage == "mcap" else None
             if whole is None:
                 raise
-            readers.append(_entered(whole, files, stack))
+            readers.append(_reader(whole, files, stack))
             lost = part.stat().st_size - whole.end
             notes.append(
                 f"{part.name} was cut off: it was read up to its last whole record, "
@@ -218,31 +219,32 @@ def _opened(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str]
     return readers, notes
 
 
-def _entered(path: Path | MendedMcap, files: BagFiles, stack: ExitStack) -> "Reader":
-    """A reader of a file or folder, open until the stack is left; DataError where it cannot be."""
+def _reader(path: Path | RepairedMcap, files: BagFiles, stack: ExitStack) -> "Reader":
+    """Return an open reader of a file or folder; raise `DataError` if it is damaged."""
     from rosbags import rosbag1, rosbag2
 
     try:
         if files.storage == "rosbag1":
             return stack.enter_context(rosbag1.Reader(files.path))
-        # a mended file has as much of a path as rosbags asks of one file
+        # a repaired file has the methods of a path that rosbags uses
         return stack.enter_context(rosbag2.Reader(cast(Path, path)))
     except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
-        raise damaged(files, error) from error
+        raise damage_error(files, error) from error
 
 
 def _topic(name: str, same: "list[rosbags.interfaces.Connection]") -> StoredTopic:
+    """Return a topic from its connections."""
     types = dict.fromkeys(connection.msgtype for connection in same)
     carried = [c.msgdef for c in same if c.msgdef.format.value] or [same[0].msgdef]
     count = sum(connection.msgcount for connection in same)
     return StoredTopic(name, " and ".join(types), count, carried[0])
 
 
-def damaged(files: BagFiles, error: Exception) -> DataError:
-    """The error about a bag that rosbags cannot read."""
-    said = (str(error).splitlines() or [type(error).__name__])[0][:200]
+def damage_error(files: BagFiles, error: Exception) -> DataError:
+    """Return the error about a bag that rosbags cannot read."""
+    text = (str(error).splitlines() or [type(error).__name__])[0][:200]
     file = files.parts[0]
-    if "not indexed" in said:
+    if "not indexed" in text:
         expected = f"a whole bag; {_REMEDY['rosbag1'].format(file=file)}"
         return bad_data(files.path, "the bag has no index: its recording was cut off", expected)
     if isinstance(error, PermissionError):
@@ -251,11 +253,11 @@ def damaged(files: BagFiles, error: Exception) -> DataError:
         found = f"it holds messages encoded as {error.args[0]}, which are not read"
         expected = "ROS messages only; filter them out with: mcap filter"
         return bad_data(files.path, found, expected)
-    if "Profile is not ros2" in said:
+    if "Profile is not ros2" in text:
         expected = "one that ROS 2 recorded (profile ros2); write it again with: ros2 bag convert"
         return bad_data(files.path, "an MCAP file of another profile", expected)
     remedy = _REMEDY[files.storage].format(file=file)
-    if "metadata" in said.lower() or "files are missing" in said:
+    if "metadata" in text.lower() or "files are missing" in text:
         remedy = _METADATA.format(file=files.path)
-    found = f"the bag is damaged or was cut off ({said})"
+    found = f"the bag is damaged or was cut off ({text})"
     return bad_data(files.path, found, f"a whole one; {remedy}")

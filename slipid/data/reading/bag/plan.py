@@ -1,17 +1,17 @@
-"""What a layout wants of a bag: for each channel the topics, and the numbers in their messages."""
+"""Plan of reading a bag: for each channel its topics, and the numbers in their messages."""
 
 from dataclasses import dataclass
 from itertools import islice
 
-from slipid.data.reading.bag.definitions import Message, definition_of
+from slipid.data.reading.bag.definitions import MessageType, definition_of
 from slipid.data.reading.bag.layout import GROUPS, BagLayout, TopicChannel
 from slipid.data.reading.bag.meanings import (
-    Unfit,
+    UnsuitableType,
     channel_meaning,
+    first_names,
     fits,
     group_meaning,
     is_transforms,
-    listed,
 )
 from slipid.data.reading.bag.opened import OpenBag, StoredTopic
 from slipid.data.reading.bag.shape import (
@@ -23,27 +23,27 @@ from slipid.data.reading.bag.shape import (
     steps_of,
 )
 from slipid.data.reading.bag.streams import topic_error
-from slipid.data.reading.bag.transforms import STATIC, Link, chain_of
+from slipid.data.reading.bag.transforms import STATIC, ChainLink, chain_of
 from slipid.support.errors import DataError, bad_data, did_you_mean
 
 
 @dataclass(frozen=True, eq=False)
-class Wanted:
+class TopicPick:
     """Numbers of the messages of one topic."""
 
     topic: str
-    message: Message
+    message: MessageType
     pick: Pick
 
 
 @dataclass(frozen=True, eq=False)
 class ChannelPlan:
-    """Where the numbers of a channel, or of a pose or a twist, come from.
+    """Source of the numbers of a channel, or of a pose or a twist.
 
     Attributes:
         channel: its name in the layout.
-        spec: what the layout says of it.
-        unit: of the numbers; empty for a pose or a twist, which are in SI.
+        spec: its section of the layout.
+        unit: unit of the numbers; empty for a pose or a twist, which are in SI.
         wanted: the numbers, topic by topic.
         links: chain of transforms that a pose is composed of; empty otherwise.
     """
@@ -51,21 +51,22 @@ class ChannelPlan:
     channel: str
     spec: TopicChannel
     unit: str
-    wanted: tuple[Wanted, ...]
-    links: tuple[Link, ...] = ()
+    wanted: tuple[TopicPick, ...]
+    links: tuple[ChainLink, ...] = ()
 
 
 def plan(bag: OpenBag, layout: BagLayout) -> tuple[ChannelPlan, ...]:
-    """Plan of every channel of a layout.
+    """Return the plan of every channel of a layout.
 
     Raises:
-        DataError: a topic is missing or empty, its messages do not serve the channel, or no
+        DataError: a topic is missing or empty, its messages do not fit the channel, or no
             definition of them is found.
     """
     return tuple(_planned(bag, layout, name, spec) for name, spec in layout.topics.items())
 
 
 def _planned(bag: OpenBag, layout: BagLayout, channel: str, spec: TopicChannel) -> ChannelPlan:
+    """Return the plan of one channel."""
     wanted, unit = [], ""
     for name in spec.topics:
         message = message_of(bag, layout, name, channel)
@@ -80,42 +81,42 @@ def _planned(bag: OpenBag, layout: BagLayout, channel: str, spec: TopicChannel) 
                 meaning = group_meaning(channel, spec, message)
             else:
                 meaning = channel_meaning(channel, spec, message, layout.joints)
-        except Unfit as error:
+        except UnsuitableType as error:
             expected = error.expected
             if "joints are named" in error.found:
                 shapes = first_shapes(bag, name, message, 10)
                 there = [joint for one in shapes for joint in one.texts(steps_of("name"))]
-                expected += f" (there are: {listed(dict.fromkeys(there))})"
+                expected += f" (there are: {first_names(dict.fromkeys(there))})"
             raise topic_error(bag.path, name, error.found, expected) from None
         unit = meaning.unit
-        wanted.append(Wanted(name, message, meaning.pick))
+        wanted.append(TopicPick(name, message, meaning.pick))
     return ChannelPlan(channel, spec, unit, tuple(wanted))
 
 
 def _transformed(
-    bag: OpenBag, layout: BagLayout, spec: TopicChannel, topic: str, message: Message
+    bag: OpenBag, layout: BagLayout, spec: TopicChannel, topic: str, message: MessageType
 ) -> ChannelPlan:
-    """Plan of a pose from transforms, with those of the static topic beside."""
+    """Return the plan of a pose from transforms, with those of the static topic."""
     messages = {topic: message}
     static = topic + STATIC
     if static in bag.topics and bag.topics[static].count:
         messages[static] = message_of(bag, layout, static, "pose")
     if spec.frame is None or spec.child is None:
         shape = next(iter(first_shapes(bag, topic, message, 1)))
-        pairs = listed(f"{edge.parent} -> {edge.child}" for edge in edges_of(shape))
+        pairs = first_names(f"{edge.parent} -> {edge.child}" for edge in edges_of(shape))
         expected = f"frame and child, the frames that the pose is between ({pairs})"
         raise topic_error(bag.path, topic, "transforms, without saying which", expected)
     links = chain_of(bag, messages, spec.frame, spec.child)
     wanted = (
-        Wanted(name, messages[name], TransformPick(link.edge))
+        TopicPick(name, messages[name], TransformPick(link.edge))
         for name in messages
         for link in links
     )
     return ChannelPlan("pose", spec, "", tuple(wanted), links)
 
 
-def message_of(bag: OpenBag, layout: BagLayout, name: str, channel: str) -> Message:
-    """Type of a topic's messages; DataError where the topic is missing or empty."""
+def message_of(bag: OpenBag, layout: BagLayout, name: str, channel: str) -> MessageType:
+    """Return the type of a topic's messages; `DataError` where the topic is missing or empty."""
     topic = bag.topics.get(name)
     if topic is None:
         found = f"no topic '{name}' for {channel}{did_you_mean(name, bag.topics)}"
@@ -130,7 +131,7 @@ def message_of(bag: OpenBag, layout: BagLayout, name: str, channel: str) -> Mess
 
 
 def _one_of(bag: OpenBag, layout: BagLayout, channel: str) -> str:
-    """Topics that would serve a channel, else every topic."""
+    """Return the topics that fit a channel, else every topic, for error messages."""
 
     def serves(topic: StoredTopic) -> bool:
         try:
@@ -141,14 +142,14 @@ def _one_of(bag: OpenBag, layout: BagLayout, channel: str) -> str:
 
     fitting = [topic.name for topic in bag.topics.values() if serves(topic)]
     if fitting:
-        return f"one of {listed(fitting)}, which hold such messages"
-    return f"one of {listed(bag.topics)}"
+        return f"one of {first_names(fitting)}, which hold such messages"
+    return f"one of {first_names(bag.topics)}"
 
 
 def first_shapes(
-    bag: OpenBag, topic: str, message: Message, count: int
+    bag: OpenBag, topic: str, message: MessageType, count: int
 ) -> tuple[MessageShape, ...]:
-    """Shapes of the first messages of a topic."""
+    """Return the shapes of the first messages of a topic."""
     raws = islice(bag.messages((topic,)), count)
     try:
         return tuple(shape_of(raw.data, message, cdr=bag.cdr) for raw in raws)

@@ -1,4 +1,4 @@
-"""Where the runs of a bag begin and end: by a topic, by pauses or by a table."""
+"""Begin and end of the runs of a bag: by a topic, by pauses or by a table."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -10,20 +10,21 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.bag.layout import TURNS, BagLayout, RunRule
+from slipid.data.reading.bag.layout import BagLayout, RunRule
 from slipid.data.reading.bag.opened import OpenBag
 from slipid.data.reading.bag.plan import message_of
 from slipid.data.reading.bag.shape import STAMPS, MessageShape, shape_of, steps_of
 from slipid.data.reading.bag.streams import topic_error
+from slipid.data.reading.layout import TURNS
 from slipid.data.reading.signal import Signal
 from slipid.support.errors import bad_data, did_you_mean
 
 STILL = 0.02
-"""A wheel that turned by less [rad], or is turning slower [rad/s], stands still."""
+"""Angle [rad] or speed [rad/s] of a wheel below which it stands still."""
 PAUSE_S = 1.0
-"""Pause at which a long drive is proposed to be cut [s]."""
+"""Pause at which `slipid new` proposes to cut a long drive [s]."""
 COLUMNS = ("start", "end", "surface", "load", "name", "bag")
-"""Columns that a table of runs may have; the first two it must have."""
+"""Possible columns of a table of runs; the first two are required."""
 Value = str | float
 
 
@@ -32,9 +33,9 @@ class RunSpan:
     """One run in time.
 
     Attributes:
-        start: of its time [s].
-        end: first time behind it [s].
-        suffix: what follows the bag's name; empty where it is to be numbered.
+        start: its first time [s].
+        end: first time after it [s].
+        suffix: suffix of the bag's name; empty where the run gets a number.
         surface: name of the floor, or None.
         load: name of the load set-up, or None.
     """
@@ -49,12 +50,12 @@ class RunSpan:
 def run_spans(
     bag: OpenBag, layout: BagLayout, signals: Mapping[str, Signal], notes: list[str]
 ) -> tuple[RunSpan, ...]:
-    """The runs of a bag; all of it where the layout does not say what tells them apart.
+    """Return the runs of a bag, or the whole bag where the layout has no rule.
 
     Runs in which a wheel has fewer than two samples are left out, with a note.
 
     Raises:
-        DataError: there is no run, or the topic or the table that tells them is wrong.
+        DataError: there is no run, or the topic or the table of runs is wrong.
     """
     rule = layout.runs
     if rule is None:
@@ -71,19 +72,19 @@ def run_spans(
         last = max(float(signal.time[-1]) for signal in signals.values())
         raise bad_data(bag.path, *_none(rule, found, f"from {first:.3f} to {last:.3f} s"))
     if len(inside) < len(found):
-        notes.append(f"{len(found) - len(inside)} runs left out in which the wheels were not seen")
+        notes.append(f"{len(found) - len(inside)} runs left out that have no samples of the wheels")
     return _named(inside)
 
 
-def _sampled(signals: Mapping[str, Signal], stretch: RunSpan) -> bool:
-    """Whether a run has two samples of every signal that tells of motion, or else of any."""
-    telling = [signals[name] for name in TURNS if name in signals] or list(signals.values())
-    ends = [np.searchsorted(signal.time, (stretch.start, stretch.end)) for signal in telling]
+def _sampled(signals: Mapping[str, Signal], span: RunSpan) -> bool:
+    """Return whether a run has two samples of every signal of the wheels, or of all without any."""
+    moving = [signals[name] for name in TURNS if name in signals] or list(signals.values())
+    ends = [np.searchsorted(signal.time, (span.start, span.end)) for signal in moving]
     return all(end - first >= 2 for first, end in ends)
 
 
 def _none(rule: RunRule, found: Sequence[RunSpan], samples: str) -> tuple[str, str]:
-    """What was found instead of runs, and what was expected."""
+    """Return texts about what was found instead of runs, and what was expected."""
     times = ", ".join(f"{one.start:.3f} to {one.end:.3f} s" for one in found[:3])
     if rule.pause_s is not None:
         return "no run: no wheel moves", f"a wheel that turns by more than {STILL:g} rad"
@@ -102,7 +103,7 @@ def _none(rule: RunRule, found: Sequence[RunSpan], samples: str) -> tuple[str, s
 
 
 def _named(found: Sequence[RunSpan]) -> tuple[RunSpan, ...]:
-    """Runs by their names, else by numbers; a single one without a name needs none."""
+    """Return the runs with their names, else numbers; a single one needs none."""
     if len(found) == 1:
         return tuple(found)
     width = max(2, len(str(len(found))))
@@ -112,12 +113,12 @@ def _named(found: Sequence[RunSpan]) -> tuple[RunSpan, ...]:
 
 
 def by_pauses(layout: BagLayout, signals: Mapping[str, Signal], pause_s: float) -> list[RunSpan]:
-    """Runs between pauses, each with half of the shortest pause before and behind it.
+    """Return the runs between pauses, each with half of the shortest pause before and after it.
 
     Args:
-        layout: how the wheels are read.
-        signals: with one of `TURNS`.
-        pause_s: shortest time without motion that parts two runs [s].
+        layout: layout of the wheels.
+        signals: signals with one of `TURNS`.
+        pause_s: shortest time without motion between two runs [s].
     """
     moves = _moves(layout, signals)
     if not len(moves):
@@ -130,7 +131,7 @@ def by_pauses(layout: BagLayout, signals: Mapping[str, Signal], pause_s: float) 
 
 
 def _moves(layout: BagLayout, signals: Mapping[str, Signal]) -> Float[np.ndarray, " move"]:
-    """Times at which some wheel was seen to have moved [s]."""
+    """Return the times by which some wheel has moved [s]."""
     name = next(name for name in TURNS if name in signals)
     time, values = signals[name].time, signals[name].values
     if name.startswith("motor_") or name == "wheel_ticks":
@@ -145,9 +146,9 @@ def _moves(layout: BagLayout, signals: Mapping[str, Signal]) -> Float[np.ndarray
 
 
 def _moved(angle: Float[np.ndarray, " sample"]) -> list[int]:
-    """Samples at which an angle is farther than `STILL` from where it last was found moved.
+    """Return the samples at which an angle has changed by `STILL` since the last such sample.
 
-    So neither the last digit of an encoder, which may flicker, nor noise counts as motion.
+    So neither the flickering last digit of an encoder nor noise counts as motion.
     """
     found, held = [], float(angle[0])
     changed = np.flatnonzero(np.diff(angle)) + 1
@@ -158,20 +159,20 @@ def _moved(angle: Float[np.ndarray, " sample"]) -> list[int]:
     return found
 
 
-def parts_between_pauses(log: Log, pause_s: float) -> int:
-    """Into how many runs longer pauses of its wheels would cut a log."""
+def runs_between_pauses(log: Log, pause_s: float) -> int:
+    """Return the number of runs into which longer pauses of its wheels would cut a log."""
     turned = np.abs(np.diff(log.wheel_angle, axis=0)) > STILL * np.diff(log.time)[:, None]
     moves = log.time[1:][turned.any(axis=1)]
     return int((np.diff(moves) > pause_s).sum()) + 1 if len(moves) else 0
 
 
 def by_table(path: Path, rule: RunRule, zero: float) -> list[RunSpan]:
-    """Runs in a CSV file.
+    """Return the runs in a CSV file.
 
     Args:
         path: the bag; rows whose column `bag` names another are left out.
-        rule: names the table.
-        zero: time that its times count from [s].
+        rule: the rule with the name of the table.
+        zero: time from which its times count [s].
 
     Raises:
         DataError: the table is missing or wrong; the message names the row.
@@ -205,6 +206,7 @@ def by_table(path: Path, rule: RunRule, zero: float) -> list[RunSpan]:
 
 
 def _time(file: Path, row: int, column: str, cell: str | None) -> float:
+    """Return the time in a cell [s]."""
     try:
         return float(cell or "")
     except ValueError as error:
@@ -213,8 +215,8 @@ def _time(file: Path, row: int, column: str, cell: str | None) -> float:
 
 
 @dataclass(frozen=True)
-class _Mark:
-    """What one message says: when [s], its value, and the floor and the load it names."""
+class _TimedValue:
+    """Content of one message: its time [s], value, and names of the floor and the load set-up."""
 
     time: float
     value: Value
@@ -223,19 +225,19 @@ class _Mark:
 
     @property
     def marked(self) -> tuple[Value, str | None, str | None]:
-        """All but the time."""
+        """Return everything but the time."""
         return self.value, self.surface, self.load
 
 
 def by_topic(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[RunSpan]:
-    """A run as long as the value of a topic stays, but for values between runs.
+    """Return one run for each constant value of a topic, except values between runs.
 
     Raises:
         DataError: the topic or a field is missing.
     """
     found: list[RunSpan] = []
-    start: _Mark | None = None
-    for mark in (*_marks(bag, layout, rule), None):
+    start: _TimedValue | None = None
+    for mark in (*_timed_values(bag, layout, rule), None):
         if start is not None and mark is not None and mark.marked == start.marked:
             continue
         if start is not None and start.value not in rule.between:
@@ -245,8 +247,8 @@ def by_topic(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[RunSpan]:
     return found
 
 
-def _marks(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[_Mark]:
-    """Every message of the topic in order of time."""
+def _timed_values(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[_TimedValue]:
+    """Return every message of the topic in order of time."""
     name = str(rule.topic)
     message = message_of(bag, layout, name, "runs")
     for path in (rule.field, rule.surface, rule.load):
@@ -263,13 +265,15 @@ def _marks(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[_Mark]:
             expected = "messages as their definition says; is the bag damaged?"
             raise topic_error(bag.path, name, str(error), expected, number) from error
         surface, load = (_text(shape, path) for path in (rule.surface, rule.load))
-        own = _stamp(shape, raw.data) if layout.stamp == "header" else None
-        marks.append(_Mark((raw.received if own is None else own) / 1e9, value, surface, load))
+        stamp = _stamp(shape, raw.data) if layout.stamp == "header" else None
+        marks.append(
+            _TimedValue((raw.received if stamp is None else stamp) / 1e9, value, surface, load)
+        )
     return sorted(marks, key=lambda mark: mark.time)
 
 
 def _value(shape: MessageShape, raw: bytes, path: str) -> Value:
-    """Text or number at a path; ValueError where there is none."""
+    """Return the text or number at a path; ValueError where there is none."""
     steps = steps_of(path)
     if texts := shape.texts(steps):
         return texts[0]
@@ -280,13 +284,13 @@ def _value(shape: MessageShape, raw: bytes, path: str) -> Value:
 
 
 def _text(shape: MessageShape, path: str | None) -> str | None:
-    """Text at a path, None where there is none or it is empty."""
+    """Return the text at a path, None where there is none or it is empty."""
     texts: Sequence[str] = shape.texts(steps_of(path)) if path else ()
     return (texts[0] or None) if texts else None
 
 
 def _stamp(shape: MessageShape, raw: bytes) -> int | None:
-    """Time of a message itself [ns], None where it has none."""
+    """Return the message's own time [ns], None where it has none."""
     for path in STAMPS:
         parts = [shape.places(steps_of(f"{path}.{unit}")) for unit in ("sec", "nanosec")]
         if all(len(places) == 1 for places in parts):
@@ -296,4 +300,5 @@ def _stamp(shape: MessageShape, raw: bytes) -> int | None:
 
 
 def _block(raw: bytes) -> np.ndarray:
+    """Return the bytes of one message as a block."""
     return np.frombuffer(raw, np.uint8)[None]

@@ -1,10 +1,10 @@
-"""Where the numbers of a serialised message lie in its bytes.
+"""Places of the numbers in the bytes of a serialised message.
 
 Messages of one topic mostly have one shape: the same texts, and arrays of the same lengths. So one
 message is walked through field by field, and the numbers of all others that have its shape are
 taken from the same places, thousands at a time.
 
-Which numbers of a message are wanted: by paths, by names of joints, by frames of a transform.
+Numbers are picked by paths, by names of joints, or by frames of a transform.
 """
 
 import struct
@@ -16,12 +16,18 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from slipid.data.reading.bag.definitions import Kind, Many, Message, NumberType, Text
+from slipid.data.reading.bag.definitions import (
+    ArrayType,
+    FieldType,
+    MessageType,
+    NumberType,
+    TextType,
+)
 
 
 @dataclass(frozen=True)
 class PathStep:
-    """One step of a path: the name of a field, and which element of it, or None for all."""
+    """One step of a path: the name of a field, and the index of an element, or None for all."""
 
     name: str
     index: int | None = None
@@ -35,27 +41,29 @@ class BytePlace:
     dtype: str
 
     def of(self, block: UInt8[np.ndarray, "message byte"]) -> Float[np.ndarray, " message"]:
-        """The number in each of some messages of one shape."""
-        size = int(self.dtype[2:])
-        cells = np.ascontiguousarray(block[:, self.offset : self.offset + size])
-        return cells.view(self.dtype)[:, 0].astype(float)
+        """Return the number in each of some messages of one shape."""
+        return self._cells(block).astype(float)
 
     def whole(self, block: UInt8[np.ndarray, "message byte"]) -> Int[np.ndarray, " message"]:
-        """The same of a whole number, without rounding."""
+        """Return the same for a whole number, without rounding."""
+        return self._cells(block).astype(np.int64)
+
+    def _cells(self, block: UInt8[np.ndarray, "message byte"]) -> np.ndarray:
+        """Return the number in each message with its own type."""
         cells = np.ascontiguousarray(block[:, self.offset : self.offset + int(self.dtype[2:])])
-        return cells.view(self.dtype)[:, 0].astype(np.int64)
+        return cells.view(self.dtype)[:, 0]
 
 
 @dataclass(frozen=True)
 class MessageLeaf:
-    """What lies at one path of a message.
+    """A number, an array of numbers or a text at one path of a message.
 
     Attributes:
         path: the steps from the message to it.
-        dtype: of its numbers, with byte order; empty for a text.
+        dtype: type of its numbers, with byte order; empty for a text.
         offset: first byte.
-        count: how many numbers, None where it is one and no array.
-        text: of a text.
+        count: number of elements, None where it is no array.
+        text: content of a text.
     """
 
     path: tuple[PathStep, ...]
@@ -65,7 +73,7 @@ class MessageLeaf:
     text: str = ""
 
     def places(self, index: int | None) -> tuple[BytePlace, ...]:
-        """Places of its numbers, or of the one with an index."""
+        """Return the places of its numbers, or of the one with an index."""
         size = int(self.dtype[2:])
         every = range(1 if self.count is None else self.count)
         if index is not None:
@@ -75,13 +83,13 @@ class MessageLeaf:
 
 @dataclass(frozen=True, eq=False)
 class MessageShape:
-    """How the messages of a topic that look like one of them are laid out.
+    """Byte layout that messages of a topic have in common.
 
     Attributes:
         size: bytes of the message.
         leaves: everything in it, in order.
         fixed: bytes that are the same in all messages of this shape: texts and lengths of arrays.
-        values: what these bytes are.
+        values: values of these bytes.
     """
 
     size: int
@@ -90,23 +98,23 @@ class MessageShape:
     values: UInt8[np.ndarray, " fixed"]
 
     def fits(self, block: UInt8[np.ndarray, "message byte"]) -> Bool[np.ndarray, " message"]:
-        """Which of some messages of its size have this shape."""
+        """Return which of some messages of its size have this shape."""
         return np.all(block[:, self.fixed] == self.values, axis=1)
 
     def places(self, path: Sequence[PathStep]) -> tuple[BytePlace, ...]:
-        """Places of the numbers at a path, none where there are none."""
+        """Return the places of the numbers at a path; empty where there are none."""
         return tuple(p for leaf, index in self._at(path) if leaf.dtype for p in leaf.places(index))
 
     def texts(self, path: Sequence[PathStep]) -> tuple[str, ...]:
-        """Texts at a path."""
+        """Return the texts at a path."""
         return tuple(leaf.text for leaf, _ in self._at(path) if not leaf.dtype)
 
     def count(self, path: Sequence[PathStep]) -> int:
-        """How many numbers or texts are at a path."""
+        """Return the number of numbers or texts at a path."""
         return sum(1 if leaf.count is None else leaf.count for leaf, _ in self._at(path))
 
     def _at(self, path: Sequence[PathStep]) -> list[tuple[MessageLeaf, int | None]]:
-        """Leaves at a path, and which of its elements is meant."""
+        """Return the leaves at a path, with the index of the element for each."""
         found = []
         for leaf in self._by_names.get(tuple(step.name for step in path), ()):
             ends = zip(leaf.path[:-1], path[:-1], strict=True)
@@ -127,7 +135,7 @@ class MessageShape:
 
 
 def steps_of(path: str) -> tuple[PathStep, ...]:
-    """Steps of a path as people write it, such as `motors[0].current`; ValueError otherwise."""
+    """Return the steps of a path such as `motors[0].current`; ValueError if it is none."""
     steps = []
     for part in path.split("."):
         name, bracket, rest = part.partition("[")
@@ -139,8 +147,8 @@ def steps_of(path: str) -> tuple[PathStep, ...]:
     return tuple(steps)
 
 
-def shape_of(raw: bytes, message: Message, *, cdr: bool) -> MessageShape:
-    """Shape of one message.
+def shape_of(raw: bytes, message: MessageType, *, cdr: bool) -> MessageShape:
+    """Return the shape of one message.
 
     Args:
         raw: its bytes.
@@ -161,7 +169,7 @@ def shape_of(raw: bytes, message: Message, *, cdr: bool) -> MessageShape:
 
 
 class _MessageWalk:
-    """A walk through the bytes of one message, which notes what it passes."""
+    """A walk through the bytes of one message that collects its leaves."""
 
     def __init__(self, raw: bytes, cdr: bool) -> None:
         self.raw, self.cdr, self.order = raw, cdr, "<"
@@ -175,21 +183,21 @@ class _MessageWalk:
             self.at = self.origin = 4
             self.fixed.append((0, 2))
 
-    def through(self, kind: Kind, path: tuple[PathStep, ...]) -> None:
-        """Note the leaves of a field."""
+    def through(self, kind: FieldType, path: tuple[PathStep, ...]) -> None:
+        """Collect the leaves of a field."""
         if isinstance(kind, NumberType):
             dtype = self.order + kind.dtype
             self.leaves.append(MessageLeaf(path, dtype, self.numbers(kind.size, 1)))
-        elif isinstance(kind, Text):
+        elif isinstance(kind, TextType):
             self.leaves.append(MessageLeaf(path, "", self.at, None, self.text()))
-        elif isinstance(kind, Message):
+        elif isinstance(kind, MessageType):
             for field in kind.fields:
                 self.through(field.kind, (*path, PathStep(field.name)))
         else:
             self.several(kind, path)
 
-    def several(self, kind: Many, path: tuple[PathStep, ...]) -> None:
-        """Note the leaves of an array."""
+    def several(self, kind: ArrayType, path: tuple[PathStep, ...]) -> None:
+        """Collect the leaves of an array."""
         count = self.length() if kind.count is None else kind.count
         if isinstance(kind.element, NumberType):
             dtype = self.order + kind.element.dtype
@@ -213,13 +221,13 @@ class _MessageWalk:
         return first
 
     def length(self) -> int:
-        """Pass the length of an array or a text."""
+        """Pass the length of an array or a text, and return it."""
         at = self.numbers(4, 1)
         self.fixed.append((at, at + 4))
         return int(struct.unpack_from(self.order + "I", self.raw, at)[0])
 
     def text(self) -> str:
-        """Pass a text."""
+        """Pass a text and return it."""
         size = self.length()
         at = self.numbers(1, size)
         self.fixed.append((at, at + size))
@@ -229,18 +237,19 @@ class _MessageWalk:
 
 
 STAMPS = ("header.stamp", "stamp")
-"""Where messages that have a time of their own keep it."""
+"""Paths of the time in messages that have one."""
 POSITION = ("translation.x", "translation.y", "translation.z")
 ROTATION = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
 
 
 @dataclass(frozen=True)
 class Located:
-    """Where the wanted numbers lie in messages of one shape.
+    """Places of the picked numbers in messages of one shape.
 
     Attributes:
-        seconds: of the message's own time, and `nanoseconds`; None where it has none.
-        numbers: the wanted ones in order, None for one that is not in these messages.
+        seconds: seconds of the message's own time, None where it has none.
+        nanoseconds: nanoseconds of the message's own time, None where it has none.
+        numbers: picked numbers in order, None for one that is not in these messages.
     """
 
     seconds: BytePlace | None
@@ -250,14 +259,14 @@ class Located:
 
 @runtime_checkable
 class Pick(Protocol):
-    """What is wanted of the messages of a topic: one row of numbers a message, or none, or more."""
+    """Numbers picked from the messages of a topic, as any number of rows per message."""
 
     def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        """The rows in messages of a shape."""
+        """Return the rows in messages of a shape."""
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Name of each number in a row; may be empty before a message was seen."""
+        """Return the name of each number in a row; possibly none before the first message."""
 
 
 @dataclass(eq=False)
@@ -265,8 +274,8 @@ class FieldPick:
     """Numbers by the paths of their fields; an array without an index counts with all elements.
 
     Attributes:
-        paths: of the fields.
-        names: name of each number, as the first message has them.
+        paths: paths of the fields.
+        names: name of each number in the first message.
     """
 
     paths: tuple[str, ...]
@@ -294,9 +303,9 @@ class JointPick:
     """Numbers of joints by name, from messages like JointState.
 
     Attributes:
-        joints: names of the wanted ones, in the order of the columns.
-        array: which array holds the numbers: `position`, `velocity` or `effort`.
-        names: every name that was in some message.
+        joints: names of the picked joints, in the order of the columns.
+        array: array with the numbers: `position`, `velocity` or `effort`.
+        names: every name that occurred in some message.
     """
 
     joints: tuple[str, ...]
@@ -321,7 +330,7 @@ class JointPick:
 
 @dataclass(frozen=True)
 class Edge:
-    """A transform as messages name it: the pose of frame `child` in frame `parent`."""
+    """A transform by its names: the pose of frame `child` in frame `parent`."""
 
     parent: str
     child: str
@@ -349,7 +358,7 @@ class TransformPick:
 
 
 def edges_of(shape: MessageShape) -> tuple[Edge, ...]:
-    """Every transform of a TFMessage, names without the slash that ROS 1 once began them with."""
+    """Return every transform of a TFMessage, without the leading slash of names in early ROS 1."""
     parents = shape.texts(steps_of("transforms.header.frame_id"))
     children = shape.texts(steps_of("transforms.child_frame_id"))
     pairs = zip(parents, children, strict=True)
@@ -359,7 +368,7 @@ def edges_of(shape: MessageShape) -> tuple[Edge, ...]:
 def _located(
     shape: MessageShape, first: tuple[PathStep, ...], numbers: Sequence[BytePlace | None]
 ) -> Located:
-    """With the time of the message, or of the part of it that `first` leads to."""
+    """Return places with the time of the message, or of its part at the path `first`."""
     for stamp in STAMPS:
         whole, part = (
             shape.places((*first, *steps_of(f"{stamp}.{unit}"))) for unit in ("sec", "nanosec")

@@ -1,6 +1,6 @@
-"""The time of messages: which clock counts, in order, each time once.
+"""Signals of channels, poses and twists, from rows of numbers of one or several topics.
 
-Signals of channels, poses and twists, from rows of numbers of one or several topics.
+The rows are sorted by the clock that the layout names, each time once.
 """
 
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.data.reading.bag.layout import GROUPS, BagLayout
-from slipid.data.reading.bag.meanings import listed
+from slipid.data.reading.bag.meanings import first_names
 from slipid.data.reading.bag.plan import ChannelPlan
 from slipid.data.reading.bag.shape import Edge, JointPick, TransformPick
 from slipid.data.reading.bag.streams import Stream
-from slipid.data.reading.bag.transforms import STATIC, Moving, composed, heading, tilt
+from slipid.data.reading.bag.transforms import STATIC, TransformSeries, composed, heading, tilt
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL
 from slipid.data.reading.signal import Signal, SignalSource
 from slipid.data.reading.units import factor
@@ -26,8 +26,8 @@ APART_REFUSED = 60.0
 """Difference between two clocks that makes their times incomparable [s]."""
 
 
-def timed(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
-    """Rows of a stream in the order of their time, each time once.
+def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
+    """Return the rows of a stream in the order of their time, each time once.
 
     Raises:
         DataError: stamps are zero, or the clock jumps back.
@@ -68,14 +68,14 @@ def timed(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
 
 
 def clock(stream: Stream, layout: BagLayout) -> Int[np.ndarray, " row"]:
-    """Time of each row on the clock that the layout wants [ns]."""
+    """Return the time of each row on the clock that the layout names [ns]."""
     if layout.stamp == "header" and stream.stamp is not None:
         return stream.stamp
     return stream.received
 
 
 def seconds(time: Int[np.ndarray, " row"]) -> np.ndarray:
-    """Nanoseconds in seconds, as near as a double is to them."""
+    """Return nanoseconds in seconds, to the precision of a double."""
     return time // 10**9 + (time % 10**9) / 1e9
 
 
@@ -112,24 +112,24 @@ def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str])
 
 
 ABSURD = 1e30
-"""No sensor gives a number as large, in whatever unit: the bag is damaged."""
+"""Number above any sensor's range, in whatever unit; the bag is damaged."""
 TILT_NOTED = np.radians(20.0)
-"""Tilt of a robot on a floor that is worth a note: the z axis may not point up."""
+"""Tilt of a robot on a floor that is worth a note, since the z axis may not point up [rad]."""
 
 
 def signal_of(stream: Stream, layout: BagLayout) -> Signal:
-    """Rows of a stream as they are in the messages, no unit converted, at their times."""
+    """Return the rows of a stream as in the messages, no unit converted, at their times."""
     source = SignalSource(stream.path, stream.columns, stream.number, stream.topic)
     return Signal(seconds(clock(stream, layout)), stream.values, source)
 
 
 def whole_signal(stream: Stream, layout: BagLayout, notes: list[str]) -> Signal:
-    """Rows of one stream that have every number, ordered in time.
+    """Return the rows of one stream that have every number, ordered in time.
 
     Raises:
         DataError: there are none, numbers are not finite, or the clock jumps.
     """
-    stream = timed(finite(stream, layout, notes), layout, notes)
+    stream = in_time_order(finite(stream, layout, notes), layout, notes)
     whole = np.all(~stream.absent, axis=1)
     if not whole.all():
         notes.append(
@@ -143,22 +143,22 @@ def whole_signal(stream: Stream, layout: BagLayout, notes: list[str]) -> Signal:
 def side_by_side(
     streams: Sequence[Stream], layout: BagLayout, notes: list[str], *, by_name: bool
 ) -> Signal:
-    """Columns that lie in several topics, or in messages that have some of them only.
+    """Return columns of several topics, or of messages that have some of them only, side by side.
 
-    They are laid side by side at the times of the first column; the others are interpolated
-    linearly there, and times that they do not span are left out.
+    They are at the times of the first column; the others are interpolated linearly there, and times
+    that they do not span are left out.
 
     Args:
-        streams: which hold the columns.
-        layout: what the bag is read by.
-        notes: which more are added to.
+        streams: streams with the columns.
+        layout: layout of the bag.
+        notes: list to which notes are appended.
         by_name: whether the streams have the same columns, of which each is taken from the first
-            that fills it in; else all columns of all streams are wanted.
+            stream with numbers in it; else all columns of all streams are used.
 
     Raises:
         DataError: as `whole_signal`, or no time is common to the columns.
     """
-    ordered = [timed(finite(one, layout, notes), layout, notes) for one in streams]
+    ordered = [in_time_order(finite(one, layout, notes), layout, notes) for one in streams]
     columns = _columns(ordered, layout, by_name)
     first = columns[0]
     inside = np.ones(len(first.time), dtype=bool)
@@ -181,10 +181,10 @@ def side_by_side(
 
 
 def _columns(streams: Sequence[Stream], layout: BagLayout, by_name: bool) -> list[Signal]:
-    """Each column for itself."""
+    """Return each column as a signal of its own."""
     pairs = [(stream, j) for stream in streams for j in range(len(stream.columns))]
     if by_name:
-        # every stream has a column for every joint, in which most of them are empty
+        # every stream has a column for every joint, and most of them are empty
         having = [(stream, j) for stream, j in pairs if not stream.absent[:, j].all()]
         owner = {j: stream for stream, j in reversed(having)}
         pairs = [(owner[j], j) for j in sorted(owner)]
@@ -197,13 +197,13 @@ def _columns(streams: Sequence[Stream], layout: BagLayout, by_name: bool) -> lis
 
 
 def mostly_whole(stream: Stream) -> bool:
-    """Whether about all rows that have one of the numbers have all of them."""
+    """Return whether at least half of the rows with any number have all of them."""
     whole = int((~stream.absent.any(axis=1)).sum())
     return whole >= 0.5 * int((~stream.absent).sum(axis=0).max(initial=0))
 
 
 def finite(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
-    """Rows without NaN, where the layout lets these be left out; refuses all that is no number."""
+    """Return rows without NaN, where the layout drops these; `DataError` for other bad numbers."""
     bad = ~np.all(np.abs(stream.values) < ABSURD, axis=1)
     if not bad.any():
         return stream
@@ -227,13 +227,13 @@ def finite(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
 def channel_signal(
     plan: ChannelPlan, streams: Sequence[Stream], layout: BagLayout, notes: list[str]
 ) -> Signal:
-    """Signal of a channel.
+    """Return the signal of a channel.
 
     Args:
-        plan: of the channel.
-        streams: of its topics, in the order of the plan.
-        layout: what the bag is read by.
-        notes: which more are added to.
+        plan: plan of the channel.
+        streams: streams of its topics, in the order of the plan.
+        layout: layout of the bag.
+        notes: list to which notes are appended.
 
     Raises:
         DataError: a joint or a number is missing, not finite, or out of time.
@@ -242,7 +242,7 @@ def channel_signal(
     if by_name:
         _check_joints(plan, streams)
     else:
-        streams = [filled(stream) for stream in streams]
+        streams = [checked_stream(stream) for stream in streams]
     if len(streams) == 1 and mostly_whole(streams[0]):
         samples = whole_signal(streams[0], layout, notes)
     else:
@@ -259,8 +259,8 @@ def channel_signal(
     return Signal(samples.time, values, samples.source)
 
 
-def filled(stream: Stream) -> Stream:
-    """The same stream; DataError where no message has the wanted numbers."""
+def checked_stream(stream: Stream) -> Stream:
+    """Return the same stream; raise `DataError` where no message has the numbers."""
     if len(stream.number):
         return stream
     found = f"no numbers in {', '.join(stream.columns)} of any message"
@@ -268,13 +268,13 @@ def filled(stream: Stream) -> Stream:
 
 
 def _check_joints(plan: ChannelPlan, streams: Sequence[Stream]) -> None:
-    """Refuse joints that no message has, with the names that are there."""
+    """Raise `DataError` for joints that no message has, with the names in the messages."""
     picks = [wanted.pick for wanted in plan.wanted if isinstance(wanted.pick, JointPick)]
     there = list(dict.fromkeys(name for pick in picks for name in pick.names))
     for j, joint in enumerate(picks[0].joints):
         if joint not in there:
             found = f"no joint '{joint}'{did_you_mean(joint, there)}"
-            raise streams[0].error(found, f"one of the names that are there: {listed(there)}")
+            raise streams[0].error(found, f"one of the names that are there: {first_names(there)}")
         if all(stream.absent[:, j].all() for stream in streams):
             found = f"{picks[0].array} of joint '{joint}' is empty in every message"
             expected = "numbers in it; is another field meant: position, velocity or effort?"
@@ -284,13 +284,13 @@ def _check_joints(plan: ChannelPlan, streams: Sequence[Stream]) -> None:
 def group_signals(
     plan: ChannelPlan, streams: Sequence[Stream], layout: BagLayout, notes: list[str]
 ) -> dict[str, Signal]:
-    """Signals of a pose (x, y, heading without wrap-around) or a twist, by channel.
+    """Return the signals of a pose (x, y, heading without wrap-around) or a twist, by channel.
 
     Args:
-        plan: of the pose or twist.
-        streams: of its topics, in the order of the plan.
-        layout: what the bag is read by.
-        notes: which more are added to.
+        plan: plan of the pose or twist.
+        streams: streams of its topics, in the order of the plan.
+        layout: layout of the bag.
+        notes: list to which notes are appended.
 
     Raises:
         DataError: numbers are missing, not finite, or out of time.
@@ -298,12 +298,12 @@ def group_signals(
     if plan.links:
         samples = _transformed(plan, streams, layout, notes)
     else:
-        samples = whole_signal(filled(streams[0]), layout, notes)
+        samples = whole_signal(checked_stream(streams[0]), layout, notes)
     values = samples.values
     if plan.channel == "pose":
         values = _planar(samples, notes)
     names = GROUPS[plan.channel]
-    # a column each, and all of them at the times of the messages
+    # one column each, all at the times of the messages
     return {
         name: Signal(samples.time, values[:, [j]], _column(samples.source, j))
         for j, name in enumerate(names)
@@ -311,7 +311,7 @@ def group_signals(
 
 
 def _column(source: SignalSource, j: int) -> SignalSource:
-    """Source of one column; a heading may be made of a whole quaternion."""
+    """Return the source of one column; a heading may come from a whole quaternion."""
     names = source.columns
     name = names[min(j, len(names) - 1)]
     if j == 2 and len(names) > 3:
@@ -320,7 +320,7 @@ def _column(source: SignalSource, j: int) -> SignalSource:
 
 
 def _planar(samples: Signal, notes: list[str]) -> Float[np.ndarray, "sample 3"]:
-    """Place and heading of x, y and a quaternion, or of x, y and a heading with wrap-around."""
+    """Return x, y and heading from x, y and a quaternion, or from x, y and a wrapped heading."""
     place = samples.values[:, :2]
     if samples.values.shape[1] == 3:
         return np.column_stack([place, np.unwrap(samples.values[:, 2])])
@@ -336,20 +336,20 @@ def _planar(samples: Signal, notes: list[str]) -> Float[np.ndarray, "sample 3"]:
 def _transformed(
     plan: ChannelPlan, streams: Sequence[Stream], layout: BagLayout, notes: list[str]
 ) -> Signal:
-    """Place in the plane, and quaternion, of a chain of transforms."""
-    moving: dict[Edge, Moving] = {}
+    """Return x, y and the quaternion of a chain of transforms."""
+    moving: dict[Edge, TransformSeries] = {}
     sources: dict[Edge, SignalSource] = {}
     for stream, wanted in zip(streams, plan.wanted, strict=True):
         assert isinstance(wanted.pick, TransformPick)
-        # topics that move come first in a plan, and the static one repeats what never changes
+        # moving topics come first in a plan; the static one repeats constant transforms
         if wanted.pick.edge not in moving and len(stream.number):
             if stream.topic.endswith(STATIC):
                 stream = finite(stream.part(np.array([len(stream.number) - 1])), layout, notes)
             else:
-                stream = timed(finite(stream, layout, notes), layout, notes)
+                stream = in_time_order(finite(stream, layout, notes), layout, notes)
             one = signal_of(stream, layout)
             rotation = _unit(one.values[:, 3:], one.source)
-            moving[wanted.pick.edge] = Moving(one.time, one.values[:, :3], rotation)
+            moving[wanted.pick.edge] = TransformSeries(one.time, one.values[:, :3], rotation)
             sources[wanted.pick.edge] = one.source
     edge = max(moving, key=lambda edge: len(moving[edge].time))
     source, densest = sources[edge], moving[edge].time
@@ -369,7 +369,7 @@ def _transformed(
 def _unit(
     rotation: Float[np.ndarray, "sample 4"], source: SignalSource
 ) -> Float[np.ndarray, "sample 4"]:
-    """Quaternions made of length 1; DataError where they are far from it."""
+    """Return quaternions of length 1; raise `DataError` where they are far from it."""
     length = np.linalg.norm(rotation, axis=1)
     wrong = np.flatnonzero(np.abs(length - 1.0) > 0.1)
     if len(wrong):

@@ -1,6 +1,6 @@
-"""Which files a bag is made of, of which kind, and the hash of them all.
+"""Files of a bag, their type and hash.
 
-An MCAP file that was cut off, shown to a reader as if it ended with its last whole record.
+An MCAP file that was cut off is presented to a reader as if it ended with its last whole record.
 """
 
 import hashlib
@@ -32,8 +32,8 @@ class BagFiles:
     """The files of one bag.
 
     Attributes:
-        path: what was asked for: a file, or the folder of a rosbag2.
-        storage: how messages are stored.
+        path: the given file, or the folder of a rosbag2.
+        storage: storage format of the messages.
         parts: the files with messages, in order of their numbers.
         metadata: metadata.yaml of a rosbag2 folder, None for a single file or where it is missing.
     """
@@ -45,7 +45,7 @@ class BagFiles:
 
     @property
     def sha256(self) -> str:
-        """Hash of the only file, else of the lines `hash  name` that sha256sum prints of all."""
+        """Return the hash of the only file, else of the lines that sha256sum would print."""
         files = [*self.parts, *([self.metadata] if self.metadata else [])]
         if len(files) == 1:
             return _hash(files[0])
@@ -55,7 +55,7 @@ class BagFiles:
 
 
 def files_of(path: Path) -> BagFiles:
-    """Files of a bag.
+    """Return the files of a bag.
 
     Args:
         path: a file, the folder of a rosbag2, or the metadata.yaml in it.
@@ -83,7 +83,7 @@ def files_of(path: Path) -> BagFiles:
 
 
 def _storage_of(path: Path) -> Storage:
-    """What a file is by its first bytes, which its name must agree with."""
+    """Return the storage format by a file's first bytes, which must agree with its name."""
     try:
         with path.open("rb") as file:
             start = file.read(16)
@@ -101,13 +101,13 @@ def _storage_of(path: Path) -> Storage:
 
 
 def _numbers_in_name(path: Path) -> tuple[tuple[int, str], ...]:
-    """Key that sorts `bag_10` behind `bag_9`."""
+    """Return a key that sorts `bag_10` after `bag_9`."""
     parts = re.split(r"(\d+)", path.name)
     return tuple((int(part), "") if part.isdigit() else (-1, part) for part in parts)
 
 
 def _hash(path: Path) -> str:
-    """Hash of a file, block by block."""
+    """Return the hash of a file, read block by block."""
     digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
@@ -118,14 +118,13 @@ def _hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-MAGIC = b"\x89MCAP0\r\n"
 _DATA_END, _FOOTER = 0x0F, 0x02
-# A footer that names no summary: readers then look through the records themselves.
-_END = struct.pack("<BQQQI", _FOOTER, 20, 0, 0, 0) + MAGIC
+# A footer without a summary, so that readers go through the records themselves.
+_END = struct.pack("<BQQQI", _FOOTER, 20, 0, 0, 0) + _MAGIC["mcap"]
 
 
 @dataclass(frozen=True)
-class MendedMcap:
+class RepairedMcap:
     """Path of a cut MCAP file that opens as a whole one.
 
     Attributes:
@@ -138,32 +137,32 @@ class MendedMcap:
 
     @property
     def suffix(self) -> str:
-        """As of a path."""
+        """Return the suffix of the path."""
         return self.path.suffix
 
     @property
     def stem(self) -> str:
-        """As of a path."""
+        """Return the stem of the path."""
         return self.path.stem
 
     def exists(self) -> bool:
-        """As of a path."""
+        """Return True, as the file exists."""
         return True
 
     def is_dir(self) -> bool:
-        """As of a path."""
+        """Return False, as the path is a file."""
         return False
 
     def open(self, *_: object, **__: object) -> io.BufferedReader:
-        """The whole records, and an end."""
-        return io.BufferedReader(_Mended(self.path, self.end), buffer_size=1 << 16)
+        """Return the whole records, followed by an end."""
+        return io.BufferedReader(_RepairedBytes(self.path, self.end), buffer_size=1 << 16)
 
 
-def mended(path: Path) -> MendedMcap | None:
-    """The whole records of a cut MCAP file, None where there are none, or where it has its end."""
+def repaired(path: Path) -> RepairedMcap | None:
+    """Return the whole records of a cut MCAP file, or None if there are none or it is complete."""
     size = path.stat().st_size
     with path.open("rb") as file:
-        if file.read(8) != MAGIC:
+        if file.read(8) != _MAGIC["mcap"]:
             return None
         end, records = 8, 0
         while True:
@@ -171,16 +170,16 @@ def mended(path: Path) -> MendedMcap | None:
             if len(head) < 9:
                 break
             kind, length = struct.unpack("<BQ", head)
-            # where the summary begins there are no more messages
+            # no message follows the begin of the summary
             if kind == _DATA_END or kind == 0 or end + 9 + length > size:
                 break
             end, records = file.seek(end + 9 + length), records + 1
-    # the first record is a header, which alone is no bag
-    return MendedMcap(path, end) if records > 1 else None
+    # the first record is a header, which alone is not a bag
+    return RepairedMcap(path, end) if records > 1 else None
 
 
-class _Mended(io.RawIOBase):
-    """Bytes of a file up to an end, and behind them the end of an MCAP file."""
+class _RepairedBytes(io.RawIOBase):
+    """Bytes of a file up to an end, followed by the end of an MCAP file."""
 
     def __init__(self, path: Path, end: int) -> None:
         super().__init__()

@@ -7,29 +7,30 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from slipid.data.reading.bag.definitions import Message
+from slipid.data.reading.bag.definitions import MessageType
 from slipid.data.reading.bag.opened import MessageBatch
 from slipid.data.reading.bag.shape import Located, MessageShape, Pick, shape_of
 from slipid.support.errors import DataError, bad_data
 
 MAX_SHAPES = 256
-"""Shapes of a topic that are remembered; with more of them the oldest are found anew."""
+"""Number of remembered shapes of a topic; when there are more, all are forgotten."""
 FEW_SHAPES = 16
-"""Shapes in a batch that are looked for in all of it; beyond them each message is its own."""
+"""Number of new shapes in a batch that are searched in all of it; then each message has its own."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Rows of numbers from the messages of a topic, in the order in which they were received.
+    """Rows of numbers from the messages of a topic, in the order of receipt.
 
     Attributes:
-        path: the bag; `topic`: the topic.
+        path: the bag.
+        topic: the topic.
         columns: name of each number of a row.
         stamp: the messages' own time [ns], or None where they have none.
-        received: when the recorder had them [ns].
-        number: of the message in its topic, from 1.
+        received: time at which the recorder received them [ns].
+        number: number of the message in its topic, from 1.
         values: the numbers, as they are in the messages.
-        absent: numbers that the message did not have, such as other joints.
+        absent: True for numbers that the message did not have, such as other joints.
     """
 
     path: Path
@@ -42,12 +43,12 @@ class Stream:
     absent: Bool[np.ndarray, "row column"]
 
     def error(self, found: str, expected: str, row: int | None = None) -> DataError:
-        """The error about a row (counted from 0), or about the topic."""
+        """Return the error about a row (counted from 0), or about the topic."""
         message = None if row is None else int(self.number[row])
         return topic_error(self.path, self.topic, found, expected, message)
 
     def part(self, which: Int[np.ndarray, " part"] | Bool[np.ndarray, " row"]) -> "Stream":
-        """Some of the rows."""
+        """Return some of the rows."""
         return replace(
             self,
             stamp=None if self.stamp is None else self.stamp[which],
@@ -60,15 +61,15 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class _KnownShape:
-    """A shape that was met, and where the numbers of each pick lie in it."""
+    """A known shape, and the places of each pick's numbers in it."""
 
     shape: MessageShape
     places: tuple[tuple[Located, ...], ...]
 
 
 @dataclass(frozen=True, eq=False)
-class _Alike:
-    """Messages of one shape: which of a batch they are, their bytes, and as in `_KnownShape`."""
+class _SameShape:
+    """Messages of one shape: indices in a batch, bytes, and places as in `_KnownShape`."""
 
     which: Int[np.ndarray, " message"]
     block: UInt8[np.ndarray, "message byte"]
@@ -76,10 +77,10 @@ class _Alike:
 
 
 class TopicStreams:
-    """Takes the messages of a topic and keeps the numbers that some picks want of them."""
+    """Collector of the picked numbers in the messages of a topic."""
 
     def __init__(
-        self, path: Path, topic: str, message: Message, picks: Sequence[Pick], *, cdr: bool
+        self, path: Path, topic: str, message: MessageType, picks: Sequence[Pick], *, cdr: bool
     ) -> None:
         self.path, self.topic, self.message, self.cdr = path, topic, message, cdr
         self.picks = tuple(picks)
@@ -88,22 +89,19 @@ class TopicStreams:
         self._shapes: dict[int, list[_KnownShape]] = {}
 
     def add(self, batch: MessageBatch) -> None:
-        """Take the messages that follow in the topic."""
+        """Add the next messages of the topic."""
         if set(map(type, batch.data)) != {bytes}:
             raise topic_error(self.path, self.topic, "a message that is no bytes", "a whole bag")
         received = np.array(batch.received, dtype=np.int64)
         numbers = self.count + 1 + np.arange(len(received))
-        for alike in self._alike(batch.data):
-            which = alike.which
-            for pick, rows, located in zip(self.picks, self._rows, alike.places, strict=True):
-                rows += [
-                    self._taken(pick, alike.block, received[which], numbers[which], x)
-                    for x in located
-                ]
+        for same in self._by_shape(batch.data):
+            when, number = received[same.which], numbers[same.which]
+            for pick, rows, located in zip(self.picks, self._rows, same.places, strict=True):
+                rows += [self._taken(pick, same.block, when, number, place) for place in located]
         self.count += len(received)
 
     def stream(self, pick: Pick) -> Stream:
-        """Every row of one of the picks."""
+        """Return every row of one of the picks."""
         parts = self._rows[self.picks.index(pick)]
         widths = {part.values.shape[1] for part in parts}
         if len(widths) > 1:
@@ -112,7 +110,7 @@ class TopicStreams:
             found = f"{other.values.shape[1]} numbers, and {first.values.shape[1]} of them before"
             expected = "as many in every message; name one by its index, such as [0]?"
             raise topic_error(self.path, self.topic, found, expected, int(other.number[0]))
-        number = _laid([part.number for part in parts], np.zeros(0, dtype=np.int64))
+        number = _concatenated([part.number for part in parts], np.zeros(0, dtype=np.int64))
         stamps = [part.stamp for part in parts if part.stamp is not None]
         empty = np.zeros((0, len(pick.columns)))
         stream = Stream(
@@ -120,39 +118,39 @@ class TopicStreams:
             topic=self.topic,
             columns=pick.columns,
             stamp=np.concatenate(stamps) if stamps and len(stamps) == len(parts) else None,
-            received=_laid([part.received for part in parts], number),
+            received=_concatenated([part.received for part in parts], number),
             number=number,
-            values=_laid([part.values for part in parts], empty),
-            absent=_laid([part.absent for part in parts], empty.astype(bool)),
+            values=_concatenated([part.values for part in parts], empty),
+            absent=_concatenated([part.absent for part in parts], empty.astype(bool)),
         )
-        # messages of other shapes, and other transforms of a message, came one after the other
+        # the rows of different shapes, and of transforms of one message, are appended in turn
         in_order = (np.diff(number) >= 0).all()
         return stream if in_order else stream.part(np.argsort(number, kind="stable"))
 
-    def _alike(self, data: Sequence[bytes]) -> Iterator[_Alike]:
-        """Messages by shape."""
+    def _by_shape(self, data: Sequence[bytes]) -> Iterator[_SameShape]:
+        """Yield messages by shape."""
         lengths = np.fromiter(map(len, data), np.int64, len(data))
         for length in np.unique(lengths).tolist():
-            left = np.flatnonzero(lengths == length)
-            joined = b"".join(data if len(left) == len(data) else [data[int(k)] for k in left])
-            block = np.frombuffer(joined, np.uint8).reshape(len(left), length)
+            rest = np.flatnonzero(lengths == length)
+            joined = b"".join(data if len(rest) == len(data) else [data[int(k)] for k in rest])
+            block = np.frombuffer(joined, np.uint8).reshape(len(rest), length)
             known, new = list(self._shapes.get(length, ())), 0
-            while len(left):
+            while len(rest):
                 if known:
                     one = known.pop(0)
                 else:
-                    row = int(left[0])
+                    row = int(rest[0])
                     one, new = self._known(data[row], self.count + row + 1), new + 1
-                same = one.shape.fits(block) if new <= FEW_SHAPES else np.arange(len(left)) == 0
+                same = one.shape.fits(block) if new <= FEW_SHAPES else np.arange(len(rest)) == 0
                 if same.all():
-                    yield _Alike(left, block, one.places)
+                    yield _SameShape(rest, block, one.places)
                     break
                 if same.any():
-                    yield _Alike(left[same], block[same], one.places)
-                    left, block = left[~same], block[~same]
+                    yield _SameShape(rest[same], block[same], one.places)
+                    rest, block = rest[~same], block[~same]
 
     def _known(self, data: bytes, number: int) -> _KnownShape:
-        """Shape of a message that has a new one, and where the wanted numbers lie in it."""
+        """Return the new shape of a message, with the places of the picked numbers."""
         try:
             shape = shape_of(data, self.message, cdr=self.cdr)
         except ValueError as error:
@@ -173,7 +171,7 @@ class TopicStreams:
         number: Int[np.ndarray, " message"],
         located: Located,
     ) -> Stream:
-        """The wanted numbers of some messages of one shape."""
+        """Return the picked numbers of some messages of one shape."""
         columns = [np.zeros(len(block)) if p is None else p.of(block) for p in located.numbers]
         absent = np.tile([place is None for place in located.numbers], (len(block), 1))
         stamp = None
@@ -184,14 +182,14 @@ class TopicStreams:
         return Stream(*where, stamp, received, number, values, absent)
 
 
-def _laid(parts: Sequence[np.ndarray], none: np.ndarray) -> np.ndarray:
-    """Arrays end to end; another where there are none."""
+def _concatenated(parts: Sequence[np.ndarray], none: np.ndarray) -> np.ndarray:
+    """Return arrays end to end, or `none` where there are none."""
     return np.concatenate(parts) if parts else none
 
 
 def topic_error(
     path: Path, topic: str, found: str, expected: str, message: int | None = None
 ) -> DataError:
-    """The error about a topic, or about one of its messages, counted from 1."""
+    """Return the error about a topic, or about one of its messages, counted from 1."""
     where = f"{path} topic '{topic}'" + ("" if message is None else f" message {message}")
     return bad_data(where, found, expected)

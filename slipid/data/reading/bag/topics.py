@@ -1,6 +1,7 @@
-"""What is in a bag: its topics, with what their first messages tell, without reading them all.
+"""Topics and runs of a bag.
 
-Read a bag: every channel that a layout wants, each at its own times, run by run.
+Topics are listed with the content of their first messages, without reading the whole bag. Reading a
+bag returns every channel of a layout, each at its own times, run by run.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.data.reading.bag.definitions import Message, definition_of
+from slipid.data.reading.bag.definitions import MessageType, definition_of
 from slipid.data.reading.bag.layout import GROUPS, BagLayout
 from slipid.data.reading.bag.meanings import JOINT_STATE, fits
 from slipid.data.reading.bag.opened import OpenBag, StoredTopic, open_bag
@@ -24,10 +25,18 @@ from slipid.data.reading.layout import PER_WHEEL
 from slipid.data.reading.signal import Signal
 from slipid.support.errors import DataError
 
-_LOOKED_AT = 10
-"""First messages of a topic that are looked into."""
+_FIRST_MESSAGES = 10
+"""Number of first messages of a topic that are examined."""
 _SECOND = 10**9
-_TOLD = ("pose", "twist_command", "gyro", "bus_voltage", "wheel_ticks", "motor_speed", "current")
+_SELF_EXPLAINED = (
+    "pose",
+    "twist_command",
+    "gyro",
+    "bus_voltage",
+    "wheel_ticks",
+    "motor_speed",
+    "current",
+)
 _JOINTS = {"wheel_angle": "position", "wheel_speed": "velocity"}
 
 
@@ -36,9 +45,9 @@ class TopicField:
     """A number, text or array in the messages of a topic.
 
     Attributes:
-        path: as a layout names it, such as `motors.current`.
+        path: its path in a layout, such as `motors.current`.
         type: such as `float64`, `float64[]`, `text`.
-        count: how many the first message has of it.
+        count: number of elements in the first message.
     """
 
     path: str
@@ -51,17 +60,17 @@ class Topic:
     """A topic of a bag.
 
     Attributes:
-        name: of the topic.
-        type: of its messages, as `sensor_msgs/msg/JointState`.
-        count: how many messages it has.
-        first: when the first was received [s], None where there is none.
-        last: when the last was received [s].
-        fields: what its messages hold; empty where there are none, or `problem` says why.
+        name: name of the topic.
+        type: type of its messages, such as `sensor_msgs/msg/JointState`.
+        count: number of messages.
+        first: time of receipt of the first message [s], None where there is none.
+        last: time of receipt of the last message [s].
+        fields: fields of its messages; empty where there are none, or `problem` says why.
         joints: names in the first messages of a JointState.
         frames: parent and child of each transform in the first messages, as `map -> base_link`.
         serves: channels, or groups of them, that a layout may take from it without a field or a
-            unit. What the effort of joints is no message tells.
-        problem: why its messages could not be looked into, or None.
+            unit; the effort of joints is not among them, since its meaning is unknown.
+        problem: reason why its messages could not be examined, or None.
     """
 
     name: str
@@ -77,7 +86,7 @@ class Topic:
 
 
 def topics_of(path: Path, definitions: Path | None = None) -> tuple[Topic, ...]:
-    """Every topic of a bag, from its index and the first messages of each.
+    """Return every topic of a bag, from its index and the first messages of each.
 
     Args:
         path: a .bag, .db3 or .mcap file, the folder of a rosbag2, or the metadata.yaml in it.
@@ -91,8 +100,8 @@ def topics_of(path: Path, definitions: Path | None = None) -> tuple[Topic, ...]:
 
 
 def _described(bag: OpenBag, stored: StoredTopic, definitions: Path | None) -> Topic:
-    """What is known of one topic."""
-    raws = list(islice(bag.messages((stored.name,)), _LOOKED_AT)) if stored.count else []
+    """Return the description of one topic."""
+    raws = list(islice(bag.messages((stored.name,)), _FIRST_MESSAGES)) if stored.count else []
     if not raws:
         return Topic(stored.name, stored.type, stored.count)
     first, last = raws[0].received / 1e9, _last(bag, stored, raws[-1].received) / 1e9
@@ -113,22 +122,22 @@ def _described(bag: OpenBag, stored: StoredTopic, definitions: Path | None) -> T
     )
 
 
-def _served(message: Message, shape: MessageShape) -> tuple[str, ...]:
-    """Channels that messages of a type tell of themselves, of joints those that are filled in."""
+def _served(message: MessageType, shape: MessageShape) -> tuple[str, ...]:
+    """Return the channels that messages of a type have by themselves, and filled-in joints."""
     if message.name == JOINT_STATE:
         return tuple(name for name, array in _JOINTS.items() if shape.places(steps_of(array)))
-    return tuple(name for name in _TOLD if fits(name, message))
+    return tuple(name for name in _SELF_EXPLAINED if fits(name, message))
 
 
-def _fields(message: Message, shape: MessageShape) -> tuple[TopicField, ...]:
-    """Everything in a type of message, with how much of it one message has."""
+def _fields(message: MessageType, shape: MessageShape) -> tuple[TopicField, ...]:
+    """Return all fields of a type of message, with their number of elements in one message."""
     return tuple(
         TopicField(path, what, shape.count(steps_of(path))) for path, what in message.paths.items()
     )
 
 
 def _last(bag: OpenBag, stored: StoredTopic, known: int) -> int:
-    """When the last message of a topic was received [ns], looked for from the end of the bag."""
+    """Return the time of receipt of a topic's last message [ns], searched from the bag's end."""
     back = _SECOND
     while (start := bag.end - back) > known:
         received = [raw.received for raw in bag.messages((stored.name,), start)]
@@ -143,13 +152,13 @@ class BagRun:
     """One run of a bag.
 
     Attributes:
-        name_suffix: what follows the bag's name: nothing for the only run, else `#03` or `#name`.
+        name_suffix: suffix of the bag's name: empty for the only run, else `#03` or `#name`.
         sha256: hash of the bag's files.
-        signals: what was recorded, by channel, in the units of `CHANNELS`; a pose as pose_x, pose_y
-            and pose_heading (without wrap-around), a twist as twist_command_x, _y and _yaw.
-        surface: name of the floor where the bag or the table of runs tells it, else None.
+        signals: signals by channel, in the units of `CHANNELS`; a pose as pose_x, pose_y and
+            pose_heading (without wrap-around), a twist as twist_command_x, _y and _yaw.
+        surface: name of the floor in the bag or the table of runs, else None.
         load: name of the load set-up, likewise.
-        notes: what was repaired or left out, one sentence each.
+        notes: repairs and omissions, one sentence each.
     """
 
     name_suffix: str
@@ -161,31 +170,31 @@ class BagRun:
 
 
 def read_bag(path: Path, layout: BagLayout) -> tuple[BagRun, ...]:
-    """Every run in a bag.
+    """Return every run in a bag.
 
     Args:
         path: a .bag, .db3 or .mcap file, the folder of a rosbag2, or the metadata.yaml in it.
-        layout: which topics hold what.
+        layout: topics of the channels.
 
     Raises:
-        DataError: the bag is damaged, or does not hold what the layout says; the message names the
-            topic, what is there, and the next step.
+        DataError: the bag is damaged, or does not match the layout; the message names the topic,
+            what is there, and the next step.
     """
     with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
-        # hashing lets other threads run, so that on two cores it takes no time of its own
+        # hashing releases the interpreter lock, so on two cores it takes no extra time
         sha256 = beside.submit(lambda: bag.files.sha256)
         notes = list(bag.notes)
         signals = _signals(bag, layout, notes)
-        stretches = run_spans(bag, layout, signals, notes)
-        # two channels of one topic say the same of it
-        said = tuple(dict.fromkeys(notes))
-        return tuple(_run(signals, one, sha256.result(), said) for one in stretches)
+        spans = run_spans(bag, layout, signals, notes)
+        # two channels of one topic repeat its notes
+        unique = tuple(dict.fromkeys(notes))
+        return tuple(_run(signals, span, sha256.result(), unique) for span in spans)
 
 
 def _run(
     signals: dict[str, Signal], stretch: RunSpan, sha256: str, notes: tuple[str, ...]
 ) -> BagRun:
-    """The part of all signals that lies in one run."""
+    """Return the part of all signals that lies in one run."""
     parts, without = {}, []
     for name, signal in signals.items():
         first, end = np.searchsorted(signal.time, (stretch.start, stretch.end)).tolist()
@@ -199,7 +208,7 @@ def _run(
 
 
 def _signals(bag: OpenBag, layout: BagLayout, notes: list[str]) -> dict[str, Signal]:
-    """Every signal that the layout wants, from one pass over the bag."""
+    """Return every signal of the layout, from one pass over the bag."""
     plans = plan(bag, layout)
     collected = _collected(bag, plans)
     signals: dict[str, Signal] = {}
@@ -220,7 +229,7 @@ def _signals(bag: OpenBag, layout: BagLayout, notes: list[str]) -> dict[str, Sig
 
 
 def _collected(bag: OpenBag, plans: Sequence[ChannelPlan]) -> list[list[Stream]]:
-    """Numbers of every plan, topic by topic."""
+    """Return the numbers of every plan, topic by topic."""
     topics = {}
     for name in dict.fromkeys(w.topic for one in plans for w in one.wanted):
         wanted = [w for one in plans for w in one.wanted if w.topic == name]

@@ -5,33 +5,34 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
-from slipid.data.reading.bag.definitions import Message
-from slipid.data.reading.bag.meanings import listed
+from slipid.data.reading.bag.definitions import MessageType
+from slipid.data.reading.bag.meanings import first_names
 from slipid.data.reading.bag.opened import OpenBag
 from slipid.data.reading.bag.shape import Edge, Located, MessageShape, edges_of
 from slipid.data.reading.bag.streams import TopicStreams, topic_error
 from slipid.support.errors import did_you_mean
 
 STATIC = "_static"
-"""End of the topic's name beside `/tf` that holds transforms which never change."""
+"""Suffix of the topic of constant transforms beside `/tf`."""
 
 
 @dataclass(frozen=True)
-class Link:
-    """One transform of a chain, and whether the chain goes through it from child to parent."""
+class ChainLink:
+    """One transform of a chain; it is inverted where the chain passes it from child to parent."""
 
     edge: Edge
     inverted: bool
 
 
 @dataclass(frozen=True, eq=False)
-class Moving:
+class TransformSeries:
     """A transform over time.
 
     Attributes:
-        time: [s], increasing.
-        translation: [m].
+        time: increasing times [s].
+        translation: translations [m].
         rotation: unit quaternions x, y, z, w.
     """
 
@@ -39,11 +40,11 @@ class Moving:
     translation: Float[np.ndarray, "sample 3"]
     rotation: Float[np.ndarray, "sample 4"]
 
-    def at(self, time: Float[np.ndarray, " time"]) -> "Moving":
-        """Between the samples: linear, and along the short arc; one sample counts for all times."""
+    def at(self, time: Float[np.ndarray, " time"]) -> "TransformSeries":
+        """Interpolate linearly and along the short arc; a single sample holds for all times."""
         if len(self.time) == 1:
             rows = np.zeros(len(time), dtype=int)
-            return Moving(time, self.translation[rows], self.rotation[rows])
+            return TransformSeries(time, self.translation[rows], self.rotation[rows])
         flips = np.sum(self.rotation[1:] * self.rotation[:-1], axis=1) < 0
         sign = np.where(np.append(0, np.cumsum(flips)) % 2, -1.0, 1.0)
         same_side = self.rotation * sign[:, None]
@@ -51,21 +52,24 @@ class Moving:
             np.column_stack([np.interp(time, self.time, column) for column in values.T])
             for values in (self.translation, same_side)
         )
-        return Moving(time, translation, rotation / np.linalg.norm(rotation, axis=1)[:, None])
+        return TransformSeries(
+            time, translation, rotation / np.linalg.norm(rotation, axis=1)[:, None]
+        )
 
-    def inverse(self) -> "Moving":
-        """The transform the other way."""
-        back = self.rotation * [-1.0, -1.0, -1.0, 1.0]
-        return Moving(self.time, -_rotated(back, self.translation), back)
+    def inverse(self) -> "TransformSeries":
+        """Return the inverse transform."""
+        back = Rotation.from_quat(self.rotation).inv()
+        return TransformSeries(self.time, -back.apply(self.translation), back.as_quat())
 
-    def then(self, other: "Moving") -> "Moving":
-        """Composition with a transform from this one's child on, at the same times."""
-        translation = self.translation + _rotated(self.rotation, other.translation)
-        return Moving(self.time, translation, _product(self.rotation, other.rotation))
+    def then(self, other: "TransformSeries") -> "TransformSeries":
+        """Return the composition with a transform from this one's child on, at the same times."""
+        first, second = Rotation.from_quat(self.rotation), Rotation.from_quat(other.rotation)
+        translation = self.translation + first.apply(other.translation)
+        return TransformSeries(self.time, translation, (first * second).as_quat())
 
 
-def composed(links: Sequence[Link], moving: Mapping[Edge, Moving]) -> Moving:
-    """Pose of the last frame of a chain in the first, at the times of its densest transform.
+def composed(links: Sequence[ChainLink], moving: Mapping[Edge, TransformSeries]) -> TransformSeries:
+    """Return the pose of the last frame of a chain in the first, at its densest times.
 
     Times that some other transform does not span are left out.
     """
@@ -84,75 +88,58 @@ def composed(links: Sequence[Link], moving: Mapping[Edge, Moving]) -> Moving:
 
 
 def heading(rotation: Float[np.ndarray, "sample 4"]) -> Float[np.ndarray, " sample"]:
-    """Turn about the vertical of unit quaternions x, y, z, w [rad], without wrap-around."""
+    """Return the yaw angle of unit quaternions x, y, z, w [rad], without wrap-around."""
     x, y, z, w = rotation.T
     return np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
 def tilt(rotation: Float[np.ndarray, "sample 4"]) -> Float[np.ndarray, " sample"]:
-    """Angle between the vertical and the turned vertical [rad]."""
+    """Return the angle between the vertical and the rotated vertical [rad]."""
     x, y, _, _ = rotation.T
     return np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))
 
 
-def _rotated(
-    rotation: Float[np.ndarray, "sample 4"], vector: Float[np.ndarray, "sample 3"]
-) -> Float[np.ndarray, "sample 3"]:
-    axis, w = rotation[:, :3], rotation[:, 3:]
-    twice = 2.0 * np.cross(axis, vector)
-    return vector + w * twice + np.cross(axis, twice)
-
-
-def _product(
-    one: Float[np.ndarray, "sample 4"], other: Float[np.ndarray, "sample 4"]
-) -> Float[np.ndarray, "sample 4"]:
-    a, b = one[:, :3], other[:, :3]
-    axis = one[:, 3:] * b + other[:, 3:] * a + np.cross(a, b)
-    w = one[:, 3] * other[:, 3] - np.sum(a * b, axis=1)
-    return np.column_stack([axis, w])
-
-
 def chain_of(
-    bag: OpenBag, messages: Mapping[str, Message], frame: str, child: str
-) -> tuple[Link, ...]:
-    """Transforms that lead from a frame to another, found in as few messages as tell it.
+    bag: OpenBag, messages: Mapping[str, MessageType], frame: str, child: str
+) -> tuple[ChainLink, ...]:
+    """Return the transforms that lead from a frame to another, from as few messages as possible.
 
     Args:
         bag: the bag.
         messages: type of each topic that holds transforms.
-        frame: where the chain starts.
-        child: where it ends.
+        frame: first frame of the chain.
+        child: last frame of the chain.
 
     Raises:
         DataError: no chain leads there; the message lists the frames.
     """
-    seen = _FrameParents()
+    parents = _FrameParents()
     streams = {
-        topic: TopicStreams(bag.path, topic, message, [seen], cdr=bag.cdr)
+        topic: TopicStreams(bag.path, topic, message, [parents], cdr=bag.cdr)
         for topic, message in messages.items()
     }
     frame, child = frame.lstrip("/"), child.lstrip("/")
     for batch in bag.batches(tuple(messages)):
         streams[batch.topic].add(batch)
-        if links := _links(seen.parent, frame, child):
+        if links := _links(parents.parent, frame, child):
             return links
-    frames = sorted({*seen.parent.keys(), *seen.parent.values()})
+    frames = sorted({*parents.parent.keys(), *parents.parent.values()})
     where = ", ".join(messages)
     for name in (frame, child):
         if name not in frames:
             found, expected = (
                 f"no frame '{name}'{did_you_mean(name, frames)}",
-                f"one of {listed(frames)}",
+                f"one of {first_names(frames)}",
             )
             raise topic_error(bag.path, where, found, expected)
     found = f"no transforms lead from '{frame}' to '{child}'"
-    pairs = listed(f"{parent} -> {name}" for name, parent in sorted(seen.parent.items()))
+    pairs = first_names(f"{parent} -> {name}" for name, parent in sorted(parents.parent.items()))
     raise topic_error(bag.path, where, found, f"two frames of one tree ({pairs})")
 
 
 @dataclass(eq=False)
 class _FrameParents:
-    """A pick of nothing, which remembers the parent of every frame that it comes across."""
+    """A pick without numbers that collects the parent of every frame."""
 
     parent: dict[str, str] = field(default_factory=dict)
     columns: tuple[str, ...] = ()
@@ -163,21 +150,21 @@ class _FrameParents:
         return ()
 
 
-def _links(parent: Mapping[str, str], frame: str, child: str) -> tuple[Link, ...]:
-    """The chain, empty while it is not known."""
+def _links(parent: Mapping[str, str], frame: str, child: str) -> tuple[ChainLink, ...]:
+    """Return the chain, empty while it is not known."""
     up, down = _ancestors(parent, frame), _ancestors(parent, child)
     common = next((name for name in down if name in up), None)
     if common is None or frame == child:
         return ()
     rise, fall = up[: up.index(common)], down[: down.index(common)]
     return (
-        *(Link(Edge(parent[name], name), True) for name in rise),
-        *(Link(Edge(parent[name], name), False) for name in reversed(fall)),
+        *(ChainLink(Edge(parent[name], name), True) for name in rise),
+        *(ChainLink(Edge(parent[name], name), False) for name in reversed(fall)),
     )
 
 
 def _ancestors(parent: Mapping[str, str], name: str) -> list[str]:
-    """A frame, its parent, and so on; no frame twice."""
+    """Return a frame, its parent, and so on; no frame twice."""
     names = [name]
     while (above := parent.get(names[-1])) is not None and above not in names:
         names.append(above)

@@ -106,7 +106,7 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
 @pytest.mark.parametrize(
     ("channel", "spec", "words"),
     [
-        ("gyro", {"topic": "/pose"}, (POSE, "where in it gyro is", "sensor_msgs/Imu")),
+        ("gyro", {"topic": "/pose"}, (POSE, "the field of gyro is unknown", "sensor_msgs/Imu")),
         ("pose", {"topic": "/imu"}, ("no pose of type", "TransformStamped", "field that holds it")),
         ("twist_command", {"topic": "/pose"}, ("no twist_command", "geometry_msgs/Twist")),
         ("bus_voltage", {"topic": "/imu"}, ("BatteryState", "field = one of its numbers")),

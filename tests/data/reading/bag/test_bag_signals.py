@@ -171,11 +171,18 @@ def test_the_hash_is_what_sha256sum_prints(tmp_path):
 
 
 def test_a_big_endian_message(tmp_path):
-    from slipid.data.reading.bag.definitions import Many, Message, MessageField, NumberType, Text
+    from slipid.data.reading.bag.definitions import (
+        ArrayType,
+        MessageField,
+        MessageType,
+        NumberType,
+        TextType,
+    )
     from slipid.data.reading.bag.shape import shape_of, steps_of
 
-    kind = Message(
-        "x/msg/Y", (MessageField("s", Text()), MessageField("v", Many(NumberType("f8"), None)))
+    kind = MessageType(
+        "x/msg/Y",
+        (MessageField("s", TextType()), MessageField("v", ArrayType(NumberType("f8"), None))),
     )
     text = b"\0\0\0\x03ab\0\0"  # and one byte up to the next length
     raw = b"\0\0\0\0" + text + b"\0\0\0\x01" + b"\0\0\0\0" + np.array([2.5], ">f8").tobytes()

@@ -1,22 +1,86 @@
-"""Sentences about order, signs, axes, units and sizes, and which key of the config to change."""
+"""Findings of the check: what is wrong or could not be checked, and which config key to change."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import isclose, pi
+from typing import Literal
 
-from slipid.data.check.columns import Finding
 from slipid.data.check.interpretation import Interpretation
 from slipid.data.check.joined import PoseConvention
 from slipid.data.check.mistakes import Candidate, Mistake
 from slipid.data.check.ratios import ScaleCause, ScaleRatios
+from slipid.support.content import Content
 
-_OF_CONVENTION = {
+Severity = Literal["wrong", "suspicious", "note"]
+"""`wrong` must be corrected before a fit, `suspicious` needs a look, `note` could not be
+checked."""
+ORDER: tuple[Severity, ...] = ("wrong", "suspicious", "note")
+NAMED = 4
+"""Most runs that a sentence names; the others are counted."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that the check found in the runs.
+
+    Attributes:
+        kind: name of the finding, such as `wheel_sign`; `sanity` lists all of them.
+        found: what is wrong, with numbers.
+        remedy: which key to change, and to what; or None.
+        severity: how bad it is.
+        runs: names of the runs concerned; empty where all are.
+    """
+
+    kind: str
+    found: str
+    remedy: str | None
+    severity: Severity = "wrong"
+    runs: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        where = f" (in {listed(self.runs)})" if self.runs else ""
+        return self.found + where + (f"; {self.remedy}" if self.remedy else "")
+
+    def explained(self, how: str, others: Iterable["Finding"] = ()) -> "Finding":
+        """Return the finding with its evidence and the remedies of equally good ones."""
+        more = "".join(f"; or, which explains these logs as well: {o.remedy}" for o in others)
+        return replace(self, found=f"{self.found}: {how}", remedy=f"{self.remedy}{more}")
+
+    def to_json(self) -> Content:
+        """Return the finding as check.json has it."""
+        return {
+            "kind": self.kind,
+            "severity": self.severity,
+            "found": self.found,
+            "remedy": self.remedy,
+            "runs": list(self.runs),
+        }
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return the first few names, and how many more there are."""
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return the findings, those that forbid a fit first."""
+    return tuple(sorted(findings, key=lambda f: ORDER.index(f.severity)))
+
+
+def wrong(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return the findings that forbid a fit."""
+    return tuple(f for f in findings if f.severity == "wrong")
+
+
+_CONVENTION_SENTENCES = {
     "heading_sign": "the heading of the poses turns the other way round than the body does",
     "pose_axis": "an axis of the poses has the wrong sign",
     "pose_swapped": "x and y of the poses are exchanged",
     "pose_mirrored": "the poses are mirrored, as from below or in an image whose y points down",
     "heading_quaternion": "the heading is the z of a quaternion, sin(yaw / 2), not an angle",
 }
-_OF_CAUSE = {
+_CAUSE_KINDS = {
     "time": "time_unit",
     "pose_length": "pose_length",
     "heading": "heading_unit",
@@ -33,21 +97,23 @@ _OF_CAUSE = {
 """Kind of the finding about each wrong factor."""
 
 
-def of_mistake(mistake: Mistake) -> Finding:
-    """The finding about order, signs or axes."""
+def mistake_finding(mistake: Mistake) -> Finding:
+    """Return the finding about a mistake in order, signs or axes."""
     how = (
-        f"read so, {mistake.after:.2f} of the motion is left unexplained, "
+        f"with this correction {mistake.after:.2f} of the motion is unexplained, "
         f"as declared {mistake.before:.2f}"
     )
-    return _of_candidate(mistake.found).explained(how, map(_of_candidate, mistake.others[:2]))
+    return _candidate_finding(mistake.found).explained(
+        how, map(_candidate_finding, mistake.others[:2])
+    )
 
 
-def _of_candidate(candidate: Candidate) -> Finding:
-    """The finding about one mistake in order, signs or axes."""
+def _candidate_finding(candidate: Candidate) -> Finding:
+    """Return the finding about one interpretation that differs in order, signs or axes."""
     kind, meant = candidate.kind, candidate.meant
     if kind in ("wheel_sign", "command_sign") and (meant.sign or meant.command_sign):
         sign = meant.sign if kind == "wheel_sign" else meant.command_sign
-        return _signs(kind, [k + 1 for k, s in enumerate(sign) if s < 0], len(sign))
+        return _sign_finding(kind, [k + 1 for k, s in enumerate(sign) if s < 0], len(sign))
     if kind == "command_sign":
         axes = [a for a, s in zip(("x", "y", "yaw"), meant.twist_sign, strict=True) if s < 0]
         return Finding(
@@ -57,7 +123,7 @@ def _of_candidate(candidate: Candidate) -> Finding:
             + " and ".join(f"the channel twist_command_{axis}" for axis in axes),
         )
     if kind in ("wheel_order", "command_order"):
-        return _order(kind, meant)
+        return _order_finding(kind, meant)
     if kind == "wheel_azimuths":
         return Finding(
             kind,
@@ -72,11 +138,11 @@ def _of_candidate(candidate: Candidate) -> Finding:
             "the gyro turns the other way round than the poses",
             "turn the sign of scale for the channel gyro",
         )
-    return _convention(kind, meant.convention)
+    return _convention_finding(kind, meant.convention)
 
 
-def _signs(kind: str, turned: Sequence[int], wheels: int) -> Finding:
-    """The finding about wheels that count backwards."""
+def _sign_finding(kind: str, turned: Sequence[int], wheels: int) -> Finding:
+    """Return the finding about wheels that count backwards."""
     names = " and ".join(map(str, turned))
     channel = "its column" if len(turned) == 1 else "their columns"
     if kind == "command_sign":
@@ -98,8 +164,8 @@ def _signs(kind: str, turned: Sequence[int], wheels: int) -> Finding:
     )
 
 
-def _order(kind: str, meant: Interpretation) -> Finding:
-    """The finding about columns in another order."""
+def _order_finding(kind: str, meant: Interpretation) -> Finding:
+    """Return the finding about columns in another order."""
     order, what = (
         (meant.order, "the wheels' columns")
         if kind == "wheel_order"
@@ -113,8 +179,8 @@ def _order(kind: str, meant: Interpretation) -> Finding:
     )
 
 
-def _convention(kind: str, convention: PoseConvention) -> Finding:
-    """The finding about what the poses mean."""
+def _convention_finding(kind: str, convention: PoseConvention) -> Finding:
+    """Return the finding about the convention of the poses."""
     turn = convention.offset
     offset = f" and add {turn} deg to its offset" if turn else ""
     if kind == "heading_offset":
@@ -134,25 +200,25 @@ def _convention(kind: str, convention: PoseConvention) -> Finding:
         "pose_mirrored": "turn the sign of scale for the channels pose_y and pose_heading (or of "
         f"pose_x and pose_heading, with 180 deg more in its offset){offset}",
     }[kind]
-    return Finding(kind, _OF_CONVENTION[kind], remedy)
+    return Finding(kind, _CONVENTION_SENTENCES[kind], remedy)
 
 
-def of_causes(
+def cause_findings(
     fitting: Sequence[ScaleCause], single: bool, why: str, gear_ratio: float
 ) -> tuple[Finding, ...]:
-    """Findings about factors: the likeliest with the others as ways out, or all of a pair.
+    """Return findings about wrong factors: the likeliest with alternatives, or both of a pair.
 
     Args:
         fitting: causes that fit, the likeliest first.
         single: whether each of them fits alone.
-        why: the ratios that are not natural, as a sentence.
-        gear_ratio: of the declared robot.
+        why: sentence about the ratios that are out of range.
+        gear_ratio: gear ratio of the declared robot.
     """
     if not fitting:
         return ()
     if not single:
-        return tuple(_factor(one, gear_ratio).explained(why) for one in fitting)
-    first, *others = (_factor(one, gear_ratio) for one in fitting)
+        return tuple(_factor_finding(one, gear_ratio).explained(why) for one in fitting)
+    first, *others = (_factor_finding(one, gear_ratio) for one in fitting)
     likely = [
         other
         for other, cause in zip(others, fitting[1:], strict=True)
@@ -161,31 +227,32 @@ def of_causes(
     return (first.explained(why, likely[:2]),)
 
 
-def of_ratios(seen: ScaleRatios) -> str:
-    """The ratios that are not natural, as a sentence."""
-    words = {
-        "travel": "the body moves {:.3g} times as far as the wheels say",
-        "turning": "the body turns {:.3g} times as far as the wheels say",
+def ratio_sentence(scales: ScaleRatios) -> str:
+    """Return a sentence about the ratios that are out of range."""
+    sentences = {
+        "travel": "the body's path length is {:.3g} times that of the wheels",
+        "turning": "the body turns {:.3g} times as much as the wheels",
         "drive": "the commanded motion is {:.3g} times what the wheels did",
         "steer": "the commanded turn is {:.3g} times what the wheels did",
         "command": "the commanded wheel speeds are {:.3g} times the measured ones",
         "report": "the reported wheel speeds are {:.3g} times what the encoders say",
-        "gyro": "the gyro turns {:.3g} times as far as the poses",
+        "gyro": "the gyro turns {:.3g} times as much as the poses",
     }
-    return ", ".join(words[k].format(r.value) for k, r in seen.known.items() if not r.natural)
+    unnatural = {k: r.value for k, r in scales.known.items() if not r.natural}
+    return ", ".join(sentences[k].format(value) for k, value in unnatural.items())
 
 
-def _factor(of: ScaleCause, gear_ratio: float) -> Finding:
-    """The finding about a factor by which a channel is too large."""
-    name, kind = of.name, _OF_CAUSE[of.name]
+def _factor_finding(of: ScaleCause, gear_ratio: float) -> Finding:
+    """Return the finding about a factor by which a channel is too large."""
+    name, kind = of.name, _CAUSE_KINDS[of.name]
     size = of.factor if of.factor > 1 else 1 / of.factor
     much = f"{size:.3g} times too " + ("large" if of.factor > 1 else "small")
     if name == "time":
-        unit = _named(of.factor, {1e3: "ms", 1e6: "us", 1e9: "ns", 60.0: "s", 1e-3: "s"})
+        unit = _unit_name(of.factor, {1e3: "ms", 1e6: "us", 1e9: "ns", 60.0: "s", 1e-3: "s"})
         to = f"set unit = '{unit}' for the channel time" if unit else "correct the unit of time"
         return Finding(kind, f"time is in another unit, {much}", to)
     if name == "pose_length":
-        unit = _named(of.factor, {1e3: "mm", 1e2: "cm", 1e-3: "m", 1e-2: "m"})
+        unit = _unit_name(of.factor, {1e3: "mm", 1e2: "cm", 1e-3: "m", 1e-2: "m"})
         to = f"set unit = '{unit}' for the channels" if unit else "correct the unit or scale of"
         remedy = f"{to} pose_x and pose_y (scale = {1 / of.factor:.3g})"
         return Finding(kind, f"the poses' lengths are {much}", remedy)
@@ -226,19 +293,21 @@ def _factor(of: ScaleCause, gear_ratio: float) -> Finding:
 
 
 def _turns(factor: float, gear_ratio: float) -> str:
-    """The remedy for turns that are too large by a factor."""
-    ways = [f"multiply ticks_per_revolution or the layout's gear_ratio by {factor:.3g}"]
+    """Return the remedy for wheel turns that are too large by a factor."""
+    remedies = [f"multiply ticks_per_revolution or the layout's gear_ratio by {factor:.3g}"]
     if gear_ratio > 1.5 and isclose(1 / factor, gear_ratio, rel_tol=0.02):
-        ways = ["set gear_ratio = 1 in the layout, if the encoder sits at the wheel, not the motor"]
+        remedies = [
+            "set gear_ratio = 1 in the layout, if the encoder is at the wheel, not the motor"
+        ]
     elif gear_ratio > 1.5 and isclose(factor, gear_ratio, rel_tol=0.02):
-        ways = [f"set gear_ratio = {gear_ratio:g} in the layout: the encoder sits at the motor"]
+        remedies = [f"set gear_ratio = {gear_ratio:g} in the layout: the encoder is at the motor"]
     if unit := _unit_of_rate(factor):
-        ways.append("correct the unit, if wheels are logged as speeds or angles" + unit)
-    return ", or ".join(ways)
+        remedies.append("correct the unit, if wheels are logged as speeds or angles" + unit)
+    return ", or ".join(remedies)
 
 
 def _unit_of_rate(factor: float) -> str:
-    """Name of a unit that is taken for radians, if a factor says so."""
+    """Return which units were confused if a factor is their ratio, else an empty text."""
     names = {
         30 / pi: ": 'rpm' was taken for 'rad/s'",
         pi / 30: ": 'rad/s' was taken for 'rpm'",
@@ -248,9 +317,9 @@ def _unit_of_rate(factor: float) -> str:
         2 * pi: ": radians were taken for revolutions",
         1000.0: ": thousandths were taken for the whole",
     }
-    return _named(factor, names)
+    return _unit_name(factor, names)
 
 
-def _named(factor: float, names: Mapping[float, str]) -> str:
-    """The name of a factor, or nothing."""
+def _unit_name(factor: float, names: Mapping[float, str]) -> str:
+    """Return the name that belongs to a factor, else an empty text."""
     return next((name for f, name in names.items() if isclose(f, factor, rel_tol=1e-3)), "")

@@ -1,26 +1,25 @@
-"""One frame, and what every source of frames offers.
-
-Times of frames: given in a file, or even.
-
-Frames decoded ahead, in a thread of their own.
-"""
+"""Video frames: their pixels, their times, and the interface of everything that supplies them."""
 
 import csv
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import Grey, opencv
 from slipid.support.errors import DataError, bad_data
 
 LOST = 0.02
-"""Part of the frames a file may announce and not have: some formats only estimate how many."""
+"""Part of the announced frames that a file may lack: some formats only estimate their number."""
+UNEVEN = 0.2
+"""Part by which intervals between frames may differ from their median and still count as even."""
+DEPTH = 8
+"""Number of frames that are decoded ahead."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,80 +28,71 @@ class Frame:
 
     Attributes:
         index: its number, from 0.
-        time: when it was taken [s].
-        grey: its pixels, from 0 to 255.
+        time: time at which it was taken [s].
+        grey: its grey levels, from 0 to 255.
     """
 
     index: int
     time: float
-    grey: UInt8[np.ndarray, "row column"]
+    grey: Grey
 
 
-@runtime_checkable
-class Source(Protocol):
-    """Where frames come from."""
+@dataclass(frozen=True, eq=False)
+class FrameSource(ABC):
+    """A video, a folder of pictures or a device that supplies frames.
 
-    @property
-    def name(self) -> str:
-        """What messages call it."""
+    Attributes:
+        name: its name in messages.
+        image_px: width and height of every frame.
+        count: expected number of frames; None where it is not known.
+        exact: whether `count` is exact, as where each frame has a given time.
+        identity: text that changes with its content, such as name, size and date.
+    """
 
-    @property
-    def image_px(self) -> tuple[int, int]:
-        """Width and height of every frame."""
+    name: str
+    image_px: tuple[int, int]
+    count: int | None
+    exact: bool
+    identity: str
 
-    @property
-    def count(self) -> int | None:
-        """How many frames there should be; None where nobody knows."""
-
-    @property
-    def exact(self) -> bool:
-        """Whether there are just so many, as where each has a time of its own."""
-
-    @property
-    def identity(self) -> str:
-        """What tells it from others: name, size and date."""
-
+    @abstractmethod
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Frames from a number on, in order."""
+        """Yield the frames from a number on, in order."""
 
 
-def cut_off(source: Source, found: int) -> str | None:
-    """A sentence where a source ended before it should have."""
-    if source.count is None or found == source.count:
+def cut_off(source: FrameSource, count: int) -> str | None:
+    """Return a sentence where a source ended too early after `count` frames; None otherwise."""
+    if source.count is None or count == source.count:
         return None
     if source.exact:
-        return f"{source.name}: {found} frames, but {source.count} times; expected a time for each"
-    if found >= (1 - LOST) * source.count - 1:
+        return f"{source.name}: {count} frames, but {source.count} times; expected a time for each"
+    if count >= (1 - LOST) * source.count - 1:
         return None
     return (
-        f"{source.name}: ends after frame {found} of {source.count}; the file was cut off or is "
+        f"{source.name}: ends after frame {count} of {source.count}; the file was cut off or is "
         "damaged there"
     )
 
 
 def stamp(path: Path) -> tuple[str, int, int]:
-    """Name, size and date of a file, which change when it does."""
+    """Return name, size and date of a file, which change when its content does."""
     status = path.stat()
     return path.name, status.st_size, status.st_mtime_ns
 
 
-def grey_of(picture: np.ndarray) -> UInt8[np.ndarray, "row column"]:
-    """Grey levels of a picture in blue, green and red, or of one that is grey already."""
-    cv2 = opencv()
+def grey_of(picture: np.ndarray) -> Grey:
+    """Return the grey levels of a picture in blue, green, red, or of one that is grey already."""
     if picture.ndim == 2 or picture.shape[2] == 1:
         return np.asarray(picture).reshape(picture.shape[:2])
+    cv2 = opencv()
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
 
 
-UNEVEN = 0.2
-"""Part by which times between frames may differ from their median and still count as even."""
-
-
 def read_times(path: Path) -> Float[np.ndarray, " frame"]:
-    """Times [s] of frames 0, 1, 2, ... from a CSV file with the columns frame and time.
+    """Return the times [s] of frames 0, 1, 2, ... from a CSV file with columns frame and time.
 
     Raises:
-        DataError: unreadable, other columns, frames left out, or times that do not increase.
+        DataError: unreadable, other columns, missing frames, or times that do not increase.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -113,29 +103,33 @@ def read_times(path: Path) -> Float[np.ndarray, " frame"]:
         raise DataError(f"{path}: no CSV text; expected the columns frame, time") from error
     if not rows or [cell.strip() for cell in rows[0][:2]] != ["frame", "time"]:
         raise bad_data(path, "other columns", "the columns frame, time [s]", row=1)
-    out: list[float] = []
+    times: list[float] = []
     for line, row in enumerate(rows[1:], 2):
         try:
             number, at = int(row[0]), float(row[1])
         except (ValueError, IndexError):
             raise bad_data(path, f"{','.join(row)!r}", "a frame and its time", row=line) from None
-        if number != len(out):
-            raise bad_data(path, f"frame {number}", f"frame {len(out)}", row=line)
-        if not np.isfinite(at) or (out and at <= out[-1]):
+        if number != len(times):
+            raise bad_data(path, f"frame {number}", f"frame {len(times)}", row=line)
+        if not np.isfinite(at) or (times and at <= times[-1]):
             raise bad_data(path, f"time {at:g}", "times that increase", row=line)
-        out.append(at)
-    return np.array(out)
+        times.append(at)
+    return np.array(times)
 
 
 def even_times(count: int, fps: float) -> Float[np.ndarray, " frame"]:
-    """Times [s] of frames that come evenly from 0 on; DataError where the rate is none."""
+    """Return the times [s] of frames at an even rate from 0 on.
+
+    Raises:
+        DataError: the rate is not a positive number.
+    """
     if not 0 < fps < np.inf:
         raise DataError(f"--fps {fps:g}; expected frames per second")
     return np.arange(count) / fps
 
 
 def uneven(times: Sequence[float] | Float[np.ndarray, " frame"]) -> str | None:
-    """A sentence where frames do not come evenly, for a person to know."""
+    """Return a sentence for the user where frames do not come evenly; None otherwise."""
     steps = np.diff(np.asarray(times, float))
     if len(steps) < 2:
         return None
@@ -148,14 +142,10 @@ def uneven(times: Sequence[float] | Float[np.ndarray, " frame"]) -> str | None:
     )
 
 
-DEPTH = 8
-"""Frames that are decoded ahead."""
+def read_ahead(frames: Iterator[Frame]) -> Generator[Frame]:
+    """Yield the same frames, decoded ahead in a thread; its errors are raised here.
 
-
-def ahead(frames: Iterator[Frame]) -> Generator[Frame]:
-    """The same frames, decoded in a thread of their own; its errors are raised where they are used.
-
-    Decoding ends with the frames, or when nobody wants more.
+    Decoding ends with the frames, or when this generator is closed.
     """
     with ThreadPoolExecutor(1) as thread:
         decoded = deque(thread.submit(next, frames, None) for _ in range(DEPTH))

@@ -1,0 +1,207 @@
+"""The part of the floor that a config requests, as cells, and the cells that it marks."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from slipid.camera.floor.grid import (
+    LEAST_CELLS,
+    DetectedRobot,
+    Extent,
+    Rectified,
+    RobotShape,
+    detected_robots,
+    filled,
+    grid_over,
+    hidden_by,
+    pixel_size,
+    rectified,
+    view_of,
+)
+from slipid.camera.floor.light import Features, lab_of, linear_of_code
+from slipid.camera.floor.palette import Palette, Places, Polygon
+from slipid.camera.floor.surfaces import MarkedCells, Seeds
+from slipid.camera.opencv import Mask, size_of
+from slipid.camera.overhead import OverheadCamera
+from slipid.support.errors import DataError
+
+ABSENT = 30.0
+"""Distance from every cell above which a colour is not in the picture [L, a, b]."""
+
+
+@dataclass(frozen=True, eq=False)
+class FloorPicture:
+    """A picture of the floor, and the camera that took it.
+
+    Attributes:
+        path: file of the picture, for messages.
+        config: file of the palette, for messages.
+        picture: blue, green, red of every pixel.
+        camera: the calibrated camera.
+    """
+
+    path: Path
+    config: Path
+    picture: UInt8[np.ndarray, "y x 3"]
+    camera: OverheadCamera
+
+
+@dataclass(frozen=True, eq=False)
+class FloorRegion:
+    """The part of the floor to be mapped.
+
+    Attributes:
+        floor: the picture laid onto the floor.
+        requested: cells of the region that lie in the camera's view.
+        visible: those of them that show the floor, without masks and robots.
+        robots: robots detected in the picture.
+    """
+
+    floor: Rectified
+    requested: Mask
+    visible: Mask
+    robots: tuple[DetectedRobot, ...]
+
+
+def requested_region(
+    source: FloorPicture, palette: Palette, robot: RobotShape, cell: float | None
+) -> FloorRegion:
+    """Return the cells that a config requests, and which of them show the floor.
+
+    Args:
+        source: the picture and its camera.
+        palette: the config, with its region and masks.
+        robot: shape of robots that may hide the floor.
+        cell: edge of a cell [m]; None takes that of a pixel.
+
+    Raises:
+        DataError: another resolution than the camera's, or a region without visible floor.
+    """
+    picture, camera = source.picture, source.camera
+    camera.lens.check_size(size_of(picture), source.path)
+    grid = grid_over(_extent(source, palette.region), cell or pixel_size(camera), source.path)
+    floor = rectified(picture, camera, grid)
+    requested = floor.in_view.copy()
+    if palette.region is not None:
+        requested &= _cells(source, floor, palette.region)
+    if requested.sum() < LEAST_CELLS:
+        raise DataError(
+            f"{source.config if palette.region else source.path}: region: {requested.sum()} cells "
+            f"of {1e3 * grid.cell:.3g} mm that the camera sees; expected {LEAST_CELLS} or more"
+        )
+    visible = requested.copy()
+    for polygon in palette.mask:
+        visible &= ~_cells(source, floor, polygon)
+    robots = detected_robots(picture, camera, robot)
+    for one in robots:
+        visible &= ~floor.of_picture(hidden_by(one, robot, camera))
+    if visible.sum() < LEAST_CELLS:
+        raise DataError(
+            f"{source.path}: masks and robots hide all but {visible.sum()} cells; expected "
+            f"{LEAST_CELLS} or more of floor"
+        )
+    return FloorRegion(floor, requested, visible, robots)
+
+
+def _extent(source: FloorPicture, region: Polygon | None) -> Extent:
+    """Return the rectangle around a region within the view, or around the whole view."""
+    view = view_of(source.camera)
+    if region is None:
+        return view
+    if region.at_m is not None:
+        corners = np.array(region.at_m)
+    else:
+        pixels = np.array(region.at_px)
+        part = np.linspace(0, 1, 33)[:, None, None]
+        corners = source.camera.on_plane(pixels + part * (np.roll(pixels, -1, 0) - pixels), 0.0)
+        corners = corners[np.isfinite(corners).all(axis=-1)]
+    low = np.maximum(corners.min(axis=0, initial=np.inf), [view.low_x, view.low_y])
+    high = np.minimum(corners.max(axis=0, initial=-np.inf), [view.high_x, view.high_y])
+    if not (low < high).all():
+        raise DataError(
+            f"{source.config}: region: no floor that the camera sees; expected a polygon within "
+            f"x {view.low_x:.2f} to {view.high_x:.2f} m, y {view.low_y:.2f} to {view.high_y:.2f} m"
+        )
+    return Extent(*(float(v) for v in (*low, *high)))
+
+
+def _cells(source: FloorPicture, floor: Rectified, polygon: Polygon) -> Mask:
+    """Return the cells in a polygon."""
+    if polygon.at_m is not None:
+        return floor.grid.inside(np.array(polygon.at_m))
+    width, height = size_of(source.picture)
+    return floor.of_picture(filled(np.array(polygon.at_px), height, width))
+
+
+def seeds_of(
+    source: FloorPicture, features: Features, region: FloorRegion, palette: Palette
+) -> Seeds:
+    """Return colours and marked cells of the surfaces that a config names.
+
+    Raises:
+        DataError: a marked point shows no floor, or a colour is not in the picture.
+    """
+    names = palette.names
+    marked = MarkedCells(*np.zeros((3, 0), int))
+    for k, one in enumerate(palette.points):
+        row, column = _marked(source, region, one, k).T
+        points = MarkedCells(row, column, np.full(len(row), names.index(one.surface)))
+        marked = marked.joined(points.surroundings(region.visible))
+    colours = np.zeros((len(names), 3))
+    for k, name in enumerate(names):
+        own = marked.only(marked.surface == k)
+        if len(own.row):
+            colours[k] = np.median(features.rgb[own.row, own.column], axis=0)
+        else:
+            colours[k] = linear_of_code(palette.palette[name])
+            _check_present(source, name, palette, features.appearance[region.visible][:, :3])
+    return Seeds(colours, marked)
+
+
+def _marked(
+    source: FloorPicture, region: FloorRegion, marked: Places, k: int
+) -> Int[np.ndarray, "point 2"]:
+    """Return row and column of the marked points of entry `k` of a config."""
+    grid = region.floor.grid
+    given = np.array(marked.at_px or marked.at_m, float)
+    width, height = size_of(source.picture)
+    if marked.at_px is not None:
+        out = ~((given >= -0.5) & (given < [width - 0.5, height - 0.5])).all(axis=1)
+        _refuse(source, given[out], k, f"outside the picture of {width} x {height} pixels")
+        xy = source.camera.on_plane(given, 0.0)
+    else:
+        xy = given
+    with np.errstate(invalid="ignore"):
+        cells = np.rint(np.nan_to_num(grid.steps(xy), nan=-9.0)).astype(int)[:, ::-1]
+    off = ~((cells >= 0) & (cells < [grid.rows, grid.columns])).all(axis=1)
+    inside = cells.clip(0, [grid.rows - 1, grid.columns - 1])
+    off |= ~region.visible[inside[:, 0], inside[:, 1]]
+    _refuse(source, given[off], k, "not visible, outside the region, on a mask or on a robot")
+    return inside
+
+
+def _refuse(
+    source: FloorPicture, points: Float[np.ndarray, "point 2"], k: int, problem: str
+) -> None:
+    if len(points):
+        x, y = points[0]
+        raise DataError(
+            f"{source.config}: points[{k + 1}]: [{x:g}, {y:g}] is {problem}; expected a point on "
+            "the surface"
+        )
+
+
+def _check_present(
+    source: FloorPicture, name: str, palette: Palette, lab: Float[np.ndarray, "cell 3"]
+) -> None:
+    """Raise `DataError` where no cell has nearly the colour of a surface."""
+    colour = palette.palette[name]
+    off = np.linalg.norm(lab - lab_of(linear_of_code(colour)[None])[0], axis=1)
+    if (nearest := float(np.percentile(off, 0.5))) > ABSENT:
+        raise DataError(
+            f"{source.config}: palette.{name}: '{colour}' is nowhere in the picture (the nearest "
+            f"is {nearest:.0f} off in CIELAB); expected a colour as the picture shows it, or "
+            "points on the surface"
+        )

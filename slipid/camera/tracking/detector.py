@@ -1,0 +1,282 @@
+"""Markers in frames: detected near their last place, and in the whole frame now and then.
+
+OpenCV searches a whole frame in tens of milliseconds and the surroundings of a marker in one. Where
+every wanted marker was detected in the last frame and is detected again near its expected place,
+the rest of the frame is skipped, except in every `WHOLE`-th frame, in which a second marker of the
+same number shows.
+
+Corners are refined below a pixel as intersections of straight lines through the four edges. A
+corner alone says little where a marker is small: the window around it is full of the pattern
+inside, and all four corners are drawn the same way, as if the marker were turned. An edge is
+visible over its whole length. Across it, from the black border to the white margin, brightness
+rises from one level to another, and the area below that rise gives the place of its middle, however
+blurred it is by the lens or by motion.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.camera.opencv import Grey, marker_dictionary, opencv
+
+WHOLE = 30
+"""Interval, in frames, at which the whole frame is searched."""
+AROUND = 0.7
+"""Margin around the expected place, as a part of the marker's size in the picture."""
+LEAST_AROUND = 12.0
+"""Smallest margin [pixel]: the detector ignores markers that touch the border."""
+ROUNDS = 3
+"""Number of times edges are sampled: the first starts from corners that are off by a pixel."""
+ALONG, ACROSS = 20, 11
+"""Number of places along an edge, and of samples across it at each."""
+ENDS = 0.12
+"""Part of an edge left out at both ends, where the next edge is near."""
+REACH = 0.6
+"""Reach of the samples to both sides, in squares of the marker: beyond it lies the pattern."""
+MOST_REACH = 6.0
+"""Largest reach [pixel]; more would only take up noise."""
+LEVELS = 3
+"""Number of outermost samples on each side that give the dark and the bright level."""
+LEAST_CONTRAST = 12.0
+"""Difference of these levels below which there is no edge [grey levels]."""
+OFF = 0.15
+"""Smallest distance from its line at which a point may be left out [pixel]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """A marker in a frame.
+
+    Attributes:
+        id: its number.
+        corners: x, y [pixel] of top left, top right, bottom right, bottom left.
+    """
+
+    id: int
+    corners: Float[np.ndarray, "corner 2"]
+
+    @property
+    def middle(self) -> Float[np.ndarray, "2"]:
+        """Mean of the corners [pixel]."""
+        return np.asarray(self.corners.mean(axis=0))
+
+
+@dataclass(frozen=True)
+class Region:
+    """A rectangle of the picture, without its right column and its bottom row [pixel]."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def within(self, other: "Region") -> "Region":
+        """Return the intersection with another region, which may be empty."""
+        left, top = max(self.left, other.left), max(self.top, other.top)
+        right, bottom = min(self.right, other.right), min(self.bottom, other.bottom)
+        return Region(left, top, max(left, right), max(top, bottom))
+
+    @property
+    def empty(self) -> bool:
+        """Whether no pixel is in it."""
+        return self.right <= self.left or self.bottom <= self.top
+
+
+class MarkerDetector:
+    """OpenCV's detector of the markers of a dictionary, with corners refined below a pixel.
+
+    Raises:
+        DataError: no dictionary of that name, or no OpenCV.
+    """
+
+    def __init__(self, dictionary: str):
+        book = marker_dictionary(dictionary)
+        self._squares = int(book.markerSize) + 2
+        self._detector = opencv().aruco.ArucoDetector(book)
+
+    def detect(self, grey: Grey, region: Region | None = None) -> list[Detection]:
+        """Return every marker in a frame, or in a region of it."""
+        whole = Region(0, 0, grey.shape[1], grey.shape[0])
+        part = whole if region is None else region.within(whole)
+        if part.empty:
+            return []
+        searched = np.ascontiguousarray(grey[part.top : part.bottom, part.left : part.right])
+        corners, ids, _ = self._detector.detectMarkers(searched)
+        if ids is None or not len(ids):
+            return []
+        rough = np.asarray(corners, float).reshape(-1, 4, 2) + np.array([part.left, part.top])
+        fine = refined(grey, rough, self._squares)
+        numbers = np.asarray(ids).ravel().tolist()
+        return [Detection(*one) for one in zip(numbers, fine, strict=True)]
+
+
+@dataclass(eq=False)
+class MarkerTracker:
+    """Follows markers from frame to frame.
+
+    Attributes:
+        detector: detector of the markers.
+        ids: numbers of the wanted markers.
+        region: region of the picture to which detections are limited.
+        last: last detection of each wanted marker.
+        speed: motion of each marker's middle since the frame before [pixel].
+        whole: number of frames that were searched as a whole.
+        twice: whether a marker was detected twice in the frame before; the next frame is then
+            searched as a whole, so that the tracker does not follow the wrong one.
+    """
+
+    detector: MarkerDetector
+    ids: frozenset[int]
+    region: Region | None = None
+    last: dict[int, Detection] = field(default_factory=dict)
+    speed: dict[int, Float[np.ndarray, "2"]] = field(default_factory=dict)
+    whole: int = 0
+    twice: bool = False
+
+    def detect(self, grey: Grey, number: int) -> list[Detection]:
+        """Return all detections of the wanted markers in the frame of this number."""
+        if self.ids == self.last.keys() and not self.twice and number % WHOLE:
+            near = [d for d in self.detector.detect(grey, self._around()) if d.id in self.ids]
+            if self.ids == {d.id for d in near}:
+                return self._followed(near)
+        self.whole += 1
+        return self._followed(
+            [d for d in self.detector.detect(grey, self.region) if d.id in self.ids]
+        )
+
+    def _around(self) -> Region:
+        """Return the region in which the markers of the last frame are expected."""
+        low, high = np.full(2, np.inf), np.full(2, -np.inf)
+        for number, detection in self.last.items():
+            speed = self.speed.get(number, np.zeros(2))
+            corners = detection.corners + speed
+            margin = max(LEAST_AROUND, AROUND * float(np.ptp(corners, axis=0).max()))
+            low = np.minimum(low, corners.min(axis=0) - (margin + np.abs(speed)))
+            high = np.maximum(high, corners.max(axis=0) + (margin + np.abs(speed)))
+        left, top = np.floor(low).astype(int).tolist()
+        right, bottom = np.ceil(high).astype(int).tolist()
+        around = Region(left, top, right + 1, bottom + 1)
+        return around if self.region is None else around.within(self.region)
+
+    def _followed(self, detections: list[Detection]) -> list[Detection]:
+        """Return the same detections, and remember them for the next frame."""
+        now = {one.id: one for one in detections}
+        self.twice = len(now) < len(detections)
+        self.speed = {
+            number: one.middle - self.last[number].middle
+            for number, one in now.items()
+            if number in self.last
+        }
+        self.last = now
+        return detections
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """The edges between neighbouring corners, in their order.
+
+    Attributes:
+        start: x, y of the start of each edge [pixel].
+        along: vector from its start to its end [pixel].
+        outward: unit vector at a right angle to it, outwards.
+        reach: reach of the samples to both sides [pixel].
+    """
+
+    start: Float[np.ndarray, "marker 4 2"]
+    along: Float[np.ndarray, "marker 4 2"]
+    outward: Float[np.ndarray, "marker 4 2"]
+    reach: Float[np.ndarray, "marker 4"]
+
+    @classmethod
+    def between(cls, corners: Float[np.ndarray, "marker 4 2"], squares: int) -> "_Edges":
+        along = np.roll(corners, -1, axis=1) - corners
+        length = np.maximum(np.linalg.norm(along, axis=-1), 1e-6)
+        outward = np.stack([along[..., 1], -along[..., 0]], axis=-1) / length[..., None]
+        return cls(corners, along, outward, np.minimum(REACH * length / squares, MOST_REACH))
+
+
+def refined(
+    grey: Grey, corners: Float[np.ndarray, "marker 4 2"], squares: int
+) -> Float[np.ndarray, "marker 4 2"]:
+    """Return corners as intersections of lines through the edges.
+
+    Corners of a marker without clear edges, or that would move too far, stay as they were.
+
+    Args:
+        grey: the frame.
+        corners: x, y [pixel], clockwise, off by a pixel or so.
+        squares: number of squares along an edge of the marker, with its border.
+    """
+    result = corners
+    for _ in range(ROUNDS):
+        edges = _Edges.between(result, squares)
+        better = _intersections(edges, _offsets(edges, _profiles(grey, edges)))
+        moved = np.linalg.norm(better - corners, axis=-1).max(axis=-1)
+        with np.errstate(invalid="ignore"):
+            sound = moved < 1.5 + edges.reach.min(axis=-1)
+        result = np.where(sound[:, None, None], better, corners)
+    return result
+
+
+def _profiles(grey: Grey, edges: _Edges) -> Float[np.ndarray, "marker 4 along across"]:
+    """Return the brightness from inside to outside, at places along each edge."""
+    along, across = np.linspace(ENDS, 1 - ENDS, ALONG), np.linspace(-1, 1, ACROSS)
+    aside = edges.reach[..., None] * across
+    places = (
+        edges.start[:, :, None, None]
+        + edges.along[:, :, None, None] * along[:, None, None]
+        + (edges.outward[:, :, None] * aside[..., None])[:, :, None]
+    )
+    flat = places.reshape(-1, ALONG * ACROSS, 2).astype(np.float32)
+    cv2 = opencv()
+    brightness = cv2.remap(
+        *(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR), borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(brightness, float).reshape(places.shape[:-1])
+
+
+def _offsets(
+    edges: _Edges, profiles: Float[np.ndarray, "marker 4 along across"]
+) -> Float[np.ndarray, "marker 4 2"]:
+    """Return the distance of each edge's fitted line outwards from its start and its end [pixel].
+
+    It is NaN where black and white do not differ.
+    """
+    dark = np.median(profiles[..., :LEVELS], axis=(-1, -2))
+    bright = np.median(profiles[..., -LEVELS:], axis=(-1, -2))
+    contrast = np.where(bright - dark > LEAST_CONTRAST, bright - dark, np.nan)
+    part = (profiles - dark[..., None, None]) / contrast[..., None, None]
+    area = np.trapezoid(np.clip(part, -0.2, 1.2), dx=2 / (ACROSS - 1), axis=-1)
+    outside = (1.0 - area) * edges.reach[..., None]
+    along = np.broadcast_to(np.linspace(ENDS, 1 - ENDS, ALONG), outside.shape)
+    kept = np.ones(outside.shape)
+    for _ in range(2):
+        weight = kept / kept.sum(axis=-1, keepdims=True)
+        middle = (weight * along).sum(axis=-1, keepdims=True)
+        mean = (weight * outside).sum(axis=-1, keepdims=True)
+        spread = (weight * (along - middle) ** 2).sum(axis=-1, keepdims=True)
+        slope = (weight * (along - middle) * (outside - mean)).sum(axis=-1, keepdims=True) / spread
+        residual = np.abs(outside - mean - slope * (along - middle))
+        limit = np.maximum(OFF, 4.5 * np.median(residual, axis=-1, keepdims=True))
+        kept = np.where(np.isfinite(residual), (residual <= limit) * 1.0, 1.0)
+    return np.asarray(mean + slope * (np.array([0.0, 1.0]) - middle))
+
+
+def _intersections(
+    edges: _Edges, offsets: Float[np.ndarray, "marker 4 2"]
+) -> Float[np.ndarray, "marker 4 2"]:
+    """Return the intersection of each edge's line with that of the edge before: its start."""
+    start = edges.start + edges.outward * offsets[..., :1]
+    along = edges.start + edges.along + edges.outward * offsets[..., 1:] - start
+    other, other_along = np.roll(start, 1, axis=1), np.roll(along, 1, axis=1)
+    gap = other - start
+    with np.errstate(divide="ignore", invalid="ignore"):
+        part = _cross(gap, other_along) / _cross(along, other_along)
+    return np.asarray(start + part[..., None] * along)
+
+
+def _cross(
+    one: Float[np.ndarray, "*batch 2"], other: Float[np.ndarray, "*batch 2"]
+) -> Float[np.ndarray, "*batch"]:
+    return one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]

@@ -1,0 +1,233 @@
+"""A file of tracked poses beside a log, and a picture of one frame to check them by eye.
+
+The file is CSV or Parquet, with a row for each frame. Columns: frame; time [s]; x, y [m],
+heading [rad], empty where the frame has no pose; their covariance (var_x, var_y, var_heading,
+cov_xy, cov_x_heading, cov_y_heading) [m, rad]; size, the apparent over the true size of the markers
+[1]; rejected_x, rejected_y, rejected_heading, a fitted but rejected pose; and flag, a word.
+"""
+
+import io
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from slipid.camera.opencv import Grey, opencv
+from slipid.camera.overhead import OverheadCamera
+from slipid.camera.tracking.track import Flag, TrackedPoses
+from slipid.support.errors import DataError
+from slipid.support.files import writable, write_bytes
+
+_FORMATS = {
+    **dict.fromkeys(("time", "x", "y", "heading"), "%.6f"),
+    **dict.fromkeys(("var_x", "var_y", "var_heading"), "%.4g"),
+    **dict.fromkeys(("cov_xy", "cov_x_heading", "cov_y_heading"), "%.4g"),
+    "size": "%.5f",
+    **dict.fromkeys(("rejected_x", "rejected_y", "rejected_heading"), "%.6f"),
+}
+"""Format in CSV of each column of numbers."""
+_HEAD = ",".join(["frame", *_FORMATS, "flag"])
+
+
+def check_writable(path: Path) -> None:
+    """Check that poses can be written to a file.
+
+    Raises:
+        DataError: they cannot, or it is Parquet without pyarrow.
+    """
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        raise DataError(f"{path}: a folder; expected the name of a file, .csv or .parquet")
+    if suffix not in (".csv", ".parquet"):
+        raise DataError(f"{path}: expected a name that ends in .csv or .parquet")
+    if suffix == ".csv" and path.is_file():
+        with path.open("rb") as file:
+            head = file.read(len(_HEAD))
+        if head not in (b"", _HEAD.encode()):
+            raise DataError(
+                f"{path}: there is a file of another kind, which would be lost; expected another "
+                "name"
+            )
+    if suffix == ".parquet":
+        _pyarrow()
+    writable(path.parent)
+
+
+def write_poses(path: Path, track: TrackedPoses) -> None:
+    """Write tracked poses: Parquet where the name ends in .parquet, otherwise CSV.
+
+    Raises:
+        DataError: nothing can be written there, or Parquet without pyarrow.
+    """
+    parquet = path.suffix.lower() == ".parquet"
+    write_bytes(path, _parquet(track) if parquet else _csv(track).encode())
+
+
+def _columns(track: TrackedPoses) -> dict[str, np.ndarray]:
+    """Return the columns of numbers, NaN where a cell is empty."""
+    p, c, r = track.pose, track.covariance, track.rejected
+    values = (
+        *(track.time, p[:, 0], p[:, 1], p[:, 2]),
+        *(c[:, 0, 0], c[:, 1, 1], c[:, 2, 2], c[:, 0, 1], c[:, 0, 2], c[:, 1, 2]),
+        *(track.size, r[:, 0], r[:, 1], r[:, 2]),
+    )
+    return dict(zip(_FORMATS, values, strict=True))
+
+
+def _flags(track: TrackedPoses) -> list[str]:
+    return [Flag(flag).word for flag in track.flag.tolist()]
+
+
+def _csv(track: TrackedPoses) -> str:
+    columns = [
+        [form % value if np.isfinite(value) else "" for value in values]
+        for form, values in zip(_FORMATS.values(), _columns(track).values(), strict=True)
+    ]
+    rows = zip(map(str, track.frame.tolist()), *columns, _flags(track), strict=True)
+    return "".join(line + "\n" for line in (_HEAD, *map(",".join, rows)))
+
+
+def _pyarrow() -> ModuleType:
+    try:
+        import pyarrow.parquet
+    except ImportError as error:
+        raise DataError(
+            f"Parquet needs {error.name}; expected: pip install 'slipid[parquet]', or a name that "
+            "ends in .csv"
+        ) from error
+    return pyarrow
+
+
+def _parquet(track: TrackedPoses) -> bytes:
+    pa = _pyarrow()
+    columns = {
+        name: pa.array(values, mask=~np.isfinite(values))
+        for name, values in _columns(track).items()
+    }
+    table = pa.table({"frame": track.frame, **columns, "flag": _flags(track)})
+    out = io.BytesIO()
+    pa.parquet.write_table(table, out)
+    return out.getvalue()
+
+
+GRID = 0.25
+"""Distance between the lines drawn on the floor [m]."""
+FLOOR, EDGE, AHEAD, LEFT = (190, 190, 60), (0, 170, 255), (40, 40, 230), (60, 190, 60)
+"""Colours of the floor, the markers' edges and the bodies' axes, in blue, green, red."""
+
+
+def write_preview(
+    path: Path, grey: Grey, camera: OverheadCamera, tracks: tuple[TrackedPoses, ...], row: int
+) -> None:
+    """Write a frame with a grid on the floor, the markers' edges and the bodies' axes.
+
+    Args:
+        path: the PNG or JPEG file to write.
+        grey: the frame.
+        camera: the camera that took it.
+        tracks: tracked poses of every body.
+        row: row of the frame in the tracks.
+
+    Raises:
+        DataError: the suffix is not of a picture, or nothing can be written there.
+    """
+    cv2 = opencv()
+    drawn = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    _grid(drawn, camera)
+    for track in tracks:
+        if track.good[row]:
+            _body(drawn, camera, track, track.pose[row])
+    write_bytes(path, _encoded(path, drawn))
+
+
+def check_drawable(path: Path) -> None:
+    """Check that a picture can be written to a file.
+
+    Raises:
+        DataError: it cannot, or the suffix is not of a picture.
+    """
+    _encoded(path, np.zeros((8, 8, 3), np.uint8))
+    writable(path.parent)
+
+
+def _encoded(path: Path, drawn: UInt8[np.ndarray, "row column 3"]) -> bytes:
+    cv2 = opencv()
+    try:
+        there, data = cv2.imencode(path.suffix or ".", drawn)
+    except cv2.error:
+        there = False
+    if not there:
+        raise DataError(f"{path}: no picture that OpenCV writes; expected .png or .jpg")
+    return bytes(data)
+
+
+def _line(
+    drawn: np.ndarray,
+    camera: OverheadCamera,
+    points: Float[np.ndarray, "point 3"],
+    colour: tuple[int, int, int],
+    width: int,
+) -> None:
+    """Draw a line through places in the world, unless it lies far outside of the picture."""
+    cv2 = opencv()
+    pixels = camera.pixels(points)
+    if np.isfinite(pixels).all() and (np.abs(pixels) < 1e5).all():
+        whole = np.round(pixels).astype(np.int32).reshape(-1, 1, 2)
+        cv2.polylines(drawn, [whole], False, colour, width, cv2.LINE_AA)
+
+
+def _grid(drawn: np.ndarray, camera: OverheadCamera) -> None:
+    """Draw lines on the visible floor, and write their distance."""
+    cv2 = opencv()
+    width, height = camera.lens.image_px
+    frame = np.stack(np.meshgrid(np.linspace(0, width, 9), np.linspace(0, height, 9)), -1)
+    floor = camera.on_plane(frame.reshape(-1, 2), 0.0)
+    floor = floor[np.isfinite(floor).all(axis=1)]
+    low, high = floor.min(axis=0), floor.max(axis=0)
+    high = np.minimum(high, low + 100 * GRID)  # a tilted camera may see the horizon
+    lines = [np.arange(np.ceil(low[k] / GRID), high[k] / GRID) * GRID for k in range(2)]
+    for axis in range(2):
+        along = np.linspace(low[1 - axis], high[1 - axis], 40)
+        for at in lines[axis]:
+            points = np.zeros((len(along), 3))
+            points[:, axis], points[:, 1 - axis] = at, along
+            _line(drawn, camera, points, FLOOR, 2 if abs(at) < 1e-9 else 1)
+            if abs(at) > 1e-9:
+                _label(drawn, camera, at * np.eye(3)[axis], f"{'xy'[axis]} {at:g}")
+    text = f"lines on the floor every {GRID:g} m, thick through the origin"
+    cv2.putText(drawn, text, (20, height - 20), cv2.FONT_HERSHEY_SIMPLEX, 0.8, FLOOR, 2)
+
+
+def _label(
+    drawn: np.ndarray, camera: OverheadCamera, place: Float[np.ndarray, "3"], text: str
+) -> None:
+    """Write text beside a place on the floor, where the picture shows it."""
+    cv2 = opencv()
+    x, y = camera.pixels(place[None])[0].tolist()
+    width, height = camera.lens.image_px
+    if 0 <= x < width and 0 <= y < height:
+        where = (round(x) + 6, round(y) - 6)
+        cv2.putText(drawn, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.6, FLOOR, 1, cv2.LINE_AA)
+
+
+def _body(
+    drawn: np.ndarray, camera: OverheadCamera, track: TrackedPoses, pose: Float[np.ndarray, "3"]
+) -> None:
+    """Draw the expected edges of the markers, and the body's axes, x red and y green."""
+    cv2 = opencv()
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    place = np.array([pose[0], pose[1], 0.0])
+    for marker in track.target.markers:
+        around = marker.corners[[0, 1, 2, 3, 0]] @ turn.T + place
+        _line(drawn, camera, around, EDGE, 2)
+    length = 1.5 * max(marker.size for marker in track.target.markers)
+    origin = np.array([0.0, 0.0, track.target.height])
+    for axis, colour in enumerate((AHEAD, LEFT)):
+        tip = origin + length * np.eye(3)[axis]
+        _line(drawn, camera, np.stack([origin, tip]) @ turn.T + place, colour, 3)
+    at = camera.pixels((origin + place)[None])[0] + (30, -60)
+    text = f"{track.target.name}: {pose[0]:.3f}, {pose[1]:.3f} m, {np.degrees(pose[2]):.1f} deg"
+    where = tuple(np.round(at).astype(int).tolist())
+    cv2.putText(drawn, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.9, AHEAD, 2)
