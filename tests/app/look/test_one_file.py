@@ -221,7 +221,7 @@ def test_currents_of_the_battery_are_left_out(tmp_path):
     layout = layout_in(config)
     assert "current" not in layout["columns"]
     assert "current_is_signed" not in layout
-    assert "what the battery gives" in config.text.replace("\n# ", " ")
+    assert "so it is the battery's" in config.text.replace("\n# ", " ")
 
 
 def test_currents_without_voltages_ask_for_the_datasheet(tmp_path):
