@@ -42,8 +42,8 @@ class BenchTask:
         choices: fixed, free and prior values of each motor's numbers by its label.
         skipped: a line for each log that is not used.
         columns_used: a line for each channel that columns of a single file were assigned to.
-        unit_is_known: the unit of the current was given, or the resistance is restricted, so
-            that an unlikely current is no error.
+        unit_is_known: the unit of the current was given, or the resistance is restricted, so that
+            an unlikely current is no error.
     """
 
     records: Mapping[str, tuple[BenchRecord, ...]]

@@ -151,8 +151,8 @@ def drawing(robot: Geometry) -> str:
     """Return a drawing of the robot from above, x up and y left, and a line for every wheel.
 
     A wheel is drawn as its number in the order of the log columns, an arrow in the direction in
-    which
-    it rolls at a positive speed, and the letter of the motor that it shares with other wheels.
+    which it rolls at a positive speed, and the letter of the motor that it shares with other
+    wheels.
     """
     lines = ["seen from above, arrows: the way of a positive wheel speed", ""]
     lines += _picture(_grid_wheels(robot))

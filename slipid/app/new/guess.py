@@ -1,7 +1,7 @@
 """Guess the robot behind logs, and sort log files into runs.
 
-The drive follows from the number of wheels and from sideways motion. Files of published formats
-are recognised, and files that belong to one run are put together.
+The drive follows from the number of wheels and from sideways motion. Files of published formats are
+recognised, and files that belong to one run are put together.
 """
 
 from dataclasses import dataclass, replace
