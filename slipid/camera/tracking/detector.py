@@ -84,7 +84,7 @@ class Region:
 
 
 def cut(grey: Grey, region: Region | None) -> UInt8[np.ndarray, "down across"]:
-    """Return a region of a picture, without what lies outside of it; all of it for None."""
+    """Return the part of a picture within a region, or all of it where that is None."""
     if region is None:
         return grey
     part = region.within(Region(0, 0, *size_of(grey)))
