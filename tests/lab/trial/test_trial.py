@@ -551,7 +551,7 @@ def test_a_controller_is_told_another_map_than_the_true_one(tmp_path, deployed, 
         return tr._tasks(tmp_path, tr.TrialOptions(**wish, **more))
 
     plain, other = jobs()[0], jobs(told_map=tmp_path / "told.toml")[0]
-    assert plain.told is plain.floor
+    assert plain.known_map is plain.floor
     assert other.kept.folder != plain.kept.folder
     middle = np.array([[0.0, 0.5], [0.9, 0.5]])
 
@@ -559,7 +559,7 @@ def test_a_controller_is_told_another_map_than_the_true_one(tmp_path, deployed, 
         return [floor.surfaces[int(k)] for k in floor.at(middle)]
 
     assert named(other.floor) == named(plain.floor) == labels[:2]
-    assert named(other.told) == labels[1::-1]
+    assert named(other.known_map) == labels[1::-1]
 
     class Told(Exception):
         pass
@@ -690,7 +690,7 @@ def test_the_summary_is_of_medians_over_starts_with_intervals():
 
 def test_live_readings_are_as_the_sensors_log_them():
     live = SitePlant(uniform("firm"), "as_built", (0.0, 0.0, 0.0), 1, gyro=False)
-    forward = live.plant.machine.wheel_from_twist @ np.array([0.2, 0.0, 0.0])
+    forward = live.plant.robot.wheel_from_twist @ np.array([0.2, 0.0, 0.0])
     for _ in range(20):
         reading = live.step(forward)
     tick = 2 * np.pi / (2000 * 16)
