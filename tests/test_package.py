@@ -19,6 +19,11 @@ def test_version_is_the_installed_one():
     assert slipid.__version__ == importlib.metadata.version("slipid")
 
 
+def test_older_public_names_still_work():
+    assert slipid.made_runs is slipid.simulate_runs
+    assert slipid.move is slipid.steady_motion
+
+
 def test_import_is_light_and_silent():
     code = (
         f"import json, sys, slipid\nprint(json.dumps([m for m in {HEAVY!r} if m in sys.modules]))"
