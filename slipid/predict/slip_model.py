@@ -174,8 +174,8 @@ class RunSignals:
         """
         if self.current is None:
             raise ValueError(f"{self.name}: no current; this method needs one")
-        way = np.sign(self.speed)
-        return np.asarray(self.current * way if self.current_is_signed else self.current)
+        signed = self.current_is_signed
+        return np.asarray(self.current * np.sign(self.speed) if signed else self.current)
 
     def torque(self, spec: RobotSpec, rest: float = SHAFT_W0) -> Float[np.ndarray, "step drive"]:
         """Return M = C_e I + R I^2 w / (w^2 + w0^2) [N m], w the shaft's speed and w0 `rest`.
@@ -394,8 +394,8 @@ def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, 
 
 def relative_to_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "edge 3"]:
     """Return poses relative to the first of them."""
-    moved = path - path[0]
-    return np.column_stack([turned(-path[0, 2], moved[:, :2]), moved[:, 2]])
+    offset = path - path[0]
+    return np.column_stack([turned(-path[0, 2], offset[:, :2]), offset[:, 2]])
 
 
 def body_increments(pose: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "step 3"]:

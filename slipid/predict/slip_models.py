@@ -167,8 +167,8 @@ def _of_wheels(has_current: bool, together: Together | None) -> list[TwistModel]
 def restored(shape: Geometry, states: Mapping[str, Mapping[str, Sequence]]) -> list[FloorModels]:
     """Return slip models from their names and states, as `{model.name: model.state}` wrote them."""
     known = {model.name: model for model in slip_models(shape, has_current=True)}
-    if strange := sorted(set(states) - set(known)):
-        raise ValueError(f"no model '{strange[0]}'; there are: {', '.join(known)}")
+    if unknown := sorted(set(states) - set(known)):
+        raise ValueError(f"no model '{unknown[0]}'; there are: {', '.join(known)}")
     return [
         known[name].with_state({floor: np.asarray(v, float) for floor, v in state.items()})
         for name, state in states.items()
