@@ -133,7 +133,7 @@ def joined(data: Runs) -> JoinedRuns:
     length = np.array([log.duration for log in data.logs])
     starts = np.concatenate([[0.0], np.cumsum(length + 1.0)])[:-1]
     time = data.time + np.repeat(starts - first, np.diff(data.offset))
-    # a pose holds to both ends of its run: nothing is drawn between runs
+    # a pose holds to both ends of its run, so that none is interpolated between runs
     fresh = data.fresh.copy()
     fresh[data.offset[:-1]] = fresh[data.offset[1:] - 1] = True
 
@@ -253,7 +253,7 @@ def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, 
     before, after = at.pose_before * flip, at.pose_after * flip
     before[:, 2] = _heading(before[:, 2], convention.heading)
     turned = _heading(after[:, 2], convention.heading) - before[:, 2]
-    if convention.heading in ("radians", "half_sine"):  # the reader could not see where it wraps
+    if convention.heading in ("radians", "half_sine"):  # the reader did not know the wrap
         turned = np.mod(turned + np.pi, 2 * np.pi) - np.pi
     after[:, 2] = before[:, 2] + turned
     return body_increments(before, after)
@@ -268,7 +268,7 @@ def _heading(logged: Float[np.ndarray, " step"], meaning: Heading) -> Float[np.n
     if meaning == "radians":
         return np.degrees(logged)
     if meaning == "half_sine":
-        # beyond: no sine
+        # values beyond 1 are no sine
         return 2 * np.arcsin(np.where(np.abs(logged) <= 1.0 + 1e-3, logged.clip(-1, 1), np.nan))
     return logged
 

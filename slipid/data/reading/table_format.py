@@ -189,7 +189,7 @@ def _header_rows(rows: list[list[str]], width: int) -> tuple[int, int]:
         filled = [cell for cell in row if cell]
         if len(row) < width - 1 or len(filled) < len(row) - 2:
             continue
-        # below names single letters are units as well: above, they may be the names themselves
+        # single letters are units below the names; above, they may be names themselves
         counted = sum(map(bool, map(unit_in, filled))) if names else sum(map(is_unit, filled))
         if counted > 0.5 * len(filled) and (names or any(len(c) > 1 for c in filled)):
             units = k
@@ -197,7 +197,7 @@ def _header_rows(rows: list[list[str]], width: int) -> tuple[int, int]:
             names = k
     if names or not units:
         return names, units
-    # units written out, each once, are the names of their columns
+    # written-out units that occur once each are the names of their columns
     cells = [cell for cell in rows[units - 1] if cell]
     words = any(len(cell) > 4 and cell.isalpha() for cell in cells)
     return (units, 0) if words and len(set(cells)) == len(cells) else (0, 0)

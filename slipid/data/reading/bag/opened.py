@@ -123,7 +123,7 @@ class OpenBag:
                     if data.__class__ is not bytes:
                         raise TypeError(f"a message of type {type(data).__name__}")
                     yield RawMessage(connection.topic, received, data)
-            except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
+            except Exception as error:  # rosbags raises errors of many types on damaged bytes
                 raise damage_error(self.files, error) from error
 
     def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
@@ -150,7 +150,7 @@ class OpenBag:
                     if room[topic] < 0:
                         yield batch
                         waiting[topic], room[topic] = MessageBatch(topic, [], []), _BATCH_BYTES
-            except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
+            except Exception as error:  # rosbags raises errors of many types on damaged bytes
                 raise damage_error(self.files, error) from error
         yield from (batch for batch in waiting.values() if batch.data)
 
@@ -228,7 +228,7 @@ def _reader(path: Path | RepairedMcap, files: BagFiles, stack: ExitStack) -> "Re
             return stack.enter_context(rosbag1.Reader(files.path))
         # a repaired file has the methods of a path that rosbags uses
         return stack.enter_context(rosbag2.Reader(cast(Path, path)))
-    except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
+    except Exception as error:  # rosbags raises errors of many types on damaged bytes
         raise damage_error(files, error) from error
 
 

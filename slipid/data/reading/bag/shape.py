@@ -320,7 +320,7 @@ class JointPick:
         names = shape.texts((PathStep("name"),))
         self.names.update(dict.fromkeys(names))
         places = shape.places((PathStep(self.array),))
-        # an array may be left empty; of any other length it says nothing of the names
+        # an array may be empty; one of another length does not match the names
         have = dict(zip(names, places, strict=True)) if len(places) == len(names) else {}
         numbers = [have.get(joint) for joint in self.joints]
         if not any(numbers):

@@ -58,7 +58,7 @@ def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream
             f"{late.max() / 1e9:.3g} s were sorted"
         )
     order = np.argsort(time, kind="stable")
-    # of messages with one stamp the last one stands
+    # the last of several messages with the same stamp is kept
     last = np.append(np.diff(time[order]) != 0, True)
     if repeated := int((~last).sum()):
         notes.append(
