@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.data.reading.bag.layout import GROUPS, BagLayout
-from slipid.data.reading.bag.meanings import first_names
 from slipid.data.reading.bag.plan import ChannelPlan
 from slipid.data.reading.bag.shape import Edge, JointPick, TransformPick
 from slipid.data.reading.bag.streams import Stream
@@ -18,7 +17,7 @@ from slipid.data.reading.bag.transforms import STATIC, TransformSeries, composed
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL
 from slipid.data.reading.signal import Signal, SignalSource
 from slipid.data.reading.units import factor
-from slipid.support.errors import DataError, did_you_mean
+from slipid.support.errors import DataError, did_you_mean, first_names
 
 APART_NOTED = 0.5
 """Difference between two clocks that is worth a note [s]."""
