@@ -79,7 +79,9 @@ class VectorMap:
         """Return a FeatureCollection, with all other data under the key `slipid`."""
         about = {
             "schema": SCHEMA,
-            "extent_m": [round(v, DIGITS) for v in self._corners()],
+            "extent_m": [
+                round(v, DIGITS) for v in (self.low_x, self.low_y, self.high_x, self.high_y)
+            ],
             "cell_m": self.cell,
             "base": self.base,
             "colours": self.colours,
@@ -89,9 +91,6 @@ class VectorMap:
         }
         features = [self._feature(patch) for patch in self.patches]
         return {"type": "FeatureCollection", "slipid": about, "features": features}
-
-    def _corners(self) -> tuple[float, float, float, float]:
-        return self.low_x, self.low_y, self.high_x, self.high_y
 
     def _feature(self, patch: Patch) -> Content:
         closed = [np.concatenate([ring, ring[:1]]).round(DIGITS) for ring in patch.rings]

@@ -11,14 +11,12 @@ mean:
 since a linear map of turns absorbs order, signs, radius, azimuths and heading offset alike.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import body_increments, integral, interpolate
 
@@ -137,17 +135,20 @@ def joined(data: Runs) -> JoinedRuns:
     fresh = data.fresh.copy()
     fresh[data.offset[:-1]] = fresh[data.offset[1:] - 1] = True
 
-    def channel(of: Callable[[Log], np.ndarray | None], summed: bool) -> JoinedChannel | None:
-        """A channel, or its integral, nan where a run lacks it; None where every run does."""
-        parts = [_columns(log, of(log), summed) for log in data.logs]
-        columns = next((part.shape[1] for part in parts if part is not None), None)
-        if columns is None:
+    def channel(name: str, summed: bool = True) -> JoinedChannel | None:
+        """Return a channel, or its integral; nan where a run lacks it, None where all do."""
+        logged = [getattr(log, name) for log in data.logs]
+        columns = [values.size // len(values) for values in logged if values is not None]
+        if not columns:
             return None
-        filled = [
-            np.full((log.samples, columns), np.nan) if part is None else part
-            for log, part in zip(data.logs, parts, strict=True)
-        ]
-        return JoinedChannel(time, np.concatenate(filled))
+        parts = []
+        for log, values in zip(data.logs, logged, strict=True):
+            if values is None:
+                parts.append(np.full((log.samples, columns[0]), np.nan))
+                continue
+            part = values.reshape(log.samples, -1)
+            parts.append(integral(log.time, part) if summed else part)
+        return JoinedChannel(time, np.concatenate(parts))
 
     return JoinedRuns(
         names=tuple(log.name for log in data.logs),
@@ -156,23 +157,15 @@ def joined(data: Runs) -> JoinedRuns:
         row=np.array([float(np.median(np.diff(log.time))) for log in data.logs]),
         angle=JoinedChannel(time, data.wheel_angle),
         pose=JoinedChannel(time[fresh], data.pose[fresh]),
-        reported=channel(lambda log: log.wheel_speed, summed=True),
-        commanded=channel(lambda log: log.wheel_speed_command, summed=True),
-        twist=channel(lambda log: log.twist_command, summed=True),
-        gyro=channel(lambda log: log.gyro, summed=True),
-        current=channel(lambda log: log.current, summed=False),
-        voltage=channel(lambda log: log.voltage, summed=False),
-        bus=channel(lambda log: log.bus_voltage, summed=False),
+        reported=channel("wheel_speed"),
+        commanded=channel("wheel_speed_command"),
+        twist=channel("twist_command"),
+        gyro=channel("gyro"),
+        current=channel("current", summed=False),
+        voltage=channel("voltage", summed=False),
+        bus=channel("bus_voltage", summed=False),
         current_is_signed=data.current_is_signed,
     )
-
-
-def _columns(log: Log, values: np.ndarray | None, summed: bool) -> np.ndarray | None:
-    """Return the columns of a channel of a run, or their integrals."""
-    if values is None:
-        return None
-    columns = values.reshape(log.samples, -1)
-    return integral(log.time, columns) if summed else columns
 
 
 def edges(data: JoinedRuns) -> StepEdges:
@@ -199,11 +192,9 @@ def increments(data: JoinedRuns, at: StepEdges, lag: float) -> ChannelIncrements
         change[outside] = np.nan
         return change
 
-    def maybe(channel: JoinedChannel | None) -> np.ndarray | None:
-        return None if channel is None else moved(channel)
-
+    optional = (data.commanded, data.twist, data.gyro)
     return ChannelIncrements(
-        moved(data.angle), maybe(data.commanded), maybe(data.twist), maybe(data.gyro)
+        moved(data.angle), *(None if channel is None else moved(channel) for channel in optional)
     )
 
 

@@ -114,17 +114,20 @@ class OpenBag:
         Raises:
             DataError: the bag is damaged.
         """
+        for connection, received, data in self._stored(topics, start):
+            if data.__class__ is not bytes:
+                error = TypeError(f"a message of type {type(data).__name__}")
+                raise damage_error(self.files, error)
+            yield RawMessage(connection.topic, received, data)
+
+    def _stored(self, topics: Sequence[str], start: int | None) -> Iterator[Any]:
+        """Yield connection, time of receipt [ns] and data of messages, as rosbags does."""
         for reader in self.readers:
-            wanted = [c for c in reader.connections if c.topic in topics]
-            if not wanted:
-                continue
-            try:
-                for connection, received, data in _source(reader)(wanted, start):
-                    if data.__class__ is not bytes:
-                        raise TypeError(f"a message of type {type(data).__name__}")
-                    yield RawMessage(connection.topic, received, data)
-            except Exception as error:  # rosbags raises errors of many types on damaged bytes
-                raise damage_error(self.files, error) from error
+            if wanted := [c for c in reader.connections if c.topic in topics]:
+                try:
+                    yield from _source(reader)(wanted, start)
+                except Exception as error:  # rosbags raises many types of errors on damaged bytes
+                    raise damage_error(self.files, error) from error
 
     def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
         """Yield the same messages topic by topic, about a megabyte at a time.
@@ -136,22 +139,15 @@ class OpenBag:
         """
         waiting = {topic: MessageBatch(topic, [], []) for topic in topics}
         room = dict.fromkeys(topics, _BATCH_BYTES)
-        for reader in self.readers:
-            wanted = [c for c in reader.connections if c.topic in waiting]
-            if not wanted:
-                continue
-            try:
-                for connection, received, data in _source(reader)(wanted, None):
-                    topic = connection.topic
-                    batch = waiting[topic]
-                    batch.received.append(received)
-                    batch.data.append(data)
-                    room[topic] -= len(data)
-                    if room[topic] < 0:
-                        yield batch
-                        waiting[topic], room[topic] = MessageBatch(topic, [], []), _BATCH_BYTES
-            except Exception as error:  # rosbags raises errors of many types on damaged bytes
-                raise damage_error(self.files, error) from error
+        for connection, received, data in self._stored(topics, None):
+            topic = connection.topic
+            batch = waiting[topic]
+            batch.received.append(received)
+            batch.data.append(data)
+            room[topic] -= len(data)
+            if room[topic] < 0:
+                yield batch
+                waiting[topic], room[topic] = MessageBatch(topic, [], []), _BATCH_BYTES
         yield from (batch for batch in waiting.values() if batch.data)
 
 
