@@ -103,7 +103,7 @@ def collect(
             )
         if log.pose is None:
             raise DataError(
-                f"{log.name}: no pose; expected camera columns, there is nothing to fit without"
+                f"{log.name}: no pose; expected the columns of a camera, which a fit needs"
             )
     offset = np.concatenate([[0], np.cumsum([log.samples for log in logs])])
     heading, speed, turn = np.array([_command(log) for log in logs]).T

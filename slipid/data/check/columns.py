@@ -51,7 +51,7 @@ def misordered(logs: Sequence[Log]) -> Iterator[Finding]:
         listed = ", ".join(map(str, order))
         yield Finding(
             "wheel_columns",
-            f"the wheels move as their {name} says only if their columns are taken in the order "
+            f"the wheels match their {name} only with their columns in the order "
             f"{listed}, where those below zero count backwards",
             f"list the columns of the wheels, or those of {name}, in another order, or set "
             "scale = -1 for those that count backwards",
@@ -235,8 +235,8 @@ def _sign_findings(
         listed = ", ".join(str(k + 1) for k in order)
         yield Finding(
             f"{name}_order",
-            f"the columns of the {name} are in another order than the wheels: number {listed} "
-            f"go with wheels 1 to {len(order)}",
+            f"the columns of the {name} are in another order than the wheels: columns {listed} "
+            f"belong to wheels 1 to {len(order)}",
             f"name the columns of the channel {name} in the order {listed}",
         )
         return

@@ -73,7 +73,7 @@ def wrong(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 _CONVENTION_SENTENCES = {
-    "heading_sign": "the heading of the poses turns the other way round than the body does",
+    "heading_sign": "the heading of the poses turns in the opposite direction of the body",
     "pose_axis": "an axis of the poses has the wrong sign",
     "pose_swapped": "x and y of the poses are exchanged",
     "pose_mirrored": "the poses are mirrored, as from below or in an image whose y points down",
@@ -218,10 +218,10 @@ def ratio_sentence(scales: ScaleRatios) -> str:
     sentences = {
         "travel": "the body's path length is {:.3g} times that of the wheels",
         "turning": "the body turns {:.3g} times as much as the wheels",
-        "drive": "the commanded motion is {:.3g} times what the wheels did",
-        "steer": "the commanded turn is {:.3g} times what the wheels did",
+        "drive": "the commanded motion is {:.3g} times that of the wheels",
+        "steer": "the commanded turn is {:.3g} times that of the wheels",
         "command": "the commanded wheel speeds are {:.3g} times the measured ones",
-        "report": "the reported wheel speeds are {:.3g} times what the encoders say",
+        "report": "the reported wheel speeds are {:.3g} times those of the encoders",
         "gyro": "the gyro turns {:.3g} times as much as the poses",
     }
     unnatural = {k: r.value for k, r in scales.known.items() if not r.natural}

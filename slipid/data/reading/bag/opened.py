@@ -179,7 +179,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
 def _readers(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str]]":
     """Return open readers of a bag, which a stack closes, and notes on its defects."""
     notes = [
-        f"{part.name}-wal lies beside the bag: messages in it are not read; "
+        f"{part.name}-wal has messages of the bag that are not read; "
         f"to add them run: sqlite3 {part} 'PRAGMA wal_checkpoint'"
         for part in files.parts
         if (wal := part.with_name(part.name + "-wal")).exists() and wal.stat().st_size
