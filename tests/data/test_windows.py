@@ -349,7 +349,7 @@ def test_different_robots_are_refused():
 
 
 def test_runs_without_poses_are_refused():
-    with pytest.raises(DataError, match=r"b\.csv: no pose; expected camera columns"):
+    with pytest.raises(DataError, match=r"b\.csv: no pose; expected the columns of a camera"):
         collect([run("a.csv"), run("b.csv", pose=None, pose_fresh=None)])
 
 
