@@ -228,30 +228,30 @@ def ratio_sentence(scales: ScaleRatios) -> str:
     return ", ".join(sentences[k].format(value) for k, value in unnatural.items())
 
 
-def _factor_finding(of: ScaleCause, gear_ratio: float) -> Finding:
+def _factor_finding(cause: ScaleCause, gear_ratio: float) -> Finding:
     """Return the finding about a factor by which a channel is too large."""
-    factor, (kind, channel) = of.factor, _CAUSES[of.name]
+    factor, (kind, channel) = cause.factor, _CAUSES[cause.name]
     ratio = f"{max(factor, 1 / factor):.3g}"
     size = f"{ratio} times too {'large' if factor > 1 else 'small'}"
     found = f"{channel} is {size}"
-    if of.name == "time":
+    if cause.name == "time":
         unit = _unit_name(factor, {1e3: "ms", 1e6: "us", 1e9: "ns", 60.0: "s", 1e-3: "s"})
         remedy = f"set unit = '{unit}' for the channel time" if unit else "correct the unit of time"
         found = f"time is in another unit, {size}"
-    elif of.name == "pose_length":
+    elif cause.name == "pose_length":
         unit = _unit_name(factor, {1e3: "mm", 1e2: "cm", 1e-3: "m", 1e-2: "m"})
         to = f"set unit = '{unit}' for the channels" if unit else "correct the unit or scale of"
         remedy = f"{to} pose_x and pose_y (scale = {1 / factor:.3g})"
-    elif of.name == "heading":
+    elif cause.name == "heading":
         remedy = f"set unit = '{'deg' if factor > 1 else 'rad'}' for the channel pose_heading"
-    elif of.name == "wheel_radius":
+    elif cause.name == "wheel_radius":
         found = f"wheel_radius_m is {size}, or the wheels' turns are"
         remedy = (
             f"divide wheel_radius_m in [robot] by {factor:.3g}, or {_turns(factor, gear_ratio)}"
         )
     elif kind == "wheel_scale":
         remedy = _turns(factor, gear_ratio)
-    elif of.name == "base":
+    elif cause.name == "base":
         found = (
             f"{channel} is {'more' if factor > 1 else 'less'} than declared, by a factor of {ratio}"
         )

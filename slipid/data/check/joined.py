@@ -289,6 +289,16 @@ class Products:
     known: Bool[np.ndarray, " every"]
     weight: Float[np.ndarray, " step"]
 
+    def predicted(self, predict: Float[np.ndarray, "3 wheel"]) -> Float[np.ndarray, "3"]:
+        """Return the sum of squares of the predicted body increments along each axis [m^2]."""
+        return np.einsum("aw,wv,av->a", predict, self.turns, predict)
+
+    def matched(
+        self, predict: Float[np.ndarray, "3 wheel"], axes: Float[np.ndarray, "3 3"]
+    ) -> Float[np.ndarray, "3"]:
+        """Return the sum of products of predicted and measured increments along each axis [m^2]."""
+        return np.einsum("aw,wa->a", predict, self.across @ axes.T)
+
 
 def usable(*parts: Float[np.ndarray, "step _"]) -> Bool[np.ndarray, " step"]:
     """Return whether all parts are known, for each step."""
