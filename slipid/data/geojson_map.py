@@ -135,7 +135,7 @@ class _About(Section):
     notes: list[str]
 
 
-class _File(Section):
+class _GeojsonFile(Section):
     """A GeoJSON map file."""
 
     type: Literal["FeatureCollection"]
@@ -149,7 +149,7 @@ def read_vector_map(path: Path) -> VectorMap:
     Raises:
         DataError: the file is absent, is no such map, or has wrong values.
     """
-    given = checked(path, read_json(path, WHAT), _File)
+    given = checked(path, read_json(path, WHAT), _GeojsonFile)
     about = given.slipid
     low_x, low_y, high_x, high_y = about.extent_m
     if not (low_x < high_x and low_y < high_y):
