@@ -180,7 +180,7 @@ def turn_per_lag(data, lag, small):
 
 
 @pytest.mark.parametrize("lag", [0.1, 0.156])
-def test_faster_is_the_derivative_by_the_lag(logs, lag):
+def test_speed_change_is_the_derivative_by_the_lag(logs, lag):
     data = collect(logs)
     w = windows(data, RADIUS, lag=lag)
     # a secant over the 0.16 s in which speeds are taken, but for the end of the run
