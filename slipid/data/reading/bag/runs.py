@@ -13,7 +13,7 @@ from slipid.data.log import Log
 from slipid.data.reading.bag.layout import BagLayout, RunRule
 from slipid.data.reading.bag.opened import OpenBag
 from slipid.data.reading.bag.plan import message_of
-from slipid.data.reading.bag.shape import MessageShape, shape_of, steps_of
+from slipid.data.reading.bag.shape import MessageShape, located_with_time, shape_of, steps_of
 from slipid.data.reading.bag.streams import topic_error
 from slipid.data.reading.layout import TURNS
 from slipid.data.reading.signal import Signal
