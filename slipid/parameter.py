@@ -1,4 +1,4 @@
-"""Numbers with a name, a unit, bounds and a prior; the way from SI values to the search space.
+"""Fitted numbers with a name, a unit, bounds and a prior, and their map to the search space.
 
 A class declares its numbers where its equations are:
 
@@ -20,28 +20,31 @@ import numpy as np
 from jaxtyping import Array, Float
 
 Numbers = Array | np.ndarray
-"""Numbers that are being traced or lie on a device, or numpy's, for which nothing is compiled."""
+"""Arrays of jax (traced or on a device) or of numpy, for which nothing is compiled."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Declaration:
-    """What a number is, wherever it stands.
+    """Unit, bounds and prior of a number, the same wherever it occurs.
 
     Attributes:
-        unit: as pint spells it, "1" without dimension.
-        symbol: as the equations write it.
-        start: value when nothing else is known [unit].
-        lower: smallest value; with no `upper` the search space is logarithmic above it.
-        upper: largest value; with both the search space is the log-odds of the place between them.
-        spread: std of the prior in the search space when the user gives none: a log-std where the
-            space is logarithmic, in [unit] where there are no bounds.
-        free: whether it is fitted unless the user says otherwise.
-        shares: the numbers of the array are positive and sum to one.
-        deviation: the numbers of the array sum to zero and stand for what a model lacks; the spread
-            of all of them together is found from the data, up to about `spread`.
+        unit: unit as pint spells it, "1" for a dimensionless number.
+        symbol: symbol in the equations.
+        start: value used when nothing else is known [unit].
+        lower: smallest value; with no `upper` the search space is the logarithm of the value above
+            it.
+        upper: largest value; with both bounds the search space is the log-odds of the position
+            between them.
+        spread: default std of the prior in the search space: a log-std where the space is
+            logarithmic, in [unit] where there are no bounds.
+        free: whether the number is fitted unless the user says otherwise.
+        shares: whether the numbers of the array are positive and sum to one.
+        deviation: whether the numbers of the array sum to zero and stand for what the model lacks;
+            their common spread is estimated from the data, up to about `spread`.
         doc: one line for people.
-        electric: it is read from currents and voltages given the motion, not from the motion.
-        of: what the numbers of a vector are of, one each: a wheel, a drive or an axis.
+        electric: whether the number is estimated from currents and voltages given the motion, not
+            from the motion.
+        of: what each number of a vector belongs to: a wheel, a drive or an axis.
     """
 
     unit: str
@@ -59,16 +62,16 @@ class Declaration:
 
     @property
     def logarithmic(self) -> bool:
-        """Whether the search space is that of a logarithm."""
+        """Whether the search space is logarithmic."""
         return math.isinf(self.upper) and not math.isinf(self.lower)
 
     @property
     def constrained(self) -> bool:
-        """Whether its numbers have one coordinate less than there are of them."""
+        """Whether the array has one search-space coordinate less than it has numbers."""
         return self.shares or self.deviation
 
     def to_search(self, value: Any) -> np.ndarray:
-        """Search-space vector of an SI value (scalar or array)."""
+        """Return the search-space vector of an SI value (scalar or array)."""
         x = np.atleast_1d(np.asarray(value, float))
         if self.constrained:
             return np.asarray((np.log(x) if self.shares else x) @ share_basis(len(x)))
@@ -80,7 +83,7 @@ class Declaration:
         return np.log(p) - np.log1p(-p)
 
     def to_si(self, z: Float[Numbers, "*some n"]) -> Float[Numbers, "*some m"]:
-        """SI values of a search-space vector, or of many; numpy's for numpy's, uncompiled."""
+        """Return the SI values of one or many search-space vectors; numpy input is not compiled."""
         if self.constrained:
             x: Numbers = z @ share_basis(z.shape[-1] + 1).T
             return _softmax(x) if self.shares else x
@@ -91,7 +94,7 @@ class Declaration:
         return self.lower + (self.upper - self.lower) * _sigmoid(z)
 
     def slope(self, value: Any) -> Any:
-        """Derivative d SI / d search at SI values, of numbers that are not tied."""
+        """Return d SI / d search at SI values; the numbers must not be constrained."""
         if math.isinf(self.lower) and math.isinf(self.upper):
             return np.ones_like(value)
         if math.isinf(self.upper):
@@ -115,7 +118,7 @@ def _sigmoid(z: Numbers) -> Numbers:
 
 
 def share_basis(n: int) -> np.ndarray:
-    """Orthonormal basis (n, n-1) of the vectors that sum to zero (Helmert)."""
+    """Return an orthonormal basis (n, n-1) of the vectors that sum to zero (Helmert)."""
     basis = np.zeros((n, n - 1))
     for k in range(1, n):
         basis[:k, k - 1] = 1.0
@@ -127,7 +130,7 @@ def share_basis(n: int) -> np.ndarray:
 def parameter(
     unit: str, symbol: str, doc: str = "", *, per: str | None = None, **declared: Any
 ) -> Any:
-    """Dataclass field that holds a fitted number, declared by the attributes of `Declaration`.
+    """Return a dataclass field of a fitted number, declared by the attributes of `Declaration`.
 
     Args:
         per: name of the attribute of the same object, `loads` or `sessions`, that holds one label
@@ -144,21 +147,22 @@ def parameter(
 
 
 _OF = {"labels": "surface", "loads": "load", "sessions": "session"}
-"""What the labels under a name are of."""
+"""Name of the `Entry` attribute that holds a label, by the attribute that lists the labels."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """One declared number (or short vector) of a tree.
+    """A declared number (or short vector) at its place in a tree.
 
     Attributes:
-        path: its one name, as in tables, files and errors.
-        quantity: the same without the floor, load set-up or session it is of: `surface.friction`.
-        declaration: unit, bounds, prior.
+        path: unique name, as in tables, files and errors.
+        quantity: the path without the surface, load set-up or session: `surface.friction`.
+        declaration: unit, bounds and prior.
         leaf: attribute names from the root to the array.
-        index: place on the array's leading axis, None for the whole array.
-        size: how many numbers.
-        surface, load, session: that it is of, None for a number that all of them share.
+        index: position on the array's leading axis, None for the whole array.
+        size: number of values.
+        surface, load, session: label the number belongs to, None for a number that all labels
+            share.
     """
 
     path: str
@@ -173,15 +177,15 @@ class Entry:
 
     @property
     def part(self) -> str:
-        """Attribute of the whole it belongs to: `motor`, `surfaces`, `camera`."""
+        """Attribute of the root it belongs to: `motor`, `surfaces`, `camera`."""
         return self.leaf[0]
 
     def whole(self, tree: Any) -> Any:
-        """Array of a tree that it stands in."""
+        """Return the whole array of a tree that contains this number."""
         return functools.reduce(getattr, self.leaf, tree)
 
     def get(self, tree: Any) -> Any:
-        """Value in a tree [SI], scalar or vector."""
+        """Return the value in a tree [SI], scalar or vector."""
         whole = self.whole(tree)
         if self.index is None:
             return whole
@@ -190,7 +194,7 @@ class Entry:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Names of a vector's entries, none for a scalar."""
+        """Names of a vector's entries, empty for a scalar."""
         if self.size == 1:
             return ()
         if self.declaration.of == "axis":
@@ -199,12 +203,12 @@ class Entry:
 
     @property
     def coordinates(self) -> int:
-        """How many search-space coordinates it takes when free."""
+        """Number of search-space coordinates it takes when it is free."""
         return self.size - 1 if self.declaration.constrained else self.size
 
 
 def entries(tree: Any, prefix: str = "", leaf: tuple[str, ...] = ()) -> Iterator[Entry]:
-    """Every declared number below an equinox module, in order of declaration.
+    """Yield every declared number below an equinox module, in order of declaration.
 
     A child module with a static tuple `labels` is a stack along its leading axis: its paths read
     `<field>.<label>.<name>`. A field `path` in the metadata renames a child (`surfaces` ->

@@ -1,4 +1,4 @@
-"""What the user wants of declared numbers, and the free ones as a vector without bounds."""
+"""The user's choices for declared numbers, and the free numbers as one vector without bounds."""
 
 import fnmatch
 from collections.abc import Callable, Mapping, Sequence
@@ -16,13 +16,13 @@ from slipid.parameter import Entry, entries, share_basis
 
 @dataclass(frozen=True)
 class Choice:
-    """What the user wants of the paths that match a pattern.
+    """The user's choice for all numbers whose path matches a pattern.
 
     Attributes:
-        pattern: path, `*` and `?` allowed: `surface.*.creep`.
-        start: value to begin with [SI]; a number that is fixed stays so, at this value.
-        fixed: value it keeps [SI]; None leaves it free.
-        free: True or False to say it without a value.
+        pattern: path, with `*` and `?` as wildcards: `surface.*.creep`.
+        start: start value [SI]; a number that is fixed keeps this value.
+        fixed: value at which the number is fixed [SI]; None leaves it free.
+        free: True or False to free or fix the number without giving a value.
         prior_mean: centre of the prior [SI].
         prior_std: std of the prior, in SI around its centre, which without `prior_mean` is the
             declared start.
@@ -37,16 +37,19 @@ class Choice:
 
 
 class Space(eqx.Module):
-    """The free numbers of a tree as one vector without bounds, Gaussian prior included.
+    """The free numbers of a tree as one vector without bounds, with their Gaussian prior.
 
-    Goes through compiled functions as an argument: spaces of the same parameters share them.
+    A space is passed to compiled functions as an argument: spaces of the same parameters share
+    them.
 
     Attributes:
-        template: the tree; what is fixed keeps its value here.
-        start, prior_mean, prior_std: in the search space.
-        pooled: deviations whose prior std is found from the data, for the user gave none.
+        template: tree that holds the values of the fixed numbers.
+        start, prior_mean, prior_std: start vector, and mean and std of the prior, in the search
+            space.
+        pooled: coordinates of deviations whose prior std is estimated from the data because the
+            user gave none.
         all: every declared number of the tree.
-        free: those that are fitted.
+        free: the numbers that are fitted.
     """
 
     template: Any
@@ -58,7 +61,7 @@ class Space(eqx.Module):
     free: tuple[Entry, ...] = eqx.field(static=True)
 
     def __init__(self, tree: Any, choices: Sequence[Choice] = ()):
-        """Space of a module with declared numbers; later choices win.
+        """Build the space of a module with declared numbers; later choices override earlier ones.
 
         Raises:
             ValueError: a pattern matches no path, or a value lies outside its bounds.
@@ -89,24 +92,24 @@ class Space(eqx.Module):
         self.pooled = np.concatenate([np.zeros(0, bool), *pooled])
 
     def with_pooled(self, std: float) -> "Space":
-        """The same with the prior std that was found for the deviations."""
+        """Return the same space with an estimated prior std for the pooled deviations."""
         prior_std = np.where(self.pooled, std, self.prior_std)
         return eqx.tree_at(lambda space: space.prior_std, self, prior_std)
 
     @property
     def slices(self) -> dict[str, slice]:
-        """Where the coordinates of every free number are, by path."""
+        """Slice of the search vector that holds each free number, by path."""
         ends = np.cumsum([0, *(e.coordinates for e in self.free)]).tolist()
         return {e.path: slice(a, b) for e, a, b in zip(self.free, ends, ends[1:], strict=False)}
 
     def where(self, wanted: Callable[[Entry], bool]) -> Bool[np.ndarray, " free"]:
-        """Coordinates of the free numbers that are wanted."""
+        """Return a mask of the coordinates whose number satisfies a condition."""
         count = [e.coordinates for e in self.free]
         return np.repeat(np.array([wanted(e) for e in self.free], bool), count)
 
     @property
     def electric(self) -> Bool[np.ndarray, " free"]:
-        """Coordinates that are read from currents and voltages given the motion."""
+        """Mask of the coordinates estimated from currents and voltages given the motion."""
         return self.where(lambda e: e.declaration.electric)
 
     @property
@@ -124,20 +127,20 @@ class Space(eqx.Module):
         ]
 
     def tree(self, z: Float[Array, " free"] | Float[np.ndarray, " free"]) -> Any:
-        """Tree of SI values at a search-space vector; jit-able."""
+        """Return the tree of SI values at a search-space vector; can be compiled."""
         z, slices = z if isinstance(z, jax.core.Tracer) else np.asarray(z, float), self.slices
         return with_values(
             self.template, {e: e.declaration.to_si(z[slices[e.path]]) for e in self.free}
         )
 
     def vector(self, tree: Any) -> np.ndarray:
-        """Search-space vector of a tree's free numbers."""
+        """Return the search-space vector of a tree's free numbers."""
         parts = [e.declaration.to_search(np.asarray(e.get(tree))) for e in self.free]
         return np.concatenate([np.zeros(0), *parts])
 
 
 def with_values(tree: Any, values: Mapping[Entry, Any]) -> Any:
-    """The tree with these values [SI] at their places; compiles nothing where nothing is traced."""
+    """Return the tree with new values [SI] at some entries; nothing is compiled without tracing."""
     changed: dict[tuple[str, ...], tuple[Entry, Any]] = {}
     for entry, value in values.items():
         whole = changed[entry.leaf][1] if entry.leaf in changed else entry.whole(tree)
@@ -151,7 +154,7 @@ def with_values(tree: Any, values: Mapping[Entry, Any]) -> Any:
 
 
 def _replaced(whole: Any, index: int | None, value: Any) -> Any:
-    """An array with a value in one of its rows, or in place of all of it."""
+    """Return an array with a new value in one of its rows, or in place of the whole array."""
     shape = whole.shape if index is None else whole.shape[1:]
     if isinstance(whole, jax.core.Tracer) or isinstance(value, jax.core.Tracer):
         traced = jnp.asarray(value, dtype=whole.dtype).reshape(shape)
@@ -165,7 +168,7 @@ def _replaced(whole: Any, index: int | None, value: Any) -> Any:
 
 
 def _resolved(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, Any, bool]:
-    """Value, prior mean and std in the search space, and whether it is free."""
+    """Return the value, prior mean and std in the search space, and whether it is free."""
     d = entry.declaration
     usual = np.full(entry.size, 1 / entry.size if d.shares else d.start)
     is_free, mean_si, std_si = d.free, None, None
@@ -199,7 +202,7 @@ def _resolved(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any,
 
 
 def _checked_std(entry: Entry, std: Any) -> np.ndarray | None:
-    """Std of a prior, checked; None where only its centre was given."""
+    """Return a valid std of a prior, None where only its centre was given."""
     if std is None:
         return None
     x = np.asarray(std, float).ravel()
@@ -209,7 +212,7 @@ def _checked_std(entry: Entry, std: Any) -> np.ndarray | None:
 
 
 def _checked_value(entry: Entry, value: Any) -> np.ndarray:
-    """Value as an array, checked; one number stands for all of a vector."""
+    """Return a valid value as an array; one number stands for all entries of a vector."""
     x, d = np.asarray(value, float), entry.declaration
     if x.size not in (1, entry.size):
         raise ValueError(f"{entry.path} takes {entry.size} numbers, got {x.size}")

@@ -29,13 +29,12 @@ class WheeledDrive(Section):
         gear_ratio: motor turns per wheel turn.
         mass_kg: mass of the robot as it drives; friction scales with it.
         drives: which wheels, counted from 1, share a motor with its encoder and ammeter, in the
-            order of
-            the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together. Without
+            order of the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together.
+            Without
                 it
             each wheel has its own.
         motor: file that `slipid identify` or `slipid motor` wrote about its motor on a bench,
-            relative
-            to the config.
+            relative to the config.
     """
 
     wheel_radius_m: Positive
@@ -64,8 +63,7 @@ class OmniDrive(WheeledDrive):
     Attributes:
         base_radius_m: distance from the middle to the wheel centres.
         wheel_azimuths_deg: directions of the wheels from the middle, counter-clockwise from ahead,
-            in
-            the order of the columns of the logs.
+            in the order of the columns of the logs.
         roller_angle_deg: angle from the rollers' free direction to the drive direction.
     """
 
@@ -105,11 +103,9 @@ class GeneralDrive(WheeledDrive):
     Attributes:
         wheel_places_m: x (ahead) and y (left) of every wheel's centre, in the order of the columns.
         drive_directions_deg: direction in which each wheel rolls at a positive speed,
-            counter-clockwise
-            from ahead.
+            counter-clockwise from ahead.
         roller_angles_deg: angle from each wheel's rollers to its drive direction; "none" is an
-            ordinary
-            wheel.
+            ordinary wheel.
     """
 
     drive: Literal["general"]
@@ -150,13 +146,11 @@ class LogsSection(Section):
         format: one of the config's own layouts, or a preset.
         surface: name of the floor; "folder" takes the name of the folder that each file lies in.
         map: file of a floor map, relative to the config, instead of a surface: runs cross the
-            floors it
-            shows, and their poses are in its frame.
+            floors it shows, and their poses are in its frame.
         load: name of the load set-up; each has its own wheel loads.
         session: what the runs of a session have in common; the marker stays in place within one.
         session_name: instead of session: runs that belong together, of this section and of others
-            with
-            the same name, such as those of a day, or between two set-ups of the robot.
+            with the same name, such as those of a day, or between two set-ups of the robot.
         min_rows: shorter runs are left out.
     """
 
@@ -183,8 +177,7 @@ class CameraSection(Section):
 
     Attributes:
         image_centre_m: middle of the picture in the frame of the poses, where tilt and distortion
-            are
-            zero.
+            are zero.
     """
 
     image_centre_m: tuple[Number, Number] = (0.0, 0.0)
@@ -228,8 +221,7 @@ class WeightsSection(Section):
     """Known weight on the wheels in a load set-up.
 
     Either what scales show under each wheel, `kg`; or that it is `like` another set-up, with
-    `mass_kg`
-    more (or less) at `place_m`.
+    `mass_kg` more (or less) at `place_m`.
 
     Attributes:
         std_kg: standard deviation of each scale, or of the weight that the mass adds to each wheel.
@@ -263,8 +255,7 @@ class FitSection(Section):
     Attributes:
         lengths_from: which of the two is known: "poses" in true metres, as those of motion capture,
             lidar and RTK are, make the wheel radius free; "wheels" that were measured make the
-            scale of
-            the camera free. Without it both are as `[parameters]` says.
+            scale of the camera free. Without it both are as `[parameters]` says.
         windows_per_piece: number of windows in a segment of a run.
         longest_window_s: longer windows become more segments.
         rounds: largest number of rounds.

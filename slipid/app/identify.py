@@ -166,9 +166,8 @@ def optimised(
     """Return the optimum of a task and the problem it belongs to, starting from `task.problem()`.
 
     Windows are cut again, which makes another problem, where the fitted lag is far from the
-    expected
-    one (see `FitTask.cutting_robot`). The fit continues from the checkpoint of this very task, and
-    every round is kept there.
+    expected one (see `FitTask.cutting_robot`). The fit continues from the checkpoint of this very
+    task, and every round is kept there.
     """
     optimum = _optimised(task, problem, _restored(kept, report), kept, report)
     robot = task.cutting_robot(problem.space.tree(optimum.state.z))

@@ -7,9 +7,16 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, UInt8
 
 from slipid.support.errors import DataError, did_you_mean
+
+Mask = Bool[np.ndarray, "row column"]
+"""Some of the pixels of a picture or of the cells of a grid."""
+Labels = Int[np.ndarray, "row column"]
+"""A number for each cell of a grid."""
+Grey = UInt8[np.ndarray, "row column"]
+"""Grey levels of a picture, from 0 to 255."""
 
 
 @cache
@@ -79,6 +86,11 @@ def read_picture(path: Path) -> np.ndarray:
     if picture is None:
         raise DataError(f"{path}: no picture that OpenCV reads; expected PNG, JPEG or the like")
     return np.asarray(picture)
+
+
+def size_of(picture: np.ndarray) -> tuple[int, int]:
+    """Return width and height of a picture [pixel]."""
+    return int(picture.shape[1]), int(picture.shape[0])
 
 
 def ideal_points(

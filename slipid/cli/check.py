@@ -1,4 +1,4 @@
-"""`slipid check`: what logs can tell, before any fit."""
+"""`slipid check`: what logs can identify, before any fit."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,9 +18,9 @@ def check(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Read and validate logs; say what is wrong and what they can tell before anything is fitted.
+    """Read and validate logs; report errors, and what a fit can be expected to identify.
 
-    Exit code 1 where logs and config do not go together.
+    Exit code 1 where logs and config contradict each other.
     """
     from slipid.app import check as job
     from slipid.app.config import BenchMotors, read_config
@@ -41,7 +41,7 @@ def check(
 
 
 def bench(config: "Config", data: Path, out: Path | None, json: str | None, quiet: bool) -> int:
-    """The same for motors on a bench."""
+    """Check the logs of motors on a bench."""
     from slipid.app.bench import check_bench
     from slipid.report.estimates import show_bench_check
 

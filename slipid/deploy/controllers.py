@@ -1,4 +1,4 @@
-"""Estimator and controller by name: what a robot is given, and the rows of a trial."""
+"""Estimator and controller by name: the rows of a trial, and the choices of an export."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -16,21 +16,21 @@ from slipid.robot.interface import AbstractEstimator, Settings
 from slipid.support.errors import DataError
 
 PAPER_WHEELS = 3
-"""Wheels of the 2021 paper's robot."""
+"""Number of wheels of the 2021 paper's robot."""
 
 
 @dataclass(frozen=True)
 class ControllerRow:
-    """One controller, by what it observes and corrects.
+    """One choice of estimator and controller.
 
     Attributes:
-        observer: `encoder`, `curve` (slip over current, wheel by wheel) or `contact`.
+        observer: `encoder`, `curve` (slip by current, wheel by wheel) or `contact`.
         about: one sentence for people.
-        correction: of the 2021 paper.
-        law: a published one in place of the pose loop, made for a robot.
-        tuned: whether it has the tuned gains of its file, where they are better than by hand.
-        gyro: whether the robot has one.
-        mapped: whether it is told the map of its floors.
+        correction: torque correction of the 2021 paper.
+        law: published law that replaces the pose loop, made for a robot.
+        tuned: whether it uses the tuned gains of robot.json where they are better than by hand.
+        gyro: whether the robot has a gyro.
+        mapped: whether the estimator has the map of its floors.
     """
 
     observer: str
@@ -42,12 +42,12 @@ class ControllerRow:
     mapped: bool = False
 
     def drives(self, robot: DeployedRobot) -> bool:
-        """Whether it applies: torque corrections have gains of the 2021 paper's three wheels."""
+        """Return whether it applies: torque corrections have gains for three wheels only."""
         return self.correction == "none" or robot.wheels == PAPER_WHEELS
 
 
 CONTROLLERS: Mapping[str, ControllerRow] = {
-    "encoder": ControllerRow("encoder", "believes its encoders"),
+    "encoder": ControllerRow("encoder", "trusts its encoders"),
     "slip_odometry": ControllerRow("curve", "odometry less slip over current (figure 5)"),
     "paper_print": ControllerRow("curve", "and torque correction as printed", "paper_print"),
     "paper_code": ControllerRow(
@@ -58,7 +58,7 @@ CONTROLLERS: Mapping[str, ControllerRow] = {
         "contact", "contact estimator, tuned gains where they are better", tuned=True
     ),
     "contact_map": ControllerRow(
-        "contact", "contact, told the map of its floors", tuned=True, mapped=True
+        "contact", "contact, with the map of its floors", tuned=True, mapped=True
     ),
     "contact_gyro": ControllerRow("contact", "contact, with a gyro", tuned=True, gyro=True),
 }
@@ -71,10 +71,10 @@ def control_loop_of(
     forced: bool = False,
     floor: Floor | None = None,
 ) -> ControlLoop[eqx.Module]:
-    """Estimator and controller of a row; some rows have the gains tuned for the robot.
+    """Return the control loop of a row for a robot.
 
-    Those are taken where they are better than gains set by hand, or forced. A map of the floors is
-    told to the rows that may know it.
+    Rows with tuned gains use them where they are better than those by hand, or if `forced`. `floor`
+    is the map for rows that use one.
 
     Raises:
         DataError: the row does not apply to the robot's wheels.
@@ -84,10 +84,10 @@ def control_loop_of(
             f"the torque correction of the 2021 paper has gains for {PAPER_WHEELS} wheels; this "
             f"robot has {robot.wheels}"
         )
-    own = Gains.of(robot, forced) if row.tuned else Gains()
+    gains = Gains.of(robot, forced) if row.tuned else Gains()
     estimator: AbstractEstimator[Any] = Estimator(robot, settings, floor if row.mapped else None)
     if row.observer != "contact":
         estimator = Odometry(robot, settings, curve=row.observer == "curve")
-        own = replace(own, preview=jnp.asarray(0.0))  # the paper's loop has none
+        gains = replace(gains, preview=jnp.asarray(0.0))  # the paper's loop has none
     law = None if row.law is None else row.law(robot)
-    return ControlLoop(estimator, Controller(robot, own, correction=row.correction, law=law))
+    return ControlLoop(estimator, Controller(robot, gains, correction=row.correction, law=law))

@@ -1,4 +1,4 @@
-"""From robot.json to a folder for a robot, with a run of its path that was driven on the twin."""
+"""From robot.json to a folder for a robot, with an example run driven on the twin."""
 
 from __future__ import annotations
 
@@ -43,12 +43,14 @@ FORMS = ("c", "ros2", "stablehlo", "table")
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What is to be exported.
+    """Choices of an export.
 
     Attributes:
-        forms: of `FORMS`; controller: row of the trial.
-        path: that the example in C follows; speed: along it [m/s].
-        map: file of a floor map, for a controller that is told one.
+        forms: forms to write, of `FORMS`.
+        controller: row of the trial.
+        path: path of the example in C.
+        speed: speed along it [m/s].
+        map: file of a floor map, for a controller that uses one.
     """
 
     forms: Sequence[str] = FORMS
@@ -60,11 +62,14 @@ class ExportOptions:
 
 @dataclass(frozen=True)
 class Exported:
-    """A folder that was written.
+    """A folder that an export wrote.
 
     Attributes:
-        folder: it; files: their names; robot: hash of the robot's numbers.
-        forms: that are in it; warnings: of numbers that are not identified.
+        folder: path of the folder.
+        files: names of its files.
+        robot: hash of the robot's numbers.
+        forms: forms that are in it.
+        warnings: warnings about numbers that are not identified.
     """
 
     folder: Path
@@ -76,39 +81,39 @@ class Exported:
 
 @dataclass(frozen=True)
 class ExampleStart:
-    """Where the example is driven.
+    """Site and start of the example run.
 
     Attributes:
-        floor: map of it; true: pose there from which the robot starts.
-        believed: the same as the robot has it: its own axes where it is told no map.
+        floor: map of the site.
+        true: pose on the map at which the robot starts.
+        estimated: the same for its estimator; without a map it has axes of its own.
     """
 
     floor: FloorMap
     true: tuple[float, float, float]
-    believed: tuple[float, float, float]
+    estimated: tuple[float, float, float]
 
 
-def _place(robot: DeployedRobot, path: trajectory.Path, file: Path | None) -> ExampleStart:
-    """Patches of the robot's floors, or what a map shows; DataError if it shows other floors."""
+def _example_start(robot: DeployedRobot, path: trajectory.Path, file: Path | None) -> ExampleStart:
+    """Return the start on patches of the robot's floors, or on a map of no other floors."""
     floor = twin_floor(robot) if file is None else read_map(file)
     require_known_surfaces(floor, robot, str(file))
-    begin = starts(20, floor, path)[0]
-    return ExampleStart(floor, begin, (0.0, 0.0, 0.0) if file is None else begin)
+    pose = starts(20, floor, path)[0]
+    return ExampleStart(floor, pose, (0.0, 0.0, 0.0) if file is None else pose)
 
 
 def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedRobot:
-    """The robot of a file, or of the folder that `slipid identify` wrote.
+    """Return the robot of a file, or of the folder that `slipid identify` wrote.
 
     Raises:
         DataError: there is none, it is damaged, or has no such load set-up or floor.
     """
     is_file = source.suffix == ".json"
     path = source if is_file else source / ROBOT
-    robot = (
-        require_steering(path, DeployedRobot.load(path, load))
-        if is_file
-        else read_robot(source, load)
-    )
+    if is_file:
+        robot = require_steering(path, DeployedRobot.load(path, load))
+    else:
+        robot = read_robot(source, load)
     try:
         return robot.on(*floors) if floors else robot
     except ValueError as error:
@@ -118,44 +123,36 @@ def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedR
 def export(
     robot: DeployedRobot,
     out: Path,
-    wish: ExportOptions,
+    options: ExportOptions,
     report: Reporter,
     rows: Mapping[str, ControllerRow] = CONTROLLERS,
 ) -> Exported:
-    """Write a robot in all wanted forms to a folder, with one of the controllers `rows`.
+    """Write a robot in all requested forms to a folder, with one of the controllers `rows`.
 
     Raises:
-        DataError: no such form, controller or path; a step that has no form in C; nothing can be
-            written there, or other files lie there.
+        DataError: there is no such form, controller or path, a step has no form in C, or the folder
+            cannot be written or holds other files.
     """
-    if not wish.forms:
-        raise DataError(f"no form; expected one or more of {', '.join(FORMS)}")
-    for name in wish.forms:
-        if name not in FORMS:
-            raise DataError(
-                f"no form '{name}'{did_you_mean(name, FORMS)}; expected {', '.join(FORMS)}"
-            )
-    if wish.controller not in rows:
-        close = did_you_mean(wish.controller, rows)
-        choices = ", ".join(rows)
-        raise DataError(f"no controller '{wish.controller}'{close}; expected one of {choices}")
-    row = rows[wish.controller]
-    if row.mapped != (wish.map is not None):
-        told = "the map of its floors; name one with --map"
-        none = "no map; leave out --map, or take contact_map"
-        raise DataError(f"controller {wish.controller} is told {told if row.mapped else none}")
+    row = _checked_row(options, rows)
     check_writable(out)
-    path = path_of(wish.path, wish.speed, robot)
-    place = _place(robot, path, wish.map)
-    pilot = control_loop_of(robot, row, floor=floor_of(place.floor, robot.labels))
-    path = path.moved(place.believed).waiting(REST_S)
+    path = path_of(options.path, options.speed, robot)
+    start = _example_start(robot, path, options.map)
+    loop = control_loop_of(robot, row, floor=floor_of(start.floor, robot.labels))
+    path = path.moved(start.estimated).after_rest(REST_S)
     content: dict[str, bytes] = {"robot.json": robot_bytes(robot.record)}
-    forms = tuple(form for form in FORMS if form in wish.forms)
+    forms = tuple(form for form in FORMS if form in options.forms)
     for form in forms:
         report.stage(f"writing {form}")
-        files = _form(form, robot, pilot, path, wish, place, row.gyro)
+        if form == "stablehlo":
+            files = stablehlo_files(loop)
+        elif form == "c":
+            run = record_example(robot, loop, path, options, start, row.gyro)
+            files = _c_files(robot, loop, path, run, options.controller)
+        else:
+            text = ros2_files(robot) if form == "ros2" else table_files(robot)
+            files = {name: data.encode() for name, data in text.items()}
         content |= {f"{form}/{name}": data for name, data in files.items()}
-    content["README.md"] = readme(robot, forms, wish.controller).encode()
+    content["README.md"] = readme(robot, forms, options.controller).encode()
     write_folder(out, content)
     report.stage("checking what was written")
     check_folder(out)
@@ -164,66 +161,81 @@ def export(
     return Exported(out, tuple(content), robot.record.numbers, forms, warnings(robot))
 
 
-def _form(
-    form: str,
-    robot: DeployedRobot,
-    pilot: ControlLoop[eqx.Module],
-    path: trajectory.Path,
-    wish: ExportOptions,
-    place: ExampleStart,
-    gyro: bool,
-) -> dict[str, bytes]:
-    if form == "stablehlo":
-        return stablehlo_files(pilot)
-    if form == "c":
-        try:
-            text = c_files(
-                robot, pilot, path, record_example(robot, pilot, path, wish, place, gyro)
+def _checked_row(options: ExportOptions, rows: Mapping[str, ControllerRow]) -> ControllerRow:
+    """Return the row of the chosen controller; raise `DataError` for choices that do not fit."""
+    if not options.forms:
+        raise DataError(f"no form; expected one or more of {', '.join(FORMS)}")
+    for name in options.forms:
+        if name not in FORMS:
+            raise DataError(
+                f"no form '{name}'{did_you_mean(name, FORMS)}; expected {', '.join(FORMS)}"
             )
-        except UnsupportedError as error:
-            raise DataError(f"controller {wish.controller}: {error}") from error
-    else:
-        text = ros2_files(robot) if form == "ros2" else table_files(robot)
+    controller = options.controller
+    if controller not in rows:
+        close, choices = did_you_mean(controller, rows), ", ".join(rows)
+        raise DataError(f"no controller '{controller}'{close}; expected one of {choices}")
+    row = rows[controller]
+    if row.mapped and options.map is None:
+        raise DataError(f"controller {controller} needs the map of its floors; name one with --map")
+    if options.map is not None and not row.mapped:
+        raise DataError(
+            f"controller {controller} uses no map; leave out --map, or take contact_map"
+        )
+    return row
+
+
+def _c_files(
+    robot: DeployedRobot,
+    loop: ControlLoop[eqx.Module],
+    path: trajectory.Path,
+    run: Recording,
+    controller: str,
+) -> dict[str, bytes]:
+    """Return the content of the C folder; raise `DataError` for a step without a form in C."""
+    try:
+        text = c_files(robot, loop, path, run)
+    except UnsupportedError as error:
+        raise DataError(f"controller {controller}: {error}") from error
     return {name: data.encode() for name, data in text.items()}
 
 
 class _RecordingPlant:
-    """A plant whose readings are kept."""
+    """A plant that keeps its readings."""
 
     def __init__(self, plant: Plant, wheels: int):
         self._plant, self._wheels = plant, wheels
         self.readings: list[Readings] = []
 
     def reset(self) -> Readings:
-        return self._kept(self._plant.reset())
+        return self._record(self._plant.reset())
 
     def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Readings:
-        return self._kept(self._plant.step(wheel_speed))
+        return self._record(self._plant.step(wheel_speed))
 
     @property
     def pose(self) -> tuple[float, float, float]:
         return self._plant.pose
 
-    def _kept(self, reading: Measurement | Readings) -> Readings:
+    def _record(self, reading: Measurement | Readings) -> Readings:
         self.readings.append(reading.filled(self._wheels))
         return self.readings[-1]
 
 
 def record_example(
     robot: DeployedRobot,
-    pilot: ControlLoop[eqx.Module],
+    loop: ControlLoop[eqx.Module],
     path: trajectory.Path,
-    wish: ExportOptions,
-    place: ExampleStart,
+    options: ExportOptions,
+    start: ExampleStart,
     gyro: bool = False,
 ) -> Recording:
-    """A run of a path, as it lies for the robot's start, on the twin."""
-    habits = actuator_model_of(robot, gyro=gyro)
-    plant = _RecordingPlant(twin_plant(robot, place.floor, place.true, 0, habits), robot.wheels)
-    course = run_closed_loop(pilot, path, plant, place.believed)
-    given = [
+    """Return a run of a path on the twin; the path is placed for the estimator's start."""
+    model = actuator_model_of(robot, gyro=gyro)
+    plant = _RecordingPlant(twin_plant(robot, start.floor, start.true, 0, model), robot.wheels)
+    run = run_closed_loop(loop, path, plant, start.estimated)
+    inputs = [
         np.concatenate([[PERIOD], *(np.ravel(x) for x in jax.tree.leaves(reading))])
-        for reading in plant.readings[: len(course.command)]
+        for reading in plant.readings[: len(run.command)]
     ]
-    about = f"the identified model as a plant, with delays and noise, along the path {wish.path}"
-    return Recording(about, place.believed, np.array(given), course.command, course.own)
+    about = f"the identified model as a plant, with delays and noise, along the path {options.path}"
+    return Recording(about, start.estimated, np.array(inputs), run.command, run.path_time)

@@ -1,4 +1,4 @@
-"""From a map of floors, as a file or as cells, to what an estimator or a user looks up."""
+"""Lookups of a floor map, from a file or cells, for an estimator or a user."""
 
 from pathlib import Path
 
@@ -16,30 +16,30 @@ from slipid.support.errors import DataError
 
 
 def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Floor:
-    """A map as arrays, its surfaces counted as the fit counts them, -1 for one it does not know."""
+    """Return a map as arrays with surfaces numbered as in `labels`, -1 for an unknown one."""
     return Floor.of(floor.surfaces, floor.cells, floor.corner, floor.cell, labels)
 
 
 def floor_map(path: Path | str, robot: DeployedRobot) -> Floor:
-    """The floor map of a TOML file, as `Estimator` takes it for a robot.
+    """Return the floor map of a TOML file, as `Estimator` takes it for a robot.
 
     `Floor.save` writes it for a robot that has jax alone, whose `Floor.load` reads it. Cells of
-    surfaces that the robot does not know tell it nothing.
+    surfaces that the robot does not know give it no information.
 
     Raises:
-        DataError: no map, or one that has none of the robot's surfaces.
+        DataError: the file is not a map, or has none of the robot's surfaces.
     """
-    read = read_map(Path(path))
-    if not set(read.surfaces) & set(robot.labels):
+    floor = read_map(Path(path))
+    if not set(floor.surfaces) & set(robot.labels):
         raise DataError(
-            f"{path}: surfaces {', '.join(read.surfaces)}; expected some of those identified: "
+            f"{path}: surfaces {', '.join(floor.surfaces)}; expected some of those identified: "
             f"{', '.join(robot.labels)}"
         )
-    return floor_of(read, robot.labels)
+    return floor_of(floor, robot.labels)
 
 
 class WheelFloors(eqx.Module):
-    """What is under each wheel.
+    """Floor under each wheel.
 
     Attributes:
         surface: number of the surface, in the order of the map's.
@@ -55,12 +55,12 @@ class WheelFloors(eqx.Module):
 
 
 class FloorLookup(eqx.Module):
-    """A floor map that jitted functions ask for the floor under each wheel, and for its border.
+    """Floor map for jitted functions that look up the floor under each wheel and its border.
 
     Attributes:
-        floor: surfaces by cell, counted as in `surfaces`.
+        floor: surfaces by cell, numbered as in `surfaces`.
         border: distance from the middle of every cell to the nearest other surface [m].
-        surfaces: their names.
+        surfaces: names of the surfaces.
     """
 
     floor: Floor
@@ -69,27 +69,26 @@ class FloorLookup(eqx.Module):
 
     @classmethod
     def of(cls, floor: FloorMap) -> "FloorLookup":
-        """Of a floor map."""
+        """Return the lookup of a floor map."""
         border = np.full(floor.cells.shape, np.inf)
         for number in np.unique(floor.cells):
-            own = floor.cells == number
-            if not own.all():
-                border[own] = (distance_transform_edt(own)[own] - 0.5) * floor.cell
-        found = floor_of(floor, floor.surfaces)
-        return cls(found, jnp.asarray(border), floor.surfaces)
+            on = floor.cells == number
+            if not on.all():
+                border[on] = (distance_transform_edt(on)[on] - 0.5) * floor.cell
+        return cls(floor_of(floor, floor.surfaces), jnp.asarray(border), floor.surfaces)
 
     @classmethod
     def read(cls, path: Path | str) -> "FloorLookup":
-        """Of a map file; DataError where it is none."""
+        """Return the lookup of a map file; raise `DataError` where it is not a map."""
         return cls.of(read_map(Path(path)))
 
     @eqx.filter_jit
     def under(self, pose: Float[Array, "*batch 3"], wheels: Float[Array, "wheel 2"]) -> WheelFloors:
-        """Floor and border under the wheels of bodies at some poses.
+        """Return floor and border under the wheels of bodies at some poses.
 
         Args:
             pose: x, y [m], heading [rad].
-            wheels: where the wheels are on the body, x ahead, y left [m].
+            wheels: places of the wheels on the body, x ahead, y left [m].
         """
         flat = pose.reshape(-1, 3)
         row, column = jax.vmap(self.floor.steps_to, (0, None))(flat, wheels)
@@ -97,5 +96,5 @@ class FloorLookup(eqx.Module):
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         row, column = row.clip(0, rows - 1), column.clip(0, columns - 1)
         shape = (*pose.shape[:-1], len(wheels))
-        found = self.floor.cells[row, column], self.border[row, column], inside
-        return WheelFloors(*(part.reshape(shape) for part in found))
+        parts = self.floor.cells[row, column], self.border[row, column], inside
+        return WheelFloors(*(part.reshape(shape) for part in parts))

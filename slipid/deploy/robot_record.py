@@ -1,20 +1,20 @@
-"""The record of a robot: its numbers as they are, and what the model makes of them once for all.
+"""Record of a robot: its numbers, and quantities computed from the model once and for all.
 
-What the fitted runs tell of the effects of floors, as the table that robot.json has.
+The effect table of robot.json follows from the effects that fitted runs share. The motion per metre
+along, across and in yaw, of wheels without slip, is predicted to be
 
-The motion per metre along, across and in yaw, of wheels that would not slip, is predicted to be
+    contact(z) - shared(z),   shared(z) = mean + slope (z - z_fit)
 
-    contact(z) - told(z),   told(z) = mean + slope (z - z_fit)
-
-as forecasts have it (`slipid.fit.shared_effects`). The mean of the table is what that is beyond
-the contact model with the robot's numbers; what is left is the covariance of the effects given the
-numbers, grown as forecasts are, and the scatter of this very sum over draws of the numbers: where
-runs were near, another number is made up for by another effect.
+as forecasts have it (`slipid.fit.shared_effects`). The table's mean is the second term at the
+robot's numbers. Its remaining variance is the covariance of the effects given the numbers, extended
+as in forecasts, and the scatter of this whole sum over draws of the numbers: near fitted runs,
+another number is compensated by another effect.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from functools import reduce
+from types import MappingProxyType
 
 import equinox as eqx
 import jax
@@ -32,7 +32,7 @@ from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.parameter import entries
 from slipid.predict.predictive import ForceBalance
 from slipid.robot import record
-from slipid.robot.record import Axes, EffectRecord
+from slipid.robot.record import EffectRecord, axes_of, plain
 
 
 def robot_record(
@@ -43,21 +43,21 @@ def robot_record(
     highest_speed: float,
     current_trend: record.Pair,
     seen: Mapping[str, Validity],
-    told: Mapping[str, record.EffectRecord] | None = None,
+    effects: Mapping[str, EffectRecord] = MappingProxyType({}),
 ) -> record.RobotRecord:
-    """The record of a robot, but for what is known of where its numbers come from.
+    """Return the record of a robot, without the origin of its numbers.
 
     Args:
-        robot: with every number at its value in `numbers`.
-        numbers: by path; those that the deployed robot does not need, the camera's, are left out.
-        std: of every variance component by name (`process.gray.along`), as runs that were not seen
-            are forecast with.
-        draws: the robot's posterior, stacked, for what the uncertainty of the numbers adds to the
-            effects.
-        highest_speed: of the wheels in the fitted runs [rad/s].
-        current_trend: of currents over the model's in the fitted runs, all floors [A], [A s/m].
-        seen: what the floors were seen with, as far as that is known.
-        told: what the fitted runs tell of effects, by load set-up, as far as that is known.
+        robot: robot with every number at its value in `numbers`.
+        numbers: numbers by path; those of the camera are left out.
+        std: std of every variance component by name (`process.gray.along`), as in forecasts of new
+            runs.
+        draws: posterior draws of the robot, stacked, for the effects of uncertain numbers.
+        highest_speed: highest wheel speed of the fitted runs [rad/s].
+        current_trend: a and b of a + b v, by which measured currents exceed the model's [A], [A
+            s/m].
+        seen: range of the fitted runs by floor, as far as it is known.
+        effects: effect tables by load set-up, as far as they are known.
     """
     return record.RobotRecord(
         wheels=record.Wheels(
@@ -66,8 +66,7 @@ def robot_record(
         parameters={p: n for p, n in numbers.items() if not p.startswith("camera.")},
         floors=tuple(_floor(name, std, seen.get(name)) for name in robot.surfaces.labels),
         loads=tuple(
-            _load(robot, name, highest_speed, draws, (told or {}).get(name))
-            for name in robot.body.loads
+            _load(robot, name, highest_speed, draws, effects.get(name)) for name in robot.body.loads
         ),
         current_trend=current_trend,
         highest_speed=highest_speed,
@@ -75,13 +74,8 @@ def robot_record(
     )
 
 
-def plain(value: np.ndarray) -> record.Numbers:
-    """A float, or a tuple of floats."""
-    return float(value.reshape(())) if value.size == 1 else tuple(float(v) for v in value)
-
-
 def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numbers, ...]]]:
-    """Paths and draws of all numbers that differ between draws, the camera's left out."""
+    """Yield path and draws of every number that differs between draws, without the camera's."""
     for e in entries(robot):
         leaf = np.asarray(reduce(getattr, e.leaf, draws))
         rows = leaf if e.index is None else leaf[:, e.index]
@@ -90,7 +84,7 @@ def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numb
 
 
 def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> record.FloorRecord:
-    """What the model misses on a floor."""
+    """Return the record of a floor's errors, from stds by name."""
 
     def of(kind: str, default: record.Axes) -> np.ndarray:
         return np.array(
@@ -102,52 +96,47 @@ def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> record
     kinds = [std.get(f"current.{name}.{kind}", 0.05) for kind in ("window", "run")]
     return record.FloorRecord(
         name=name,
-        process=_axes(of("process", (0.005, 0.002, 0.01))),
-        effect=_axes(effect),
+        process=axes_of(of("process", (0.005, 0.002, 0.01))),
+        effect=axes_of(effect),
         current_std=float((kinds[0] ** 2 + kinds[1] ** 2) ** 0.5),
         seen=seen,
     )
 
 
-def _axes(row: Sequence[float] | np.ndarray) -> record.Axes:
-    along, across, yaw = (float(x) for x in row)
-    return along, across, yaw
-
-
 def _load(
-    robot: Robot, name: str, top: float, draws: Robot, told: record.EffectRecord | None
+    robot: Robot, name: str, top: float, draws: Robot, effects: EffectRecord | None
 ) -> record.LoadRecord:
-    """What depends on how the robot is loaded."""
+    """Return the record of a load set-up."""
     shape, k = robot.geometry, jnp.asarray(robot.load_index(name))
-    frame, ways = shape.frame(), directions(36)
+    frame, twists = shape.frame(), directions(36)
     if not shape.determines_twist:
-        ways = jnp.concatenate([ways, _turns(frame)])
+        twists = jnp.concatenate([twists, _turns(frame)])
     wheels, rest = _WheelArrays.of(robot), robot.body.load_share[k]
     floors, motor, mass = robot.surfaces, robot.motor, robot.body.mass
-    speed, amps, slip = _circle(wheels, floors, rest, motor, mass, jnp.asarray(top), ways)
+    speed, amps, slip = _circle(wheels, floors, rest, motor, mass, jnp.asarray(top), twists)
     curve = np.asarray(_wheel_curve(speed, amps, slip))
     return record.LoadRecord(
         name=name,
-        spread=tuple(_axes(row) for row in _spread(robot, frame, draws, k)),
-        told=told,
+        spread=tuple(axes_of(row) for row in _spread(robot, frame, draws, k)),
+        told=effects,
         highest_current=float(jnp.max(jnp.abs(amps))),
         wheel_curve=tuple((float(a), float(b)) for a, b in curve),
     )
 
 
-def directions(count: int) -> Float[Array, "way 3"]:
-    """Twists of 1 m/s in so many directions, without turning."""
+def directions(count: int) -> Float[Array, "twist 3"]:
+    """Return twists of 1 m/s in evenly spaced directions, without turning."""
     angle = jnp.linspace(0.0, 2 * jnp.pi, count, endpoint=False)
     return jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
 
 
-def _turns(frame: WheelFrame) -> Float[Array, "way 3"]:
-    """Twists on the spot, to the left and to the right, with a rim speed of 1 m/s or so."""
+def _turns(frame: WheelFrame) -> Float[Array, "twist 3"]:
+    """Return twists on the spot to the left and to the right, with a rim speed of about 1 m/s."""
     return jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / frame.base
 
 
 class _WheelArrays(eqx.Module):
-    """The wheels as arrays, wherever they are: what is compiled for some serves all as many."""
+    """Geometry of the wheels as arrays, so that one compilation serves all robots of a shape."""
 
     frame: WheelFrame
     forward: Float[Array, "*draw drive 3"]
@@ -159,7 +148,7 @@ class _WheelArrays(eqx.Module):
         return cls(shape.frame(), shape.forward(), shape.drive_of)
 
     def rim(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """Rim speeds of the wheels by those of their drives [m/s]."""
+        """Return rim speeds of the wheels from those of their drives [m/s]."""
         return at_wheels(self.drive_of, of_drives)
 
 
@@ -171,11 +160,11 @@ def _circle(
     motor: Motor,
     mass: Array,
     top: Array,
-    ways: Float[Array, "way 3"],
+    twists: Float[Array, "twist 3"],
 ) -> tuple[Array, Array, Array]:
-    """Wheel speeds, currents, slip ratios on every floor for all ways to move (.., drive)."""
+    """Return wheel speeds, currents and slip ratios on every floor for some twists (.., drive)."""
     frame = wheels.frame
-    speed = ways @ wheels.forward.T / frame.radius
+    speed = twists @ wheels.forward.T / frame.radius
     speed = jnp.stack([0.4 * top, 0.8 * top])[:, None, None] * speed / jnp.max(jnp.abs(speed))
 
     def one(w: Array, floor: ContactSurface) -> tuple[Array, Array]:
@@ -184,10 +173,9 @@ def _circle(
         xi = contact.equilibrium(rim, frame, floor, rest)
         force = floor.friction * mass * GRAVITY * frame.radius
         where = xi, rim, frame, floor, rest
-        motor_force = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
-        amps = motor.current(
-            at_drives(wheels.drive_of, force * motor.opposing_force(motor_force)), w
-        )
+        forces = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
+        torque = at_drives(wheels.drive_of, force * motor.opposing_force(forces))
+        amps = motor.current(torque, w)
         lost = turned - wheels.forward @ xi
         return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
 
@@ -198,10 +186,10 @@ def _circle(
 
 @eqx.filter_jit
 def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
-    """Least squares of the slip speed on a + b |I|, drive by drive, over all floors.
+    """Return the least squares fit of slip speed on a + b |I|, drive by drive, over all floors.
 
-    The 2021 paper's deployed form, its coefficients refitted; weighted by wheel speed, so that
-    wheels that hardly turn do not decide.
+    It is the form that the 2021 paper's robot used, refitted here. Rows count in proportion to the
+    wheel speed, so that wheels that hardly turn have little weight.
     """
     flat = [x.reshape(-1, x.shape[-1]) for x in (speed, jnp.abs(amps), slip)]
 
@@ -215,32 +203,36 @@ def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
 def _spread(
     robot: Robot, frame: WheelFrame, draws: Robot, load: Array
 ) -> Float[np.ndarray, "floor 3"]:
-    """Std over posterior draws of the motion per metre, a row per floor (along, across, yaw).
+    """Return the posterior std of the motion per metre, a row per floor (along, across, yaw).
 
-    On average over all directions; of wheels that do not drive sideways the largest, turns on the
-    spot included.
+    It is the average over all directions. Of wheels that do not drive sideways it is the largest,
+    turns on the spot included.
     """
     free, speed = robot.geometry.determines_twist, jnp.asarray(0.2)
-    ways = directions(12) if free else jnp.concatenate([directions(2), _turns(frame)])
-    std = spread_of(np.asarray(moved_per_metre(draws, load, speed, ways)))
+    twists = directions(12) if free else jnp.concatenate([directions(2), _turns(frame)])
+    std = spread_of(np.asarray(moved_per_metre(draws, load, speed, twists)))
     return np.sqrt(np.mean(std**2, axis=1)) if free else std.max(axis=1)
 
 
 def spread_of(draws: Float[np.ndarray, "draw *rest"]) -> Float[np.ndarray, "*rest"]:
-    """Std over draws by the middle two thirds of them: a few that get stuck do not decide."""
+    """Return the std over draws from their central 68 %, so that a few stuck draws do not count."""
     low, high = np.quantile(draws, (0.1587, 0.8413), axis=0)
     return np.asarray(high - low) / 2
 
 
 def moved_per_metre(
-    draws: Robot, load: Array, speed: Array, way: Float[Array, "way 3"]
-) -> Float[Array, "draw floor way 3"]:
-    """Motion along, across and in yaw per metre of wheels that would not slip, at a speed [m/s].
+    draws: Robot, load: Array, speed: Array, twist: Float[Array, "twist 3"]
+) -> Float[Array, "draw floor twist 3"]:
+    """Return the motion along, across and in yaw per metre that wheels would roll without slip.
 
-    For ways to move at 1 m/s, of robots that are stacked.
+    Args:
+        draws: stacked robots.
+        load: number of the load set-up.
+        speed: speed of the body without slip [m/s].
+        twist: twists of 1 m/s.
     """
     rest = draws.body.load_share[:, load]
-    return _moved(jax.vmap(_WheelArrays.of)(draws), draws.surfaces, rest, speed, way)
+    return _moved(jax.vmap(_WheelArrays.of)(draws), draws.surfaces, rest, speed, twist)
 
 
 @eqx.filter_jit
@@ -249,87 +241,82 @@ def _moved(
     surfaces: ContactSurface,
     rest: Float[Array, "draw wheel"],
     speed: Array,
-    way: Float[Array, "way 3"],
+    twist: Float[Array, "twist 3"],
 ) -> Array:
-    """As `moved_per_metre`."""
+    """Return what `moved_per_metre` does, compiled."""
 
     def one(wheels: _WheelArrays, surfaces: ContactSurface, rest: Array) -> Array:
-        rim, frame = wheels.rim(speed * way @ wheels.forward.T), wheels.frame
+        rim, frame = wheels.rim(speed * twist @ wheels.forward.T), wheels.frame
         xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
             surfaces
         )
-        along = jnp.einsum("fkc,kc->fk", xi[..., :2], way[:, :2])
-        across = xi[..., 1] * way[:, 0] - xi[..., 0] * way[:, 1]
+        along = jnp.einsum("fkc,kc->fk", xi[..., :2], twist[:, :2])
+        across = xi[..., 1] * twist[:, 0] - xi[..., 0] * twist[:, 1]
         return jnp.stack([along, across, xi[..., 2]], axis=-1) / speed
 
     return jax.vmap(one)(wheels, surfaces, rest)
 
 
 DIRECTIONS = 72
-"""Of the table; half of the kernel's length apart."""
+"""Number of directions in the table, which are half a kernel's length apart."""
 _Grid = Float[np.ndarray, "floor speed direction 3"]
 
 
 def effects_by_load(
     contact: ForceBalance, center: Float[np.ndarray, " free"], draws: Float[np.ndarray, "draw free"]
 ) -> dict[str, EffectRecord]:
-    """What is told of effects by load set-up; nothing where no runs share any.
+    """Return the effect table of every load set-up; empty where no runs share effects.
 
     Args:
-        contact: the fit as a model that forecasts.
-        center: search vector of the deployed numbers; draws: of their posterior.
+        contact: fitted force balance.
+        center: search vector of the deployed numbers.
+        draws: posterior draws of the search vector.
     """
-    paces = [pace for found in contact.shared.values() for pace in found.speeds_and_loads]
-    if not paces:
+    speeds = {s.log_speed for shared in contact.shared.values() for s in shared.speeds_and_loads}
+    if not speeds:
         return {}
-    speeds = sorted({pace.log_speed for pace in paces})
     return {
-        load: _table(contact, center, draws, load, np.array(speeds))
+        load: _effect_table(contact, center, draws, load, np.array(sorted(speeds)))
         for load in contact.robot.body.loads
     }
 
 
-def _table(
+def _effect_table(
     contact: ForceBalance, center: np.ndarray, draws: np.ndarray, load: str, log_speed: np.ndarray
 ) -> EffectRecord:
+    """Return the effect table of a load set-up."""
     count, labels = len(log_speed), contact.robot.surfaces.labels
     angle = np.linspace(0.0, 2 * np.pi, DIRECTIONS, endpoint=False)
-    paces = tuple(SpeedAndLoad(float(s), load) for s in log_speed for _ in angle)
-    way = TravelConditions(np.tile(angle, count), paces, contact.robot.geometry.mirror())
+    speeds = tuple(SpeedAndLoad(float(s), load) for s in log_speed for _ in angle)
+    rows = TravelConditions(np.tile(angle, count), speeds, contact.robot.geometry.mirror())
     robots = jax.vmap(contact.space.tree)(jnp.asarray(draws))
     k = jnp.asarray(contact.robot.load_index(load))
     moved = [moved_per_metre(robots, k, jnp.exp(s), directions(DIRECTIONS)) for s in log_speed]
-    predicted = np.concatenate([np.asarray(x) for x in moved], axis=2)  # speeds in turn
+    predicted = np.concatenate([np.asarray(x) for x in moved], axis=2)  # one speed after the other
     shape = (len(labels), count, DIRECTIONS, len(AXES))
     mean, left = np.zeros(shape), np.zeros(shape)
     for n, floor in enumerate(labels):
-        found = contact.shared[floor]
-        told = found.forecast(way)
-        grown = contact.extrapolation.get(f"{floor}@{load}", 1.0)
-        given = np.diagonal(told.covariance, axis1=1, axis2=2) + _of(contact, "session", floor)
-        off = predicted[:, n] - np.einsum("nap,kp->kna", told.slope, draws - center)
-        at = told.mean + told.slope @ (center - contact.z)
+        effect = contact.shared[floor].forecast(rows)
+        growth = contact.extrapolation.get(f"{floor}@{load}", 1.0)
+        given = np.diagonal(effect.covariance, axis1=1, axis2=2)
+        given = given + _variances(contact, "session", floor)
+        corrected = predicted[:, n] - np.einsum("nap,kp->kna", effect.slope, draws - center)
+        at = effect.mean + effect.slope @ (center - contact.z)
         mean[n] = -at.reshape(shape[1:])
-        left[n] = np.sqrt(
-            _of(contact, "run", floor) + grown * (given + spread_of(off) ** 2)
-        ).reshape(shape[1:])
-    speeds = tuple(_short(np.exp(s)) for s in log_speed)
-    return EffectRecord(speeds, _rows(mean), _rows(left))
+        variance = _variances(contact, "run", floor) + growth * (given + spread_of(corrected) ** 2)
+        left[n] = np.sqrt(variance).reshape(shape[1:])
+    return EffectRecord(tuple(_rounded(np.exp(s)) for s in log_speed), _rows(mean), _rows(left))
 
 
-def _of(contact: ForceBalance, kind: str, floor: str) -> Float[np.ndarray, "3"]:
-    """Variances of what a run has of its own, or of what a session shares, by axis."""
+def _variances(contact: ForceBalance, kind: str, floor: str) -> Float[np.ndarray, "3"]:
+    """Return the variances of one kind of effect on a floor, by axis."""
     return np.array([contact.variance.get(f"{kind}.{floor}.{axis}", 0.0) for axis in AXES])
 
 
-def _rows(grid: _Grid) -> tuple[tuple[tuple[Axes, ...], ...], ...]:
-    def axes(row: np.ndarray) -> Axes:
-        along, across, yaw = (_short(x) for x in row)
-        return along, across, yaw
-
-    return tuple(tuple(tuple(axes(a) for a in d) for d in s) for s in grid)
+def _rows(grid: _Grid) -> tuple[tuple[tuple[record.Axes, ...], ...], ...]:
+    return tuple(tuple(tuple(axes_of(map(_rounded, a)) for a in d) for d in s) for s in grid)
 
 
-def _short(value: float) -> float:
-    """To four digits: the table is long, and known no better."""
+def _rounded(value: float) -> float:
+    """Return a number to four digits, which keeps the table short and exceeds its accuracy."""
     return float(f"{value:.4g}")

@@ -1,4 +1,4 @@
-"""Where a robot's twin is driven: patches of its floors, starts, and the paths."""
+"""Site, starts and paths of a robot's twin."""
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +14,11 @@ from slipid.support.errors import DataError
 
 SITE_SEED, STARTS_SEED = 7, 2021
 REST_S = 1.0
-"""Time for which the robot stands before it drives: a gyro learns its zero [s]."""
+"""Rest before the robot drives, during which a gyro learns its zero [s]."""
 
 
 def twin_floor(robot: DeployedRobot) -> FloorMap:
-    """Patches of about the robot's size, half of them of the floor on which it slips least.
+    """Return patches about as large as the robot, half of them of the floor with the least slip.
 
     On the test site's firm, medium and soft floors encoders then travel 80 to 90 % of the first
     side, as on the paper's site.
@@ -27,13 +27,13 @@ def twin_floor(robot: DeployedRobot) -> FloorMap:
     slip = [float(np.mean(f.seen.slip)) if f.seen is not None else 0.0 for f in robot.record.floors]
     order = [labels[k] for k in np.argsort(slip)]
     names = order if len(order) == 1 else [*order, "more of the first"]
-    drawn = patchwork(names, seed=SITE_SEED, patch=0.35, half=2.0)
-    cells = np.where(drawn.cells == len(order), 0, drawn.cells)
-    return FloorMap(tuple(order), cells, drawn.corner, drawn.cell)
+    patches = patchwork(names, seed=SITE_SEED, patch=0.35, half=2.0)
+    cells = np.where(patches.cells == len(order), 0, patches.cells)
+    return FloorMap(tuple(order), cells, patches.corner, patches.cell)
 
 
 def starts(count: int, floor: FloorMap, path: Path) -> list[tuple[float, float, float]]:
-    """Poses all over a site in evenly spread headings, the same ones for every controller.
+    """Return poses all over a site with evenly spread headings, the same for every controller.
 
     The middle of the path, which begins at the origin, keeps 0.8 m from the site's edge where there
     is room.
@@ -54,25 +54,25 @@ def starts(count: int, floor: FloorMap, path: Path) -> list[tuple[float, float, 
 
 
 def require_known_surfaces(floor: FloorMap, robot: DeployedRobot, path: str) -> None:
-    """Refuse a map, from this file, with a surface that the twin of a robot does not have."""
+    """Raise `DataError` for a map, from this file, with a surface that the robot does not know."""
     if absent := [name for name in floor.surfaces if name not in robot.labels]:
         known = ", ".join(robot.labels)
         raise DataError(f"{path}: no surface '{absent[0]}'; identified: {known}")
 
 
 def path_of(name: str, speed: float, robot: DeployedRobot) -> trajectory.Path:
-    """A path from the origin at a speed [m/s].
+    """Return a path from the origin at a speed [m/s].
 
     Raises:
-        DataError: no such path, or a speed at which wheels are faster than the fit has seen them.
+        DataError: there is no such path, or the wheels would exceed their highest fitted speed.
     """
     if name not in trajectory.PATHS:
         raise DataError(f"no path '{name}'; expected one of {', '.join(trajectory.PATHS)}")
     most = float(robot.highest[0] * robot.frame.radius)
     if not 0 < speed <= most:
         raise DataError(
-            f"speed {speed:g} m/s; expected above 0 and at most {most:.2g} m/s, the rim speed up "
-            "to which the fit has seen the wheels"
+            f"speed {speed:g} m/s; expected above 0 and at most {most:.2g} m/s, the highest "
+            "rim speed of the fitted runs"
         )
     return trajectory.PATHS[name](speed)
 
@@ -82,8 +82,8 @@ def twin_plant(
     floor: FloorMap,
     start: tuple[float, float, float],
     seed: int,
-    habits: ActuatorModel,
+    actuators: ActuatorModel,
 ) -> TwinPlant:
-    """The identified model itself as a plant, see `slipid.robot.twin`."""
-    made = Twin(robot, floor_of(floor, robot.labels), habits)
-    return TwinPlant(made, jnp.asarray(start), jax.random.key(seed))
+    """Return the identified model itself as a plant, see `slipid.robot.twin`."""
+    model = Twin(robot, floor_of(floor, robot.labels), actuators)
+    return TwinPlant(model, jnp.asarray(start), jax.random.key(seed))

@@ -1,11 +1,4 @@
-"""The numbers of an identified robot one by one, with all that is known of each.
-
-Sentences on the origin of a controller's gains and limits.
-
-Head of every file that is made of a robot: its origin, floors, verdicts and warnings.
-
-README of an exported folder.
-"""
+"""Texts that all exported files share: numbers of a robot, their origin, warnings, README."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,7 +29,7 @@ PROVENANCES: Mapping[Provenance, str] = {
     "override": "it was held at a chosen value",
 }
 WARNED_VERDICTS: tuple[Verdict, ...] = ("not_identified", "at_bound", "disputed")
-"""Verdicts of numbers of which a user must be warned."""
+"""Verdicts about which a user must be warned."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +37,15 @@ class NumberRow:
     """One number of a robot.
 
     Attributes:
-        path: of robot.json; entry: "wheel 2", empty for a number of the whole robot.
-        symbol, about: as equations and people call it.
-        value: [unit]; interval90: equal-tailed, None where it was fixed.
+        path: path in robot.json.
+        entry: "wheel 2" for example, empty for a number of the whole robot.
+        symbol: symbol in equations.
+        about: meaning in words.
+        unit: unit of the value.
+        value: value [unit].
+        interval90: equal-tailed 90 % interval [unit]; None where the number was fixed.
+        verdict: how well the logs determine it.
+        provenance: whether the logs, a prior or an explicit choice determine it.
     """
 
     path: str
@@ -66,31 +65,36 @@ class NumberRow:
 
 
 def verdict_text(verdict: Verdict) -> str:
-    """A verdict as people read it, in capitals where they must be warned."""
+    """Return a verdict as people read it, in capitals where they must be warned."""
     words = verdict.replace("_", " ")
     return words.upper() if verdict in WARNED_VERDICTS else words
 
 
+def verdict_markdown(verdict: Verdict) -> str:
+    """Return a verdict for Markdown, in bold where users must be warned."""
+    text = verdict_text(verdict)
+    return f"**{text}**" if verdict in WARNED_VERDICTS else text
+
+
 def values_of(number: RecordedNumber) -> tuple[float, ...]:
-    """Its values, one or as many as wheels."""
+    """Return the values of a number, one or as many as wheels."""
     return number.value if isinstance(number.value, tuple) else (number.value,)
 
 
 def number_rows(robot: DeployedRobot) -> tuple[NumberRow, ...]:
-    """Every number of a robot, those per wheel one by one."""
-    known = robot.record.parameters
-    numbers = declared_numbers(robot.record)
+    """Return every number of a robot, those per wheel one by one."""
+    known, numbers = robot.record.parameters, declared_numbers(robot.record)
     return tuple(row for e in numbers for row in _of_entry(e, known[e.path]))
 
 
 def paths_with_verdict(robot: DeployedRobot, verdict: Verdict) -> tuple[str, ...]:
-    """Paths of the numbers with a verdict."""
-    known = robot.record.parameters
-    numbers = declared_numbers(robot.record)
+    """Return the paths of the numbers with a verdict."""
+    known, numbers = robot.record.parameters, declared_numbers(robot.record)
     return tuple(e.path for e in numbers if known[e.path].verdict == verdict)
 
 
 def _of_entry(e: Entry, number: RecordedNumber) -> tuple[NumberRow, ...]:
+    """Return the rows of a number, one per wheel if it has several values."""
     ends = np.reshape([] if number.interval90 is None else number.interval90, (-1, 2))
     d, rows = e.declaration, []
     for k, value in enumerate(values_of(number)):
@@ -111,7 +115,7 @@ LIMITS: Mapping[str, tuple[str, str]] = {
 
 
 def gains_origin(robot: DeployedRobot) -> str:
-    """Where the gains of a robot come from, and that limits were not identified, as sentences."""
+    """Return sentences on the origin of a robot's gains, and that limits were not identified."""
     limits = "Limits are the defaults of slipid: put in those of your motors and supply."
     tuned = robot.record.gains
     if tuned is None:
@@ -139,37 +143,38 @@ WARNINGS: Mapping[Verdict, str] = {
 
 
 def header(robot: DeployedRobot) -> list[str]:
-    """Lines of a comment without its sign: origin, floors, loads, verdicts and warnings of a robot.
+    """Return lines of a comment without its sign: origin, floors, loads, verdicts and warnings.
 
     Each is plain printable text, of 96 characters at most where no word is longer.
     """
-    said = (*_sentences(robot), *(f"WARNING: {text}" for text in warnings(robot)))
-    return [line for part in said for line in wrapped(part)]
+    sentences = (*_sentences(robot), *(f"WARNING: {text}" for text in warnings(robot)))
+    return [line for sentence in sentences for line in wrapped(sentence)]
 
 
 def in_markdown(robot: DeployedRobot) -> list[str]:
-    """The head as Markdown, warnings first, with the messages of the fit."""
+    """Return the head as Markdown, warnings first, with the messages of the fit."""
     return [*warned(robot), *facts(robot)]
 
 
 def warned(robot: DeployedRobot) -> list[str]:
-    """Warnings as Markdown."""
+    """Return the warnings as Markdown."""
     return [line for text in warnings(robot) for line in (f"> **WARNING.** {text}", "")]
 
 
 def facts(robot: DeployedRobot) -> list[str]:
-    """Origin, floors, loads, verdicts and messages of the fit as a list in Markdown."""
+    """Return origin, floors, loads, verdicts and messages of the fit as a list in Markdown."""
     notes = (f"Note of the fit: {message}" for message in robot.record.messages)
     return [*(f"- {one_line(part)}" for part in (*_sentences(robot), *notes)), ""]
 
 
 def warnings(robot: DeployedRobot) -> tuple[str, ...]:
-    """A sentence for each verdict of which a user must be warned, where a number has it."""
-    found = {verdict: paths_with_verdict(robot, verdict) for verdict in WARNED_VERDICTS}
-    return tuple(f"{WARNINGS[v]}: {listed(paths)}." for v, paths in found.items() if paths)
+    """Return a warning for each verdict that some number has and that a user must know of."""
+    by_verdict = {verdict: paths_with_verdict(robot, verdict) for verdict in WARNED_VERDICTS}
+    return tuple(f"{WARNINGS[v]}: {listed(paths)}." for v, paths in by_verdict.items() if paths)
 
 
 def _sentences(robot: DeployedRobot) -> Iterator[str]:
+    """Yield sentences on origin, floors, loads and verdicts."""
     record = robot.record
     yield f"Made by slipid {made_with()} from robot.json; make it anew rather than change it."
     yield f"Numbers: {record.numbers} (`numbers` of robot.json)."
@@ -177,14 +182,13 @@ def _sentences(robot: DeployedRobot) -> Iterator[str]:
     loads = listed([load.name for load in record.loads])
     yield f"Load set-up: {one_line(robot.load_setup)}, of those known: {loads}."
     yield f"Floors: {listed(robot.labels)}."
-    numbers = declared_numbers(record)
-    counts = Counter(record.parameters[e.path].verdict for e in numbers)
-    said = ", ".join(f"{n} {v.replace('_', ' ')}" for v, n in counts.most_common())
-    yield f"Verdicts: {said}."
+    counts = Counter(record.parameters[e.path].verdict for e in declared_numbers(record))
+    listing = ", ".join(f"{n} {v.replace('_', ' ')}" for v, n in counts.most_common())
+    yield f"Verdicts: {listing}."
 
 
 def made_with() -> str:
-    """Version of slipid."""
+    """Return the version of slipid."""
     try:
         return version("slipid")
     except PackageNotFoundError:
@@ -203,7 +207,7 @@ ABOUT: Mapping[str, str] = {
 
 
 def readme(robot: DeployedRobot, forms: Sequence[str], controller: str) -> str:
-    """Text of README.md."""
+    """Return the text of README.md."""
     lines = [
         "# One identified robot, ready to be taken along",
         "",

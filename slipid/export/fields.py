@@ -1,7 +1,7 @@
-"""Structs of the generated code: a field for every array of a step's state, input and output.
+"""Structs of the generated code, with a field for every array of a state, an input or an output.
 
-Their comments are those of the Python classes, whose docstrings say what each attribute is, with
-its unit in brackets.
+Their comments are those of the Python classes, whose docstrings describe each attribute with its
+unit in brackets.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Kind = Literal["real", "int", "bool"]
 DTYPES: dict[Kind, type] = {"real": np.float64, "int": np.int64, "bool": np.bool_}
 UNIT = re.compile(r"\[[^\]]+\]")
 ONE = "[1]"
-"""Unit of what has none."""
+"""Unit of a field without one."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,10 @@ class Field:
     """A member of a struct.
 
     Attributes:
-        name: in C; kind: of its numbers; shape: () where it is a single one.
-        comment: what it is, with its unit.
+        name: name in C.
+        kind: kind of its numbers.
+        shape: shape of the array; () for a single number.
+        comment: meaning with its unit.
     """
 
     name: str
@@ -47,7 +49,9 @@ class Struct:
     """A struct of C.
 
     Attributes:
-        name: of the type; about: one sentence; fields: in the order of the tree's leaves.
+        name: name of the type.
+        about: one sentence.
+        fields: fields in the order of the tree's leaves.
     """
 
     name: str
@@ -55,23 +59,26 @@ class Struct:
     fields: tuple[Field, ...]
 
     @classmethod
-    def of(cls, name: str, about: str, tree: object, said: type | None = None) -> Struct:
-        """For a tree of arrays, of modules with documented attributes, or documented by a class."""
-        return cls(name, about, tuple(_fields(tree, "", "", said)))
+    def of(cls, name: str, about: str, tree: object, documented: type | None = None) -> Struct:
+        """Return the struct of a tree of arrays, or of modules with documented attributes.
+
+        `documented` is the class whose docstring describes the attributes, if not the tree's own.
+        """
+        return cls(name, about, tuple(_fields(tree, "", "", documented)))
 
 
 def kind_of(dtype: np.dtype) -> Kind:
-    """Kind of the numbers of a type of jax or numpy."""
+    """Return the kind of the numbers of a type of jax or numpy."""
     if dtype == np.bool_:
         return "bool"
     return "int" if np.issubdtype(dtype, np.integer) else "real"
 
 
 def attribute_docs(kind: type) -> dict[str, str]:
-    """What a class's docstring says of every attribute.
+    """Return the description of every attribute in a class's docstring.
 
-    Several attributes may share a sentence, `place, turn: of its ... [m], [rad].`, or a line, apart
-    by semicolons.
+    Several attributes may share a sentence, `place, turn: of its ... [m], [rad].`, or a line,
+    separated by semicolons.
     """
     names = [field.name for field in fields(kind)]
     text = inspect.getdoc(kind) or ""
@@ -79,24 +86,24 @@ def attribute_docs(kind: type) -> dict[str, str]:
     flat = " ".join(rest.split())
     either = "|".join(re.escape(name) for name in names)
     head = re.compile(rf"(?:^|(?<=[.;] )|(?<=[.;]))((?:(?:{either})(?:, )?)+): ")
-    found = list(head.finditer(flat))
-    ends = [*(match.start() for match in found[1:]), len(flat)][: len(found)]
-    out = {}
-    for match, end in zip(found, ends, strict=True):
-        said = flat[match.end() : end].strip().rstrip(";.")
-        for name in match.group(1).split(", "):
-            out[name] = said
-    return out
+    heads = list(head.finditer(flat))
+    ends = [*(match.start() for match in heads[1:]), len(flat)][: len(heads)]
+    return {
+        name: flat[match.end() : end].strip().rstrip(";.")
+        for match, end in zip(heads, ends, strict=True)
+        for name in match.group(1).split(", ")
+    }
 
 
 def _fields(tree: object, prefix: str, above: str, by: type | None = None) -> list[Field]:
+    """Return the fields of a tree, whose names begin with a prefix."""
     if is_dataclass(tree) and not isinstance(tree, type):
-        said = attribute_docs(by or type(tree))
+        docs = attribute_docs(by or type(tree))
         parts = []
         for field in fields(tree):
             if not field.metadata.get("static", False):
                 name = f"{prefix}_{field.name}" if prefix else field.name
-                parts += _fields(getattr(tree, field.name), name, said.get(field.name, above))
+                parts += _fields(getattr(tree, field.name), name, docs.get(field.name, above))
         return parts
     array = jnp.asarray(tree)
     comment = above if UNIT.search(above) else f"{above} {ONE}".strip()

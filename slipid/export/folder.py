@@ -1,7 +1,7 @@
-"""A folder that goes to a robot: robot.json, the forms made of it, and the checksum of every file.
+"""A folder for a robot: robot.json, its exported forms, and a checksum of every file.
 
-`sha256sum -c SHA256SUMS` checks it where there is no slipid. Folders named `build` hold what is
-built of it, and count as no part of it.
+`sha256sum -c SHA256SUMS` checks it without slipid. Folders named `build` hold what is built from it
+and do not belong to it.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ BUILD = "build"
 
 
 def write_folder(folder: Path, content: Mapping[str, bytes]) -> None:
-    """Write files and their checksums in place of an older export, of which nothing stays.
+    """Write files and their checksums; nothing of an older export remains.
 
-    Checksums come first: a folder of which some files were not written any more is then known as
-    one that was cut short, and can be written again.
+    Checksums are written first: a folder that lacks some files is then recognized as an incomplete
+    export, and can be written again.
 
     Raises:
-        DataError: as `check_writable`, or nothing can be written there.
+        DataError: as in `check_writable`, or the folder cannot be written.
     """
     check_writable(folder)
     for name in sorted(_files(folder) - {SUMS}):
@@ -41,10 +41,10 @@ def write_folder(folder: Path, content: Mapping[str, bytes]) -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Refuse a folder whose content is not all an export's, as it was written.
+    """Refuse a folder that contains anything but an unchanged export.
 
     Raises:
-        DataError: it is no folder, or a file in it was added or changed by hand.
+        DataError: it is not a folder, or a file in it was added or changed by hand.
     """
     if not folder.exists():
         return
@@ -66,10 +66,10 @@ def check_writable(folder: Path) -> None:
 
 
 def check_folder(folder: Path | str) -> tuple[str, ...]:
-    """Names of the files of a folder, all of them as they were written.
+    """Return the names of the files of a folder, all of them unchanged.
 
     Raises:
-        DataError: one is absent, changed, or was not there when the folder was written.
+        DataError: a file is absent, changed, or was not there when the folder was written.
     """
     place = Path(folder)
     sums = _sums(place)
@@ -92,7 +92,7 @@ def check_folder(folder: Path | str) -> tuple[str, ...]:
 
 
 def _sums(folder: Path) -> dict[str, str]:
-    """Checksum of every file by its name, as they were written."""
+    """Return the checksum of every file by its name, as they were written."""
     try:
         text = (folder / SUMS).read_text()
     except (OSError, UnicodeDecodeError):
@@ -107,13 +107,13 @@ def _sums(folder: Path) -> dict[str, str]:
 
 
 def _whole(name: str) -> str | None:
-    """Name of the file of which a file is a part that `write_bytes` left; None if it is none."""
+    """Return the file's name of which this is an unfinished part by `write_bytes`, or None."""
     match = re.fullmatch(r"((?:.*/)?)\.(.+)\.[0-9a-f]{8}", name)
     return None if match is None else match[1] + match[2]
 
 
 def _files(folder: Path) -> set[str]:
-    """Files of a folder but for those in folders named `build`."""
+    """Return the files of a folder except those in folders named `build`."""
     paths = (p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
     return {p.as_posix() for p in paths if BUILD not in p.parts}
 

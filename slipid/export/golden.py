@@ -1,4 +1,4 @@
-"""Steps that an exported program must repeat: what goes in, and what the library makes of it."""
+"""Reference steps that an exported program must repeat: inputs, and the library's outputs."""
 
 from __future__ import annotations
 
@@ -12,48 +12,54 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.robot.closed_loop import PERIOD, ControlLoop
-from slipid.robot.interface import Readings
+from slipid.robot.controller import ControllerState
+from slipid.robot.interface import Readings, StateEstimate
 
 STEPS = 48
 
 
 @dataclass(frozen=True)
 class Golden:
-    """Steps in a row from rest at 0, 0, 0, a row each.
+    """Successive steps from rest at 0, 0, 0, one row each.
 
     Attributes:
-        given: leaves of the reading, the reference, and dt; said: leaves of the estimate.
+        given: leaves of the reading, the reference, and dt.
+        said: leaves of the estimate.
         command: wheel speeds [rad/s].
     """
 
-    given: Float[np.ndarray, "step given"]
-    said: Float[np.ndarray, "step said"]
+    given: Float[np.ndarray, "step input"]
+    said: Float[np.ndarray, "step output"]
     command: Float[np.ndarray, "step wheel"]
 
 
-def golden(pilot: ControlLoop[eqx.Module]) -> Golden:
-    """A drive in which every sensor speaks up, and is silent, once."""
-    run = jax.jit(lambda *given: _step(pilot, *given))
-    begin = pilot.init()
-    state, rows = (begin.seen, begin.held), []
-    for z, reference, dt in _drive(pilot):
-        state, said, command = run(state, z, reference, dt)
-        rows.append((_flat((z, reference, dt)), _flat(said), np.asarray(command)))
-    given, estimates, commands = zip(*rows, strict=True)
-    return Golden(np.array(given), np.array(estimates), np.array(commands))
+def golden(loop: ControlLoop[eqx.Module]) -> Golden:
+    """Return steps in which every sensor gives readings and is silent at least once."""
+    run = jax.jit(lambda *inputs: loop_step(loop, *inputs))
+    begin = loop.init()
+    state, rows = (begin.estimator, begin.controller), []
+    for z, reference, dt in _inputs(loop):
+        state, estimate, command = run(state, z, reference, dt)
+        rows.append((_flat((z, reference, dt)), _flat(estimate), np.asarray(command)))
+    return Golden(*map(np.array, zip(*rows, strict=True)))
 
 
-def _step(
-    pilot: ControlLoop[eqx.Module], state: tuple, z: Readings, reference: jax.Array, dt: jax.Array
-) -> tuple:
-    seen, said = pilot.estimator.step(state[0], z, dt)
-    held, command = pilot.controller.step(state[1], reference, said, dt)
-    return (seen, held), said, command
+def loop_step(
+    loop: ControlLoop[eqx.Module],
+    state: tuple[eqx.Module, ControllerState],
+    z: Readings,
+    reference: jax.Array,
+    dt: jax.Array,
+) -> tuple[tuple[eqx.Module, ControllerState], StateEstimate, jax.Array]:
+    """Return state, estimate and command of one step of a control loop with this reference."""
+    estimator, estimate = loop.estimator.step(state[0], z, dt)
+    controller, command = loop.controller.step(state[1], reference, estimate, dt)
+    return (estimator, controller), estimate, command
 
 
-def _drive(pilot: ControlLoop[eqx.Module]) -> Iterator[tuple[Readings, jax.Array, float]]:
-    """Readings, references and time steps: a late and a lost one, and wheels silent for long."""
-    robot = pilot.controller.robot
+def _inputs(loop: ControlLoop[eqx.Module]) -> Iterator[tuple[Readings, jax.Array, float]]:
+    """Yield readings, references and time steps, with a late and a lost one, and a long silence."""
+    robot = loop.controller.robot
     angle, count = np.zeros(robot.wheels), robot.wheels
     for step in range(STEPS):
         t = step * PERIOD
@@ -81,5 +87,4 @@ def _drive(pilot: ControlLoop[eqx.Module]) -> Iterator[tuple[Readings, jax.Array
 
 
 def _flat(tree: object) -> Float[np.ndarray, " flat"]:
-    leaves = [np.asarray(leaf, float).reshape(-1) for leaf in jax.tree.leaves(tree)]
-    return np.concatenate(leaves)
+    return np.concatenate([np.asarray(x, float).reshape(-1) for x in jax.tree.leaves(tree)])

@@ -1,4 +1,4 @@
-"""A pilot's step as StableHLO: for programs that run XLA and know nothing of slipid.
+"""A control loop's step as StableHLO, for programs that run XLA without slipid.
 
 Arrays go in and come out in the order that `step.json` lists, with names, shapes and units.
 """
@@ -20,7 +20,7 @@ from jax import export
 from jaxtyping import Array
 
 from slipid.export.fields import Struct
-from slipid.export.golden import Golden, golden
+from slipid.export.golden import Golden, golden, loop_step
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.interface import Measurement, Readings
 from slipid.robot.robot_file import typed
@@ -28,7 +28,7 @@ from slipid.support.errors import DataError
 
 SCHEMA = "slipid.stablehlo/1"
 CLOSE = 1e-9
-"""Over its scale, by which a number may differ once the program is loaded."""
+"""Largest difference of a number, relative to its scale, once the program is loaded."""
 PLATFORMS = ("cpu", "cuda", "tpu")
 """Platforms that the programs run on."""
 FILES = ("step.stablehlo", "step_batch.stablehlo", "step.json", "golden.npz")
@@ -57,7 +57,7 @@ state, said = found[: len(state)], found[len(state) :]
 
 @dataclass(frozen=True)
 class Leaf:
-    """An array that goes in or comes out; `numbers` is `real`, `int` or `bool`."""
+    """An input or output array; `numbers` is `real`, `int` or `bool`."""
 
     name: str
     numbers: str
@@ -67,7 +67,13 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Signature:
-    """Arrays in their order: those kept, those given besides them, those said besides them."""
+    """Arrays of a step in their order, as step.json lists them.
+
+    Attributes:
+        state: arrays of the state, which go in and come out.
+        given: further inputs.
+        said: further outputs.
+    """
 
     state: tuple[Leaf, ...]
     given: tuple[Leaf, ...]
@@ -79,8 +85,10 @@ class Program:
     """A step that was read back.
 
     Attributes:
-        signature: of its arrays; start: state of a robot at rest at 0, 0, 0.
-        step: of one robot; batch: of many, a leading axis on every array.
+        signature: names and shapes of its arrays.
+        start: state of a robot at rest at 0, 0, 0.
+        step: step of one robot.
+        batch: step of many robots, with a leading axis on every array.
     """
 
     signature: Signature
@@ -89,19 +97,16 @@ class Program:
     batch: export.Exported
 
 
-def stablehlo_files(pilot: ControlLoop[eqx.Module]) -> dict[str, bytes]:
-    """Content of the files by their names: the step of one robot and of many, and what goes in."""
-    begin = pilot.init()
-    state = begin.seen, begin.held
-    nothing, zero = Readings.nothing(pilot.controller.robot.wheels), jnp.zeros(())
+def stablehlo_files(loop: ControlLoop[eqx.Module]) -> dict[str, bytes]:
+    """Return the files' content by name: the step of one robot and of many, and its inputs."""
+    begin = loop.init()
+    state = begin.estimator, begin.controller
+    nothing, zero = Readings.nothing(loop.controller.robot.wheels), jnp.zeros(())
     like = (state, nothing, jnp.zeros(6), zero)
     structure = jax.tree.structure(like)
 
     def step(*flat: Array) -> list[Array]:
-        (seen, held), z, reference, dt = jax.tree.unflatten(structure, flat)
-        seen, said = pilot.estimator.step(seen, z, dt)
-        held, command = pilot.controller.step(held, reference, said, dt)
-        return jax.tree.leaves((seen, held, said, command))
+        return jax.tree.leaves(loop_step(loop, *jax.tree.unflatten(structure, flat)))
 
     flat = [jnp.asarray(x) for x in jax.tree.leaves(like)]
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in flat]
@@ -109,14 +114,11 @@ def stablehlo_files(pilot: ControlLoop[eqx.Module]) -> dict[str, bytes]:
     many = [jax.ShapeDtypeStruct((count, *x.shape), x.dtype) for x in flat]
     one = export.export(jax.jit(step), platforms=PLATFORMS)(*shapes)
     batch = export.export(jax.jit(jax.vmap(step)), platforms=PLATFORMS)(*many)
-    kept = golden(pilot)
+    start = {f"start{k}": np.asarray(x) for k, x in enumerate(jax.tree.leaves(state))}
+    arrays: dict[str, Any] = start | vars(golden(loop))
     buffer = io.BytesIO()
-    arrays: dict[str, Any] = {
-        f"start{k}": np.asarray(x) for k, x in enumerate(jax.tree.leaves(state))
-    }
-    arrays |= vars(kept)
     np.savez_compressed(buffer, **arrays)
-    about = {"schema": SCHEMA, **asdict(_signature(pilot))}
+    about = {"schema": SCHEMA, **asdict(_signature(loop))}
     return {
         "step.stablehlo": bytes(one.serialize()),
         "step_batch.stablehlo": bytes(batch.serialize()),
@@ -126,30 +128,30 @@ def stablehlo_files(pilot: ControlLoop[eqx.Module]) -> dict[str, bytes]:
     }
 
 
-def _signature(pilot: ControlLoop[eqx.Module]) -> Signature:
-    begin = pilot.init()
-    wheels = pilot.controller.robot.wheels
+def _signature(loop: ControlLoop[eqx.Module]) -> Signature:
+    begin = loop.init()
+    wheels = loop.controller.robot.wheels
     nothing = Readings.nothing(wheels)
-    said = pilot.estimator.step(begin.seen, nothing, 0.0)[1]
-    rest = (
+    estimate = loop.estimator.step(begin.estimator, nothing, 0.0)[1]
+    others = (
         Leaf("reference", "real", (6,), "pose and rates in the world [m, m, rad and per s]"),
         Leaf("dt", "real", (), "since the last step [s]"),
     )
     command = Leaf("command", "real", (wheels,), "wheel speeds [rad/s]")
     return Signature(
-        (*_leaves("estimator", begin.seen), *_leaves("controller", begin.held)),
-        (*_leaves("reading", nothing, Measurement), *rest),
-        (*_leaves("estimate", said), command),
+        (*_leaves("estimator", begin.estimator), *_leaves("controller", begin.controller)),
+        (*_leaves("reading", nothing, Measurement), *others),
+        (*_leaves("estimate", estimate), command),
     )
 
 
-def _leaves(name: str, tree: object, said: type | None = None) -> list[Leaf]:
-    fields = Struct.of(name, "", tree, said).fields
+def _leaves(name: str, tree: object, documented: type | None = None) -> list[Leaf]:
+    fields = Struct.of(name, "", tree, documented).fields
     return [Leaf(f"{name}.{f.name}", f.kind, f.shape, f.comment) for f in fields]
 
 
 def load_program(folder: Path | str) -> Program:
-    """The step of a folder, once it has repeated what the library computed.
+    """Return the step of a folder, once it has repeated the library's results.
 
     Raises:
         DataError: a file is absent, damaged or of a newer version, or numbers differ.
@@ -172,12 +174,12 @@ def load_program(folder: Path | str) -> Program:
             "slipid, or export the robot again"
         )
     try:
-        kept = np.load(io.BytesIO(content["golden.npz"]), allow_pickle=False)
+        arrays = np.load(io.BytesIO(content["golden.npz"]), allow_pickle=False)
         signature = typed(Signature, about)
-        start = [jnp.asarray(kept[f"start{k}"]) for k in range(len(signature.state))]
+        start = [jnp.asarray(arrays[f"start{k}"]) for k in range(len(signature.state))]
         programs = [export.deserialize(bytearray(content[name])) for name in FILES[:2]]
-        steps = Golden(kept["given"], kept["said"], kept["command"])
-    except Exception as error:  # whatever the parsers of three formats raise
+        steps = Golden(arrays["given"], arrays["said"], arrays["command"])
+    except Exception as error:  # the parsers of three formats raise many kinds of errors
         raise DataError(f"{place}: damaged ({error}); export the robot again") from error
     program = Program(signature, tuple(start), *programs)
     _repeated(program, steps, place)
@@ -185,18 +187,18 @@ def load_program(folder: Path | str) -> Program:
 
 
 def _repeated(program: Program, steps: Golden, place: Path) -> None:
-    """Refuse a program, for one robot or for two at once, that says other numbers."""
+    """Refuse a program whose results differ, for one robot or for two at once."""
     one, two = list(program.start), [jnp.stack([x, x]) for x in program.start]
     count = len(one)
     scale = np.maximum(np.abs(steps.said).max(axis=0), 1e-3)
-    for row, said, command in zip(steps.given, steps.said, steps.command, strict=True):
-        given = _split(row, program.signature.given)
-        found = program.step.call(*one, *given)
-        both = program.batch.call(*two, *(jnp.stack([x, x]) for x in given))
-        one, two = list(found[:count]), list(both[:count])
-        for got in (found[count:], [x[1] for x in both[count:]]):
-            numbers = np.concatenate([np.asarray(x, float).reshape(-1) for x in got])
-            gap = np.abs(numbers - np.concatenate([said, command]))
+    for row, estimate, command in zip(steps.given, steps.said, steps.command, strict=True):
+        inputs = _split(row, program.signature.given)
+        single = program.step.call(*one, *inputs)
+        both = program.batch.call(*two, *(jnp.stack([x, x]) for x in inputs))
+        one, two = list(single[:count]), list(both[:count])
+        for outputs in (single[count:], [x[1] for x in both[count:]]):
+            numbers = np.concatenate([np.asarray(x, float).reshape(-1) for x in outputs])
+            gap = np.abs(numbers - np.concatenate([estimate, command]))
             if not (gap <= CLOSE * np.concatenate([scale, np.ones(len(command))])).all():
                 raise DataError(
                     f"{place}: the program does not repeat what was computed when it was made "

@@ -1,6 +1,6 @@
 """The numbers of a robot as plain tables, for a person who types them into a controller.
 
-`gains.md` is for reading: values rounded beside those with all digits. `gains.csv` has the same
+`gains.md` is for reading: rounded values beside those with all digits. `gains.csv` has the same
 rows with all digits; its lines that start with # are comments.
 """
 
@@ -50,9 +50,16 @@ class TableRow:
     """One number.
 
     Attributes:
-        group: key of the table it stands in; name, entry: which one.
-        low_high: 90 % interval, None where there is none.
-        verdict, provenance: how sure it is, as people read it.
+        group: key of its table.
+        name: name of the number.
+        entry: entry of the number, such as a wheel.
+        symbol: symbol in equations.
+        value: value [unit].
+        unit: unit of the value.
+        low_high: 90 % interval; None where there is none.
+        verdict: how certain it is, as people read it.
+        provenance: its origin, as people read it.
+        meaning: meaning in words.
     """
 
     group: str
@@ -68,7 +75,7 @@ class TableRow:
 
 
 def table_files(robot: DeployedRobot) -> dict[str, str]:
-    """Text of gains.md and gains.csv, for the robot's load set-up."""
+    """Return the text of gains.md and gains.csv, for the robot's load set-up."""
     lines = tuple(_lines(robot))
     return {"gains.md": _markdown(robot, lines), "gains.csv": _csv(robot, lines)}
 
@@ -123,7 +130,7 @@ def _curve(robot: DeployedRobot) -> Iterator[TableRow]:
 
 
 def _numbers(robot: DeployedRobot) -> Iterator[TableRow]:
-    """The robot's numbers, the gear ratio among those of the motor."""
+    """Yield the robot's numbers, with the gear ratio among those of the motor."""
     ratio = robot.record.wheels.gear_ratio
     about = ("fixed", "override", "motor speed over wheel speed")
     yield TableRow("motor", "wheels.gear_ratio", "", "n", float(ratio), "1", None, *about)

@@ -1,6 +1,6 @@
 """Text for people: words on one line, rounded numbers, Markdown tables.
 
-Names of floors and load set-ups that ROS parameters, C++ and files can have.
+It also makes names of floors and load set-ups that ROS parameters, C++ and files can have.
 """
 
 import re
@@ -8,39 +8,39 @@ import textwrap
 from collections.abc import Iterator, Sequence
 
 WIDTH = 96
-"""Longest line of a comment, its sign left out."""
+"""Longest line of a comment, without its sign."""
 
 
 def one_line(text: str) -> str:
-    """Words of any origin on one line, without what no file may hold."""
+    """Return words of any origin on one line, without characters that no file may hold."""
     shown = "".join(c if c.isprintable() else " " for c in text)
     return " ".join(shown.split())
 
 
 def short(value: float) -> str:
-    """A number rounded for people, to four digits."""
+    """Return a number rounded for people, to four digits."""
     return f"{value:.4g}"
 
 
 def interval(ends: tuple[float, float] | None) -> str:
-    """An interval rounded for people; empty where there is none."""
+    """Return an interval rounded for people; empty where there is none."""
     return "" if ends is None else f"{short(ends[0])} to {short(ends[1])}"
 
 
 def wrapped(text: str, width: int = WIDTH) -> Iterator[str]:
-    """A paragraph as lines of a comment; paths and addresses stay whole."""
+    """Yield a paragraph as lines of a comment; paths and addresses stay whole."""
     lines = textwrap.wrap(one_line(text), width, break_long_words=False, break_on_hyphens=False)
     yield from lines or [""]
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A Markdown table."""
+    """Return a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return ["| " + " | ".join(map(_cell, line)) + " |" for line in lines]
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names with commas, or the word that there are none."""
+    """Return names with commas, or "none"."""
     return ", ".join(one_line(name) for name in names) or "none"
 
 
@@ -56,14 +56,14 @@ register requires return short signed sizeof static struct switch template this 
 typedef typeid typename union unsigned using virtual void volatile while xor
 """
 _TAKEN = frozenset(_WORDS.split())
-"""Words of C++, which the fields of a generated struct cannot have."""
+"""Keywords of C++, which the fields of a generated struct cannot be named after."""
 
 
 def identifiers(labels: Sequence[str], kind: str) -> tuple[str, ...]:
-    """A name of small letters, digits and single underscores for each label, no two alike.
+    """Return a unique name of small letters, digits and single underscores for each label.
 
-    They differ without underscores, too: generated structs are called after them in that way.
-    `kind` stands before a label that is no name by itself.
+    They also differ without underscores, which generated structs omit. `kind` is put before a label
+    that is not a name by itself.
     """
     names: list[str] = []
     for label in labels:

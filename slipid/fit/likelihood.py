@@ -1,6 +1,6 @@
-"""What a robot predicts of every piece of every run, and how far that is from what was measured.
+"""Predictions of a robot for every segment of every run, and their residuals to the measurements.
 
-A piece is a few neighbouring windows of one run. How the difference is weighed is in `noise`.
+A segment is a few neighbouring windows of one run. The weighting of residuals is in `noise`.
 """
 
 from collections.abc import Callable
@@ -17,42 +17,42 @@ from slipid.model import robot as model
 from slipid.model import se2
 from slipid.model.robot import Robot
 
-Marker = Float[Array, "piece window 3"]
+Marker = Float[Array, "segment window 3"]
 """Increments of the marker [m, m, rad], or body twists [m/s, m/s, rad/s], of every window."""
-PerDrive = Float[Array, "piece window drive"]
-MotorForce = Float[Array, "piece window drive 2"]
-"""What `model.robot.felt` says of the wheels of every drive."""
-PerChannel = Float[Array, "piece m"]
-"""Window by window the drives of every piece, as residuals are."""
+PerDrive = Float[Array, "segment window drive"]
+MotorForce = Float[Array, "segment window drive 2"]
+"""Forces of `model.robot.motor_forces`, summed over the wheels of every drive."""
+PerChannel = Float[Array, "segment m"]
+"""Values of every segment in one row, window by window and drive by drive, as residuals are."""
 Std = Float[Array, ""] | float
 SMOOTH = 0.03
 """Magnitude below which the mean of an unsigned current levels off [A]."""
 FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
-"""Variance added to every residual: rounding of the logs [m^2, A^2, V^2]."""
+"""Variance added to every residual for the rounding of the logs [m^2, A^2, V^2]."""
 
 _AS_THEY_ARE = ("dt", "turn", "speed_change", "pose", "current", "voltage", "current_var", "lag")
 
 
 def with_slope(of: Callable[[Array], Array], z: Array | np.ndarray) -> tuple[Array, Array]:
-    """A function's value at a vector and its derivative by it, from one pass."""
+    """Return a function's value at a vector and its derivative by the vector, from one pass."""
     slope, value = jax.jacfwd(lambda x: (of(x),) * 2, has_aux=True)(z)
     return value, slope
 
 
 class Batch(eqx.Module):
-    """Windows as arrays for a jitted function; names are indices of the robot's stacks.
+    """Windows as arrays for a compiled function, with indices of the robot's stacks as names.
 
-    The surface is the one under the robot (piece,), or under each of its wheels in every window
-    (piece, window, wheel).
+    The surface is the one under the robot (segment,), or under each of its wheels in every window
+    (segment, window, wheel).
     """
 
-    surface: Int[Array, "piece *window_wheel"]
-    load: Int[Array, " piece"]
-    session: Int[Array, " piece"]
-    dt: Float[Array, "piece window"]
+    surface: Int[Array, "segment *window_wheel"]
+    load: Int[Array, " segment"]
+    session: Int[Array, " segment"]
+    dt: Float[Array, "segment window"]
     turn: PerDrive
     speed_change: PerDrive
-    pose: Float[Array, "piece edge 3"]
+    pose: Float[Array, "segment edge 3"]
     current: PerDrive
     voltage: PerDrive
     current_var: PerDrive
@@ -63,11 +63,11 @@ class Batch(eqx.Module):
 
 
 def batch(
-    windows: Windows, robot: Robot, floor: Int[np.ndarray, "piece window wheel"] | None = None
+    windows: Windows, robot: Robot, floor: Int[np.ndarray, "segment window wheel"] | None = None
 ) -> Batch:
-    """Batch for a robot that knows the floors, loads and sessions of the windows.
+    """Return the batch for a robot that knows the floors, loads and sessions of the windows.
 
-    The floor is the surface under each wheel in every window, where the windows do not know theirs.
+    `floor` is the surface under each wheel in every window, for windows on several floors.
     """
     if floor is None:
         floor = np.asarray([robot.surface_index(s) for s in windows.surface])
@@ -83,12 +83,15 @@ def batch(
 
 
 class ElectricNoise(eqx.Module):
-    """What voltages are predicted with: the voltmeter's std [V], and how far currents scatter.
+    """Noise that the prediction of voltages depends on.
 
-    The scatter is the variance of the true current of every window around the predicted one [A^2],
-    without the ammeter's noise. The resistance [ohm] says how far what stays unknown of the true
-    current moves voltages: a fit holds it in every round, as it holds the variances, because these
-    are fitted to the size of the residuals, which then tells nothing more of R.
+    Attributes:
+        voltage_std: std of the voltmeter [V].
+        scatter: variance of the true current of every window around the predicted one [A^2],
+            without the ammeter's noise.
+        resistance: winding resistance [ohm], which converts unknown current to voltage. It is fixed
+            during every round of a fit, as the variances are: these are fitted to the size of the
+            residuals, which then contains no information about R.
     """
 
     voltage_std: Std
@@ -97,9 +100,12 @@ class ElectricNoise(eqx.Module):
 
 
 class Predicted(eqx.Module):
-    """What the robot says of each window: marker increments (x, y [m], yaw [rad]), body twists.
+    """Predicted motion and motor forces of every window.
 
-    Felt is what each motor works against, in units of mu m g.
+    Attributes:
+        increment: increments of the marker (x, y [m], yaw [rad]).
+        twist: body twists.
+        motor_force: forces each motor works against, in units of mu m g.
     """
 
     increment: Marker
@@ -108,12 +114,12 @@ class Predicted(eqx.Module):
 
 
 def wheel_speed(robot: Robot, b: Batch) -> PerDrive:
-    """Mean wheel speed of every drive and window at the robot's camera lag [rad/s]."""
+    """Return the mean wheel speed of every drive and window at the robot's camera lag [rad/s]."""
     return (b.turn - (robot.camera.lag - b.lag) * b.speed_change) / b.dt[..., None]
 
 
 def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
-    """Contact equilibrium of every window, looked for near twists as `model.robot.twist` does."""
+    """Return the contact equilibrium of every window; `near` is as in `model.robot.twist`."""
     shape, frame = robot.geometry, robot.geometry.frame()
 
     def window(w: Array, near: Array | None, surface: Array, load: Array) -> tuple[Array, Array]:
@@ -126,10 +132,9 @@ def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
 
 
 def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | None = None) -> Any:
-    """A function of every window's wheel speeds, a twist near it, its surface and its load.
+    """Apply a function to every window: wheel speeds, a nearby twist, surface and load.
 
-    All windows are one axis meanwhile: two, one inside the other, take JAX half as long again to
-    trace.
+    All windows are one axis meanwhile: two nested ones take JAX half as long again to trace.
     """
     segments, windows = b.dt.shape
 
@@ -148,9 +153,9 @@ def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | No
 
 
 def marker_increments(
-    robot: Robot, twist: Marker, dt: Float[Array, "piece window"], session: Int[Array, " piece"]
+    robot: Robot, twist: Marker, dt: Float[Array, "segment window"], session: Int[Array, " segment"]
 ) -> Marker:
-    """Marker increments of every window for given body twists."""
+    """Return the marker increments of every window for given body twists."""
 
     def window(xi: Array, dt: Array, session: Array) -> Array:
         return robot.camera.marker_increment(se2.advance(xi, dt), session)
@@ -159,7 +164,7 @@ def marker_increments(
 
 
 def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDrive:
-    """Motor current of every window [A] given what motors work against, or its size."""
+    """Return the motor current of every window [A], its magnitude if logs are unsigned."""
     friction = robot.surfaces.friction[b.surface]  # of the wheels on average, as `felt` has it
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
     weight = friction * robot.body.mass * model.GRAVITY
@@ -172,8 +177,8 @@ def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDri
     return jnp.sqrt(amps**2 + SMOOTH**2) + robot.motor.current_offset
 
 
-def measured_increments(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Marker:
-    """Marker increments in the frame of each window's start, in corrected metres."""
+def measured_increments(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Marker:
+    """Return measured marker increments in the frame of each window's start [m, m, rad]."""
 
     def segment(edges: Float[Array, "edge 3"]) -> Float[Array, "window 3"]:
         p = jax.vmap(robot.camera.corrected)(edges)
@@ -184,18 +189,18 @@ def measured_increments(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Mar
     return jax.vmap(segment)(pose)
 
 
-def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "piece m"]:
-    """Predicted less measured marker increments, a row per piece [m, m, rad]."""
+def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "segment m"]:
+    """Return predicted less measured marker increments, a row per segment [m, m, rad]."""
     return (p.increment - measured_increments(robot, b.pose)).reshape(b.dt.shape[0], -1)
 
 
 def electric_residuals(
     robot: Robot, b: Batch, motor_force: MotorForce, noise: ElectricNoise
 ) -> dict[str, Array]:
-    """Predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
+    """Return predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
 
-    Voltages are predicted from what is expected of the true current given the measured and the
-    predicted one: predicted from the measured one alone, its noise would make R too small.
+    Voltages are predicted from the expected true current given the measured and the predicted one:
+    predicted from the measured current alone, its noise would bias R towards small values.
     """
     if not b.has_current:
         return {}
@@ -214,16 +219,16 @@ def _flat(x: PerDrive) -> PerChannel:
 
 
 def _direction(b: Batch) -> PerDrive:
-    """What a logged current counts for in the direction of the wheel: 1 if it is signed."""
+    """Return the factor from a logged current to the wheel's direction, 1 if it is signed."""
     return jnp.ones_like(b.turn) if b.signed else jnp.tanh(b.turn / b.dt[..., None] / 0.2)
 
 
 def _true_current_share(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDrive]:
-    """Share k of the gap of a measured current that is true current, and what stays unknown of it.
+    """Return the share k of measured less predicted current that is true, and the variance left.
 
     The true current is N(predicted, s^2) before it is measured with the noise sigma^2. Afterwards
-    it is N(predicted + k (measured - predicted), k sigma^2) with k = s^2 / (s^2 + sigma^2).
-    Source: Kelly 2007, ApJ 665(2), whose population of true values is here the model's prediction.
+    it is N(predicted + k (measured - predicted), k sigma^2) with k = s^2 / (s^2 + sigma^2). Source:
+    Kelly 2007, ApJ 665(2), whose population of true values is here the model's prediction.
     """
     scatter = noise.scatter.reshape(b.current.shape)
     share = scatter / (scatter + b.current_var)
@@ -231,9 +236,9 @@ def _true_current_share(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDr
 
 
 def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, Array]:
-    """Log |d residuals / d data| of the motion and of the voltage of every piece.
+    """Return log |d residuals / d data| of the motion and of the voltage of every segment.
 
-    The camera corrects measured places and the voltage residual is scaled by its own spread:
+    The camera corrects measured positions and the voltage residual is scaled by its own spread:
     without these terms a smaller scale would fit better only because it shrinks the residuals.
     """
     camera = camera_log_jacobian(robot, b.pose)
@@ -242,22 +247,24 @@ def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, 
     return camera, -jnp.sum(jnp.log(voltage_spread(b, noise)), axis=1)
 
 
-def camera_log_jacobian(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, " piece"]:
-    """Log |d motion residuals / d logged poses| of every piece; its first pose is given."""
+def camera_log_jacobian(
+    robot: Robot, pose: Float[Array, "segment edge 3"]
+) -> Float[Array, " segment"]:
+    """Return log |d motion residuals / d logged poses| of every segment, given its first pose."""
     return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
 
 
 def voltage_spread(b: Batch, noise: ElectricNoise) -> PerChannel:
-    """Std of the voltage residual over that of the voltage noise.
+    """Return the std of the voltage residual over that of the voltage noise.
 
-    The rest is of the true current that the ammeter and the model leave unknown, times R.
+    The remainder comes from the true current that ammeter and model leave unknown, times R.
     """
     unknown = (noise.resistance * _direction(b)) ** 2 * _true_current_share(b, noise)[1]
     return _flat(jnp.sqrt(1.0 + unknown / noise.voltage_std**2))
 
 
 def voltage_std(log_variance: Float[Array, ""]) -> Float[Array, ""]:
-    """Std of the voltage noise, rounding included, from the log of its variance [V].
+    """Return the std of the voltage noise, rounding included, from the log of its variance [V].
 
     The voltage residual is in units of it: without the floor it would vanish with the noise.
     """

@@ -1,11 +1,11 @@
 """Runs over several floors: short windows in a row, with the floor under each wheel in each window.
 
-How hard a floor grips is not to be seen where all wheels stand on it: the forces balance whatever
-they are in units of. Where wheels stand on different floors the ratio of their frictions turns the
-robot. A run is one piece of many short windows, so that its camera noise, its process noise and
-what its motion and its currents are off all run long are in the covariance of the piece, as they
-are for runs that keep to one floor. Windows in which a wheel changes floors, in which wheels do not
-turn evenly or beyond the end of a run do not count: their residuals are zero.
+The friction of a floor cannot be seen where all wheels stand on it: the forces balance in any unit.
+Where wheels stand on different floors, the ratio of their frictions turns the robot. A run is one
+segment of many short windows, so that its camera noise, its process noise and the constant errors
+of its motion and its currents are in the covariance of the segment, as they are for runs on one
+floor. Windows in which a wheel changes floors, in which wheels turn unevenly, or beyond the end of
+a run do not count: their residuals are zero.
 """
 
 from collections.abc import Sequence
@@ -27,41 +27,47 @@ from slipid.search_space import Space
 from slipid.support.errors import DataError
 
 SHORTEST, LONGEST = 0.25, 0.5
-"""Lengths of windows [s]: short against the time a wheel stays on a patch."""
+"""Shortest and longest window [s], short compared with the time a wheel stays on a patch."""
 LEAST_SPEED = 0.04
-"""Speed of the fastest rim below which a window says nothing [m/s]."""
+"""Speed of the fastest rim below which a window does not count [m/s]."""
 MOST_ACCELERATION = 0.6
-"""Of a rim: beyond it the balance of forces is not that of rest [m/s^2]."""
+"""Acceleration of a rim above which the forces are not those of steady motion [m/s^2]."""
 MOST_WINDOWS = 40
-"""Most windows in a piece, for which windows are made longer; a run that has still more of them
-makes several pieces, as if it were several runs."""
+"""Largest number of windows in a segment, for which windows are made longer.
+
+A run with still more windows makes several segments, as if it were several runs.
+"""
 MULTI_FLOOR_MOTION = "crossing.motion"
+"""Name of the block of motion residuals of runs over several floors."""
 MULTI_FLOOR_CURRENT = "crossing.current"
-"""Names of their blocks of residuals."""
+"""Name of the block of current residuals of runs over several floors."""
 
 
 @dataclass(frozen=True, eq=False)
 class MultiFloorRuns:
-    """Runs over several floors, a piece per run; runs are (name, sha256).
+    """Runs over several floors, one segment per run.
 
-    The floor is that under each wheel in the middle of each window, by number in the robot's stack.
-    A window that does not `count` says nothing.
+    Attributes:
+        windows: windows of every segment.
+        floor: floor under each wheel in the middle of each window, by number in the robot's stack.
+        counts: whether a window counts in the likelihood.
+        runs: (name, sha256) of every run.
     """
 
     windows: Windows
-    floor: Int[np.ndarray, "piece window wheel"]
-    counts: Bool[np.ndarray, "piece window"]
+    floor: Int[np.ndarray, "segment window wheel"]
+    counts: Bool[np.ndarray, "segment window"]
     runs: tuple[tuple[str, str], ...]
 
 
 def multi_floor_runs(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> MultiFloorRuns:
-    """Pieces of runs whose poses are in the frame of a map, for every map its runs.
+    """Return the segments of runs whose poses are in the frame of a map, for several maps.
 
-    Where wheels stand is read through the camera of the fitted robot, which knows every surface of
-    the maps and every load of the runs.
+    The wheel positions come from the camera of the fitted robot, which knows every surface of the
+    maps and every load of the runs.
 
     Raises:
-        DataError: runs of a map in which no window counts, or of which only some log currents.
+        DataError: no window of a map's runs counts, or only some runs log currents.
     """
     cut = [_windows_on(data, floor, robot) for data, floor in sets]
     if len({(c.windows.has_current, c.windows.current_is_signed) for c in cut}) > 1:
@@ -72,9 +78,14 @@ def multi_floor_runs(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Mul
     floor, counts = (np.concatenate([getattr(c, f) for c in cut]) for f in ("floor", "counts"))
     first = np.cumsum([0, *(len(c.runs) for c in cut)])
     run = np.concatenate([c.windows.run + k for c, k in zip(cut, first, strict=False)])
-    rows = [part for k in np.unique(run) for part in _parts(np.flatnonzero(run == k))]
-    rows = [row for row in rows if counts[row].any()]
-    at, there = _padded(rows)
+    rows = []
+    for k in np.unique(run):
+        mine = np.flatnonzero(run == k)
+        parts = np.array_split(mine, -(-len(mine) // MOST_WINDOWS))
+        rows += [part for part in parts if counts[part].any()]
+    longest = max(len(row) for row in rows)
+    at = np.array([np.pad(row, (0, longest - len(row)), mode="edge") for row in rows])
+    original = np.arange(longest) < np.array([[len(row)] for row in rows])
     w = _joined([c.windows for c in cut], run)
     whole = replace(
         w.segments(at[:, 0]),
@@ -82,14 +93,15 @@ def multi_floor_runs(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Mul
         **{name: getattr(w, name)[at, 0] for name in _PER_WINDOW},
     )
     names = tuple(name for c in cut for name in c.runs)
-    return MultiFloorRuns(whole, floor[at, 0], counts[at, 0] & there, names)
+    return MultiFloorRuns(whole, floor[at, 0], counts[at, 0] & original, names)
 
 
 _PER_WINDOW = ("dt", "turn", "speed_change", "current", "voltage", "current_var", "voltage_var")
+"""Fields of `Windows` with one value per window."""
 
 
 def _windows_on(data: Runs, floor: FloorMap, robot: Robot) -> MultiFloorRuns:
-    """The same of one map, each window a piece of its own."""
+    """Return the windows of the runs on one map, each a segment of its own."""
     radius = float(robot.geometry.wheel_radius)
     w = _short(data, radius, float(robot.camera.lag))
     number = np.array([robot.surface_index(name) for name in floor.surfaces])
@@ -105,7 +117,7 @@ def _windows_on(data: Runs, floor: FloorMap, robot: Robot) -> MultiFloorRuns:
 
 
 def _short(data: Runs, radius: float, lag: float) -> Windows:
-    """Windows of every run, each a piece of its own; arguments are those of `windows`."""
+    """Return the windows of every run, each a segment of its own; arguments as in `windows`."""
     each = []
     for k in range(len(data)):
         t = data.time[data.rows(k)]
@@ -114,21 +126,8 @@ def _short(data: Runs, radius: float, lag: float) -> Windows:
     return _joined(each, np.repeat(np.arange(len(each)), [len(w) for w in each]))
 
 
-def _parts(windows_of_run: Int[np.ndarray, " window"]) -> list[Int[np.ndarray, " part"]]:
-    return np.array_split(windows_of_run, -(-len(windows_of_run) // MOST_WINDOWS))
-
-
-def _padded(
-    rows: Sequence[Int[np.ndarray, " _"]],
-) -> tuple[Int[np.ndarray, "row longest"], Bool[np.ndarray, "row longest"]]:
-    """Rows of one length, their last number repeated, and what was there before."""
-    longest = max(len(row) for row in rows)
-    at = np.array([np.pad(row, (0, longest - len(row)), mode="edge") for row in rows])
-    return at, np.array([np.arange(longest) < len(row) for row in rows])
-
-
-def _joined(each: Sequence[Windows], run: Int[np.ndarray, " piece"]) -> Windows:
-    """Windows of several sets as one, their runs numbered anew."""
+def _joined(each: Sequence[Windows], run: Int[np.ndarray, " segment"]) -> Windows:
+    """Return several sets of windows as one, with new run numbers."""
     whole: dict[str, Any] = {"run": run}
     for name in (f.name for f in fields(Windows) if f.name != "run"):
         values = [getattr(w, name) for w in each]
@@ -139,8 +138,8 @@ def _joined(each: Sequence[Windows], run: Int[np.ndarray, " piece"]) -> Windows:
     return replace(each[0], **whole)
 
 
-def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "piece time wheel 2"]:
-    """Wheel centres at start, middle and end of one window per piece [m], by the camera."""
+def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "segment time wheel 2"]:
+    """Return wheel centres at start, middle and end of every segment's only window [m]."""
     edges = np.asarray(jax.vmap(jax.vmap(robot.camera.corrected))(jnp.asarray(w.pose)))
     pose = np.stack([edges[:, 0], edges.mean(axis=1), edges[:, 1]], axis=1)
     yaw = np.array([float(robot.camera.yaw(robot.session_index(s))) for s in w.session])
@@ -152,8 +151,8 @@ def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "piece time whee
     return np.asarray(pose[..., None, :2] + np.einsum("ntij,wj->ntwi", turn, from_marker))
 
 
-def _steady(w: Windows, radius: float) -> Bool[np.ndarray, " piece"]:
-    """Windows in which wheels turn, about evenly, and no camera frames are missing."""
+def _steady(w: Windows, radius: float) -> Bool[np.ndarray, " segment"]:
+    """Return a mask of windows in which wheels turn evenly and no camera frames are missing."""
     rim, jump = radius * w.turn[:, 0] / w.dt, radius * w.speed_change[:, 0] / w.dt
     moves = np.abs(rim).max(axis=1) >= LEAST_SPEED
     even = np.abs(jump).max(axis=1) <= MOST_ACCELERATION
@@ -163,49 +162,55 @@ def _steady(w: Windows, radius: float) -> Bool[np.ndarray, " piece"]:
 class MultiFloorBatch(eqx.Module):
     """Runs over several floors as arrays for compiled functions.
 
-    Counts are 1 for windows that count, else 0.
+    Attributes:
+        batch: the windows.
+        counts: 1 for windows that count, else 0.
     """
 
     batch: lk.Batch
-    counts: Float[Array, "piece window"]
+    counts: Float[Array, "segment window"]
 
     @staticmethod
-    def of(multi_floor_runs: MultiFloorRuns, robot: Robot) -> "MultiFloorBatch":
-        b = lk.batch(multi_floor_runs.windows, robot, multi_floor_runs.floor)
-        return MultiFloorBatch(b, jnp.asarray(multi_floor_runs.counts, float))
+    def of(runs: MultiFloorRuns, robot: Robot) -> "MultiFloorBatch":
+        """Return the batch of runs for a robot."""
+        b = lk.batch(runs.windows, robot, runs.floor)
+        return MultiFloorBatch(b, jnp.asarray(runs.counts, float))
 
     def as_if_on(self, floor: int) -> "MultiFloorBatch":
-        """The same runs as if all wheels had stood on one floor all the while."""
+        """Return the same runs as if all wheels had always stood on one floor."""
         alone = jnp.full_like(self.batch.surface, floor)
         return replace(self, batch=replace(self.batch, surface=alone))
 
     def residuals(self, robot: Robot, p: lk.Predicted) -> dict[str, Array]:
-        """Predicted less measured motion and, where they are logged, currents."""
+        """Return predicted less measured motion and, where they are logged, currents."""
         b = self.batch
-        gap = lk.motion_residual(robot, b, p)
-        out = {MULTI_FLOOR_MOTION: gap * jnp.repeat(self.counts, 3, axis=1)}
+        motion = lk.motion_residual(robot, b, p)
+        out = {MULTI_FLOOR_MOTION: motion * jnp.repeat(self.counts, 3, axis=1)}
         if b.has_current:
             amps = lk.predicted_current(robot, b, p.motor_force) - b.current
-            out[MULTI_FLOOR_CURRENT] = (amps * self.counts[..., None]).reshape(len(gap), -1)
+            out[MULTI_FLOOR_CURRENT] = (amps * self.counts[..., None]).reshape(len(motion), -1)
         return out
 
-    def log_jacobian(self, robot: Robot) -> Float[Array, " piece"]:
-        """Log |d motion residuals / d logged poses| of every piece."""
+    def log_jacobian(self, robot: Robot) -> Float[Array, " segment"]:
+        """Return log |d motion residuals / d logged poses| of every segment."""
         each = jax.vmap(jax.vmap(robot.camera.log_jacobian))(self.batch.pose[:, 1:])
         return jnp.sum(each * self.counts, axis=1)
 
 
 @eqx.filter_jit
 def residuals_at(space: Space, multi_floor: MultiFloorBatch, z: Array) -> dict[str, Array]:
-    """Residuals of runs over several floors at a search vector."""
+    """Return the residuals of runs over several floors at a search vector."""
     robot = space.tree(z)
     return multi_floor.residuals(robot, lk.predict(robot, multi_floor.batch))
 
 
 class WindowErrors(NamedTuple):
-    """Root mean square errors of windows: `speed` [m/s], `yaw_rate` [rad/s], `current` [A].
+    """Root mean square errors of windows.
 
-    The current is None where it was not logged.
+    Attributes:
+        speed: error of the speed [m/s].
+        yaw_rate: error of the yaw rate [rad/s].
+        current: error of the current [A], None where it was not logged.
     """
 
     speed: float
@@ -215,9 +220,9 @@ class WindowErrors(NamedTuple):
 
 def window_errors(
     multi_floor: MultiFloorBatch,
-    judged: Sequence[tuple[dict[str, Array], Float[np.ndarray, " piece"]]],
+    judged: Sequence[tuple[dict[str, Array], Float[np.ndarray, " segment"]]],
 ) -> WindowErrors:
-    """Of residuals by block, each with the weight of every piece in it, 1 or 0."""
+    """Return the errors of residuals by block, each set with the weight 1 or 0 of every segment."""
     counts, dt = np.asarray(multi_floor.counts), np.asarray(multi_floor.batch.dt)
     motion, current, total = np.zeros(3), 0.0, 0.0
     for residual, weight in judged:

@@ -1,7 +1,7 @@
-"""What runs over several floors teach beside those that each keep to one floor.
+"""Fit of runs over several floors together with the runs that each keep to one floor.
 
-They are further pieces of the one likelihood. How well they are predicted is told by left-out ones:
-each half of the runs is judged by a fit that has seen the other half only.
+They are further segments of the same likelihood. The quality of their prediction is judged on
+held-out runs: each half of them is predicted by a fit to the other half.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,20 +22,21 @@ from slipid.fit.optimise import Optimum, optimise
 from slipid.fit.problem import FitState, Problem
 
 _ROUNDS = 6
-"""Most rounds of the fits to half of the runs, which only judge."""
+"""Largest number of rounds of the fits to half of the runs, which serve for judgement only."""
 
 
 @dataclass(frozen=True, eq=False)
 class MultiFloorFit:
-    """A fit of runs on one floor and on several together.
+    """A fit of runs on one floor and on several floors together.
 
     Attributes:
-        problem, optimum: of all runs.
-        before: errors of the runs over several floors by a fit that has seen none of them.
-        after: of each half by a fit that has seen the other, None where there is only one run.
-        learnt: by the fit to all of them.
-        as_if: the same had all wheels stood on one floor all the while, by floor; a map that is
-            right predicts better than that.
+        problem: problem of all runs.
+        optimum: optimum of all runs.
+        before: errors of the runs over several floors by a fit without any of them.
+        after: errors of each half by a fit to the other half, None where there is only one run.
+        learnt: errors by the fit to all of them.
+        as_if: errors as if all wheels had always stood on one floor, by floor; a correct map
+            predicts better than that.
     """
 
     problem: Problem
@@ -54,47 +55,42 @@ def fit_multi_floor(
     most_rounds: int = 30,
     tolerance: float = 0.02,
 ) -> MultiFloorFit:
-    """Goes on from the optimum of a problem with runs over several floors.
+    """Continue from the optimum of a problem with runs over several floors.
 
     `tell` is called after every round of the fit to all runs; the limits are those of `optimise`.
     """
     whole = problem.with_multi_floor(multi_floor)
     start = replace(whole.carried_over(optimum.state, problem), round=0)
-    on_one, number = (
-        len(problem.windows),
-        np.unique(multi_floor.windows.run, return_inverse=True)[1],
-    )
-    odd = number % 2 == 1
+    odd = np.unique(multi_floor.windows.run, return_inverse=True)[1] % 2 == 1
     objective, every = whole.objective, np.ones(len(odd))
-    assert objective.multi_floor is not None, "runs over several floors"
+    batch = objective.multi_floor
+    assert batch is not None, "runs over several floors"
 
-    def off(
-        multi_floor: MultiFloorBatch, *judged: tuple[FitState, Float[np.ndarray, " run"]]
+    def errors(
+        of: MultiFloorBatch, *judged: tuple[FitState, Float[np.ndarray, " run"]]
     ) -> WindowErrors:
-        """Errors, each run by the state that judges it with weight 1 and the others with 0."""
-        found = [
-            (residuals_at(objective.space, multi_floor, jnp.asarray(s.z)), w) for s, w in judged
-        ]
-        return window_errors(multi_floor, found)
+        """Return the errors of runs, each by the state that judges it with weight 1."""
+        found = [(residuals_at(objective.space, of, jnp.asarray(s.z)), w) for s, w in judged]
+        return window_errors(of, found)
 
     learnt = optimise(whole, start=start, tell=tell, most_rounds=most_rounds, tolerance=tolerance)
     after = None
     if odd.any() and not odd.all():
         parts = []
         for half in (odd, ~odd):
-            keep = np.concatenate([np.ones(on_one), ~half])
+            keep = np.concatenate([np.ones(len(problem.windows)), ~half])
             other = optimise(whole, keep=keep, start=start, most_rounds=_ROUNDS)
             parts.append((other.state, half.astype(float)))
-        after = off(objective.multi_floor, *parts)
+        after = errors(batch, *parts)
     end = (learnt.state, every)
     return MultiFloorFit(
         problem=whole,
         optimum=learnt,
-        before=off(objective.multi_floor, (start, every)),
+        before=errors(batch, (start, every)),
         after=after,
-        learnt=off(objective.multi_floor, end),
+        learnt=errors(batch, end),
         as_if={
-            floor: off(objective.multi_floor.as_if_on(k), end)
+            floor: errors(batch.as_if_on(k), end)
             for k, floor in enumerate(whole.robot.surfaces.labels)
         },
     )

@@ -1,15 +1,15 @@
-"""Variance components of the residuals of a piece, and the covariance they make.
+"""Variance components of the residuals of a segment, and the covariance they make.
 
-The residuals of a piece have the covariance
+The residuals of a segment have the covariance
 
-    V = sum_c v_c B_c,   B from: camera place and heading noise, shared by neighbouring windows;
+    V = sum_c v_c B_c,   B from: camera position and heading noise, shared by neighbouring windows;
                          process noise along, across and in yaw, growing with distance, per floor;
                          the run's own effect along, across and in yaw, per floor
 
 so the run effects are marginalised. Runs over several floors have variances of their own, as if
-they were driven on one more floor. What runs share with each other (`slipid.fit.shared_effects`)
-and how far floors differ from what is common to them have variances, too, beside these blocks. What
-is known beside them, as the ammeter's noise is, is added.
+they were driven on one more floor. Effects that runs share (`slipid.fit.shared_effects`) and the
+deviations of floors from their common values have variances, too, beside these blocks. Known
+variances, such as the ammeter's noise, are added.
 """
 
 from dataclasses import dataclass
@@ -26,30 +26,32 @@ from slipid.model.robot import Robot
 
 
 class Components(eqx.Module):
-    """Covariance pieces B_c of one block, the variance each belongs to, and what is known beside.
+    """Covariance terms of one block of residuals and the variances they belong to.
 
     Attributes:
-        known: variances of single residuals: rounding, and the ammeter's noise.
-        pieces: numbers of its pieces among all pieces of a problem.
-        count: how many of the residuals of each piece say something.
+        base: covariance B_c of every segment and component at unit variance.
+        which: number of the variance of every segment and component.
+        known: known variances of single residuals: rounding, and the ammeter's noise.
+        segments: numbers of its segments among all segments of a problem.
+        count: number of informative residuals of each segment.
     """
 
-    base: Float[Array, "piece component m m"]
-    which: Int[Array, "piece component"]
-    known: Float[Array, "piece m"]
-    segments: Int[Array, " piece"]
-    count: Float[Array, " piece"]
+    base: Float[Array, "segment component m m"]
+    which: Int[Array, "segment component"]
+    known: Float[Array, "segment m"]
+    segments: Int[Array, " segment"]
+    count: Float[Array, " segment"]
 
     def covariance(
         self, log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"]
-    ) -> Float[Array, "piece m m"]:
-        """V of every piece."""
+    ) -> Float[Array, "segment m m"]:
+        """Return V of every segment."""
         v, m = jnp.exp(log_variance)[self.which], self.base.shape[-1]
         return jnp.einsum("nc,ncij->nij", v, self.base) + self.known[..., None] * jnp.eye(m)
 
     @property
-    def single(self) -> Float[Array, "piece component m"]:
-        """How the variance of every single residual grows with each component."""
+    def single(self) -> Float[Array, "segment component m"]:
+        """Growth of the variance of every single residual with each component."""
         return jnp.diagonal(self.base, axis1=-2, axis2=-1)
 
 
@@ -57,8 +59,12 @@ class Components(eqx.Module):
 class Component:
     """One source of noise: `process` `along`, `camera` `place`, `current` `window` and so on.
 
-    It is met on a floor, None for all; unit and typical value, which the weak log-normal prior is
-    centred on, are of its std.
+    Attributes:
+        kind: source of the noise.
+        what: direction or channel of the source.
+        floor: floor it belongs to, None for all floors.
+        unit: unit of its std.
+        typical: typical std, the centre of its weak log-normal prior.
     """
 
     kind: str
@@ -69,7 +75,7 @@ class Component:
 
     @property
     def name(self) -> str:
-        """As tables and files have it: `camera.place`, `process.<floor>.along`."""
+        """Name in tables and files: `camera.place`, `process.<floor>.along`."""
         return ".".join(part for part in (self.kind, self.floor, self.what) if part is not None)
 
 
@@ -110,9 +116,9 @@ POOLED = "pooled.load_bias"
 
 
 def noise(windows: Windows, robot: Robot, multi_floor: MultiFloorRuns | None = None) -> NoiseModel:
-    """Variance components for these windows, with distances and directions from the encoders.
+    """Return the noise model of these windows; distances and directions are the encoders'.
 
-    Pieces of runs over several floors are numbered after those of the windows.
+    Segments of runs over several floors are numbered after those of the windows.
     """
     floors = robot.surfaces.labels
     table = [
@@ -146,7 +152,7 @@ def noise(windows: Windows, robot: Robot, multi_floor: MultiFloorRuns | None = N
 
 
 def sessions_on(windows: Windows, floor: str) -> list[str]:
-    """Sessions in which a floor was driven on, in alphabetical order."""
+    """Return the sessions in which a floor was driven on, in alphabetical order."""
     pairs = zip(windows.surface, windows.session, strict=True)
     return sorted({session for name, session in pairs if name == floor})
 
@@ -156,7 +162,7 @@ def electric_noise(
     log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"],
     resistance: Array,
 ) -> ElectricNoise:
-    """What voltages are predicted with; nothing of meaning where none are logged."""
+    """Return the noise that voltages are predicted with; a placeholder where none are logged."""
     if "voltage" not in blocks:
         return ElectricNoise(jnp.ones(()), jnp.ones((1, 1)), resistance)
     current, log_v = blocks["current"], jnp.asarray(log_variance)
@@ -171,9 +177,9 @@ def _multi_floor_components(
     start: int,
     blocks: dict[str, Components],
 ) -> list[Component]:
-    """Variances of runs over several floors, whose covariance pieces go into the blocks.
+    """Return the variances of runs over several floors and put their covariances into the blocks.
 
-    `pieces` is how many pieces come before theirs, `start` how many variances.
+    `segments` segments and `start` variances come before theirs.
     """
     w, none = multi_floor.windows, np.zeros((len(multi_floor.windows), 1), int)
     table = [
@@ -191,8 +197,8 @@ def _multi_floor_components(
     return table
 
 
-def _counted(of: Components, live: Bool[np.ndarray, "piece m"], first: int) -> Components:
-    """Covariance pieces in which residuals that say nothing, and are zero, have the variance 1."""
+def _counted(of: Components, live: Bool[np.ndarray, "segment m"], first: int) -> Components:
+    """Return covariances in which uninformative residuals, which are zero, have the variance 1."""
     both = live[:, None, :, None] & live[:, None, None, :]
     return Components(
         base=jnp.where(both, of.base, 0.0),
@@ -206,7 +212,7 @@ def _counted(of: Components, live: Bool[np.ndarray, "piece m"], first: int) -> C
 def _components(
     block: str, base: np.ndarray, which: np.ndarray, more: np.ndarray | float = 0.0
 ) -> Components:
-    """Covariance pieces with the rounding of the logs, and with known variances (piece, m)."""
+    """Return components with the rounding of the logs, and with known variances (segment, m)."""
     n, m = base.shape[0], base.shape[-1]
     return Components(
         base=jnp.asarray(base),
@@ -219,30 +225,30 @@ def _components(
 
 def encoder_increments(
     windows: Windows | Batch, robot: Robot
-) -> Float[np.ndarray, "piece window 3"]:
-    """Movement of the body in each window by the encoders, in its own frame [m, m, rad]."""
+) -> Float[np.ndarray, "segment window 3"]:
+    """Return the body's motion in each window by the encoders, in its own frame [m, m, rad]."""
     j = np.asarray(robot.geometry.pseudo_inverse())
     return np.asarray(windows.turn) * float(robot.geometry.wheel_radius) @ j.T
 
 
 def travel(windows: Windows | Batch, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of each window by the encoders (piece, window) [m], and its unit direction.
+    """Return the distance of each window by the encoders (segment, window) [m], and its direction.
 
-    Turning counts with the way of the wheels.
+    Turning counts with the distance the wheels travel. The direction is a unit vector.
     """
     step = encoder_increments(windows, robot)
-    far = np.linalg.norm(step[..., :2], axis=-1)
+    distance = np.linalg.norm(step[..., :2], axis=-1)
     turned = np.abs(step[..., 2]) * float(robot.geometry.base_radius)
-    way = step[..., :2] / np.maximum(far, 1e-9)[..., None]
-    return far + turned, np.where(far[..., None] > 1e-6, way, [1.0, 0.0])
+    direction = step[..., :2] / np.maximum(distance, 1e-9)[..., None]
+    return distance + turned, np.where(distance[..., None] > 1e-6, direction, [1.0, 0.0])
 
 
 def _motion_components(
-    windows: Windows, robot: Robot, first: Int[np.ndarray, "piece 1"]
+    windows: Windows, robot: Robot, first: Int[np.ndarray, "segment 1"]
 ) -> Components:
-    """Those of the motion; first is the number of the first variance of each piece's floor."""
-    far, u = travel(windows, robot)
-    n, k = far.shape
+    """Return the components of the motion; `first` numbers each floor's first variance."""
+    distance, u = travel(windows, robot)
+    n, k = distance.shape
     scale = float(robot.camera.scale)
     place, heading = np.zeros((n, 3 * k, 2 * (k + 1))), np.zeros((n, 3 * k, k + 1))
     for j in range(k):
@@ -254,7 +260,7 @@ def _motion_components(
         move = np.einsum("nij,nj->ni", back, windows.pose[:, j + 1, :2] - windows.pose[:, j, :2])
         heading[:, 3 * j, j], heading[:, 3 * j + 1, j] = move[:, 1], -move[:, 0]
         heading[:, 3 * j + 2, j], heading[:, 3 * j + 2, j + 1] = -1.0, 1.0
-    grown = axes(u) * np.sqrt(far)[None, :, None, :]
+    grown = axes(u) * np.sqrt(distance)[None, :, None, :]
     effect = effects(windows, robot).transpose(2, 0, 1)[..., None]
     parts = [place, heading, *grown, *effect]
     base = np.stack([p @ p.transpose(0, 2, 1) for p in parts], axis=1)
@@ -262,12 +268,13 @@ def _motion_components(
     return _components("motion", base, np.insert(of_floor, 0, [[0], [1]], axis=1))
 
 
-def _floors(windows: Windows, robot: Robot) -> Int[np.ndarray, "piece 1"]:
+def _floors(windows: Windows, robot: Robot) -> Int[np.ndarray, "segment 1"]:
+    """Return the number of each segment's floor."""
     return np.array([[robot.surface_index(s)] for s in windows.surface])
 
 
 def axes(u: np.ndarray) -> np.ndarray:
-    """Direction of along, across and yaw in each window (axis, piece, 3 window, window)."""
+    """Return directions along, across and in yaw per window (axis, segment, 3 window, window)."""
     n, k, _ = u.shape
     out = np.zeros((3, n, 3 * k, k))
     for j in range(k):
@@ -277,14 +284,14 @@ def axes(u: np.ndarray) -> np.ndarray:
     return out
 
 
-def effects(windows: Windows, robot: Robot) -> Float[np.ndarray, "piece m 3"]:
-    """What one unit of an effect along, across and in yaw moves in the residuals of a piece."""
-    far, u = travel(windows, robot)
-    return (axes(u) * far[None, :, None, :]).sum(-1).transpose(1, 2, 0)
+def effects(windows: Windows, robot: Robot) -> Float[np.ndarray, "segment m 3"]:
+    """Return the change of a segment's residuals per unit of an effect along, across and in yaw."""
+    distance, u = travel(windows, robot)
+    return (axes(u) * distance[None, :, None, :]).sum(-1).transpose(1, 2, 0)
 
 
-def _current_components(windows: Windows, first: Int[np.ndarray, "piece 1"]) -> Components:
-    """Those of the currents; first is the number of the first variance of each piece's floor."""
+def _current_components(windows: Windows, first: Int[np.ndarray, "segment 1"]) -> Components:
+    """Return the components of the currents; `first` numbers each floor's first variance."""
     n, k, w = windows.turn.shape
     same = np.kron(np.ones((k, k)), np.eye(w))
     base = np.broadcast_to(np.stack([np.eye(k * w), same]), (n, 2, k * w, k * w)).copy()

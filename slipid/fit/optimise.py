@@ -1,4 +1,4 @@
-"""Maximum a posteriori over trajectories: weights, structure, variances in turn until all rest."""
+"""Maximum a posteriori fit: weights, numbers and variances alternate until all are at rest."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from slipid.fit import likelihood as lk
 from slipid.fit.hierarchy import effect_variances, pooled
-from slipid.fit.multi_floor import MULTI_FLOOR_MOTION, MultiFloorBatch
+from slipid.fit.multi_floor import MULTI_FLOOR_MOTION
 from slipid.fit.noise import SHARED
 from slipid.fit.problem import (
     CREEPS,
@@ -24,17 +24,24 @@ from slipid.fit.problem import (
     log_jacobian,
     without_effects,
 )
-from slipid.fit.shared_effects import EffectPosterior, marginal_residuals
+from slipid.fit.shared_effects import Posteriors, marginal_residuals
 from slipid.fit.variances import Blocks, Objective, Search, Square, fitted_covariance, scoring_step
-from slipid.model.robot import Robot
 
 _REFUSED = 12
-"""Steps of the solver that may be refused in a round."""
+"""Number of steps that the solver may refuse in a round."""
 
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """End of a fit: Laplace covariance, why it stopped, for people, and the loss of every round."""
+    """End of a fit.
+
+    Attributes:
+        state: state at the end.
+        covariance: Laplace covariance of the search vector.
+        converged: whether the fit settled.
+        reason: why it stopped, for people.
+        history: loss of every round.
+    """
 
     state: FitState
     covariance: Square
@@ -53,17 +60,18 @@ def optimise(
     free: np.ndarray | None = None,
     variances: bool = True,
 ) -> Optimum:
-    """Maximum a posteriori from a staged start, or going on from a state.
+    """Return the maximum a posteriori, from a staged start or continued from a state.
 
     Args:
-        keep: weight of each piece, 1 or 0, as `Problem.every` has them (piece,); all by default.
-            Folds of a cross-validation differ in this only, so they share one compiled function.
-        start: goes on from here instead of the staged start.
-        most_rounds: of weights, structure and variances.
-        tolerance: it stops when no number moves more posterior stds than this in a round.
-        tell: called after every round, for progress and checkpoints.
-        free: 1 for coordinates that may move from the start, 0 for those held there (free,).
-        variances: whether to fit those of the noise, too.
+        keep: weight of each segment, 1 or 0, in the order of `Problem.full_weight`; all 1 by
+            default. Folds of a cross-validation differ in this only, so they share one compiled
+            function.
+        start: state to continue from instead of the staged start.
+        most_rounds: largest number of rounds.
+        tolerance: the fit stops when no number moves more posterior stds than this in a round.
+        tell: function called after every round, for progress and checkpoints.
+        free: 1 for coordinates that may move from the start, 0 for fixed ones (free,).
+        variances: whether the variances of the noise are fitted, too.
     """
     keep = problem.full_weight if keep is None else np.asarray(keep, float)
     state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
@@ -87,59 +95,60 @@ def optimise(
 def one_round(
     problem: Problem,
     state: FitState,
-    keep: Float[np.ndarray, " piece"],
+    keep: Float[np.ndarray, " segment"],
     mask: Search,
     steps: int,
     scoring: int,
 ) -> FitState:
-    """Weights, structure, variances: one turn of each.
+    """Return the state after one round: weights, then numbers, then variances.
 
-    At most so many steps of the structure, and so many scoring steps of the variances; the mask is
-    1 for coordinates that may move, 0 for those held.
+    Args:
+        mask: 1 for coordinates that may move, 0 for fixed ones.
+        steps: largest number of solver steps of the numbers.
+        scoring: number of scoring steps of the variances.
     """
     objective, log_v = problem.objective, jnp.asarray(state.log_variance)
     electric = problem.electric(state.z, log_v)
     residual, _, motor_force = linear(objective, jnp.asarray(state.z), electric)
     before = state.shared(len(problem.windows))
-    seen = problem.weighed(residual, log_v, keep, before)
-    held = LeastSquaresInputs(
+    weighed = problem.weighed(residual, log_v, keep, before)
+    root = weighed.whitening.root
+    fixed = RoundInputs(
         objective=objective,
         z=jnp.asarray(state.z),
         mask=jnp.asarray(mask),
-        root=seen.whitening.root,
-        effects=seen.effects,
+        root=root,
+        effects=weighed.effects,
         prior_std=objective.prior_std(log_v),
         electric=electric,
         motor_force=motor_force,
         slope=log_jacobian(objective, state.z, electric, keep)[1],
     )
-    z = np.asarray(levenberg(held, LimitedLevenberg(steps)))
+    z = np.asarray(levenberg(fixed, LimitedLevenberg(steps)))
     electric = problem.electric(z, log_v)
     whole, jacobian, motor_force = linear(objective, jnp.asarray(z), electric)
-    effect = effects_given(seen.effects, seen.whitening.root["motion"], whole["motion"])
-    # weights follow effects and effects follow weights: half way, or they can swing for ever
+    effect = effects_given(weighed.effects, root["motion"], whole["motion"])
+    # weights and effects depend on each other: half a step, or they can oscillate for ever
     effect = 0.5 * (effect + before) if state.round else effect
-    residual, told = (
-        without_effects(objective, whole, effect),
-        problem.voltage_information(z, log_v, motor_force),
-    )
+    residual = without_effects(objective, whole, effect)
+    voltage = problem.voltage_information(z, log_v, motor_force)
     if scoring:
         spread = fitted_covariance(objective, jacobian, log_v, jnp.asarray(keep))
     for _ in range(scoring):
-        log_v = scoring_step(objective, residual, spread, log_v, jnp.asarray(keep), told)
-        last, told = told, problem.voltage_information(z, log_v, motor_force)
-        if last is not None and told is not None:  # in units of the noise just found
-            scale = jnp.sqrt(told.share / last.share)
-            residual = residual | {"voltage": told.residual}
+        log_v = scoring_step(objective, residual, spread, log_v, jnp.asarray(keep), voltage)
+        last, voltage = voltage, problem.voltage_information(z, log_v, motor_force)
+        if last is not None and voltage is not None:  # rescale to the new noise
+            scale = jnp.sqrt(voltage.share / last.share)
+            residual = residual | {"voltage": voltage.residual}
             both = scale[:, :, None] * scale[:, None, :]
             spread = spread | {"voltage": spread["voltage"] * both}
-    if told is not None and scoring:  # the Jacobian by R changes by more than its scale
+    if voltage is not None and scoring:  # the Jacobian by R changes beyond its scale
         electric = problem.electric(z, log_v)
         whole, jacobian = problem.linear(z, electric)
     information = np.asarray(problem.precision(jacobian, log_v, keep))
     covariance = np.linalg.inv(information)
     if scoring:
-        weight, motion = seen.whitening.weight["motion"], (whole["motion"], jacobian["motion"])
+        weight, motion = weighed.whitening.weight["motion"], (whole["motion"], jacobian["motion"])
         found = effect_variances(objective, motion, weight, covariance, np.asarray(log_v))
         found[objective.pooled] = pooled(information, z, objective, np.asarray(log_v))
         log_v = jnp.asarray(found)
@@ -158,15 +167,15 @@ def one_round(
 
 
 def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], None]) -> FitState:
-    """Motor by regression, then every floor by itself from several starts, best start per floor.
+    """Return a start: motor by regression, then every floor by itself, the best of several starts.
 
-    Floors share nothing while the shared numbers are held, so one masked fit of all floors is a fit
-    of each by itself.
+    Floors share nothing while the shared numbers are fixed, so one masked fit of all floors is a
+    fit of each by itself.
     """
     space, labels = problem.space, problem.robot.surfaces.labels
     mask = space.where(lambda e: e.surface is not None).astype(float)
     creep = space.where(lambda e: e.quantity == "surface.creep")
-    # far from the optimum every run is an outlier
+    # far from the optimum every run is an outlier: start with wide variances
     usual = {"camera": 1.0, "pooled": 1.0} | dict.fromkeys(SHARED, 0.1)
     wide = [usual.get(c.kind, 3.0) for c in problem.noise.components]
     log_v = 2 * np.log(problem.noise.typical) + 2 * np.log(wide)
@@ -179,14 +188,12 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
         stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
         start = np.where(creep, np.log(value), first)
         state = FitState(start, log_v, 0, np.inf, np.inf, stage)
-        for steps in (15, 6, 6):  # the damping has to grow from 1 to the size of the problem first
+        for steps in (15, 6, 6):  # the damping must grow from 1 to the problem's scale first
             state = one_round(independent, state, keep, mask, steps=steps, scoring=0)
             tell(state)
         residual, _ = independent.linear(state.z, problem.electric(state.z, state.log_variance))
-        weight = problem.whitening(residual, state.log_variance, problem.full_weight).weight[
-            "motion"
-        ]
-        cost = -np.log(np.asarray(weight))  # as good as the loss, but for factor and constant
+        found = problem.whitening(residual, state.log_variance, problem.full_weight)
+        cost = -np.log(np.asarray(found.weight["motion"]))  # the loss up to a factor and a constant
         for number, label in enumerate(labels):
             mine = float(np.sum(cost[(floors == number) & (keep[: len(floors)] > 0)]))
             if mine < best[number]:
@@ -196,7 +203,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
 
 
 def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
-    """Search vector with R and C_e by regression of the voltage where it is logged."""
+    """Return the search vector with R and C_e from a regression of logged voltages."""
     z = problem.space.start.copy()
     w = problem.windows.segments(np.flatnonzero(keep > 0))
     if not (w.has_voltage and w.has_current):
@@ -205,27 +212,33 @@ def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
     amps = w.current.ravel() if w.current_is_signed else (w.current.ravel() * np.sign(speed))
     wm = speed * float(problem.robot.motor.gear_ratio)
     a, *_ = np.linalg.lstsq(np.stack([amps, wm], -1), w.voltage.ravel(), rcond=None)
-    place = problem.space.slices
+    slices = problem.space.slices
     for path, value in (("motor.resistance", a[0]), ("motor.back_emf", a[1])):
-        if path in place and value > 0:
-            z[place[path]] = np.log(value)
+        if path in slices and value > 0:
+            z[slices[path]] = np.log(value)
     return z
 
 
-class LeastSquaresInputs(eqx.Module):
-    """What is held while the structural numbers move from z.
+class RoundInputs(eqx.Module):
+    """Quantities that stay fixed while the solver moves the numbers from z.
 
-    The mask is 1 for coordinates that may move; root whitens residuals, tied is what runs share
-    given these; prior_std is of every coordinate, electric what voltages are predicted with, felt
-    what motors work against at z, which currents and voltages are predicted from, and
-    slope that of log |d residuals / d data| by the search vector.
+    Attributes:
+        objective: the objective of the fit.
+        z: search vector at the start.
+        mask: 1 for coordinates that may move.
+        root: whitening roots of the residuals.
+        effects: posterior of the shared effects given these roots.
+        prior_std: prior std of every coordinate.
+        electric: noise that voltages are predicted with.
+        motor_force: forces of the motors at z, from which currents and voltages are predicted.
+        slope: derivative of log |d residuals / d data| by the search vector.
     """
 
     objective: Objective
     z: Float[Array, " free"]
     mask: Float[Array, " free"]
     root: Blocks
-    effects: tuple[EffectPosterior, ...]
+    effects: Posteriors
     prior_std: Float[Array, " free"]
     electric: lk.ElectricNoise
     motor_force: lk.MotorForce
@@ -233,10 +246,10 @@ class LeastSquaresInputs(eqx.Module):
 
 
 class LimitedLevenberg(optx.LevenbergMarquardt):
-    """Levenberg-Marquardt that ends after so many steps that were taken.
+    """Levenberg-Marquardt that ends after a given number of accepted steps.
 
-    One that is refused shrinks the next, and to stop among refused ones would look like having
-    arrived. The solver counts its look at the start as a step that was taken.
+    A refused step shrinks the next one, and stopping among refused steps would look like
+    convergence. The solver counts its evaluation of the start as an accepted step.
     """
 
     most: Array
@@ -249,7 +262,7 @@ class LimitedLevenberg(optx.LevenbergMarquardt):
         self,
         fn: Any,
         y: Array,
-        args: LeastSquaresInputs,
+        args: RoundInputs,
         options: Any,
         state: Any,
         tags: frozenset[object],
@@ -260,45 +273,36 @@ class LimitedLevenberg(optx.LevenbergMarquardt):
 
 
 @eqx.filter_jit
-def levenberg(held: LeastSquaresInputs, solver: LimitedLevenberg) -> Float[Array, " free"]:
-    """Search vector after the solver's steps with fixed whitening."""
-    start = jnp.zeros_like(held.z)
-    found = optx.least_squares(_stacked, solver, start, held, max_steps=None, throw=False)
-    return _at(held, found.value)
+def levenberg(fixed: RoundInputs, solver: LimitedLevenberg) -> Float[Array, " free"]:
+    """Return the search vector after the solver's steps with fixed whitening."""
+    start = jnp.zeros_like(fixed.z)
+    found = optx.least_squares(_stacked, solver, start, fixed, max_steps=None, throw=False)
+    return _at(fixed, found.value)
 
 
-def _multi_floor_residuals(of: MultiFloorBatch, robot: Robot, given: Robot) -> Blocks:
-    """Residuals of runs over several floors: their currents move electric numbers only.
-
-    Friction moves the equilibrium that currents come from, so that it is found for them, too.
-    """
-    motion = {
-        MULTI_FLOOR_MOTION: of.residuals(robot, lk.predict(robot, of.batch))[MULTI_FLOOR_MOTION]
-    }
-    return of.residuals(given, lk.predict(given, of.batch)) | motion
+def _at(fixed: RoundInputs, y: Array) -> Array:
+    """Return the search vector of a step in prior stds."""
+    return fixed.z + fixed.mask * fixed.prior_std * y
 
 
-def _at(held: LeastSquaresInputs, y: Array) -> Array:
-    """Search vector of a step in prior stds."""
-    return held.z + held.mask * held.prior_std * y
-
-
-def _stacked(y: Array, held: LeastSquaresInputs) -> Array:
-    """Whitened residuals of all blocks and of the prior."""
-    objective, space = held.objective, held.objective.space
-    z = _at(held, y)
-    robot, given = space.tree(z), space.tree(jnp.where(space.electric, z, held.z))
+def _stacked(y: Array, fixed: RoundInputs) -> Array:
+    """Return the whitened residuals of all blocks and of the prior."""
+    objective, space = fixed.objective, fixed.objective.space
+    z = _at(fixed, y)
+    robot, given = space.tree(z), space.tree(jnp.where(space.electric, z, fixed.z))
     motion = lk.motion_residual(robot, objective.batch, lk.predict(robot, objective.batch))
     # currents and voltages given the motion of the round's start
-    electric = lk.electric_residuals(given, objective.batch, held.motor_force, held.electric)
+    electric = lk.electric_residuals(given, objective.batch, fixed.motor_force, fixed.electric)
     blocks = {"motion": motion} | electric
-    if objective.multi_floor is not None:
-        blocks |= _multi_floor_residuals(objective.multi_floor, robot, given)
-    white = {k: jnp.einsum("nij,nj->ni", held.root[k], r) for k, r in blocks.items()}
-    parts = [
-        marginal_residuals(held.effects, w) if k == "motion" else w.ravel()
-        for k, w in white.items()
-    ]
+    if (of := objective.multi_floor) is not None:
+        # here, too, currents move electric numbers only; friction is one of them, and it moves the
+        # equilibrium that currents come from
+        blocks |= of.residuals(given, lk.predict(given, of.batch))
+        of_robot = of.residuals(robot, lk.predict(robot, of.batch))
+        blocks[MULTI_FLOOR_MOTION] = of_robot[MULTI_FLOOR_MOTION]
+    white = {k: jnp.einsum("nij,nj->ni", fixed.root[k], r) for k, r in blocks.items()}
+    rest = [w.ravel() for k, w in white.items() if k != "motion"]
+    parts = [marginal_residuals(fixed.effects, white["motion"]), *rest]
     # the slope of the log Jacobian adds slope . z to the log posterior
-    mean = space.prior_mean + held.prior_std**2 * held.slope
-    return jnp.concatenate([*parts, (z - mean) / held.prior_std])
+    mean = space.prior_mean + fixed.prior_std**2 * fixed.slope
+    return jnp.concatenate([*parts, (z - mean) / fixed.prior_std])

@@ -1,4 +1,4 @@
-"""Posterior of a robot given windows of its runs, compiled for all windows of the same shapes."""
+"""Posterior of a robot given windows of its runs, compiled once for all windows of equal shapes."""
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,7 +19,7 @@ from slipid.fit import variances
 from slipid.fit.multi_floor import MULTI_FLOOR_CURRENT, MultiFloorBatch, MultiFloorRuns
 from slipid.fit.noise import POOLED, SHARED, electric_noise, noise
 from slipid.fit.shared_effects import (
-    EffectPosterior,
+    Posteriors,
     effect_posteriors,
     effects_by_floor,
     marginal_residuals,
@@ -39,16 +39,21 @@ from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
 
 CREEPS = (0.05, 0.4, 1.0)
-"""Starts of the creep of every floor; others end in poor minima."""
+"""Start values of the creep of every floor; other starts end in poor minima."""
 
 
 @dataclass(frozen=True)
 class FitState:
-    """Where a fit stands; enough to go on from.
+    """State of a fit, sufficient to continue it.
 
-    The effect is what runs were found to share, along, across and in yaw. The loss is minus log
-    posterior up to a constant, `moved` the largest step of the last round in
-    posterior stds, the stage what it was doing, for progress.
+    Attributes:
+        z: search vector.
+        log_variance: log variances of the noise.
+        round: number of finished rounds.
+        loss: minus log posterior up to a constant.
+        moved: largest step of the last round in posterior stds.
+        stage: current activity, for progress.
+        effect: mean shared effects along, across and in yaw.
     """
 
     z: Search
@@ -57,20 +62,20 @@ class FitState:
     loss: float
     moved: float
     stage: str
-    effect: Float[np.ndarray, "piece 3"] | None = None
+    effect: Float[np.ndarray, "segment 3"] | None = None
 
-    def shared(self, segments: int) -> Float[np.ndarray, "piece 3"]:
-        """The effects, zero where none were found yet."""
+    def shared(self, segments: int) -> Float[np.ndarray, "segment 3"]:
+        """Return the shared effects of that many segments, zero before any were estimated."""
         return np.zeros((segments, 3)) if self.effect is None else self.effect
 
     @property
     def arrays(self) -> dict[str, Any]:
-        """What a checkpoint keeps of it, by name."""
+        """Values that a checkpoint stores, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @classmethod
     def of(cls, kept: Mapping[str, np.ndarray]) -> "FitState":
-        """The state whose `arrays` a checkpoint has kept."""
+        """Return the state whose `arrays` a checkpoint has stored."""
         plain: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in kept.items()}
         return cls(**plain)
 
@@ -78,12 +83,12 @@ class FitState:
 class Problem:
     """Likelihood of a set of windows as functions of the search vector.
 
-    Currents and voltages do not move the numbers of the motion ("cut"): the torque scale
-    is read from currents given the motion, whose errors are carried along. A friction model good to
-    5 % in current would otherwise outvote forces that motion shows to 1 %.
+    Currents and voltages do not move the numbers of the motion ("cut"): the torque scale is
+    estimated from currents given the motion, whose errors are propagated. A friction model good to
+    5 % in current would otherwise outvote forces that motion determines to 1 %.
 
-    `keep`, below, chooses the pieces that count. `compiled` holds what was compiled for windows of
-    these shapes by others, under their own keys.
+    The argument `keep` of the methods weighs segments with 1 or 0. `compiled` holds functions that
+    other modules compiled for windows of these shapes, under their own keys.
     """
 
     def __init__(self, windows: Windows, robot: Robot, choices: Sequence[Choice]):
@@ -93,13 +98,13 @@ class Problem:
         self._read(windows, None)
 
     def of(self, windows: Windows) -> "Problem":
-        """The same problem for other windows; those of the same shapes share what is compiled."""
+        """Return the same problem for other windows; equal shapes share compiled functions."""
         other = copy.copy(self)
         other._read(windows, self.multi_floor)
         return other
 
     def with_multi_floor(self, multi_floor: MultiFloorRuns) -> "Problem":
-        """The same problem with runs over several floors."""
+        """Return the same problem with runs over several floors."""
         other = copy.copy(self)
         other.compiled = {}
         other._read(self.windows, multi_floor)
@@ -110,12 +115,11 @@ class Problem:
         self.noise = noise(windows, self.robot, multi_floor)
         shared, self.speeds_and_loads = effects_by_floor(windows, self.robot, self.noise)
         kinds = np.array([c.kind for c in self.noise.components])
+        batch = None if multi_floor is None else MultiFloorBatch.of(multi_floor, self.robot)
         self.objective = Objective(
             space=self.space,
             batch=lk.batch(windows, self.robot),
-            multi_floor=None
-            if multi_floor is None
-            else MultiFloorBatch.of(multi_floor, self.robot),
+            multi_floor=batch,
             blocks=self.noise.blocks,
             shared=shared,
             typical=jnp.asarray(2 * np.log(self.noise.typical)),
@@ -125,20 +129,19 @@ class Problem:
         )
 
     @property
-    def full_weight(self) -> Float[np.ndarray, " piece"]:
-        """Weights with which every piece counts, those of runs over several floors last."""
-        return np.ones(
-            len(self.windows) + (0 if self.multi_floor is None else len(self.multi_floor.counts))
-        )
+    def full_weight(self) -> Float[np.ndarray, " segment"]:
+        """Weight 1 for every segment, those of runs over several floors last."""
+        more = () if self.multi_floor is None else self.multi_floor.counts
+        return np.ones(len(self.windows) + len(more))
 
     def carried_over(self, state: FitState, of: "Problem") -> FitState:
-        """A state of another problem with the same numbers as one of this problem."""
+        """Return the state of another problem with the same numbers as a state of this problem."""
         known = dict(zip(of.noise.names, state.log_variance, strict=True))
         log_v = [known.get(c.name, 2 * np.log(c.typical)) for c in self.noise.components]
         return replace(state, log_variance=np.array(log_v), moved=np.inf)
 
     def without_shared_effects(self) -> "Problem":
-        """The same problem as if runs shared nothing."""
+        """Return the same problem as if runs shared no effects."""
         other = copy.copy(self)
         other.objective = replace(self.objective, shared=())
         return other
@@ -148,11 +151,11 @@ class Problem:
         return self.objective.batch
 
     def linear(self, z: Vector, electric: lk.ElectricNoise) -> tuple[Blocks, Blocks]:
-        """Residual blocks (piece, m) and their Jacobians (piece, m, free)."""
+        """Return residual blocks (segment, m) and their Jacobians (segment, m, free)."""
         return linear(self.objective, z, electric)[:2]
 
     def covariance(self, block: str, log_v: Vector) -> Array:
-        """Covariance of the residuals of a block (piece, m, m)."""
+        """Return the covariance of the residuals of a block (segment, m, m)."""
         return self.noise.blocks[block].covariance(log_v)
 
     def whitening(self, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
@@ -164,62 +167,56 @@ class Problem:
     def laplace(
         self, z: Vector, log_v: Vector, keep: Vector, alone: bool = False
     ) -> Float[np.ndarray, "free free"]:
-        """Covariance of the search vector: inverse information, prior included."""
+        """Return the covariance of the search vector: inverse information, prior included."""
         jacobian = self.linear(z, self.electric(z, log_v))[1]
-        told = variances.precision(self.objective, jacobian, log_v, keep, alone)
-        return np.linalg.inv(np.asarray(told))
+        information = variances.precision(self.objective, jacobian, log_v, keep, alone)
+        return np.linalg.inv(np.asarray(information))
 
     def weighed(
         self, residual: Blocks, log_v: Vector, keep: Vector, effect: Vector
     ) -> "WeighedResiduals":
-        """Residuals weighed: outliers are so only for what they do not share with other runs.
+        """Return weighed residuals; outliers are judged without the effects they share.
 
-        The effect is what they were found to share (piece, 3).
+        `effect` are the shared effects found so far (segment, 3).
         """
         where = jnp.asarray(log_v), jnp.asarray(keep), jnp.asarray(effect)
         return _weighed(self.objective, residual, *where)
 
     def loss(
-        self,
-        z: Vector,
-        log_v: Vector,
-        keep: Vector,
-        seen: "WeighedResiduals",
-        electric: lk.ElectricNoise,
+        self, z: Vector, log_v: Vector, keep: Vector, at: "WeighedResiduals", e: lk.ElectricNoise
     ) -> float:
-        """Minus log posterior of structure and variances given the residuals, less constants."""
-        nll = float(seen.loss)
-        nll -= float(log_jacobian(self.objective, z, electric, keep)[0])
+        """Return minus the log posterior of numbers and variances, less constants."""
+        nll = float(at.loss) - float(log_jacobian(self.objective, z, e, keep)[0])
         prior_std = np.asarray(self.objective.prior_std(log_v))
-        pull = (np.asarray(z) - self.space.prior_mean) / prior_std
+        deviation = (np.asarray(z) - self.space.prior_mean) / prior_std
         nll += float(np.log(prior_std).sum())
         spread = (np.asarray(log_v) - np.asarray(self.objective.typical)) / VARIANCE_SPREAD
-        return nll + 0.5 * float(np.sum(pull**2)) + 0.5 * float(np.sum(spread**2))
+        return nll + 0.5 * float(np.sum(deviation**2)) + 0.5 * float(np.sum(spread**2))
 
     def electric(self, z: Vector, log_v: Vector) -> lk.ElectricNoise:
-        """What voltages are predicted with at this resistance and these variances."""
+        """Return the noise that voltages are predicted with at these numbers and variances."""
         return _electric(self.objective, z, log_v)
 
     def voltage_information(
         self, z: Vector, log_v: Vector, motor_force: Array
     ) -> VoltageInformation | None:
-        """What voltages tell of variances given the traction, None where none are logged."""
+        """Return the information of voltages about variances, None where none are logged."""
         if "voltage" not in self.noise.blocks:
             return None
         return voltage_information(self.objective, z, log_v, motor_force)
 
 
 class WeighedResiduals(NamedTuple):
-    """Residuals of a problem at given variances, and what runs share.
+    """Residuals of a problem at given variances, and the effects that runs share.
 
     Attributes:
-        whitening: weights and roots of residuals less the effects that runs share.
-        tied: what runs share, given residuals whitened by these roots.
+        whitening: weights and roots of residuals less the shared effects.
+        effects: posterior of the shared effects given residuals whitened by these roots.
         loss: minus log posterior of the residuals, less constants.
     """
 
     whitening: Whitening
-    effects: tuple[EffectPosterior, ...]
+    effects: Posteriors
     loss: Array
 
 
@@ -227,21 +224,19 @@ class WeighedResiduals(NamedTuple):
 def _weighed(
     objective: Objective, residual: Blocks, log_v: Array, keep: Array, effect: Array
 ) -> WeighedResiduals:
-    found = variances.whitening(
-        objective.blocks, without_effects(objective, residual, effect), log_v, keep
-    )
+    own, motion = without_effects(objective, residual, effect), residual["motion"]
+    found = variances.whitening(objective.blocks, own, log_v, keep)
     root = found.root["motion"]
     posteriors = effect_posteriors(objective.shared, log_v, root)
-    coefs = marginal_residuals(posteriors, jnp.einsum("nij,nj->ni", root, residual["motion"]))[
-        residual["motion"].size :
-    ]
-    log_det = sum(jnp.sum(jnp.log(jnp.diagonal(tie.factor))) for tie in posteriors)
+    rows = marginal_residuals(posteriors, jnp.einsum("nij,nj->ni", root, motion))
+    coefs = rows[motion.size :]
+    log_det = sum(jnp.sum(jnp.log(jnp.diagonal(p.factor))) for p in posteriors)
     return WeighedResiduals(found, posteriors, found.loss + 0.5 * jnp.sum(coefs**2) + log_det)
 
 
 @eqx.filter_jit
 def without_effects(objective: Objective, residual: Blocks, effect: Array) -> Blocks:
-    """Residual blocks less effects that runs share (piece, 3)."""
+    """Return residual blocks less shared effects (segment, 3)."""
     motion = residual["motion"]
     for of in objective.shared:
         off = jnp.einsum("nma,na->nm", of.effect, effect[of.segments])
@@ -250,8 +245,8 @@ def without_effects(objective: Objective, residual: Blocks, effect: Array) -> Bl
 
 
 @eqx.filter_jit
-def effects_given(posteriors: tuple[EffectPosterior, ...], root: Array, motion: Array) -> Array:
-    """Conditional mean of the effects that runs share (piece, 3) given residuals of the motion."""
+def effects_given(posteriors: Posteriors, root: Array, motion: Array) -> Array:
+    """Return the conditional mean of the shared effects (segment, 3) given motion residuals."""
     return mean_effects(posteriors, jnp.einsum("nij,nj->ni", root, motion))
 
 
@@ -259,7 +254,7 @@ def effects_given(posteriors: tuple[EffectPosterior, ...], root: Array, motion: 
 def linear(
     objective: Objective, z: Vector, electric: lk.ElectricNoise
 ) -> tuple[Blocks, Blocks, Array]:
-    """Residual blocks, their Jacobians, and the traction of every wheel's motor."""
+    """Return residual blocks, their Jacobians, and the forces of every motor."""
 
     def blocks(x: Array) -> tuple[Blocks, tuple[Blocks, Array]]:
         robot = objective.space.tree(x)
@@ -283,7 +278,7 @@ def _electric(objective: Objective, z: Vector, log_v: Vector) -> lk.ElectricNois
 def log_jacobian(
     objective: Objective, z: Vector, electric: lk.ElectricNoise, keep: Vector
 ) -> tuple[Array, Array]:
-    """Log |d residuals / d data| of all pieces, and its gradient by the search vector."""
+    """Return log |d residuals / d data| of all segments, and its gradient by the search vector."""
 
     def total(x: Array) -> Array:
         robot = objective.space.tree(x)
@@ -297,21 +292,21 @@ def log_jacobian(
 
 @eqx.filter_jit
 def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
-    """Body twist of every window (piece, window, 3), and its derivative by z (.., free)."""
+    """Return every window's body twist (segment, window, 3) and its derivative by z (.., free)."""
     return lk.with_slope(lambda x: lk.predict(space.tree(x), batch).twist, z)
 
 
 def fixed_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:
-    """Viscous terms held near zero on every floor that was driven at one speed only.
+    """Return choices that fix viscous terms near zero on floors driven at one speed only.
 
-    With one speed they cannot be told from creep, and what they take from it is wrong at every
-    other speed.
+    With one speed they cannot be distinguished from creep, and a wrong split of the two is wrong at
+    every other speed.
     """
-    seen: dict[str, list[float]] = {}
+    driven: dict[str, list[float]] = {}
     for k in range(len(data)) if runs is None else runs:
-        seen.setdefault(data.logs[k].surface or "unknown", []).append(float(data.speed[k]))
+        driven.setdefault(data.logs[k].surface or "unknown", []).append(float(data.speed[k]))
     out = []
-    for floor, speeds in seen.items():
+    for floor, speeds in driven.items():
         known = np.asarray(speeds)[np.isfinite(speeds)]
         if len(known) == len(speeds) and known.max() < 1.3 * max(known.min(), 1e-3):
             names = (f"surface.{floor}.{name}" for name in ("slide_viscosity", "roller_viscosity"))

@@ -1,15 +1,15 @@
-"""What the runs of one session share beyond the model, and how much less they then tell.
+"""Effects that the runs of one session share beyond the model, and the information they cost.
 
 Runs driven on one floor at one time slip a little more or less than the model says, all of them
 together: a slip model of the comparison is fitted as if they were independent. After its fit the
-effects that are left in its runs,
+remaining effects of its runs,
 
     a_i = (E_i^T W_i E_i)^-1 E_i^T W_i r_i     along, across, yaw
 
-have a part that is common to the session (E_i moves the residuals by an effect, W_i weighs
-without the run effects). Its variance v is found per floor and axis by restricted
-likelihood, the run effects' own held, in turn with the Student-t weights of the runs, which are
-outliers only for what their session does not share; the covariance C of the fitted numbers grows to
+have a part that is common to the session (E_i moves the residuals by an effect, W_i weighs without
+the run effects). Its variance v is estimated per floor and axis by restricted likelihood, at fixed
+variances of the run effects, in turn with the Student-t weights of the runs, which are outliers
+only for effects that their session does not share; the covariance C of the fitted numbers grows to
 
     C + C (sum_s v u_s u_s^T) C,    u_s = sum_{i in s} J_i^T V_i^-1 E_i
 """
@@ -26,67 +26,76 @@ from slipid.fit.shared_effects import AXES
 from slipid.fit.variances import DEGREES
 
 SPREAD = 3.0
-"""Std of the prior of a log variance, around that of the run effects."""
+"""Std of the prior of a log variance around the log variance of the run effects."""
 TURNS = 4
-"""Of weights and variances, each given the other."""
+"""Number of alternations between weights and variances."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """A fitted model made linear at its fit, on all pieces of a problem.
+    """A fitted model linearised at its fit, on all segments of a problem.
 
-    Gap is predicted less measured; `wide` the covariance of the numbers as they were before a
-    floor's own runs were seen; scale the noise covariance, the run's own effect included; effect
-    what one unit along, across and in yaw moves; run the variance of these effects.
+    Attributes:
+        gap: predicted less measured increments.
+        slope: derivative of the increments by the numbers.
+        covariance: covariance of the numbers.
+        wide: covariance of the numbers before the floor's own runs were used.
+        scale: noise covariance, the run's own effect included.
+        effect: change of the increments per unit of an effect along, across and in yaw.
+        run: variance of the run's own effects.
     """
 
-    gap: Float[np.ndarray, "piece m"]
-    slope: Float[np.ndarray, "piece m number"]
+    gap: Float[np.ndarray, "segment m"]
+    slope: Float[np.ndarray, "segment m number"]
     covariance: Float[np.ndarray, "number number"]
     wide: Float[np.ndarray, "number number"]
-    scale: Float[np.ndarray, "piece m m"]
-    effect: Float[np.ndarray, "piece m 3"]
-    run: Float[np.ndarray, "piece 3"]
+    scale: Float[np.ndarray, "segment m m"]
+    effect: Float[np.ndarray, "segment m 3"]
+    run: Float[np.ndarray, "segment 3"]
 
 
 def with_session_effects(
-    model: LinearModel, w: Windows, keep: Float[np.ndarray, " piece"]
+    model: LinearModel, w: Windows, keep: Float[np.ndarray, " segment"]
 ) -> tuple[dict[str, float], Float[np.ndarray, "number number"]]:
-    """Variances `session.<floor>.<axis>`, and the covariance of the numbers with them.
+    """Return variances `session.<floor>.<axis>`, and the numbers' covariance that includes them.
 
-    A floor that was driven in one session only has none: what it shares is in the floor's numbers.
+    A floor driven in only one session has none: shared effects are then part of the floor's
+    numbers.
     """
     variance: dict[str, float] = {}
     for _ in range(TURNS):
         variance = _variances(model, w, keep, _weights(model, by_axis(variance, "session", w)))
     weighted = np.swapaxes(model.effect, 1, 2) @ np.linalg.solve(model.scale, model.slope)
-    pulls = weighted * (_weights(model, np.zeros_like(model.run)) * keep)[:, None, None]
+    scores = weighted * (_weights(model, np.zeros_like(model.run)) * keep)[:, None, None]
     of_session = by_axis(variance, "session", w)
     meat = np.zeros_like(model.covariance)
     of_segment = floors_and_sessions(w)
     for pair in dict.fromkeys(of_segment):
         mine = np.array([other == pair for other in of_segment]) & (keep > 0)
         if mine.any():
-            u = pulls[mine].sum(axis=0)
+            u = scores[mine].sum(axis=0)
             meat += u.T @ (of_session[mine][0][:, None] * u)
     return variance, model.covariance + model.covariance @ meat @ model.covariance
 
 
 def floors_and_sessions(w: Windows) -> list[tuple[str, str]]:
-    """Floor and session of every piece; what is shared is shared by these."""
+    """Return the floor and session of every segment; segments of equal pairs share effects."""
     return list(zip(w.surface, w.session, strict=True))
 
 
-def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.ndarray, "piece 3"]:
-    """Variances of an effect of every piece, zero where there is none."""
+def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.ndarray, "segment 3"]:
+    """Return the variances of an effect of every segment, zero where there is none."""
     return np.array([[variance.get(f"{kind}.{f}.{axis}", 0.0) for axis in AXES] for f in w.surface])
 
 
 def _variances(
     model: LinearModel, w: Windows, keep: np.ndarray, weight: np.ndarray
 ) -> dict[str, float]:
+    """Return the variances of session effects by name, at given weights of the segments."""
     session, floor = np.asarray(w.session), np.asarray(w.surface)
-    left, noise, slope = _remaining_effects(model)
+    left, noise, slope = remaining_effects(
+        model.gap, model.slope, model.scale, model.effect, model.run
+    )
     variance: dict[str, float] = {}
     for name in dict.fromkeys(floor[keep > 0].tolist()):
         mine = (floor == name) & (keep > 0)
@@ -103,7 +112,7 @@ def _variances(
 
 
 def _weights(model: LinearModel, more: np.ndarray) -> np.ndarray:
-    """Student-t weight of every piece, given the variances of effects beyond its scale."""
+    """Return the Student-t weight of every segment, given additional variances of effects."""
     e = model.effect
     scale = model.scale + np.einsum("nma,na,nla->nml", e, more, e)
     white = np.linalg.solve(scale, model.gap[..., None])[..., 0]
@@ -111,22 +120,29 @@ def _weights(model: LinearModel, more: np.ndarray) -> np.ndarray:
     return np.asarray((DEGREES + m) / (DEGREES + q))
 
 
-def _remaining_effects(model: LinearModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Effects left in each run (piece, 3), their variance by camera and process, their slope."""
-    e = model.effect
-    plain = model.scale - np.einsum("nma,na,nla->nml", e, model.run, e)
-    by_noise = np.linalg.solve(plain, e)
-    cov = np.linalg.inv(np.swapaxes(e, 1, 2) @ by_noise)
+def remaining_effects(
+    gap: np.ndarray, slope: np.ndarray, scale: np.ndarray, effect: np.ndarray, run: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return remaining effects of each run (run, 3), their noise variance and their derivative.
+
+    Arguments are those of `LinearModel`.
+    """
+    plain = scale - np.einsum("nma,na,nla->nml", effect, run, effect)
+    by_noise = np.linalg.solve(plain, effect)
+    cov = np.linalg.inv(np.swapaxes(effect, 1, 2) @ by_noise)
     take = cov @ np.swapaxes(by_noise, 1, 2)
-    left = np.einsum("nam,nm->na", take, model.gap)
-    return left, np.diagonal(cov, axis1=1, axis2=2), take @ model.slope
+    left = np.einsum("nam,nm->na", take, gap)
+    return left, np.diagonal(cov, axis1=1, axis2=2), take @ slope
 
 
 def _variance(left: np.ndarray, own: np.ndarray, member: np.ndarray, centre: float) -> float:
-    """Most likely variance of what the members of each session share (run, session), each 1 or 0.
+    """Return the most likely variance of effects shared by the members of each session.
 
-    `own` is the covariance of the effects left without it, `centre` that of the log variance's
-    prior.
+    Args:
+        left: remaining effects of the runs.
+        own: their covariance without shared effects.
+        member: 1 where a run belongs to a session, else 0 (run, session).
+        centre: centre of the prior of the log variance.
     """
     root = np.linalg.cholesky(own)
     white = np.linalg.solve(root, np.concatenate([left[:, None], member], axis=1))
@@ -135,9 +151,9 @@ def _variance(left: np.ndarray, own: np.ndarray, member: np.ndarray, centre: flo
 
     def loss(log_v: float) -> float:
         grown = 1.0 + np.exp(log_v) * scale
-        told = np.exp(log_v) * np.sum(along**2 / grown)
-        pull = (log_v - centre) / SPREAD
-        return float(0.5 * (np.log(grown).sum() - told + pull**2))
+        explained = np.exp(log_v) * np.sum(along**2 / grown)
+        deviation = (log_v - centre) / SPREAD
+        return float(0.5 * (np.log(grown).sum() - explained + deviation**2))
 
     span = (centre - 4 * SPREAD, centre + 4 * SPREAD)
     return float(np.exp(minimize_scalar(loss, bounds=span, method="bounded").x))

@@ -1,8 +1,8 @@
 """Weights of residuals given their variances, and the variances by Fisher scoring.
 
-Residuals of a piece are a multivariate Student t with the scale matrix V of `noise`. The restricted
-likelihood of the variances takes into account what the structural numbers have been fitted to
-(Patterson and Thompson 1971, Biometrika 58(3)).
+Residuals of a segment are a multivariate Student t with the scale matrix V of `noise`. The
+restricted likelihood of the variances accounts for the numbers having been fitted to the same
+residuals (Patterson and Thompson 1971, Biometrika 58(3)).
 """
 
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from slipid.fit import likelihood as lk
 from slipid.fit.multi_floor import MULTI_FLOOR_CURRENT, MULTI_FLOOR_MOTION, MultiFloorBatch
 from slipid.fit.noise import Components, electric_noise
 from slipid.fit.shared_effects import (
-    EffectPosterior,
+    Posteriors,
     SharedEffects,
     effect_covariances,
     effect_posteriors,
@@ -27,17 +27,17 @@ from slipid.fit.shared_effects import (
 from slipid.search_space import Space
 
 Vector = Array | np.ndarray
-"""One-dimensional, of jax or numpy."""
+"""One-dimensional array of jax or numpy."""
 Search = Float[np.ndarray, " free"]
 """A search vector, or one number for each of its coordinates."""
 Square = Float[np.ndarray, "free free"]
 """Covariance or information of the search vector."""
 Blocks = dict[str, Array]
-"""An array for every block of residuals: `motion`, `current`, `voltage`, those of `crossing`."""
+"""An array for every block of residuals: `motion`, `current`, `voltage`, `crossing.*`."""
 Noises = dict[str, Components]
-"""Covariance pieces of every block."""
+"""Covariance components of every block."""
 MOTION_BLOCKS = ("motion", MULTI_FLOOR_MOTION)
-"""Blocks of residuals of the motion; the others are read given it."""
+"""Blocks of residuals of the motion; the others are conditional on it."""
 DEGREES = 8.0
 """Degrees of freedom of the Student-t weight of a run."""
 VARIANCE_SPREAD = 3.0
@@ -45,15 +45,18 @@ VARIANCE_SPREAD = 3.0
 
 
 class Objective(eqx.Module):
-    """What a fit maximises, as an argument of compiled functions.
+    """Data and priors of a fit, as an argument of compiled functions.
 
     Attributes:
-        several: runs over several floors, None where there are none.
-        shared: what runs on each floor share.
+        space: free numbers and their prior.
+        batch: runs on one floor each.
+        multi_floor: runs over several floors, None where there are none.
+        blocks: covariance components of every block.
+        shared: effects that the runs on each floor share.
         typical: centre of the prior of the log variances.
-        scored: variances that are found from the residuals of each piece alone.
-        pooled: number of the variance that the space's pooled coordinates have a priori.
-        joint: there are no currents, and all numbers are the motion's.
+        scored: variances that are estimated from the residuals of each segment alone.
+        pooled: number of the prior variance of the space's pooled coordinates.
+        joint: whether there are no currents, so that all numbers are estimated from motion.
     """
 
     space: Space
@@ -67,15 +70,18 @@ class Objective(eqx.Module):
     joint: bool = eqx.field(static=True)
 
     def prior_std(self, log_v: Vector) -> Array:
-        """Std of the prior of every coordinate at given variances."""
+        """Return the prior std of every coordinate at given variances."""
         pooled = jnp.exp(0.5 * jnp.asarray(log_v)[self.pooled])
         return jnp.where(self.space.pooled, pooled, jnp.asarray(self.space.prior_std))
 
 
 class Whitening(NamedTuple):
-    """Root W of every piece with W^T W = w V^-1, weight w, small for an outlier, and the loss.
+    """Weighted inverse roots of the covariance of every segment.
 
-    The loss is minus log likelihood, less constants.
+    Attributes:
+        root: W with W^T W = w V^-1.
+        weight: Student-t weight w, small for an outlier.
+        loss: minus log likelihood, less constants.
     """
 
     root: Blocks
@@ -84,15 +90,15 @@ class Whitening(NamedTuple):
 
 
 class VoltageInformation(NamedTuple):
-    """What voltages tell of variances, each (piece, m).
+    """Information of voltages about variances, each (segment, m).
 
     Attributes:
-        residual: of the voltages, in units of their own noise.
-        share: part that this noise has in the variance of every residual.
+        residual: residual of the voltages in units of their own noise.
+        share: share of this noise in the variance of every residual.
         slope: derivative of the log likelihood by the scatter of the true current.
-        information: expected, of that scatter.
-        steeper: by how much the loss bends more than expected in the log of the voltage noise,
-            where others explain the residuals.
+        information: expected information about that scatter.
+        steeper: curvature of the loss beyond its expectation in the log of the voltage noise, where
+            other variances explain the residuals.
     """
 
     residual: Array
@@ -106,7 +112,7 @@ class VoltageInformation(NamedTuple):
 def voltage_information(
     objective: Objective, z: Vector, log_v: Vector, motor_force: Array
 ) -> VoltageInformation:
-    """What voltages tell of variances given the traction of every wheel's motor."""
+    """Return the information of voltages about variances, given the forces of every motor."""
     robot, b = objective.space.tree(z), objective.batch
     noise = electric_noise(objective.blocks, log_v, robot.motor.resistance)
 
@@ -114,7 +120,7 @@ def voltage_information(
         at = lk.ElectricNoise(noise.voltage_std, scatter, noise.resistance)
         return lk.electric_residuals(robot, b, motor_force, at)["voltage"], lk.voltage_spread(b, at)
 
-    # every residual depends on its own scatter only
+    # every residual depends on its own scatter only: one product gives all derivatives
     (r, spread), (more, wider) = jax.jvp(scaled, (noise.scatter,), (jnp.ones_like(noise.scatter),))
     variance, m, wider = noise.voltage_std**2, r.shape[1], wider / spread
     weight = (DEGREES + m) / (DEGREES + jnp.sum(r**2, axis=1, keepdims=True) / variance)
@@ -127,7 +133,7 @@ def voltage_information(
 
 @eqx.filter_jit
 def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
-    """Weights of residuals, for pieces that count as `keep` says."""
+    """Return the weights of residuals; `keep` is 1 for segments that count."""
     roots, weights, loss = {}, {}, jnp.zeros(())
     for k, r in residual.items():
         inverse = inverse_root(noises[k].covariance(log_v))
@@ -142,7 +148,7 @@ def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> 
 
 @eqx.filter_jit
 def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> Blocks:
-    """Jacobians H (piece, m, free) such that H^T H is the expected information of a piece."""
+    """Return Jacobians H (segment, m, free) such that H^T H is a segment's expected information."""
     out = {}
     for k, jac in jacobian.items():
         factor = jnp.asarray(keep)[noises[k].segments] * expected(noises[k].count)
@@ -155,47 +161,42 @@ def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> B
 def precision(
     objective: Objective, jacobian: Blocks, log_v: Vector, keep: Vector, alone: bool = False
 ) -> Array:
-    """Expected information of the search vector, prior included (free, free).
+    """Return the expected information of the search vector, prior included (free, free).
 
-    What runs share is marginalised; `alone` counts every run as if it shared nothing.
+    Shared effects are marginalised; with `alone` every run counts as if it shared none.
     """
     prior = jnp.diag(1 / objective.prior_std(log_v) ** 2)
     total, of_motion = prior, prior
     for k, half in whitened(objective.blocks, jacobian, log_v, keep).items():
         flat = half.reshape(-1, half.shape[-1])
         if k == "motion" and not alone:
-            posteriors = expected_posteriors(objective, log_v, keep)
-            flat = marginal_slopes(posteriors, half)
+            flat = marginal_slopes(expected_posteriors(objective, log_v, keep), half)
         total += flat.T @ flat
         of_motion += flat.T @ flat if k in MOTION_BLOCKS else 0.0
-    return (
-        total if objective.joint else _cut(total, of_motion, jnp.asarray(objective.space.electric))
-    )
+    if objective.joint:
+        return total
+    return _cut(total, of_motion, jnp.asarray(objective.space.electric))
 
 
-def expected_posteriors(
-    objective: Objective, log_v: Vector, keep: Vector
-) -> tuple[EffectPosterior, ...]:
-    """What runs share, given residuals whitened by `whitened`."""
-    block = objective.blocks["motion"]
-    roots = inverse_root(block.covariance(jnp.asarray(log_v)))
+def expected_posteriors(objective: Objective, log_v: Vector, keep: Vector) -> Posteriors:
+    """Return the posteriors of shared effects, given residuals whitened by `whitened`."""
+    block, log_v = objective.blocks["motion"], jnp.asarray(log_v)
     factor = expected(block.count) * jnp.asarray(keep)[block.segments]
-    return effect_posteriors(
-        objective.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None]
-    )
+    roots = inverse_root(block.covariance(log_v)) * jnp.sqrt(factor)[:, None, None]
+    return effect_posteriors(objective.shared, log_v, roots)
 
 
 def expected(m: Array | float | int) -> Any:
-    """Fisher information of a Student-t location in m dimensions, over that of a Gaussian."""
+    """Return the Fisher information of an m-dimensional Student-t location over the Gaussian's."""
     return (DEGREES + m) / (DEGREES + m + 2)
 
 
 def _cut(total: Array, of_motion: Array, e: Array) -> Array:
-    """Information of p(motion | motion data) p(electric | motion, all data).
+    """Return the information of p(motion | motion data) p(electric | motion, all data).
 
-    Where wheels stand on several floors motion depends on their friction, which is electric: it is
-    marginalised in the first factor, as if currents told nothing of it. The fit's estimate of the
-    motion does follow what currents tell of friction: its interval is rather too wide there.
+    Where wheels stand on several floors, motion depends on their friction, which is electric: it is
+    marginalised in the first factor as if currents contained no information about it. The estimate
+    of the motion does follow the friction from currents: its interval is rather too wide there.
     """
     first = of_motion - _schur_term(of_motion, e)
     motion = ~e[:, None] & ~e[None, :]
@@ -203,7 +204,7 @@ def _cut(total: Array, of_motion: Array, e: Array) -> Array:
 
 
 def _schur_term(information: Array, e: Array) -> Array:
-    """B^T A^-1 B for the block A of the coordinates e, and B between these and the others."""
+    """Return B^T A^-1 B for the block A of the coordinates e, and B between it and the rest."""
     own = jnp.where(e[:, None] & e[None, :], information, jnp.diag(jnp.where(e, 0.0, 1.0)))
     cross = jnp.where(e[:, None] & ~e[None, :], information, 0.0)
     return cross.T @ jnp.linalg.solve(own, cross)
@@ -211,9 +212,9 @@ def _schur_term(information: Array, e: Array) -> Array:
 
 @eqx.filter_jit
 def fitted_covariance(objective: Objective, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
-    """Covariance of the residuals from fitted numbers and from what runs share (piece, m, m).
+    """Return the residuals' covariance due to fitted numbers and shared effects (segment, m, m).
 
-    The Jacobian is of the structural numbers; what runs share follows them.
+    The Jacobian is that of the structural numbers; the shared effects follow them.
     """
     cov = jnp.linalg.inv(precision(objective, jacobian, log_v, keep))
     posteriors = expected_posteriors(objective, log_v, keep)
@@ -241,19 +242,19 @@ def scoring_step(
     keep: Array,
     voltage: VoltageInformation | None,
 ) -> Array:
-    """One Fisher-scoring step of the restricted likelihood in the log variances of blocks.
+    """Return the log variances after one Fisher-scoring step of the restricted likelihood.
 
-    Residuals are those of a model, this or another, less what runs share. `spread` is their
-    covariance from what was fitted to them (piece, m, m); the degrees of freedom it stands for are
-    not the variances' to have.
+    Residuals are those of any model, less shared effects. `spread` is their covariance due to what
+    was fitted to them (segment, m, m); the degrees of freedom spent there are not available to the
+    variances.
     """
     _, weights, _ = whitening(objective.blocks, residual, log_v, keep)
     score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])
     for k, r in residual.items():
-        noise, mine = objective.blocks[k], _own_share(k, voltage)
+        noise = objective.blocks[k]
         root = inverse_root(noise.covariance(log_v))
         inverse = jnp.einsum("nji,njk->nik", root, root)
-        base, which = _scaled_base(noise.base, mine), noise.which
+        base, which = _scaled_base(noise, k, voltage), noise.which
         v = jnp.exp(log_v)[which]
         vr, kept = jnp.einsum("nij,nj->ni", inverse, r), keep[noise.segments]
         fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
@@ -262,15 +263,13 @@ def scoring_step(
         lost = jnp.einsum("nij,ncij->nc", spent, base)
         slope = 0.5 * v * (fit + kept[:, None] * (lost - trace))
         if voltage is not None and k == "current":
-            told = jnp.einsum("ni,nci->nc", voltage.slope, noise.single)
-            slope += v * kept[:, None] * told
+            slope += v * kept[:, None] * jnp.einsum("ni,nci->nc", voltage.slope, noise.single)
         score = score.at[which].add(slope)
         if voltage is not None and k == "voltage":
             steeper = steeper.at[which].add((kept * jnp.sum(voltage.steeper, axis=1))[:, None])
-        if k in (MULTI_FLOOR_MOTION, MULTI_FLOOR_CURRENT) or (
-            voltage is not None and k == "current"
-        ):
-            # a logarithm that falls bends the more: its slope is in proportion to the variance
+        others = () if voltage is None else ("current",)
+        if k in (MULTI_FLOOR_MOTION, MULTI_FLOOR_CURRENT, *others):
+            # the curvature grows where a log variance falls: the slope is in proportion to it
             steeper = steeper.at[which].add(-slope)
     score -= (log_v - objective.typical) / VARIANCE_SPREAD**2
     info = information(objective.blocks, log_v, keep, voltage)
@@ -283,10 +282,10 @@ def scoring_step(
 def information(
     noises: Noises, log_v: Vector, keep: Vector, voltage: VoltageInformation | None
 ) -> Array:
-    """Expected information of the log variances, prior included (variance, variance)."""
+    """Return the expected information of the log variances, prior included (variance, variance)."""
     info = jnp.eye(log_v.shape[0]) / VARIANCE_SPREAD**2
     for k, noise in noises.items():
-        base, which = _scaled_base(noise.base, _own_share(k, voltage)), noise.which
+        base, which = _scaled_base(noise, k, voltage), noise.which
         root = inverse_root(noise.covariance(log_v))
         vb = jnp.einsum("nji,njk,nckl->ncil", root, root, base)
         v = jnp.exp(log_v)[which]
@@ -294,42 +293,30 @@ def information(
         cross *= v[:, :, None] * v[:, None, :]
         kept = jnp.asarray(keep)[noise.segments, None, None]
         info = info.at[which[:, :, None], which[:, None, :]].add(kept * cross)
-    return (
-        info
-        if voltage is None
-        else info + _scatter_information(noises["current"], log_v, keep, voltage)
-    )
-
-
-def _scatter_information(
-    noise: Components, log_v: Vector, keep: Vector, voltage: VoltageInformation
-) -> Array:
-    """Expected information of the log variances that voltages have of the scatter of currents."""
+    if voltage is None:
+        return info
+    # voltages also depend on the scatter of the currents
+    noise = noises["current"]
     grown = jnp.exp(log_v)[noise.which][..., None] * noise.single
     kept = jnp.asarray(keep)[noise.segments]
     cross = jnp.einsum("n,ni,nci,ndi->ncd", kept, voltage.information, grown, grown)
-    info = jnp.zeros((log_v.shape[0],) * 2)
-    return info.at[noise.which[:, :, None], noise.which[:, None, :]].add(cross)
+    through = jnp.zeros_like(info)
+    return info + through.at[noise.which[:, :, None], noise.which[:, None, :]].add(cross)
 
 
-def _own_share(block: str, voltage: VoltageInformation | None) -> Array | None:
-    """Part that the variances have in that of the residuals of a block, None for all."""
-    return voltage.share if voltage is not None and block == "voltage" else None
+def _scaled_base(noise: Components, block: str, voltage: VoltageInformation | None) -> Array:
+    """Return a block's covariance components, scaled by their noise's share in its residuals."""
+    if voltage is None or block != "voltage":
+        return noise.base
+    root = jnp.sqrt(voltage.share)
+    return noise.base * root[:, None, :, None] * root[:, None, None, :]
 
 
-def _scaled_base(base: Array, own: Array | None) -> Array:
-    """How the covariance of residuals grows with each variance, of which only a part is in them."""
-    if own is None:
-        return base
-    root = jnp.sqrt(own)
-    return base * root[:, None, :, None] * root[:, None, None, :]
-
-
-def inverse_root(v: Float[Array, "piece m m"]) -> Float[Array, "piece m m"]:
-    """L^-1 of V = L L^T for many small matrices, all at once, column by column.
+def inverse_root(v: Float[Array, "segment m m"]) -> Float[Array, "segment m m"]:
+    """Return L^-1 of V = L L^T for many small matrices at once, column by column.
 
     Written out because batched LAPACK calls that run beside each other inside one compiled function
-    can wait for each other for ever on a machine with two cores (seen with jax 0.10).
+    can deadlock on a computer with two cores (jax 0.10).
     """
     a = jnp.moveaxis(v, 0, -1)
     m = a.shape[0]

@@ -1,4 +1,4 @@
-"""From the body on the floor to the logged pose: scale, tilt, lens, marker."""
+"""Camera model: from the body's pose on the floor to the logged pose of its marker."""
 
 from functools import partial
 
@@ -10,19 +10,19 @@ from jaxtyping import Array, Float, Int
 from slipid.parameter import parameter
 
 known = partial(parameter, free=False)
-"""Held where it is unless the user says otherwise."""
+"""A number that stays fixed unless the user frees it."""
 plane = partial(known, of="axis")
-"""A vector in the plane, x and y."""
+"""A fixed vector in the plane, x and y."""
 
 
 class Camera(eqx.Module):
-    """From the body on the floor to the logged pose.
+    """Map from the body's pose on the floor to the logged pose of its marker.
 
-    Logged places are corrected by `corrected`: true = scale * Q(q), q from the image centre, with
-    Q(q) = (q (1 + k q.q) + p q.q + 2 q (p.q)) / (1 + tilt.q): perspective of a tilted camera,
-    radial and tangential distortion (Brown 1966, Conrady 1919; first order of each). The marker's
-    heading is the body's plus `marker_yaw`, with an own deviation per session in which it was put
-    on.
+    Logged positions are corrected by `corrected`: true = scale * Q(q), with q measured from the
+    image centre and Q(q) = (q (1 + k q.q) + p q.q + 2 q (p.q)) / (1 + tilt.q): perspective of a
+    tilted camera, radial and tangential distortion (Brown 1966, Conrady 1919; first order of each).
+    The marker's heading is the body's plus `marker_yaw`, plus a deviation for each session in which
+    the marker was mounted anew.
     """
 
     scale: Array = known("1", "s", "true over logged length", start=1.0, lower=0.0, spread=0.02)
@@ -39,16 +39,20 @@ class Camera(eqx.Module):
     sessions: tuple[str, ...] = eqx.field(static=True, default=())
 
     def corrected(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Pose in true metres, heading turned as the map turns it; the marker yaw stays in."""
+        """Return a logged pose in true metres, its heading turned as the map turns it.
+
+        The marker yaw stays in the heading.
+        """
         u = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
         place, turned = jax.jvp(self._ground, (pose[:2],), (u,))
         turn = jnp.arctan2(u[0] * turned[1] - u[1] * turned[0], u @ turned)
         return jnp.concatenate([place, (pose[2] + turn)[None]])
 
     def logged(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
-        """What is logged of a true pose: the inverse of `corrected`, by iteration.
+        """Return the logged pose of a true pose: the inverse of `corrected`, by iteration.
 
-        Every step shrinks the error by the bend of the map, some percent across a picture.
+        Every iteration shrinks the error by the nonlinearity of the map, a few percent across a
+        picture.
         """
         step = jnp.stack([self.scale, self.scale, jnp.ones(())])
         q = (pose / step).at[:2].add(jnp.asarray(self.centre))
@@ -57,10 +61,10 @@ class Camera(eqx.Module):
         return q
 
     def log_jacobian(self, pose: Float[Array, "3"]) -> Float[Array, ""]:
-        """Log |d corrected / d pose|, which a density of logged poses has beside its residuals.
+        """Return log |d corrected / d pose|, which a density of logged poses needs.
 
-        With m the derivative of the map of places and u the heading's direction the place gives
-        log |m|, the heading log(|m| / |m u|^2).
+        With m the derivative of the map of positions and u the direction of the heading, the
+        position contributes log |m| and the heading log(|m| / |m u|^2).
         """
         m = jax.jacfwd(self._ground)(pose[:2])
         turned = m @ jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
@@ -68,14 +72,14 @@ class Camera(eqx.Module):
         return 2 * jnp.log(area) - jnp.log(turned @ turned)
 
     def _ground(self, place: Float[Array, "2"]) -> Float[Array, "2"]:
-        """True place on the floor of a logged one."""
+        """Return the true position on the floor of a logged position."""
         q = place - jnp.asarray(self.centre)
         p, r2 = self.tangential, q @ q
         bent = q * (1 + self.radial * r2) + p * r2 + 2 * q * (p @ q)
         return self.scale * bent / (1 + self.tilt @ q)
 
     def yaw(self, session: Int[Array, ""] | int) -> Float[Array, ""]:
-        """Marker heading less body heading in a session; an unknown one (-1) has the common yaw."""
+        """Return the marker's heading less the body's in a session; -1 is an unknown one."""
         if not self.sessions:
             return self.marker_yaw
         own = jnp.where(session >= 0, self.session_yaw[session], 0.0)
@@ -84,7 +88,7 @@ class Camera(eqx.Module):
     def marker_increment(
         self, increment: Float[Array, "3"], session: Int[Array, ""] | int
     ) -> Float[Array, "3"]:
-        """Body-frame increment of the marker from the body's (x, y [m], yaw [rad])."""
+        """Return the marker's body-frame increment for a body increment (x, y [m], yaw [rad])."""
         c, s = jnp.cos(increment[2]), jnp.sin(increment[2])
         px, py = self.marker_place[0], self.marker_place[1]
         x = increment[0] + (c - 1) * px - s * py

@@ -1,7 +1,7 @@
-"""Contact equilibrium: the body moves so that wheel traction, roller drag and scrub balance.
+"""Contact equilibrium: the twist at which wheel traction, roller drag and scrub balance.
 
 The forces are those of `slipid.model.contact_law`. The root of their balance is found by a fixed
-number of chord steps, which come near from anywhere, and then of damped Newton steps with the
+number of chord steps, which come near it from anywhere, followed by damped Newton steps with the
 analytic 3x3 Jacobian; its derivative comes from the implicit function theorem.
 """
 
@@ -25,19 +25,19 @@ _ROUNDING = 1e-20
 _NEAR = 1e-6
 _MOST_NEAR = 12
 CHORD, NEWTON = 4, 2
-"""Steps of each kind that `settle` takes from the twist of a moment ago.
+"""Number of steps of each kind that `settle` takes from the twist of the previous time step.
 
-Wheel speeds that change by up to 1.25 rad/s a step, three floors: 99 % of all twists are then
-within 3 mm/s (20 mm/s with 2 and 3 steps), half of them within rounding.
+With wheel speeds that change by up to 1.25 rad/s per time step and three floors, 99 % of all twists
+are then within 3 mm/s (20 mm/s with 2 and 3 steps), half of them within rounding.
 """
 
 
 class ContactProblem(eqx.Module):
-    """What the twist of a robot depends on.
+    """Inputs that determine the twist of a robot.
 
     Attributes:
-        rim, frame, surface, rest: as of `equilibrium`.
-        start: where the twist is looked for.
+        rim, frame, surface, rest: as in `equilibrium`.
+        start: twist from which the search starts.
     """
 
     rim: Float[Array, " wheel"]
@@ -47,12 +47,12 @@ class ContactProblem(eqx.Module):
     start: Float[Array, "3"]
 
     def balance(self) -> Balance:
-        """The forces as a function of the twist."""
+        """Return the forces as a function of the twist."""
         return Balance(self.rim, stand(self.frame, self.surface, self.rest))
 
 
 def _damped(balance: Balance, xi: Planar) -> Planar:
-    """The best of some damped Newton steps, or a chord step."""
+    """Return the best of several damped Newton steps, or a chord step if none of them improves."""
     step, before = balance.newton(xi), balance.size(balance.force(xi))
 
     def less(alpha: Array) -> Planar:
@@ -110,7 +110,7 @@ OneProblem = tuple[ContactProblem]
 def _implicit_derivative(
     root: Callable[[ContactProblem], Array],
 ) -> Callable[[OneProblem, OneProblem], tuple[Array, Array]]:
-    """Derivative of a root of the balance by what it depends on."""
+    """Return the derivative rule of a root of the balance by its inputs."""
 
     def rule(primals: OneProblem, tangents: OneProblem) -> tuple[Array, Array]:
         xi = root(*primals)
@@ -130,7 +130,7 @@ _solve_near.defjvp(_implicit_derivative(_solve_near))
 
 
 def initial_twist(rim: Float[Array, " wheel"], frame: WheelFrame) -> Float[Array, "3"]:
-    """Start of the root finder: the twist without slip, a little slower (least squares)."""
+    """Return the start of the root finder: 0.8 times the twist without slip (least squares)."""
     j = frame.hold
     m = Columns(*(Planar(*column) for column in j.T @ j + 1e-6 * jnp.eye(3)))
     return 0.8 * jnp.stack(solve3(m, Planar(*(j.T @ (rim * frame.drive_share)))))
@@ -143,15 +143,16 @@ def equilibrium(
     rest: Float[Array, " wheel"],
     near: Float[Array, "3"] | None = None,
 ) -> Float[Array, "3"]:
-    """Body twist (vx [m/s], vy [m/s], yaw rate [rad/s]) at which the contact forces balance.
+    """Return the body twist (vx [m/s], vy [m/s], yaw rate [rad/s]) at which contact forces balance.
 
     Args:
         rim: r w, rim speed of each wheel [m/s].
         frame: wheel directions.
         surface: one floor, or one under each wheel.
         rest: load shares at rest, sum 1.
-        near: a twist so close that plain Newton steps arrive, about ten times cheaper; NaN comes
-            back where they do not. The last step is below 1e-6, which Newton's squares.
+        near: a twist so close to the root that plain Newton steps converge, which is about ten
+            times cheaper; the result is NaN where they do not. The last step is below 1e-6, so the
+            remaining error is about its square.
 
     Source: the balance at the head of `slipid.model.contact_law`.
     """
@@ -167,7 +168,7 @@ def traction(
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
 ) -> Float[Array, " wheel"]:
-    """Traction along the drive of each wheel that its motor works against at a twist [mu m g]."""
+    """Return the traction along the drive of each wheel that its motor works against [mu m g]."""
     return Balance(rim, stand(frame, surface, rest)).motor_force(Planar(*xi))
 
 
@@ -178,9 +179,9 @@ def rolling_drag(
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
 ) -> Float[Array, " wheel"]:
-    """Drag of each wheel along its drive at a twist, if it is that of its rollers [mu m g].
+    """Return the drag of each wheel along its drive if it equals that of its rollers [mu m g].
 
-    The motor bears it, in units of `Motor.rolling_drag`, and the body does not feel it.
+    It counts in units of `Motor.rolling_drag`; the motor works against it, the body does not.
     """
     return Balance(rim, stand(frame, surface, rest)).rolling_drag(Planar(*xi))
 
@@ -188,11 +189,11 @@ def rolling_drag(
 def settle(
     start: Float[Array, "3 floors"], rim: Array, on: Stance, plain: Float[Array, "3 wheel"]
 ) -> tuple[Float[Array, "3 floors"], Float[Array, "wheel floors"]]:
-    """Equilibrium of many floors at once from the twist of a moment ago, and the traction felt.
+    """Return the equilibria on many floors at once, and the tractions, from recent twists.
 
-    A few chord steps, then Newton's where these come nearer: for a robot's computer. Where a number
-    is lost it is the twist without slip. What a jump of the wheel speeds leaves over, the next call
-    settles.
+    It takes a few chord steps, then Newton steps where these reduce the residual: made for a
+    robot's computer. Where a number is not finite, the twist is that without slip. What remains
+    after a jump of the wheel speeds is settled by the next call.
 
     Args:
         start: twists [m/s, m/s, rad/s].

@@ -1,8 +1,8 @@
-"""Balance of the contact forces of a robot, of many at once, or of one on many floors.
+"""Balance of the contact forces of one robot, of many at once, or of one on many floors.
 
-Wheels are the first axis of every array and the batch the others, if there is one; sums over wheels
-and over x, y, yaw are written out. Nothing is a matrix product then, so that XLA makes few loops
-over contiguous numbers of it; each costs it 0.2 us and more, whatever it does.
+Wheels are the first axis of every array and the batch, if there is one, the others; sums over
+wheels and over x, y, yaw are written out. Nothing is a matrix product then, so that XLA makes few
+loops over contiguous numbers of it; every loop costs it at least 0.2 us.
 """
 
 from dataclasses import replace
@@ -21,17 +21,16 @@ _LEAST_LOAD = 1e-3
 
 
 class Stance(eqx.Module):
-    """A robot on its floors.
+    """A robot standing on its floors: geometry, loads and floor numbers of every wheel.
 
     Attributes:
-        frame, rest: wheel directions and load shares at rest as the floors see them, with an axis
-            for the batch.
-        hold, roll, shift: those of the frame by the parts of a twist, each (wheel, *one).
-        floor: numbers under each wheel or under all; friction is that over its mean, scrub and lead
-            are means over the loads, and what belongs to rollers is as of `law.sideways`.
+        frame, rest: wheel directions and apparent load shares at rest, with an axis for the batch.
+        hold, roll, shift: rows of the frame by the components of a twist, each (wheel, *one).
+        floor: numbers under each wheel or under all; friction is relative to its mean, scrub and
+            lead are means over the loads, and the roller numbers are those of `law.sideways`.
         drag_onset: roller speed below which drag is viscous [m/s].
         friction: mean over the wheels; forces are in units of it times m g.
-        sunk: drag of the rollers of each wheel under an even load.
+        roller_scale: roller drag of each wheel under an even load.
     """
 
     frame: WheelFrame
@@ -42,11 +41,11 @@ class Stance(eqx.Module):
     floor: ContactSurface
     drag_onset: Float[Array, "wheel *one"]
     friction: Float[Array, "*batch"]
-    sunk: Float[Array, "wheel *batch"]
+    roller_scale: Float[Array, "wheel *batch"]
 
 
 def stand(frame: WheelFrame, surface: ContactSurface, rest: Float[Array, " wheel"]) -> Stance:
-    """A robot on one floor (leaves are numbers) or on one per wheel (wheel, *batch)."""
+    """Return a robot's stance on one floor (leaves are numbers) or one per wheel (wheel, batch)."""
     floor, friction = replace(surface, friction=jnp.ones(())), surface.friction
     if jnp.ndim(friction) > 0:
         ones = (1,) * (jnp.ndim(friction) - 1)
@@ -60,15 +59,17 @@ def stand(frame: WheelFrame, surface: ContactSurface, rest: Float[Array, " wheel
             scrub=total(rest * surface.scrub),
             lead=total(rest * surface.lead),
         )
-    sunk = (1 - frame.grip) * floor.friction * floor.roller_drag / len(rest)
+    roller_scale = (1 - frame.grip) * floor.friction * floor.roller_drag / len(rest)
     floor, onset = law.sideways(law.at_load(floor, len(rest) * rest), frame.grip)
     # parts first: XLA then keeps what belongs to a part, and its derivatives, side by side
     hold, roll, shift = (jnp.moveaxis(r, 1, 0) for r in (frame.hold, frame.roll, frame.shift))
-    return Stance(frame, Planar(*hold), Planar(*roll), shift, rest, floor, onset, friction, sunk)
+    return Stance(
+        frame, Planar(*hold), Planar(*roll), shift, rest, floor, onset, friction, roller_scale
+    )
 
 
 def total(of_wheels: Float[Array, "wheel *batch"]) -> Float[Array, "*batch"]:
-    """Sum over wheels, written out."""
+    """Return the sum over wheels, written out."""
     return sum(of_wheels[1:], start=of_wheels[0])
 
 
@@ -77,20 +78,20 @@ class Balance(eqx.Module):
 
     Attributes:
         rim: r w, rim speeds [m/s].
-        on: how it stands.
+        on: stance of the robot on its floors.
     """
 
     rim: Float[Array, "wheel *batch"]
     on: Stance
 
     def force(self, xi: Planar) -> Planar:
-        """What does not balance."""
+        """Return the resultant force on the body, zero at equilibrium."""
         w, load = self.wheels(*self._speeds(xi)), self.load(xi)
         x, y, yaw = self._summed(load * w.push(), -load * w.drag.force())
         return Planar(x, y, yaw - law.scrub_moment(xi.yaw, self.on.floor.scrub).force())
 
     def jacobian(self, xi: Planar) -> Columns:
-        """Derivative of the force by the twist: by the speeds of the wheels, and by their loads."""
+        """Return the derivative of the force by the twist, through speeds and through loads."""
         (along, roll), load, rows = self._speeds(xi), self.load(xi), self.on
         w = self.wheels(along, roll)
         push, drag = w.push(), -w.drag.force()
@@ -118,14 +119,14 @@ class Balance(eqx.Module):
         return Columns(x, y, yaw._replace(yaw=yaw.yaw - scrub))
 
     def newton(self, xi: Planar) -> Planar:
-        """Newton's step, to be taken off the twist."""
+        """Return Newton's step, to be subtracted from the twist."""
         return solve3(self.jacobian(xi), self.force(xi))
 
     def chord(self, xi: Planar) -> Planar:
-        """Twist that balances the forces when each is drawn as its chord from zero speed to xi.
+        """Return the twist that balances the forces when each is replaced by its chord.
 
-        tanh(x) / x falls with |x|, so that no step overshoots where Newton's does; near the root it
-        is slow (Weiszfeld's iteration).
+        The chord goes from zero speed to xi. tanh(x) / x falls with |x|, so that no step overshoots
+        where Newton's does; near the root it is slow (Weiszfeld's iteration).
         """
         on, f, w = self.on, self.on.frame, self.wheels(*self._speeds(xi))
         # a lifted wheel would push the chord the wrong way
@@ -145,42 +146,47 @@ class Balance(eqx.Module):
         return solve3(m, drive)
 
     def motor_force(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Traction that each motor works against."""
+        """Return the traction that each motor works against."""
         f = self.on.frame
         return self.load(xi) * self.wheels(*self._speeds(xi)).motor_force(
             f.drive_share, f.roller_share
         )
 
     def rolling_drag(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Drag of wheels that roll along their drive, if it is that of rollers; motors bear it."""
+        """Return the drag of rolling along the drive, if it equals that of the rollers.
+
+        Only the motors work against it.
+        """
         _, roll = self._speeds(xi)
-        return self.on.sunk * law.rolling_fraction(self.rim, roll, self.on.frame.drive_share)
+        return self.on.roller_scale * law.rolling_fraction(
+            self.rim, roll, self.on.frame.drive_share
+        )
 
     def size(self, force: Planar) -> Float[Array, "*batch"]:
-        """Square of a force, its moment over the base radius."""
+        """Return the squared size of a force, its moment taken over the base radius."""
         return force.x**2 + force.y**2 + (force.yaw / self.on.frame.base) ** 2
 
     def share(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Load shares."""
+        """Return the load shares in motion."""
         return law.load_shift(xi, self.on.rest, self.on.shift, self.on.floor.lead)
 
     def load(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Loads as forces count them."""
+        """Return friction times load of every wheel, relative to mean(mu) m g."""
         return law.load_force(self.share(xi), self.on.floor)
 
     def wheels(self, along: Array, roll: Array) -> WheelForces:
-        """The law at speeds of the wheels."""
+        """Return the forces of the contact law at the speeds of the wheels."""
         f = self.on.frame
         grip = f.grip if f.ordinary else None
         where = along, roll, self.rim, f.drive_share, self.on.drag_onset
         return law.wheel_forces(*where, self.on.floor, grip)
 
     def _speeds(self, xi: Planar) -> tuple[Array, Array]:
-        """Speeds of the wheels along their drive and along their rollers."""
+        """Return the speeds of the wheels along their drive and along their rollers."""
         on = self.on
         return dot(on.hold, xi), dot(on.roll, xi) - self.rim * on.frame.roller_share
 
     def _summed(self, along: Array, roll: Array) -> Planar:
-        """Force on the body of what wheels exert along their drive and along their rollers."""
+        """Return the force on the body from forces along the drives and along the rollers."""
         hold, free = self.on.hold, self.on.roll
         return Planar(*(total(hold[k] * along + free[k] * roll) for k in range(3)))

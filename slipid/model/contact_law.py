@@ -1,8 +1,8 @@
-"""The contact law: what floors do to rolling wheels, wheel by wheel.
+"""The contact law: the forces between floors and rolling wheels, wheel by wheel.
 
 With xi = (v_x, v_y, W) the body twist, r w_i the rim speed, J_i and K_i the rows that give the
-speed of wheel i along its drive and along its rollers' free direction, p_i its place, N_i its load
-share, v^ the direction of motion, and forces in units of mu m g:
+speed of wheel i along its drive and along its rollers' free direction, p_i its position, N_i its
+load share, v^ the direction of motion, and forces in units of mu m g:
 
     N0_i  = (share of the weight) exp(delta_i), scaled to sum 1
     g_i   = (w N0_i)^(p - 1)                           drag grows with the load; w wheels
@@ -15,10 +15,10 @@ share, v^ the direction of motion, and forces in units of mu m g:
     D_i   = -N_i [g_i cr tanh(q_i / (vr + sr c_i)) + kl q_i]
     0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz tanh(W / W0))
 
-This is for omni wheels; where rollers stand at an angle g to the drive, vs_i is r w_i sin g less
-the speed along the direction in which the rollers do not give way, and r w_i cos g is taken off
-q_i. Ordinary wheels grip sideways as they do ahead, and friction is against their sliding as a
-whole: with m_i = sqrt(vs_i^2 + q_i^2) the first terms of T_i and D_i are
+These equations are for omni wheels. Where rollers stand at an angle g to the drive, vs_i is r w_i
+sin g less the speed along the direction in which the rollers do not give way, and r w_i cos g is
+subtracted from q_i. Ordinary wheels grip sideways as they do ahead, and friction acts against their
+total sliding: with m_i = sqrt(vs_i^2 + q_i^2) the first terms of T_i and D_i are
 
     N_i tanh(m_i / (v0 + s0 c_i)) vs_i / m_i,     -N_i tanh(m_i / (v0 + s0 c_i)) q_i / m_i
 
@@ -27,9 +27,10 @@ weighted by mu_i / mean(mu), and b and cz are means over the loads. Creep and ro
 rate-independent (s0 is a slip *ratio*): with a resistance that sets in at 20 mm/s instead, runs
 faster than the fitted ones are predicted worse.
 
-Friction grows with the load, drag faster: with N^(4/3) where bodies deform elastically (Hertz), up
-to N^2 where wheels sink in (Bekker). That is how motion tells a load from a drag. What the law
-still lacks bends the loads that one floor alone would tell; delta, per floor, stands for that.
+Friction grows linearly with the load and drag faster: with N^(4/3) where bodies deform elastically
+(Hertz), up to N^2 where wheels sink in (Bekker). This is how motion distinguishes a load from a
+drag. Errors of the law bend the loads that a single floor would suggest; delta, per floor, absorbs
+them.
 
 Every function here is elementwise: it takes arrays of any shapes that broadcast.
 """
@@ -47,7 +48,7 @@ from slipid.model.se2 import Planar
 from slipid.parameter import parameter
 
 _LIFTED = 0.03
-"""Load over an even one below which drag falls no faster than the load."""
+"""Load relative to an even one below which drag falls no faster than the load."""
 V0 = 0.002
 """Sliding speed below which traction is viscous [m/s]."""
 VR = 0.001
@@ -59,12 +60,13 @@ W0 = 0.05
 
 
 _STILL = 1e-6
-"""Sliding that is none [m/s]."""
+"""Sliding speed that is treated as zero [m/s]."""
 positive = partial(parameter, lower=0.0)
+"""A number above zero."""
 
 
 class ContactSurface(eqx.Module):
-    """What a floor does to rolling wheels; leaves may be stacked, one row per label.
+    """Parameters of a floor under rolling wheels; leaves may be stacked, one row per label.
 
     In the force balance leaves are numbers, or one per wheel where wheels stand on several floors.
 
@@ -103,9 +105,9 @@ class ContactSurface(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True, default=())
 
     def at(self, index: Int[Array | np.ndarray, "..."] | int) -> "ContactSurface":
-        """Surface number `index` of the stack (may be traced), or those under each wheel.
+        """Return surface number `index` of the stack (may be traced), or the one under each wheel.
 
-        The index of wheels has their axis first. A load bias is then the wheel's own.
+        An index per wheel has the wheels first. The load bias of each wheel is then its own.
         """
         bias = self.load_bias[index]
         if jnp.ndim(index):
@@ -113,7 +115,7 @@ class ContactSurface(eqx.Module):
         return replace(jax.tree.map(lambda leaf: leaf[index], self), load_bias=bias)
 
     def mixed(self, share: Float[Array, "wheel floor"]) -> "ContactSurface":
-        """Mean floor under each wheel, for the share of each floor of the stack there."""
+        """Return the mean floor under each wheel, for the shares of the floors there."""
         bias = jnp.sum(share * self.load_bias.T, axis=1)
         return replace(jax.tree.map(lambda leaf: share @ leaf, self), load_bias=bias)
 
@@ -121,14 +123,17 @@ class ContactSurface(eqx.Module):
 class Friction(eqx.Module):
     """A force against a speed that saturates: top tanh(m / onset) speed / m + viscosity speed.
 
-    m is the size of the speed, or of the whole sliding of which this is one part: friction is
-    against the sliding as a whole.
+    m is the magnitude of the speed, or of the total sliding of which this speed is one component:
+    friction acts against the total sliding.
 
     Attributes:
-        speed: [m/s].
-        onset: speed at which it is nearly saturated [m/s], linear in the wheel's activity.
-        ratio: onset per activity; top: where it saturates; viscosity: force per speed.
-        beside: the part of the sliding at right angles [m/s]; None where parts do not share.
+        speed: sliding or rolling speed [m/s].
+        onset: speed at which the force is nearly saturated [m/s], linear in the wheel's activity.
+        ratio: derivative of the onset by the activity.
+        top: saturated force.
+        viscosity: force per speed.
+        beside: component of the sliding at right angles [m/s]; None where components are
+            independent.
     """
 
     speed: Array
@@ -139,61 +144,62 @@ class Friction(eqx.Module):
     beside: Array | None = None
 
     def force(self) -> Array:
-        """The force."""
+        """Return the force."""
         if self.beside is None:
             return self.top * jnp.tanh(self.speed / self.onset) + self.viscosity * self.speed
         return (self.top * self._slope() + self.viscosity) * self.speed
 
     def chord(self) -> Array:
-        """Force over speed, which is even in the speed and finite at rest."""
+        """Return force over speed, which is even in the speed and finite at rest."""
         if self.beside is None:
             size = jnp.abs(self.speed) + 1e-12 * self.onset
             return self.top * (jnp.tanh(size / self.onset) / size) + self.viscosity
         return self.top * self._slope() + self.viscosity
 
     def by_speed(self) -> Array:
-        """Derivative by the speed, at a constant activity."""
+        """Return the derivative by the speed at a constant activity."""
         if self.beside is None:
             return self._steep() / self.onset + self.viscosity
         return self.top * (self._slope() + self._bent() * self.speed**2) + self.viscosity
 
     def by_beside(self) -> Array | float:
-        """Derivative by the part of the sliding at right angles."""
+        """Return the derivative by the sliding at right angles."""
         if self.beside is None:
             return 0.0
         return self.top * self._bent() * self.speed * self.beside
 
     def by_activity(self) -> Array:
-        """Derivative by the wheel's activity, at a constant speed."""
+        """Return the derivative by the wheel's activity at a constant speed."""
         return -(self._steep() / self.onset) * (self.speed / self.onset) * self.ratio
 
     def _steep(self) -> Array:
+        """Return top (1 - tanh^2), the slope of the saturating term in units of the onset."""
         return self.top * (1 - jnp.tanh(self._size() / self.onset) ** 2)
 
     def _size(self) -> Array:
-        """Size of the sliding, away from zero where it is of two parts."""
+        """Return the magnitude of the sliding, kept away from zero where it has two components."""
         if self.beside is None:
             return self.speed
         return jnp.sqrt(self.speed**2 + self.beside**2 + _STILL**2)
 
     def _slope(self) -> Array:
-        """tanh(m / onset) / m."""
+        """Return tanh(m / onset) / m."""
         return jnp.tanh(self._size() / self.onset) / self._size()
 
     def _bent(self) -> Array:
-        """Derivative of `_slope` by m, over m."""
+        """Return the derivative of `_slope` by m, over m."""
         m = self._size()
         steep = (1 - jnp.tanh(m / self.onset) ** 2) / self.onset
         return (steep - self._slope()) / m**2
 
 
 class WheelForces(eqx.Module):
-    """Forces of a wheel per friction mu N.
+    """Forces of a wheel in units of mu N.
 
     Attributes:
-        active: c, rim and roller speed together [m/s].
-        traction, resistance: ahead and back along the drive.
-        drag: back along the rollers.
+        active: c, rim and roller speed combined [m/s].
+        traction, resistance: forces ahead and back along the drive.
+        drag: force back along the rollers.
     """
 
     active: Array
@@ -202,15 +208,15 @@ class WheelForces(eqx.Module):
     drag: Friction
 
     def push(self) -> Array:
-        """On the body, along the drive."""
+        """Return the force on the body along the drive."""
         return self.traction.force() - self.resistance.force()
 
     def motor_force(self, drive_share: Array, roller_share: Array) -> Array:
-        """On the motor, for the wheel's `Frame.pull` and `Frame.slip_through`.
+        """Return the force on the motor, for the wheel's two shares of the frame.
 
-        Rolling resistance is counted as a force on the body that the motor does not feel; what the
-        motor bears of it is in its own friction. Rollers at an angle (mecanum) pass on a part of
-        what holds the wheel and a part of their drag.
+        Rolling resistance counts as a force on the body only; the part that the motor bears is in
+        its own friction. Rollers at an angle (mecanum) transmit a part of the force that holds the
+        wheel and a part of their drag.
         """
         return self.traction.force() * drive_share - self.drag.force() * roller_share
 
@@ -218,24 +224,27 @@ class WheelForces(eqx.Module):
 def wheel_traction(
     slide: Array, active: Array, floor: ContactSurface, beside: Array | None = None
 ) -> Friction:
-    """Traction at a sliding speed, and at the sliding beside it of a wheel without rollers."""
+    """Return the traction at a sliding speed; `beside` is that across, without rollers."""
     onset = V0 + floor.creep * active
     return Friction(slide, onset, floor.creep, 1.0, floor.slide_viscosity, beside)
 
 
 def rolling_fraction(rim: Array, roll: Array, drive_share: Array) -> Array:
-    """Part of a wheel's motion that is along its drive, (r w / c) |r w / c|: how it drags there."""
+    """Return (r w / c) |r w / c|, the signed fraction of a wheel's motion along its drive.
+
+    Rolling drag along the drive is in proportion to it.
+    """
     along = rim * drive_share * jax.lax.rsqrt(rim**2 + roll**2 + 1e-12)
     return along * jnp.abs(along)
 
 
 def scrub_moment(yaw_rate: Array, scrub: Array) -> Friction:
-    """Moment at a yaw rate [m]."""
+    """Return the scrub moment at a yaw rate [m]."""
     return Friction(yaw_rate, W0, 0.0, scrub)
 
 
 def at_load(floor: ContactSurface, relative: Array) -> ContactSurface:
-    """Floor for a wheel at rest under so many times an even load."""
+    """Return the floor for a wheel at rest with a given load relative to an even one."""
     grown = jnp.maximum(relative, _LIFTED) ** (floor.drag_exponent - 1)
     return replace(
         floor,
@@ -245,13 +254,13 @@ def at_load(floor: ContactSurface, relative: Array) -> ContactSurface:
 
 
 def apparent_load(rest: Float[Array, "wheel *one"], bias: Array) -> Float[Array, "wheel *batch"]:
-    """Load shares at rest as floors see them, for their load biases (wheel, *batch) or 0."""
+    """Return apparent load shares at rest, for a floor's load biases (wheel, *batch) or 0."""
     seen = rest * jnp.exp(bias)
     return seen / sum(seen[1:], start=seen[0])
 
 
 def sideways(floor: ContactSurface, grip: Array) -> tuple[ContactSurface, Array]:
-    """Floor for a wheel without rollers (grip 1) or with (0), and the onset of its drag [m/s].
+    """Return the floor for a wheel without rollers (grip 1) or with (0), and its drag onset [m/s].
 
     An ordinary wheel grips sideways as it does ahead.
     """
@@ -274,14 +283,14 @@ def wheel_forces(
     floor: ContactSurface,
     grip: Array | None = None,
 ) -> WheelForces:
-    """The law at the speeds of a wheel [m/s].
+    """Return the forces of the contact law at the speeds of a wheel [m/s].
 
     Args:
-        along, roll, rim: J xi, q and r w of the head of this module.
-        pull: `Frame.pull`.
-        at_rest, floor: from `sideways`.
-        grip: `Frame.grip` of a robot with wheels without rollers, whose friction is against their
-            sliding as a whole; None of one without.
+        along, roll, rim: J xi, q and r w of the module docstring.
+        drive_share: `WheelFrame.drive_share`.
+        at_rest, floor: results of `sideways`.
+        grip: `WheelFrame.grip` of a robot with wheels without rollers, where friction acts against
+            the total sliding; None for a robot without such wheels.
     """
     active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
     onset, slide = at_rest + floor.roller_creep * active, rim * drive_share - along
@@ -296,11 +305,11 @@ def wheel_forces(
 
 
 def load_force(load: Array, floor: ContactSurface) -> Array:
-    """Friction mu N that its load share gives a wheel [m g]: where loads become forces."""
+    """Return the friction mu N of a wheel from its load share [m g]."""
     return floor.friction * load
 
 
 def load_shift(xi: Planar, rest: Array, shift: Float[Array, "2 wheel *one"], lead: Array) -> Array:
-    """Load shares in motion: those at rest, shifted by contacts that lead along the motion [m]."""
+    """Return load shares in motion, shifted by contacts that lead along the motion [m]."""
     inv = jax.lax.rsqrt(xi.x**2 + xi.y**2 + 1e-8)
     return rest - lead * (shift[0] * (xi.x * inv) + shift[1] * (xi.y * inv))

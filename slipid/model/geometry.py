@@ -1,4 +1,4 @@
-"""Where the wheels stand and which way they drive (Indiveri 2009, IEEE T-RO 25(1))."""
+"""Wheel positions and drive directions (Indiveri 2009, IEEE T-RO 25(1))."""
 
 import math
 from collections.abc import Sequence
@@ -19,19 +19,20 @@ _MIRRORED = 0.01
 class Geometry(eqx.Module):
     """Wheels on a rigid body, REP-103 axes (x ahead, y left, yaw counter-clockwise).
 
-    A wheel has a place, a drive direction, and rollers that run freely at `roller_angle` from it:
-    90 deg for an omni wheel, 45 deg for mecanum; `grips` marks an ordinary wheel without rollers.
-    A drive is a motor with its encoder and ammeter; it turns one wheel, or several alike.
+    A wheel has a position, a drive direction, and rollers that run freely at `roller_angle` from
+    it: 90 deg for an omni wheel, 45 deg for mecanum; `grips` marks an ordinary wheel without
+    rollers. A drive is a motor with its encoder and ammeter; it turns one wheel, or several equal
+    ones.
 
     Attributes:
         wheel_radius: r [m].
         base_radius: L [m], multiplies `place`.
         drive_offset: small rotation of each wheel's drive direction [rad].
-        radius_deviation: what the wheels of each drive are larger than r, over r (drive,).
+        radius_deviation: relative deviation of each drive's wheel radius from r (drive,).
         place: wheel centres (wheel, 2) in units of the base radius.
         drive_angle: direction of travel of a positive wheel speed (wheel,) [rad].
-        roller_angle: from the free rolling direction to the drive direction (wheel,) [rad].
-        grips: 1 for an ordinary wheel, 0 with rollers (wheel,).
+        roller_angle: angle from the free rolling direction to the drive direction (wheel,) [rad].
+        grips: True for an ordinary wheel, False for one with rollers (wheel,).
         drive_of: number of the drive that turns each wheel, from 0 (wheel,); empty where every
             wheel has its own.
         gear_ratio: n, motor speed over wheel speed.
@@ -57,7 +58,7 @@ class Geometry(eqx.Module):
     gear_ratio: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self) -> None:
-        """Refuse roller angles that cannot drive, and drives that turn no wheel."""
+        """Raise `ValueError` for rollers that cannot drive and for drives that turn no wheel."""
         if self.drive_of and (
             len(self.drive_of) != self.wheels
             or set(self.drive_of) != set(range(len(set(self.drive_of))))
@@ -86,19 +87,19 @@ class Geometry(eqx.Module):
 
     @property
     def determines_twist(self) -> bool:
-        """Whether the turns of the wheels tell x, y and yaw, if nothing slips."""
+        """Whether the wheel rotations determine x, y and yaw if nothing slips."""
         return int(np.linalg.matrix_rank(np.asarray(self.forward()), tol=1e-6)) == 3
 
     def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """What every wheel has of its drive, such as its speed."""
+        """Return the value of every wheel's drive, such as its speed."""
         return at_wheels(self.drive_of, of_drives)
 
     def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
-        """What every drive has of all its wheels together, such as their torque."""
+        """Return the sum over every drive's wheels, such as their torque."""
         return at_drives(self.drive_of, of_wheels)
 
     def frame(self) -> "WheelFrame":
-        """The wheels as rows of matrices, at the current radius, base and offsets."""
+        """Return the wheels as rows of matrices, at the current radius, base and offsets."""
         return _wheel_frame(
             jnp.asarray(self.place) * self.base_radius,
             jnp.asarray(self.drive_angle) + self.drive_offset,
@@ -110,13 +111,13 @@ class Geometry(eqx.Module):
         )
 
     def _larger(self) -> Float[Array, " wheel"]:
-        """Radius of each wheel over r."""
+        """Return the radius of each wheel over r."""
         of_drives = jnp.broadcast_to(self.radius_deviation, (self.drives,))
         return 1.0 + self.at_wheels(of_drives)
 
     @property
     def around(self) -> tuple[int, ...]:
-        """Wheels in the order in which one meets them going around the robot from the first."""
+        """Wheels in counter-clockwise order around the robot, beginning with the first."""
         place = np.asarray(self.place)
         x, y = (place - place.mean(axis=0)).T
         order = np.argsort(np.arctan2(y, x), kind="stable").tolist()
@@ -124,10 +125,11 @@ class Geometry(eqx.Module):
         return (*order[first:], *order[:first])
 
     def mirror(self) -> float | None:
-        """Axis of the body about which its wheels are their own mirror image [rad], or None.
+        """Return the axis about which the wheels are their own mirror image [rad], or None.
 
-        Ahead is asked before sideways. Wheels count by their places and by the lines of their
-        drives and rollers, up to what a config that was measured by hand is off.
+        The axis ahead is tried before the sideways one. Wheels are compared by their positions and
+        by the lines of their drives and rollers, with a tolerance for a config that was measured by
+        hand.
         """
         drive = np.asarray(self.drive_angle)
         free = np.where(self.grips, drive, drive - np.asarray(self.roller_angle))
@@ -142,9 +144,9 @@ class Geometry(eqx.Module):
         return None
 
     def forward(self) -> Float[Array, "drive 3"]:
-        """J: rim speed r w of each drive without slip [m/s] from the body twist.
+        """Return J: rim speed r w of each drive without slip [m/s] from the body twist.
 
-        That of a drive with several wheels is their mean.
+        The value of a drive with several wheels is their mean.
         """
         frame = self.frame()
         of_wheels = frame.hold / frame.drive_share[:, None]
@@ -154,9 +156,9 @@ class Geometry(eqx.Module):
         return jnp.asarray((share / share.sum(axis=0)).T) @ of_wheels
 
     def pseudo_inverse(self) -> Float[Array, "3 drive"]:
-        """J^+: the smallest body twist that comes nearest to rim speeds [m/s], of any drives.
+        """Return J^+: the smallest body twist that comes nearest to the drives' rim speeds [m/s].
 
-        Wheels that all point ahead do not tell motion sideways: it is taken for none.
+        Wheels that all point ahead do not determine motion sideways: it is then zero.
         """
         return jnp.asarray(np.linalg.pinv(np.asarray(self.forward()), rcond=1e-6))
 
@@ -164,14 +166,14 @@ class Geometry(eqx.Module):
 def at_wheels(
     drive_of: tuple[int, ...], of_drives: Float[Array, "*batch drive"]
 ) -> Float[Array, "*batch wheel"]:
-    """What every wheel has of its drive; `drive_of` as of `Geometry`."""
+    """Return the value of every wheel's drive; `drive_of` as in `Geometry`."""
     return of_drives[..., jnp.asarray(drive_of)] if drive_of else of_drives
 
 
 def at_drives(
     drive_of: tuple[int, ...], of_wheels: Float[Array, "*batch wheel"]
 ) -> Float[Array, "*batch drive"]:
-    """What every drive has of all its wheels together; `drive_of` as of `Geometry`."""
+    """Return the sum over every drive's wheels; `drive_of` as in `Geometry`."""
     if not drive_of:
         return of_wheels
     return of_wheels @ jnp.asarray(np.eye(len(set(drive_of)))[list(drive_of)])
@@ -181,16 +183,16 @@ class WheelFrame(eqx.Module):
     """Wheel directions and levers as the force balance uses them.
 
     Attributes:
-        hold: speed along the direction the rollers do not give way in (wheel, 3); for an omni wheel
-            this is the drive direction.
-        roll: speed along the free rolling direction (wheel, 3).
-        pull: share of the rim speed r w along `hold`, sin(roller angle), times the wheel's radius
-            over r; how hard a wheel creeps counts with r.
-        slip_through: share along `roll`, cos(roller angle), times the same.
+        hold: row of the speed along the direction in which the rollers do not give way (wheel, 3);
+            for an omni wheel this is the drive direction.
+        roll: row of the speed along the free rolling direction (wheel, 3).
+        drive_share: share of the rim speed r w along `hold`, sin(roller angle), times the wheel's
+            radius over r; wheel activity counts with r itself.
+        roller_share: share of the rim speed along `roll`, cos(roller angle), times the same ratio.
         grip: 1 where the wheel has no rollers.
         shift: change of load shares per contact displacement (wheel, 2) [1/m].
         radius: wheel radius [m].
-        base: base radius [m], scales the moment.
+        base: base radius [m], which scales the moment.
         ordinary: whether some wheel has no rollers.
     """
 
@@ -245,7 +247,7 @@ def omni(
     roller_deg: float = 90.0,
     drive_of: Sequence[int] = (),
 ) -> Geometry:
-    """Omni robot of any number of wheels, each driving 90 deg ahead of its azimuth."""
+    """Return an omni robot with any number of wheels, each driving 90 deg ahead of its azimuth."""
     d = np.radians(np.asarray(azimuth_deg, float))
     place, ways = np.stack([np.cos(d), np.sin(d)], -1) * base_radius, np.degrees(d) + 90.0
     return general(place, ways, [roller_deg] * len(d), wheel_radius, gear_ratio, drive_of)
@@ -258,7 +260,7 @@ def mecanum(
     gear_ratio: float = 1.0,
     drive_of: Sequence[int] = (),
 ) -> Geometry:
-    """Four mecanum wheels in X: front left, front right, rear left, rear right."""
+    """Return a robot with four mecanum wheels in X: front left and right, rear left and right."""
     corners = _corners(half_length, half_width)
     rollers = [135.0, 45.0, 45.0, 135.0]
     return general(corners, [0.0] * 4, rollers, wheel_radius, gear_ratio, drive_of)
@@ -271,16 +273,17 @@ def skid_steer(
     gear_ratio: float = 1.0,
     drive_of: Sequence[int] = (),
 ) -> Geometry:
-    """Four ordinary wheels that all point ahead: front left, front right, rear left, rear right.
+    """Return a robot with four ordinary wheels that point ahead: two at the front, two at the rear.
 
-    With `drive_of` (0, 1, 0, 1) a drive turns both wheels of a side.
+    The order is front left, front right, rear left, rear right. With `drive_of` (0, 1, 0, 1) a
+    drive turns both wheels of a side.
     """
     corners = _corners(half_length, half_width)
     return general(corners, [0.0] * 4, [None] * 4, wheel_radius, gear_ratio, drive_of)
 
 
 def differential(half_track: float, wheel_radius: float, gear_ratio: float = 1.0) -> Geometry:
-    """Two ordinary wheels on an axle, left and right, and casters that carry the rest."""
+    """Return a robot with two ordinary wheels on an axle, left and right, and casters."""
     axle = [(0.0, half_track), (0.0, -half_track)]
     return general(axle, [0.0] * 2, [None] * 2, wheel_radius, gear_ratio)
 
@@ -297,7 +300,7 @@ def general(
     gear_ratio: float = 1.0,
     drive_of: Sequence[int] = (),
 ) -> Geometry:
-    """Any wheels: centres [m], drive directions and roller angles [deg] (None: no rollers).
+    """Return any wheels: centres [m], drive directions and roller angles [deg] (None: no rollers).
 
     `drive_of` is the number of the drive that turns each wheel, from 0, where wheels share drives.
     """

@@ -1,4 +1,4 @@
-"""DC motor with brushes: U = R I + C_e wm + L_a dI/dt + brush drop."""
+"""Brushed DC motor: U = R I + C_e wm + L_a dI/dt + brush drop."""
 
 from functools import partial
 
@@ -12,15 +12,16 @@ from slipid.parameter import parameter
 electric = partial(parameter, electric=True)
 
 REST = 2.5
-"""Motor speed below which a sign is not trusted, about one speed quantum [rad/s]."""
+"""Motor speed below which its sign is not trusted, about one quantum of the speed signal [rad/s].
+"""
 
 
 held = partial(electric, free=False)
-"""Not fitted unless the user says so."""
+"""An electric number that is fixed unless the user frees it."""
 
 
 class Motor(eqx.Module):
-    """Brushed DC motor behind a gear; all wheels have the same.
+    """Brushed DC motor behind a gear; all wheels have the same motor.
 
     Attributes:
         gear_ratio: n, motor speed over wheel speed.
@@ -60,20 +61,23 @@ class Motor(eqx.Module):
     def voltage(
         self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
     ) -> Float[Array, " *w"]:
-        """Steady terminal voltage [V] of signed current [A] and wheel speed [rad/s]."""
+        """Return the steady terminal voltage [V] at a signed current and wheel speed [rad/s]."""
         wm = self.gear_ratio * wheel_speed
         drop = self.brush_drop * jnp.tanh(current / 0.05)
         return self.resistance * current + self.back_emf * wm + drop
 
     def friction(self, wheel_speed: Float[Array, " *w"]) -> Float[Array, " *w"]:
-        """Friction torque at the wheel [N m], against the motion."""
+        """Return the friction torque at the wheel [N m], against the motion."""
         return (
             self.coulomb_friction * jnp.tanh(wheel_speed / 0.2)
             + self.viscous_friction * wheel_speed
         )
 
     def opposing_force(self, motor_force: Float[Array, "*w 2"]) -> Float[Array, " *w"]:
-        """What a motor works against: traction, and drag along the drive (`robot.felt`)."""
+        """Return the force a motor works against: traction, and drag along the drive.
+
+        `motor_force` holds both, as `slipid.model.robot.motor_forces` returns them.
+        """
         return motor_force[..., 0] + self.rolling_drag * motor_force[..., 1]
 
     @property
@@ -84,19 +88,19 @@ class Motor(eqx.Module):
     def torque(
         self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
     ) -> Float[Array, " *w"]:
-        """Torque at the wheel [N m] of a signed current: n eta C_e I - friction."""
+        """Return the torque at the wheel [N m] of a signed current: n eta C_e I - friction."""
         return self.gain * current - self.friction(wheel_speed)
 
     def current(
         self, torque: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
     ) -> Float[Array, " *w"]:
-        """Signed current [A] that gives a wheel torque [N m], the inverse of `torque`."""
+        """Return the signed current [A] for a wheel torque [N m], the inverse of `torque`."""
         return (torque + self.friction(wheel_speed)) / self.gain
 
     def characteristic(
         self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
     ) -> Float[Array, " *w"]:
-        """M = U I / wm = C_e I + R I^2 wm / (wm^2 + w0^2) [N m], regular at standstill.
+        """Return M = U I / wm = C_e I + R I^2 wm / (wm^2 + w0^2) [N m], regular at standstill.
 
         Source: the paper's "torque characterising variable" (Belyaev, Brylev, Ivanov 2021).
         """
@@ -107,6 +111,9 @@ class Motor(eqx.Module):
 def signed(
     current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"], gear_ratio: Array | float
 ) -> Float[Array, " *w"]:
-    """Sign for magnitudes of an unsigned log: I = |I| wm / sqrt(wm^2 + w0^2); braking is lost."""
+    """Return signed currents of an unsigned log: I = |I| wm / sqrt(wm^2 + w0^2).
+
+    The sign of a braking current is lost.
+    """
     wm = gear_ratio * wheel_speed
     return jnp.abs(current) * wm / jnp.sqrt(wm**2 + REST**2)

@@ -16,11 +16,11 @@ from slipid.parameter import entries, parameter
 
 Number = int | float
 GRAVITY = 9.81
-"""[m/s^2]"""
+"""Gravitational acceleration [m/s^2]."""
 
 
 class Body(eqx.Module):
-    """Mass and how it rests on the wheels; the leading axis of `load_share` is the load set-up."""
+    """Mass, inertia and load shares; the leading axis of `load_share` is the load set-up."""
 
     mass: Array = parameter("kg", "m", "mass", start=10.0, lower=0.0, spread=0.1, free=False)
     yaw_inertia: Array = parameter(
@@ -39,7 +39,7 @@ class Body(eqx.Module):
 
 
 class Robot(eqx.Module):
-    """Everything that is known or fitted; `entries(robot)` names every number.
+    """All known or fitted numbers of a robot; `entries(robot)` names each of them.
 
     Attributes:
         surfaces: floors, stacked in the order of `surfaces.labels`.
@@ -60,13 +60,14 @@ class Robot(eqx.Module):
         gear_ratio: Number = 1.0,
         mass: Number = 10.0,
     ) -> "Robot":
-        """Robot with omni wheels on a circle, each driving 90 deg ahead of its azimuth.
+        """Return a robot with omni wheels on a circle, each driving 90 deg ahead of its azimuth.
 
         Args:
-            azimuth_deg: where the wheels stand, counter-clockwise from ahead [deg].
-            base_radius: from the middle to the wheel centres [m]; wheel_radius: [m].
+            azimuth_deg: azimuths of the wheels, counter-clockwise from ahead [deg].
+            base_radius: distance of the wheel centres from the middle [m].
+            wheel_radius: radius of the wheels [m].
             gear_ratio: motor turns per wheel turn.
-            mass: [kg]; torques scale with it.
+            mass: mass of the robot, which scales torques [kg].
         """
         azimuths = [float(a) for a in azimuth_deg]
         sizes = float(base_radius), float(wheel_radius), float(gear_ratio)
@@ -74,7 +75,7 @@ class Robot(eqx.Module):
 
     @classmethod
     def of(cls, shape: Geometry, mass: Number = 10.0) -> "Robot":
-        """Robot of any wheels, see `slipid.model.geometry`, that was on no floor yet."""
+        """Return a robot with any wheels (see `slipid.model.geometry`) and no floors yet."""
         return _with_mass(build(shape, ()), jnp.asarray(mass, dtype=float))
 
     def on(
@@ -84,7 +85,7 @@ class Robot(eqx.Module):
         sessions: Sequence[str] = (),
         image_centre: tuple[float, float] = (0.0, 0.0),
     ) -> "Robot":
-        """The same robot for these floors, load set-ups and sessions, their numbers at the start.
+        """Return the same robot for these floors, load set-ups and sessions, at start values.
 
         `image_centre` is where the camera's tilt and distortion are zero [m].
         """
@@ -92,34 +93,39 @@ class Robot(eqx.Module):
         return _with_mass(replace(made, motor=self.motor), self.body.mass)
 
     def surface_index(self, name: str) -> int:
-        """Place of a floor in the stack; ValueError with the choices when there is none."""
+        """Return the position of a floor in the stack; ValueError with the choices if unknown."""
         if name not in self.surfaces.labels:
             known = ", ".join(self.surfaces.labels)
             raise ValueError(f"no surface '{name}'; identified: {known}")
         return self.surfaces.labels.index(name)
 
     def load_index(self, name: str) -> int:
-        """Place of a load set-up; ValueError with the choices when there is none."""
+        """Return the position of a load set-up; ValueError with the choices if unknown."""
         if name not in self.body.loads:
             raise ValueError(f"no load set-up '{name}'; identified: {', '.join(self.body.loads)}")
         return self.body.loads.index(name)
 
     def session_index(self, name: str) -> int:
-        """Place of a session, -1 for one that was not fitted."""
+        """Return the position of a session, -1 for one that was not fitted."""
         return self.camera.sessions.index(name) if name in self.camera.sessions else -1
 
 
 @dataclass(frozen=True)
 class Validity:
-    """What a floor was seen with; beyond it numbers extrapolate.
+    """Range of conditions a floor was driven in; outside it the fitted numbers extrapolate.
 
     Attributes:
-        runs: how many; loads: with which load set-ups.
-        wheel_speed, torque_nm, slip, yaw_rate: smallest and largest [rad/s], [N m], 1, [rad/s];
-            the yaw rate by the encoders.
-        headings_deg, speeds, turn_rates: of the body, each that was driven [deg], [m/s], [rad/s];
-            by the encoders, and roughly, where no steady command was logged.
-        distance: of a run, on average [m].
+        runs: number of runs.
+        loads: load set-ups.
+        wheel_speed: smallest and largest wheel speed [rad/s].
+        torque_nm: smallest and largest torque [N m].
+        slip: smallest and largest slip.
+        yaw_rate: smallest and largest yaw rate by the encoders [rad/s].
+        headings_deg: headings of the body that were driven [deg]; this and the next two are read
+            from the encoders, roughly, where no steady command was logged.
+        speeds: speeds of the body that were driven [m/s].
+        turn_rates: turn rates of the body that were driven [rad/s].
+        distance: mean distance of a run [m].
     """
 
     runs: int
@@ -145,7 +151,7 @@ def build(
     sessions: Sequence[str] = (),
     centre: tuple[float, float] = (0.0, 0.0),
 ) -> Robot:
-    """Robot with every number at its declared start, for these floors, loads and sessions."""
+    """Return a robot with every number at its declared start."""
     names = sorted(surfaces)
     single = ContactSurface()
     stack = {e.path: jnp.full((len(names),), e.get(single)) for e in entries(single)}
@@ -175,9 +181,9 @@ def twist(
     load: Array,
     near: Float[Array, "3"] | None = None,
 ) -> Float[Array, "3"]:
-    """Body twist on floor `surface` (index) with load set-up `load` (index), by wheel speeds.
+    """Return the body twist on floor `surface` with load set-up `load` (indices), by wheel speeds.
 
-    `surface` may have one index per wheel, here and below; `near` is as of `contact.equilibrium`.
+    `surface` may have one index per wheel, here and below; `near` is as in `contact.equilibrium`.
     """
     floor, rest = robot.surfaces.at(surface), robot.body.load_share[load]
     return contact.equilibrium(frame.radius * wheel_speed, frame, floor, rest, near)
@@ -191,10 +197,10 @@ def motor_forces(
     surface: Array,
     load: Array,
 ) -> Float[Array, "wheel 2"]:
-    """What each motor works against at a twist, in units of mean(mu) m g.
+    """Return the forces each motor works against at a twist, in units of mean(mu) m g.
 
-    The traction, and the drag along the drive if it is as large as that of rollers
-    (`contact.rolled`).
+    They are the traction, and the drag along the drive if it equals that of the rollers
+    (`contact.rolling_drag`).
     """
     rim, floor = frame.radius * wheel_speed, robot.surfaces.at(surface)
     where = xi, rim, frame, floor, robot.body.load_share[load]
@@ -209,7 +215,7 @@ def wheel_torque(
     surface: Array,
     load: Array,
 ) -> Float[Array, " wheel"]:
-    """Torque of the traction of each wheel: r mu m g T [N m]."""
+    """Return the torque of the traction of each wheel: r mu m g T [N m]."""
     force = jnp.mean(robot.surfaces.friction[surface]) * robot.body.mass * GRAVITY
     return frame.radius * force * motor_forces(robot, frame, xi, wheel_speed, surface, load)[..., 0]
 
@@ -222,9 +228,9 @@ def motor_current(
     surface: Array,
     load: Array,
 ) -> Float[Array, " drive"]:
-    """Signed current of each motor [A]: traction and drag of its wheels, and its own friction.
+    """Return the signed current of each motor [A]: force of its wheels, and its own friction.
 
-    `speed` is that of the wheels of each drive [rad/s].
+    `speed` is the speed of the wheels of each drive [rad/s].
     """
     shape = robot.geometry
     force = jnp.mean(robot.surfaces.friction[surface]) * robot.body.mass * GRAVITY

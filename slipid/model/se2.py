@@ -1,4 +1,4 @@
-"""Motions and forces in the plane: poses, what adds up, and three equations (exact SE(2))."""
+"""Plane motion and forces: exact SE(2) poses, and small linear algebra without LAPACK."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 
 class Planar(NamedTuple):
-    """Three numbers of the plane, each of any batch: a twist, a force, or rows of a matrix."""
+    """A twist, a force or a matrix column: three arrays (x, y, yaw) of any batch shape."""
 
     x: Array
     y: Array
@@ -16,7 +16,7 @@ class Planar(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """A 3x3 matrix: what a twist's parts do to a force, each of any batch."""
+    """A 3x3 matrix by its columns: the derivative of a force by a twist, of any batch shape."""
 
     x: Planar
     y: Planar
@@ -24,18 +24,18 @@ class Columns(NamedTuple):
 
 
 def dot(a: Planar, b: Planar) -> Array:
-    """Sum of the products, written out: a matrix product is a loop of its own to XLA."""
+    """Return the scalar product, written out: to XLA a matrix product is a loop of its own."""
     return a.x * b.x + a.y * b.y + a.yaw * b.yaw
 
 
 def cross(a: Planar, b: Planar) -> Planar:
-    """Cross product of the triples."""
+    """Return the cross product of two triples."""
     x, y = a.y * b.yaw - a.yaw * b.y, a.yaw * b.x - a.x * b.yaw
     return Planar(x, y, a.x * b.y - a.y * b.x)
 
 
 def solve3(m: Columns, b: Planar) -> Planar:
-    """m^-1 b by Cramer's rule: no LAPACK call per row of a batch, and it exports to C."""
+    """Return m^-1 b by Cramer's rule: no LAPACK call per row of a batch, and it exports to C."""
     first = cross(m.y, m.yaw)
     det = dot(m.x, first)
     scale = 1 / jnp.where(jnp.abs(det) < 1e-30, 1e-30, det)
@@ -44,7 +44,10 @@ def solve3(m: Columns, b: Planar) -> Planar:
 
 
 def advance(xi: Float[Array, "3"], dt: Float[Array, ""] | float) -> Float[Array, "3"]:
-    """Pose increment in the frame of its start after moving at a constant twist (exact SE(2))."""
+    """Return the pose increment after moving for dt at a constant twist (exact SE(2)).
+
+    The increment is in the frame of the start pose.
+    """
     w = xi[2] * dt
     small = jnp.abs(w) < 1e-6
     safe = jnp.where(small, 1.0, w)
@@ -54,7 +57,7 @@ def advance(xi: Float[Array, "3"], dt: Float[Array, ""] | float) -> Float[Array,
 
 
 def compose(pose: Float[Array, "3"], increment: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Pose after a body-frame increment."""
+    """Return the pose after a body-frame increment."""
     c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
     x, y = increment[0], increment[1]
     return jnp.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y, pose[2] + increment[2]])
@@ -63,7 +66,7 @@ def compose(pose: Float[Array, "3"], increment: Float[Array, "3"]) -> Float[Arra
 def path(
     xi: Float[Array, "step 3"], dt: Float[Array, " step"], start: Float[Array, "3"]
 ) -> Float[Array, "edge 3"]:
-    """Poses before the first and after every step at constant twists (exact SE(2))."""
+    """Return the poses before the first and after every step at constant twists (exact SE(2))."""
 
     def step(pose: Array, increment: Array) -> tuple[Array, Array]:
         pose = compose(pose, increment)

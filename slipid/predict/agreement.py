@@ -1,11 +1,12 @@
-"""Whether what runs over several floors taught still predicts the runs that kept to one floor.
+"""Checks of what other runs did to the fit of runs on one floor, and the scatter of runs.
 
-How far runs scatter, before any physics is fitted to them.
+Two questions are answered here: whether a fit that includes runs over several floors still predicts
+the runs on one floor, and how much runs scatter before any physics is fitted to them.
 
-The motion of the body is regressed on what is smooth in that of the wheels, floor by floor and load
-by load: a Fourier series in the direction of travel, yaw, whatever a lag of the camera moves, and
-what turning moves in a marker whose place on the body is not known.
-Every run is predicted by the others. What is left in window k of run r, over the distance d_rk, is
+For the scatter, the motion of the body is regressed on smooth functions of the wheels' motion, by
+floor and load set-up: a Fourier series in the direction of travel, yaw, the change with a lag of
+the camera, and the change by turning of a marker whose position on the body is unknown. Every run
+is predicted by the others. The remainder in window k of run r, over the distance d_rk, is
 
     e_rk = a_r d_rk + s_rk,   var a = v_run,   var s_rk = v_process d_rk
 
@@ -16,7 +17,7 @@ and a^_r = sum_k e_rk / D_r are expected to be
     sum_r (sum_k e_rk)^2        = v_run sum_r D_r^2 + v_process sum_r D_r
 
 Squares are summed before anything is divided by a distance: where a robot stands or nearly so, the
-poses' own noise over the little distance would count for all.
+poses' own noise over the small distance would dominate.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,18 +42,18 @@ from slipid.predict.slip_model import body_twist, turned
 from slipid.search_space import Space
 
 WORSE = 1.5
-"""Factor by which end-point errors on a floor may grow; a map that is wrong makes it several."""
+"""Factor by which end-point errors on a floor may grow; a wrong map makes it several."""
 FAR = 4.0
-"""Standard errors beyond which no number that runs on one floor tell may move."""
+"""Standard errors by which runs over several floors may move a number known from single floors."""
 BETTER = 0.8
-"""Part of the error by a map below which a single floor explains runs better than the map does."""
+"""Share of the error by a map below which a single floor explains runs better than the map."""
 SURE = 3.0
 """Standard errors of paired differences beyond which a growth is not chance."""
 
 
 @dataclass(frozen=True)
 class FloorErrors:
-    """End-point errors of the runs on one floor, over the distance driven, before and after."""
+    """End-point errors of the runs on one floor over the distance driven, before and after."""
 
     before: float
     after: float
@@ -62,31 +63,31 @@ class FloorErrors:
 def floor_errors(
     before: PredictiveModel, after: PredictiveModel, data: Runs
 ) -> dict[str, FloorErrors]:
-    """Errors of runs on one floor each under two models, by floor.
+    """Return the errors of runs on one floor each under two models, by floor.
 
-    Both learnt from these runs, the second from others, too.
+    Both models were fitted to these runs, the second one also to others.
     """
-    (old, far), (new, _) = end_errors(before, data), end_errors(after, data)
-    return compared([log.surface or "unknown" for log in data.logs], old, new, far)
+    (old, distance), (new, _) = end_errors(before, data), end_errors(after, data)
+    return compared([log.surface or "unknown" for log in data.logs], old, new, distance)
 
 
 def compared(
     floors: Sequence[str],
     old: Float[np.ndarray, " run"],
     new: Float[np.ndarray, " run"],
-    far: Float[np.ndarray, " run"],
+    distance: Float[np.ndarray, " run"],
 ) -> dict[str, FloorErrors]:
-    """Errors of runs by their floors, old and new, and how far they went [m]."""
+    """Return old and new errors of runs by floor, for the distances [m] that the runs drove."""
     out = {}
     for name in dict.fromkeys(floors):
         mine = np.array([floor == name for floor in floors])
         grown = new[mine] - old[mine]
         _, error, _ = mean_error(grown, np.arange(len(grown)))
         much = new[mine].mean() > WORSE * old[mine].mean()
-        way = max(float(far[mine].sum()), 1e-9)  # runs may only have turned
+        total = max(float(distance[mine].sum()), 1e-9)  # runs may only have turned
         out[name] = FloorErrors(
-            float(old[mine].sum() / way),
-            float(new[mine].sum() / way),
+            float(old[mine].sum() / total),
+            float(new[mine].sum() / total),
             bool(much and grown.mean() > SURE * error),
         )
     return out
@@ -95,17 +96,17 @@ def compared(
 def end_errors(
     model: PredictiveModel, data: Runs
 ) -> tuple[Float[np.ndarray, " run"], Float[np.ndarray, " run"]]:
-    """Distance of predicted from measured end, and how far each run went as the crow flies [m]."""
-    error, far = np.zeros(len(data)), np.zeros(len(data))
+    """Return the distance of predicted from measured end, and the chord, of each run [m]."""
+    error, distance = np.zeros(len(data)), np.zeros(len(data))
     for w in replay.replay_windows(data, model.robot):
         tracks, _ = model.ends(w)
         error[tracks.run] = np.linalg.norm(tracks.gap[:, :2], axis=1)
-        far[tracks.run] = chords(tracks.measured)
-    return error, far
+        distance[tracks.run] = chords(tracks.measured)
+    return error, distance
 
 
 class LargestShift(NamedTuple):
-    """The number that other runs moved most, and by how many of its standard errors before."""
+    """The number that additional runs moved most, and by how many of its former standard errors."""
 
     name: str
     sigma: float
@@ -114,13 +115,13 @@ class LargestShift(NamedTuple):
 def largest_shift(
     space: Space, before: Search, covariance: Square, after: Search, settled: bool
 ) -> LargestShift:
-    """Of the numbers that runs on one floor tell from motion; infinite where no rest was found.
+    """Return the largest shift among numbers known from motion; infinite if the fit did not settle.
 
-    Runs that agree move a number by less than the standard error it had without them (Hausman
-    1978, Econometrica 46(6)).
+    Runs that agree move a number by less than the standard error it had without them (Hausman 1978,
+    Econometrica 46(6)).
     """
-    told = ~space.electric & ~space.where(lambda e: e.part == "camera")
-    sigma = np.where(told, np.abs(after - before) / np.sqrt(np.diag(covariance)), 0.0)
+    known = ~space.electric & ~space.where(lambda e: e.part == "camera")
+    sigma = np.where(known, np.abs(after - before) / np.sqrt(np.diag(covariance)), 0.0)
     worst = int(np.argmax(sigma))
     return LargestShift(space.names[worst], float(sigma[worst]) if settled else np.inf)
 
@@ -128,57 +129,54 @@ def largest_shift(
 def contradiction(
     found: Mapping[str, FloorErrors], moved: LargestShift, by_map: float, as_if: Mapping[str, float]
 ) -> str | None:
-    """Why runs over several floors are not learnt from, None where they agree with the others.
+    """Return why runs over several floors are not used, None where they agree with the others.
 
     Args:
         found: errors of the runs on one floor each.
-        moved: what they moved most.
-        by_map: error of the runs over several floors [m/s], whose map says where wheels stand.
-        as_if: the same had all wheels stood on one floor all the while, by floor [m/s].
+        moved: number that was moved most.
+        by_map: error of the runs over several floors [m/s], with the map for the wheels' floors.
+        as_if: error as if all wheels had always stood on one floor, by floor [m/s].
     """
-    worse = [
-        f"{floor} from {100 * e.before:.1f} to {100 * e.after:.1f} % of the way"
+    worse = ", ".join(
+        f"{floor} from {100 * e.before:.1f} to {100 * e.after:.1f} % of the distance driven"
         for floor, e in found.items()
         if e.is_worse
-    ]
-    if worse:
-        return f"{_NOT_LEARNT} (end-point errors on {', '.join(worse)}); {_WHY}"
-    if not np.isfinite(moved.sigma):
-        return f"{_NOT_LEARNT} (the fit to all found no rest); {_WHY}"
-    if moved.sigma > FAR:
-        return f"{_NOT_LEARNT} ({moved.name} moves by {moved.sigma:.0f} standard errors); {_WHY}"
+    )
     best = min(as_if, key=lambda floor: as_if[floor])
-    if as_if[best] < BETTER * by_map:
-        told = (
-            f"{1000 * by_map:.1f} mm/s by their map, {1000 * as_if[best]:.1f} as if all on {best}"
-        )
-        return f"{_NOT_LEARNT} (errors of {told}); {_WHY}"
-    return None
-
-
-_NOT_LEARNT = (
-    "the runs over several floors were not learnt from: they contradict those on one floor"
-)
-_WHY = "their map may be wrong or out of place, or the contact law where floors meet"
+    if worse:
+        reason = f"end-point errors on {worse}"
+    elif not np.isfinite(moved.sigma):
+        reason = "the fit to all of them did not settle"
+    elif moved.sigma > FAR:
+        reason = f"{moved.name} moves by {moved.sigma:.0f} standard errors"
+    elif as_if[best] < BETTER * by_map:
+        errors = f"{1000 * by_map:.1f} mm/s by their map, {1000 * as_if[best]:.1f} mm/s"
+        reason = f"errors of {errors} as if all on {best}"
+    else:
+        return None
+    return (
+        "the runs over several floors were not used: they contradict those on one floor "
+        f"({reason}); their map may be wrong or misplaced, or the contact law where floors meet"
+    )
 
 
 _TINY = 1e-6
-"""Ridge, as part of a feature's own size: of runs too few to be predicted."""
+"""Ridge for runs too few to be predicted, relative to a feature's own size."""
 
 
 def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
-    """Log variance of every noise component: what is typical, or what runs scatter if that is more.
+    """Return the log variance of every noise component: the scatter of runs, or the typical one.
 
-    To a model that is no better than smooth the rest is noise. A floor whose runs are too few to
-    predict one from the others scatters much.
+    The larger of the two counts. A model that is no better than smooth counts all else as noise.
+    The scatter is large on a floor with too few runs to predict one from the others.
     """
     w, robot = problem.windows, problem.robot
-    far, _ = travel(w, robot)
+    distance, _ = travel(w, robot)
     left = _unpredicted_motion(w, robot, "camera.marker_place" in problem.space.slices)
     variance = dict(zip(problem.noise.names, problem.noise.typical**2, strict=True))
     for floor in dict.fromkeys(w.surface):
         mine = np.asarray(w.surface) == floor
-        e, d, whole = left[mine], far[mine], far[mine].sum(axis=1)
+        e, d, whole = left[mine], distance[mine], distance[mine].sum(axis=1)
         total, most = e.sum(axis=1), np.maximum(whole, 1e-9)
         level = total / most[:, None]
         within = ((e - level[:, None] * d[..., None]) ** 2).sum(axis=(0, 1))
@@ -193,8 +191,8 @@ def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
 
 def _unpredicted_motion(
     w: Windows, robot: Robot, place_is_free: bool
-) -> Float[np.ndarray, "piece window 3"]:
-    """Motion along, across and in yaw that other runs do not predict [m, m, rad]."""
+) -> Float[np.ndarray, "segment window 3"]:
+    """Return the motion along, across and in yaw that other runs do not predict [m, m, rad]."""
     shape = robot.geometry
     back = np.asarray(shape.pseudo_inverse()).T * float(shape.wheel_radius)
     step, late = w.turn @ back, w.speed_change @ back

@@ -2,7 +2,7 @@
 
     xi = J^+ r (w_i (1 - s_i))
 
-Residuals are in displacement, so nothing is divided by a wheel speed.
+Residuals are displacements, so that nothing is divided by a wheel speed.
 """
 
 import abc
@@ -22,28 +22,28 @@ from slipid.predict.steps import Steps, TrainingWindows, TwistModel, scaled_leas
 
 Slips = Float[np.ndarray, "step drive"]
 Regressor = Callable[[RunSignals, RobotSpec], Slips]
-"""What the slip of each wheel is a curve of, in every step."""
+"""Function that returns the argument of each wheel's slip curve in every step."""
 Features = Callable[[np.ndarray], np.ndarray]
-"""From the regressor (...,) to features (..., k); slip is their weighted sum."""
+"""Function from the regressor (...,) to features (..., k); slip is their weighted sum."""
 HELD = 1e12
 """Precision of a coefficient that rests on its bound."""
 RIDGE = 1e-6
-"""Pull of each coefficient of a monotone curve towards zero, in the length of its column.
+"""Ridge on each coefficient of a monotone curve, relative to the length of its column.
 
-Too weak to matter where runs tell coefficients apart; where they do not, the smallest are taken
-instead of whichever rounding prefers.
+It is too weak to matter where runs determine the coefficients; where they do not, it selects the
+smallest ones instead of those that rounding happens to prefer.
 """
 
 
 def current(signals: RunSignals, spec: RobotSpec) -> Slips:
-    """Current of every wheel along its motion [A]; zeros where none was logged."""
+    """Return the current of every wheel along its motion [A]; zeros where none was logged."""
     return np.zeros_like(signals.turn) if signals.current is None else signals.along(spec)
 
 
 def soft_torque(signals: RunSignals, spec: RobotSpec) -> Slips:
-    """Torque of every wheel [N m] as the motor's model has it; zeros where none was logged.
+    """Return the torque of every wheel [N m] by the motor's model; zeros without logged currents.
 
-    The sign of a current fades as a wheel comes to rest, I = |I| w / sqrt(w^2 + w0^2), since an
+    The sign of a current fades as a wheel comes to rest, I = |I| w / sqrt(w^2 + w0^2), because an
     unsigned ammeter does not show it.
     """
     shaft = np.abs(spec.gear_ratio * signals.speed)
@@ -53,11 +53,11 @@ def soft_torque(signals: RunSignals, spec: RobotSpec) -> Slips:
 
 @dataclass(frozen=True)
 class WheelSlip(TwistModel, abc.ABC):
-    """A model that gives the slip of each wheel from what its own motor takes."""
+    """A model that predicts the slip of each wheel from its own motor's current."""
 
     @abc.abstractmethod
     def slip(self, steps: Steps, spec: RobotSpec) -> Slips:
-        """Slip of each drive [-] in every step."""
+        """Return the slip of each drive [-] in every step."""
 
     def twist(self, steps: Steps, spec: RobotSpec) -> Twists:
         rim = steps.signals.speed * spec.wheel_radius * (1.0 - self.slip(steps, spec))
@@ -74,11 +74,12 @@ class CurveModel(WheelSlip):
     Attributes:
         features: phi.
         regressor: x, the current [A] or a torque [N m].
-        per_wheel: own coefficients for every wheel.
-        monotone: no coefficient but the first is negative.
-        insensitive: epsilon-insensitive loss instead of least squares, as support vector regression
-            with a linear kernel has it; epsilon is a tenth of a robust std of what slip takes away.
-        smoothing: time constant of a low pass of x, None without [s].
+        per_wheel: whether every wheel has its own coefficients.
+        monotone: whether no coefficient but the first may be negative.
+        insensitive: whether the loss is epsilon-insensitive instead of least squares, as in support
+            vector regression with a linear kernel; epsilon is a tenth of a robust std of the
+            displacement lost to slip.
+        smoothing: time constant of a low pass of x [s], None for no smoothing.
         most: largest slip of either sign; where a wheel is dragged along its slip is negative.
     """
 
@@ -107,7 +108,7 @@ class CurveModel(WheelSlip):
         return np.clip(self.regressors(steps, spec) @ self.known, -self.most, self.most)
 
     def regressors(self, steps: Steps, spec: RobotSpec) -> Float[np.ndarray, "step drive k"]:
-        """What slip is linear in."""
+        """Return the values that slip is linear in."""
         x = self.regressor(steps.signals, spec)
         phi = self.features(x if self.smoothing is None else steps.smoothed(x, self.smoothing))
         if not self.per_wheel:
@@ -115,15 +116,15 @@ class CurveModel(WheelSlip):
         return np.einsum("sdk,de->sdek", phi, np.eye(phi.shape[1])).reshape(*phi.shape[:2], -1)
 
     def stiffness(self, w: TrainingWindows, spec: RobotSpec) -> Float[np.ndarray, "k k"]:
-        """A coefficient that rests on its bound does not move with the data."""
+        """Return a large precision for coefficients that rest on their bound."""
         held = self.monotone & (np.arange(self.numbers) > 0) & (self.known <= 0)
         return np.diag(held * HELD)
 
 
 def insensitive(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Least sum of max(|a beta - b| - epsilon, 0), epsilon a tenth of a robust std of b.
+    """Return the least sum of max(|a beta - b| - epsilon, 0), epsilon a tenth of a robust std of b.
 
-    Support vector regression (Vapnik 1995) where its penalty on beta does not count, as a linear
+    This is support vector regression (Vapnik 1995) with a negligible penalty on beta, as a linear
     program.
     """
     epsilon = 0.1 * robust_std(b)
@@ -139,14 +140,14 @@ def insensitive(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def robust_std(x: Float[np.ndarray, " sample"]) -> float:
-    """Standard deviation by the interquartile range, which is 1.349 of it for what is Gaussian."""
+    """Return a std from the interquartile range, which is 1.349 stds of a Gaussian."""
     return float(np.subtract(*np.percentile(x, (75, 25)))) / 1.349
 
 
 @final
 @dataclass(frozen=True)
 class Saturating(WheelSlip):
-    """Janosi-Hanamoto read backwards: M = M_max (1 - exp(-s / kappa)), s on the rising branch.
+    """Janosi-Hanamoto curve inverted: M = M_max (1 - exp(-s / kappa)), s on the rising branch.
 
         s = -kappa log(1 - min(M / M_max, 0.98))
 
@@ -176,17 +177,20 @@ class Saturating(WheelSlip):
 
 
 def powers(*exponents: int) -> Features:
-    """Powers of the regressor."""
+    """Return features that are powers of the regressor."""
     return lambda x: np.stack([x**k for k in exponents], -1)
 
 
 def above(threshold: float) -> Features:
-    """The deployed form of the 2021 paper: affine above a current, no slip below."""
+    """Return the deployed form of the 2021 paper: affine above a current, no slip below."""
     return lambda x: np.stack([np.where(x > threshold, x, 0.0), (x > threshold) * 1.0], -1)
 
 
 def ramps(knots: Sequence[float]) -> Features:
-    """I-spline of degree 1: a constant and rising ramps between knots; monotone if weights >= 0."""
+    """Return an I-spline of degree 1: a constant and rising ramps between knots.
+
+    It is monotone if its weights are not negative.
+    """
 
     def phi(x: np.ndarray) -> np.ndarray:
         rising = [np.clip((x - a) / (b - a), 0, 1) for a, b in pairwise(knots)]

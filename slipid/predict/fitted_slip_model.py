@@ -1,4 +1,4 @@
-"""A slip model with noise of its own, so that it forecasts as the force balance does."""
+"""A slip model with noise variances of its own, so that it forecasts as the force balance does."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -28,16 +28,16 @@ from slipid.predict.slip_models import FloorModels
 from slipid.search_space import Space
 
 MOST_TURNS, SCORING, SETTLED = 15, 4, 0.02
-"""Turns of a model's covariance and so many steps of its log variances, and what counts as rest."""
+"""Rounds of a model's covariance, scoring steps per round, and the change that counts as rest."""
 VAGUE = 1e-2
-"""Precision of a model's number before any data: of slips below one, a std of 10 says nothing."""
+"""Precision of a model's numbers before any data: for slips below one, a std of 10 is vague."""
 STEP = 1e-4
-"""Of the difference quotients by a model's numbers."""
+"""Step of the difference quotients by a model's numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedSlipModel(PredictiveModel):
-    """A slip model with noise of its own and a fit's camera, which the model's numbers follow."""
+    """A slip model with noise of its own and a fit's camera, whose errors its numbers follow."""
 
     model: FloorModels
     contact: ForceBalance
@@ -64,7 +64,7 @@ class FittedSlipModel(PredictiveModel):
         by_camera = by_z[..., self.contact.camera]
         return gap(model), np.concatenate([slopes(model, w, gap), by_camera], axis=-1)
 
-    def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
+    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
         robot, contact = self.robot, self.contact
 
         def tracks_of(model: FloorModels) -> replay.Tracks:
@@ -74,30 +74,27 @@ class FittedSlipModel(PredictiveModel):
         twist, start = self.model.twist(w, robot), tracks.predicted[:, 0]
         camera = replay.end_jacobian(contact.space, contact.z, lk.batch(w, robot), start, twist)
         own = slopes(self.model, w, lambda model: tracks_of(model).predicted[:, -1, :2])
-        jac = np.concatenate([own, np.asarray(camera)[..., contact.camera]], axis=-1)
-        spread = parameter_covariance(jac, self.covariance)
-        effect = self.effect_covariance(w)
-        return tracks, replay.end_covariance(robot, w, tracks, self.variance, effect, spread)
+        return tracks, np.concatenate([own, np.asarray(camera)[..., contact.camera]], axis=-1)
 
 
 def fit_with_noise(
-    model: FloorModels, contact: ForceBalance, problem: Problem, keep: Float[np.ndarray, " piece"]
+    model: FloorModels, contact: ForceBalance, problem: Problem, keep: Float[np.ndarray, " segment"]
 ) -> FittedSlipModel:
-    """A slip model fitted to the kept pieces of a problem, with noise found from what it leaves.
+    """Return a slip model fitted to the kept segments of a problem, with noise from its residuals.
 
-    Variances by Fisher scoring of the restricted likelihood, as for the force balance; the degrees
-    of freedom of the model's own numbers are taken off.
+    Variances are estimated by Fisher scoring of the restricted likelihood, as for the force
+    balance; the degrees of freedom of the model's own numbers are subtracted.
     """
     robot = contact.robot
-    seen = problem.windows.at_lag(float(robot.camera.lag)).segments(np.flatnonzero(keep > 0))
-    model = model.fit(seen, robot)
-    before = _prior_precision(model, seen, robot)
+    w = problem.windows.at_lag(float(robot.camera.lag)).segments(np.flatnonzero(keep > 0))
+    model = model.fit(w, robot)
+    before = _prior_precision(model, w, robot)
     common = contact.covariance[np.ix_(contact.camera, contact.camera)]
     plain = FittedSlipModel(robot, contact.variance, common, model, contact)
     gap, slope = plain.linear(problem)
     log_v, count = jnp.asarray(contact.log_variance(problem)), jnp.asarray(keep, float)
     own_effects = np.array([c.kind == "run" for c in problem.noise.components])
-    target = replace(problem.objective, scored=problem.objective.scored | own_effects)
+    objective = replace(problem.objective, scored=problem.objective.scored | own_effects)
     for _ in range(MOST_TURNS):
         last = log_v
         scale = np.asarray(problem.covariance("motion", log_v))
@@ -105,7 +102,7 @@ def fit_with_noise(
         spread = jnp.asarray(parameter_covariance(slope, covariance))
         blocks = {"motion": jnp.asarray(gap)}, {"motion": spread}
         for _ in range(SCORING):
-            log_v = scoring_step(target, *blocks, log_v, count, None)
+            log_v = scoring_step(objective, *blocks, log_v, count, None)
         if float(jnp.abs(log_v - last).max()) < SETTLED:
             break
     plain = replace(plain, variance=by_name(problem, log_v), covariance=covariance)
@@ -116,7 +113,7 @@ def fit_with_noise(
 
 
 def _prior_precision(model: FloorModels, w: Windows, robot: Robot) -> np.ndarray:
-    """Precision of a model's numbers without the data."""
+    """Return the precision of a model's numbers without the data."""
     held = model.stiffness(w, robot)
     parts = [VAGUE * np.eye(v.size) + held.get(key, 0.0) for key, v in model.state.items()]
     return np.asarray(block_diag(np.zeros((0, 0)), *parts))
@@ -125,7 +122,7 @@ def _prior_precision(model: FloorModels, w: Windows, robot: Robot) -> np.ndarray
 def _number_covariance(
     before: np.ndarray, common: np.ndarray, scale: np.ndarray, slope: Slopes, keep: np.ndarray
 ) -> np.ndarray:
-    """Covariance of a model's numbers and the camera's; the former follow the latter."""
+    """Return the covariance of a model's numbers and the camera's; the former follow the latter."""
     own, m = len(before), slope.shape[1]
     factor = keep * (DEGREES + m) / (DEGREES + m + 2)
     weighted = np.linalg.solve(scale, slope[..., :own]) * factor[:, None, None]
@@ -152,14 +149,14 @@ _gap_jacobian = eqx.filter_jit(jax.jacfwd(_gap, argnums=1))
 
 
 def slopes(model: FloorModels, w: Windows, of: Callable[[FloorModels], np.ndarray]) -> np.ndarray:
-    """Slope of a function of a model by its numbers, key after key (piece, ..., number).
+    """Return the derivative of a function of a model by its numbers (segment, ..., number).
 
-    Keys share no piece, so one number of each is moved at once.
+    Numbers are in order of the keys. Keys share no segment, so one number of each is moved at once.
     """
     ends = np.cumsum([0, *(v.size for v in model.state.values())]).tolist()
     now = of(model)
     out = np.zeros((*now.shape, ends[-1]))
-    keys = np.array([model.series(s, load) for s, load in zip(w.surface, w.load, strict=True)])
+    keys = np.array([model.key_of(s, load) for s, load in zip(w.surface, w.load, strict=True)])
     for k in range(max((v.size for v in model.state.values()), default=0)):
         moved = {key: np.array(value, float) for key, value in model.state.items()}
         for value in moved.values():

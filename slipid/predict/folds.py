@@ -1,7 +1,7 @@
-"""Every slip model judged on held-out runs: who is left out together, and how they score.
+"""Judgement of every slip model on held-out runs: the folds, and the scores of each fold.
 
-Runs of one heading stay in one fold at every speed and on every floor, so that nothing of a
-left-out heading is seen.
+Runs of one heading are in one fold at every speed and on every floor, so that a held-out heading is
+not fitted anywhere.
 """
 
 import time
@@ -29,7 +29,13 @@ Fold = Int[np.ndarray, " run"]
 
 @dataclass(frozen=True)
 class FoldKey:
-    """What folds go by: floor with load set-up, direction commanded [deg] and speed [m/s]."""
+    """Properties of a run by which folds are made.
+
+    Attributes:
+        floor: floor with load set-up.
+        heading_deg: commanded direction [deg].
+        speed: commanded speed [m/s].
+    """
 
     floor: str
     heading_deg: float
@@ -37,33 +43,34 @@ class FoldKey:
 
 
 def fold_keys(data: Runs) -> list[FoldKey]:
-    """Facts of all runs; directions and speeds are nan where they are not known."""
+    """Return the fold keys of all runs; unknown directions and speeds are nan."""
     where = setups([log.surface or "unknown" for log in data.logs], [log.load for log in data.logs])
-    way = np.degrees(data.heading).tolist()
-    return [FoldKey(*one) for one in zip(where, way, data.speed.tolist(), strict=True)]
+    heading, speed = np.degrees(data.heading).tolist(), data.speed.tolist()
+    return [FoldKey(*key) for key in zip(where, heading, speed, strict=True)]
 
 
-def sectors(facts: Sequence[FoldKey]) -> Fold:
-    """Fold of every run by the 60 deg its commanded heading lies in, -1 where it has none."""
-    way, known = _headings(facts)
-    return np.where(known, (np.floor((way % 360.0 + 1e-6) / 60.0) % 6).astype(int), -1)
+def sectors(keys: Sequence[FoldKey]) -> Fold:
+    """Return the fold of every run by its commanded heading's 60 deg sector, -1 without one."""
+    heading, known = _headings(keys)
+    return np.where(known, (np.floor((heading % 360.0 + 1e-6) / 60.0) % 6).astype(int), -1)
 
 
-def random_headings(facts: Sequence[FoldKey]) -> Fold:
-    """One of six folds of every run by its heading, dealt every 5 deg, -1 where it has none."""
+def random_headings(keys: Sequence[FoldKey]) -> Fold:
+    """Return a random one of six folds for every 5 deg of heading, -1 for runs without one."""
     dealt = np.random.default_rng(0).permutation(72) % 6
-    way, known = _headings(facts)
-    return np.where(known, dealt[np.round(way / 5.0).astype(int) % 72], -1)
+    heading, known = _headings(keys)
+    return np.where(known, dealt[np.round(heading / 5.0).astype(int) % 72], -1)
 
 
-def speeds(facts: Sequence[FoldKey], most: int | None = None) -> Fold:
-    """Fold of every run by its commanded speed, -1 where its floor and load saw one fold only.
+def speeds(keys: Sequence[FoldKey], most: int | None = None) -> Fold:
+    """Return the fold of every run by its commanded speed, -1 where there is nothing to hold out.
 
-    Where there are more than twice `most` speeds, so many folds have equally many of them. Turns on
-    the spot have no speed to leave out.
+    This is so where the runs of its floor and load set-up are all in one fold. If there are more
+    than twice `most` speeds, the folds are `most` groups of equally many speeds. Turns on the spot
+    have no speed to hold out.
     """
-    speed = np.round([f.speed for f in facts], 3)
-    where, known = np.array([f.floor for f in facts]), np.isfinite(speed) & (speed > 0)
+    speed = np.round([f.speed for f in keys], 3)
+    where, known = np.array([f.floor for f in keys]), np.isfinite(speed) & (speed > 0)
     every = np.unique(speed[known])
     edges = every[1:]
     if most is not None and len(every) > 2 * most:
@@ -76,12 +83,12 @@ def speeds(facts: Sequence[FoldKey], most: int | None = None) -> Fold:
 
 
 def _headings(
-    facts: Sequence[FoldKey],
+    keys: Sequence[FoldKey],
 ) -> tuple[Float[np.ndarray, " run"], Bool[np.ndarray, " run"]]:
-    """Commanded headings, zero where there is none [deg], and whether there is one."""
-    way = np.array([f.heading_deg for f in facts], float)
-    known = np.isfinite(way)
-    return np.where(known, way, 0.0), known
+    """Return commanded headings, zero where there is none [deg], and whether there is one."""
+    heading = np.array([f.heading_deg for f in keys], float)
+    known = np.isfinite(heading)
+    return np.where(known, heading, 0.0), known
 
 
 QUESTIONS: dict[str, Callable[[Sequence[FoldKey]], Fold]] = {
@@ -89,14 +96,14 @@ QUESTIONS: dict[str, Callable[[Sequence[FoldKey]], Fold]] = {
     "speeds": speeds,
     "random": random_headings,
 }
-"""What is left out together: 60-degree sectors of headings, one speed, headings dealt at random."""
+"""Runs held out together: 60-degree sectors of headings, one speed, or random headings."""
 
 
 def nested(data: Runs, question: str, judged: np.ndarray) -> Fold:
-    """Fold of every run while a model tunes itself for a question on the runs that are not judged.
+    """Return the folds in which a model tunes itself for a question, on runs that are not judged.
 
-    A sector beside one that is judged would leave a wider gap than is asked about: it is -1, seen
-    always, where two sectors or more are left.
+    A sector beside a judged one would leave a wider gap than the question has: its fold is -1,
+    always fitted, where two sectors or more are left.
     """
     fold = QUESTIONS[question](fold_keys(data))
     if question != "sectors":
@@ -109,10 +116,10 @@ def nested(data: Runs, question: str, judged: np.ndarray) -> Fold:
 
 
 def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
-    """Fold of every run; -1 for one that cannot be judged and is always fitted.
+    """Return the fold of every run; -1 for one that cannot be judged and is always fitted.
 
-    Leaving out its fold would leave nothing of its floor and load set-up. With `parts`, every
-    parts-th fold is left out together.
+    Holding out its fold would leave nothing of its floor and load set-up. With `parts`, every
+    parts-th fold is held out together.
 
     Raises:
         DataError: no such question.
@@ -124,11 +131,11 @@ def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
         )
     if parts is not None and parts < 2:
         raise ValueError(f"{parts} parts; expected 2 or more")
-    facts = fold_keys(data)
-    fold = QUESTIONS[question](facts)
+    keys = fold_keys(data)
+    fold = QUESTIONS[question](keys)
     if parts is not None:
         fold = np.where(fold < 0, fold, fold % parts)
-    group = np.array([f.floor for f in facts])
+    group = np.array([f.floor for f in keys])
     for name in np.unique(group):
         if len(np.unique(fold[group == name])) < 2:
             fold[group == name] = -1
@@ -137,10 +144,14 @@ def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
 
 @dataclass(frozen=True)
 class FoldResult:
-    """What the models say of the runs of a fold, and how the fit of the force balance ended.
+    """Scores of all models on the runs of a fold, and how the fit of the force balance ended.
 
-    Seconds are to `fit` and to `predict`, of every model; numbers are counts of fitted ones, by
-    floor.
+    Attributes:
+        rows: scores of every run.
+        seconds: time to `fit` and to `predict`, by model.
+        numbers: count of fitted numbers by floor, by model.
+        converged: whether the fit of the force balance converged.
+        reason: why that fit stopped.
     """
 
     rows: tuple[ScoredRun, ...]
@@ -157,7 +168,11 @@ class FoldResult:
 class FoldModels:
     """Every model, the force balance first, fitted to some runs of a problem.
 
-    Seconds are to fit, by model.
+    Attributes:
+        problem: problem of the fit.
+        optimum: end of the fit of the force balance.
+        models: the fitted models.
+        seconds: time to fit, by model.
     """
 
     problem: Problem
@@ -174,9 +189,9 @@ def fit_fold(
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
 ) -> FoldModels:
-    """Every slip model fitted without some runs; arguments as of `judge`.
+    """Return every slip model fitted without some runs; arguments as in `judge`.
 
-    Of the runs left out nothing is used but which they are.
+    Nothing but the numbers of the held-out runs is used of them.
     """
     fitted = np.setdiff1d(np.arange(len(data)), judged)
     problem = problem_of_runs(problem, choices, data, fitted)
@@ -197,7 +212,7 @@ def fit_fold(
 def problem_of_runs(
     problem: Problem, choices: Sequence[Choice], data: Runs, fitted: np.ndarray
 ) -> Problem:
-    """The problem of a fit to some of its runs: what those cannot tell is held."""
+    """Return the problem of a fit to some of its runs; what these cannot determine is fixed."""
     held = [*fixed_viscosities(data, fitted), *choices]
     if Space(problem.robot, held).names == problem.space.names:
         return problem
@@ -212,19 +227,24 @@ def judge(
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
 ) -> FoldResult:
-    """One fold: every slip model fitted without some runs, and its scores on them.
+    """Return the scores of one fold: every slip model fitted without some runs, and judged on them.
 
-    The problem is of all the runs of `data`, made with these choices; `judged` are numbers of runs,
-    left out for one of the `QUESTIONS`; a model that tunes itself does so for that question, on the
-    other runs. `fit` is how the problem is fitted.
+    Args:
+        problem: problem of all the runs of `data`, made with the choices.
+        choices: the user's choices for numbers.
+        data: all runs.
+        question: the one of the `QUESTIONS` for which runs are held out, and for which a model
+            tunes itself on the other runs.
+        judged: numbers of the held-out runs.
+        fit: function that fits the problem.
     """
-    learnt = fit_fold(problem, choices, data, question, judged, fit)
-    problem, optimum = learnt.problem, learnt.optimum
-    seconds = {name: {"fit": spent} for name, spent in learnt.seconds.items()}
+    fold = fit_fold(problem, choices, data, question, judged, fit)
+    problem, optimum = fold.problem, fold.optimum
+    seconds = {name: {"fit": spent} for name, spent in fold.seconds.items()}
     part = data.subset(judged)
     runs: dict[int, ScoredRun] = {}
-    cuts = replay.replay_windows(part, learnt.models[0].robot)
-    for model in learnt.models:
+    cuts = replay.replay_windows(part, fold.models[0].robot)
+    for model in fold.models:
         began = time.perf_counter()
         for w in cuts:
             add_scores(runs, part, model.name, *model.ends(w))
@@ -236,7 +256,7 @@ def judge(
     return FoldResult(
         rows=tuple(replace(runs[k], session=name) for k, name in enumerate(part.session)),
         seconds=seconds,
-        numbers={model.name: model.numbers for model in learnt.models},
+        numbers={model.name: model.numbers for model in fold.models},
         converged=bool(optimum.converged),
         reason=optimum.reason,
     )

@@ -1,48 +1,49 @@
-"""Kinematics alone: encoders, and what practitioners correct in them by least squares.
+"""Kinematic slip models: encoders, and the corrections that practitioners fit by least squares.
 
 With (s, 0, d) the body twist J^+ r w of wheels that do not slip:
 
-    encoder                 v_x = s              yaw = d              v_y as the wheels have it
+    encoder                 v_x = s              yaw = d              v_y by the wheels
     effective_track         v_x = a s            yaw = b d            v_y = -x yaw
     instantaneous_centres   v_x = a s + c d      yaw = b d + e s      v_y = -x yaw
     full_linear             v_x = a s + c d      yaw = b d + e s      v_y = f s - x yaw
 
-a is what the wheels are larger, 1 / b what the track is wider (over a), x the place on the
-longitudinal axis about which the robot turns [m]; c and e tell a robot whose sides differ. All but
-the encoders are for wheels that do not tell motion sideways, skid steer and differential drives:
-where wheels do, v_y is not -x yaw. Nothing is tuned.
+a is the relative size of the wheels, 1 / b the relative track (over a), x the position on the
+longitudinal axis about which the robot turns [m]; c and e describe a robot whose sides differ. All
+but the encoders are for wheels that do not determine motion sideways, skid steer and differential
+drives: on other robots v_y is not -x yaw. Nothing is tuned.
 
 Liberties:
-    - The five numbers of the instantaneous centres are those of Mandow et al. in other words: they
-      give the places y_left, y_right, x of three centres and two gains, alpha_left, alpha_right.
-    - Least squares in displacement over windows instead of an optimiser over whole paths; the
-      effective track of a ROS controller is usually trimmed by hand, and has no place x.
-    - Where the lag of the poses behind the wheels is not settled before, it is one number more.
+    - The five numbers of the instantaneous centres are those of Mandow et al. in another form: they
+        give the positions y_left, y_right, x of three centres and two gains, alpha_left,
+        alpha_right.
+    - Least squares of displacements over windows instead of an optimiser over whole paths; the
+        effective track of a ROS controller is usually trimmed by hand and has no position x.
+    - Where the lag of the poses behind the wheels is not known, it is one number more.
 
 Source: Mandow et al. 2007, "Experimental kinematics for wheeled skid-steer mobile robots", IROS,
 eq. 1 to 5; effective track: the `wheel_separation_multiplier` of ROS controllers; encoders of omni
 wheels: Indiveri 2009, IEEE Transactions on Robotics 25(1).
 
-Encoders corrected by a table over the direction of travel, as a smooth Fourier series.
+`HeadingLookup` corrects encoders by a table over the direction of travel, a smooth Fourier series:
 
     (along, across, yaw) = (far, 0, turn) + far sum_k c_k phi_k(angle)
 
 with far, angle and turn the encoders' displacement, its direction in the body frame and their yaw,
-and phi = 1, cos angle, sin angle, ..., cos 6 angle, sin 6 angle. The coefficients c are found by
-ridge regression on windows; the k-th harmonic is held down by weight k^4 times the sum of far^2,
-the constant not at all. There are two ways to the weight:
+and phi = 1, cos angle, sin angle, ..., cos 6 angle, sin 6 angle. The coefficients c are estimated
+by ridge regression on windows; the k-th harmonic is penalised by weight k^4 times the sum of far^2,
+the constant not at all. The weight is chosen in one of two ways:
 
-    - The benchmark gives it, as any other setting: it tries `RIDGES`. A floor's loads are pooled.
-    - Without one the table picks it from `WEIGHTS` by a cross-validation of its own, over runs that
-      are left out `together`, so that the table is made for the question it will be asked, else
-      over random runs, which makes it good in between. In the comparison a floor has one table for
+    - The benchmark sets it, like any other setting: it tries `RIDGES`. A floor's loads are pooled.
+    - Otherwise the table selects it from `WEIGHTS` by a cross-validation of its own: over runs that
+      are held out `together`, which suits the table to the question it is judged by, or over random
+      runs, which suits it to interpolation. In the comparison a floor has one table for
       each load set-up it was driven with.
 
 Liberties:
-    - It is not published as a system. A table of corrections over the direction of travel is what a
-      practitioner would make for an omni robot, and what any model of slip has to beat.
-    - Harmonics above the sixth are left out.
-    - It does not know speeds: runs with all of them are pooled.
+    - It is not a published system. A table of corrections over the direction of travel is what a
+        practitioner would make for an omni robot, and what any model of slip has to beat.
+    - Harmonics above the sixth are omitted.
+    - It does not depend on speed: runs of all speeds are pooled.
 
 Source: slipid's own.
 """
@@ -59,9 +60,9 @@ from slipid.predict.slip_model import Channel, RobotSpec, Twists, turned
 from slipid.predict.steps import Steps, TrainingWindows, TwistModel
 
 TERMS = {"effective_track": 3, "instantaneous_centres": 5, "full_linear": 6}
-"""How many numbers each has beside its lag."""
+"""Number of coefficients of each model beside its lag."""
 LONGEST_LAG = 2.0
-"""Lag beyond which the windows' own lag no longer says where a wheel was [s]."""
+"""Lag beyond which the windows' own lag no longer tells where a wheel was [s]."""
 
 
 @final
@@ -70,8 +71,8 @@ class Encoder(TwistModel):
     """No slip: xi = J^+ r w. Nothing is fitted; every other model is compared with it.
 
     Attributes:
-        shape: sizes to be used instead of the robot's, None for the robot's own.
-        lag: of the poses [s], None for that of the steps.
+        shape: sizes to use instead of the robot's, None for the robot's own.
+        lag: lag of the poses [s], None for that of the steps.
     """
 
     learns: ClassVar[bool] = False
@@ -88,14 +89,14 @@ class Encoder(TwistModel):
 
 
 def nominal(shape: Geometry) -> Encoder:
-    """No slip, radius and places as in the config, and no lag: what the user has today."""
+    """Return encoders with radius and positions as in the config and no lag: today's user model."""
     return Encoder("nominal", shape, 0.0)
 
 
 @final
 @dataclass(frozen=True)
 class Corrected(TwistModel):
-    """Kinematics corrected by least squares; see the head of this module.
+    """Kinematics corrected by least squares; see the module docstring.
 
     The coefficients are a, b, x, then c, e, then f, as far as its name has them; the lag [s] is
     last where steps have one.
@@ -132,7 +133,7 @@ class Corrected(TwistModel):
 
 
 def corrected(rolling: Twists, numbers: Float[np.ndarray, " number"]) -> Twists:
-    """Twists by the encoders, corrected by a, b, x, and if they are there c, e and f."""
+    """Return the encoders' twists corrected by a, b, x and, if present, c, e and f."""
     a, b, x, c, e, f = np.pad(numbers, (0, 6 - len(numbers)))
     s, d = rolling[:, 0], rolling[:, 2]
     yaw = b * d + e * s
@@ -143,19 +144,21 @@ HARMONICS = 6
 RIDGES = (1e-5, 1e-3, 1e-1, 10.0)
 """Weights of the ridge that the benchmark tries."""
 WEIGHTS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
-"""Weights from which the table picks one itself."""
+"""Weights from which the table selects its own."""
 Together = Int[np.ndarray, " run"]
-"""A number for every run: runs of one number are left out together, those of -1 never are."""
+"""A number for every run: runs with equal numbers are held out together, those with -1 never."""
 
 
 @final
 @dataclass(frozen=True)
 class HeadingLookup(TwistModel):
-    """See the head of this module; the coefficients are c of (along, across, yaw).
+    """A table of corrections over the direction of travel; see the module docstring.
+
+    The coefficients are c for (along, across, yaw).
 
     Attributes:
-        ridge: weight of the ridge, None to pick it by cross-validation.
-        together: which runs are left out together then.
+        ridge: weight of the ridge, None to select it by cross-validation.
+        together: runs held out together in that cross-validation.
     """
 
     by_load: ClassVar[bool] = True
@@ -173,7 +176,7 @@ class HeadingLookup(TwistModel):
         return replace(self, ridge=ridge, coefficients=table.solved(ridge))
 
     def stiffness(self, w: TrainingWindows, spec: RobotSpec) -> Float[np.ndarray, "k k"]:
-        """The ridge as a Gaussian prior: its penalty over the mean square of what is left."""
+        """Return the ridge as a Gaussian prior's precision: penalty over mean squared residual."""
         table = self._table(w, spec)
         left = np.mean((table.gap - table.phi @ self.known) ** 2, axis=0)
         weight = table.best_weight() if self.ridge is None else self.ridge
@@ -192,7 +195,7 @@ class HeadingLookup(TwistModel):
         return _HeadingTable(fourier(rolling * w.dt[:, None]), gap, self._fold(w.run))
 
     def _fold(self, run: Int[np.ndarray, " window"]) -> Int[np.ndarray, " window"]:
-        """Fold of every window, five of random runs where fewer than two are left out together."""
+        """Return the fold of every window; without two groups of `together`, five random ones."""
         fold = np.full(len(run), -1) if self.together is None else self.together[run]
         if len(set(fold[fold >= 0].tolist())) > 1:
             return fold
@@ -200,7 +203,7 @@ class HeadingLookup(TwistModel):
 
 
 class _HeadingTable(NamedTuple):
-    """Features (window, k), the gap they explain, and folds."""
+    """Features (window, k), the displacements they explain, and folds."""
 
     phi: np.ndarray
     gap: np.ndarray
@@ -219,7 +222,7 @@ class _HeadingTable(NamedTuple):
         return min(WEIGHTS, key=self._left_out)
 
     def _left_out(self, weight: float) -> float:
-        """Squared error over the folds."""
+        """Return the squared error over the folds."""
         loss = 0.0
         for test in (self.fold == k for k in set(self.fold.tolist()) - {-1}):
             if not test.all():
@@ -230,12 +233,12 @@ class _HeadingTable(NamedTuple):
 
 
 def _direction(rolling: Float[np.ndarray, "*step 3"]) -> Float[np.ndarray, "*step"]:
-    """Direction of travel by the encoders [rad]."""
+    """Return the direction of travel by the encoders [rad]."""
     return np.asarray(np.arctan2(rolling[..., 1], rolling[..., 0]))
 
 
 def fourier(rolling: Float[np.ndarray, "*step 3"]) -> Float[np.ndarray, "*step k"]:
-    """Far phi(angle), from twists by the encoders, or from displacements [m]."""
+    """Return far phi(angle) of the encoders' twists, or of displacements [m]."""
     angle = _direction(rolling)
     waves = [wave(k * angle) for k in range(1, HARMONICS + 1) for wave in (np.cos, np.sin)]
     far = np.hypot(rolling[..., 0], rolling[..., 1])

@@ -1,6 +1,6 @@
-"""Open loop: from the first pose on, where does a model say the robot went, and how sure is it?
+"""Open-loop prediction of paths from the first pose on, with the uncertainty of their ends.
 
-Everything is in the corrected metres of the fitted camera; the measured pose is used once, at the
+All poses are in the corrected metres of the fitted camera; the measured pose is used once, at the
 start.
 """
 
@@ -27,7 +27,7 @@ STEP = 0.5
 """Longest step of a replay [s]."""
 Numbers = Array | np.ndarray
 TOGETHER = 32
-"""Runs replayed in one call."""
+"""Number of runs replayed in one call."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Tracks:
 
 
 def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
-    """The runs, each as one piece of short steps, `TOGETHER` at a time.
+    """Return the runs, each as one segment of short steps, `TOGETHER` at a time.
 
     Numbers of steps are powers of two, so that few shapes are compiled.
     """
@@ -60,7 +60,7 @@ def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
 
 
 def whole_runs(data: Runs, robot: Robot, steps: Sequence[int]) -> list[Windows]:
-    """The runs, each as one piece of so many steps, `TOGETHER` of as many steps at a time.
+    """Return the runs, each as one segment of a given number of steps, `TOGETHER` at a time.
 
     The last runs of a group are repeated to fill it up, so that few shapes are compiled.
     """
@@ -77,20 +77,20 @@ def whole_runs(data: Runs, robot: Robot, steps: Sequence[int]) -> list[Windows]:
 
 
 @jax.jit
-def contact_increments(robot: Robot, b: lk.Batch) -> Float[Array, "piece window 3"]:
-    """Marker increments of the contact equilibrium."""
+def contact_increments(robot: Robot, b: lk.Batch) -> Float[Array, "segment window 3"]:
+    """Return the marker increments of the contact equilibrium."""
     return lk.predict(robot, b).increment
 
 
 @jax.jit
-def corrected(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, "piece edge 3"]:
-    """Logged poses in corrected metres."""
+def corrected(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Float[Array, "segment edge 3"]:
+    """Return logged poses in corrected metres."""
     return jax.vmap(jax.vmap(robot.camera.corrected))(pose)
 
 
 @jax.jit
-def chain(start: Float[Array, "piece 3"], step: Float[Array, "piece window 3"]) -> Array:
-    """Poses from a start pose and body-frame increments (piece, window + 1, 3)."""
+def chain(start: Float[Array, "segment 3"], step: Float[Array, "segment window 3"]) -> Array:
+    """Return the poses from a start pose and body-frame increments (segment, window + 1, 3)."""
 
     def one(p: Array, steps: Array) -> Array:
         _, poses = jax.lax.scan(lambda q, d: (compose(q, d),) * 2, p, steps)
@@ -100,19 +100,24 @@ def chain(start: Float[Array, "piece 3"], step: Float[Array, "piece window 3"]) 
 
 
 def tracks_from_increments(
-    robot: Robot, w: Windows, increment: Float[np.ndarray, "piece window 3"]
+    robot: Robot, w: Windows, increment: Float[np.ndarray, "segment window 3"]
 ) -> Tracks:
-    """Tracks of a model that gives marker increments."""
+    """Return the tracks of a model that predicts marker increments."""
     pose = np.asarray(corrected(robot, jnp.asarray(w.pose)))
     path = np.asarray(chain(jnp.asarray(pose[:, 0]), jnp.asarray(increment)))
     return Tracks(w.run, path, pose)
 
 
 class IncrementCorrection(eqx.Module):
-    """What is taken off predicted increments, and its slope by the search vector."""
+    """Correction to be subtracted from predicted increments.
 
-    moved: Float[Array, "piece window 3"]
-    by_number: Float[Array, "piece window 3 free"]
+    Attributes:
+        moved: increments to subtract.
+        by_number: their derivative by the search vector.
+    """
+
+    moved: Float[Array, "segment window 3"]
+    by_number: Float[Array, "segment window 3 free"]
 
 
 @eqx.filter_jit
@@ -123,11 +128,11 @@ def end_jacobian(
     start: Numbers,
     twist: Numbers | None = None,
     corrected: IncrementCorrection | None = None,
-) -> Float[Array, "piece 2 free"]:
-    """Slope of the ends by the search vector, from given start poses.
+) -> Float[Array, "segment 2 free"]:
+    """Return the derivative of the ends by the search vector, from given start poses.
 
-    Of the contact equilibrium with its correction, or where the body's twists are given
-    (piece, window, 3).
+    The path is that of the contact equilibrium with its correction, or of given body twists
+    (segment, window, 3).
     """
 
     def end(x: Array) -> Array:
@@ -149,13 +154,13 @@ def end_covariance(
     w: Windows,
     tracks: Tracks,
     variance: Mapping[str, float],
-    shared: Float[np.ndarray, "piece 3 3"],
-    of_parameters: Float[np.ndarray, "piece 2 2"],
-) -> Float[np.ndarray, "piece 2 2"]:
-    """Covariance of the gap between predicted and measured end [m^2], scale matrix of a Student t.
+    shared: Float[np.ndarray, "segment 3 3"],
+    of_parameters: Float[np.ndarray, "segment 2 2"],
+) -> Float[np.ndarray, "segment 2 2"]:
+    """Return the covariance of predicted less measured ends [m^2], scale matrix of a Student t.
 
-    Process noise, the run's own effect and what it shares with others, camera noise at both ends
-    and in the start heading, and the parameters' uncertainty, each carried to the end along the
+    It includes process noise, the run's own effect and the shared ones, camera noise at both ends
+    and in the start heading, and the parameters' uncertainty, each propagated to the end along the
     predicted path.
     """
     far, u = travel(w, robot)

@@ -1,16 +1,16 @@
-"""What any slip model predicts of runs it has not seen, and how sure it may be.
+"""Predictive distributions of fitted models for runs they were not fitted to.
 
-Every model gets a predictive distribution of the same form: a Student t around what it predicts,
-with scale
+Every model gets a predictive distribution of the same form: a Student t around its prediction, with
+scale
 
     V + E diag(v) E^T + J C J^T
 
 V of its own camera, process and run variances, found by restricted likelihood from its own
-residuals; v what runs share, E what that moves; J the slope by its own numbers and the camera's, C
-their covariance. Simpler models have v of sessions (`slipid.fit.session_effects`); the force
-balance has what its fit found of sessions and neighbours (`slipid.fit.shared_effects`), and v
-grows where leaving out sectors asks for it. All models share the fitted camera;
-the numbers of a simpler model follow it.
+residuals; v the variances of shared effects and E their derivative; J the derivative by its own
+numbers and the camera's, C their covariance. Simpler models have v of sessions
+(`slipid.fit.session_effects`); the force balance has the effects of sessions and neighbours of its
+fit (`slipid.fit.shared_effects`), and its v grows where held-out sectors ask for it. All models
+share the fitted camera; the numbers of a simpler model follow it.
 """
 
 import abc
@@ -43,17 +43,20 @@ from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.search_space import Space
 
-Gaps = Float[np.ndarray, "piece m"]
-Slopes = Float[np.ndarray, "piece m number"]
+Gaps = Float[np.ndarray, "segment m"]
+Slopes = Float[np.ndarray, "segment m number"]
 Fitted = TypeVar("Fitted", bound="PredictiveModel")
 
 
 @dataclass(frozen=True, eq=False)
 class PredictiveModel(abc.ABC):
-    """A fitted model with noise of its own, seen by the camera of its robot.
+    """A fitted model with noise of its own, and the camera of its robot.
 
-    Variances are of every noise component by name, and of what sessions share, where they do. The
-    covariance is of the model's numbers and the camera's.
+    Attributes:
+        robot: the fitted robot, for its camera and geometry.
+        variance: variance of every noise component by name, and of session effects where there are
+            any.
+        covariance: covariance of the model's numbers and the camera's.
     """
 
     robot: Robot
@@ -63,46 +66,54 @@ class PredictiveModel(abc.ABC):
     @property
     @abc.abstractmethod
     def name(self) -> str:
-        """Of the model."""
+        """Name of the model."""
 
     @property
     @abc.abstractmethod
     def numbers(self) -> dict[str, int]:
-        """How many were fitted: of every floor, and `shared` by all, the camera's not counted."""
+        """Count of fitted numbers by floor, and of those `shared` by all, except the camera's."""
 
     def log_variance(self, problem: Problem) -> Float[np.ndarray, " variance"]:
-        """Of every noise component of a problem."""
+        """Return the log variance of every noise component of a problem."""
         return np.log([self.variance[name] for name in problem.noise.names])
 
     @abc.abstractmethod
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
-        """Predicted less measured increments of every piece, and their slope."""
+        """Return predicted less measured increments of every segment, and their derivative."""
 
     @abc.abstractmethod
-    def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
-        """Tracks of whole runs, and the covariance of their ends, scale matrix of a Student t."""
+    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
+        """Return tracks of whole runs and the derivative of their ends (segment, 2, number)."""
 
-    def scale(self, problem: Problem) -> tuple[Gaps, Float[np.ndarray, "piece m m"]]:
-        """Gaps of every piece, and the scale matrix of their distribution."""
+    def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "segment 2 2"]]:
+        """Return tracks of whole runs and the scale matrix of their ends' Student t."""
+        tracks, slope = self.tracks_and_slopes(w)
+        numbers, effect = self._number_covariance(w, slope), self.effect_covariance(w)
+        return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, numbers)
+
+    def scale(self, problem: Problem) -> tuple[Gaps, Float[np.ndarray, "segment m m"]]:
+        """Return the residuals of every segment, and the scale matrix of their distribution."""
         gap, slope = self.linear(problem)
         noise = np.asarray(problem.covariance("motion", self.log_variance(problem)))
         e = effects(problem.windows, problem.robot)
         v = self.effect_covariance(problem.windows)
-        numbers = self.growth(problem.windows)[:, None, None] * parameter_covariance(
-            slope, self.covariance
-        )
+        numbers = self._number_covariance(problem.windows, slope)
         return gap, noise + np.einsum("nma,nab,nlb->nml", e, v, e) + numbers
 
-    def growth(self, w: Windows) -> Float[np.ndarray, " piece"]:
-        """Factor of the variances of numbers and shared effects, of runs it has not seen."""
+    def _number_covariance(self, w: Windows, slope: Slopes) -> Float[np.ndarray, "segment m m"]:
+        """Return the covariance due to the uncertain numbers, grown for new runs."""
+        return self.growth(w)[:, None, None] * parameter_covariance(slope, self.covariance)
+
+    def growth(self, w: Windows) -> Float[np.ndarray, " segment"]:
+        """Return the factor of the variances of numbers and shared effects for new runs."""
         return np.ones(len(w))
 
-    def effect_covariance(self, w: Windows) -> Float[np.ndarray, "piece 3 3"]:
-        """Of what a run shares with others, in a session that was not seen."""
+    def effect_covariance(self, w: Windows) -> Float[np.ndarray, "segment 3 3"]:
+        """Return the covariance of a run's shared effects in a session that was not fitted."""
         return by_axis(self.variance, "session", w)[:, :, None] * np.eye(len(AXES))
 
-    def log_density(self, problem: Problem) -> Float[np.ndarray, " piece"]:
-        """Log density of every piece's logged poses but the first, in logged units."""
+    def log_density(self, problem: Problem) -> Float[np.ndarray, " segment"]:
+        """Return the log density of every segment's logged poses but the first, in logged units."""
         return log_student(*self.scale(problem)) + np.asarray(
             _camera_log_jacobian(self.robot, problem.batch.pose)
         )
@@ -114,7 +125,7 @@ class PredictiveModel(abc.ABC):
         wide: np.ndarray,
         keep: np.ndarray,
     ) -> Fitted:
-        """The model with what runs of a session share in its variances and in its covariance."""
+        """Return the model with session effects in its variances and in its covariance."""
         model = LinearModel(
             *linear,
             covariance=self.covariance,
@@ -128,9 +139,9 @@ class PredictiveModel(abc.ABC):
 
 
 def log_student(
-    gap: Gaps, scale: Float[np.ndarray, "piece m m"] | Float[np.ndarray, "m m"]
-) -> Float[np.ndarray, " piece"]:
-    """Log density of a multivariate Student t around zero with `DEGREES` degrees of freedom.
+    gap: Gaps, scale: Float[np.ndarray, "segment m m"] | Float[np.ndarray, "m m"]
+) -> Float[np.ndarray, " segment"]:
+    """Return the log density of a multivariate Student t around zero, `DEGREES` degrees of freedom.
 
     Source: Kotz and Nadarajah 2004, Multivariate t Distributions, eq. 1.1.
     """
@@ -148,10 +159,14 @@ _camera_log_jacobian = jax.jit(lk.camera_log_jacobian)
 
 @dataclass(frozen=True, eq=False)
 class ForceBalance(PredictiveModel):
-    """The force balance where a fit has left it, at the search vector z.
+    """The fitted force balance, at the search vector z.
 
-    Variances of numbers and of shared effects are too small for runs it has not seen, by the factor
-    `extrapolation` of their floor and load.
+    Attributes:
+        space: free numbers and their prior.
+        z: search vector of the fit.
+        shared: effects that neighbouring runs share, by floor.
+        extrapolation: factor, by floor and load, of the variances of numbers and shared effects for
+            runs that were not fitted.
     """
 
     space: Space
@@ -165,7 +180,7 @@ class ForceBalance(PredictiveModel):
 
     @property
     def forecast(self) -> dict[str, float]:
-        """Variances of runs it has not seen, with the load of each floor that is the least sure."""
+        """Variances for runs that were not fitted, at each floor's least certain load set-up."""
         out = dict(self.variance)
         for name in out:
             kind, _, rest = name.partition(".")
@@ -176,14 +191,14 @@ class ForceBalance(PredictiveModel):
         return out
 
     def expected_effects(self, w: Windows) -> EffectForecast:
-        """What neighbours among the fitted runs tell of runs."""
+        """Return the effects of runs that are expected from their fitted neighbours."""
         return forecast_effects(self.shared, w, self.robot, self.space.size)
 
-    def effect_covariance(self, w: Windows) -> Float[np.ndarray, "piece 3 3"]:
+    def effect_covariance(self, w: Windows) -> Float[np.ndarray, "segment 3 3"]:
         shared = super().effect_covariance(w) + self.expected_effects(w).covariance
         return self.growth(w)[:, None, None] * shared
 
-    def growth(self, w: Windows) -> Float[np.ndarray, " piece"]:
+    def growth(self, w: Windows) -> Float[np.ndarray, " segment"]:
         return np.array([self.extrapolation.get(name, 1.0) for name in setups(w)])
 
     @property
@@ -202,51 +217,44 @@ class ForceBalance(PredictiveModel):
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
         electric = problem.electric(self.z, self.log_variance(problem))
         blocks, jac = problem.linear(self.z, electric)
-        told, e = self.expected_effects(problem.windows), effects(problem.windows, problem.robot)
-        gap = np.asarray(blocks["motion"]) - np.einsum("nma,na->nm", e, told.mean)
-        slope = np.asarray(jac["motion"]) - np.einsum("nma,nap->nmp", e, told.slope)
-        return gap, slope
+        gap, slope = self._correction(problem.windows)
+        return np.asarray(blocks["motion"]) - gap, np.asarray(jac["motion"]) - slope
+
+    def _correction(self, w: Windows) -> tuple[Gaps, Slopes]:
+        """Return the expected effects on increments, and their derivative; both are subtracted."""
+        expected, e = self.expected_effects(w), effects(w, self.robot)
+        mean = np.einsum("nma,na->nm", e, expected.mean)
+        return mean, np.einsum("nma,nap->nmp", e, expected.slope)
 
     def tracks(self, w: Windows) -> replay.Tracks:
-        """Of whole runs, as the force balance and what neighbours tell have them."""
-        return self._tracks(w, self._moved(w, self.expected_effects(w)))
+        """Return the tracks of whole runs by the force balance and the expected effects."""
+        increments = np.asarray(replay.contact_increments(self.robot, lk.batch(w, self.robot)))
+        mean = self._correction(w)[0].reshape(increments.shape)
+        return replay.tracks_from_increments(self.robot, w, increments - mean)
 
-    def _moved(self, w: Windows, told: EffectForecast) -> Float[np.ndarray, "piece window 3"]:
-        """By what neighbours tell that the force balance moves too far."""
-        moved = np.einsum("nma,na->nm", effects(w, self.robot), told.mean)
-        return moved.reshape(*w.dt.shape, 3)
-
-    def _tracks(self, w: Windows, moved: Float[np.ndarray, "piece window 3"]) -> replay.Tracks:
-        b = lk.batch(w, self.robot)
-        increments = np.asarray(replay.contact_increments(self.robot, b)) - moved
-        return replay.tracks_from_increments(self.robot, w, increments)
-
-    def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "piece 2 2"]]:
-        b, told, e = lk.batch(w, self.robot), self.expected_effects(w), effects(w, self.robot)
-        moved = self._moved(w, told)
-        tracks = self._tracks(w, moved)
-        by_number = np.einsum("nma,nap->nmp", e, told.slope).reshape(*moved.shape, -1)
-        more = replay.IncrementCorrection(jnp.asarray(moved), jnp.asarray(by_number))
-        start = tracks.predicted[:, 0]
-        jac = np.asarray(replay.end_jacobian(self.space, self.z, b, start, corrected=more))
-        own = np.einsum("nip,pq,njq->nij", jac, self.covariance, jac)
-        own *= self.growth(w)[:, None, None]
-        effect = self.effect_covariance(w)
-        return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, own)
+    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
+        tracks, (mean, slope) = self.tracks(w), self._correction(w)
+        shape = *w.dt.shape, 3
+        correction = replay.IncrementCorrection(
+            jnp.asarray(mean.reshape(shape)), jnp.asarray(slope.reshape(*shape, -1))
+        )
+        b, start = lk.batch(w, self.robot), tracks.predicted[:, 0]
+        by_z = replay.end_jacobian(self.space, self.z, b, start, corrected=correction)
+        return tracks, np.asarray(by_z)
 
 
 def force_balance_of(
-    problem: Problem, state: FitState, covariance: Square, keep: Float[np.ndarray, " piece"]
+    problem: Problem, state: FitState, covariance: Square, keep: Float[np.ndarray, " segment"]
 ) -> ForceBalance:
-    """The force balance at the end of a fit of the kept pieces, with what sessions share."""
+    """Return the force balance at the end of a fit of the kept segments, with shared effects."""
     robot, variance = problem.space.tree(state.z), by_name(problem, state.log_variance)
     z, log_v = np.asarray(state.z), np.asarray(state.log_variance)
     blocks, jacobian = problem.linear(z, problem.electric(z, log_v))
     motion = blocks["motion"], jacobian["motion"]
     w = problem.windows
     direction = TravelConditions.of(w, problem.robot).direction
-    courses = TravelDirections(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
-    grown = extrapolation(problem.objective, motion, keep[: len(w)], covariance, log_v, courses)
+    travelled = TravelDirections(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
+    grown = extrapolation(problem.objective, motion, keep[: len(w)], covariance, log_v, travelled)
     return ForceBalance(
         robot,
         variance,
@@ -259,20 +267,19 @@ def force_balance_of(
 
 
 def effect_tables(
-    problem: Problem, state: FitState, keep: Float[np.ndarray, " piece"]
+    problem: Problem, state: FitState, keep: Float[np.ndarray, " segment"]
 ) -> dict[str, EffectTable]:
-    """What neighbouring runs on every floor share, by a fit of the kept pieces."""
+    """Return the effects that neighbouring runs share on every floor, by a fit of some segments."""
     log_v, free = jnp.asarray(state.log_variance), problem.space.size
     residual, jacobian = problem.linear(state.z, problem.electric(state.z, log_v))
-    seen = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
-    white = jnp.einsum("nij,nj->ni", seen.whitening.root["motion"], residual["motion"])
+    weighed = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
+    white = jnp.einsum("nij,nj->ni", weighed.whitening.root["motion"], residual["motion"])
     half = whitened(problem.objective.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]
     expected = expected_posteriors(problem.objective, log_v, jnp.asarray(keep))
     std = np.exp(0.5 * np.asarray(log_v))
     out = {}
-    for floor, of, tie, to in zip(
-        problem.robot.surfaces.labels, problem.objective.shared, seen.effects, expected, strict=True
-    ):
+    floors, shared = problem.robot.surfaces.labels, problem.objective.shared
+    for floor, of, fitted, to in zip(floors, shared, weighed.effects, expected, strict=True):
         near = of.near.shape[-1]
         count = near + of.session.shape[1]
         inverse = np.linalg.inv(np.asarray(to.factor))
@@ -281,7 +288,7 @@ def effect_tables(
         out[floor] = EffectTable(
             speeds_and_loads=problem.speeds_and_loads[floor],
             std=std[np.asarray(of.numbers)[1]],
-            coefs=np.asarray(tie.coefs(white)).reshape(3, count)[:, :near],
+            coefs=np.asarray(fitted.coefs(white)).reshape(3, count)[:, :near],
             by_number=np.asarray(slope).reshape(3, count, free)[:, :near],
             covariance=covariance[:, :near, :, :near],
         )
@@ -289,7 +296,7 @@ def effect_tables(
 
 
 def parameter_covariance(jac: Slopes, cov: np.ndarray) -> np.ndarray:
-    """J C J^T of every piece, without the columns that are zero for it."""
+    """Return J C J^T of every segment, without the columns that are zero for it."""
     used = (jac != 0.0).any(axis=1)
     patterns, which = np.unique(used, axis=0, return_inverse=True)
     out = np.zeros((len(jac), jac.shape[1], jac.shape[1]))
@@ -301,10 +308,10 @@ def parameter_covariance(jac: Slopes, cov: np.ndarray) -> np.ndarray:
 
 
 def setups(w: Windows) -> list[str]:
-    """Floor and load of every piece, `floor@load`."""
+    """Return the floor and load of every segment, `floor@load`."""
     return [f"{floor}@{load}" for floor, load in zip(w.surface, w.load, strict=True)]
 
 
 def by_name(problem: Problem, log_v: Vector) -> dict[str, float]:
-    """Variances by the names of their components."""
+    """Return variances by the names of their components."""
     return dict(zip(problem.noise.names, np.exp(np.asarray(log_v)).tolist(), strict=True))

@@ -1,9 +1,8 @@
-"""Which model the left-out runs of a floor prefer, by how much, and whether they can tell.
+"""Ranking of slip models by held-out runs, and transfer of slip curves between floors.
 
-Does slip against current carry over to a floor it was not fitted on?
-
-One curve s = b0 + b1 |I| for all wheels, fitted to all floors but one and judged on that one,
-beside a constant fitted to the same floors and a curve fitted to the floor itself.
+The transfer asks whether slip against current carries over to a floor it was not fitted on: one
+curve s = b0 + b1 |I| for all wheels is fitted to all floors but one and judged on that one, beside
+a constant fitted to the same floors and a curve fitted to the floor itself.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,21 +29,29 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SURE, SMALL = 2.0, 4.0
-"""A difference counts from so many standard errors on, and so many nats over all runs together.
+"""Standard errors, and nats over all runs together, from which a difference counts.
 
-Below four nats models predict alike, and the standard error of their difference is not to be relied
-on: one with an idle number more loses a little in every run.
-Source: Sivula, Magnusson, Matamoros and Vehtari 2020, arXiv:2008.10296.
+Below four nats models predict alike, and the standard error of their difference is unreliable: a
+model with one idle number more loses a little in every run. Source: Sivula, Magnusson, Matamoros
+and Vehtari 2020, arXiv:2008.10296.
 """
 
 
 @dataclass(frozen=True)
 class RankedModel:
-    """A model on a floor: its score [nats per run], see `ranking`, and means over the runs.
+    """Score of a model on a floor, and its difference to the best model.
 
-    The difference is to the best, `se` over runs, `se_clustered` over sectors of headings as that
-    of the end-point error; the verdict is `best`, `tied` or `worse`. Coverages are shares of runs
-    that ended in the regions of this probability, the energy score is in m.
+    Attributes:
+        elpd: mean log predictive density [nats per run], see `ranking`.
+        difference: difference to the best model [nats per run].
+        se: standard error of the difference over runs.
+        se_clustered: standard error of the difference over sectors of headings.
+        verdict: `best`, `tied` or `worse`.
+        endpoint_error: mean end-point error.
+        endpoint_error_se: its standard error over sectors of headings.
+        energy_score: mean energy score [m].
+        coverage50, coverage90: share of runs that ended in the region of this probability.
+        heading_error_median_deg: median heading error [deg].
     """
 
     elpd: float
@@ -62,10 +69,15 @@ class RankedModel:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The models on a floor, the best of them, and what a reader should take home.
+    """Ranking of the models on a floor.
 
-    Clusters are sectors of headings, bands the shares of runs in regions that honest forecasts
-    have, see `_band`.
+    Attributes:
+        runs: number of runs.
+        clusters: number of sectors of headings.
+        best: name of the best model.
+        sentence: summary for a reader.
+        band50, band90: range of coverages that calibrated forecasts have, see `_band`.
+        models: every model by name.
     """
 
     runs: int
@@ -78,11 +90,11 @@ class Ranking:
 
 
 def ranking(runs: Sequence[ScoredRun]) -> dict[str, Ranking]:
-    """Every floor: every model's score, its distance to the best, and who cannot be told from it.
+    """Return, for every floor, the models' scores, differences to the best and verdicts.
 
     The score is the expected log predictive density of a run's logged poses [nats per run], every
-    run predicted by a fit that has not seen it. A model is tied with the best where the difference
-    is less than `SURE` clustered standard errors or, over all runs, less than `SMALL` nats.
+    run predicted by a fit without it. A model is tied with the best where the difference is less
+    than `SURE` clustered standard errors or, over all runs, less than `SMALL` nats.
     """
     return {floor: _floor(floor, mine) for floor, mine in by_floor(runs).items()}
 
@@ -107,7 +119,7 @@ def _floor(floor: str, runs: Sequence[ScoredRun]) -> Ranking:
 def _ranked(
     scores: Sequence[Score], behind: np.ndarray, is_best: bool, cluster: np.ndarray
 ) -> RankedModel:
-    """A model whose runs have these log densities less the best model's."""
+    """Return a model with these differences of log densities to the best model's."""
     difference, se, clustered = mean_error(behind, cluster)
     far, _, far_se = mean_error(np.array([s.endpoint_error for s in scores]), cluster)
     level = np.array([s.level for s in scores], float)
@@ -128,7 +140,7 @@ def _ranked(
 
 
 def _band(runs: int, share: float) -> tuple[float, float]:
-    """Shares of runs in regions of this probability that 99 % of honest forecasts would have."""
+    """Return the range of coverages that 99 % of calibrated forecasts of so many runs have."""
     low, high = (float(binom.ppf(q, runs, share)) / runs for q in (0.005, 0.995))
     return low, high
 
@@ -159,11 +171,11 @@ def _name(model: str) -> str:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Which slip model each floor prefers; `print` says so in a sentence per floor.
+    """Ranking of slip models on each floor; `print` shows a sentence per floor.
 
     Attributes:
-        floors: by name; each has its `best` model, and every model's score and verdict.
-        question: what was left out together.
+        floors: ranking by floor.
+        question: which runs were held out together.
     """
 
     floors: dict[str, Ranking]
@@ -173,7 +185,7 @@ class Comparison:
         return "\n".join(floor.sentence for floor in self.floors.values())
 
     def plot(self) -> "Figure":
-        """Every model's distance to the best one, and its end-point error."""
+        """Plot every model's difference to the best one, and its end-point error."""
         from slipid.plots.compare import SHOWN, compare_figure
 
         floors = {name: asdict(floor) for name, floor in self.floors.items()}
@@ -188,7 +200,7 @@ def compared(
     parts: int,
     quiet: bool = False,
 ) -> Comparison:
-    """Every slip model judged fold by fold; `problem` is of all runs and the choices.
+    """Return the comparison of every slip model, fold by fold, for a problem of all runs.
 
     The other arguments and errors are those of `Fit.compare`.
     """
@@ -204,7 +216,7 @@ def compared(
 
 
 LEAST = 0.2
-"""A wheel counts in a window where it turns at least this part of the fastest one."""
+"""Speed of a wheel over the fastest one's from which it counts in a window."""
 VARIANTS: dict[str, tuple[float, bool, bool]] = {
     "all": (LEAST, False, False),
     "slower wheels too": (0.1, False, False),
@@ -212,16 +224,18 @@ VARIANTS: dict[str, tuple[float, bool, bool]] = {
     "as built only": (LEAST, True, False),
     "0 < s <= 1, I > 0.25 A only": (LEAST, False, True),
 }
-"""What may be chosen otherwise: least speed of a wheel, one load set-up, the 2021 paper's filter
-(which cuts the response off and so flatters what it leaves)."""
+"""Alternative choices: least speed of a wheel, one load set-up, the 2021 paper's filter.
+
+The filter truncates the response and so underestimates the remaining errors.
+"""
 
 
 def transfer(w: Windows, robot: Robot) -> dict[str, Content]:
-    """Leave-one-surface-out errors of slip, per variant of what counts as a row; none of one floor.
+    """Return leave-one-surface-out errors of slip, per variant of the rows; empty for one floor.
 
-    Root mean squares over all `rows`, mean of `floors`, and of `each`, of what is left of slip by
-    the curve of the other floors (`pooled`), by their mean slip (`constant`), and by the floor's
-    own curve (`per_surface`); `count` is of rows.
+    They are root mean squares over all `rows`, means over `floors`, and of `each` floor, of the
+    slip that remains after the curve of the other floors (`pooled`), their mean slip (`constant`),
+    and the floor's own curve (`per_surface`); `count` is the number of rows.
 
     A row is one wheel in one window: s = 1 - J xi / (r w), xi the body twist from the camera in
     corrected metres, I the mean magnitude of the wheel's current.
@@ -248,7 +262,7 @@ def transfer(w: Windows, robot: Robot) -> dict[str, Content]:
 
 
 def errors_by_floor(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Content:
-    """Errors of rows of slip and current [A] on floors by name, see `transfer`."""
+    """Return the errors of rows of slip and current [A] on named floors, see `transfer`."""
     pooled, constant, own = {}, {}, {}
     line = np.stack([np.ones_like(amps), amps], axis=-1)
     for name in sorted(set(floor.tolist())):

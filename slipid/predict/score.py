@@ -1,4 +1,4 @@
-"""How good predictions of runs are: the one scorer of every slip model."""
+"""Scores of predicted runs, the same for every slip model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,19 +10,29 @@ from scipy.stats import f as fisher
 from slipid.fit.variances import DEGREES
 
 CLUSTER_DEG = 30.0
-"""Neighbouring headings share their errors (they are correlated by a half at 5 degrees, by nothing
-at 30): runs of one such sector are one observation of the clustered standard error."""
+"""Width of a sector of headings that counts as one observation of a clustered standard error.
+
+Runs of neighbouring headings share their errors: their correlation is a half at 5 degrees and none
+at 30.
+"""
 
 
 @dataclass(frozen=True)
 class Score:
     """Errors of a model's prediction of a run.
 
-    The pose at the end is x, y [m] and yaw [rad]; the end-point error is over the chord, and over
-    the path, which means something on closed paths, too; the length error is relative; the heading
-    error is at most 180 degrees. `level` is the probability of the region whose edge the end lies
-    on, `covered90` whether that is at most 0.9, both None for a model without. The energy score is
-    in m, the log density of the logged poses in nats, None where it was not asked for.
+    Attributes:
+        predicted_end: predicted pose at the end, x, y [m] and yaw [rad].
+        endpoint_error: distance of the ends over the chord.
+        endpoint_error_over_path: distance of the ends over the path, which is meaningful on closed
+            paths, too.
+        length_error: relative error of the chord.
+        heading_error_deg: error of the final heading, at most 180 [deg].
+        level: probability of the region whose edge the end lies on, None for a model without
+            regions.
+        covered90: whether the level is at most 0.9, None for a model without regions.
+        energy_score: energy score [m].
+        log_density: log density of the logged poses [nats], None where it was not computed.
     """
 
     predicted_end: Sequence[float]
@@ -42,11 +52,11 @@ def scores(
     cov: Float[np.ndarray, "run 2 2"] | None,
     freedom: float = DEGREES,
 ) -> list[Score]:
-    """Scores of predicted paths from the measured start on, one by one.
+    """Return the scores of predicted paths from the measured start on, one by one.
 
     Args:
         predicted, measured: poses x, y [m] and yaw [rad] in one frame.
-        cov: scale matrices of the ends' Student t, None for a model without [m^2].
+        cov: scale matrices of the ends' Student t [m^2], None for a model without.
         freedom: its degrees of freedom, infinite for a Gaussian.
     """
     gap = predicted[:, -1] - measured[:, -1]
@@ -58,27 +68,25 @@ def scores(
         Score(
             predicted_end=predicted[n, -1].tolist(),
             endpoint_error=float(off[n]) / max(whole[n], 1e-9),
-            endpoint_error_over_path=float(off[n]) / max(way, 1e-9),
+            endpoint_error_over_path=float(off[n]) / max(length, 1e-9),
             length_error=abs(ahead[n] / max(whole[n], 1e-9) - 1.0),
             heading_error_deg=float(turn[n]),
             level=None if level is None else float(level[n]),
             covered90=None if level is None else bool(level[n] <= 0.9),
             energy_score=float(energy[n]),
         )
-        for n, way in enumerate(lengths(measured))
+        for n, length in enumerate(lengths(measured))
     ]
 
 
 def chords(path: Float[np.ndarray, "run edge 3"]) -> list[float]:
-    """Straight-line displacement of every path [m]."""
-    moved: list[float] = np.linalg.norm((path[:, -1] - path[:, 0])[:, :2], axis=1).tolist()
-    return moved
+    """Return the straight-line displacement of every path [m]."""
+    return list(np.linalg.norm((path[:, -1] - path[:, 0])[:, :2], axis=1).tolist())
 
 
 def lengths(path: Float[np.ndarray, "run edge 3"]) -> list[float]:
-    """Length of every path, step by step [m]."""
-    moved: list[float] = np.linalg.norm(np.diff(path[..., :2], axis=1), axis=2).sum(axis=1).tolist()
-    return moved
+    """Return the length of every path, step by step [m]."""
+    return list(np.linalg.norm(np.diff(path[..., :2], axis=1), axis=2).sum(axis=1).tolist())
 
 
 def forecast(
@@ -86,12 +94,11 @@ def forecast(
     cov: Float[np.ndarray, "run 2 2"] | None,
     freedom: float = DEGREES,
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """Probability of the region whose edge each end lies on, and the energy score of each [m].
+    """Return the probability of the region whose edge each end lies on, and its energy score [m].
 
-    An end lies in the 90 % region where the first is at most 0.9. The predictive distribution is a
-    Student t with so many degrees of freedom; without one (None) the energy score is the distance
-    itself, as for a point forecast.
-    Source: Gneiting and Raftery 2007, JASA 102, eq. 22.
+    An end lies in the 90 % region where the probability is at most 0.9. The predictive distribution
+    is a Student t with so many degrees of freedom; without one (None) the energy score is the
+    distance itself, as for a point forecast. Source: Gneiting and Raftery 2007, JASA 102, eq. 22.
     """
     if cov is None:
         return None, np.linalg.norm(gap, axis=1)
@@ -110,7 +117,10 @@ def forecast(
 
 
 def clusters(heading_deg: Sequence[float | None]) -> Int[np.ndarray, " run"]:
-    """Sector of heading of each run; a run without heading is by itself, with a negative number."""
+    """Return the sector of heading of each run; a run without heading is a sector of its own.
+
+    Such sectors have negative numbers.
+    """
     return np.array(
         [
             -1 - k if h is None or not np.isfinite(h) else int((h % 360.0 + 1e-6) // CLUSTER_DEG)
@@ -122,7 +132,7 @@ def clusters(heading_deg: Sequence[float | None]) -> Int[np.ndarray, " run"]:
 def mean_error(
     value: Float[np.ndarray, " run"], cluster: Int[np.ndarray, " run"]
 ) -> tuple[float, float, float]:
-    """Mean, its standard error over runs, and that over clusters of runs.
+    """Return the mean, its standard error over runs, and that over clusters of runs.
 
         se^2 = G / (G - 1) sum_g (sum_{i in g} (x_i - mean))^2 / n^2
 
@@ -141,11 +151,11 @@ def mean_error(
 
 
 def main_load(loads: Sequence[str]) -> str:
-    """The set-up as built, else the most common."""
+    """Return the set-up as built if it occurs, else the most common one."""
     return "as_built" if "as_built" in loads else max(sorted(set(loads)), key=loads.count)
 
 
 def setups(floors: Sequence[str], loads: Sequence[str]) -> list[str]:
-    """Floor of each run, `floor@load` where its load set-up is not the main one."""
+    """Return the floor of each run, `floor@load` where its load set-up is not the main one."""
     main = main_load(loads)
     return [f if load == main else f"{f}@{load}" for f, load in zip(floors, loads, strict=True)]

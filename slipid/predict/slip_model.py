@@ -1,6 +1,4 @@
-"""Motion of the body and of the marker that a camera sees: increments, twists, turned vectors.
-
-The interface of every slip model, ours and published ones, and the runs that it predicts.
+"""Slip models: the common interface of all of them, and the runs that they predict.
 
 A slip model is fitted to runs with poses, and then predicts runs from what the robot itself
 measures: wheels, currents, commands, perhaps a gyro. All are given the same steps of the same runs.
@@ -21,19 +19,19 @@ from slipid.fit.likelihood import marker_increments, measured_increments
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 
-Increments = Float[np.ndarray, "piece window 3"]
+Increments = Float[np.ndarray, "segment window 3"]
 _marker_increments = jax.jit(marker_increments)
 _measured_increments = jax.jit(measured_increments)
 
 
 def as_increments(twist: np.ndarray, w: Windows, robot: Robot) -> Increments:
-    """Marker increments [m, m, rad] of body twists (piece, window, 3)."""
+    """Return marker increments [m, m, rad] of body twists (segment, window, 3)."""
     session = jnp.asarray([robot.session_index(s) for s in w.session])
     return np.asarray(_marker_increments(robot, jnp.asarray(twist), jnp.asarray(w.dt), session))
 
 
 def body_twist(w: Windows, robot: Robot) -> np.ndarray:
-    """Measured body twist of every window: yaw and place of the marker taken out, over dt."""
+    """Return the measured body twist of every window, without yaw and position of the marker."""
     moved = np.asarray(_measured_increments(robot, jnp.asarray(w.pose)))
     yaw = moved[..., 2]
     yaws = {s: float(robot.camera.yaw(robot.session_index(s))) for s in set(w.session)}
@@ -47,46 +45,46 @@ def body_twist(w: Windows, robot: Robot) -> np.ndarray:
 
 
 def turned(angle: np.ndarray | float, v: np.ndarray) -> np.ndarray:
-    """Plane vectors (..., 2), each turned by its angle (...)."""
+    """Return plane vectors (..., 2), each turned by its angle (...)."""
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], -1)
 
 
 def turned_left(v: np.ndarray) -> np.ndarray:
-    """Plane vectors (..., 2), each turned by a quarter to the left."""
+    """Return plane vectors (..., 2), each turned by a quarter to the left."""
     return np.stack([-v[..., 1], v[..., 0]], -1)
 
 
 Channel = Literal["current", "gyro", "command", "twist"]
-"""What a method may need beside the encoders. `twist`: wheels that determine the body's twist."""
+"""Input a model may need beside the encoders; `twist`: wheels that determine the body's twist."""
 Aim = Literal["end", "energy"]
-"""What a method predicts of a run: where it ends, or how much electric energy it takes."""
+"""Prediction of a model for a run: its end, or its electric energy."""
 Numbers = Float[np.ndarray, " step"]
 Twists = Float[np.ndarray, "step 3"]
 """Body twist of each step: ahead [m/s], to the left [m/s], yaw [rad/s]."""
 TRIES = 4
-"""Settings that a method may try in its inner cross-validation, the same for all of them."""
+"""Number of settings that a model may try in its inner cross-validation, the same for all."""
 WINDOW_S = 0.5
-"""Length of the windows that methods are trained on and that twists are judged on [s]."""
+"""Length of the windows on which models are trained and twists are judged [s]."""
 FEWEST = 5
-"""Runs on a floor, or with a load, below which a method takes its fit to all runs for them."""
+"""Runs on a floor, or with a load, below which a model uses its fit to all runs for them."""
 SHAFT_W0 = 3.0
-"""Shaft speed below which the torque of a current is not known by its power [rad/s]."""
+"""Shaft speed below which a current's power does not determine its torque [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class RobotSpec:
-    """What is known of a robot before anything is fitted.
+    """Properties of a robot that are known before anything is fitted.
 
     A drive is a motor with all the wheels that it turns: one wheel, or a side of a skid steer.
 
     Attributes:
         forward: rim speed of each drive [m/s] from the body twist.
-        back: body twist from the drives' rim speeds, by least squares, if nothing slips.
-        wheel_radius, base_radius: [m].
+        back: body twist from the drives' rim speeds if nothing slips, by least squares.
+        wheel_radius, base_radius: radii [m].
         gear_ratio: motor turns per wheel turn.
-        resistance, back_emf: of the motor by its datasheet [ohm], [V s/rad].
-        mass: of the robot [kg].
+        resistance, back_emf: constants of the motor by its datasheet [ohm], [V s/rad].
+        mass: mass of the robot [kg].
         determines_twist: whether the drives determine the body's twist; a skid steer's do not.
     """
 
@@ -102,7 +100,7 @@ class RobotSpec:
 
     @classmethod
     def of(cls, robot: Robot) -> "RobotSpec":
-        """Of a robot as its config has it."""
+        """Return the properties of a robot as in its config."""
         shape, motor = robot.geometry, robot.motor
         back = np.asarray(shape.pseudo_inverse())
         return cls(
@@ -118,7 +116,7 @@ class RobotSpec:
         )
 
     def of_shape(self, shape: Geometry) -> "RobotSpec":
-        """The same robot whose encoders are read with other sizes of its wheels and places."""
+        """Return the same robot with other wheel sizes and positions for reading encoders."""
         back = np.asarray(shape.pseudo_inverse())
         return replace(self, back=back, wheel_radius=float(shape.wheel_radius))
 
@@ -130,17 +128,17 @@ class RobotSpec:
 
 @dataclass(frozen=True, eq=False)
 class RunSignals:
-    """What the robot measures of a run, in steps of a tenth to half a second.
+    """Measurements of a robot during a run, in steps of a tenth to half a second.
 
     Attributes:
-        name: of the run.
+        name: name of the run.
         dt: length of each step [s].
         turn: rotation of each drive's wheels in the step [rad].
         current: mean current of each motor [A], signed along its wheel's forward direction where
             `current_is_signed`, else its magnitude; None where it was not logged.
         gyro: mean yaw rate [rad/s], or None.
-        command: twist that was commanded, or None.
-        floor: name of the floor; None where a model has to find out.
+        command: commanded twist, or None.
+        floor: name of the floor; None where a model has to infer it.
         load: name of the load set-up, which a robot knows.
     """
 
@@ -163,34 +161,34 @@ class RunSignals:
         return self.turn / self.dt[:, None]
 
     def rolling(self, spec: RobotSpec) -> Twists:
-        """Body twist if nothing slips: what encoders alone say."""
+        """Return the body twist if nothing slips, by the encoders alone."""
         return np.asarray(self.speed * spec.wheel_radius @ spec.back.T)
 
     def along(self, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
-        """Current along the wheel's motion [A]: positive where the motor drives.
+        """Return the current along the wheel's motion [A]: positive where the motor drives.
 
-        Of an unsigned ammeter it is the magnitude, as if the motor always drove.
+        For an unsigned ammeter it is the magnitude, as if the motor always drove.
 
         Raises:
             ValueError: no current was logged.
         """
         if self.current is None:
             raise ValueError(f"{self.name}: no current; this method needs one")
-        way = np.sign(self.speed)
-        return np.asarray(self.current * way if self.current_is_signed else self.current)
+        signed = self.current_is_signed
+        return np.asarray(self.current * np.sign(self.speed) if signed else self.current)
 
     def torque(self, spec: RobotSpec, rest: float = SHAFT_W0) -> Float[np.ndarray, "step drive"]:
-        """M = C_e I + R I^2 w / (w^2 + w0^2) [N m], w the shaft's speed and w0 that at `rest`.
+        """Return M = C_e I + R I^2 w / (w^2 + w0^2) [N m], w the shaft's speed and w0 `rest`.
 
         The 2021 paper's torque characterising variable M = U I / w, with U = C_e w + R I, regular
-        at rest. Positive where the motor drives.
+        at rest. It is positive where the motor drives.
         """
         amps, shaft = self.along(spec), np.abs(spec.gear_ratio * self.speed)
         heat = spec.resistance * amps**2 * shaft / (shaft**2 + rest**2)
         return np.asarray(spec.back_emf * amps + heat)
 
     def power(self, spec: RobotSpec) -> Numbers:
-        """Electric power of all motors [W], by the currents and the motor's datasheet.
+        """Return the electric power of all motors [W], by the currents and the motor's datasheet.
 
         P = sum_i (R I_i + C_e |w_i|) I_i
         """
@@ -198,7 +196,7 @@ class RunSignals:
         return np.asarray(((spec.resistance * amps + spec.back_emf * shaft) * amps).sum(1))
 
     def windowed(self, seconds: float = WINDOW_S) -> "RunSignals":
-        """The same run in longer steps: neighbours joined until they are about so long."""
+        """Return the same run in longer steps: neighbours joined to about that length."""
         first = groups(self.dt, seconds)
         dt = np.add.reduceat(self.dt, first)
 
@@ -220,15 +218,15 @@ class RunSignals:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run with the pose of its body, for training and for the judge.
+    """A run with the pose of its body, for training and judgement.
 
     Attributes:
-        signals: what the robot measured; its `floor` is None where models do not know it.
+        signals: measurements of the robot; their `floor` is None where models do not know it.
         pose: x, y [m] and heading [rad] of the body at the edges of the steps, in true metres.
         floor: name of the floor it was driven on.
         load: name of the load set-up.
-        heading: direction of travel commanded [rad], nan where there is none.
-        speed: commanded [m/s], nan where none was logged.
+        heading: commanded direction of travel [rad], nan where there is none.
+        speed: commanded speed [m/s], nan where none was logged.
     """
 
     signals: RunSignals
@@ -240,16 +238,16 @@ class Run:
 
     @property
     def twist(self) -> Twists:
-        """Body twist of every step by the pose: constant over a step, exact on SE(2)."""
+        """Body twist of every step by the poses: constant over a step, exact on SE(2)."""
         return body_increments(self.pose) / self.signals.dt[:, None]
 
     def windowed(self, seconds: float = WINDOW_S) -> "Run":
-        """The same run in longer steps."""
+        """Return the same run in longer steps."""
         edges = np.append(groups(self.signals.dt, seconds), len(self.signals))
         return replace(self, signals=self.signals.windowed(seconds), pose=self.pose[edges])
 
     def with_floor(self, floor: bool) -> "Run":
-        """The same run, its floor known to models or not."""
+        """Return the same run, its floor known to models or not."""
         return replace(self, signals=replace(self.signals, floor=self.floor if floor else None))
 
 
@@ -258,17 +256,17 @@ class PredictedRun:
     """Prediction of a run by a slip model.
 
     Attributes:
-        path: pose at every edge of the steps, seen from the pose at the start [m, m, rad].
-        end_covariance: of the place at the end, seen from the start [m^2]; None of a method that
-            knows no uncertainty.
-        freedom: degrees of freedom of the Student t that it is the scale matrix of; infinite where
-            it is the covariance of a Gaussian.
-        slipping: how sure it is that the robot slips in a step; any rising scale. None where that
-            is to be taken from how far its twist is from that of the encoders.
-        floors: probability of each floor in every step, by name; None of a method that does not
-            tell floors.
+        path: pose at every edge of the steps, relative to the pose at the start [m, m, rad].
+        end_covariance: covariance of the end position, relative to the start [m^2]; None for a
+            model without uncertainty.
+        freedom: degrees of freedom of the Student t whose scale matrix it is; infinite for a
+            Gaussian's covariance.
+        slipping: confidence that the robot slips in a step, on any rising scale; None to derive it
+            from the difference of twist and encoders.
+        floors: probability of each floor in every step, by name; None for a model that does not
+            infer floors.
         power: electric power of all motors in every step [W], predicted without the currents; None
-            of a method that does not predict it.
+            for a model that does not predict it.
     """
 
     path: Float[np.ndarray, "edge 3"]
@@ -281,12 +279,12 @@ class PredictedRun:
 
 @dataclass(frozen=True)
 class SlipModel(abc.ABC):
-    """Anything that predicts the motion of the body from wheels, before or after it is fitted.
+    """A model that predicts the motion of the body from wheels, before or after it is fitted.
 
     Attributes:
-        name: of its row.
+        name: name of its row.
         needs: channels without which it does not run.
-        aim: what it predicts, by which its settings are picked.
+        aim: what it predicts, by which its settings are selected.
     """
 
     name: str
@@ -294,34 +292,34 @@ class SlipModel(abc.ABC):
     aim: Aim = field(default="end", kw_only=True)
 
     def candidates(self) -> Sequence["SlipModel"]:
-        """Itself with other settings, at most `TRIES`, from which cross-validation picks one."""
+        """Return the model with other settings, at most `TRIES`, for cross-validation."""
         return (self,)
 
     @abc.abstractmethod
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> Self:
-        """The method fitted to runs."""
+        """Return the model fitted to runs."""
 
     @abc.abstractmethod
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
-        """Predictions of runs the model has not seen, from the signals alone."""
+        """Return predictions of runs the model was not fitted to, from the signals alone."""
 
     @property
     @abc.abstractmethod
     def numbers(self) -> int:
-        """How many numbers were fitted."""
+        """Count of fitted numbers."""
 
 
 @dataclass(frozen=True)
 class ByFloor(SlipModel):
-    """A slip model fitted floor by floor where floors are known, else load set-up by load set-up.
+    """A slip model fitted by floor where floors are known, else by load set-up.
 
-    Groups of fewer than `FEWEST` runs have the fit to all runs.
+    Groups of fewer than `FEWEST` runs use the fit to all runs.
 
     Attributes:
-        method: unfitted.
-        pooled: whether it takes no notice of floors and loads, and is fitted once to all runs.
-        fitted: to the runs of each group, by its name, the largest group first; under None to all
-            runs.
+        method: the model, not fitted.
+        pooled: whether it ignores floors and loads, and is fitted once to all runs.
+        fitted: the model fitted to the runs of each group, by name, the largest group first; under
+            None to all runs.
     """
 
     method: SlipModel
@@ -356,7 +354,7 @@ class ByFloor(SlipModel):
         return [found[k] for k in range(len(runs))]
 
     def _fitted_group(self, signals: RunSignals) -> str | None:
-        """The group of a run; a load set-up that no training run had is taken for the usual one."""
+        """Return the group of a run; the usual one for a load set-up that no training run had."""
         group = self.group_of(signals)
         if group not in self.fitted:
             if signals.floor is not None:
@@ -366,7 +364,7 @@ class ByFloor(SlipModel):
         return group
 
     def group_of(self, signals: RunSignals) -> str | None:
-        """Name of the runs that this one is fitted with: its floor where known, or its load."""
+        """Return the group a run is fitted with: its floor where known, else its load set-up."""
         if self.pooled:
             return None
         return signals.load if signals.floor is None else signals.floor
@@ -377,14 +375,14 @@ class ByFloor(SlipModel):
 
 
 def groups(dt: Float[np.ndarray, " step"], seconds: float) -> np.ndarray:
-    """First step of every group of neighbours that together are about so long [s]."""
+    """Return the first step of every group of neighbours that together last about so long [s]."""
     count = max(1, round(float(dt.sum()) / seconds))
     number = np.minimum((np.cumsum(dt) - 0.5 * dt) / dt.sum() * count, count - 1).astype(int)
     return np.flatnonzero(np.diff(number, prepend=-1))
 
 
 def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, "edge 3"]:
-    """Poses from the origin on, of a body that keeps its twist over each step; exact on SE(2)."""
+    """Return poses from the origin on for a twist constant over each step (exact SE(2))."""
     heading = np.concatenate([[0.0], np.cumsum(twist[:, 2] * dt)])
     middle = 0.5 * (heading[1:] + heading[:-1])
     # a chord is the arc times sinc, and points half the turn away from its start
@@ -395,13 +393,13 @@ def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, 
 
 
 def relative_to_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "edge 3"]:
-    """Poses as they are seen from the first of them."""
-    moved = path - path[0]
-    return np.column_stack([turned(-path[0, 2], moved[:, :2]), moved[:, 2]])
+    """Return poses relative to the first of them."""
+    offset = path - path[0]
+    return np.column_stack([turned(-path[0, 2], offset[:, :2]), offset[:, 2]])
 
 
 def body_increments(pose: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "step 3"]:
-    """Logarithm on SE(2) of each step of a path: twist times time [m, m, rad]."""
+    """Return the logarithm on SE(2) of each step of a path: twist times time [m, m, rad]."""
     turn = np.diff(pose[:, 2])
     middle = 0.5 * (pose[1:, 2] + pose[:-1, 2])
     arc = turned(-middle, np.diff(pose[:, :2], axis=0)) / np.sinc(turn / (2 * np.pi))[:, None]

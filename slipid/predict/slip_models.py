@@ -1,6 +1,6 @@
-"""Slip models with numbers of their own for every floor, on the windows of a fitted robot.
+"""Slip models that are compared with the force balance, fitted floor by floor.
 
-The slip models below the force balance that a fit is compared with, and back from files.
+`slip_models` lists them, `restored` builds them again from files.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,11 +19,14 @@ from slipid.predict.steps import Steps, TrainingWindows, TwistModel
 
 @dataclass(frozen=True)
 class FloorModels:
-    """A slip model that turns wheel motion into marker increments, in corrected metres.
+    """A slip model fitted separately for every floor.
+
+    It predicts marker increments in corrected metres.
 
     Attributes:
-        model: unfitted.
-        fitted: to the windows of each floor, or of each `floor@load` where the model asks for it.
+        model: the slip model, not fitted.
+        fitted: the model fitted to the windows of each floor, or of each `floor@load` where the
+            model needs it.
     """
 
     model: TwistModel
@@ -40,14 +43,14 @@ class FloorModels:
         return {key: m.coefficients for key, m in self.fitted.items() if m.coefficients is not None}
 
     def with_state(self, state: Mapping[str, np.ndarray]) -> "FloorModels":
-        """The models with these numbers."""
+        """Return the models with these numbers."""
         models = {
             k: replace(self.fitted.get(k, self.model), coefficients=v) for k, v in state.items()
         }
         return replace(self, fitted=models)
 
     def fit(self, w: Windows, robot: Robot) -> "FloorModels":
-        """The model fitted to these windows, floor by floor."""
+        """Return the model fitted to these windows, floor by floor."""
         if not self.model.learns:
             return self
         spec = RobotSpec.of(robot)
@@ -56,9 +59,9 @@ class FloorModels:
         return replace(self, fitted=fitted)
 
     def twist(self, w: Windows, robot: Robot) -> np.ndarray:
-        """Body twist of every window (piece, window, 3) [m/s, m/s, rad/s]."""
+        """Return the body twist of every window (segment, window, 3) [m/s, m/s, rad/s]."""
         spec, out = RobotSpec.of(robot), np.empty((*w.dt.shape, 3))
-        keys = np.array([self.series(s, load) for s, load in zip(w.surface, w.load, strict=True)])
+        keys = np.array([self.key_of(s, load) for s, load in zip(w.surface, w.load, strict=True)])
         for key in dict.fromkeys(keys.tolist()):
             mine = keys == key
             steps = steps_of(w.segments(np.flatnonzero(mine)))
@@ -67,11 +70,11 @@ class FloorModels:
         return out
 
     def increments(self, w: Windows, robot: Robot) -> Increments:
-        """Marker increments of every window [m, m, rad]."""
+        """Return the marker increments of every window [m, m, rad]."""
         return as_increments(self.twist(w, robot), w, robot)
 
-    def series(self, surface: str, load: str) -> str:
-        """Key of the model of a floor and load set-up.
+    def key_of(self, surface: str, load: str) -> str:
+        """Return the key of the model of a floor and load set-up.
 
         A load set-up that was not fitted takes the one the floor was first driven with.
 
@@ -88,7 +91,7 @@ class FloorModels:
         return floors[surface]
 
     def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
-        """Precision of each key's flat numbers by what holds them besides the data."""
+        """Return the precision of each key's flat numbers that comes from anything but the data."""
         spec, parts = RobotSpec.of(robot), self._parts(w)
         return {
             key: model.stiffness(training_windows(parts[key], robot), spec)
@@ -96,14 +99,14 @@ class FloorModels:
         }
 
     def _parts(self, w: Windows) -> dict[str, Windows]:
-        """Windows by the key of the model that is fitted to them."""
+        """Return the windows by the key of the model that is fitted to them."""
         setups = [f"{s}@{load}" for s, load in zip(w.surface, w.load, strict=True)]
         keys = np.array(setups if self.model.by_load else w.surface)
         return {k: w.segments(np.flatnonzero(keys == k)) for k in dict.fromkeys(keys.tolist())}
 
 
 def steps_of(w: Windows) -> Steps:
-    """The windows as steps, each piece a run of its own; of currents their magnitudes."""
+    """Return the windows as steps, each segment a run; currents are magnitudes."""
     drives = w.turn.shape[-1]
     signals = RunSignals(
         name="windows",
@@ -116,13 +119,13 @@ def steps_of(w: Windows) -> Steps:
 
 
 def training_windows(w: Windows, robot: Robot) -> TrainingWindows:
-    """The windows with the body twists that were measured in them, each a step."""
+    """Return the windows with the body twists measured in them, each window a step."""
     twist, run = body_twist(w, robot).reshape(-1, 3), np.repeat(w.run, w.dt.shape[1])
     return TrainingWindows(steps_of(w), np.arange(w.dt.size), w.dt.ravel(), twist, run)
 
 
 KNOTS = (0.0, 0.02, 0.04, 0.06, 0.1, 0.15, 0.25)
-"""Of the monotone spline [N m]."""
+"""Knots of the monotone spline [N m]."""
 PAPER_THRESHOLD = 0.4
 """Current above which the 2021 paper's deployed form corrects [A]."""
 
@@ -130,11 +133,11 @@ PAPER_THRESHOLD = 0.4
 def slip_models(
     shape: Geometry, has_current: bool, together: Together | None = None
 ) -> list[FloorModels]:
-    """Every slip model the logs allow, unfitted; `paper` is the form the authors ran on the robot.
+    """Return every slip model the logs allow, not fitted; `paper` is the form the authors ran.
 
-    The shape is the robot's as its config has it: wheels that do not determine the twist have
-    models of their own. The threshold of `paper` and the spline's knots are for motors of that
-    size. Runs that will be left out `together` are so, too, where a model tunes itself.
+    The shape is the robot's as in its config: wheels that do not determine the twist have models of
+    their own. The threshold of `paper` and the spline's knots are for motors of that size. Runs
+    held out `together` are also held out together where a model tunes itself.
     """
     models: list[TwistModel] = [nominal(shape), Encoder()]
     if shape.determines_twist:
@@ -145,7 +148,7 @@ def slip_models(
 
 
 def _of_wheels(has_current: bool, together: Together | None) -> list[TwistModel]:
-    """Slip wheel by wheel, and by the direction of travel."""
+    """Return models of slip by wheel, and by direction of travel."""
     out: list[TwistModel] = [CurveModel("constant", powers(0))]
     if has_current:
         out += [
@@ -162,10 +165,10 @@ def _of_wheels(has_current: bool, together: Together | None) -> list[TwistModel]
 
 
 def restored(shape: Geometry, states: Mapping[str, Mapping[str, Sequence]]) -> list[FloorModels]:
-    """Slip models from their names and states, as `{model.name: model.state}` wrote them."""
+    """Return slip models from their names and states, as `{model.name: model.state}` wrote them."""
     known = {model.name: model for model in slip_models(shape, has_current=True)}
-    if strange := sorted(set(states) - set(known)):
-        raise ValueError(f"no model '{strange[0]}'; there are: {', '.join(known)}")
+    if unknown := sorted(set(states) - set(known)):
+        raise ValueError(f"no model '{unknown[0]}'; there are: {', '.join(known)}")
     return [
         known[name].with_state({floor: np.asarray(v, float) for floor, v in state.items()})
         for name, state in states.items()

@@ -1,4 +1,4 @@
-"""The steps of many runs together, and slip models that give a body twist in each of them."""
+"""Steps of many runs together, and slip models that predict a body twist in each of them."""
 
 import abc
 from collections.abc import Sequence
@@ -25,14 +25,14 @@ from slipid.predict.slip_model import (
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """The steps of several runs one after the other, so that all are computed in one go.
+    """The steps of several runs one after the other, so that all are computed at once.
 
     Attributes:
-        signals: all steps as if they were one run; its name and floor are those of the first.
+        signals: all steps as if they were one run; its name and floor are those of the first run.
         first: first step of each run.
-        speed_change: wheel speed at the end of each step less that at its start [rad/s], so that
-            d turn / d lag = -speed_change; None where the lag of the poses is settled.
-        lag: lag of the poses behind the wheels that was assumed [s].
+        faster: wheel speed at the end of each step less that at its start [rad/s], so that d turn /
+            d lag = -faster; None where the lag of the poses is known.
+        lag: assumed lag of the poses behind the wheels [s].
     """
 
     signals: RunSignals
@@ -42,7 +42,7 @@ class Steps:
 
     @classmethod
     def of(cls, runs: Sequence[RunSignals]) -> "Steps":
-        """All steps of runs of one robot.
+        """Return all steps of several runs of one robot.
 
         Raises:
             ValueError: the currents of some runs are signed and those of others are not.
@@ -63,7 +63,7 @@ class Steps:
         return cls(signals, np.cumsum([0, *(len(run) for run in runs[:-1])]))
 
     def at_lag(self, lag: float) -> "Steps":
-        """The same steps at another lag, to first order [s]; as they are where it is settled."""
+        """Return the same steps at another lag, to first order [s]; unchanged where it is known."""
         if self.speed_change is None:
             return self
         turn = self.signals.turn - (lag - self.lag) * self.speed_change
@@ -71,13 +71,13 @@ class Steps:
 
     @property
     def length(self) -> Int[np.ndarray, " run"]:
-        """How many steps each run has."""
+        """Number of steps of each run."""
         return np.diff(self.first, append=len(self.signals))
 
     def predicted(
         self, twist: Twists, slipping: Float[np.ndarray, " step"] | None = None
     ) -> list[PredictedRun]:
-        """Each run's path from the twists of all steps [m/s, m/s, rad/s], and its slip if known."""
+        """Return each run's path from all twists [m/s, m/s, rad/s], and its slip if known."""
         parts = zip(self._runs(twist), self._runs(self.signals.dt), strict=True)
         paths = [path_of(xi, dt) for xi, dt in parts]
         if slipping is None:
@@ -88,7 +88,7 @@ class Steps:
     def smoothed(
         self, values: Float[np.ndarray, "step drive"], time_constant: float
     ) -> Float[np.ndarray, "step drive"]:
-        """First-order low pass of each run, which starts at the run's first value.
+        """Return a first-order low pass of each run, which starts at the run's first value.
 
         x~_k = a x~_(k-1) + (1 - a) x_k   with   a = exp(-dt / time constant [s])
         """
@@ -104,7 +104,7 @@ class Steps:
         return x[run, step]
 
     def ends(self, twist: Twists) -> Float[np.ndarray, "run 3"]:
-        """Pose at each run's end, seen from its start [m, m, rad], of the twists of all steps."""
+        """Return the pose at each run's end, relative to its start [m, m, rad], from all twists."""
         dt = self.signals.dt
         turn = twist[:, 2] * dt
         before = np.cumsum(turn) - turn
@@ -114,7 +114,7 @@ class Steps:
         return np.add.reduceat(np.column_stack([step, turn]), self.first)
 
     def _runs(self, values: np.ndarray) -> list[np.ndarray]:
-        """Values of all steps, run by run."""
+        """Return the values of all steps, run by run."""
         return np.split(values, self.first[1:])
 
 
@@ -122,15 +122,15 @@ class Steps:
 class TrainingWindows:
     """Windows of about half a second of the same steps, with the true twist in each.
 
-    A camera's noise is large over one step, so methods learn from windows; what they learn from is
-    the mean over a window of what they compute in each step.
+    A camera's noise is large over one step, so models are trained on windows, with the mean over a
+    window of what they compute in each step.
 
     Attributes:
-        steps: of all runs.
+        steps: steps of all runs.
         first: first step of each window.
         dt: length of each window [s].
-        twist: by the poses [m/s, m/s, rad/s].
-        run: number of the run that each window is of.
+        twist: twist by the poses [m/s, m/s, rad/s].
+        run: number of the run of each window.
     """
 
     steps: Steps
@@ -141,6 +141,7 @@ class TrainingWindows:
 
     @classmethod
     def of(cls, runs: Sequence[Run]) -> "TrainingWindows":
+        """Return the windows of runs."""
         steps = Steps.of([run.signals for run in runs])
         begins = [groups(run.signals.dt, WINDOW_S) for run in runs]
         edges = [
@@ -154,20 +155,20 @@ class TrainingWindows:
 
     @property
     def signals(self) -> RunSignals:
-        """What was measured, each window as one step."""
+        """Measurements with each window as one step."""
         signals = self.steps.signals
         current = None if signals.current is None else self.means(signals.current)
         turn = np.add.reduceat(signals.turn, self.first)
         return replace(signals, dt=self.dt, turn=turn, current=current, gyro=None, command=None)
 
     def means(self, values: Float[np.ndarray, "step *any"]) -> Float[np.ndarray, "window *any"]:
-        """Mean over time of every window."""
+        """Return the mean over time of every window."""
         one = [1] * (values.ndim - 1)
         total = np.add.reduceat(values * self.steps.signals.dt.reshape(-1, *one), self.first)
         return np.asarray(total / self.dt.reshape(-1, *one))
 
     def rows(self, parts: Float[np.ndarray, "step 3 k"], spec: RobotSpec) -> "SlipEquations":
-        """What of the encoders' displacement is too much, as a sum of parts with weights.
+        """Return equations for the excess of the encoders' displacement as a weighted sum of parts.
 
         gap = (rolling - twist) dt = sum_k weight_k part_k dt, yaw times the base radius.
         """
@@ -178,11 +179,11 @@ class TrainingWindows:
 
 @dataclass(frozen=True, eq=False)
 class SlipEquations:
-    """Equations that are linear in a method's coefficients, three for each window.
+    """Equations that are linear in a model's coefficients, three for each window.
 
     Attributes:
-        parts: displacement that each coefficient takes from the encoders [m per unit].
-        gap: displacement to be taken from them [m].
+        parts: displacement that each coefficient subtracts from the encoders' [m per unit].
+        gap: displacement to be subtracted [m].
     """
 
     parts: Float[np.ndarray, "window 3 k"]
@@ -192,7 +193,7 @@ class SlipEquations:
 def scaled_least_squares(
     a: Float[np.ndarray, "row k"], b: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, " k"]:
-    """Least squares with columns of one length; of many solutions the shortest in those lengths."""
+    """Return least squares with columns scaled to one length; the shortest of many solutions."""
     size = np.linalg.norm(a, axis=0)
     # a column of nothing but rounding says nothing
     size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
@@ -201,28 +202,28 @@ def scaled_least_squares(
 
 @dataclass(frozen=True)
 class TwistModel(SlipModel, abc.ABC):
-    """A slip model that gives the body twist of every step, from the signals of its run.
+    """A slip model that predicts the body twist of every step from the signals of its run.
 
     Attributes:
-        coefficients: fitted numbers; None before a fit, and of a model that learns nothing.
+        coefficients: fitted numbers; None before a fit, and for a model that learns nothing.
     """
 
     learns: ClassVar[bool] = True
     """Whether numbers are fitted."""
     by_load: ClassVar[bool] = False
-    """Whether `slipid compare` fits every load set-up of a floor by itself."""
+    """Whether `slipid compare` fits every load set-up of a floor separately."""
     coefficients: np.ndarray | None = field(default=None, kw_only=True)
 
     @abc.abstractmethod
     def learn(self, w: TrainingWindows, spec: RobotSpec) -> Self:
-        """The model fitted to windows."""
+        """Return the model fitted to windows."""
 
     @abc.abstractmethod
     def twist(self, steps: Steps, spec: RobotSpec) -> Twists:
-        """Body twist of every step [m/s, m/s, rad/s]."""
+        """Return the body twist of every step [m/s, m/s, rad/s]."""
 
     def stiffness(self, w: TrainingWindows, spec: RobotSpec) -> Float[np.ndarray, "k k"]:
-        """Precision of the flat coefficients by what holds them besides the windows."""
+        """Return the precision of the flat coefficients that does not come from the windows."""
         return np.zeros((self.numbers, self.numbers))
 
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "TwistModel":

@@ -1,4 +1,4 @@
-"""Open-loop prediction of runs a fit has not seen, beside every slip model it was compared with."""
+"""Open-loop prediction of runs that were not fitted, by the fit and by every other slip model."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -26,9 +26,17 @@ SCHEMA = "slipid.validation/1"
 class ScoredRun:
     """A run and the scores of every model on it.
 
-    Heading and speed are as commanded [deg], [m/s], None where not known; the chord is the camera's
-    straight-line displacement [m], the path its way [m], the measured end a pose (x, y [m],
-    yaw [rad]).
+    Attributes:
+        name: name of the run.
+        surface: floor of the run.
+        load: load set-up of the run.
+        heading_deg: commanded heading [deg], None where not known.
+        speed: commanded speed [m/s], None where not known.
+        chord: straight-line displacement by the camera [m].
+        path: path length by the camera [m].
+        measured_end: measured pose at the end (x, y [m], yaw [rad]).
+        models: scores by model.
+        session: session of the run.
     """
 
     name: str
@@ -52,13 +60,13 @@ class ScoredRun:
 
 
 def plain_values(values: Iterable[tuple[str, object]]) -> Content:
-    """Plain values without what was not asked for."""
+    """Return plain values without optional ones that were not computed."""
     return {k: v for k, v in values if v is not None or k not in ("session", "log_density")}
 
 
 @dataclass(frozen=True)
 class FloorSummary:
-    """Scores of a model over the runs on a floor; attributes as of `Score`."""
+    """Scores of a model over the runs on a floor; attributes as in `Score`."""
 
     endpoint_error_mean: float
     endpoint_error_median: float
@@ -76,8 +84,8 @@ class Validation:
     """Runs that a fit predicted open loop, model by model; `print` shows the mean errors.
 
     Attributes:
-        runs: with the scores of every model.
-        new: how many of them the fit has not seen.
+        runs: runs with the scores of every model.
+        new: number of them that were not fitted.
     """
 
     runs: tuple[ScoredRun, ...]
@@ -88,14 +96,14 @@ class Validation:
 
     @property
     def which(self) -> str:
-        """A line on how many runs the fit has not seen."""
+        """Sentence on how many runs are new to the fit."""
         return f"{self.new} of {len(self.runs)} runs are new to the fit"
 
     def plot(self) -> "Figure":
-        """End-point errors of every model."""
-        from slipid.plots.compare import ladder_figure
+        """Plot the end-point errors of every model."""
+        from slipid.plots.compare import validation_figure
 
-        return ladder_figure(self.to_json(), self.which)
+        return validation_figure(self.to_json(), self.which)
 
     @property
     def summary(self) -> dict[str, dict[str, FloorSummary]]:
@@ -129,13 +137,13 @@ class Validation:
 def validation(
     fit: ForceBalance, models: Sequence[FloorModels], data: Runs, new: int = 0
 ) -> Validation:
-    """Prediction of runs of known floors by a fit, beside every slip model fitted on the same runs.
+    """Return the prediction of runs on known floors by a fit and by every slip model.
 
-    The fit has not seen `new` of the runs.
+    `new` of the runs were not fitted.
 
-    As in `folds`, every run is predicted as of a session of its own: what its session
-    shares widens its region by the variance found in fitting, whether or not other runs of that
-    session were fitted. A run begins at its first pose after the wheels moved 10 mm.
+    As in `folds`, every run is predicted as of a session of its own: its shared session effect
+    widens its region by the variance found in fitting, whether or not other runs of that session
+    were fitted. A run begins at its first pose after the wheels moved 10 mm.
 
     Raises:
         DataError: a run on a floor or with a load set-up that was not identified.
@@ -170,10 +178,10 @@ def add_scores(
     tracks: replay.Tracks,
     cov: Float[np.ndarray, "run 2 2"] | None,
 ) -> None:
-    """Write the scores of a model's tracks into those of their runs.
+    """Add the scores of a model's tracks to those of their runs.
 
-    `runs` go by their number in `data`; those that are met for the first time are added. `cov` is
-    of the ends, None for a model without.
+    `runs` are keyed by their number in `data`; new ones are added. `cov` is the covariance of the
+    ends, None for a model without.
     """
     found = scores(tracks.predicted, tracks.measured, cov)
     chord, path = chords(tracks.measured), lengths(tracks.measured)
@@ -195,12 +203,12 @@ def add_scores(
 
 
 def finite(x: float) -> float | None:
-    """A number, None for one that is not."""
+    """Return a number, None for one that is not finite."""
     return float(x) if np.isfinite(x) else None
 
 
 def by_floor(runs: Sequence[ScoredRun]) -> dict[str, list[ScoredRun]]:
-    """Runs of every floor, those of other load set-ups by themselves.
+    """Return the runs of every floor, those of other load set-ups separately.
 
     A set-up other than the one as built, else the most common, is written `<floor>@<load>`.
     """

@@ -1,4 +1,4 @@
-"""An estimator and a controller as one pure function, and what becomes of a path on a plant."""
+"""An estimator and a controller joined to one pure function, and its runs on a plant."""
 
 from dataclasses import dataclass
 from typing import Generic, Protocol, runtime_checkable
@@ -22,31 +22,39 @@ from slipid.robot.interface import (
 from slipid.robot.trajectory import Path
 
 PERIOD = 0.05
-"""Between commands [s]."""
+"""Time between two commands [s]."""
 LONGEST = 2.0
-"""Times the path's own duration after which a run is given up."""
+"""A run is stopped after this multiple of the path's own duration, plus 10 s."""
 
 
 class ControlLoopState(eqx.Module, Generic[State]):
-    """What a pilot keeps: state of its estimator, of its controller, time of the path [s]."""
+    """State of a control loop between two steps.
 
-    seen: State
-    held: ControllerState
+    Attributes:
+        estimator: state of the estimator.
+        controller: state of the controller.
+        time: time of the path [s].
+    """
+
+    estimator: State
+    controller: ControllerState
     time: Float[Array, ""]
 
 
 class ControlLoopOutput(eqx.Module):
-    """What a pilot says after a step: wheel speeds [rad/s], an estimate, time of the path [s].
+    """Output of one step of a control loop; in a run every array has a leading axis of steps.
 
-    `given_up` says that the robot was stuck and has stopped for good.
-
-    Runs have leading axes in front of every array.
+    Attributes:
+        command: wheel speeds [rad/s].
+        estimate: output of the estimator.
+        time: time of the path [s].
+        gave_up: whether the robot was stuck and has stopped for good.
     """
 
     command: Float[Array, " wheel"]
     estimate: StateEstimate
     time: Float[Array, ""]
-    given_up: Bool[Array, ""]
+    gave_up: Bool[Array, ""]
 
 
 class ControlLoop(eqx.Module, Generic[State]):
@@ -56,9 +64,9 @@ class ControlLoop(eqx.Module, Generic[State]):
     controller: Controller
 
     def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> ControlLoopState[State]:
-        """State of a robot at rest at a pose [m, m, rad], at the start of its path."""
-        seen = self.estimator.init(jnp.asarray(pose, dtype=float))
-        return ControlLoopState(seen, self.controller.init(), jnp.zeros(()))
+        """Return the state of a robot at rest at a pose [m, m, rad], at the start of its path."""
+        estimator = self.estimator.init(jnp.asarray(pose, dtype=float))
+        return ControlLoopState(estimator, self.controller.init(), jnp.zeros(()))
 
     def step(
         self,
@@ -67,127 +75,132 @@ class ControlLoop(eqx.Module, Generic[State]):
         measurement: Measurement | Readings,
         dt: Float[Numbers, ""] | float,
     ) -> tuple[ControlLoopState[State], ControlLoopOutput]:
-        """Next state, and what is commanded and believed."""
+        """Return the next state, and the command with the estimate that it follows from."""
         dt = jnp.asarray(dt, dtype=float)
-        seen, estimate = self.estimator.step(state.seen, measurement, dt)
+        estimator, estimate = self.estimator.step(state.estimator, measurement, dt)
         here = jnp.where(jnp.isfinite(estimate.pose), estimate.pose, 1e3)
         time, reference = path.follow(state.time, here, dt, self.controller.gains.preview)
-        held, command = self.controller.step(state.held, reference, estimate, dt)
-        return ControlLoopState(seen, held, time), ControlLoopOutput(
-            command, estimate, time, held.given_up
-        )
+        controller, command = self.controller.step(state.controller, reference, estimate, dt)
+        output = ControlLoopOutput(command, estimate, time, controller.gave_up)
+        return ControlLoopState(estimator, controller, time), output
 
 
 @runtime_checkable
 class Plant(Protocol):
-    """A robot that takes wheel speeds and gives back what its sensors read."""
+    """A robot that takes wheel speeds and returns the readings of its sensors."""
 
     def reset(self) -> Measurement | Readings:
-        """First readings, of the robot at rest."""
+        """Return the first readings, of the robot at rest."""
         ...
 
     def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Measurement | Readings:
-        """Readings one control period later, with these wheel speeds commanded [rad/s]."""
+        """Return the readings one control period after a command of these wheel speeds [rad/s]."""
         ...
 
     @property
     def pose(self) -> tuple[float, float, float]:
-        """True x, y [m] and heading [rad]; for the judge, no controller sees it."""
+        """True x, y [m] and heading [rad]; it serves the metrics and no controller reads it."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoopRun:
-    """One closed-loop run, a row per period.
+    """A closed-loop run, with one row per control period.
 
     Attributes:
-        path: what was asked.
-        time: [s]; own: time of the path [s].
-        pose: true [m, m, rad]; command: wheel speeds [rad/s].
-        estimate: all that was estimated, a leading axis of steps on every array.
-        energy: of the motors until then [J]; NaN where the plant does not know.
+        path: path that the robot had to follow.
+        time: time of each row [s].
+        path_time: time of the path at each row [s].
+        pose: true pose [m, m, rad].
+        command: commanded wheel speeds [rad/s].
+        estimate: everything that was estimated; every array has a leading axis of steps.
+        energy: energy used by the motors so far [J]; NaN where the plant does not know it.
     """
 
     path: Path
     time: Float[np.ndarray, " step"]
-    own: Float[np.ndarray, " step"]
+    path_time: Float[np.ndarray, " step"]
     pose: Float[np.ndarray, "step 3"]
     command: Float[np.ndarray, "step wheel"]
     estimate: StateEstimate
     energy: Float[np.ndarray, " step"]
 
     @property
-    def believed(self) -> Float[np.ndarray, "step 3"]:
+    def estimated_pose(self) -> Float[np.ndarray, "step 3"]:
         """Estimated poses [m, m, rad]."""
         return np.asarray(self.estimate.pose)
 
 
 _step = eqx.filter_jit(ControlLoop.step)
-"""The step with its numbers as arguments: compiled once for all pilots and starts alike."""
+"""Compiled step with all numbers as arguments, so that all loops of one structure share it."""
 
 
 def run_closed_loop(
-    pilot: ControlLoop[State], path: Path, plant: Plant, start: Pose
+    loop: ControlLoop[State], path: Path, plant: Plant, start: Pose
 ) -> ClosedLoopRun:
-    """Run a pilot on a plant at rest until its path is over.
+    """Run a control loop on a plant at rest until its path is over or the controller gives up.
 
-    It also ends when the pilot gives up. The path is as it lies for the start, where the pilot
-    believes it stands [m, m, rad].
+    Args:
+        loop: estimator and controller.
+        path: path, already placed for a robot at `start`.
+        plant: robot that is driven.
+        start: pose at which the estimator starts [m, m, rad].
     """
-    wheels = pilot.controller.robot.wheels
-    state, reading, dt = pilot.init(start), plant.reset().filled(wheels), jnp.asarray(PERIOD)
+    wheels = loop.controller.robot.wheels
+    state, reading, dt = loop.init(start), plant.reset().filled(wheels), jnp.asarray(PERIOD)
     rows: list[tuple[float, float, tuple[float, float, float], ControlLoopOutput]] = []
-    energy, own, begun = 0.0, 0.0, 0.0
-    helpless, longest = False, LONGEST * path.duration + 10.0
-    while own < path.duration - 1e-6 and begun < longest and not helpless:
-        state, out = _step(pilot, path, state, reading, dt)
-        own, helpless = float(out.time), bool(out.given_up)
-        rows.append((begun, energy, plant.pose, out))
+    energy, path_time, time = 0.0, 0.0, 0.0
+    gave_up, longest = False, LONGEST * path.duration + 10.0
+    while path_time < path.duration - 1e-6 and time < longest and not gave_up:
+        state, out = _step(loop, path, state, reading, dt)
+        path_time, gave_up = float(out.time), bool(out.gave_up)
+        rows.append((time, energy, plant.pose, out))
         reading = plant.step(np.asarray(out.command)).filled(wheels)
         energy += getattr(plant, "power", np.nan) * PERIOD
-        begun += PERIOD
-    time, spent, poses, said = zip(*rows, strict=True)
-    every: ControlLoopOutput = jax.tree.map(lambda *x: np.stack([np.asarray(v) for v in x]), *said)
+        time += PERIOD
+    times, energies, poses, outputs = zip(*rows, strict=True)
+    run: ControlLoopOutput = jax.tree.map(lambda *x: np.stack([np.asarray(v) for v in x]), *outputs)
     pose = np.array(poses)
     pose[:, 2] = np.unwrap(pose[:, 2])
     return ClosedLoopRun(
         path=path,
-        time=np.array(time),
-        own=np.asarray(every.time),
+        time=np.array(times),
+        path_time=np.asarray(run.time),
         pose=pose,
-        command=np.asarray(every.command),
-        estimate=every.estimate,
-        energy=np.array(spent),
+        command=np.asarray(run.command),
+        estimate=run.estimate,
+        energy=np.array(energies),
     )
 
 
-def _from_line(
-    places: Float[np.ndarray, "step 2"], line: Float[np.ndarray, "point 2"]
+def _distance_from_line(
+    points: Float[np.ndarray, "step 2"], line: Float[np.ndarray, "corner 2"]
 ) -> Float[np.ndarray, " step"]:
-    """Distance of places from a line through points [m]."""
+    """Return the distance of each point from a polygonal line [m]."""
     begin, side = line[:-1], np.diff(line, axis=0)
     square = np.maximum((side**2).sum(-1), 1e-18)
-    since = places[:, None] - begin
+    since = points[:, None] - begin
     part = np.clip((since * side).sum(-1) / square, 0.0, 1.0)
     return np.asarray(np.sqrt(((since - part[..., None] * side) ** 2).sum(-1)).min(1))
 
 
 @dataclass(frozen=True)
 class PathMetrics:
-    """What became of a path, from true poses.
+    """Errors of a closed-loop run along its path, computed from true poses.
 
     Attributes:
-        along_track_mm: travelled less wanted at the end of every side, or quarter of a curve.
-        sides_mm: what was wanted, straight from one end to the next.
-        closure_mm: from the end to where it should be, and what was left of the way where the run
-            was given up.
-        cross_track_rmse_mm: distance from the path as a line, over time.
-        heading_error_deg: at the end.
-        path_length_mm: the 2021 paper's metric.
-        energy_j: of the motors; None where the plant does not know.
-        effort: rms of the change of wheel speed commands [rad/s].
-        seconds: that it took.
-        finished: whether the path's end was reached.
+        along_track_mm: distance travelled less distance wanted, at the end of every side or quarter
+            of a curve [mm].
+        sides_mm: straight distance wanted from one of these ends to the next [mm].
+        closure_mm: distance from the last pose to the end of the path, plus the path length that
+            remained where the controller gave up [mm].
+        cross_track_rmse_mm: root mean square over time of the distance from the path [mm].
+        heading_error_deg: heading error at the end [deg].
+        path_length_mm: length of the path driven, the 2021 paper's metric [mm].
+        energy_j: energy used by the motors [J]; None where the plant does not know it.
+        effort: root mean square change of the commanded wheel speeds per period [rad/s].
+        seconds: duration of the run [s].
+        finished: whether the end of the path was reached.
     """
 
     along_track_mm: tuple[float, ...]
@@ -202,28 +215,28 @@ class PathMetrics:
     finished: bool
 
 
-def path_metrics(course: ClosedLoopRun) -> PathMetrics:
-    """What became of a path, from true poses."""
-    p, path = course.pose, course.path
+def path_metrics(run: ClosedLoopRun) -> PathMetrics:
+    """Return the errors of a run along its path, computed from true poses."""
+    p, path = run.pose, run.path
     corners = np.vstack([np.asarray(path.rows[0, :2]), np.asarray(path.corners)])
     sides = np.diff(corners, axis=0)
     sizes = np.hypot(*sides.T)
-    at = np.minimum(np.searchsorted(course.own, np.asarray(path.marks) - 1e-6), len(p) - 1)
+    at = np.minimum(np.searchsorted(run.path_time, np.asarray(path.marks) - 1e-6), len(p) - 1)
     along = ((p[at, :2] - corners[1:]) * sides).sum(axis=1) / np.maximum(sizes, 1e-9)
     rows = np.asarray(path.rows[:, :2])
-    near = _from_line(p[:, :2], rows[::5] if len(rows) > 5 else rows)
-    left_mm = 1000 * float(path.left(course.own[-1]))
+    off = _distance_from_line(p[:, :2], rows[::5] if len(rows) > 5 else rows)
+    remaining_mm = 1000 * float(path.remaining(run.path_time[-1]))
     wanted = float(path.rows[-1, 2])
     turned = np.degrees((p[-1, 2] - wanted + np.pi) % (2 * np.pi) - np.pi)
     return PathMetrics(
         along_track_mm=tuple((1000 * along).tolist()),
         sides_mm=tuple((1000 * sizes).tolist()),
-        closure_mm=1000 * float(np.hypot(*(p[-1, :2] - corners[-1]))) + left_mm,
-        cross_track_rmse_mm=1000 * float(np.sqrt((near**2).mean())),
+        closure_mm=1000 * float(np.hypot(*(p[-1, :2] - corners[-1]))) + remaining_mm,
+        cross_track_rmse_mm=1000 * float(np.sqrt((off**2).mean())),
         heading_error_deg=float(turned),
         path_length_mm=1000 * float(np.hypot(*np.diff(p[:, :2], axis=0).T).sum()),
-        energy_j=None if np.isnan(course.energy[-1]) else float(course.energy[-1]),
-        effort=float(np.sqrt((np.diff(course.command, axis=0) ** 2).mean())),
-        seconds=float(course.time[-1]),
-        finished=bool(course.own[-1] >= path.duration - 1e-6),
+        energy_j=None if np.isnan(run.energy[-1]) else float(run.energy[-1]),
+        effort=float(np.sqrt((np.diff(run.command, axis=0) ** 2).mean())),
+        seconds=float(run.time[-1]),
+        finished=bool(run.path_time[-1] >= path.duration - 1e-6),
     )

@@ -1,17 +1,18 @@
-"""Controllers: from where the robot should be and what is estimated to wheel speed commands.
+"""Controllers compute wheel speed commands from a reference pose and an estimate.
 
 All share one interface, `init() -> state` and `step(state, reference, estimate, dt) -> (state,
 wheel speeds)`, one limiter that keeps the direction of motion, and one safe stop. They differ in
-what they do beyond the pose loop
+the terms that they add to the pose loop
 
     v = R(-heading) (v_ref + k (p_ref - p)),   W = W_ref + k_yaw sin(heading_ref - heading)
 
-or in the law that stands in its place.
+or in a law that replaces it.
 
-A robot whose wheels turn and which does not move turns and goes by turns, ever harder: demands to
-go and to turn that cancel at the wheels that have grip, so that only a wheel without any spins, are
-a rest of the loop far from its path. It goes on as usual once it has moved for a while; if that
-does not come about it stops and says so.
+A robot whose wheels turn while its body stands still enters recovery: it alternates between turning
+on the spot and driving, with growing effort. Such rests exist far from the path, where the demands
+to drive and to turn cancel at the wheels that have grip and only a wheel without grip spins. The
+controller returns to normal operation once the robot has moved for a while. Otherwise it stops for
+good and reports that it gave up.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,26 +30,27 @@ from slipid.robot.interface import UNTIMED_S, Numbers, Scalar, StateEstimate, as
 
 Correction = Literal["none", "torque", "paper_print", "paper_code"]
 Law = Callable[[Float[Array, "6"], Float[Array, "3"]], Float[Array, "3"]]
-"""Twist of the body to ask for [m/s, m/s, rad/s], of a reference as of `Path.at` and a pose."""
+"""Function from a reference (see `Path.at`) and a pose to a body twist [m/s, m/s, rad/s]."""
 PAPER_GAIN = {"x": (3000.0, 500.0, 3000.0), "y": (2000.0, 2000.0, 2000.0)}
-"""Of the 2021 paper's torque correction, motor rpm per N m at the motor shaft, by leg."""
+"""Gains of the 2021 paper's torque correction by leg [motor rpm per N m at the motor shaft]."""
 OBSERVE_S = 0.4
 """Time constant of the disturbance observer [s]."""
 LONGEST_I = 0.06
-"""Largest velocity the integral may ask for [m/s]."""
-STUCK_S, SLOW, ASKED = 0.5, 0.2, 0.1
-"""A robot that goes at less than this part of what it is asked for, if that is more than so much
-[m/s], is stuck after so long, and free once it has gone for as long [s]."""
+"""Largest velocity that the integral term may add [m/s]."""
+STUCK_S = 0.5
+"""Time without the demanded motion until a robot is stuck, and with it until it is free [s]."""
+STUCK_SHARE, STUCK_FROM = 0.2, 0.1
+"""A robot is blocked below this share of the demanded speed, for demands above this speed [m/s]."""
 TURN_S, GO_S = 0.6, 1.2
-"""For which a robot that is stuck turns, then goes, by turns [s]."""
-HARDER = 0.6
-"""By which part it then tries harder each second."""
+"""Durations for which a stuck robot alternately turns on the spot and drives [s]."""
+RECOVERY_GROWTH = 0.6
+"""Relative growth of the demand per second of recovery [1/s]."""
 GIVES_UP_S = 15.0
-"""For which it tries before it stops [s]."""
+"""Duration of a recovery after which the robot stops for good [s]."""
 
 
 class Gains(eqx.Module):
-    """Gains of a controller; by default those set by hand."""
+    """Gains of a controller; the defaults were set by hand."""
 
     place: Array = parameter("1/s", "k", "pose loop", start=1.5)
     yaw: Array = parameter("1/s", "k_yaw", "heading loop", start=1.5)
@@ -60,9 +62,10 @@ class Gains(eqx.Module):
 
     @classmethod
     def of(cls, robot: RobotArrays, forced: bool = False) -> "Gains":
-        """Those tuned for a robot and its load set-up if they are better, else those set by hand.
+        """Return the gains tuned for a robot and its load set-up where they beat those set by hand.
 
-        If they are forced, those tuned for them, whether they are better or not.
+        With `forced` they are returned whether they are better or not. Without tuned gains for this
+        load set-up, those set by hand are returned.
 
         Raises:
             ValueError: the robot comes without its record.
@@ -77,16 +80,18 @@ class Gains(eqx.Module):
 
     @classmethod
     def at(cls, values: Sequence[Float[Array, ""] | float] | Float[Numbers, " gain"]) -> "Gains":
-        """Those of a vector, in the order in which they are declared."""
+        """Return the gains of a vector, in the order in which they are declared."""
         return cls(*(jnp.asarray(value, dtype=float) for value in values))
 
 
 class Limits(eqx.Module):
-    """What a command may not exceed.
+    """Limits of a command.
 
     Attributes:
-        wheel_speed: [rad/s]; acceleration: of a wheel [rad/s^2].
-        voltage: of the supply [V]; twist: largest speed asked of the body [m/s].
+        wheel_speed: largest speed of a wheel [rad/s].
+        acceleration: largest acceleration of a wheel [rad/s^2].
+        voltage: voltage of the supply [V].
+        twist: largest translational speed demanded of the body [m/s].
     """
 
     wheel_speed: Scalar = 13.0
@@ -96,15 +101,16 @@ class Limits(eqx.Module):
 
 
 class ControllerState(eqx.Module):
-    """What a controller keeps from step to step.
+    """State of a controller between two steps.
 
     Attributes:
-        command: the last one [rad/s]; integral: velocity it asks for [m/s].
-        wanted: twist asked for last [m/s, m/s, rad/s]; miss: what the robot was seen to do beyond
-            it, smoothed [m/s, m/s, rad/s].
-        still: for how long it has not gone where it was asked to go; going counts back [s].
-        tried: for how long it has tried to free itself, since it was last free [s].
-        begun: whether anything was commanded.
+        command: last command [rad/s].
+        integral: velocity of the integral term [m/s].
+        wanted: twist demanded in the last step [m/s, m/s, rad/s].
+        miss: smoothed difference of the estimated twist and the demanded one [m/s, m/s, rad/s].
+        still: time for which the body has not moved as demanded; it counts down while it moves [s].
+        tried: time since the current recovery began; 0 while there is none [s].
+        begun: whether anything was commanded yet.
     """
 
     command: Float[Array, " wheel"]
@@ -116,8 +122,8 @@ class ControllerState(eqx.Module):
     begun: Bool[Array, ""]
 
     @property
-    def given_up(self) -> Bool[Array, ""]:
-        """Whether it has stopped for good, being stuck."""
+    def gave_up(self) -> Bool[Array, ""]:
+        """Whether the controller has stopped for good because the robot is stuck."""
         return self.tried > GIVES_UP_S
 
 
@@ -129,16 +135,18 @@ def limit_command(
     limits: Limits,
     dt: Float[Array, ""] | float,
 ) -> Float[Array, " wheel"]:
-    """Wheel speeds within all limits, scaled together so that the robot keeps its direction.
+    """Return wheel speeds within all limits, scaled together so that the robot keeps its direction.
 
-    Speed and voltage scale the command, U = R |I| + n C_e |w| at most the supply's; acceleration
-    scales the change from the last command. Never NaN.
+    Speed and voltage scale the command, U = R |I| + n C_e |w| being at most the supply's voltage;
+    acceleration scales the change from the last command. The result is never NaN.
 
     Args:
-        wanted, before: this command and the last one [rad/s].
-        current: of the motors, for what is left of the supply [A].
-        robot, limits: the motor's numbers, and what is allowed.
-        dt: since the last command [s].
+        wanted: demanded wheel speeds [rad/s].
+        before: last command [rad/s].
+        current: motor currents, which determine how much voltage remains for speed [A].
+        robot: robot with the constants of its motor.
+        limits: limits of the command.
+        dt: time since the last command [s].
     """
     motor = robot.motor
     wanted = jnp.where(jnp.all(jnp.isfinite(wanted)), wanted, 0.0)
@@ -157,25 +165,26 @@ def limit_command(
 
 
 def _turns(tried: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether a robot that has tried to free itself for so long [s] is turning on the spot."""
+    """Return whether a robot turns on the spot after `tried` seconds of recovery."""
     return (tried > 0) & (jnp.mod(tried, TURN_S + GO_S) < TURN_S)
 
 
-def _freeing(tried: Float[Array, ""]) -> Float[Array, "3"]:
-    """What it makes of the twist it is asked for."""
+def _recovery_factors(tried: Float[Array, ""]) -> Float[Array, "3"]:
+    """Return the factors on the demanded twist after `tried` seconds of recovery."""
     one = jnp.where(_turns(tried), jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 1.0, 0.0]))
-    return jnp.where(tried > 0, one * (1 + HARDER * tried), 1.0)
+    return jnp.where(tried > 0, one * (1 + RECOVERY_GROWTH * tried), 1.0)
 
 
 class Controller(eqx.Module):
-    """Pose loop with whatever a row of the trial adds to it.
+    """Pose loop with optional correction terms, or with another law in its place.
 
     Attributes:
-        gains: by default those tuned for the robot where they are better, else those set by hand.
-        correction: torque correction of the 2021 paper, in the form it prints, the form its authors
-            ran, or corrected.
-        law: in place of the pose loop and its integral; a module, so that numbers of another law of
-            its kind need no other compilation.
+        gains: gains; by default those tuned for the robot where they are better than those by hand.
+        limits: limits of the command.
+        correction: torque correction of the 2021 paper, as the paper prints it, as its authors ran
+            it, or corrected.
+        law: law that replaces the pose loop and its integral; as a module, its numbers are
+            arguments of the compiled code.
     """
 
     robot: RobotArrays
@@ -197,7 +206,7 @@ class Controller(eqx.Module):
         self.gains = Gains.of(robot) if gains is None else gains
 
     def init(self) -> ControllerState:
-        """State of a controller that has commanded nothing yet."""
+        """Return the state of a controller that has commanded nothing yet."""
         none, still, zero = jnp.zeros(self.robot.wheels), jnp.zeros(3), jnp.zeros(())
         return ControllerState(none, jnp.zeros(2), still, still, zero, zero, jnp.zeros((), bool))
 
@@ -208,15 +217,17 @@ class Controller(eqx.Module):
         estimate: StateEstimate,
         dt: Float[Array, ""] | float,
     ) -> tuple[ControllerState, Float[Array, " wheel"]]:
-        """Wheel speeds to command [rad/s].
+        """Return the next state and the wheel speeds to command [rad/s].
 
-        Stops, at the allowed deceleration, while the estimate is stale or anything is no number,
-        and for good once it has given up; starts from the speed the wheels have.
+        The robot stops, at the allowed deceleration, while the estimate is stale or any input is
+        not finite, and for good once the controller has given up. It starts from the measured wheel
+        speeds.
 
         Args:
-            state, estimate: from `init` or the last step; of an estimator.
-            reference: pose and rates in the world, `slipid.robot.trajectory.Path.at`.
-            dt: since the last step [s].
+            state: state from `init` or the last step.
+            reference: pose and rates in the world, from `slipid.robot.trajectory.Path.at`.
+            estimate: output of an estimator.
+            dt: time since the last step [s].
         """
         old, e, k = state, estimate, self.gains
         safe = e.finite & jnp.all(jnp.isfinite(reference)) & ~e.stale
@@ -225,15 +236,15 @@ class Controller(eqx.Module):
         dt = jnp.asarray(dt, dtype=float)
         dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, 0.5), 0.0)
         gap = ref[:2] - pose[:2]
-        safe &= ~old.given_up
-        still, tried = self._held(old, e, jnp.where(safe, dt, 0.0))
+        safe &= ~old.gave_up
+        still, tried = self._recovery(old, e, jnp.where(safe, dt, 0.0))
         wanted = self._wanted(old, ref, pose, gap)
-        # what the robot does less what it was asked to do, as far as the estimator sees it
+        # motion of the robot by the estimator, less the motion that was demanded
         twist = jnp.where(safe, e.twist, 0.0)
         a = 1 - jnp.exp(-dt / OBSERVE_S)
         miss = old.miss + a * (twist - old.wanted - old.miss)
-        asked = wanted - k.observer * miss
-        wheels = self.robot.forward @ asked / self.robot.frame.radius + self._torque(wanted, e)
+        demand = wanted - k.observer * miss
+        wheels = self.robot.forward @ demand / self.robot.frame.radius + self._torque(wanted, e)
         before = jnp.where(old.begun, old.command, jnp.where(safe, e.wheel_speed, 0.0))
         wheels = jnp.where(safe, wheels, 0.0)
         since = jnp.where(safe, dt, jnp.maximum(dt, UNTIMED_S))
@@ -243,7 +254,7 @@ class Controller(eqx.Module):
         new = ControllerState(
             command=command,
             integral=jnp.where(free, summed, jnp.where(safe, old.integral, 0.0)),
-            wanted=jnp.where(safe, asked, 0.0),
+            wanted=jnp.where(safe, demand, 0.0),
             miss=jnp.where(safe, jnp.clip(miss, -0.2, 0.2), 0.0),
             still=still,
             tried=tried,
@@ -251,36 +262,37 @@ class Controller(eqx.Module):
         )
         return new, command
 
-    def _held(self, old: ControllerState, e: StateEstimate, dt: Array) -> tuple[Array, Array]:
-        """For how long the body has not gone where it should, and has tried to free itself [s].
+    def _recovery(self, old: ControllerState, e: StateEstimate, dt: Array) -> tuple[Array, Array]:
+        """Return the times without the demanded motion and since recovery began [s].
 
-        While it turns on the spot it is asked to go nowhere, which tells nothing of that.
+        While the robot turns on the spot no translation is demanded, so the first time stands still
+        at that stage.
         """
-        asked = jnp.sqrt(old.wanted[:2] @ old.wanted[:2] + 1e-12)
-        goes = jnp.sqrt(e.twist[:2] @ e.twist[:2] + 1e-12)
-        held = e.immobilised | ((asked > ASKED) & (goes < SLOW * asked))
-        since = jnp.where(_turns(old.tried), 0.0, jnp.where(held, dt, -dt))
+        demand = jnp.sqrt(old.wanted[:2] @ old.wanted[:2] + 1e-12)
+        speed = jnp.sqrt(e.twist[:2] @ e.twist[:2] + 1e-12)
+        blocked = e.immobilised | ((demand > STUCK_FROM) & (speed < STUCK_SHARE * demand))
+        since = jnp.where(_turns(old.tried), 0.0, jnp.where(blocked, dt, -dt))
         still = jnp.clip(old.still + since, 0.0, 2 * STUCK_S)
         tries = still > STUCK_S
         still = jnp.where(tries & (old.tried == 0), 2 * STUCK_S, still)
         return still, jnp.where(tries, old.tried + dt, 0.0)
 
     def _wanted(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
-        """Twist that the pose loop or the law asks for, its speed limited [m/s, m/s, rad/s]."""
+        """Return the speed-limited twist of the pose loop or the law [m/s, m/s, rad/s]."""
         wanted = self._pose_loop(old, ref, pose, gap) if self.law is None else self.law(ref, pose)
-        wanted = wanted * _freeing(old.tried)
+        wanted = wanted * _recovery_factors(old.tried)
         fast = jnp.sqrt(wanted[:2] @ wanted[:2] + 1e-12) / self.limits.twist
         return wanted.at[:2].divide(jnp.maximum(fast, 1.0))
 
     def _pose_loop(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
-        """Twist that the pose loop asks for [m/s, m/s, rad/s]."""
+        """Return the twist that the pose loop demands [m/s, m/s, rad/s]."""
         v = ref[3:5] + self.gains.place * gap + old.integral
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         turn = ref[5] + self.gains.yaw * jnp.sin(ref[2] - pose[2])
         return jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0], turn])
 
     def _torque(self, wanted: Array, e: StateEstimate) -> Array:
-        """The 2021 paper's correction by the forces off the commanded direction [rad/s]."""
+        """Return the 2021 paper's correction for forces across the commanded direction [rad/s]."""
         if self.correction == "none":
             return jnp.zeros(self.robot.wheels)
         f = self.robot

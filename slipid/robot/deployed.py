@@ -1,4 +1,4 @@
-"""What an estimator and a controller know of an identified robot, as arrays."""
+"""Arrays of an identified robot that estimators and controllers use, and their robot.json."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -22,32 +22,36 @@ from slipid.support.errors import DataError
 
 
 class RobotArrays(eqx.Module):
-    """An identified robot with one load set-up as arrays: what estimators and controllers hold.
+    """Arrays of an identified robot with one load set-up, as estimators and controllers hold them.
 
-    Compiled code depends on what is static here, the robot's structure, and on no number: robots of
-    one structure share it.
+    Compiled code depends on the static fields, which are the robot's structure, and on no number:
+    robots of one structure share it. A drive is a motor with its encoder and ammeter. There is one
+    for every wheel unless a motor drives several wheels.
 
     Attributes:
-        frame: wheel directions; `places`: wheel centres in the body frame [m].
-        forward: J (drive, 3); `inverse`: its pseudo-inverse. A drive is a motor with its encoder
-            and ammeter; all but robots with several wheels on a drive have one for every wheel.
-        motor: of every wheel.
-        floors: stacked, a row per floor in the order of `labels`.
-        rest: load shares at rest.
-        mass: [kg].
-        process: std of what the model misses, growing with the root of the distance, along and
-            across [m/sqrt(m)] and in yaw [rad/sqrt(m)].
-        effect: std of what it misses all the way, [m/m], [m/m], [rad/m]; the spread of the fitted
-            numbers included.
-        told: what the fitted runs tell of that effect, by direction of travel and speed.
-        friction_covariance: of the log frictions, by the spread of the fitted numbers.
-        current_std: of the current that flows from the model's, the ammeter's noise aside [A].
-        current_trend: a + b v, measured currents over the model's at speed v [A, A s/m].
-        highest: wheel speed up to which the fit has seen the robot [rad/s], and the model's largest
-            current up to 0.8 of it [A].
-        wheel_curve: a + b |I|, the slip ratio of each drive, of all floors together (drive, 2).
-        drive_of, around: of the wheels, as of `slipid.model.geometry.Geometry`.
-        unseen: for each floor, whether nobody drove on it.
+        frame: directions and size of the wheels.
+        places: wheel centres in the body frame [m].
+        forward: J, rim speeds per body twist (drive, 3).
+        inverse: pseudo-inverse of J (3, drive).
+        motor: constants of the motor, which all drives share.
+        floors: contact parameters, one row per floor in the order of `labels`.
+        rest: share of the load on each wheel at rest.
+        mass: mass of the robot [kg].
+        process: std of the model's random errors, which grow with the root of the path length,
+            along and across [m/sqrt(m)] and in yaw [rad/sqrt(m)].
+        effect: std of the effects, which stay the same over the path, [m/m], [m/m], [rad/m]; the
+            posterior spread of the fitted numbers is included.
+        effect_table: estimates of the effects from the fitted runs, by direction and speed.
+        friction_covariance: posterior covariance of the log frictions.
+        current_std: std of measured currents about the model's, without the ammeters' noise [A].
+        current_trend: a and b of a + b v, by which measured currents exceed the model's at speed v
+            [A, A s/m].
+        highest: highest wheel speed of the fitted runs [rad/s], and the model's largest current up
+            to 0.8 of it [A].
+        wheel_curve: a and b of a + b |I|, the slip ratio of each drive over all floors (drive, 2).
+        drive_of: drive of each wheel, see `slipid.model.geometry.Geometry`.
+        around: order of the wheels around the body, see `slipid.model.geometry.Geometry`.
+        unseen: for each floor, whether no run drove on it.
     """
 
     frame: WheelFrame
@@ -60,7 +64,7 @@ class RobotArrays(eqx.Module):
     mass: Float[Array, ""]
     process: Float[Array, "floor 3"]
     effect: Float[Array, "floor 3"]
-    told: EffectTable
+    effect_table: EffectTable
     friction_covariance: Float[Array, "floor floor"]
     current_std: Float[Array, " floor"]
     current_trend: Float[Array, "2"]
@@ -72,7 +76,7 @@ class RobotArrays(eqx.Module):
 
     @property
     def arrays(self) -> "RobotArrays":
-        """The robot without its record."""
+        """The robot's arrays without its record."""
         return RobotArrays(**{f.name: getattr(self, f.name) for f in fields(RobotArrays)})
 
     @property
@@ -82,26 +86,26 @@ class RobotArrays(eqx.Module):
 
     @property
     def drives(self) -> int:
-        """Number of drives: as many angles, currents and voltages are measured."""
+        """Number of drives, which is also the number of measured angles, currents and voltages."""
         return len(set(self.drive_of)) or self.wheels
 
     @property
     def by_wheels(self) -> Float[Array, "3 wheel"]:
-        """Twist per rim speed of every wheel, where those of a drive turn alike."""
+        """Body twist per rim speed of every wheel, where all wheels of a drive have one speed."""
         if not self.drive_of:
             return self.inverse
         return self.inverse @ self.on_average(jnp.eye(self.wheels)).T
 
     def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """What every wheel has of its drive, such as its speed."""
+        """Return the value of each wheel's drive, such as its speed."""
         return at_wheels(self.drive_of, of_drives)
 
     def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
-        """What every drive has of all its wheels together, such as their torque."""
+        """Return the sum over the wheels of every drive, such as their torque."""
         return at_drives(self.drive_of, of_wheels)
 
     def on_average(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
-        """Mean of what the wheels of every drive have."""
+        """Return the mean over the wheels of every drive."""
         if not self.drive_of:
             return of_wheels
         return self.at_drives(of_wheels) / self.at_drives(jnp.ones(self.wheels))
@@ -113,7 +117,7 @@ class RobotArrays(eqx.Module):
 
 
 class DeployedRobot(RobotArrays):
-    """An identified robot, ready to be deployed: what robot.json holds, for one load set-up.
+    """An identified robot ready for deployment: the content of robot.json for one load set-up.
 
     Attributes:
         record: every number with its interval, verdict and provenance.
@@ -125,29 +129,29 @@ class DeployedRobot(RobotArrays):
 
     @property
     def steers(self) -> bool:
-        """Whether its wheels can be asked for any twist, each of them alone.
+        """Whether its wheels can produce any twist, each of them driven alone.
 
-        Else it has an estimator, but no controller: `slipid.robot.controller` asks for motion
-        sideways as well.
+        A robot that does not steer has an estimator but no controller, since
+        `slipid.robot.controller` demands sideways motion as well.
         """
         shape = geometry_of(self.record)
         return not shape.drive_of and shape.determines_twist
 
     @classmethod
     def of(cls, record: RobotRecord, load: str | None = None) -> "DeployedRobot":
-        """The robot of a record, as it drives with a load set-up, the first one by default.
+        """Return the robot of a record with a load set-up, the first one by default.
 
         Raises:
-            ValueError: no such load set-up, or a number that is missing or out of its bounds.
+            ValueError: there is no such load set-up, or a number is missing or out of its bounds.
         """
         check_record(record)
         return _arrays(record, load, {path: n.value for path, n in record.parameters.items()})
 
     @classmethod
     def load(cls, path: Path | str, load: str | None = None) -> "DeployedRobot":
-        """The robot of a file that `slipid identify`, `slipid sample` or `save` wrote.
+        """Return the robot of a file that `slipid identify`, `slipid sample` or `save` wrote.
 
-        It drives with a load set-up of this name, the first one by default.
+        `load` names its load set-up, the first one by default.
 
         Raises:
             DataError: the file is absent, damaged, changed or of a newer version, or has no such
@@ -167,22 +171,23 @@ class DeployedRobot(RobotArrays):
         """Write robot.json, with all load set-ups.
 
         Raises:
-            ValueError: arrays were changed since the robot was made, which no file would tell.
-            DataError: nothing can be written there.
+            ValueError: arrays were changed after the robot was made, which the file could not hold.
+            DataError: the file cannot be written.
         """
         same = DeployedRobot.of(self.record, self.load_setup)
         pairs = zip(jax.tree.leaves(self), jax.tree.leaves(same), strict=True)
         if not all(np.array_equal(a, b) for a, b in pairs):
             raise ValueError(
-                "arrays of this robot are not those of its record; expected both alike"
+                "arrays of this robot are not those of its record, so a file cannot hold them"
             )
         write_robot(Path(path), self.record)
 
     def on(self, *floors: str) -> "DeployedRobot":
-        """For a place of which it is known that there are only these floors.
+        """Return the robot for a site that is known to have these floors only.
 
         Raises:
-            ValueError: none, one twice, or one that is not identified; names those that are.
+            ValueError: no floor is given, one is given twice or is not identified; names those that
+                are.
         """
         known = ", ".join(self.labels)
         for name in floors:
@@ -194,20 +199,20 @@ class DeployedRobot(RobotArrays):
         return DeployedRobot.of(self.record.on(rows), self.load_setup)
 
     def with_unseen(self) -> "DeployedRobot":
-        """For a place that may have floors on which nobody drove, `unseen_1` and on.
+        """Return the robot for a site that may have floors without a run, `unseen_1` and on.
 
-        An estimator of it takes a strange floor for the one of them that fits the currents best,
-        and says how unsure that is; without them it is taken for a floor that is known. See
+        Its estimator then assigns an unfamiliar floor to whichever of them fits the currents best,
+        with their large uncertainty; without them it assigns it to a known floor. See
         `slipid.robot.unseen`.
         """
         return DeployedRobot.of(with_unseen(self.record), self.load_setup)
 
 
 def with_record(robot: RobotArrays) -> DeployedRobot:
-    """The same robot, once it is sure that it has its record.
+    """Return the same robot once it is certain that it has its record.
 
     Raises:
-        ValueError: these are arrays alone.
+        ValueError: it consists of arrays alone.
     """
     if not isinstance(robot, DeployedRobot):
         raise ValueError(
@@ -218,11 +223,11 @@ def with_record(robot: RobotArrays) -> DeployedRobot:
 
 
 def posterior_robots(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
-    """Robots that the posterior holds possible, stacked along a leading axis.
+    """Return the robots of some posterior draws, stacked along a leading axis.
 
-    What runs differ by stays in `DeployedRobot.effect`; the spread of the numbers is in the draws.
-    What is told of effects is so with the robot's own numbers, and the same part of them is left.
-    What the robot was seen with (`highest`, `wheel_curve`) is that of the robot.
+    Differences between runs stay in `DeployedRobot.effect`; the spread of the numbers is in the
+    draws. Effect tables belong to the robot's own numbers, with the same share of the std
+    unexplained. `highest` and `wheel_curve` are those of the robot.
     """
     record, one = robot.record, []
     plain = {path: n.value for path, n in record.parameters.items()}
@@ -235,9 +240,9 @@ def posterior_robots(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedR
 def _arrays(
     record: RobotRecord, load: str | None, values: Mapping[str, Numbers], spread: bool = True
 ) -> DeployedRobot:
-    """The arrays of a record at some values of its numbers, by path.
+    """Return the arrays of a record at some values of its numbers, by path.
 
-    With `spread` their uncertainty counts as an effect.
+    With `spread` the posterior uncertainty of the numbers counts as an effect.
     """
     place = record.load_index(load)
     chosen, wheels, floors = record.loads[place], record.wheels, record.floors
@@ -265,7 +270,7 @@ def _arrays(
         mass=_array(values["robot.mass"]),
         process=_array([floor.process for floor in floors]),
         effect=whole if spread else effect,
-        told=_told(chosen, whole),
+        effect_table=_effect_table(chosen, whole),
         friction_covariance=_friction_covariance(record) * spread,
         current_std=_array([floor.current_std for floor in floors]),
         current_trend=_array(record.current_trend),
@@ -283,17 +288,17 @@ def _array(value: Numbers | Sequence[object]) -> Array:
     return jnp.asarray(value, dtype=float)
 
 
-def _told(load: LoadRecord, whole: Array) -> EffectTable:
-    """What is told of effects, what is left over the whole std of every floor."""
+def _effect_table(load: LoadRecord, whole: Array) -> EffectTable:
+    """Return the effect table of a load set-up, its stds relative to the whole std of a floor."""
     if load.told is None:
-        return EffectTable.nothing(len(whole))
+        return EffectTable.empty(len(whole))
     mean, left = _array(load.told.mean), _array(load.told.left)
     part = left / jnp.maximum(whole[:, None, None], 1e-12)
     return EffectTable(jnp.log(_array(load.told.speeds)), jnp.concatenate([mean, part], axis=-1))
 
 
 def _friction_covariance(record: RobotRecord) -> Array:
-    """Covariance of the floors' log frictions over the posterior; of fixed ones zero."""
+    """Return the posterior covariance of the floors' log frictions, which is 0 for fixed ones."""
     still = (1.0,) * max(record.drawn, 1)
     paths = [f"surface.{name}.friction" for name in record.labels]
     logs = np.log(np.array([record.draws.get(path, still) for path in paths], dtype=float))

@@ -1,9 +1,9 @@
-"""Slip, surface and pose from wheel speed and current, and odometry that knows no contact.
+"""Estimators of slip, floor and pose from wheel speeds and currents, and odometry without contact.
 
-In `Estimator` wheel readings go through a filter over the floors under the wheels (`floor_filter`)
-to the motion of the body, and that through a filter of the pose (`pose_filter`):
+In `Estimator` wheel readings go through a filter over the floors under the wheels (`floor_filter`),
+which yields the body's motion, and that goes through a filter of the pose (`pose_filter`):
 
-    xi = sum_c p_c xi_c,   pose <- pose * exp(xi dt) * (late news of the floors)
+    xi = sum_c p_c xi_c,   pose <- pose * exp(xi dt) * (late corrections from the floors)
 """
 
 from dataclasses import replace
@@ -30,16 +30,18 @@ from slipid.robot.interface import (
 )
 
 CURRENT_FROM = 0.4
-"""Current from which the 2021 paper's deployed estimator counts slip [A]."""
+"""Current above which the 2021 paper's deployed estimator subtracts slip [A]."""
 
 
 class EstimatorState(eqx.Module):
-    """What an estimator keeps from step to step.
+    """State of an estimator between two steps.
 
     Attributes:
-        wheels: how they turn; current: of the motors, filtered [A].
-        floors: what is believed of them; place: pose and covariance.
-        stuck: for how long the body has hardly moved while its wheels turn [s].
+        wheels: angles, speeds and ages of the wheels' readings.
+        current: filtered currents of the motors [A].
+        floors: belief about the floors.
+        place: pose with its covariance.
+        stuck: time since the body stopped moving while its wheels turn [s].
     """
 
     wheels: WheelState
@@ -53,11 +55,11 @@ class Estimator(AbstractEstimator[EstimatorState]):
     """Filter over the floors under the wheels, with pose and covariance.
 
     Attributes:
-        robot: the identified robot; its `labels` name the floors in the order of
+        robot: identified robot; its `labels` name the floors in the order of
             `StateEstimate.surface_probability`.
-        settings: by default as the robot's logs were.
-        floor: map of the place, its surfaces by number in the robot's `labels`; None where there
-            is none.
+        settings: settings; by default those that fit the robot's logs.
+        floor: map of the site, its surfaces numbered as in the robot's `labels`; None without a
+            map.
     """
 
     robot: RobotArrays
@@ -73,7 +75,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
     def init(
         self, pose: Pose = (0.0, 0.0, 0.0), std: tuple[float, float] = (0.0, 0.0)
     ) -> EstimatorState:
-        """State of a robot at rest at a pose [m, m, rad] that is known so well [m], [rad]."""
+        """Return the state of a robot at rest at a pose [m, m, rad] with stds [m], [rad]."""
         f, s = self.robot, self.settings
         return EstimatorState(
             wheels=WheelState.init(f, s),
@@ -86,7 +88,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
     def advance(
         self, state: EstimatorState, z: Readings, dt: Float[Array, ""]
     ) -> tuple[EstimatorState, StateEstimate]:
-        """One time step; see `AbstractEstimator.step`."""
+        """Return state and estimate one time step later; see `AbstractEstimator.step`."""
         f, s, old = self.robot, self.settings, state
         dt = time_step(dt, s)
         wheels = read_wheels(f, s, old.wheels, z, dt)
@@ -131,13 +133,13 @@ class Estimator(AbstractEstimator[EstimatorState]):
         )
 
     def _slip(self, w: Array, twist: Array) -> Array:
-        """Slip ratio of each drive, 0 for one that stands."""
+        """Return the slip ratio of each drive, which is 0 while it stands."""
         f, turns = self.robot, jnp.abs(w) > 1e-3
         rim = f.frame.radius * jnp.where(turns, w, 1.0)
         return jnp.where(turns, jnp.clip(1 - f.forward @ twist / rim, -2.0, 2.0), 0.0)
 
     def _stuck(self, before: Array, w: Array, twist: Array, tick: TimeStep) -> Array:
-        """For how long the body has hardly moved while its wheels turn [s].
+        """Return the time since the body stopped moving while its wheels turn [s].
 
         Source: Ward and Iagnemma 2008, below a fifth of the wheels' speed.
         """
@@ -147,24 +149,25 @@ class Estimator(AbstractEstimator[EstimatorState]):
         return jnp.where(blocked, jnp.minimum(before + tick.dt, 1e3), 0.0)
 
     def _beyond(self, w: Array, amps: Array, unknown: Array) -> Bool[Array, ""]:
-        """Whether speed or currents leave what the fit has seen, or no floor explains them."""
+        """Return whether speed or currents exceed the fitted runs', or no floor explains them."""
         highest = self.robot.highest
         fast = jnp.max(jnp.abs(w)) > 1.3 * highest[0]
         return fast | (jnp.max(jnp.abs(amps)) > 1.3 * highest[1]) | (unknown > 0.5)
 
 
 def _corrected(floors: FloorState, left: Array, place: PoseState, expected: Array) -> FloorState:
-    """Hypotheses once a map has corrected the pose, `left` in the world's axes."""
+    """Return the belief after a map corrected the pose, with `left` in the world's axes."""
     world = axes_rotation(place.pose[2])
     return replace(floors, apart=floors.apart @ (world.T @ left @ world).T, expected=expected)
 
 
 class OdometryState(eqx.Module):
-    """What wheel-by-wheel odometry keeps from step to step.
+    """State of wheel-by-wheel odometry between two steps.
 
     Attributes:
         pose: x, y [m], heading [rad].
-        wheels: how they turn; current: of the motors, smoothed and without a sign [A].
+        wheels: angles, speeds and ages of the wheels' readings.
+        current: smoothed magnitude of the motors' currents [A].
     """
 
     pose: Float[Array, "3"]
@@ -176,10 +179,11 @@ class Odometry(AbstractEstimator[OdometryState]):
     """Wheel-by-wheel odometry, w_eff = w (1 - s).
 
     Attributes:
-        settings: by default as the robot's logs were.
-        curve: whether slip is taken from `DeployedRobot.wheel_curve`, a + b |I| where the smoothed
-            current exceeds `CURRENT_FROM`, as the 2021 paper's robot did; else the encoders are
-            believed.
+        robot: identified robot.
+        settings: settings; by default those that fit the robot's logs.
+        curve: whether slip follows `DeployedRobot.wheel_curve`, a + b |I| where the smoothed
+            current exceeds `CURRENT_FROM`, as on the 2021 paper's robot; else encoders count as
+            free of slip.
     """
 
     robot: RobotArrays
@@ -191,7 +195,7 @@ class Odometry(AbstractEstimator[OdometryState]):
         self.settings = as_arrays(Settings.of(robot) if settings is None else settings)
 
     def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> OdometryState:
-        """State of a robot at rest at a pose [m, m, rad]."""
+        """Return the state of a robot at rest at a pose [m, m, rad]."""
         return OdometryState(
             pose=jnp.asarray(pose, dtype=float),
             wheels=WheelState.init(self.robot, self.settings),
@@ -201,7 +205,7 @@ class Odometry(AbstractEstimator[OdometryState]):
     def advance(
         self, state: OdometryState, z: Readings, dt: Float[Array, ""]
     ) -> tuple[OdometryState, StateEstimate]:
-        """One time step; see `AbstractEstimator.step`. Neither gyro nor pose fixes are used."""
+        """Return state and estimate one time step later; neither gyro nor pose fixes are used."""
         f, s, old = self.robot, self.settings, state
         dt = time_step(dt, s)
         wheels = read_wheels(f, s, old.wheels, z, dt)

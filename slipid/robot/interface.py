@@ -1,4 +1,4 @@
-"""What goes into an estimator and what comes out of it, by name, and what it is told."""
+"""Inputs, settings and output of an estimator, and the interface that all estimators share."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -15,41 +15,43 @@ from slipid.robot.deployed import RobotArrays, with_record
 
 Numbers = Array | np.ndarray
 Pose = Float[Numbers, "3"] | tuple[float, float, float]
-"""x, y [m], heading [rad]."""
+"""Pose as x, y [m] and heading [rad]."""
 Given = Numbers | Sequence[float] | float | None
 NO_FLOOR = "unknown"
-"""Name of the floor under a wheel where no identified one explains what is measured."""
+"""Name of the floor under a wheel where no identified floor explains the measurements."""
 MIXED_FLOORS_PENALTY = 1.0
-"""`Settings.alike` of a robot that is known to drive across the edges of floors."""
+"""`Settings.further_floor_penalty` of a robot that is known to drive across edges of floors."""
 UNTIMED_S = 0.01
-"""What a step without a time counts as, until readings are stale and while the robot stops [s]."""
+"""Time that counts for a step without a valid time, for staleness and while stopping [s]."""
 State = TypeVar("State", bound=eqx.Module)
 Some = TypeVar("Some", bound=eqx.Module)
 Scalar = Float[Array, ""] | float
 
 
 def as_arrays(given: Some) -> Some:
-    """The same module with arrays in place of numbers, so that compiled code takes any of them."""
+    """Return the module with arrays for numbers, so that compiled code accepts any values."""
     return jax.tree.map(partial(jnp.asarray, dtype=float), given)
 
 
 class Settings(eqx.Module):
-    """What is not identified.
+    """Settings of an estimator, none of which is identified.
 
     Attributes:
-        current_is_signed: of the ammeters.
-        forget_s: currents nearer than this in time tell the same twice [s].
-        filter_s: time constant in which currents are averaged [s].
-        patch_m: length on which the floor under a wheel changes.
-        doubt_m: length on which what is wrongly believed of the floors stays as wrong.
-        alike: how much rarer each further floor under the robot is, in log probability.
-        unknown_std: from what it predicts, in stds of a current, a hypothesis loses to "unknown".
-        ammeter_std_a, voltmeter_std_v: of the sensors.
-        gyro_std, gyro_bias_std: of a reading and of its zero [rad/s].
-        gyro_delay_s: age of its readings [s].
-        still_m_s: rim speed below which the robot stands [m/s].
-        stale_s: without a wheel's reading after which it is stale [s].
-        longest_s: time step beyond which the robot's motion is not made up [s].
+        current_is_signed: whether the ammeters measure the sign of a current.
+        forget_s: time within which currents repeat the same evidence [s].
+        filter_s: time constant of the filter of currents [s].
+        patch_m: distance over which the floor under a wheel changes [m].
+        doubt_m: distance over which an error of the belief about floors persists [m].
+        further_floor_penalty: drop in log probability for each further floor under the robot.
+        unknown_std: residual at which a hypothesis loses to "unknown", in stds of a current.
+        ammeter_std_a: noise of an ammeter [A].
+        voltmeter_std_v: noise of a voltmeter [V].
+        gyro_std: noise of a gyro's reading [rad/s].
+        gyro_bias_std: std of a gyro's bias at the start [rad/s].
+        gyro_delay_s: age of a gyro's readings [s].
+        still_m_s: rim speed below which the robot counts as standing [m/s].
+        stale_s: time without readings of a wheel after which it is stale [s].
+        longest_s: longest time step for which motion is predicted [s].
     """
 
     current_is_signed: bool = eqx.field(static=True, default=False)
@@ -57,7 +59,7 @@ class Settings(eqx.Module):
     filter_s: Scalar = 0.05
     patch_m: Scalar = 0.1
     doubt_m: Scalar = 1.5
-    alike: Scalar = 3.0
+    further_floor_penalty: Scalar = 3.0
     unknown_std: Scalar = 3.0
     ammeter_std_a: Scalar = 0.07
     voltmeter_std_v: Scalar = 0.06
@@ -70,19 +72,21 @@ class Settings(eqx.Module):
 
     @classmethod
     def of(cls, robot: RobotArrays) -> "Settings":
-        """Those of a robot: the sensors of its logs, and what they were driven over.
+        """Return the settings for a robot by the sensors and floors of its own logs.
 
         Raises:
-            ValueError: it comes without its record.
+            ValueError: the robot comes without its record.
         """
         record = with_record(robot).record
-        return cls(current_is_signed=record.sensors.current_is_signed, alike=record.alike)
+        return cls(
+            current_is_signed=record.sensors.current_is_signed, further_floor_penalty=record.alike
+        )
 
 
 class Readings(eqx.Module):
-    """A measurement with NaN where there is nothing; attributes as of `Measurement`.
+    """A measurement with NaN for everything that is absent; attributes as in `Measurement`.
 
-    Those of all robots with so many drives have one structure, whatever they measure.
+    All robots with the same number of drives share one structure, whatever they measure.
     """
 
     wheel_angle: Float[Array, "*batch drive"]
@@ -96,31 +100,31 @@ class Readings(eqx.Module):
 
     @classmethod
     def nothing(cls, drives: int) -> "Readings":
-        """Of a robot of so many drives that measures nothing."""
+        """Return the readings of a robot with this number of drives that measures nothing."""
         shapes = [(drives,)] * 4 + [(), (3,), (2,), ()]
         return cls(*(jnp.full(shape, jnp.nan, dtype=float) for shape in shapes))
 
     def filled(self, drives: int) -> "Readings":
-        """Themselves."""
+        """Return these readings, which have no gaps to fill."""
         return self
 
 
 class Measurement(eqx.Module):
-    """What the sensors give in one step; None or NaN where there is nothing.
+    """Readings of the sensors in one step; None or NaN where there is none.
 
     `Measurement(wheel_angle=angle, current=amps)` is a robot that measures these two.
 
     Attributes:
-        wheel_angle: of every encoder, as the wheel turns, cumulative [rad]; it counts before
-            `wheel_speed`.
-        wheel_speed: the same, its rate [rad/s].
-        current: of every motor [A], signed or not as the estimator's settings say.
-        voltage: of every motor [V].
+        wheel_angle: cumulative angle of every encoder, as the wheel turns [rad]; it takes
+            precedence over `wheel_speed`.
+        wheel_speed: rate of the same angle [rad/s].
+        current: current of every motor [A], signed or unsigned as the estimator's settings say.
+        voltage: voltage of every motor [V].
         gyro: yaw rate [rad/s].
-        fix: pose from elsewhere, a camera say: x, y [m], heading [rad].
-        fix_std: of its place [m] and of its heading [rad]; a fix without it counts for nothing.
-        fix_age: for how long the fix has been true [s]; not known counts as 0, and one of more
-            than 47 steps ago counts for nothing.
+        fix: pose from another source such as a camera: x, y [m], heading [rad].
+        fix_std: std of the fix's position [m] and heading [rad]; a fix without it is ignored.
+        fix_age: age of the fix [s]; an unknown age counts as 0, and a fix older than 47 steps is
+            ignored.
     """
 
     wheel_angle: Given = None
@@ -133,35 +137,38 @@ class Measurement(eqx.Module):
     fix_age: Given = None
 
     def filled(self, drives: int) -> Readings:
-        """The same with NaN where there is nothing.
+        """Return the same readings with NaN for everything that is absent.
 
         Raises:
-            ValueError: a field has another shape than a robot of so many drives gives.
+            ValueError: a field has another shape than a robot with this number of drives gives.
         """
         given = vars(Readings.nothing(drives))
         for name, value in vars(self).items():
             if value is not None:
-                found, shape = jnp.asarray(value, dtype=float), given[name].shape
-                if found.shape != shape:
+                array, shape = jnp.asarray(value, dtype=float), given[name].shape
+                if array.shape != shape:
                     of = f"a robot with {drives} encoders"
-                    raise ValueError(f"{name} of shape {found.shape}; expected {shape} of {of}")
-                given = given | {name: found}
+                    raise ValueError(f"{name} of shape {array.shape}; expected {shape} of {of}")
+                given = given | {name: array}
         return Readings(**given)
 
 
 class StateEstimate(eqx.Module):
-    """What an estimator believes after a step; runs have leading axes in front of every array.
+    """Output of an estimator after a step; in a run every array has a leading axis of steps.
 
     Attributes:
-        pose: x, y [m], heading [rad]; twist: of the body [m/s, m/s, rad/s].
-        slip: ratio of the wheels of each drive; wheel_speed: of these [rad/s].
-        current: of each motor, signed and filtered [A].
-        surface_probability: of each floor in the order of `labels`, and of none of them in the last
-            column, under each wheel.
-        covariance: of the pose in the world frame [m, m, rad, each times each].
-        stale: wheels are not heard.
-        immobilised: the wheels turn and the body does not move.
-        out_of_range: faster, or drawing more, than the fit has seen, or on an unknown floor.
+        pose: x, y [m], heading [rad].
+        twist: velocity of the body in its own axes [m/s, m/s, rad/s].
+        slip: slip ratio of the wheels of each drive [1].
+        wheel_speed: speed of the wheels of each drive [rad/s].
+        current: signed, filtered current of each motor [A].
+        surface_probability: probability of each floor under each wheel, in the order of `labels`,
+            and of none of them in the last column [1].
+        covariance: covariance of the pose in the world frame [m, m, rad, each times each].
+        stale: whether readings of a wheel are missing for too long.
+        immobilised: whether the wheels turn while the body stands still.
+        out_of_range: whether speed or currents exceed those of the fitted runs, or the floor is
+            unknown.
         labels: names of the floors.
     """
 
@@ -179,42 +186,41 @@ class StateEstimate(eqx.Module):
 
     @property
     def surface(self) -> np.ndarray:
-        """Name of the most probable floor under each wheel, `NO_FLOOR` where it is none of them."""
+        """Name of the most probable floor under each wheel; `NO_FLOOR` where none of them is."""
         names = np.array([*self.labels, NO_FLOOR])
         return np.asarray(names[np.argmax(np.asarray(self.surface_probability), axis=-1)])
 
     @property
     def finite(self) -> Bool[Array, ""]:
-        """Whether every number is one."""
+        """Whether every number of the estimate is finite."""
         parts = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(self) if x.dtype != bool]
         return jnp.all(jnp.stack(parts))
 
 
 class AbstractEstimator(eqx.Module, Generic[State]):
-    """An estimator as pure functions: `init` gives a state, `step` the next one and an estimate."""
+    """An estimator as pure functions: `init` returns a state, `step` a state and an estimate."""
 
     robot: eqx.AbstractVar[RobotArrays]
     settings: eqx.AbstractVar[Settings]
 
     @abstractmethod
     def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> State:
-        """State of a robot at rest at a pose [m, m, rad]."""
+        """Return the state of a robot at rest at a pose [m, m, rad]."""
 
     @abstractmethod
     def advance(
         self, state: State, z: Readings, dt: Float[Array, ""]
     ) -> tuple[State, StateEstimate]:
-        """As `step`, from readings."""
+        """Return state and estimate as `step` does, from complete readings."""
 
     def step(
         self, state: State, measurement: Measurement | Readings, dt: Float[Numbers, ""] | float
     ) -> tuple[State, StateEstimate]:
-        """State and estimate a time step later.
+        """Return state and estimate one time step later.
 
-        Compiled at its first call; within a function that JAX transforms, it is part of that.
-
-        What is None, no number or what no sensor of this robot could read counts as not measured;
-        where `dt` [s] is no positive number, no time has passed.
+        It is compiled at its first call; within a function that JAX transforms it becomes part of
+        that function. Readings that are None, not finite, or beyond what a sensor of this robot
+        could measure count as not measured; a `dt` [s] that is not a positive number counts as 0.
         """
         z, dt = measurement.filled(self.robot.drives), jnp.asarray(dt, dtype=float)
         given = jax.tree.leaves((self, state, z, dt))

@@ -1,12 +1,15 @@
-"""An identified robot as plain values, with how sure each is and where it comes from.
+"""An identified robot as plain values: every number with its uncertainty and its origin.
 
-Units are those of `UNITS`, numbers of the robot carry their own.
+Field names are the keys of robot.json. Units are those of `UNITS`; numbers of the robot carry
+their own.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Literal
+
+import numpy as np
 
 from slipid.model.robot import Validity
 from slipid.support.files import checksum
@@ -15,7 +18,7 @@ Numbers = float | tuple[float, ...]
 """A number, or one per wheel or drive."""
 Pair = tuple[float, float]
 Axes = tuple[float, float, float]
-"""Along, across and in yaw."""
+"""Values along, across and in yaw."""
 Source = Literal["laplace", "posterior", "given"]
 Verdict = Literal["identified", "weak", "disputed", "not_identified", "at_bound", "fixed"]
 Provenance = Literal["measured", "borrowed", "override"]
@@ -50,10 +53,16 @@ UNITS = {
 
 @dataclass(frozen=True)
 class RecordedNumber:
-    """A fitted or fixed number of the robot [unit]; attributes as of identified.json.
+    """A fitted or fixed number of the robot, with the attributes that identified.json has.
 
-    `std` and `interval90`, equal-tailed, are None where it was fixed; `source` is what they were
-    made of.
+    Attributes:
+        value: value [unit].
+        unit: unit of the value.
+        std: posterior std [unit]; None where the number was fixed.
+        interval90: equal-tailed 90 % interval [unit]; None where the number was fixed.
+        verdict: how well the logs determine it.
+        provenance: whether the logs, a prior or an explicit choice determine the value.
+        source: method that std and interval come from.
     """
 
     value: Numbers
@@ -64,10 +73,28 @@ class RecordedNumber:
     provenance: Provenance
     source: Source
 
+    @classmethod
+    def without_std(
+        cls, value: Numbers, unit: str, verdict: Verdict, provenance: Provenance
+    ) -> "RecordedNumber":
+        """Return a number that no run was fitted to."""
+        return cls(value, unit, None, None, verdict, provenance, "given")
+
+
+def plain(value: np.ndarray) -> Numbers:
+    """Return a float, or a tuple of floats."""
+    return float(value.reshape(())) if value.size == 1 else tuple(float(v) for v in value)
+
+
+def axes_of(row: Iterable[float] | np.ndarray) -> Axes:
+    """Return three numbers as a tuple of floats."""
+    along, across, yaw = (float(x) for x in row)
+    return along, across, yaw
+
 
 @dataclass(frozen=True)
 class Wheels:
-    """The shape of the robot, as `slipid.model.geometry.Geometry` has it."""
+    """The shape of the robot, with the attributes of `slipid.model.geometry.Geometry`."""
 
     place: tuple[Pair, ...]
     drive_angle: tuple[float, ...]
@@ -78,19 +105,21 @@ class Wheels:
 
     @property
     def drives(self) -> int:
-        """Number of drives; `Geometry.drives` without the arrays of one."""
+        """Number of drives, computed without arrays as `Geometry.drives` is with them."""
         return len(set(self.drive_of)) or len(self.place)
 
 
 @dataclass(frozen=True)
 class FloorRecord:
-    """What the model misses on a floor, as stds.
+    """Errors of the model on a floor, as stds.
 
     Attributes:
-        process: growing with the root of the distance; effect: all the way.
-        current_std: of the current that flows from the model's, the ammeter's noise aside.
-        seen: None where the numbers were given, not fitted.
-        unseen: whether nobody drove on it: see `slipid.robot.unseen`.
+        name: name of the floor.
+        process: std of errors that grow with the root of the path length.
+        effect: std of effects, which stay the same over the path.
+        current_std: std of measured currents about the model's, without the ammeters' noise.
+        seen: range of the fitted runs; None where the numbers were given, not fitted.
+        unseen: whether no run drove on it, see `slipid.robot.unseen`.
     """
 
     name: str
@@ -103,15 +132,15 @@ class FloorRecord:
 
 @dataclass(frozen=True)
 class EffectRecord:
-    """What the fitted runs tell of effects, a table of floors, speeds and directions of travel.
+    """Effect table of a load set-up: effects estimated from the fitted runs.
 
-    The directions are those of the body's motion relative to the body, evenly spaced from ahead
-    counter-clockwise.
+    It has rows for floors, speeds and directions of travel. Directions are those of the motion
+    relative to the body, evenly spaced from straight ahead counter-clockwise.
 
     Attributes:
-        speeds: of the table, rising.
-        mean: of the effect, what is to be added to the motion that the model predicts.
-        left: std of what then is left of effects and of the uncertainty of the numbers together.
+        speeds: speeds of the rows, rising.
+        mean: estimated effect, to be added to the motion that the model predicts.
+        left: remaining std of effects and of the numbers' uncertainty together.
     """
 
     speeds: tuple[float, ...]
@@ -121,13 +150,14 @@ class EffectRecord:
 
 @dataclass(frozen=True)
 class LoadRecord:
-    """What depends on how the robot is loaded.
+    """Quantities that depend on the load set-up.
 
     Attributes:
-        spread: std of the motion per metre by the uncertainty of the numbers, on every floor.
-        told: of the effects by the fitted runs; None where no runs are known.
-        highest_current: of the model up to 0.8 of the highest wheel speed.
-        wheel_curve: a + b |I|, the slip ratio of each drive, of all floors together.
+        name: name of the load set-up.
+        spread: std of the motion per metre from the numbers' uncertainty, on every floor.
+        told: effect table; None where no runs are known.
+        highest_current: largest current of the model up to 0.8 of the highest wheel speed.
+        wheel_curve: a and b of a + b |I|, the slip ratio of each drive over all floors.
     """
 
     name: str
@@ -137,7 +167,7 @@ class LoadRecord:
     wheel_curve: tuple[Pair, ...]
 
     def on(self, rows: tuple[int, ...]) -> "LoadRecord":
-        """With some of the floors only, by their numbers."""
+        """Return the record with these floors only, given by their numbers."""
         spread = tuple(self.spread[k] for k in rows)
         if self.told is None:
             return replace(self, spread=spread)
@@ -147,7 +177,7 @@ class LoadRecord:
 
 @dataclass(frozen=True)
 class LogSensors:
-    """What the logs held, and so what the estimator counts on."""
+    """Sensors of the logs, on which the estimator relies by default."""
 
     current_is_signed: bool = False
     voltage: bool = False
@@ -165,10 +195,15 @@ class GainRecord:
 
 @dataclass(frozen=True)
 class GainValues:
-    """Every gain as `slipid.robot.controller.Gains` has them, and one that is not used any more.
+    """All gains of `slipid.robot.controller.Gains`, and one that is no longer used.
 
     Attributes:
-        ahead: share of wheel speeds by the contact model, which controllers had.
+        place: gain of the position loop.
+        yaw: gain of the heading loop.
+        integral: gain of the integral of the position error.
+        ahead: share of wheel speeds by the contact model, which controllers once had.
+        observer: gain of the disturbance observer.
+        preview: time by which rates are previewed.
     """
 
     place: GainRecord
@@ -181,7 +216,10 @@ class GainValues:
 
 @dataclass(frozen=True)
 class Losses:
-    """Loss of gains on cases not tuned on, mean and worst tenth together, by hand and tuned."""
+    """Losses of gains by hand and of tuned ones, on cases that were not tuned on.
+
+    A loss is the mean plus the worst tenth.
+    """
 
     hand: float
     tuned: float
@@ -189,14 +227,17 @@ class Losses:
 
 @dataclass(frozen=True)
 class GainsRecord:
-    """Tuned gains of a file that an earlier version wrote; nothing tunes gains any more.
+    """Tuned gains in a file that an earlier version wrote; this version does not tune gains.
 
     Attributes:
-        load: set-up they were tuned for; gyro: whether with one.
-        method: of the search.
-        better_than_hand: part of the cases in which they are.
-        stability_margin: 1 - the largest spectral radius of a loop.
-        verdict: what the losses say; "better" where they differ by more than chance.
+        values: the gains.
+        load: load set-up they were tuned for.
+        gyro: whether the robot had a gyro.
+        method: method of the search.
+        loss: losses by hand and tuned.
+        better_than_hand: share of the cases in which the tuned gains win.
+        stability_margin: 1 less the largest spectral radius of a loop.
+        verdict: comparison of the losses; "better" where they differ by more than chance.
     """
 
     values: GainValues
@@ -210,27 +251,30 @@ class GainsRecord:
 
     @property
     def is_better(self) -> bool:
-        """Whether they are to be preferred to those set by hand."""
+        """Whether they are preferred to those set by hand."""
         return self.verdict == "better than by hand"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RobotRecord:
-    """All that robot.json holds. Two records with the same content are equal.
+    """Content of robot.json. Two records with the same content are equal.
 
     Attributes:
-        source: what the numbers were made of.
+        source: method that the numbers come from.
+        wheels: shape of the robot.
         parameters: numbers by path.
-        floors, loads: in the order that arrays have.
-        current_trend: a + b v, measured currents over the model's.
-        highest_speed: wheel speed up to which the robot was seen.
-        sensors: of the logs.
-        alike: how much rarer each further floor under the robot is, in log probability; lower where
-            the fit has learnt from runs over several floors.
-        messages: what a reader of the numbers must know.
+        floors: floors in the order of the arrays.
+        loads: load set-ups in the order of the arrays.
+        current_trend: a and b of a + b v, by which measured currents exceed the model's.
+        highest_speed: highest wheel speed of the fitted runs.
+        sensors: sensors of the logs.
+        alike: drop in log probability for each further floor under the robot; lower where the fit
+            used runs over several floors.
+        messages: messages for readers of the numbers.
         data: hash of the runs; None where the numbers were given.
-        versions: of what computed.
-        draws: the numbers that were fitted, by path, once per draw of the posterior.
+        versions: versions of the software that computed them.
+        draws: posterior draws of the fitted numbers, by path.
+        gains: tuned gains; None where there are none.
     """
 
     source: Source = "given"
@@ -265,7 +309,7 @@ class RobotRecord:
 
     @property
     def drawn(self) -> int:
-        """Number of draws of the posterior."""
+        """Number of posterior draws."""
         return len(next(iter(self.draws.values()), ()))
 
     @property
@@ -274,14 +318,18 @@ class RobotRecord:
         return tuple(floor.name for floor in self.floors)
 
     def load_index(self, name: str | None) -> int:
-        """Place of a load set-up, the first by default; ValueError with the choices if absent."""
+        """Return the position of a load set-up, the first by default.
+
+        Raises:
+            ValueError: there is none of this name; names those that exist.
+        """
         names = [load.name for load in self.loads]
         if name not in (None, *names):
             raise ValueError(f"no load set-up '{name}'; identified: {', '.join(names)}")
         return 0 if name is None else names.index(name)
 
     def on(self, rows: tuple[int, ...]) -> "RobotRecord":
-        """With some of the floors only, by their numbers."""
+        """Return the record with these floors only, given by their numbers."""
         floors = tuple(self.floors[k] for k in rows)
         kept = tuple(f"surface.{floor.name}." for floor in floors)
 

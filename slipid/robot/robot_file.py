@@ -1,8 +1,7 @@
-"""JSON values as the types a dataclass declares, refused with their place where they are not.
+"""robot.json: written whole or not at all, and read with one clear message for any error.
 
-robot.json: written whole or not at all, and read with one clear sentence for all that is wrong.
-
-`robot.schema.json` beside this package describes the file for other programs.
+`typed` turns JSON values into dataclasses. `robot.schema.json` beside this package describes the
+file for other programs.
 """
 
 import json
@@ -33,16 +32,16 @@ _PLAIN = {bool: "true or false", str: "text", int: "a whole number", NoneType: "
 
 
 def typed(kind: type[Kind], value: object, where: str = "") -> Kind:
-    """A JSON value as a dataclass, with every number finite, no key missing and none to spare.
+    """Return a JSON value as a dataclass: every number finite, no key missing and none unknown.
 
     Args:
         kind: a dataclass of bool, int, float, str, None, `Literal`, tuples, mappings by str, unions
             and dataclasses.
-        value: as `json.loads` gives it.
-        where: its place, for messages.
+        value: value as `json.loads` returns it.
+        where: its place in the file, for messages.
 
     Raises:
-        ValueError: something is missing, too much, or of another type; says where.
+        ValueError: something is missing, unknown or of another type; the message says where.
     """
     return _as(kind, value, where)
 
@@ -119,12 +118,12 @@ REWRITE_HINT = "copy it again, or write it anew with `slipid identify`"
 
 
 def write_robot(path: Path, record: RobotRecord) -> None:
-    """Write a robot; DataError where nothing can be written."""
+    """Write a robot's file; raise `DataError` where it cannot be written."""
     write_bytes(path, robot_bytes(record))
 
 
 def robot_bytes(record: RobotRecord) -> bytes:
-    """Content of robot.json."""
+    """Return the content of robot.json."""
     content: dict[str, object] = {"schema": SCHEMA, "units": UNITS, **asdict(record)}
     content["numbers"] = record.numbers
     content["checksum"] = checksum(content)
@@ -132,10 +131,9 @@ def robot_bytes(record: RobotRecord) -> bytes:
 
 
 def read_robot(path: Path) -> RobotRecord:
-    """Read a robot; errors as of `DeployedRobot.load`."""
+    """Read a robot's file; it raises what `DeployedRobot.load` raises."""
     content = _content(path)
-    said = content.pop("checksum", None)
-    now = checksum(content)
+    written, computed = content.pop("checksum", None), checksum(content)
     content.pop("schema")
     if content.pop("units", None) != UNITS:
         raise DataError(f"{path}: other units than {SCHEMA} has; {REWRITE_HINT}")
@@ -145,7 +143,7 @@ def read_robot(path: Path) -> RobotRecord:
         check_record(record)
     except ValueError as error:
         raise DataError(f"{path}: {error}; {REWRITE_HINT}") from error
-    if said != now or numbers != record.numbers:
+    if written != computed or numbers != record.numbers:
         raise DataError(
             f"{path}: the content does not match its checksum, so it was changed or damaged after "
             f"it was written; {REWRITE_HINT}"
@@ -154,7 +152,7 @@ def read_robot(path: Path) -> RobotRecord:
 
 
 def _content(path: Path) -> dict[str, object]:
-    """What the file says, of a version that can be read."""
+    """Return the content of a file whose version can be read."""
     try:
         content = json.loads(
             path.read_bytes().decode("utf-8"), parse_constant=_refused, object_pairs_hook=_once
@@ -191,7 +189,7 @@ def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def _text(value: object, indent: str = "") -> str:
-    """JSON with objects over several lines and everything without objects on one."""
+    """Return JSON with objects over several lines and everything without objects on one."""
     inner = indent + " "
     if isinstance(value, dict) and value:
         rows = [f"{inner}{json.dumps(k)}: {_text(v, inner)}" for k, v in value.items()]
@@ -202,13 +200,13 @@ def _text(value: object, indent: str = "") -> str:
 
 
 def check_record(record: RobotRecord) -> None:
-    """Refuse a record whose parts do not fit together by a ValueError that says which and how."""
+    """Raise `ValueError` with the field and what is expected where parts of a record do not fit."""
     wheels = len(record.wheels.place)
     if not wheels:
         raise ValueError("wheels.place: no entries; expected one for every wheel")
     for name in ("drive_angle", "roller_angle", "grips"):
         _counted(f"wheels.{name}", getattr(record.wheels, name), wheels)
-    geometry_of(record)  # which refuses wheels that cannot drive, and drives that turn none
+    geometry_of(record)  # refuses wheels that cannot drive and drives without wheels
     for kind, names in (("floors", record.labels), ("loads", [x.name for x in record.loads])):
         if not names or len(set(names)) < len(names):
             raise ValueError(f"{kind} {list(names)}; expected one or more, each once")
@@ -216,36 +214,36 @@ def check_record(record: RobotRecord) -> None:
         _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
         _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, record.wheels.drives)
         if load.told is not None:
-            _told(f"loads, {load.name}: told", load.told, len(record.floors))
+            _check_effects(f"loads, {load.name}: told", load.told, len(record.floors))
     _numbers(record)
 
 
 def geometry_of(record: RobotRecord) -> Geometry:
-    """The wheels, every number at its start."""
+    """Return the geometry with every number at its start value."""
     plain = Geometry(**vars(record.wheels))
     return replace(
         plain, drive_offset=jnp.zeros(plain.wheels), radius_deviation=jnp.zeros(plain.drives)
     )
 
 
-def _told(where: str, told: EffectRecord, floors: int) -> None:
-    """Refuse a table whose speeds do not rise, or whose rows are not as many as they should be."""
-    speeds = told.speeds
+def _check_effects(where: str, table: EffectRecord, floors: int) -> None:
+    """Raise `ValueError` for an effect table whose speeds do not rise or whose rows do not fit."""
+    speeds = table.speeds
     if not speeds or speeds[0] <= 0 or any(a >= b for a, b in pairwise(speeds)):
         raise ValueError(f"{where}.speeds: {list(speeds)}; expected positive ones that rise")
-    around = len(told.mean[0][0]) if told.mean and told.mean[0] else 0
-    for name, table in (("mean", told.mean), ("left", told.left)):
-        _counted(f"{where}.{name}", table, floors)
-        for rows in table:
+    around = len(table.mean[0][0]) if table.mean and table.mean[0] else 0
+    for name, by_floor in (("mean", table.mean), ("left", table.left)):
+        _counted(f"{where}.{name}", by_floor, floors)
+        for rows in by_floor:
             _counted(f"{where}.{name}, of a floor", rows, len(speeds))
             for row in rows:
                 _counted(f"{where}.{name}, of a speed", row, max(around, 1))
-    if any(x < 0 for rows in told.left for row in rows for axes in row for x in axes):
+    if any(x < 0 for rows in table.left for row in rows for axes in row for x in axes):
         raise ValueError(f"{where}.left: a std below 0")
 
 
 def declared_numbers(record: RobotRecord) -> tuple[Entry, ...]:
-    """Every number that a robot of this shape has, in order; the camera is no part of it."""
+    """Return every number that a robot of this shape has, in order, without those of the camera."""
     robot = build(geometry_of(record), record.labels, [load.name for load in record.loads])
     return tuple(e for e in entries(robot) if e.part != "camera")
 
@@ -286,7 +284,7 @@ def _sized(where: str, value: Numbers, size: int) -> None:
 
 
 def _inside(where: str, value: Numbers, declaration: Declaration, size: int) -> None:
-    """Refuse a value of another size, or one out of its declared bounds."""
+    """Raise `ValueError` for a value of another size, or one out of its declared bounds."""
     _sized(where, value, size)
     x = np.asarray(value)
     if declaration.shares:

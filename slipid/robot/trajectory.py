@@ -1,4 +1,4 @@
-"""Paths in time: where the robot should be and how fast, and when to wait for it."""
+"""Paths over time: reference poses and rates, and the rule by which a path waits for its robot."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -9,21 +9,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 STEP = 0.02
-"""Between rows of a path [s]."""
-PATIENT, LOST = 0.02, 0.12
-"""Distance from the reference up to which it goes on, and from which it waits [m]."""
+"""Time between two rows of a path [s]."""
+FULL_SPEED_M, WAIT_M = 0.02, 0.12
+"""Distances of the robot up to which a path keeps its speed, and from which it waits [m]."""
 LONGEST = 0.5
-"""Time step beyond which a path does not run ahead of its robot [s]."""
+"""Largest time step by which a path advances [s]."""
 
 
 class Path(eqx.Module):
-    """Pose and twist in the world over a path's own time, which waits for a robot that lags.
+    """Pose and twist in the world over the path's own time, which waits for a robot that lags.
 
     Attributes:
-        rows: x, y [m], heading [rad], their rates [m/s, m/s, rad/s], a row every `STEP`.
-        marks: times at which a side ends, the robot having had time to settle, or a quarter of a
-            curve [s].
-        corners: where it then should be (mark, 2) [m].
+        rows: x, y [m], heading [rad] and their rates [m/s, m/s, rad/s], one row every `STEP`.
+        marks: times at which a side (its settling time included) or a quarter of a curve ends [s].
+        corners: reference positions at these times (mark, 2) [m].
     """
 
     rows: Float[Array, "row 6"]
@@ -32,18 +31,18 @@ class Path(eqx.Module):
 
     @property
     def duration(self) -> float:
-        """Own time of the path [s]."""
+        """Duration of the path in its own time [s]."""
         return (len(self.rows) - 1) * STEP
 
     def at(self, time: Float[Array, ""] | float) -> Float[Array, "6"]:
-        """Pose and rates at a time of the path; beyond its ends, at rest there."""
+        """Return pose and rates at a time of the path; beyond its ends it rests there."""
         place = jnp.clip(jnp.asarray(time) / STEP, 0.0, len(self.rows) - 1.000001)
         low = jnp.floor(place).astype(jnp.int32)
         high, part = jnp.minimum(low + 1, len(self.rows) - 1), place - low
         return (1 - part) * self.rows[low] + part * self.rows[high]
 
-    def left(self, time: Float[Array, ""] | float) -> Float[Array, ""]:
-        """Way that is left at a time of the path [m]."""
+    def remaining(self, time: Float[Array, ""] | float) -> Float[Array, ""]:
+        """Return the path length that remains at a time of the path [m]."""
         steps = jnp.diff(self.rows[:, :2], axis=0)
         after = jnp.clip(jnp.arange(1, len(self.rows)) - jnp.asarray(time) / STEP, 0.0, 1.0)
         return jnp.sum(after * jnp.sqrt(jnp.sum(steps**2, axis=1)))
@@ -55,13 +54,13 @@ class Path(eqx.Module):
         dt: Float[Array, ""] | float,
         preview: Float[Array, ""] | float = 0.0,
     ) -> tuple[Float[Array, ""], Float[Array, "6"]]:
-        """Time of the path one step later, and the reference there for a robot at a pose.
+        """Return the time of the path one step later and the reference there, for a robot's pose.
 
-        The pose is that of this time, the rates are those `preview` later [s].
+        The reference's pose is that of this time, its rates are those `preview` later [s].
 
-        The path slows down, and its rates with it, while the robot is believed to lag behind or
-        beside it; one that is ahead is no reason to wait. Where dt is no positive number, no time
-        has passed; it moves on by `LONGEST` at most.
+        The path slows down, and its rates with it, while the estimated pose lags behind it or is
+        off to the side; it does not wait for a robot that is ahead. A `dt` that is not a positive
+        number counts as 0; the time advances by `LONGEST` at most.
         """
         dt = jnp.asarray(dt, dtype=float)
         dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, LONGEST), 0.0)
@@ -72,13 +71,13 @@ class Path(eqx.Module):
         off = jnp.sqrt(
             jnp.maximum(gap @ gap - jnp.where(size > 1e-3, ahead, 0.0) ** 2, 0.0) + 1e-12
         )
-        pace = jnp.clip((LOST - off) / (LOST - PATIENT), 0.0, 1.0)
-        time = jnp.asarray(time) + pace * dt
-        rates = self.at(time + preview)[3:] * pace
+        rate = jnp.clip((WAIT_M - off) / (WAIT_M - FULL_SPEED_M), 0.0, 1.0)
+        time = jnp.asarray(time) + rate * dt
+        rates = self.at(time + preview)[3:] * rate
         return time, jnp.concatenate([self.at(time)[:3], rates])
 
     def moved(self, start: Sequence[float]) -> "Path":
-        """The path as it lies for a robot that starts at a pose (x, y [m], heading [rad])."""
+        """Return the path placed for a robot that starts at a pose (x, y [m], heading [rad])."""
         x, y, heading = (float(v) for v in start)
         c, s = np.cos(heading), np.sin(heading)
         turn = np.array([[c, s], [-s, c]])
@@ -89,8 +88,8 @@ class Path(eqx.Module):
         corners = np.asarray(self.corners).reshape(-1, 2) @ turn + [x, y]
         return Path(jnp.asarray(rows), self.marks, jnp.asarray(corners))
 
-    def waiting(self, seconds: float) -> "Path":
-        """The path after so long a rest at its start."""
+    def after_rest(self, seconds: float) -> "Path":
+        """Return the path after a rest of this duration at its start."""
         count = round(seconds / STEP)
         still = jnp.broadcast_to(self.rows[0].at[3:].set(0.0), (count, 6))
         return Path(jnp.concatenate([still, self.rows]), self.marks + count * STEP, self.corners)
@@ -103,17 +102,18 @@ def waypoints(
     pause: float = 0.6,
     turn: float = 0.0,
 ) -> Path:
-    """Straight from place to place with a stop at each.
+    """Return straight lines between way-points with a stop at each.
 
     Args:
-        places: x, y [m], the first one is where it starts.
-        speed: between stops [m/s]; acceleration: [m/s^2].
-        pause: at every place [s].
-        turn: by which it turns on the way to each place [rad].
+        places: way-points x, y [m]; the first one is the start.
+        speed: speed between stops [m/s].
+        acceleration: acceleration at both ends of each line [m/s^2].
+        pause: rest at every way-point [s].
+        turn: change of heading on each line [rad].
 
     Raises:
-        ValueError: fewer than two places, neighbours that are the same, or a speed or acceleration
-            that is not positive.
+        ValueError: there are fewer than two way-points, two neighbours are the same, or a speed or
+            acceleration is not positive.
     """
     _positive(speed, acceleration)
     p = np.asarray(places, float)
@@ -121,13 +121,13 @@ def waypoints(
         raise ValueError(f"way-points {p.tolist()}; expected two or more places x, y")
     parts, marks, time = [np.array([[*p[0], 0.0, 0.0, 0.0, 0.0]])], [], 0.0
     for k, (a, b) in enumerate(itertools.pairwise(p)):
-        far = float(np.hypot(*(b - a)))
-        if far < 1e-9:
+        length = float(np.hypot(*(b - a)))
+        if length < 1e-9:
             raise ValueError(f"way-point {b.tolist()} twice in a row; expected another place")
-        gone, pace = _trapezoid(far, speed, acceleration, pause)
-        way = np.array([*(b - a), turn]) / far
-        parts.append(np.hstack([[*a, k * turn] + gone[:, None] * way, pace[:, None] * way]))
-        time += len(gone) * STEP
+        distance, rate = _trapezoid(length, speed, acceleration, pause)
+        line = np.array([*(b - a), turn]) / length
+        parts.append(np.hstack([[*a, k * turn] + distance[:, None] * line, rate[:, None] * line]))
+        time += len(distance) * STEP
         marks.append(time)
     rows = np.concatenate(parts)
     return Path(jnp.asarray(rows), jnp.asarray(marks), jnp.asarray(p[1:]))
@@ -136,9 +136,13 @@ def waypoints(
 def rectangle(
     length: float = 0.9, width: float = 0.4, speed: float = 0.2, turn: float = 0.0
 ) -> Path:
-    """The 2021 paper's trial (figure 7): ahead, to the right, back, to the left [m], [m/s].
+    """Return the path of the 2021 paper's trial (figure 7): ahead, to the right, back, to the left.
 
-    The robot turns by `turn` on each side [rad].
+    Args:
+        length: sides ahead and back [m].
+        width: sides to the right and to the left [m].
+        speed: speed on each side [m/s].
+        turn: change of heading on each side [rad].
     """
     corners = [(0.0, 0.0), (length, 0.0), (length, -width), (0.0, -width), (0.0, 0.0)]
     return waypoints(corners, speed, turn=turn)
@@ -150,46 +154,47 @@ def curve(
     acceleration: float = 0.5,
     pause: float = 0.6,
 ) -> Path:
-    """Along a smooth line without turning and without a stop, at rest in the end.
+    """Return a smooth path driven without turning and without stops, at rest in the end.
 
     Args:
-        places: x, y [m], dense enough that straight lines between them are the curve.
-        speed: along it [m/s]; acceleration: at its ends [m/s^2].
-        pause: at its end [s].
+        places: points x, y [m], dense enough for straight lines between them to be the curve.
+        speed: speed along it [m/s].
+        acceleration: acceleration at its ends [m/s^2].
+        pause: rest at its end [s].
 
     Raises:
-        ValueError: fewer than two places, neighbours that are the same, or a speed or acceleration
-            that is not positive.
+        ValueError: there are fewer than two points, two neighbours are the same, or a speed or
+            acceleration is not positive.
     """
     _positive(speed, acceleration)
     p = np.asarray(places, float)
-    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p, axis=0).T))])
-    if len(p) < 2 or np.diff(far).min() < 1e-9:
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p, axis=0).T))])
+    if len(p) < 2 or np.diff(length).min() < 1e-9:
         raise ValueError("a curve's places; expected two or more, each another than the last")
-    gone, pace = _trapezoid(float(far[-1]), speed, acceleration, pause)
-    gone, pace = np.append(0.0, gone), np.append(0.0, pace)
-    place = np.stack([np.interp(gone, far, x) for x in p.T], axis=1)
-    rate = np.stack([np.interp(gone, far, np.gradient(x, far)) for x in p.T], axis=1)
-    still = np.zeros((len(gone), 1))
-    quarters = np.searchsorted(gone, far[-1] * np.array([0.25, 0.5, 0.75]))
-    at = np.append(quarters, len(gone) - 1)
-    rows = np.hstack([place, still, pace[:, None] * rate, still])
+    distance, rate = _trapezoid(float(length[-1]), speed, acceleration, pause)
+    distance, rate = np.append(0.0, distance), np.append(0.0, rate)
+    place = np.stack([np.interp(distance, length, x) for x in p.T], axis=1)
+    slope = np.stack([np.interp(distance, length, np.gradient(x, length)) for x in p.T], axis=1)
+    still = np.zeros((len(distance), 1))
+    quarters = np.searchsorted(distance, length[-1] * np.array([0.25, 0.5, 0.75]))
+    at = np.append(quarters, len(distance) - 1)
+    rows = np.hstack([place, still, rate[:, None] * slope, still])
     return Path(jnp.asarray(rows), jnp.asarray(at * STEP), jnp.asarray(place[at]))
 
 
 def circle(radius: float = 0.35, speed: float = 0.2) -> Path:
-    """Once round to the right, without turning [m], [m/s]."""
+    """Return one full circle to the right, driven without turning [m], [m/s]."""
     return curve(_round(radius), speed)
 
 
 def eight(radius: float = 0.25, speed: float = 0.2) -> Path:
-    """A circle to the right and one to the left, without turning [m], [m/s]."""
+    """Return a circle to the right and one to the left, driven without turning [m], [m/s]."""
     right = _round(radius)
     return curve(np.concatenate([right, right[1:] * [1.0, -1.0]]), speed)
 
 
 def turning(speed: float = 0.2) -> Path:
-    """The 2021 paper's rectangle, turning by a quarter to the right on each side [m/s]."""
+    """Return the 2021 paper's rectangle with a quarter turn to the right on each side [m/s]."""
     return rectangle(speed=speed, turn=-0.5 * np.pi)
 
 
@@ -199,30 +204,31 @@ PATHS: Mapping[str, Callable[[float], Path]] = {
     "eight": lambda speed: eight(speed=speed),
     "turning": turning,
 }
-"""Of a trial, by name, at a speed [m/s]."""
+"""Paths of a trial by name, each a function of its speed [m/s]."""
 
 
 def _round(radius: float) -> Float[np.ndarray, "place 2"]:
-    """Places of a circle to the right that begins ahead [m]."""
+    """Return the points of a circle to the right that begins straight ahead [m]."""
     angle = np.linspace(0.0, 2 * np.pi, 721)
     return radius * np.stack([np.sin(angle), np.cos(angle) - 1.0], axis=1)
 
 
 def _positive(speed: float, acceleration: float) -> None:
+    """Raise `ValueError` unless speed and acceleration are both positive."""
     if not (speed > 0 and acceleration > 0):
         raise ValueError(f"speed {speed}, acceleration {acceleration}; expected both positive")
 
 
 def _trapezoid(
-    far: float, speed: float, acceleration: float, pause: float
+    length: float, speed: float, acceleration: float, pause: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance and speed every `STEP` on a straight line with a rest at its end."""
-    top = min(speed, float(np.sqrt(far * acceleration)))
+    """Return distance and speed every `STEP` on a straight line with a rest at its end."""
+    top = min(speed, float(np.sqrt(length * acceleration)))
     ramp = top / acceleration
-    whole = far / top + ramp
+    whole = length / top + ramp
     t = np.arange(1, int(np.ceil((whole + pause) / STEP)) + 1) * STEP
     up, down = np.minimum(t, ramp), np.clip(t - (whole - ramp), 0.0, ramp)
     level = np.clip(t - ramp, 0.0, whole - 2 * ramp)
-    gone = 0.5 * acceleration * up**2 + top * level + top * down - 0.5 * acceleration * down**2
-    pace = np.where(t < whole, acceleration * up - acceleration * down, 0.0)
-    return np.minimum(gone, far), pace
+    distance = 0.5 * acceleration * up**2 + top * level + top * down - 0.5 * acceleration * down**2
+    rate = np.where(t < whole, acceleration * up - acceleration * down, 0.0)
+    return np.minimum(distance, length), rate

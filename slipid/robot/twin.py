@@ -1,20 +1,18 @@
-"""How wheels follow their commands and what sensors are like: what no fit tells.
+"""The twin: the identified robot itself as a plant, on which closed-loop runs are rehearsed.
 
-The identified robot as a plant: what closed-loop runs are rehearsed on.
-
-Commands reach the wheels late, a slew and a lag after; wheels on several floors move the body as
-the contact says, and what the fit says the model misses is drawn anew for every run, effects as
-`slipid.robot.filter.effects` has them:
+Commands reach the wheels after a delay, a slew limit and a lag. Wheels on several floors move the
+body by the contact model, and the model's errors are drawn anew for every run, with effects as in
+`slipid.robot.filter.effects`:
 
     set <- set + clip(command(t - delay) - set, slew h),   w <- w + (1 - exp(-h / lag)) (set - w)
     xi = equilibrium(r w; floor under each wheel)
-    pose <- pose * exp(xi h + s h (told + left effect) + sqrt(s h) process)
+    pose <- pose * exp(xi h + s h (estimated + remaining effect) + sqrt(s h) process)
 
-with s the speed at which the wheels would take the body if none slipped.
+with s the speed at which the wheels would take the body without slip.
 
-Everything is differentiable but for which floor a wheel is on; ticks pass derivatives through.
-Differentiate forwards (`jax.jvp`, `jax.jacfwd`): readings that are no numbers would spoil a pass
-backwards.
+Everything is differentiable except for which floor a wheel is on; derivatives pass through the
+ticks of encoders. Differentiate forwards (`jax.jvp`, `jax.jacfwd`), since NaN readings would spoil
+reverse mode.
 """
 
 from dataclasses import dataclass, replace
@@ -35,23 +33,28 @@ from slipid.robot.filter.floor import Floor
 from slipid.robot.interface import Measurement, Pose, Readings
 
 RING = 6
-"""Commands that are kept: a delay may be up to `RING` - 1 periods."""
+"""Number of commands that are kept; a delay may be up to `RING` - 1 periods."""
 
 
 @dataclass(frozen=True)
 class ActuatorModel:
-    """How wheels follow their commands and what sensors are like.
+    """Response of the wheels to commands and noise of the sensors, which no fit determines.
 
     Attributes:
-        delay_s: from a command to the wheels [s].
-        slew: of the wheels [rad/s^2]; lag_s: of their speed control [s].
-        ticks: of an encoder per turn of the wheel.
-        ammeter_a: noise of a current [A]; drift_s: how long currents stay off the model's [s].
-        voltmeter_v: noise of a voltage [V]; voltage: whether it is measured.
-        gyro_noise, gyro_bias: of a yaw rate [rad/s]; gyro: whether it is measured.
+        delay_s: time from a command to the wheels [s].
+        slew: largest acceleration of the wheels [rad/s^2].
+        lag_s: time constant of their speed control [s].
+        ticks: ticks of an encoder per turn of the wheel.
+        ammeter_a: noise of a current [A].
+        drift_s: correlation time of the currents' errors [s].
+        voltmeter_v: noise of a voltage [V].
+        voltage: whether voltages are measured.
+        gyro_noise: noise of a yaw rate [rad/s].
+        gyro_bias: std of the bias of a yaw rate [rad/s].
+        gyro: whether yaw rates are measured.
         signed: whether currents have signs.
-        substeps: of wheels and body in a control period.
-        smooth: encoders without ticks.
+        substeps: steps of wheels and body in a control period.
+        smooth: whether encoders have no ticks.
     """
 
     delay_s: float = 0.12
@@ -71,39 +74,43 @@ class ActuatorModel:
 
     @property
     def substep(self) -> float:
-        """How long it takes [s]."""
+        """Duration of a substep [s]."""
         return PERIOD / self.substeps
 
     @property
-    def follow(self) -> float:
-        """Part of the gap to its set speed that a wheel makes up in a substep."""
+    def lag_gain(self) -> float:
+        """Share of the difference from its set speed that a wheel makes up in a substep."""
         return 1 - float(np.exp(-self.substep / max(self.lag_s, 1e-6)))
 
-    def held(self) -> Float[np.ndarray, "substep command"]:
-        """Share of each of the last commands, the newest first, in the mean over every substep.
+    def command_shares(self) -> Float[np.ndarray, "substep command"]:
+        """Return the weights of the last commands, the newest first, in every substep's mean.
 
-        Commands hold for a period and arrive so late; exact, and linear in the delay.
+        Commands hold for a period and arrive after the delay. The weights are exact, and linear in
+        the delay.
         """
         h = self.substep
         begin = np.arange(self.substeps)[:, None] * h - self.delay_s
         since = -np.arange(RING)[None, :] * PERIOD
         both = np.minimum(begin + h, since + PERIOD) - np.maximum(begin, since)
         share = np.clip(both, 0.0, None) / h
-        share[:, -1] += 1.0 - share.sum(axis=1)  # what is older counts as the oldest
+        share[:, -1] += 1.0 - share.sum(axis=1)  # older commands count as the oldest
         return share
 
 
 class TwinState(eqx.Module):
-    """What is true of a twin.
+    """True state of a twin.
 
     Attributes:
-        pose: x, y [m], heading [rad]; twist: of the body [m/s, m/s, rad/s].
-        wanted: wheel speeds that the motors' control is set to [rad/s].
-        speed: of the wheels [rad/s]; angle: of the wheels [rad].
-        effect: what the model misses now on every floor beyond what is told, in stds left.
-        toward: direction of travel that counts as taken, see `slipid.robot.filter.effects`.
-        offset, drift: of the currents, all the way and for a moment [A].
-        bias: of the gyro [rad/s].
+        pose: x, y [m], heading [rad].
+        twist: velocity of the body in its own axes [m/s, m/s, rad/s].
+        wanted: set speeds of the wheels' control [rad/s].
+        speed: wheel speeds [rad/s].
+        angle: wheel angles [rad].
+        effect: present effect of every floor beyond its estimate, in remaining stds.
+        toward: settled direction of travel, see `slipid.robot.filter.effects`.
+        offset: constant error of the currents in this run [A].
+        drift: correlated error of the currents [A].
+        bias: bias of the gyro [rad/s].
         ring: commands on their way, the newest first [rad/s].
     """
 
@@ -121,31 +128,31 @@ class TwinState(eqx.Module):
 
 
 class Twin(eqx.Module):
-    """A robot on a floor.
+    """A robot on a floor map, as a plant.
 
     Attributes:
-        robot: as it is.
-        floor: which surface lies where, by number in `robot.labels`.
-        habits: what no fit tells.
+        robot: robot with its true numbers.
+        floor: map of the surfaces, by number in `robot.labels`.
+        actuators: response of the wheels and noise of the sensors.
     """
 
     robot: RobotArrays = eqx.field(converter=lambda robot: robot.arrays)
     floor: Floor
-    habits: ActuatorModel = eqx.field(static=True, default=ActuatorModel())
+    actuators: ActuatorModel = eqx.field(static=True, default=ActuatorModel())
 
     def __check_init__(self) -> None:
-        """Refuse a delay that the ring cannot hold."""
+        """Raise `ValueError` for a delay longer than the commands that are kept."""
         most = (RING - 1) * PERIOD
-        if not 0 <= self.habits.delay_s <= most:
-            raise ValueError(f"delay_s = {self.habits.delay_s}; expected 0 to {most:g}")
+        if not 0 <= self.actuators.delay_s <= most:
+            raise ValueError(f"delay_s = {self.actuators.delay_s}; expected 0 to {most:g}")
 
     def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:
-        """Standard normal numbers of a step by its number; 0 is the reading at rest."""
-        count = 3 * (self.robot.wheels + self.habits.substeps + len(self.robot.labels)) + 1
+        """Return the standard normal numbers of a step; step 0 is the reading at rest."""
+        count = 3 * (self.robot.wheels + self.actuators.substeps + len(self.robot.labels)) + 1
         return jax.random.normal(jax.random.fold_in(key, number), (count,))
 
     def init(self, pose: Pose, key: Array) -> TwinState:
-        """State at rest at a pose [m, m, rad], with what this run has of its own."""
+        """Return the state at rest at a pose [m, m, rad], with errors drawn for this run."""
         f, w = self.robot, (self.robot.wheels,)
         one, two, three = jax.random.split(jax.random.fold_in(key, 2**31 - 1), 3)
         off = jax.random.normal(two, w) * jnp.mean(f.current_std) / jnp.sqrt(2.0)
@@ -160,83 +167,83 @@ class Twin(eqx.Module):
             toward=jnp.zeros(3),
             offset=off,
             drift=zero,
-            bias=self.habits.gyro_bias * jax.random.normal(three),
+            bias=self.actuators.gyro_bias * jax.random.normal(three),
             ring=jnp.zeros((RING, *w)),
         )
 
     def step(
         self, state: TwinState, command: Float[Array, " wheel"], noise: Float[Array, " noise"]
     ) -> tuple[TwinState, Readings]:
-        """State and readings a period after a command [rad/s]."""
-        old, b, h = state, self.habits, self.habits.substep
+        """Return state and readings one period after a command [rad/s]."""
+        old, b, h = state, self.actuators, self.actuators.substep
         ring = jnp.concatenate([command[None], old.ring[:-1]])
-        shares = jnp.asarray(b.held())
+        shares = jnp.asarray(b.command_shares())
         pushes = noise[: 3 * b.substeps].reshape(-1, 3)
         pose, xi, wanted, w, angle = old.pose, old.twist, old.wanted, old.speed, old.angle
         for k in range(b.substeps):
             jump = b.slew * h
             wanted = wanted + jnp.clip(shares[k] @ ring - wanted, -jump, jump)
-            w = w + b.follow * (wanted - w)
+            w = w + b.lag_gain * (wanted - w)
             pose, xi = self._roll(pose, w, old.effect, pushes[k], h)
             angle = angle + h * w
         now = replace(old, pose=pose, twist=xi, wanted=wanted, speed=w, angle=angle, ring=ring)
-        amps, drift = self._amps(now, noise[3 * b.substeps :])
+        amps, drift = self._currents(now, noise[3 * b.substeps :])
         turned = (pose[2] - old.pose[2]) / PERIOD
-        effect, toward = self._errs(now, noise[-3 * len(self.robot.labels) :])
+        effect, toward = self._effects(now, noise[-3 * len(self.robot.labels) :])
         now = replace(now, drift=drift, effect=effect, toward=toward)
         return now, self._read(angle, w, amps, turned + old.bias, noise)
 
     def first(self, state: TwinState, noise: Array) -> Readings:
-        """Readings of a robot at rest."""
+        """Return the readings of a robot at rest."""
         still = jnp.zeros_like(state.speed)
         return self._read(state.angle, state.speed, still, state.bias, noise)
 
     def _roll(
         self, pose: Array, w: Array, effect: Array, push: Array, h: float
     ) -> tuple[Array, Array]:
-        """Pose and twist a substep later."""
+        """Return pose and twist one substep later."""
         f = self.robot
         under = self.floor.under(pose, f.places)
         rim = f.frame.radius * w
         xi = contact.equilibrium(rim, f.frame, f.floors.at(under), f.rest)
-        course = RolledMotion.of(f.inverse @ rim, f.frame.base)
-        mean, part = f.told.at(course)
-        missed, far, share = mean + part * f.effect * effect, course.speed * h, f.rest[:, None]
-        off = far * jnp.sum(share * missed[under], axis=0)
+        rolled = RolledMotion.of(f.inverse @ rim, f.frame.base)
+        mean, part = f.effect_table.at(rolled)
+        errors, far, share = mean + part * f.effect * effect, rolled.speed * h, f.rest[:, None]
+        off = far * jnp.sum(share * errors[under], axis=0)
         off += jnp.sqrt(far + 1e-12) * push * jnp.sqrt(jnp.sum(share * f.process[under] ** 2, 0))
-        return compose(pose, advance(xi + course.axes @ off / h, h)), xi
+        return compose(pose, advance(xi + rolled.axes @ off / h, h)), xi
 
-    def _errs(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
-        """Effects of the floors, and the direction that counts as taken, for the next period."""
+    def _effects(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
+        """Return effects of the floors and settled direction for the next period."""
         f, xi = self.robot, now.twist
         far = (jnp.sqrt(xi[:2] @ xi[:2] + 1e-12) + f.frame.base * jnp.abs(xi[2])) * PERIOD
         under = self.floor.under(now.pose, f.places)
         left = jnp.all(under[:, None] != jnp.arange(len(f.labels)), axis=0)
-        way = travel_direction(f.inverse @ (f.frame.radius * now.speed), f.frame.base)
-        toward, keep = effect_correlation(now.toward, way, left.astype(float), far)
+        heading = travel_direction(f.inverse @ (f.frame.radius * now.speed), f.frame.base)
+        toward, keep = effect_correlation(now.toward, heading, left.astype(float), far)
         fresh = jnp.sqrt(1 - keep**2 + 1e-15)[:, None] * noise.reshape(-1, 3)
         return keep[:, None] * now.effect + fresh, toward
 
-    def _amps(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
-        """Signed currents [A], and how far they have drifted from the model's since the last."""
+    def _currents(self, now: TwinState, noise: Array) -> tuple[Array, Array]:
+        """Return signed currents [A], and their correlated errors after this period [A]."""
         f, wheels, xi, w = self.robot, self.robot.wheels, now.twist, now.speed
         under = self.floor.under(now.pose, f.places)
         floor = f.floors.at(under)
         where = xi, f.frame.radius * w, f.frame, floor, f.rest
         motor_force = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
         force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
-        keep = float(np.exp(-PERIOD / self.habits.drift_s))
+        keep = float(np.exp(-PERIOD / self.actuators.drift_s))
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
         drift = keep * now.drift + fresh
-        moves = jnp.tanh(w / 0.2) ** 2  # a motor that stands draws nothing
+        moves = jnp.tanh(w / 0.2) ** 2  # a standing motor draws no current
         model = f.motor.current(force * f.motor.opposing_force(motor_force), w)
         free = (f.inverse @ (f.frame.radius * w))[:2]
         more = f.current_trend @ jnp.stack([1.0, jnp.sqrt(free @ free + 1e-24)])
         return model + moves * (jnp.sign(model) * more + now.offset + drift), drift
 
     def _read(self, angle: Array, w: Array, amps: Array, turn: Array, noise: Array) -> Readings:
-        """Readings; what no sensor of this robot measures is NaN."""
-        b, wheels = self.habits, self.robot.wheels
+        """Return the readings, with NaN for everything that no sensor of this robot measures."""
+        b, wheels = self.actuators, self.robot.wheels
         _, by_amps, by_volts, by_turn = jnp.split(
             noise[3 * b.substeps :], [wheels, 2 * wheels, 3 * wheels]
         )
@@ -253,7 +260,7 @@ class Twin(eqx.Module):
 
 
 class TwinPlant:
-    """A twin behind `slipid.robot.closed_loop.Plant`; a key gives the same run every time."""
+    """A twin as a `slipid.robot.closed_loop.Plant`; a key gives the same run every time."""
 
     def __init__(self, twin: Twin, start: Pose, key: Array):
         self.twin, self.start, self.key = twin, start, key

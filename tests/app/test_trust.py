@@ -17,7 +17,7 @@ def test_a_fit_that_is_not_to_be_trusted_says_so_in_its_pictures():
     bad = judged("not to be trusted")
     assert bad.is_bad
     made = drawing.figure(4.0, 3.0, "a title")
-    drawing.warned(made, bad.warning)
+    drawing.add_warning(made, bad.warning)
     assert made.get_suptitle() == "THIS FIT IS NOT TO BE TRUSTED\na title"
 
 

@@ -75,11 +75,11 @@ def steps_of(kind):
     from slipid.deploy.floors import floor_of
     from slipid.lab.trial.controllers import ROWS
     from slipid.robot.trajectory import rectangle
-    from tests.helpers.compiled_pilot import CompiledPilot
+    from tests.helpers.compiled_loop import CompiledLoop
 
     patches = floor_of(patchwork(f.labels, 7, patch=0.35, half=2.0), f.labels)
-    pilot = control_loop_of(f, ROWS[kind], floor=patches)
-    rng, compiled = np.random.default_rng(0), CompiledPilot(pilot, rectangle())
+    control_loop = control_loop_of(f, ROWS[kind], floor=patches)
+    rng, compiled = np.random.default_rng(0), CompiledLoop(control_loop, rectangle())
     speed = np.asarray(f.forward @ jnp.array([0.2, 0.05, 0.1]) / f.frame.radius)
     sensed = compiled.measurements
     readings = np.full((1000, sensed.size), np.nan)

@@ -20,7 +20,7 @@ from slipid.export.c99.code import Code
 from slipid.export.c99.folder import c_files
 from slipid.export.golden import golden
 from slipid.robot.trajectory import rectangle
-from tests.benchmarks.export_builds import HERE, KINDS, needs, pilot, ran, three_floors
+from tests.benchmarks.export_builds import HERE, KINDS, control_loop, needs, ran, three_floors
 from tests.benchmarks.quick import QUICK, quick
 
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
@@ -61,7 +61,7 @@ void _exit(int code) { (void)code; for (;;) {} }
 
 @cache
 def _files(row: str) -> dict[str, str]:
-    return c_files(three_floors(), pilot(row), rectangle())
+    return c_files(three_floors(), control_loop(row), rectangle())
 
 
 def folder_of(row: str, into: Path) -> Path:
@@ -126,7 +126,7 @@ class Sizes:
 
 @cache
 def _bare(row: str) -> Code:
-    return Code(three_floors(), pilot(row))
+    return Code(three_floors(), control_loop(row))
 
 
 def sizes(row: str, chip: str, folder: Path) -> Sizes:
@@ -188,7 +188,9 @@ def test_sanitizers(tmp_path, row, compiler, kind):
 def seeds(row: str, into: Path) -> None:
     """Drives to begin with, as `fuzz_step.c` reads them: raw numbers, and wheels that turn on."""
     into.mkdir()
-    steps = [b"\x00" + given.tobytes() for given in golden(pilot(row)).given.astype(np.float64)]
+    steps = [
+        b"\x00" + given.tobytes() for given in golden(control_loop(row)).given.astype(np.float64)
+    ]
     (into / "raw").write_bytes(b"".join(steps))
     rng = np.random.default_rng(0)
     for number in range(8):

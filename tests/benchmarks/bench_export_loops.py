@@ -20,9 +20,9 @@ from tests.benchmarks.export_builds import (
     Fleet,
     Plants,
     code,
+    control_loop,
     needs,
     nudged,
-    pilot,
     three_floors,
 )
 from tests.benchmarks.quick import QUICK
@@ -57,11 +57,11 @@ def looped(plants: Plants, drive, state, periods: int) -> Loops:
 
 
 def by_jax(row: str, count: int, nudge: float = 0.0):
-    """Drive function and first state of the library's own pilot.
+    """Drive function and first state of the library's own control loop.
 
     With a nudge its state is off by that much, relatively and at random, after every period.
     """
-    p, rng = pilot(row), np.random.default_rng(0)
+    p, rng = control_loop(row), np.random.default_rng(0)
     step = jax.jit(
         lambda state, z: jax.lax.map(lambda g: p.step(PATH, g[0], g[1], 0.05), (state, z))
     )

@@ -25,9 +25,9 @@ from slipid.model.geometry import mecanum
 from slipid.robot.controller import (
     GIVES_UP_S,
     GO_S,
-    HARDER,
     LONGEST_I,
     OBSERVE_S,
+    RECOVERY_GROWTH,
     STUCK_S,
     TURN_S,
     Limits,
@@ -44,9 +44,9 @@ from tests.benchmarks.export_builds import (
     PLAIN,
     Fleet,
     code,
+    control_loop,
     driven,
     needs,
-    pilot,
     ran,
     three_floors,
 )
@@ -111,7 +111,7 @@ def test_step(tmp_path, row, kind):
 
 def numbers() -> str:
     """The robot's numbers as macros and tables, for the step written by hand."""
-    p, s = pilot("slip_odometry"), Settings.of(three_floors())
+    p, s = control_loop("slip_odometry"), Settings.of(three_floors())
     f, k, most = p.controller.robot, p.controller.gains, Limits()
     given = {
         "RADIUS": f.frame.radius,
@@ -132,7 +132,7 @@ def numbers() -> str:
         "STUCK": STUCK_S,
         "TURN": TURN_S,
         "GO": GO_S,
-        "HARDER": HARDER,
+        "RECOVERY_GROWTH": RECOVERY_GROWTH,
         "GIVES_UP": GIVES_UP_S,
         "CURRENT_FROM": CURRENT_FROM,
         "UNTIMED": UNTIMED_S,

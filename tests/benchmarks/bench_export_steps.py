@@ -17,9 +17,9 @@ from tests.benchmarks.export_builds import (
     KINDS,
     SHARE,
     code,
+    control_loop,
     needs,
     nudged,
-    pilot,
     three_floors,
 )
 from tests.benchmarks.quick import QUICK
@@ -44,7 +44,7 @@ def extreme(key, angle):
 
 def source(row: str, drawn: str) -> Source:
     draw = wander(three_floors().wheels) if drawn == "wander" else extreme
-    return Source(pilot(row), draw, ROBOTS, ROWS_OF_BATCH)
+    return Source(control_loop(row), draw, ROBOTS, ROWS_OF_BATCH)
 
 
 def flat(tree) -> dict[str, np.ndarray]:
@@ -92,7 +92,7 @@ class Again:
     """JAX's step of some steps of a batch, as it is and from states that are changed a little."""
 
     def __init__(self, row: str, lot: int):
-        p = pilot(row)
+        p = control_loop(row)
 
         def one(given):
             seen, held, z, reference, dt = given

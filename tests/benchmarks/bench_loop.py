@@ -148,15 +148,15 @@ def driven(robot, row, path, steps=STEPS):
             share = jnp.where(jnp.all(there, axis=1), 1.0, 1e-9)
             return jnp.broadcast_to(share, (32, len(hypotheses)))
 
-    class ToldFloors(ControlLoop):
-        """A pilot that learns from its fix which floors are under its wheels, and no more."""
+    class FloorsByFix(ControlLoop):
+        """A control loop that learns only from its fix which floors are under its wheels."""
 
         def step(self, path, state, measurement, dt):
             at, known = measurement.fix, self.estimator.floor
             there = UnderWheels(known.cells, known.corner, known.cell, jnp.nan_to_num(at))
-            pilot = eqx.tree_at(lambda p: p.estimator.floor, self, there)
+            control_loop = eqx.tree_at(lambda p: p.estimator.floor, self, there)
             blind = replace(measurement, fix=jnp.full(3, jnp.nan))
-            return ControlLoop.step(pilot, path, state, blind, dt)
+            return ControlLoop.step(control_loop, path, state, blind, dt)
 
     ground = twin_floor(robot)
     floor, seeds = floor_of(ground, robot.labels), range(SEED, SEED + STARTS)
@@ -164,7 +164,7 @@ def driven(robot, row, path, steps=STEPS):
     truths = stack(*[drawn_robot(robot, seed) for seed in seeds])
     believed = stack(*[floor_of(flawed(ground, row.flaw, s), robot.labels) for s in seeds])
     places = starts(STARTS, ground, path)
-    paths = [path.moved(place).waiting(1.0) for place in places]
+    paths = [path.moved(place).after_rest(1.0) for place in places]
     keys = jnp.stack([jax.random.key(seed) for seed in seeds])
     habits = replace(actuator_model_of(robot, gyro=row.gyro), smooth=row.smooth)
     std = jnp.array([row.place_std, row.heading_std])
@@ -173,11 +173,11 @@ def driven(robot, row, path, steps=STEPS):
     def all_of(*cases):
         def one(truth, path, place, key, there):
             known = truth if row.numbers else robot
-            pilot = control_loop_of(known, TRIAL[row.name], Settings.of(robot), floor=there)
+            control_loop = control_loop_of(known, TRIAL[row.name], Settings.of(robot), floor=there)
             if row.floors:
-                pilot = ToldFloors(pilot.estimator, pilot.controller)
+                control_loop = FloorsByFix(control_loop.estimator, control_loop.controller)
             plant = TellingTwin(truth, floor, habits, fix_std=std)
-            return rollout(pilot, path, plant, place, key, steps)
+            return rollout(control_loop, path, plant, place, key, steps)
 
         return jax.vmap(one)(*cases)
 
@@ -185,7 +185,7 @@ def driven(robot, row, path, steps=STEPS):
     out = []
     for k, path in enumerate(paths):
         own = np.asarray(said.time[k])
-        ended = np.flatnonzero((own >= path.duration - 1e-6) | np.asarray(said.given_up[k]))
+        ended = np.flatnonzero((own >= path.duration - 1e-6) | np.asarray(said.gave_up[k]))
         end = int(ended[0]) + 1 if len(ended) else steps
         course = ClosedLoopRun(
             path=path,
@@ -197,6 +197,6 @@ def driven(robot, row, path, steps=STEPS):
             energy=np.full(end, np.nan),
         )
         m = path_metrics(course)
-        helpless = bool(said.given_up[k, end - 1])
+        helpless = bool(said.gave_up[k, end - 1])
         out.append((m.closure_mm, m.cross_track_rmse_mm, m.finished, helpless))
     return np.array(out, float)

@@ -161,8 +161,13 @@ def test_two_floors(job: ConfigFitTask) -> None:
     ]
     for title, settings, there, mapped in (
         ("any of four", Settings(), known.labels, None),
-        ("these two", Settings(alike=MIXED_FLOORS_PENALTY), PAIR, None),
-        ("their map", Settings(alike=MIXED_FLOORS_PENALTY), PAIR, floor_of(floor, PAIR)),
+        ("these two", Settings(further_floor_penalty=MIXED_FLOORS_PENALTY), PAIR, None),
+        (
+            "their map",
+            Settings(further_floor_penalty=MIXED_FLOORS_PENALTY),
+            PAIR,
+            floor_of(floor, PAIR),
+        ),
     ):
         est = Estimator(known.on(*there), settings, mapped)
         said, labels = replayed.replay(est, data.logs, np.array(begin)), est.robot.labels

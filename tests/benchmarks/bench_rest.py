@@ -72,13 +72,13 @@ def ends(robot):
     line = trajectory.waypoints([(0.0, 0.0), (0.4, 0.0)], speed=0.1)
     paths = [line.moved((0.0, 0.0, float(a))) for a in heading]
     habits = actuator_model_of(robot, gyro=False)
-    pilot = control_loop_of(robot, ROWS["contact"], Settings.of(robot))
+    control_loop = control_loop_of(robot, ROWS["contact"], Settings.of(robot))
 
     @eqx.filter_jit
     def one(truth, kept, path, place, key):
         floor = OneEach(jnp.zeros((1, 1), int), jnp.zeros(2), jnp.ones(()), kept)
         plant = TellingTwin(truth, floor, habits, fix_std=jnp.full(2, 1e-3))
-        return rollout(pilot, path, plant, place, key, STEPS)
+        return rollout(control_loop, path, plant, place, key, STEPS)
 
     found = {name: np.zeros(CASES, bool) for name in ("arrive", "give up", "rest", "go on")}
     for k, path in enumerate(paths):
@@ -88,7 +88,7 @@ def ends(robot):
         off = poses[-1] - np.asarray(path.rows[-1, :3])
         off[2] = np.sin(0.5 * off[2])
         moved = np.ptp(poses[-round(LAST_S / PERIOD) :], axis=0)
-        if said.given_up[-1]:
+        if said.gave_up[-1]:
             end = "give up"
         elif said.time[-1] >= path.duration - 1e-6 and np.all(np.abs(off) < NEAR):
             end = "arrive"

@@ -77,14 +77,14 @@ def rounds(count: int) -> trajectory.Path:
     """So many times round a circle to the right, in 11 s each."""
     angle = np.linspace(0.0, 2 * np.pi * count, 720 * count + 1)
     places = 0.35 * np.stack([np.sin(angle), np.cos(angle) - 1.0], axis=1)
-    return trajectory.curve(places).waiting(1.0)
+    return trajectory.curve(places).after_rest(1.0)
 
 
 PATH = rounds(6)
 
 
 @cache
-def pilot(row: str) -> ControlLoop:
+def control_loop(row: str) -> ControlLoop:
     """Estimator and controller of a row."""
     return control_loop_of(three_floors(), ROWS[row])
 
@@ -92,7 +92,7 @@ def pilot(row: str) -> ControlLoop:
 @cache
 def code(row: str) -> Code:
     """Their code."""
-    return Code(three_floors(), pilot(row), PATH)
+    return Code(three_floors(), control_loop(row), PATH)
 
 
 class Fleet(CompiledC):

@@ -56,7 +56,11 @@ def test_a_fit_writes_its_robot(fitted):
     assert record.floors[0].seen.runs == len(DRIVES)
     assert record.floors[0].process[0] == pytest.approx(fit.variance["process.soft.along"] ** 0.5)
     assert Settings.of(robot).current_is_signed == fit.channels.signed
-    assert Settings.of(robot).alike == Settings().alike != MIXED_FLOORS_PENALTY
+    assert (
+        Settings.of(robot).further_floor_penalty
+        == Settings().further_floor_penalty
+        != MIXED_FLOORS_PENALTY
+    )
     free = {path for path in fit.space.slices if not path.startswith("camera.")}
     assert set(record.draws) == free
     again = deploy(fit)

@@ -123,8 +123,11 @@ class Program:
 def test_the_program_drives_the_test_site_to_the_last_printed_digit(tmp_path):
     """One process is the robot, in C; the other is the world, in MuJoCo."""
     pytest.importorskip("mujoco")
-    pilot, path = control_loop_of(ROBOT, ROWS["contact"]), rectangle(0.4, 0.2).waiting(REST_S)
-    for name, text in c_files(ROBOT, pilot, path).items():
+    control_loop, path = (
+        control_loop_of(ROBOT, ROWS["contact"]),
+        rectangle(0.4, 0.2).after_rest(REST_S),
+    )
+    for name, text in c_files(ROBOT, control_loop, path).items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     sources = ("examples/drive/drive.c", "src/slipid.c", "-lm")
@@ -132,7 +135,7 @@ def test_the_program_drives_the_test_site_to_the_last_printed_digit(tmp_path):
     subprocess.run(command, cwd=tmp_path, check=True)
     floor = twin_floor(ROBOT)
     plant = SitePlant(floor, "as_built", starts(20, floor, rectangle())[3], 5, False)
-    wanted = closed_loop.run_closed_loop(pilot, path, plant, (0.0, 0.0, 0.0))
+    wanted = closed_loop.run_closed_loop(control_loop, path, plant, (0.0, 0.0, 0.0))
     program, reading, rows = Program(tmp_path / "drive"), plant.reset(), []
     for _ in wanted.time:
         pose = plant.pose
@@ -177,9 +180,9 @@ def test_a_robot_is_found_in_a_folder_or_a_file_with_some_of_its_floors(tmp_path
         (ExportOptions(controller="contacts"), "no controller 'contacts', did you mean contact"),
         (
             ExportOptions(controller="contact_map"),
-            "told the map of its floors; name one with --map",
+            "needs the map of its floors; name one with --map",
         ),
-        (ExportOptions(map=Path("site.toml")), "told no map; leave out --map"),
+        (ExportOptions(map=Path("site.toml")), "uses no map; leave out --map"),
         (ExportOptions(path="square"), "no path 'square'"),
         (ExportOptions(speed=9.0), "speed 9 m/s"),
     ],

@@ -20,7 +20,7 @@ def folder(tmp_path_factory):
     """C folder of a small robot."""
     place = tmp_path_factory.mktemp("c")
     made = code("contact")
-    for name, text in c_files(made.robot, made.pilot, rectangle()).items():
+    for name, text in c_files(made.robot, made.loop, rectangle()).items():
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         (place / name).write_text(text)
     return place

@@ -36,7 +36,7 @@ def batches(row: str) -> list[Batch]:
         together = jax.tree.map(lambda *x: jnp.concatenate(x), good, bad)
         return together, jnp.concatenate([dt, times])
 
-    steps = Source(code(row).pilot, draw, 40, 20)
+    steps = Source(code(row).loop, draw, 40, 20)
     return [steps.next() for _ in range(3)]
 
 
@@ -65,16 +65,16 @@ def test_a_step_in_float_is_near_that_of_jax(tmp_path):
 def test_a_robot_starts_as_in_the_library(tmp_path):
     compiled = CompiledC(code("contact"), tmp_path)
     compiled.begin((0.3, -0.2, 1.1))
-    begin = code("contact").pilot.init((0.3, -0.2, 1.1))
-    assert max(worst(compiled.estimator, begin.seen).values()) == 0
-    assert max(worst(compiled.controller, begin.held).values()) == 0
+    begin = code("contact").loop.init((0.3, -0.2, 1.1))
+    assert max(worst(compiled.estimator, begin.estimator).values()) == 0
+    assert max(worst(compiled.controller, begin.controller).values()) == 0
 
 
 @pytest.mark.slow
 def test_a_path_is_followed_as_in_the_library(tmp_path):
     made = code("contact")
     compiled, path, time = CompiledC(made, tmp_path), rectangle(), jnp.zeros(())
-    preview = made.pilot.controller.gains.preview
+    preview = made.loop.controller.gains.preview
     rng = np.random.default_rng(0)
     for _ in range(100):
         pose = np.asarray(path.at(time))[:3] + 0.04 * rng.normal(size=3)
@@ -132,17 +132,17 @@ def test_the_loop_closes_in_c_as_it_does_in_the_library(tmp_path):
 
     made = code("contact")
     path = rectangle(length=0.4, width=0.2)
-    loop = Code(made.robot, made.pilot, path)
-    compiled = CompiledC(loop, tmp_path)
+    generated = Code(made.robot, made.loop, path)
+    compiled = CompiledC(generated, tmp_path)
     robot = made.robot
     floor = twin_floor(robot)
     place = ExampleStart(floor, starts(20, floor, path)[0], (0.0, 0.0, 0.0))
-    kept = record_example(robot, made.pilot, path, ExportOptions(), place)
+    kept = record_example(robot, made.loop, path, ExportOptions(), place)
     compiled.begin((0.0, 0.0, 0.0))
-    numbers = [f.size for f in loop.reading.fields]
+    numbers = [f.size for f in generated.reading.fields]
     for row, command, time in zip(kept.given, kept.command, kept.time, strict=True):
         parts = np.split(row[1:], np.cumsum(numbers)[:-1])
-        for field, part in zip(loop.reading.fields, parts, strict=True):
+        for field, part in zip(generated.reading.fields, parts, strict=True):
             compiled.reading[field.name] = part.reshape(field.shape)
         compiled.observe(row[0])
         compiled.follow(row[0])

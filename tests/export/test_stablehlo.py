@@ -18,12 +18,12 @@ from slipid.robot.interface import Readings
 from slipid.support.errors import DataError
 from tests.helpers import small_twin
 
-PILOT = control_loop_of(small_twin.deployed(1.0, 1.0, 0.3), ROWS["slip_odometry"])
+LOOP = control_loop_of(small_twin.deployed(1.0, 1.0, 0.3), ROWS["slip_odometry"])
 
 
 @pytest.fixture(scope="module")
 def content():
-    return stablehlo_files(PILOT)
+    return stablehlo_files(LOOP)
 
 
 @pytest.fixture
@@ -36,15 +36,15 @@ def folder(tmp_path, content):
 @pytest.mark.slow
 def test_a_program_that_was_read_back_says_what_the_pilot_says(folder):
     program, count = load_program(folder), 5
-    begin, rng = PILOT.init(), np.random.default_rng(0)
-    state = begin.seen, begin.held
+    begin, rng = LOOP.init(), np.random.default_rng(0)
+    state = begin.estimator, begin.controller
     kept, many = list(program.start), [jnp.stack([x] * count) for x in program.start]
     for _ in range(10):
         z = Readings.nothing(3)
         z = z.__class__(**{**vars(z), "wheel_speed": jnp.asarray(rng.normal(size=3))})
         reference = jnp.asarray(rng.normal(size=6))
-        seen, said = PILOT.estimator.step(state[0], z, PERIOD)
-        held, command = PILOT.controller.step(state[1], reference, said, PERIOD)
+        seen, said = LOOP.estimator.step(state[0], z, PERIOD)
+        held, command = LOOP.controller.step(state[1], reference, said, PERIOD)
         state = seen, held
         given = [*jax.tree.leaves(z), reference, jnp.asarray(PERIOD)]
         found = program.step.call(*kept, *given)

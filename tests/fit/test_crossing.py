@@ -1,4 +1,4 @@
-"""Runs over several floors: what they add to a fit, where wheels stand, what configs may say."""
+"""Runs over several floors: their part of a fit, wheel positions, and their config."""
 
 from __future__ import annotations
 
@@ -216,8 +216,8 @@ def test_windows_that_do_not_count_say_nothing(fitted):
         assert not np.asarray(r)[~live].any()
         assert np.asarray(r)[live].all()
         v = np.asarray(whole.covariance(k, state.log_variance))
-        piece, row = np.argwhere(~live)[0]
-        np.testing.assert_array_equal(v[piece, row], np.eye(v.shape[1])[row])
+        segment, row = np.argwhere(~live)[0]
+        np.testing.assert_array_equal(v[segment, row], np.eye(v.shape[1])[row])
         np.testing.assert_array_equal(
             np.asarray(whole.noise.blocks[k].count), 3.0 * several.counts.sum(axis=1)
         )
@@ -225,7 +225,7 @@ def test_windows_that_do_not_count_say_nothing(fitted):
 
 @pytest.mark.slow
 def test_pieces_left_out_change_nothing(fitted):
-    """The loss of kept pieces does not know what was measured in the others."""
+    """The loss of kept segments does not know what was measured in the others."""
     true, problem, optimum = fitted
     several = crossed(true, 6, 5)
     keep = np.concatenate([np.ones(len(problem.windows)), np.arange(6) % 2])
@@ -520,7 +520,7 @@ def test_runs_with_a_wrong_map_are_refused(tmp_path):
     config, out = written(tmp_path, text), tmp_path / "out"
     said = invoke("identify", config, "--data", tmp_path / "logs", "--out", out)
     assert said.exit_code == 0, said.stderr
-    assert "were not learnt from: they contradict those on one floor" in said.stderr
+    assert "were not used: they contradict those on one floor" in said.stderr
     fit = load(out)
     assert fit.mixed is None
     assert fit.refused["reason"] in fit.messages

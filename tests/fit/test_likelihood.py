@@ -135,7 +135,7 @@ def only_piece(b, k):
 
 @pytest.mark.slow
 def test_log_jacobian_is_the_determinant_of_residuals_by_data(truth):
-    """Of the 3 numbers per window that a piece measures, its first pose given."""
+    """Of the 3 numbers per window that a segment measures, its first pose given."""
     bent = eqx.tree_at(
         lambda r: (r.camera.tilt, r.camera.radial, r.camera.tangential),
         truth,
@@ -257,8 +257,8 @@ def test_the_loss_is_a_student_t_per_run(everything):
         total = 0.0
         for k, r in blocks.items():
             v = np.asarray(everything.covariance(k, log_v))
-            for piece in np.flatnonzero(keep):
-                total -= multivariate_t.logpdf(np.asarray(r[piece]), shape=v[piece], df=DEGREES)
+            for segment in np.flatnonzero(keep):
+                total -= multivariate_t.logpdf(np.asarray(r[segment]), shape=v[segment], df=DEGREES)
         return total
 
     def ours(log_v):
@@ -363,7 +363,7 @@ def test_runs_that_are_left_out_change_nothing(truth):
 def toy(gaussian):
     """A linear Gaussian problem with many structural numbers for its data, and its truth.
 
-    The covariance pieces are those of real windows; residuals and Jacobian are random numbers.
+    The covariance segments are those of real windows; residuals and Jacobian are random numbers.
     """
     true = robot(floors=("soft",), loads=("as_built",), sessions=("one",))
     w = replace(made(true, runs=80), has_current=False, has_voltage=False)
@@ -441,11 +441,11 @@ def test_variances_are_recovered_although_the_structure_eats_degrees_of_freedom(
     flat = jacobian.reshape(-1, jacobian.shape[-1])
     total = (flat * problem.space.prior_std**2) @ flat.T
     base = np.zeros((len(std), *total.shape))
-    pieces = problem.noise.blocks["motion"].base
+    segments = problem.noise.blocks["motion"].base
     for k, v in enumerate(np.asarray(problem.covariance("motion", 2 * np.log(std)))):
         at = slice(6 * k, 6 * k + 6)
         total[at, at] += v
-        base[OF_MOTION, at, at] = pieces[k]
+        base[OF_MOTION, at, at] = segments[k]
     scaled = [v * np.linalg.solve(total, b) for v, b in zip(std**2, base, strict=True)]
     info = 0.5 * np.array([[np.sum(a * b.T) for a in scaled] for b in scaled])
     info += np.eye(len(std)) / 9
@@ -483,9 +483,9 @@ def test_scores_of_variances_have_no_bias_where_degrees_of_freedom_are_given_bac
         mean += (step(small * column.reshape(80, 6)) - still) / small**2
     info = np.asarray(variances.information(problem.objective.blocks, log_v, keep, None))
     score = -(log_v - np.asarray(problem.objective.typical)) / 9
-    pieces = problem.noise.blocks["motion"].base
+    segments = problem.noise.blocks["motion"].base
     spent = np.einsum("nij,njk,nkl->nil", inverse, spread, inverse)
-    lost = 0.5 * np.exp(log_v[OF_MOTION]) * np.einsum("nij,ncij->c", spent, pieces)
+    lost = 0.5 * np.exp(log_v[OF_MOTION]) * np.einsum("nij,ncij->c", spent, segments)
     score[OF_MOTION] -= 0.0 if careful else lost
     expected = np.linalg.solve(info, score)
     np.testing.assert_allclose((still + mean)[OF_MOTION], expected[OF_MOTION], atol=1e-5)

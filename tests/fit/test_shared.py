@@ -1,4 +1,4 @@
-"""What runs share, against covariances of all runs together, written out."""
+"""Shared effects, against covariances of all runs together, written out."""
 
 from __future__ import annotations
 

@@ -68,14 +68,14 @@ class Batch:
 class Source:
     """Batches of steps by JAX, each of which goes on from the last."""
 
-    def __init__(self, pilot: ControlLoop, draw: Draw, robots: int, steps: int):
-        wheels = pilot.controller.robot.wheels
+    def __init__(self, control_loop: ControlLoop, draw: Draw, robots: int, steps: int):
+        wheels = control_loop.controller.robot.wheels
         self._key, self._steps = jax.random.key(0), steps
 
         def one(given):
             seen, held, z, reference, dt = given
-            seen, said = pilot.estimator.step(seen, z, dt)
-            held, command = pilot.controller.step(held, reference, said, dt)
+            seen, said = control_loop.estimator.step(seen, z, dt)
+            held, command = control_loop.controller.step(held, reference, said, dt)
             return seen, held, said, command
 
         def go(carry, key):
@@ -89,9 +89,9 @@ class Source:
             angle = jnp.where(jnp.isfinite(z.wheel_angle), z.wheel_angle, angle)
             return (after[:2], angle), (given, after)
 
-        begin = pilot.init()
+        begin = control_loop.init()
         spread = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (robots, *x.shape)), (begin.seen, begin.held)
+            lambda x: jnp.broadcast_to(x, (robots, *x.shape)), (begin.estimator, begin.controller)
         )
         self._carry = spread, jnp.zeros((robots, wheels))
         self._go = jax.jit(lambda carry, keys: jax.lax.scan(go, carry, keys))

@@ -61,7 +61,7 @@ class Kinds:
 
 
 class CompiledC:
-    """A pilot's code, compiled: its structs as numpy records, its functions on them.
+    """A control loop's code, compiled: its structs as numpy records, its functions on them.
 
     Attributes:
         code: that was compiled; kinds: of its numbers.
@@ -95,7 +95,7 @@ class CompiledC:
         self.controller = np.zeros((), self.kinds.of(code.controller))
         self.reading = np.zeros((), self.kinds.of(code.reading))
         self.estimate = np.zeros((), self.kinds.of(code.estimate))
-        self.command = np.zeros(code.pilot.controller.robot.wheels, self.kinds.real)
+        self.command = np.zeros(code.loop.controller.robot.wheels, self.kinds.real)
         self.time = np.zeros((), self.kinds.real)
         self.reference = np.zeros(6, self.kinds.real)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import jax
 
@@ -34,14 +35,14 @@ def deploy_known(
     draws: Robot | None = None,
     highest_speed: float = 20.0,
     current_trend: tuple[float, float] = (0.0, 0.0),
-    told: Mapping[str, EffectRecord] | None = None,
+    effects: Mapping[str, EffectRecord] = MappingProxyType({}),
 ) -> DeployedRobot:
-    """The robot as it drives with a load set-up; arguments as of `robot_record`.
+    """Return the robot with a load set-up; arguments are those of `robot_record`.
 
-    Without draws of its posterior its numbers have no spread.
+    Without posterior draws its numbers have no spread.
     """
     several = jax.tree.map(lambda x: x[None], robot) if draws is None else draws
     record = robot_record(
-        robot, given_numbers(robot), std or {}, several, highest_speed, current_trend, {}, told
+        robot, given_numbers(robot), std or {}, several, highest_speed, current_trend, {}, effects
     )
     return DeployedRobot.of(record, load)

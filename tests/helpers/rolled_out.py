@@ -1,4 +1,4 @@
-"""A pilot on a twin as one function of JAX, for runs that are compiled, many at once."""
+"""A control loop on a twin as one function of JAX, for runs that are compiled, many at once."""
 
 from functools import partial
 
@@ -13,14 +13,14 @@ from slipid.robot.twin import Twin, TwinState
 
 
 def rollout(
-    pilot: ControlLoop[State], path: Path, twin: Twin, start: Pose, key: Array, steps: int
+    control_loop: ControlLoop[State], path: Path, twin: Twin, start: Pose, key: Array, steps: int
 ) -> tuple[Float[Array, "step 3"], ControlLoopOutput]:
-    """True poses [m, m, rad] and what the pilot says over a fixed number of steps.
+    """True poses [m, m, rad] and what the control loop says over a fixed number of steps.
 
     A path that is over is a rest at its end.
 
     Args:
-        pilot, twin: who drives, and what is driven.
+        control_loop, twin: who drives, and what is driven.
         path: as it lies for the start.
         start: where it stands and believes to stand [m, m, rad].
         key: of all that is drawn.
@@ -36,8 +36,8 @@ def rollout(
         tuple[TwinState, ControlLoopState[State], Readings], tuple[Array, ControlLoopOutput]
     ]:
         before, held, reading = carry
-        held, out = pilot.step(path, held, reading, PERIOD)
+        held, out = control_loop.step(path, held, reading, PERIOD)
         state, reading = twin.step(before, out.command, drawn)
         return (state, held, reading), (before.pose, out)
 
-    return jax.lax.scan(step, (state, pilot.init(start), reading), noise[1:])[1]
+    return jax.lax.scan(step, (state, control_loop.init(start), reading), noise[1:])[1]

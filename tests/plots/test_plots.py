@@ -26,7 +26,7 @@ from slipid.lab.selftest.logs import (
 from slipid.model.geometry import differential, omni
 from slipid.plots import fit as plots
 from slipid.plots import fit as plots_robot
-from slipid.plots.compare import WORDS, ladder_figure
+from slipid.plots.compare import WORDS, validation_figure
 from slipid.plots.drawing import figure, save
 from slipid.plots.measured_windows import by_heading, measured_windows
 from slipid.plots.motion import heading_figure
@@ -184,5 +184,5 @@ def test_every_rung_has_words_in_the_picture():
 def test_errors_are_drawn_to_scale():
     one = {"endpoint_error_mean": 0.02, "runs": 3}
     other = {"endpoint_error_mean": 0.3, "runs": 3}
-    made = ladder_figure({"summary": {"soft": {"identified": one, "encoder": other}}}, "3 runs")
+    made = validation_figure({"summary": {"soft": {"identified": one, "encoder": other}}}, "3 runs")
     assert [bar.get_width() for bar in made.axes[0].patches] == pytest.approx([2.0, 30.0])

@@ -29,7 +29,7 @@ OTHER = Settings(
     filter_s=0.04,
     patch_m=0.2,
     doubt_m=1.0,
-    alike=1.0,
+    further_floor_penalty=1.0,
     unknown_std=4.0,
     ammeter_std_a=0.05,
     voltmeter_std_v=0.05,
@@ -160,9 +160,9 @@ def test_another_robot_runs_a_closed_loop_without_compiling(robots):
     floor = small_twin.floor([[0, 1], [1, 0]])
 
     def course(robot: DeployedRobot, settings: Settings, limits: Limits) -> np.ndarray:
-        pilot = ControlLoop(Estimator(robot, settings), Controller(robot, Gains(), limits))
+        control_loop = ControlLoop(Estimator(robot, settings), Controller(robot, Gains(), limits))
         plant = TwinPlant(Twin(robot, floor), (0.0, 0.0, 0.0), jax.random.key(0))
-        return run_closed_loop(pilot, PATH, plant, (0.0, 0.0, 0.0)).command
+        return run_closed_loop(control_loop, PATH, plant, (0.0, 0.0, 0.0)).command
 
     before = course(one, ONE, Limits())
     with compilations() as found:

@@ -70,7 +70,9 @@ def driven(told, hypothesis):
     robot = deployed(run=1.0)
     if told:
         rows = jnp.concatenate([MISSED, PARTS], axis=1)[:, None, None]
-        robot = eqx.tree_at(lambda r: r.told, robot, EffectTable(jnp.log(jnp.asarray([0.2])), rows))
+        robot = eqx.tree_at(
+            lambda r: r.effect_table, robot, EffectTable(jnp.log(jnp.asarray([0.2])), rows)
+        )
     watched = Estimator(robot, Settings(patch_m=1e9))
     run = partial(stepped(watched), dt=DT)
     belief, state = jnp.full(9, 1e-12).at[hypothesis].set(1.0), watched.init()

@@ -28,7 +28,7 @@ from slipid.robot.interface import UNTIMED_S, Measurement, Readings, Settings
 from slipid.robot.trajectory import rectangle
 from slipid.robot.twin import Twin, TwinPlant
 from tests.helpers import small_twin
-from tests.helpers.compiled_pilot import Flat
+from tests.helpers.compiled_loop import Flat
 from tests.helpers.known_robot import deploy_known
 from tests.helpers.stepped import stepped
 
@@ -37,6 +37,7 @@ LIMITS = Limits()
 DT = 0.05
 KINDS = ("contact", "curve")
 CHESS = Floor.of("abc", np.add.outer(np.arange(9), np.arange(9)) % 3, (-1.0, -1.0), 0.25, "abc")
+solve = eqx.filter_jit(FloorFilter.solve)
 BAD = (np.nan, np.inf, -np.inf, 1e300, -1e300, 1e-310, 0.0, -1.0, 1e9, 3e7, 50.0)
 
 
@@ -59,7 +60,7 @@ def robot():
 
 
 @cache
-def pilot(kind):
+def control_loop(kind):
     deployed = robot()
     if kind == "curve":
         gains = Gains.at((2.0, 2.0, 0.2, 0.0, 0.15))
@@ -71,7 +72,7 @@ def pilot(kind):
 
 @cache
 def step(kind):
-    p = pilot(kind)
+    p = control_loop(kind)
     return jax.jit(lambda state, z, dt: p.step(PATH, state, z, dt))
 
 
@@ -82,9 +83,9 @@ def reading(**known):
 
 def sane(kind, state, said, before, dt):
     """Whether everything is finite and the command within its limits, for one robot."""
-    p = pilot(kind)
+    p = control_loop(kind)
     f, order = p.controller.robot, Flat(state)
-    last, now = before.held, state.held
+    last, now = before.controller, state.controller
     # an angle that was never read is NaN
     angle, numbers = order.place("seen.wheels.angle"), order.ravel(state)
     rest = jnp.concatenate([numbers[: angle.start], numbers[angle.stop :]])
@@ -154,7 +155,7 @@ def adversary(key, count, angle):
 )
 def test_adversarial_steps(kind, steps):
     """A hundred robots at once, so that the nightly ones take a million steps."""
-    p, robots = pilot(kind), 100
+    p, robots = control_loop(kind), 100
 
     def one(carry, key):
         state, angle = carry
@@ -180,7 +181,7 @@ def test_adversarial_steps(kind, steps):
 @given(data=st.data())
 def test_any_reading_leaves_a_sound_state(kind, data):
     value = st.one_of(st.sampled_from(BAD), st.floats(), st.floats(-20, 20))
-    state, size = pilot(kind).init(), SENSED.size
+    state, size = control_loop(kind).init(), SENSED.size
     for _ in range(4):
         z = SENSED.unravel(jnp.array(data.draw(st.lists(value, min_size=size, max_size=size))))
         dt = data.draw(st.one_of(st.just(DT), value))
@@ -195,7 +196,7 @@ def test_any_reading_leaves_a_sound_state(kind, data):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_stops_where_a_wheel_falls_silent_and_goes_on_without_a_bump(kind):
-    state, angle, command, rows = pilot(kind).init(), np.zeros(3), np.zeros(3), []
+    state, angle, command, rows = control_loop(kind).init(), np.zeros(3), np.zeros(3), []
     for k in range(160):
         angle = angle + command * DT
         heard = angle.copy()
@@ -216,7 +217,7 @@ def test_it_stops_where_a_wheel_falls_silent_and_goes_on_without_a_bump(kind):
 
 
 def test_a_pilot_that_wakes_on_a_moving_robot_starts_from_its_wheels():
-    state, speed = pilot("contact").init(), np.array([4.0, -3.0, 2.0])
+    state, speed = control_loop("contact").init(), np.array([4.0, -3.0, 2.0])
     state, said = step("contact")(state, reading(wheel_speed=speed), DT)
     assert np.abs(np.asarray(said.command) - speed).max() <= LIMITS.acceleration * DT + 1e-9
 
@@ -225,8 +226,8 @@ def test_a_pilot_that_wakes_on_a_moving_robot_starts_from_its_wheels():
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_state_is_of_one_kind_from_the_start(kind):
     """Else a step is compiled twice."""
-    begin = jax.eval_shape(pilot(kind).init)
-    after, _ = jax.eval_shape(pilot(kind).step, PATH, begin, reading(), jnp.asarray(DT))
+    begin = jax.eval_shape(control_loop(kind).init)
+    after, _ = jax.eval_shape(control_loop(kind).step, PATH, begin, reading(), jnp.asarray(DT))
     for a, b in zip(jax.tree.leaves(begin), jax.tree.leaves(after), strict=True):
         assert (a.shape, a.dtype, a.weak_type) == (b.shape, b.dtype, b.weak_type)
 
@@ -400,7 +401,7 @@ def test_fixes_that_all_come_late_count_for_what_they_say():
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("lost", [(), (20,), (20, 21, 22), tuple(range(3, 60, 4))])
 def test_readings_that_are_lost_do_not_make_the_way_longer(kind, lost):
-    est = pilot(kind).estimator
+    est = control_loop(kind).estimator
     run = stepped(est)
 
     def way(lost, twice=()):
@@ -420,7 +421,7 @@ def test_readings_that_are_lost_do_not_make_the_way_longer(kind, lost):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("dt", [0.0, np.nan, -1.0])
 def test_it_stops_where_the_clock_fails_for_good(kind, dt):
-    p, run = pilot(kind), step(kind)
+    p, run = control_loop(kind), step(kind)
     state, angle = p.init(), np.zeros(3)
     moved = 0.0
     for k in range(100):
@@ -462,7 +463,7 @@ def test_a_robot_that_starts_at_once_learns_its_gyro_bias_from_the_contact_model
     one = robot().on("b")
     est, there = Estimator(one), FloorFilter(one, Settings())
     state, true, twist = est.init(), 0.0, jnp.zeros((1, 3))
-    turns = jax.jit(lambda near, w: there.solve(near, w))
+    turns = partial(solve, there)
     run = stepped(est)
     for k in range(500):
         speed = wheels([0.2 * np.cos(0.01 * k), 0.2 * np.sin(0.01 * k), 0.0])
@@ -502,14 +503,14 @@ def test_a_robot_at_rest_turns_as_its_gyro_says_less_the_bias():
 @pytest.mark.slow
 def test_the_observer_takes_a_constant_disturbance_out():
     """A body that does what it is asked to but for a constant: what is wanted comes about."""
-    f = robot()
+    f, step = robot(), eqx.filter_jit(Controller.step)
     for gain, left in ((0.0, 1.0), (1.0, 0.0)):
         con = Controller(f, Gains.at((0.0, 0.0, 0.0, gain, 0.0)))
         reference = jnp.array([0.0, 0.0, 0.0, 0.1, 0.05, 0.0])
         off, state, twist = np.array([-0.04, 0.02, 0.1]), con.init(), np.zeros(3)
         for _ in range(120):
             said = estimate(f, twist=jnp.asarray(twist))
-            state, command = con.step(state, reference, said, DT)
+            state, command = step(con, state, reference, said, DT)
             twist = np.asarray(f.inverse @ (f.frame.radius * command)) + off
         np.testing.assert_allclose(twist, [0.1, 0.05, 0.0] + left * off, atol=1e-3)
 
@@ -536,7 +537,7 @@ def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_an
     for _ in range(400):
         state, command = step(state, said)
         commands.append(np.asarray(command))
-        helpless.append(bool(state.given_up))
+        helpless.append(bool(state.gave_up))
     rows = np.array(commands)
     end = helpless.index(True)
     assert 14.0 < end * DT < 16.0
@@ -551,7 +552,7 @@ def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_an
     # it has stopped for good, whatever is believed of it afterwards
     for _ in range(20):
         state, command = step(state, estimate(f))
-    assert bool(state.given_up)
+    assert bool(state.gave_up)
     np.testing.assert_allclose(command, 0.0)
 
 
@@ -588,7 +589,7 @@ def test_a_robot_that_nothing_frees_gives_up_and_its_run_ends():
         ControlLoop(Estimator(slick), Controller(slick, Gains())), PATH, plant, start
     )
     assert 15.0 < course.time[-1] < 25.0
-    assert course.own[-1] < 0.5 * PATH.duration
+    assert course.path_time[-1] < 0.5 * PATH.duration
     rolled = DT * float(slick.frame.radius) * np.abs(course.command).max(axis=1).sum()
     assert np.abs(course.pose[:, :2]).max() < 0.02 * rolled
     assert np.abs(course.command[150:300]).max() > 2 * np.abs(course.command[:20]).max()

@@ -26,7 +26,7 @@ from tests.helpers.rolled_out import rollout
 from tests.helpers.small_twin import deployed, floor
 
 CHESS = [[(i + j) % 2 for j in range(6)] for i in range(6)]
-SETTINGS = Settings(alike=MIXED_FLOORS_PENALTY)
+SETTINGS = Settings(further_floor_penalty=MIXED_FLOORS_PENALTY)
 HABITS = ActuatorModel()
 CASES, STEPS = 12, 200
 ROBOT = deployed(process=1.0, run=1.0, current=0.3)
@@ -119,10 +119,10 @@ def test_beliefs_that_nothing_has_changed_move_no_pose(belief):
 def driven(there, paths, starts, keys, habits, known):
     """True poses and what is believed on chess patches, told the map `known`."""
     robot = ROBOT
-    pilot = ControlLoop(Estimator(robot, SETTINGS, known), Controller(robot, Gains()))
+    control_loop = ControlLoop(Estimator(robot, SETTINGS, known), Controller(robot, Gains()))
 
     def one(path, start, key):
-        return rollout(pilot, path, Twin(robot, there, habits), start, key, STEPS)
+        return rollout(control_loop, path, Twin(robot, there, habits), start, key, STEPS)
 
     return jax.vmap(one)(paths, starts, keys)
 

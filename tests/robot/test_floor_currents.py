@@ -51,7 +51,7 @@ def test_where_frictions_are_open_currents_rule_out_no_mixture_of_floors():
 
     def believed(covariance):
         known = eqx.tree_at(lambda r: r.friction_covariance, robot, covariance)
-        watched = Estimator(known, Settings(current_is_signed=True, alike=0.0))
+        watched = Estimator(known, Settings(current_is_signed=True, further_floor_penalty=0.0))
         state = watched.init()
         for _ in range(100):
             reading = Measurement(wheel_speed=w, current=amps[3])

@@ -114,11 +114,11 @@ def test_twin_and_controllers_do_what_was_reviewed(deployed: DeployedRobot, gold
         ):
             kind = ROWS[row]
             habits = ActuatorModel(voltage=False, gyro=kind.gyro)
-            pilot = control_loop_of(deployed, kind, Settings(), floor=floor)
-            path = reference.rectangle().moved(start).waiting(1.0)
+            control_loop = control_loop_of(deployed, kind, Settings(), floor=floor)
+            path = reference.rectangle().moved(start).after_rest(1.0)
             twin = Twin(deployed, floor, habits)
             key = jax.random.key(1000 + k)
-            pose, said = _rollout(pilot, path, twin, jnp.asarray(start), key, 400)
+            pose, said = _rollout(control_loop, path, twin, jnp.asarray(start), key, 400)
             estimates = said.estimate
             for at in (100, 399):
                 numbers = {

@@ -101,8 +101,8 @@ def test_every_number_survives_to_the_last_bit(robot, path):
     assert float(again.floors.friction[1]) == 0.1 + 0.2
     np.testing.assert_array_equal(again.floors.load_bias, [[0.1, -0.3, 0.2], [0.0, 1 / 3, -1 / 3]])
     np.testing.assert_array_equal(again.floors.drag_exponent, [1.0, 1.6])
-    np.testing.assert_array_equal(again.told.table[..., :3], TOLD.mean)
-    np.testing.assert_array_equal(first.told.table, [[[[0, 0, 0, 1, 1, 1]]]] * 2)
+    np.testing.assert_array_equal(again.effect_table.table[..., :3], TOLD.mean)
+    np.testing.assert_array_equal(first.effect_table.table, [[[[0, 0, 0, 1, 1, 1]]]] * 2)
     text = path.read_bytes()
     first.save(path)
     assert path.read_bytes() == text
@@ -152,7 +152,7 @@ def test_what_is_known_of_the_floors_is_saved_with_them(robot, tmp_path):
     only = robot.on("soft")
     only.save(tmp_path / "soft.json")
     same(DeployedRobot.load(tmp_path / "soft.json", "moved"), only)
-    np.testing.assert_array_equal(only.told.table[0, ..., :3], ONE[::-1])
+    np.testing.assert_array_equal(only.effect_table.table[0, ..., :3], ONE[::-1])
 
 
 def test_floors_that_nobody_drove_on_are_saved_with_the_others(robot, tmp_path):
@@ -443,13 +443,13 @@ print(sorted(new - {"slipid", "jax", *sys.stdlib_module_names}))
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.interface import Measurement
 from slipid.robot.estimator import Odometry
-from slipid.robot.closed_loop import Pilot
+from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.controller import Controller
 from slipid.robot.trajectory import rectangle
 robot = DeployedRobot.load(sys.argv[1])
-pilot = Pilot(Odometry(robot), Controller(robot))
+control_loop = ControlLoop(Odometry(robot), Controller(robot))
 z = Measurement(wheel_angle=[0.0, 0.0, 0.0], current=[0.1, 0.1, 0.1])
-state, said = pilot.step(rectangle(), pilot.init(), z, 0.05)
+state, said = control_loop.step(rectangle(), control_loop.init(), z, 0.05)
 print(said.estimate.pose, said.estimate.surface, said.command)
 """
 

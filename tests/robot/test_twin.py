@@ -20,7 +20,7 @@ FIRM, BOTH = floor([[0]]), floor([[0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 0, 1], [1, 
 SILENT = ActuatorModel(ammeter_a=0.0, voltmeter_v=0.0, gyro_noise=0.0, gyro_bias=0.0, smooth=True)
 
 
-def pilot(robot, gains=(1.5, 1.5, 0.1, 0.2, 0.1)):
+def control_loop(robot, gains=(1.5, 1.5, 0.1, 0.2, 0.1)):
     return ControlLoop(Odometry(robot), Controller(robot, Gains.at(gains)))
 
 
@@ -37,7 +37,7 @@ def driven(twin, commands, key=KEY):
 
 def test_commands_arrive_late_as_a_fine_grid_says():
     for delay in (0.0, 0.03, 0.12, 0.25):
-        share = ActuatorModel(delay_s=delay).held()
+        share = ActuatorModel(delay_s=delay).command_shares()
         grid = (np.arange(100_000) + 0.5) / 100_000 * 0.05
         index = -np.floor((grid - delay) / 0.05).astype(int)
         brute = [[np.mean(part == k) for k in range(RING)] for part in np.split(index, 2)]
@@ -112,14 +112,14 @@ def test_sensors_read_ticks_and_magnitudes_and_nothing_that_is_not_there():
 def test_a_rollout_is_the_run_of_a_plant():
     robot, path = deployed(1.0, 1.0, 1.0), waypoints([(0.0, 0.0), (0.15, 0.0)], pause=0.2)
     path = path.moved(START)
-    twin, own = Twin(robot, BOTH), pilot(robot)
+    twin, own = Twin(robot, BOTH), control_loop(robot)
     plant = TwinPlant(twin, START, KEY)
     assert isinstance(plant, Plant)
     course = run_closed_loop(own, path, plant, START)
     pose, said = jax.jit(lambda k: rollout(own, path, twin, START, k, len(course.pose)))(KEY)
     np.testing.assert_allclose(pose[:, :2], course.pose[:, :2], atol=1e-12)
     np.testing.assert_allclose(said.command, course.command, atol=1e-12)
-    np.testing.assert_allclose(said.time, course.own, atol=1e-12)
+    np.testing.assert_allclose(said.time, course.path_time, atol=1e-12)
     other = run_closed_loop(own, path, TwinPlant(twin, START, jax.random.PRNGKey(4)), START)
     assert np.abs(other.pose[-1] - course.pose[-1]).max() > 1e-5
     for one, again in zip(*(jax.tree.leaves(plant.reset()) for _ in range(2)), strict=True):
@@ -133,7 +133,7 @@ def test_derivative_by_gains_is_that_of_finite_differences():
     twin = Twin(robot, FIRM, ActuatorModel(smooth=True))
 
     def end(gains):
-        return rollout(pilot(robot, gains), path, twin, START, KEY, 50)[0][-1]
+        return rollout(control_loop(robot, gains), path, twin, START, KEY, 50)[0][-1]
 
     gains = jnp.asarray([1.5, 1.2, 0.3, 0.4, 0.113])  # between rows of the path
     slope = jax.jit(jax.jacfwd(end))(gains)

@@ -138,7 +138,8 @@ def _best_topics(topics: Sequence[Topic], joints: int) -> Iterator[_TopicChannel
             if channel in taken or not topic.count:
                 continue
             taken.add(channel)
-            wheels = joints if topic.joints else _array_length(topic) if channel in PER_WHEEL else 0
+            count = max((f.count for f in topic.fields if f.type.endswith("[]")), default=1)
+            wheels = joints if topic.joints else count if channel in PER_WHEEL else 0
             yield _TopicChannel(channel, topic, wheels, _pose_question(channel, topic))
         if any(f.path == "effort" and f.count for f in topic.fields) and "current" not in taken:
             taken.add("current")
@@ -161,11 +162,6 @@ def _by_field_names(
             unit = meaning.unit or CHANNELS[meaning.channel]
             ask = f"by the name of the field: is it that, in {unit}, in the order of the joints?"
             yield _TopicChannel(meaning.channel, topic, wheels, ask, field.path, unit)
-
-
-def _array_length(topic: Topic) -> int:
-    """Return the number of wheels that a message has numbers for."""
-    return max((field.count for field in topic.fields if field.type.endswith("[]")), default=1)
 
 
 def _pose_question(channel: str, topic: Topic) -> str:

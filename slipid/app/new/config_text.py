@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from slipid.app.config import FitSection, LogsSection, Wheels, geometry, parsed
-from slipid.app.new.config_lines import ConfigBlock, ConfigLine, all_questions, drawing, toml
+from slipid.app.config import FitSection, LogsSection, OmniDrive, Wheels, geometry, parsed
+from slipid.app.new.config_lines import ConfigBlock, ConfigLine, drawing, toml
 from slipid.app.new.draft import BagDraft, ConfigDraft, FileDraft, LayoutDraft, LogsDraft
 from slipid.app.new.robot_questions import robot_of
 from slipid.app.reference.keys import in_short
@@ -107,18 +107,14 @@ def _robot_block(draft: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock
         ConfigLine("drive", toml(robot.drive), _ORDER[robot.drive], _open_question(draft, "drive"))
     ]
     given = robot.model_dump(exclude_none=True, exclude={"drive"}, exclude_defaults=False)
-    own = {key: value for key, value in given.items() if _is_worth_a_line(robot, key, value)}
+    if isinstance(robot, OmniDrive) and robot.roller_angle_deg == 90.0:
+        del given["roller_angle_deg"]  # ordinary omni wheels
     # what the drive is made of comes first, what all robots have after it
     common = ("wheel_radius_m", "gear_ratio", "mass_kg")
-    for key in (*(k for k in own if k not in common), *common):
+    for key in (*(k for k in given if k not in common), *common):
         comment = in_short(type(robot), key)
-        lines.append(ConfigLine(key, toml(own[key]), comment, _open_question(draft, key)))
+        lines.append(ConfigLine(key, toml(given[key]), comment, _open_question(draft, key)))
     return ConfigBlock("[robot]", tuple(lines), above=(*picture.splitlines(), "", FRAME))
-
-
-def _is_worth_a_line(robot: Wheels, key: str, value: object) -> bool:
-    """Return False for the default roller angle, which ordinary omni wheels need not mention."""
-    return key not in ("roller_angle_deg",) or value != type(robot).model_fields[key].default
 
 
 def _open_question(draft: ConfigDraft, key: str) -> str:
@@ -287,4 +283,5 @@ def new_config(draft: ConfigDraft, name: str) -> NewConfig:
     blocks = blocks_of(draft, robot, picture, name)
     text = "\n\n".join(block.text() for block in blocks) + "\n"
     parsed(Path(name), text)
-    return NewConfig(text, robot, picture, all_questions(blocks))
+    questions = tuple(question for block in blocks for question in block.open_questions)
+    return NewConfig(text, robot, picture, questions)

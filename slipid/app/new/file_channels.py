@@ -108,11 +108,13 @@ def channels_in(numbers: TableNumbers) -> FileChannels:
         else:
             there[one.label] = at
     found = [_file_channel(numbers, meanings, name, places) for name, places in channels.items()]
-    found = _without_duplicates(_resolved(found))
+    first: dict[str, FileChannel] = {}
+    for resolved in _resolved(found):
+        first.setdefault(resolved.channel, resolved)
     notes = _odometry_note(numbers, meanings) + [f"not used, said twice: {', '.join(also)}"] * bool(
         also
     )
-    kept, dropped = _consistent(found)
+    kept, dropped = _consistent(list(first.values()))
     used = {at for one in kept for at in one.columns}
     unused = [
         name for at, name in enumerate(format.names) if name and at in meanings and at not in used
@@ -175,14 +177,6 @@ def _stays_up(values: Float[np.ndarray, "row column"]) -> bool:
     """Return True for numbers away from 0, like a battery's voltage and unlike a speed."""
     known = values[~np.isnan(values)]
     return bool(known.size) and float(known.min()) > 0.5 * float(known.max()) > 0.0
-
-
-def _without_duplicates(found: list[FileChannel]) -> list[FileChannel]:
-    """Return the first of channels with the same name."""
-    out: dict[str, FileChannel] = {}
-    for one in found:
-        out.setdefault(one.channel, one)
-    return list(out.values())
 
 
 def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
@@ -411,13 +405,10 @@ def matching_presets(kind: FileKind) -> PresetMatches:
     fits = [name for name, layout in PRESETS.items() if _matches(kind.formats[0], layout)]
     fits = [name for name in fits if _reads(kind, PRESETS[name])]
     fits.sort(key=lambda name: len(PRESETS[name].columns), reverse=True)
-    telling = [name for name in fits if PRESETS[name].names_row and _is_telling(PRESETS[name])]
+    named = [name for name in fits if PRESETS[name].names_row]
+    telling = [name for name in named if len(PRESETS[name].columns) >= _TELLING_COLUMNS]
     sure = telling[0] if telling else None
     return PresetMatches(sure, tuple(name for name in fits if name not in telling))
-
-
-def _is_telling(layout: Layout) -> bool:
-    return len(layout.columns) >= _TELLING_COLUMNS
 
 
 def _matches(format: TableFormat, layout: Layout) -> bool:

@@ -164,8 +164,7 @@ def pose_over_wheel_speed(one: FileStudy, speed: FileChannel, by_pose: PoseMotio
     """Return the ratio of body speed to wheel speed while wheels turn; None without both.
 
     With wheel speeds in rad/s it is the wheel radius [m] where all wheels point ahead, and near
-    that
-    for other robots.
+    that for other robots.
     """
     if by_pose.time is None or by_pose.x is None or by_pose.y is None or one.clock is None:
         return None
@@ -216,8 +215,7 @@ def is_battery_voltage(voltages: Sequence[FileChannel], speed: FileChannel | Non
     """Return True where voltages stay up whatever the wheels do, as a battery's voltage does.
 
     Every run is scaled by its own high quantile: another battery, or another charge, must not look
-    like
-    the changing voltage of a motor.
+    like the changing voltage of a motor.
     """
     runs = [one.values[~np.isnan(one.values)] for one in voltages]
     high = [float(np.quantile(np.abs(run), 0.95)) if run.size else 0.0 for run in runs]

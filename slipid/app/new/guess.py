@@ -1,7 +1,7 @@
 """Guess the robot behind logs, and sort log files into runs.
 
-The drive follows from the number of wheels and from sideways motion. Files of published formats
-are recognised, and files that belong to one run are put together.
+The drive follows from the number of wheels and from sideways motion. Files of published formats are
+recognised, and files that belong to one run are put together.
 """
 
 from dataclasses import dataclass, replace
@@ -240,8 +240,8 @@ def _run_files(kinds: list[tuple[FileKind, FileStudy]]) -> tuple[list[RunFiles],
             fresh = {found.channel for found in one.channels.found} - {"time"}
             if pattern is None or not fresh or one.clock is None or main.clock is None:
                 continue
-            if not _overlap(main, one):
-                continue
+            if max(main.time[0], one.time[0]) >= min(main.time[-1], one.time[-1]):
+                continue  # files of one run cover the same time
             beside.append((pattern, one))
             have |= fresh
             used.append(other)
@@ -270,11 +270,6 @@ def _more_runs(group: RunFiles) -> tuple[RunFiles, ...]:
         except DataError:
             continue  # the reader will say it of this run; the first one tells enough
     return tuple(out)
-
-
-def _overlap(one: FileStudy, other: FileStudy) -> bool:
-    """Return True where two files cover the same time and so belong to one run."""
-    return bool(max(one.time[0], other.time[0]) < min(one.time[-1], other.time[-1]))
 
 
 def _sentence(group: RunFiles) -> str:

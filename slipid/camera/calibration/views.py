@@ -10,7 +10,6 @@ from slipid.camera.calibration.board import (
     Board,
     Picture,
     View,
-    check_same_size,
     marker_count,
     view_of,
 )
@@ -45,7 +44,12 @@ def usable(board: Board, pictures: Sequence[Picture]) -> UsableViews:
         DataError: the pictures differ in size, or none shows the board, or too few.
     """
     for other in pictures[1:]:
-        check_same_size(pictures[0], other)
+        if other.image_px != pictures[0].image_px:
+            (w, h), (width, height) = pictures[0].image_px, other.image_px
+            raise DataError(
+                f"{other.path}: {width} x {height} pixels, but {pictures[0].path} has {w} x {h}; "
+                "expected pictures of one camera at one resolution"
+            )
     views = [view_of(board, picture) for picture in pictures]
     if not any(len(view.pixels) for view in views):
         raise not_detected(board, pictures)

@@ -7,10 +7,10 @@ from contextlib import closing
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
-from slipid.camera.frames.frame import Frame, FrameSource, read_ahead
-from slipid.camera.opencv import dictionary_names
+from slipid.camera.frame import Frame, FrameSource, read_ahead
+from slipid.camera.opencv import Grey, dictionary_names
 from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
@@ -110,7 +110,7 @@ def detect_all(
     if log.frame:
         report.line(f"going on from frame {len(log.frame)}")
     report.stage("tracking")
-    before: UInt8[np.ndarray, "row column"] | None = None
+    before: Grey | None = None
     known, saved = len(log.frame), clock.monotonic()
     # the last known frame is read again, to know whether the next one repeats it
     with closing(read_ahead(source.frames(max(0, known - 1)))) as frames:
@@ -140,7 +140,7 @@ def detect_all(
     return log.detections()
 
 
-def _others(grey: UInt8[np.ndarray, "row column"], tracker: MarkerTracker) -> str | None:
+def _others(grey: Grey, tracker: MarkerTracker) -> str | None:
     """Return advice where a picture shows markers, but none that is wanted; None otherwise."""
     wanted = ", ".join(map(str, sorted(tracker.ids)))
     visible = {d.id for d in tracker.detector.detect(grey, tracker.region)}
@@ -169,9 +169,7 @@ class _VisibleDictionary:
     ids: list[int]
 
 
-def _visible_dictionary(
-    grey: UInt8[np.ndarray, "row column"], region: Region | None = None
-) -> _VisibleDictionary | None:
+def _visible_dictionary(grey: Grey, region: Region | None = None) -> _VisibleDictionary | None:
     """Return the smallest of the dictionaries with most markers in a picture; None without any."""
     ids = {
         name: {d.id for d in MarkerDetector(name).detect(grey, region)}
@@ -188,7 +186,7 @@ def only_marker(source: FrameSource, detector: MarkerDetector, region: Region | 
         DataError: it shows none, or several.
     """
     counts: Counter[int] = Counter()
-    last: UInt8[np.ndarray, "row column"] | None = None
+    last: Grey | None = None
     with closing(read_ahead(source.frames())) as frames:
         for frame in frames:
             last = frame.grey

@@ -16,9 +16,9 @@ blurred it is by the lens or by motion.
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
-from slipid.camera.opencv import marker_dictionary, opencv
+from slipid.camera.opencv import Grey, marker_dictionary, opencv
 
 WHOLE = 30
 """Interval, in frames, at which the whole frame is searched."""
@@ -95,9 +95,7 @@ class MarkerDetector:
         self._squares = int(book.markerSize) + 2
         self._detector = opencv().aruco.ArucoDetector(book)
 
-    def detect(
-        self, grey: UInt8[np.ndarray, "row column"], region: Region | None = None
-    ) -> list[Detection]:
+    def detect(self, grey: Grey, region: Region | None = None) -> list[Detection]:
         """Return every marker in a frame, or in a region of it."""
         whole = Region(0, 0, grey.shape[1], grey.shape[0])
         part = whole if region is None else region.within(whole)
@@ -136,7 +134,7 @@ class MarkerTracker:
     whole: int = 0
     twice: bool = False
 
-    def detect(self, grey: UInt8[np.ndarray, "row column"], number: int) -> list[Detection]:
+    def detect(self, grey: Grey, number: int) -> list[Detection]:
         """Return all detections of the wanted markers in the frame of this number."""
         if self.ids == self.last.keys() and not self.twice and number % WHOLE:
             near = [d for d in self.detector.detect(grey, self._around()) if d.id in self.ids]
@@ -199,7 +197,7 @@ class _Edges:
 
 
 def refined(
-    grey: UInt8[np.ndarray, "row column"], corners: Float[np.ndarray, "marker 4 2"], squares: int
+    grey: Grey, corners: Float[np.ndarray, "marker 4 2"], squares: int
 ) -> Float[np.ndarray, "marker 4 2"]:
     """Return corners as intersections of lines through the edges.
 
@@ -221,9 +219,7 @@ def refined(
     return result
 
 
-def _profiles(
-    grey: UInt8[np.ndarray, "row column"], edges: _Edges
-) -> Float[np.ndarray, "marker 4 along across"]:
+def _profiles(grey: Grey, edges: _Edges) -> Float[np.ndarray, "marker 4 along across"]:
     """Return the brightness from inside to outside, at places along each edge."""
     along, across = np.linspace(ENDS, 1 - ENDS, ALONG), np.linspace(-1, 1, ACROSS)
     aside = edges.reach[..., None] * across

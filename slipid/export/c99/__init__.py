@@ -1,1 +1,1 @@
-"""Lowering of functions that JAX has traced to text of C99."""
+"""C99 code generated from functions that JAX has traced."""

@@ -1,8 +1,8 @@
-"""Where every statement of a function stands.
+"""Builder that decides where every statement of a function stands.
 
-Every number is computed once, in the earliest block that has what it needs. A block is straight
-code, or one loop over lanes, so that what many operations do to the same lanes is one loop. What
-stays the same in every turn of a repetition is computed in front of it.
+Every number is computed once, in the earliest block that has its inputs. A block is straight code,
+or one loop over lanes, so that many operations on the same lanes form one loop. Values that are the
+same in every turn of a repetition are computed before it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from slipid.export.c99.ir import Array, At, Cell, CodeBlock, Memory, Nested, Sta
 from slipid.export.fields import DTYPES, Kind
 
 CALLS = ("r_atan2", "r_cos", "r_exp", "r_log", "r_pow", "r_rem", "r_sin", "r_floor")
-"""Functions of C's library, which no compiler makes of a few instructions."""
+"""Functions of C's library, which no compiler reduces to a few instructions."""
 
 
 class Names:
@@ -24,12 +24,12 @@ class Names:
         self.tables: dict[tuple[Kind, bytes], Memory] = {}
 
     def number(self) -> int:
-        """A new number."""
+        """Return a new number."""
         self._last += 1
         return self._last
 
     def table(self, values: np.ndarray, kind: Kind) -> Memory:
-        """Memory of constants; the one there is if it holds the same."""
+        """Return memory with constants; an existing one if it holds the same."""
         flat = np.ascontiguousarray(values.reshape(-1), dtype=DTYPES[kind])
         key = (kind, flat.tobytes())
         if key not in self.tables:
@@ -39,12 +39,14 @@ class Names:
 
 
 class Builder:
-    """Collects the statements of a function, or of the body of a condition or repetition.
+    """Collector of the statements of a function, or of the body of a condition or repetition.
 
     Attributes:
-        parent: of the code around it; turns: block that repeats this code, None if none does.
-        blocks: in their order; source: line of Python that asks for what comes next.
-        contiguous: arrays that lie in row-major order in memory as well, by their cells.
+        parent: builder of the code around it.
+        turns: block that repeats this code; None if none does.
+        blocks: blocks in their order.
+        source: line of Python that asks for the next statement.
+        contiguous: arrays that are in row-major order in memory as well, by their cells.
     """
 
     def __init__(self, names: Names, parent: Builder | None = None):
@@ -63,9 +65,9 @@ class Builder:
         lanes: int = 0,
         start: str = "",
     ) -> Variable:
-        """A variable computed from cells; the one there is if it was computed before.
+        """Return a variable computed from cells; an existing one if it was computed before.
 
-        With `start` lanes are reduced to one number.
+        With `start`, lanes are reduced to one number.
         """
         around = self._around(cells)
         if around is not self:
@@ -76,21 +78,21 @@ class Builder:
             return self.parent._known[key]
         if key not in self._known:
             block = self._place(cells, lanes, bool(start) or any(f in template for f in CALLS))
-            made_by = template, cells
-            made = Variable(kind, self.names.number(), 0 if start else lanes, block, made_by)
+            own_lanes, made_by = 0 if start else lanes, (template, cells)
+            target = Variable(kind, self.names.number(), own_lanes, block, made_by)
             block.statements.append(
-                Statement(made, template, cells, start=start, source=self.source)
+                Statement(target, template, cells, start=start, source=self.source)
             )
-            self._known[key] = made
+            self._known[key] = target
         return self._known[key]
 
     def array(self, kind: Kind, size: int, cells: tuple[Cell, ...], lanes: int = 0) -> Memory:
-        """Memory for numbers that straight code, or a loop over lanes, fills from these cells."""
+        """Return memory that straight code, or a loop over lanes, fills from these cells."""
         home = self._around(cells)._place(cells, lanes)
         return Memory(f"m{self.names.number()}", kind, size, home)
 
     def fill(self, memory: Memory, template: str, cell: Cell, times: int = 0) -> None:
-        """A statement of C that fills memory made by `array`, so many times if not 0."""
+        """Append a statement of C that fills memory made by `array`, repeated `times` if not 0."""
         block = memory.home
         assert block is not None
         block.statements.append(
@@ -100,23 +102,23 @@ class Builder:
     def append(
         self, lanes: int = 0, nested: Nested | None = None, calls: bool = False
     ) -> CodeBlock:
-        """A new block behind all others."""
+        """Return a new block after all others."""
         return self.put(CodeBlock(self, 0, lanes, calls, nested=nested))
 
     def put(self, block: CodeBlock) -> CodeBlock:
-        """A block behind all others."""
+        """Return a block that was put after all others."""
         block.place = len(self.blocks)
         self.blocks.append(block)
         return block
 
     def _around(self, cells: tuple[Cell, ...]) -> Builder:
-        """Code in which a statement with these cells can stand: around turns that change none."""
+        """Return the builder in which a statement stands: outside of turns that change no cell."""
         if self.parent is None or self.turns is None or any(map(self._changes, cells)):
             return self
         return self.parent._around(cells)
 
     def _changes(self, cell: Cell) -> bool:
-        """Whether a cell may change from turn to turn."""
+        """Return whether a cell may change from turn to turn."""
         if isinstance(cell, At):
             home = cell.memory.home
             by_index = cell.index is not None and self._changes(cell.index)
@@ -124,10 +126,10 @@ class Builder:
         return isinstance(cell, Variable) and cell.home.owner is self
 
     def _place(self, cells: tuple[Cell, ...], lanes: int, calls: bool = False) -> CodeBlock:
-        """The earliest block for a statement over so many lanes that uses these cells.
+        """Return the earliest block for a statement over these lanes that uses these cells.
 
-        Loops whose statements call functions are apart from those that a compiler can make of
-        instructions for several lanes at once.
+        Loops whose statements call functions are kept apart from loops that a compiler can
+        vectorize.
         """
         apart = calls and lanes > 0
         first = max((self._after(cell, lanes) for cell in cells), default=0)
@@ -137,7 +139,7 @@ class Builder:
         return self.append(lanes, calls=apart)
 
     def _after(self, cell: Cell, lanes: int) -> int:
-        """Place of the first block of which a statement can use a cell."""
+        """Return the place of the first block in which a statement can use a cell."""
         if isinstance(cell, At):
             inner = 0 if cell.index is None else self._after(cell.index, lanes)
             return max(inner, self._behind(cell.memory.home, False))

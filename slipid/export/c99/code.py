@@ -1,4 +1,4 @@
-"""Header and source of a pilot in C99, generated from the very steps that are tested here."""
+"""Header and source of a control loop in C99, generated from the steps that the tests cover."""
 
 from __future__ import annotations
 
@@ -26,45 +26,54 @@ TYPE = {**TYPES, "real": "slipid_real"}
 
 
 class Code:
-    """The C code of a pilot, and of a path if it follows one.
+    """The C code of a control loop, and of a path if it follows one.
 
     Attributes:
-        robot: for the record of its numbers; pilot: its estimator and controller.
-        path: as it lies for a robot that starts at 0.
-        estimator, controller: structs of what they keep.
-        reading, estimate: structs of what goes in and what comes out.
-        functions: all that are generated.
+        robot: robot with the record of its numbers.
+        loop: estimator and controller.
+        path: path placed for a robot that starts at 0.
+        estimator: struct of the estimator's state.
+        controller: struct of the controller's state.
+        reading: struct of the inputs.
+        estimate: struct of the outputs.
+        functions: all generated functions.
     """
 
     def __init__(
-        self, robot: DeployedRobot, pilot: ControlLoop[eqx.Module], path: Path | None = None
+        self, robot: DeployedRobot, loop: ControlLoop[eqx.Module], path: Path | None = None
     ):
         """Trace and lower all functions.
 
         Raises:
             UnsupportedError: a step uses a primitive without a form in C.
         """
-        self.robot, self.pilot, self.path = robot, pilot, path
+        self.robot, self.loop, self.path = robot, loop, path
         self._names = Names()
-        begin, nothing = pilot.init(), Readings.nothing(robot.wheels)
+        begin, nothing = loop.init(), Readings.nothing(robot.wheels)
         zero = jnp.zeros(())
-        believed = pilot.estimator.step(begin.seen, nothing, zero)[1]
-        self.estimator = Struct.of("slipid_estimator", "What the estimator keeps.", begin.seen)
-        self.controller = Struct.of("slipid_controller", "What the controller keeps.", begin.held)
+        estimate = loop.estimator.step(begin.estimator, nothing, zero)[1]
+        self.estimator = Struct.of("slipid_estimator", "What the estimator keeps.", begin.estimator)
+        self.controller = Struct.of(
+            "slipid_controller", "What the controller keeps.", begin.controller
+        )
         self.reading = Struct.of(
             "slipid_reading",
             "What the sensors give; NaN where there is none.",
             nothing,
             Measurement,
         )
-        self.estimate = Struct.of("slipid_estimate", "What is believed.", believed)
-        self.functions = list(self._functions(begin.seen, begin.held, nothing, believed))
+        self.estimate = Struct.of("slipid_estimate", "What is believed.", estimate)
+        self.functions = list(self._functions(begin.estimator, begin.controller, nothing, estimate))
 
     def _functions(
-        self, seen: eqx.Module, held: eqx.Module, nothing: Readings, believed: eqx.Module
+        self,
+        estimator: eqx.Module,
+        controller: eqx.Module,
+        nothing: Readings,
+        estimate: eqx.Module,
     ) -> Iterator[Function]:
-        pilot, one = self.pilot, jnp.zeros(())
-        wheels = pilot.controller.robot.wheels
+        loop, one = self.loop, jnp.zeros(())
+        wheels = loop.controller.robot.wheels
         pose, dt = Argument.plain("pose", (3,)), Argument.plain("dt", ())
         fresh = (
             Argument.of("estimator", self.estimator, False, True),
@@ -76,7 +85,7 @@ class Code:
             "Start estimator and controller of a robot that stands at a pose: x, y [m], heading "
             "[rad].",
             (*fresh, pose),
-            traced(lambda p: (pilot.init(p).seen, pilot.init(p).held), jnp.zeros(3)),
+            traced(lambda p: (loop.init(p).estimator, loop.init(p).controller), jnp.zeros(3)),
         )
         yield function(
             self._names,
@@ -95,7 +104,7 @@ class Code:
                 dt,
                 Argument.of("estimate", self.estimate, False, True),
             ),
-            traced(pilot.estimator.step, seen, nothing, one),
+            traced(loop.estimator.step, estimator, nothing, one),
         )
         yield function(
             self._names,
@@ -109,13 +118,13 @@ class Code:
                 dt,
                 Argument.plain("command", (wheels,), False, True),
             ),
-            traced(pilot.controller.step, held, jnp.zeros(6), believed, one),
+            traced(loop.controller.step, controller, jnp.zeros(6), estimate, one),
         )
         if self.path is not None:
             yield self._follow(self.path)
 
     def _follow(self, path: Path) -> Function:
-        preview = self.pilot.controller.gains.preview
+        preview = self.loop.controller.gains.preview
         begin = ", ".join(f"{float(x):g}" for x in path.rows[0, :3])
 
         def follow(time: jnp.ndarray, pose: jnp.ndarray, dt: jnp.ndarray) -> object:
@@ -144,19 +153,19 @@ class Code:
 
     @property
     def kept(self) -> int:
-        """Numbers in a state."""
+        """Count of the numbers in a state."""
         return sum(f.size for s in (self.estimator, self.controller) for f in s.fields) + 1
 
     @property
     def scratch(self) -> int:
-        """Numbers in arrays that a step has on the stack."""
+        """Count of the numbers in arrays that a step has on the stack."""
         return max(f.scratch for f in self.functions)
 
     def header(self) -> str:
-        """Text of slipid.h."""
+        """Return the text of slipid.h."""
         robot = self.robot
-        named = identifiers(robot.labels, "floor")
-        floors = [f"SLIPID_FLOOR_{name.upper()} {k}" for k, name in enumerate(named)]
+        names = identifiers(robot.labels, "floor")
+        floors = [f"SLIPID_FLOOR_{name.upper()} {k}" for k, name in enumerate(names)]
         sizes = [f"SLIPID_WHEELS {robot.wheels}", f"SLIPID_FLOORS {len(robot.labels)}"]
         defines = [f"#define {d}" for d in (*sizes, *floors, *self._duration())]
         single = [f"#define {name} {name}_float" for name in self._names_of_functions]
@@ -169,7 +178,7 @@ class Code:
             "HEAD": "\n".join(_comment(*header(robot))),
             "ROBOT": robot.record.numbers,
             "DEFINES": "\n".join(defines),
-            "ABOUT": "\n".join(line for part in about(self.pilot) for line in _comment(part)),
+            "ABOUT": "\n".join(line for part in about(self.loop) for line in _comment(part)),
             "SINGLE": "\n".join(single),
             "STRUCTS": "\n".join(line for s in self.structs for line in _struct(s)),
             "FUNCTIONS": "\n".join(declared),
@@ -184,7 +193,7 @@ class Code:
         return [] if self.path is None else [f"SLIPID_PATH_SECONDS {self.path.duration!r}"]
 
     def source(self) -> str:
-        """Text of slipid.c."""
+        """Return the text of slipid.c."""
         reads = frozenset[str]().union(*(f.reads for f in self.functions))
         tables = [m for m in self._names.tables.values() if m.name in reads]
         values = {
@@ -196,9 +205,9 @@ class Code:
         return filled("slipid.c", values)
 
 
-def about(pilot: ControlLoop[eqx.Module]) -> Iterator[str]:
-    """Sentences on axes, wheels, sensors and floors for readers of the header."""
-    robot = pilot.controller.robot
+def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
+    """Yield sentences on axes, wheels, sensors and floors for readers of the header."""
+    robot = loop.controller.robot
     yield (
         "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: those in "
         "which the start pose is given. A twist is in the body's axes."
@@ -210,27 +219,27 @@ def about(pilot: ControlLoop[eqx.Module]) -> Iterator[str]:
             f"Wheel {k} stands at x = {x:.4f} m, y = {y:.4f} m; turning at a positive speed it "
             f"pushes the body towards {drives:.1f} deg."
         )
-    settings = pilot.estimator.settings
+    settings = loop.estimator.settings
     signs = "with their signs" if settings.current_is_signed else "without a sign (a sign is lost)"
     yield f"Currents are taken {signs}. A wheel unheard for {float(settings.stale_s):g} s is stale."
     yield "Floors, as columns count them: " + listed([*robot.labels, "none of them"]) + "."
-    ways = hypotheses_of(robot).under.tolist()
-    each = "; ".join(f"{k}: {' '.join(map(str, way))}" for k, way in enumerate(ways))
+    rows = hypotheses_of(robot).under.tolist()
+    each = "; ".join(f"{k}: {' '.join(map(str, row))}" for k, row in enumerate(rows))
     yield f"Hypotheses of the floors, as rows count them, with the floor under each wheel: {each}."
 
 
 def template(name: str) -> str:
-    """Text of a file of this folder's templates."""
+    """Return the text of a file in this folder's templates."""
     return (files(__package__) / "templates" / name).read_text()
 
 
 def filled(name: str, values: dict[str, str]) -> str:
-    """A template with values for every @NAME@."""
+    """Return a template with values for every @NAME@."""
     return re.sub(r"@([A-Z]+)@", lambda match: values[match.group(1)], template(name))
 
 
 def _comment(*parts: str) -> list[str]:
-    """A comment of C."""
+    """Return a comment of C."""
     lines = [line.replace("*/", "* /") for part in parts for line in wrapped(part)]
     return (
         [f"/* {lines[0]}", *(f"   {line}" for line in lines[1:-1]), f"   {lines[-1]} */"]
@@ -244,9 +253,9 @@ def _struct(struct: Struct) -> Sequence[str]:
     for field in struct.fields:
         size = f"[{field.size}]" if field.shape else ""
         shape = "" if len(field.shape) < 2 else f", {' x '.join(map(str, field.shape))} by rows"
-        declared, said = f"  {TYPE[field.kind]} {field.name}{size};", f"{field.comment}{shape}"
-        if len(declared) + len(said) + 7 <= WIDTH:
-            lines.append(f"{declared} /* {said} */")
+        declared, comment = f"  {TYPE[field.kind]} {field.name}{size};", f"{field.comment}{shape}"
+        if len(declared) + len(comment) + 7 <= WIDTH:
+            lines.append(f"{declared} /* {comment} */")
         else:
-            lines += [*(f"  {line}" for line in _comment(said)), declared]
+            lines += [*(f"  {line}" for line in _comment(comment)), declared]
     return [*lines, f"}} {struct.name};", ""]

@@ -1,4 +1,4 @@
-"""Functions of numbers, one by one."""
+"""Rules of primitives that act on numbers one by one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from slipid.export.fields import Kind, kind_of
 Shaped = jax.ShapeDtypeStruct
 Rule = Callable[[Builder, list[Value], Params, Shaped], Value]
 Simpler = Callable[[tuple[Cell, ...]], Cell | None]
-"""Finds the cell that an operation on cells is equal to; None if it takes a statement."""
+"""Function that returns the cell an operation equals; None if it takes a statement."""
 
 
 UNARY = {
@@ -70,9 +70,9 @@ BINARY = {
     "sub": "{0} - {1}",
 }
 OF_INTS = {"max": "i_max({0}, {1})", "min": "i_min({0}, {1})", "rem": "{0} % {1}"}
-"""Templates of operations that are written otherwise for whole numbers."""
+"""Templates of operations that C writes differently for whole numbers."""
 NEUTRAL = {"add": (0.0, 0.0), "sub": (None, 0.0), "mul": (1.0, 1.0), "div": (None, 1.0)}
-"""Numbers that, in the first or second place, leave the other as it is."""
+"""Numbers that, in the first or second place, leave the other unchanged."""
 
 
 def _never(cells: tuple[Cell, ...]) -> Cell | None:
@@ -87,7 +87,7 @@ def applied(
     shape: tuple[int, ...],
     simpler: Simpler = _never,
 ) -> Array:
-    """A template applied to every number of some arrays, or of single numbers for all."""
+    """Return a template applied to every number of some arrays, or of single numbers for all."""
     axis = _axis(values, shape)
     rows = [along(builder, v, shape, axis) for v in values]
     lanes = 0 if axis is None else shape[axis]
@@ -102,26 +102,26 @@ def applied(
 
 
 def _axis(values: Sequence[Value], shape: tuple[int, ...]) -> int | None:
-    """Axis of the lanes of what is computed from values, number by number."""
+    """Return the axis of the lanes of an element-wise result."""
     axis = next((a for a in map(partial(_lanes, shape), values) if a is not None), None)
     return longest(shape) if axis is None and prod(shape) > UNROLLED else axis
 
 
 def lanes_of(values: Sequence[Value], shape: tuple[int, ...]) -> int:
-    """Number of lanes of what is computed from values, number by number; 0 for none."""
+    """Return the number of lanes of an element-wise result; 0 for none."""
     axis = _axis(values, shape)
     return 0 if axis is None else shape[axis]
 
 
 def _lanes(shape: tuple[int, ...], value: Value) -> int | None:
-    """Axis of a value's lanes, if they are as many as the result of such a shape has there."""
+    """Return the axis of a value's lanes if the result has as many there."""
     if not isinstance(value, Array) or value.axis is None or len(value.shape) != len(shape):
         return None
     return value.axis if value.shape[value.axis] == shape[value.axis] else None
 
 
 def unary(name: str) -> Rule:
-    """Rule of a function of one number."""
+    """Return the rule of a function of one number."""
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
         if UNARY[name] == "{0}":
@@ -134,7 +134,7 @@ def unary(name: str) -> Rule:
 
 
 def binary(name: str) -> Rule:
-    """Rule of a function of two numbers."""
+    """Return the rule of a function of two numbers."""
     first, second = NEUTRAL.get(name.removesuffix("_any"), (None, None))
 
     def simpler(cells: tuple[Cell, ...]) -> Cell | None:
@@ -162,7 +162,7 @@ def divided(
     out: Shaped,
     simpler: Simpler,
 ) -> Value:
-    """Quotients; a hyperbolic tangent, itself a quotient, over a number is a single one."""
+    """Return quotients; a hyperbolic tangent over a number is a single quotient."""
 
     def once(cells: tuple[Cell, ...]) -> Cell | None:
         over, by = cells
@@ -176,7 +176,7 @@ def divided(
 
 
 def integer_pow(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """A whole power, by multiplications."""
+    """Return a whole power, by multiplications."""
     power = params["y"]
     if power == 0:
         raise NoFormError("a power of 0")
@@ -196,7 +196,7 @@ CONVERTED: dict[tuple[Kind, Kind], str] = {
 
 
 def converted(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Numbers of another kind."""
+    """Return numbers of another kind."""
     pair = kind_of_value(values[0]), kind_of(out.dtype)
     if pair[0] == pair[1]:
         return values[0]
@@ -204,7 +204,7 @@ def converted(builder: Builder, values: list[Value], params: Params, out: Shaped
 
 
 def select(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """One of two numbers by a condition."""
+    """Return one of two numbers by a condition."""
 
     def simpler(cells: tuple[Cell, ...]) -> Cell | None:
         which, no, yes = cells

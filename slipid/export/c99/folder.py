@@ -1,7 +1,4 @@
-"""Steps that the generated code must repeat, as a header of C.
-
-Files of a C folder: the code, its test, an example, and what builds them.
-"""
+"""Files of a C folder: the code, its test with reference steps, an example, and build files."""
 
 from __future__ import annotations
 
@@ -22,20 +19,20 @@ from slipid.robot.trajectory import Path
 
 
 def golden_header(code: Code) -> str:
-    """Text of golden.h: the steps as tables, and how structs are filled and read."""
-    kept = golden(code.pilot)
+    """Return the text of golden.h: the steps as tables, and code that fills and reads structs."""
+    steps = golden(code.loop)
     names = [f.name for f in code.estimate.fields for _ in range(f.size)]
-    scale = np.maximum(np.abs(kept.said).max(axis=0), 1e-3)
+    scale = np.maximum(np.abs(steps.said).max(axis=0), 1e-3)
     rows = [
         "#include <math.h>",
         "",
-        f"#define GOLDEN_STEPS {len(kept.given)}",
-        f"#define GOLDEN_GIVEN {kept.given.shape[1]}",
-        f"#define GOLDEN_SAID {kept.said.shape[1]}",
+        f"#define GOLDEN_STEPS {len(steps.given)}",
+        f"#define GOLDEN_GIVEN {steps.given.shape[1]}",
+        f"#define GOLDEN_SAID {steps.said.shape[1]}",
         "",
-        *_table("golden_given[GOLDEN_STEPS][GOLDEN_GIVEN]", kept.given),
-        *_table("golden_said[GOLDEN_STEPS][GOLDEN_SAID]", kept.said),
-        *_table("golden_command[GOLDEN_STEPS][SLIPID_WHEELS]", kept.command),
+        *_table("golden_given[GOLDEN_STEPS][GOLDEN_GIVEN]", steps.given),
+        *_table("golden_said[GOLDEN_STEPS][GOLDEN_SAID]", steps.said),
+        *_table("golden_command[GOLDEN_STEPS][SLIPID_WHEELS]", steps.command),
         *_table("golden_scale[GOLDEN_SAID]", scale),
         "static const char *const golden_names[GOLDEN_SAID] = {",
         *wrapped((f'"{name}"' for name in names), "  "),
@@ -89,12 +86,14 @@ def _reading_out(struct: Struct) -> list[str]:
 
 @dataclass(frozen=True)
 class Recording:
-    """A run of a path that the library has driven, a row per period.
+    """A run of a path that the library has driven, one row per period.
 
     Attributes:
-        plant: what it was driven on; start: pose at which it began [m, m, rad].
-        given: dt [s] and the leaves of the reading; command: wheel speeds [rad/s].
-        time: of the path [s].
+        plant: description of the plant.
+        start: pose at which it began [m, m, rad].
+        given: dt [s] and the leaves of the reading.
+        command: wheel speeds [rad/s].
+        time: time of the path [s].
     """
 
     plant: str
@@ -117,7 +116,7 @@ class Recording:
 
 
 def _path(path: Path) -> str:
-    """Description of a path for people."""
+    """Return a description of a path for people."""
     corners = [f"({x:.2f}, {y:.2f})" for x, y in np.asarray(path.corners).tolist()]
     x, y, heading = np.asarray(path.rows)[0, :3].tolist()
     return (
@@ -127,28 +126,29 @@ def _path(path: Path) -> str:
 
 
 def _kib(numbers: int) -> str:
-    """Size of so many numbers in `double`."""
+    """Return the size of this count of numbers in `double`."""
     return f"{numbers * 8 / 1024:.1f} KiB"
 
 
 def c_files(
     robot: DeployedRobot,
-    pilot: ControlLoop[eqx.Module],
+    loop: ControlLoop[eqx.Module],
     path: Path,
     recording: Recording | None = None,
 ) -> dict[str, str]:
-    """Text of the files by their paths in the folder.
+    """Return the text of the files by their paths in the folder.
 
     Args:
-        robot: for the record of its numbers; pilot: its estimator and controller.
-        path: that the example follows.
+        robot: robot with the record of its numbers.
+        loop: estimator and controller.
+        path: path that the example follows.
         recording: a run of it, as a test of the example.
 
     Raises:
         UnsupportedError: a step uses a primitive that has no form in C.
     """
-    code = Code(robot, pilot, path)
-    named = {"VERSION": made_with()}
+    code = Code(robot, loop, path)
+    release = {"VERSION": made_with()}
     files = {
         "src/slipid.h": code.header(),
         "src/slipid.c": code.source(),
@@ -157,18 +157,18 @@ def c_files(
         "examples/drive/drive.c": template("drive.c"),
         "examples/Slipid/Slipid.ino": filled("Slipid.ino", {"STACK": _kib(code.scratch)}),
         "CMakeLists.txt": template("CMakeLists.txt"),
-        "library.json": filled("library.json", named),
-        "library.properties": filled("library.properties", named),
+        "library.json": filled("library.json", release),
+        "library.properties": filled("library.properties", release),
     }
-    steps = ""
+    example = ""
     if recording is not None:
         files["examples/drive/readings.txt"] = recording.readings
         files["examples/drive/commands.txt"] = recording.commands
-        steps = filled("recording.md", {"PLANT": recording.plant})
+        example = filled("recording.md", {"PLANT": recording.plant})
     values = {
         "WARNINGS": "\n".join(warned(robot)),
         "HEAD": "\n".join(facts(robot)),
-        "RECORDING": steps,
+        "RECORDING": example,
         "FLOORS": ", ".join(f"`{name}` ({k})" for k, name in enumerate(robot.labels)),
         "WHEELS": str(robot.wheels),
         "STATE": _kib(code.kept),

@@ -1,4 +1,4 @@
-"""A traced function as one of C: its arguments, its body, and what it reads."""
+"""A traced function as a function of C: its arguments, its body, and the memory that it reads."""
 
 from __future__ import annotations
 
@@ -20,9 +20,11 @@ class Argument:
     """An argument of a function of C.
 
     Attributes:
-        name: its name; type: struct that the pointer points to, empty for plain numbers.
-        fields: fields of the struct; one alone for plain numbers.
-        read, written: whether the function reads and fills it.
+        name: name of the argument.
+        type: struct that the pointer points to, empty for plain numbers.
+        fields: fields of the struct; a single one for plain numbers.
+        read: whether the function reads it.
+        written: whether the function fills it.
     """
 
     name: str
@@ -35,12 +37,12 @@ class Argument:
     def plain(
         cls, name: str, shape: tuple[int, ...], read: bool = True, written: bool = False
     ) -> Argument:
-        """A number or a row of numbers."""
+        """Return a number or a row of numbers as an argument."""
         return cls(name, "", (Field(name, "real", shape, ""),), read, written)
 
     @classmethod
     def of(cls, name: str, struct: Struct, read: bool = True, written: bool = False) -> Argument:
-        """A pointer to a struct."""
+        """Return a pointer to a struct as an argument."""
         return cls(name, struct.name, struct.fields, read, written)
 
     @property
@@ -72,9 +74,12 @@ class Function:
     """A function of C.
 
     Attributes:
-        name: its name; about: comment of its declaration; arguments: its arguments in order.
-        lines: lines of its body; reads: names of all memory that it reads.
-        scratch: numbers in arrays that it has on the stack.
+        name: name of the function.
+        about: comment of its declaration.
+        arguments: arguments in order.
+        lines: lines of its body.
+        reads: names of all memory that it reads.
+        scratch: count of the numbers in arrays that it has on the stack.
     """
 
     name: str
@@ -102,12 +107,15 @@ def function(
     arguments: Sequence[Argument],
     traced: Traced,
 ) -> Function:
-    """A traced function as one of C.
+    """Return a traced function as a function of C.
 
     Args:
-        names: of the file; name, about, arguments: of the function.
-        traced: from the fields of all arguments that are read to those of all that are written,
-            both in the order of the arguments.
+        names: names of the file.
+        name: name of the function.
+        about: comment of its declaration.
+        arguments: arguments in order.
+        traced: function from the fields of all arguments that are read to those of all that are
+            written, both in the order of the arguments.
 
     Raises:
         UnsupportedError: it uses a primitive without a rule.
@@ -119,12 +127,12 @@ def function(
         if argument.read
         for memory, field in zip(argument.memories, argument.fields, strict=True)
     ]
-    found = lowered(builder, traced, values)
+    results = lowered(builder, traced, values)
     targets = [memory for a in arguments if a.written for memory in a.memories]
     overwritten = frozenset(memory.name for memory in targets)
     changed = [
         (memory, apart(builder, value, overwritten))
-        for memory, value in zip(targets, found, strict=True)
+        for memory, value in zip(targets, results, strict=True)
         if not _holds(memory, value)
     ]
     for memory, value in changed:
@@ -136,17 +144,17 @@ def function(
 
 
 def traced(run: Callable[..., object], *like: object) -> Traced:
-    """A function of some trees, traced as one from their leaves to those of its result."""
+    """Return a function of some trees, traced as one from their leaves to those of its result."""
     structure = jax.tree.structure(like)
 
-    def of(*given: jax.Array) -> list[jax.Array]:
-        return jax.tree.leaves(run(*jax.tree.unflatten(structure, given)))
+    def of(*leaves: jax.Array) -> list[jax.Array]:
+        return jax.tree.leaves(run(*jax.tree.unflatten(structure, leaves)))
 
     return Traced.of(jax.make_jaxpr(of)(*jax.tree.leaves(like)))
 
 
 def _holds(memory: Memory, value: Value) -> bool:
-    """Whether memory holds a value already."""
+    """Return whether memory holds a value already."""
     if not isinstance(value, Array):
         return False
     like = in_memory(memory, value.shape)
@@ -154,7 +162,7 @@ def _holds(memory: Memory, value: Value) -> bool:
 
 
 def _unused(arguments: Sequence[Argument], reads: frozenset[str]) -> list[str]:
-    """Statements that tell a compiler that arguments are not read on purpose."""
+    """Return statements that mark arguments as deliberately not read."""
     idle = [
         a.name for a in arguments if not a.written and not any(m.name in reads for m in a.memories)
     ]

@@ -1,9 +1,9 @@
-"""What a traced function is lowered to: numbers, loops over lanes, and where both are computed.
+"""Intermediate representation of a traced function: numbers, loops over lanes, and their blocks.
 
 An array is a numpy array of cells, one for every number. Long arrays have one axis that is a loop
-at run time, their lanes; their cells then stand for a whole row of numbers along it. All else is
-unrolled, so that to slice, stack or transpose an array is to rearrange its cells and costs the
-robot nothing.
+at run time, their lanes; each of their cells then stands for a whole row of numbers along it.
+Everything else is unrolled, so that slicing, stacking or transposing an array rearranges its cells
+and costs the robot nothing.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ LANES = 7
 
 
 class NoFormError(Exception):
-    """Why there is no form in C for what a primitive is asked to do."""
+    """Reason why there is no form in C for an application of a primitive."""
 
 
 @dataclass(frozen=True)
 class Constant:
-    """A constant; 0 and -0 are two."""
+    """A constant; 0 and -0 are different."""
 
     value: float | int | bool = field(compare=False)
     kind: Kind
     text: str = field(init=False)
 
     def __post_init__(self) -> None:
-        """Compare by what is written."""
+        """Set the text by which constants compare."""
         object.__setattr__(self, "text", repr(self.value))
 
 
@@ -48,12 +48,14 @@ class Memory:
     """Numbers side by side: a field of a struct, an array on the stack or a table of constants.
 
     Attributes:
-        name: name in C; kind: kind of its numbers; size: count of its numbers.
+        name: name in C.
+        kind: kind of its numbers.
+        size: count of its numbers.
         home: block that fills it; None where it is filled before the function begins.
         values: bytes of a table of constants, empty for other memory.
-        scalar: whether it is a single number that C knows without an index.
-        lanes: whether a loop fills it, truth values as 1 and 0: numbers of one size make a loop
-            that compilers turn into instructions for several lanes at once.
+        scalar: whether it is a single number that C accesses without an index.
+        lanes: whether a loop fills it, truth values as 1 and 0: compilers vectorize loops over
+            numbers of one size.
     """
 
     name: str
@@ -86,7 +88,10 @@ class Variable:
     """A number that a statement computes; one for every lane where `lanes` is not 0.
 
     Attributes:
-        kind: kind of the number; number: number in its name; home: block that computes it.
+        kind: kind of the number.
+        number: number in its name.
+        lanes: count of its lanes.
+        home: block that computes it.
         made_by: template and cells of the statement that computes it.
     """
 
@@ -112,10 +117,12 @@ class Statement:
 
     Attributes:
         target: variable that it computes; None where the template is a whole statement of C.
-        writes: memory that the template fills; times: how many numbers it fills in a loop of its
-            own, 0 for a statement without one.
-        always: whether it stays though nothing reads that memory.
-        start: number that a reduction starts from; empty for a statement that is none.
+        template: text of C with places for cells.
+        cells: cells for these places.
+        writes: memory that the template fills.
+        times: count of the numbers it fills in a loop of its own, 0 for a statement without one.
+        always: whether it stays even if nothing reads that memory.
+        start: number that a reduction starts from; empty for other statements.
         source: line of Python that asks for it.
     """
 
@@ -134,8 +141,11 @@ class CodeBlock:
     """Statements that run one after the other, for every lane if `lanes` is not 0.
 
     Attributes:
-        owner: builder that it is part of; place: its number among the blocks of the owner.
-        lanes: count of the loop's turns; calls: whether its statements call functions.
+        owner: builder that it belongs to.
+        place: its number among the blocks of the owner.
+        lanes: count of the loop's turns.
+        calls: whether its statements call functions.
+        statements: statements in order.
         nested: a condition or a repetition, which has blocks of its own.
     """
 
@@ -153,7 +163,7 @@ class Nested:
 
     Attributes:
         when: condition of the first of two bodies, or None.
-        times: how often a single body runs.
+        times: number of times that a single body runs.
         bodies: code that runs.
     """
 
@@ -167,7 +177,8 @@ class Array:
     """An array of cells.
 
     Attributes:
-        shape: shape of the array; kind: kind of its numbers.
+        shape: shape of the array.
+        kind: kind of its numbers.
         axis: axis of the lanes, or None.
         cells: its cells, an array without that axis.
     """
@@ -183,19 +194,19 @@ Value = Array | np.ndarray
 
 
 def kind_of_value(value: Value) -> Kind:
-    """Kind of the numbers of a value."""
+    """Return the kind of the numbers of a value."""
     return value.kind if isinstance(value, Array) else kind_of(value.dtype)
 
 
 def cells_of(shape: Sequence[int], cells: Sequence[Cell]) -> Cells:
-    """An array of cells in row-major order."""
+    """Return an array of cells in row-major order."""
     out = np.empty(len(cells), dtype=object)
     out[:] = cells
     return out.reshape(shape)
 
 
 def varies(cell: Cell) -> bool:
-    """Whether a cell differs from lane to lane."""
+    """Return whether a cell differs from lane to lane."""
     if isinstance(cell, At):
         by_index = cell.index is not None and cell.index.lanes > 0
         return cell.stride != 0 or cell.table is not None or by_index
@@ -203,14 +214,14 @@ def varies(cell: Cell) -> bool:
 
 
 def longest(shape: Sequence[int]) -> int | None:
-    """Axis that is a loop where nothing else says which; None where all are short."""
+    """Return the axis that is a loop by default; None where all are short."""
     if max(shape, default=0) < LANES:
         return None
     return max(range(len(shape)), key=lambda axis: (shape[axis], axis))
 
 
 def in_memory(memory: Memory, shape: tuple[int, ...]) -> Array:
-    """The array that lies in memory in row-major order."""
+    """Return the array that is stored in memory in row-major order."""
     places = np.arange(prod(shape)).reshape(shape)
     axis = longest(shape)
     if axis is None:

@@ -1,4 +1,4 @@
-"""Functions that JAX has traced, read alike whichever way a version of JAX writes them.
+"""Access to functions that JAX has traced, the same for all supported versions of JAX.
 
 No other module knows where a version keeps the parameters of a primitive, the functions that it
 calls, and the lines of Python that ask for it.
@@ -17,7 +17,7 @@ from jax.extend.core import Jaxpr, JaxprEqn
 from slipid.support.errors import DataError
 
 KNOWN = ">=0.10,<0.13"
-"""Versions of JAX that write what is known here."""
+"""Versions of JAX whose traced functions are supported."""
 
 
 class Params(dict[str, Any]):
@@ -93,17 +93,17 @@ class ScanParameters:
 
 
 def called(params: Params) -> Traced:
-    """The function that a primitive calls."""
+    """Return the function that a primitive calls."""
     return Traced.of(params.get("jaxpr", params.get("call_jaxpr")))
 
 
 def branches(params: Params) -> list[Traced]:
-    """Functions of a condition, one of which is called."""
+    """Return the functions of a condition, one of which is called."""
     return [Traced.of(branch) for branch in params["branches"]]
 
 
 def source_line(equation: JaxprEqn) -> str:
-    """File and line of the innermost own code that asks for an equation; empty if none does."""
+    """Return file and line of the innermost own code that asks for an equation, or ""."""
     traceback = equation.source_info.traceback
     for frame in traceback.frames if traceback is not None else ():
         path = Path(frame.file_name)
@@ -114,7 +114,7 @@ def source_line(equation: JaxprEqn) -> str:
 
 
 def unknown(what: str) -> DataError:
-    """Error of a version of JAX that writes something in a way that is not known here."""
+    """Return the error for a version of JAX that writes something in an unsupported way."""
     return DataError(
         f"jax {jax.__version__} writes {what} in a way that this version of slipid does not know; "
         f"expected a version that it knows: pip install 'jax{KNOWN}'"

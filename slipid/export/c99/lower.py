@@ -1,4 +1,4 @@
-"""From what JAX has traced to statements: constants are computed now, the rest on the robot."""
+"""Lowering of traced functions to statements; constants are computed now, the rest on the robot."""
 
 from __future__ import annotations
 
@@ -51,13 +51,12 @@ RULES: dict[str, Rule] = {
     "scatter-mul": moves.scattered("mul", 1.0),
     "select_n": elementwise.select,
 }
-"""How a primitive becomes C, by its name.
+"""Rule that turns a primitive into C, by its name.
 
-Primitives that only move numbers need no rule of their own: they are asked, by JAX itself, where
-the numbers of their result come from.
-"""
+Primitives that only move numbers need no rule of their own: JAX itself is asked where the numbers
+of their result come from."""
 INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
-"""Primitives that call a function; its code is put in their place."""
+"""Primitives that call a function, which is inlined."""
 
 _TYPES = frozenset(map(np.dtype, ("float64", "int64", "int32", "bool")))
 """Types of numbers that have a counterpart in C."""
@@ -68,11 +67,11 @@ class UnsupportedError(Exception):
 
 
 def lowered(builder: Builder, traced: Traced, values: Sequence[Value]) -> list[Value]:
-    """Results of a traced function of these values.
+    """Return the results of a traced function of these values.
 
     Raises:
         UnsupportedError: it uses a primitive without a rule.
-        DataError: this version of JAX writes it in a way that is not known.
+        DataError: this version of JAX writes it in an unsupported way.
     """
     return _Lowering(builder).run(traced, values)
 
@@ -82,7 +81,7 @@ class _Lowering:
         self._builder = builder
 
     def run(self, traced: Traced, values: Sequence[Value]) -> list[Value]:
-        """Results of a function."""
+        """Return the results of a function."""
         jaxpr, known = traced.jaxpr, dict[Var, Value]()
         known.update(zip(jaxpr.constvars, map(np.asarray, traced.constants), strict=True))
         known.update(zip(jaxpr.invars, values, strict=True))
@@ -91,9 +90,8 @@ class _Lowering:
             return np.asarray(atom.val) if isinstance(atom, JaxLiteral) else known[atom]
 
         for equation in jaxpr.eqns:
-            given = [_filled(of(atom)) for atom in equation.invars]
-            found = self._equation(equation, given)
-            known.update(zip(equation.outvars, found, strict=True))
+            results = self._equation(equation, [_filled(of(atom)) for atom in equation.invars])
+            known.update(zip(equation.outvars, results, strict=True))
         return [of(atom) for atom in jaxpr.outvars]
 
     def _equation(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
@@ -119,7 +117,7 @@ class _Lowering:
             return self._cond(params, values)
         if name == "scan":
             return self._scan(params, values)
-        out: Any = equation.outvars[0].aval  # jax types it as less than it is
+        out: Any = equation.outvars[0].aval  # jax's type hides its attributes
         shaped = Shaped(out.shape, out.dtype)
         if out.dtype not in _TYPES:
             raise NoFormError(f"numbers of type {out.dtype}")
@@ -133,26 +131,26 @@ class _Lowering:
         return [RULES[name](self._builder, values, params, shaped)]
 
     def _several(self, equation: JaxprEqn, value: Value) -> list[Value]:
-        """Results of a primitive that takes an array apart."""
+        """Return the results of a primitive that takes an array apart."""
         places = np.arange(prod(value.shape)).reshape(value.shape)
         parts = equation.primitive.bind(places, **equation.params)
         return [rearranged(self._builder, [value], np.asarray(part)) for part in parts]
 
     def _cond(self, params: Params, values: list[Value]) -> list[Value]:
-        """One of two functions."""
+        """Return the results of one of two functions."""
         builder, which, choices = self._builder, values[0], branches(params)
         if len(choices) != 2:
             raise NoFormError("more than two branches")
         if not isinstance(which, Array):
             return lowered(builder, choices[int(np.clip(which, 0, 1))], values[1:])
         bodies = [Builder(builder.names, builder) for _ in range(2)]
-        found = [
+        results = [
             lowered(body, branch, values[1:]) for body, branch in zip(bodies, choices, strict=True)
         ]
         when = builder.compute("bool", "{0} != 0", (along(builder, which, (), None).item(),))
         block = builder.append(nested=Nested(when, 1, bodies[::-1]))
         out = []
-        for pair in zip(*found, strict=True):
+        for pair in zip(*results, strict=True):
             memory = self._memory(pair[0], block)
             for body, value in zip(bodies, pair, strict=True):
                 store(body, value, memory)
@@ -164,7 +162,7 @@ class _Lowering:
         return Memory(f"m{number}", kind_of_value(like), prod(like.shape), block)
 
     def _scan(self, params: Params, values: list[Value]) -> list[Value]:
-        """A function applied to its own result a fixed number of times."""
+        """Return the results of a function applied to its own result a fixed number of times."""
         scan = ScanParameters.of(params)
         carried, consts = scan.carried, scan.constants
         if len(values) != carried + consts or len(scan.body.jaxpr.outvars) != carried:
@@ -177,17 +175,17 @@ class _Lowering:
         for value, memory in zip(begun, memories, strict=True):
             store(builder, value, memory)
         carry = [in_memory(m, v.shape) for m, v in zip(memories, begun, strict=True)]
-        found = lowered(body, scan.body, [*values[:consts], *carry])
+        results = lowered(body, scan.body, [*values[:consts], *carry])
         names = frozenset(memory.name for memory in memories)
-        kept = [apart(body, value, names) for value in found]
-        for value, memory in zip(kept, memories, strict=True):
+        results = [apart(body, value, names) for value in results]
+        for value, memory in zip(results, memories, strict=True):
             store(body, value, memory)
         builder.put(body.turns)
         return list(carry)
 
 
 def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
-    """A result without cells of memory that is about to be overwritten, by its names."""
+    """Return a result without cells of memory that is about to be overwritten, by its names."""
     if not isinstance(value, Array):
         return value
     lanes = 0 if value.axis is None else value.shape[value.axis]
@@ -226,15 +224,15 @@ def _place(memory: Memory, offset: int, stride: int) -> str:
 
 
 def _filled(value: Value) -> Value:
-    """The value itself; a constant if it has no numbers at all."""
+    """Return the value itself, or a constant if it has no numbers at all."""
     return value if prod(value.shape) else np.zeros(value.shape, DTYPES[kind_of_value(value)])
 
 
 def _evaluated(equation: JaxprEqn, values: list[Value]) -> list[Value]:
-    """Results that depend on constants alone."""
+    """Return results that depend on constants alone."""
     avals: list[Any] = [atom.aval for atom in equation.invars]
-    given = [jax.numpy.asarray(v, a.dtype) for v, a in zip(values, avals, strict=True)]
+    inputs = [jax.numpy.asarray(v, a.dtype) for v, a in zip(values, avals, strict=True)]
     with jax.ensure_compile_time_eval():
-        found = equation.primitive.bind(*given, **equation.params)
+        result = equation.primitive.bind(*inputs, **equation.params)
     many = equation.primitive.multiple_results
-    return [np.asarray(x) for x in (found if many else [found])]
+    return [np.asarray(x) for x in (result if many else [result])]

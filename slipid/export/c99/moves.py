@@ -1,4 +1,4 @@
-"""Arrays that are taken apart and put together, at places known now or at run time."""
+"""Rules of primitives that take arrays apart and join them, at constant or variable places."""
 
 from __future__ import annotations
 
@@ -32,13 +32,16 @@ MOVES = frozenset(
         *("reshape", "rev", "slice", "split", "squeeze", "stack", "transpose", "unstack"),
     }
 )
-"""Primitives that only move numbers, if what says where is constant."""
+"""Primitives that only move numbers, if their places are constant."""
 SOURCES = {"gather": 1, "dynamic_slice": 1}
-"""How many first arguments of a primitive are moved, the others saying where; else all."""
+"""Number of first arguments that a primitive moves, the others being places; all by default."""
 
 
 def moved(primitive: Primitive, sources: int) -> Rule:
-    """Rule of a primitive that moves numbers of its first arguments, the others being constant."""
+    """Return the rule of a primitive that moves numbers of its first arguments.
+
+    The other arguments must be constant.
+    """
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
         taken = values[:sources] if sources else values
@@ -47,14 +50,14 @@ def moved(primitive: Primitive, sources: int) -> Rule:
             start + np.arange(prod(v.shape)).reshape(v.shape)
             for start, v in zip(starts, taken, strict=False)
         ]
-        found = primitive.bind(*places, *values[len(taken) :], **params)
-        return rearranged(builder, taken, np.asarray(found))
+        moved_places = primitive.bind(*places, *values[len(taken) :], **params)
+        return rearranged(builder, taken, np.asarray(moved_places))
 
     return rule
 
 
 def scatter(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Some numbers replaced at constant places."""
+    """Return an array with some numbers replaced at constant places."""
     old, where, new = values
     fresh = old_size = prod(old.shape)
     places = _scattered(np.arange(old_size).reshape(old.shape), where, new.shape, params, fresh)
@@ -62,7 +65,10 @@ def scatter(builder: Builder, values: list[Value], params: Params, out: Shaped) 
 
 
 def scattered(name: str, neutral: float) -> Rule:
-    """Rule of a primitive that adds to, or multiplies, numbers at constant places, each once."""
+    """Return the rule of a primitive that adds to or multiplies numbers at constant places.
+
+    Each place may occur once.
+    """
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
         old, where, new = values
@@ -77,7 +83,7 @@ def scattered(name: str, neutral: float) -> Rule:
 def _scattered(
     old: np.ndarray, where: Value, shape: tuple[int, ...], params: Params, fresh: int
 ) -> np.ndarray:
-    """Where every number comes from: `old`, or fresh ones that count from a number on."""
+    """Return where every number comes from: `old`, or new ones numbered from `fresh`."""
     if isinstance(where, Array):
         raise NoFormError("places that are not known before the robot runs")
     kept = {k: params[k] for k in ("dimension_numbers", "indices_are_sorted", "mode")}
@@ -90,7 +96,7 @@ def _scattered(
 
 
 def dynamic_slice(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """A part of an array from a place on that is known at run time."""
+    """Return a part of an array from a place that is known at run time."""
     whole, starts, sizes = values[0], values[1:], params["slice_sizes"]
     memory = contiguous(builder, whole)
     base = _offset(builder, [along(builder, s, (), None).item() for s in starts], whole, sizes)
@@ -109,7 +115,7 @@ def dynamic_slice(builder: Builder, values: list[Value], params: Params, out: Sh
 def _offset(
     builder: Builder, starts: Sequence[Cell], whole: Value, sizes: Sequence[int], lanes: int = 0
 ) -> Variable:
-    """Number of the first number from which a part of an array is taken, within its bounds.
+    """Return the position of the first number of a part of an array, limited to its bounds.
 
     There is one for every lane if any start differs from lane to lane.
     """
@@ -124,7 +130,7 @@ def _offset(
 
 
 def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Parts of an array from places on that are known at run time, held within its bounds."""
+    """Return parts of an array from places that are known at run time, limited to its bounds."""
     whole, where = values
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     if numbers.operand_batching_dims or numbers.start_indices_batching_dims:

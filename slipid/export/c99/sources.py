@@ -1,7 +1,4 @@
-"""Where the numbers of an array come from, and how they are brought side by side.
-
-Arrays of cells: taken apart, put together anew, and brought to the same lanes.
-"""
+"""Arrays of cells: taken apart, rearranged, and brought to the same lanes."""
 
 from __future__ import annotations
 
@@ -30,14 +27,15 @@ from slipid.export.c99.ir import (
 from slipid.export.fields import kind_of
 
 UNROLLED = 64
-"""Numbers up to which an array without lanes stays so."""
+"""Largest count of numbers for which an array without lanes stays unrolled."""
 
 
 class Sources:
     """Numbers of some arrays, one after the other.
 
     Attributes:
-        constant: whether all are constants; numbers: then they themselves.
+        constant: whether all are constants.
+        numbers: the constants, if all are.
         kind: kind of the numbers.
     """
 
@@ -56,7 +54,7 @@ class Sources:
         return self._sources[k], place - int(self._starts[k])
 
     def best_axis(self, places: np.ndarray) -> int | None:
-        """That along which most rows are lanes of a source already; none where none is."""
+        """Return the axis along which most rows are lanes of a source already; None if none is."""
         free = {axis: self._free(places, axis) for axis in range(places.ndim)}
         axis = max(free, key=lambda a: (free[a], places.shape[a], a), default=None)
         if axis is not None and 2 * free[axis] * places.shape[axis] >= places.size > 0:
@@ -64,7 +62,7 @@ class Sources:
         return longest(places.shape) if self._laned(places) else None
 
     def _laned(self, places: np.ndarray) -> bool:
-        """Whether the result is so long, and not one number over and over, that it has lanes."""
+        """Return whether the result has lanes, being long and not one number repeated."""
         return len(np.unique(places)) > UNROLLED or max(places.shape, default=0) >= 2 * LANES
 
     def _free(self, places: np.ndarray, axis: int) -> int:
@@ -75,7 +73,7 @@ class Sources:
         return sum(self._lanes(row) is not None for row in flat)
 
     def _lanes(self, row: np.ndarray) -> Cell | None:
-        """The cell of a source of which a row is just the lanes."""
+        """Return the cell of a source whose lanes are exactly this row, or None."""
         source, first = self._source(int(row[0]))
         if not isinstance(source, Array) or source.axis is None:
             return None
@@ -91,7 +89,7 @@ class Sources:
         return cell
 
     def one(self, place: int) -> Cell:
-        """The number at a place."""
+        """Return the number at a place."""
         if place not in self._ones:
             self._ones[place] = self._one(place)
         return self._ones[place]
@@ -142,42 +140,42 @@ class Sources:
         return At(first.memory, 0, table=self._builder.names.table(places, "int"))
 
     def _laned_source(self, row: np.ndarray) -> bool:
-        """Whether all of a row comes from one array that has lanes."""
+        """Return whether all of a row comes from one array that has lanes."""
         source, _ = self._source(int(row[0]))
         same = all(self._source(int(place))[0] is source for place in row)
         return same and isinstance(source, Array) and source.axis is not None
 
     def copied(self, places: np.ndarray) -> Memory:
-        """Memory that holds these numbers side by side; where they are if they do already."""
+        """Return memory that holds these numbers side by side, without a copy where it exists."""
         cells = [self.one(int(place)) for place in places]
-        found = _places(cells)
+        offsets = _places(cells)
         first = cells[0]
-        if found is not None and isinstance(first, At) and first.index is None:
+        if offsets is not None and isinstance(first, At) and first.index is None:
             whole = first.memory.size == len(cells)
-            if whole and np.array_equal(found, np.arange(len(cells))):
+            if whole and np.array_equal(offsets, np.arange(len(cells))):
                 return first.memory
         memory = self._builder.array(self.kind, len(cells), tuple(dict.fromkeys(cells)))
-        done = 0
-        for run in _runs(cells):
-            self._copy(memory, done, run)
-            done += len(run)
+        start = 0
+        for group in _runs(cells):
+            self._copy(memory, start, group)
+            start += len(group)
         return memory
 
-    def _copy(self, memory: Memory, start: int, run: list[Cell]) -> None:
-        """Fill memory from a place on with numbers that lie evenly apart, or with one."""
-        first = run[0]
-        if len(run) == 1:
+    def _copy(self, memory: Memory, start: int, group: list[Cell]) -> None:
+        """Fill memory from a place with evenly spaced numbers, or with one."""
+        first = group[0]
+        if len(group) == 1:
             self._builder.fill(memory, f"{{memory}}[{start}] = {{0}};", first)
             return
         assert isinstance(first, At)
-        second = run[1]
+        second = group[1]
         assert isinstance(second, At)
         many = At(first.memory, first.offset, second.offset - first.offset, first.index)
-        self._builder.fill(memory, f"{{memory}}[{start} + l] = {{0}};", many, len(run))
+        self._builder.fill(memory, f"{{memory}}[{start} + l] = {{0}};", many, len(group))
 
 
 def contiguous(builder: Builder, value: Value) -> Memory:
-    """Memory that holds an array in row-major order."""
+    """Return memory that holds an array in row-major order."""
     if not isinstance(value, Array):
         return builder.names.table(value, kind_of(value.dtype))
     key = id(value.cells)
@@ -189,8 +187,12 @@ def contiguous(builder: Builder, value: Value) -> Memory:
 def _contiguous(builder: Builder, value: Array) -> Memory:
     places = np.arange(prod(value.shape))
     flat = value.cells.reshape(-1)
-    lies = in_memory(flat[0].memory, value.shape) if isinstance(flat[0], At) else None
-    if lies is not None and lies.axis == value.axis and bool((lies.cells == value.cells).all()):
+    stored = in_memory(flat[0].memory, value.shape) if isinstance(flat[0], At) else None
+    if (
+        stored is not None
+        and stored.axis == value.axis
+        and bool((stored.cells == value.cells).all())
+    ):
         return flat[0].memory
     if value.axis is None:
         return Sources(builder, [value]).copied(places)
@@ -209,7 +211,7 @@ def _values(table: Memory) -> np.ndarray:
 
 
 def _places(cells: Sequence[Cell]) -> np.ndarray | None:
-    """Offsets of cells that all lie in one memory; None if they do not."""
+    """Return offsets of cells that are all in one memory; None if they are not."""
     first = cells[0]
     for cell in cells:
         if not isinstance(cell, At) or not isinstance(first, At):
@@ -220,7 +222,7 @@ def _places(cells: Sequence[Cell]) -> np.ndarray | None:
 
 
 def _runs(cells: Sequence[Cell]) -> list[list[Cell]]:
-    """Cells in their order; three or more that lie evenly apart in the same memory together."""
+    """Return cells in their order, grouped where three or more are evenly spaced in one memory."""
     runs: list[list[Cell]] = []
     for cell in cells:
         if runs and _goes_on(runs[-1], cell):
@@ -240,12 +242,13 @@ def _goes_on(run: list[Cell], cell: Cell) -> bool:
 def rearranged(
     builder: Builder, sources: Sequence[Value], places: np.ndarray, axis: int | None = -1
 ) -> Value:
-    """The array whose numbers stand at these places of all sources, flat and one after the other.
+    """Return the array whose numbers are at these places of all sources, flat and joined.
 
     Args:
-        builder: of the code; sources: arrays.
-        places: of every number of the result.
-        axis: of the result's lanes, None for none; by default the one that costs least.
+        builder: builder of the code.
+        sources: arrays.
+        places: place of every number of the result.
+        axis: axis of the result's lanes, None for none; by default the cheapest one.
     """
     known = Sources(builder, sources)
     if known.constant:
@@ -261,7 +264,7 @@ def rearranged(
 
 
 def along(builder: Builder, value: Value, shape: tuple[int, ...], axis: int | None) -> Cells:
-    """Cells of a value spread over a shape, with lanes along an axis."""
+    """Return the cells of a value broadcast to a shape, with lanes along an axis."""
     if not isinstance(value, Array):
         value = np.broadcast_to(value, shape)
         if axis is None:
@@ -279,7 +282,7 @@ def along(builder: Builder, value: Value, shape: tuple[int, ...], axis: int | No
 
 
 def _table(builder: Builder, row: np.ndarray) -> Cell:
-    """A row of constants."""
+    """Return a row of constants as a cell."""
     kind = kind_of(row.dtype)
     if row.tobytes() == len(row) * row[:1].tobytes():
         return Constant(row[0].item(), kind)

@@ -1,7 +1,7 @@
 """Sums and other reductions, over cells and over lanes.
 
-A product with a constant 0 is left out of a sum of products. No finite number differs by it; what
-is infinite or no number does not pass through it, as it would in JAX.
+A product with a constant 0 is left out of a sum of products. For finite numbers that makes no
+difference; infinity and NaN do not propagate through it as they would in JAX.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ REDUCED = {
 
 
 def chained(builder: Builder, template: str, kind: Kind, cells: Cells, lanes: int) -> Cell:
-    """Cells put together one after the other."""
+    """Return cells combined one after the other."""
     done: Cell = cells[0]
     for cell in cells[1:]:
         count = lanes if varies(done) or varies(cell) else 0
@@ -50,7 +50,7 @@ def chained(builder: Builder, template: str, kind: Kind, cells: Cells, lanes: in
 
 
 def reduced(name: str) -> Rule:
-    """Rule of a reduction over some axes."""
+    """Return the rule of a reduction over some axes."""
     template, start = REDUCED[name]
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
@@ -77,7 +77,7 @@ def reduced(name: str) -> Rule:
 
 
 def _of_ints(start: str) -> str:
-    """Neutral element of a reduction of whole numbers, from that of reals."""
+    """Return the neutral element of a reduction of whole numbers, from that of reals."""
     known = {"R(0.0)": "0", "R(1.0)": "1", "R_INFINITY": "INT32_MAX", "-R_INFINITY": "INT32_MIN"}
     if start not in known:
         raise NoFormError("of whole numbers")
@@ -87,13 +87,13 @@ def _of_ints(start: str) -> str:
 def over_lanes(
     builder: Builder, template: str, kind: Kind, cell: Cell, lanes: int, start: str
 ) -> Cell:
-    """A cell reduced over its lanes."""
+    """Return a cell reduced over its lanes."""
     text = template.replace("{0}", "{acc}").replace("{1}", "{0}")
     return builder.compute(kind, text, (cell,), lanes, start)
 
 
 def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Number of the first lane with the least number, or with none."""
+    """Return the index of the first lane with the least number, or with NaN."""
     value = values[0]
     if len(value.shape) > 1 or kind_of_value(value) != "real":
         raise NoFormError("an argmin of other than one axis of reals")
@@ -101,12 +101,12 @@ def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     least = builder.compute("real", "r_min({acc}, {0})", (cell,), lanes, "R_INFINITY")
     which = At(builder.names.table(np.arange(lanes), "int"), 0, 1)
     same = "({acc} < 0) & (({0} == {1}) | ({0} != {0})) ? {2} : {acc}"
-    found = builder.compute("int", same, (cell, least, which), lanes, "-1")
-    return Array((), "int", None, cells_of((), [found]))
+    index = builder.compute("int", same, (cell, least, which), lanes, "-1")
+    return Array((), "int", None, cells_of((), [index]))
 
 
 def dot(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Sums of products."""
+    """Return sums of products."""
     (by_left, by_right), (batch_left, batch_right) = params["dimension_numbers"]
     left, right = values
     free_left = [d for d in range(len(left.shape)) if d not in (*by_left, *batch_left)]
@@ -123,13 +123,13 @@ def dot(builder: Builder, values: list[Value], params: Params, out: Shaped) -> V
         turned = np.transpose(cells, [dims.index(d) for part in order for d in part if d != axis])
         rows.append(turned.reshape([prod(s) for s in sizes]))
     shape = tuple(n for d, n in enumerate(out.shape) if d != axes.out)
-    found = [
+    cells_out = [
         _dot_one(builder, a, b, kind_of(out.dtype), axes.lanes, axes.summed)
         for left_rows, right_rows in zip(*rows, strict=True)
         for a in left_rows
         for b in right_rows
     ]
-    return Array(out.shape, kind_of(out.dtype), axes.out, cells_of(shape, found))
+    return Array(out.shape, kind_of(out.dtype), axes.out, cells_of(shape, cells_out))
 
 
 @dataclass(frozen=True)
@@ -137,8 +137,11 @@ class _DotAxes:
     """Axes along which the lanes of a product of arrays lie.
 
     Attributes:
-        left, right, out: of the arrays, None where they have none.
-        lanes: how many; summed: whether the sum goes over them.
+        left: axis of the left array; None where it has no lanes.
+        right: axis of the right array; None where it has no lanes.
+        out: axis of the result; None where it has no lanes.
+        lanes: count of the lanes.
+        summed: whether the sum goes over them.
     """
 
     left: int | None = None

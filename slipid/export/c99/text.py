@@ -1,7 +1,4 @@
-"""What of the code is used, and which arrays on the stack can share their place.
-
-Statements as text of C99.
-"""
+"""Statements as text of C99: which of them are used, and which arrays can share memory."""
 
 from __future__ import annotations
 
@@ -19,13 +16,14 @@ from slipid.export.fields import DTYPES, Kind
 class Usage:
     """Use of the statements and arrays of a builder.
 
-    It is found from the end to the beginning, since a statement is needed if a later one uses what
-    it computes; steps are numbered downwards, so that earlier ones have smaller numbers.
+    It is determined backwards from the end, since a statement is needed if a later one uses its
+    result; steps are numbered downwards, so that earlier ones have smaller numbers.
 
     Attributes:
-        live: identities of the statements that are needed; read: names of all memory that is read.
-        shared: kind and name of the array on the stack that each memory has, by its own name.
-        sizes: of all arrays on the stack, by kind and name.
+        live: identities of the statements that are needed.
+        read: names of all memory that is read.
+        shared: kind and name of the array on the stack for each memory, by the memory's name.
+        sizes: sizes of all arrays on the stack, by kind and name.
     """
 
     def __init__(self, builder: Builder):
@@ -53,18 +51,18 @@ class Usage:
                     self._mark(statement, block)
 
     def _mark(self, statement: Statement, block: CodeBlock) -> None:
-        """Mark a statement that is needed, and what it uses."""
+        """Mark a statement as needed, with everything that it uses."""
         self.live.add(id(statement))
         writes, target = statement.writes, statement.target
         if writes is not None and writes.home is not None:
-            self._lived(writes)
+            self._use_array(writes)
         if target is not None and target.lanes and target.memory.name in self._lives:
-            self._lived(target.memory)
+            self._use_array(target.memory)
         for cell in statement.cells:
             self._uses(cell, block)
 
     def _inside(self, nested: Nested) -> None:
-        """Mark what bodies use; what a repetition finds there lives until it is over."""
+        """Mark what bodies use; memory from before a repetition is live until its end."""
         end = self._step
         for body in nested.bodies:
             self._scan(body)
@@ -94,17 +92,17 @@ class Usage:
     def _keep(self, memory: Memory) -> None:
         self.read.add(memory.name)
         if memory.home is not None:
-            self._lived(memory)
+            self._use_array(memory)
 
-    def _lived(self, memory: Memory) -> None:
-        """Note that an array is used in this step."""
+    def _use_array(self, memory: Memory) -> None:
+        """Mark an array as used in this step."""
         life = self._lives.setdefault(memory.name, _Life(memory, self._step, self._step))
         life.first = min(life.first, self._step)
 
 
 @dataclass
 class _Life:
-    """Steps of the program from the first to the last that uses an array."""
+    """First and last step of the program that use an array."""
 
     memory: Memory
     first: int
@@ -112,7 +110,7 @@ class _Life:
 
 
 def _within(memory: Memory, nested: Nested) -> bool:
-    """Whether memory is filled by the bodies of a condition or repetition, or deeper inside."""
+    """Return whether memory is filled within the bodies of a condition or repetition."""
     owner = None if memory.home is None else memory.home.owner
     while owner is not None and owner not in nested.bodies:
         owner = owner.parent
@@ -120,7 +118,7 @@ def _within(memory: Memory, nested: Nested) -> bool:
 
 
 def _shared(arrays: list[_Life]) -> dict[str, tuple[Kind, str]]:
-    """Kind and name of an array for each; those used one after another share one."""
+    """Return kind and name of an array for each; those used one after another share one."""
     slots: dict[tuple[Kind, int], list[_Life]] = {}
     names: dict[str, tuple[Kind, str]] = {}
     for life in sorted(arrays, key=lambda life: life.first):
@@ -140,7 +138,7 @@ FLOAT_MAX = float(np.finfo(np.float32).max)
 
 
 def number(value: float | int | bool, kind: Kind) -> str:
-    """A constant."""
+    """Return a constant as text."""
     if kind == "bool":
         return "true" if value else "false"
     if kind == "int":
@@ -155,7 +153,7 @@ def number(value: float | int | bool, kind: Kind) -> str:
 
 
 def table(memory: Memory) -> list[str]:
-    """Definition of a table of constants."""
+    """Return the definition of a table of constants."""
     values = np.frombuffer(memory.values, dtype=DTYPES[memory.kind]).tolist()
     small = memory.kind == "int" and min(values) >= 0 and max(values) < 2**15
     kind = "int16_t" if small else TYPES[memory.kind]
@@ -164,7 +162,7 @@ def table(memory: Memory) -> list[str]:
 
 
 def wrapped(words: Iterable[str], indent: str) -> list[str]:
-    """Words with commas between them in lines."""
+    """Return words with commas between them in lines."""
     lines, line = [], indent
     for word in words:
         if len(line) + len(word) + 2 > WIDTH and line.strip():
@@ -175,21 +173,22 @@ def wrapped(words: Iterable[str], indent: str) -> list[str]:
 
 
 class FunctionBody:
-    """Text of the code of a builder, without what nothing uses.
+    """Text of the code of a builder, without unused statements.
 
     Attributes:
-        reads: names of all memory that is read; scratch: numbers in arrays on the stack.
+        reads: names of all memory that is read.
+        scratch: count of the numbers in arrays on the stack.
     """
 
     def __init__(self, builder: Builder):
         self._usage = Usage(builder)
-        self._said = ""
+        self._source = ""
         self._lines = self._text(builder, "  ")
         self.reads = frozenset(self._usage.read)
         self.scratch = sum(self._usage.sizes.values())
 
     def lines(self) -> list[str]:
-        """Declarations and statements."""
+        """Return declarations and statements."""
         sizes = self._usage.sizes
         arrays = [f"  {TYPES[kind]} {name}[{size}];" for (kind, name), size in sizes.items()]
         return [*arrays, *self._lines]
@@ -243,7 +242,7 @@ class FunctionBody:
         return lines
 
     def _write(self, statement: Statement, cells: list[str], indent: str) -> list[str]:
-        """A statement that fills memory, in a loop of its own where it fills several numbers."""
+        """Return a statement that fills memory, in a loop if it fills several numbers."""
         assert statement.writes is not None
         text = statement.template.format(*cells, memory=self._name(statement.writes))
         if statement.times:
@@ -252,10 +251,10 @@ class FunctionBody:
         return [f"{indent}{text}"]
 
     def _where(self, statement: Statement, indent: str) -> list[str]:
-        """Line of Python that asks for a statement, where it is another one than before."""
-        if statement.source == self._said:
+        """Return a comment with the line of Python of a statement, where it changes."""
+        if statement.source == self._source:
             return []
-        self._said = statement.source
+        self._source = statement.source
         return [f"{indent}/* {statement.source} */"] if statement.source else []
 
     def _cell(self, cell: Cell, block: CodeBlock) -> str:
@@ -276,18 +275,18 @@ class FunctionBody:
         return self._number(cell.memory, " + ".join(terms))
 
     def _number(self, memory: Memory, place: str) -> str:
-        """A number of memory."""
+        """Return the text of a number in memory."""
         text = f"{self._name(memory)}[{place}]"
         return f"({text} != R(0.0))" if memory.lanes and memory.kind == "bool" else text
 
     def _name(self, memory: Memory) -> str:
-        """Name in C: that of the array on the stack which it shares, or its own."""
+        """Return the name in C: that of the shared array on the stack, or its own."""
         shared = self._usage.shared.get(memory.name)
         return memory.name if shared is None else shared[1]
 
 
 def folded(text: str, indent: str) -> list[str]:
-    """A long statement over several lines."""
+    """Return a long statement over several lines."""
     if len(indent) + len(text) <= WIDTH:
         return [indent + text]
     lines, line = [], indent

@@ -1,6 +1,6 @@
-"""The drive controller of ros2_controllers whose kinematics are those of a robot, if one has them.
+"""The drive controller of ros2_controllers with a robot's kinematics, if there is one.
 
-Such controllers take a body twist (vx, vy, yaw rate W) to wheel speeds by
+Such controllers convert a body twist (vx, vy, yaw rate W) to wheel speeds by
 
     omni      r w_k = sin(t_k) vx - cos(t_k) vy - R W,   t_k = wheel_offset + 2 pi k / n
     mecanum   r w   = vx -/+ vy -/+ s W,                 s = lx + ly, about the middle of the wheels
@@ -22,18 +22,23 @@ from slipid.export.ros.yaml_text import Parameter
 from slipid.robot.deployed import DeployedRobot
 
 MOST = 0.05
-"""Largest difference of kinematics with which a controller still counts as one for the robot: of a
-rim speed, at a body that goes at 1, or turns so that points on its base radius do."""
+"""Largest difference of kinematics with which a controller still fits the robot.
+
+It is a share of a rim speed, for a body that moves at 1, or turns so that points on its base radius
+do."""
 CORNERS = ("front_left", "front_right", "rear_right", "rear_left")
 
 
 @dataclass(frozen=True)
 class ControllerPlugin:
-    """A drive controller by the names that its users know.
+    """A drive controller with the names of its parameters and topics.
 
     Attributes:
-        plugin: its type; odometry: topic, below the name.
-        pose, twist: parameters with the diagonals of covariances.
+        name: name of the controller.
+        plugin: type of the controller.
+        odometry: topic of its odometry, below the name.
+        pose: parameter with the diagonal of the pose's covariance.
+        twist: parameter with the diagonal of the twist's covariance.
     """
 
     name: str
@@ -64,9 +69,11 @@ class DriveController:
     """A controller with the numbers of a robot.
 
     Attributes:
-        wheels: the robot's, in the order in which the controller has them.
+        controller: names of the controller.
+        wheels: the robot's wheels in the controller's order.
         turned: whether a wheel's positive speed is the controller's negative one, in that order.
-        off: largest difference of the controller's kinematics and the robot's `forward`, as of
+        parameters: parameters of the controller.
+        off: largest difference of the controller's kinematics from the robot's `forward`, as in
             `MOST`.
     """
 
@@ -78,19 +85,19 @@ class DriveController:
 
 
 def drive_controller_of(robot: DeployedRobot) -> DriveController | None:
-    """The controller for a robot; None where no controller has its kinematics."""
-    made = _mecanum(robot) or _omni(robot)
-    return made if made is not None and made.off <= MOST else None
+    """Return the controller for a robot; None where no controller has its kinematics."""
+    controller = _mecanum(robot) or _omni(robot)
+    return controller if controller is not None and controller.off <= MOST else None
 
 
 def joint(wheel: int) -> str:
-    """Name of a wheel's joint until the user has put in his own."""
+    """Return the name of a wheel's joint, a placeholder for the user's own."""
     return f"wheel_{wheel + 1}_joint"
 
 
 @dataclass(frozen=True)
 class _OrderedWheels:
-    """The robot's wheels in a controller's order, rows of its kinematics with the signs there."""
+    """The robot's wheels in a controller's order, with its rows of kinematics and signs."""
 
     order: Int[np.ndarray, " wheel"]
     turned: tuple[bool, ...]
@@ -100,7 +107,7 @@ class _OrderedWheels:
     def of(
         cls, robot: DeployedRobot, order: Int[np.ndarray, " wheel"], axis: int, sign: float
     ) -> "_OrderedWheels":
-        """With signs that give the entries of an axis of the twist this sign."""
+        """Return the wheels with signs that give the entries of an axis of the twist this sign."""
         rows = np.asarray(robot.forward)[order]
         turned = rows[:, axis] * sign < 0
         return cls(order, tuple(turned.tolist()), np.where(turned, -1.0, 1.0)[:, None] * rows)
@@ -112,7 +119,7 @@ class _OrderedWheels:
         own: Float[np.ndarray, "wheel 3"],
         parameters: tuple[Parameter, ...],
     ) -> DriveController:
-        """The controller that has these rows as its own."""
+        """Return the controller whose kinematics are these rows."""
         scale = np.array([1.0, 1.0, 1.0 / float(robot.frame.base)])
         return DriveController(
             controller=controller,
@@ -124,7 +131,7 @@ class _OrderedWheels:
 
 
 def _omni(robot: DeployedRobot) -> DriveController | None:
-    """Wheels that stand evenly on a circle, the first one of the robot first."""
+    """Return the controller of wheels evenly on a circle, the robot's first wheel first."""
     places, count = np.asarray(robot.places), robot.wheels
     azimuth = np.arctan2(places[:, 1], places[:, 0])
     # the first wheel itself, and those a rounding error before it, count as at 0
@@ -145,14 +152,14 @@ def _omni(robot: DeployedRobot) -> DriveController | None:
 
 
 def _mecanum(robot: DeployedRobot) -> DriveController | None:
-    """Four wheels, one at each corner about their middle."""
+    """Return the controller of four wheels, one at each corner about their middle."""
     places = np.asarray(robot.places)
     middle = places.mean(axis=0)
-    found = {(x > 0, y > 0): k for k, (x, y) in enumerate((places - middle).tolist())}
-    if robot.wheels != 4 or len(found) != 4:
+    by_corner = {(x > 0, y > 0): k for k, (x, y) in enumerate((places - middle).tolist())}
+    if robot.wheels != 4 or len(by_corner) != 4:
         return None
     corners = ((True, True), (True, False), (False, False), (False, True))
-    order = np.array([found[corner] for corner in corners])
+    order = np.array([by_corner[corner] for corner in corners])
     wheels = _OrderedWheels.of(robot, order, axis=0, sign=1.0)
     rows = wheels.rows
     about = rows[:, 2] - (middle[0] * rows[:, 1] - middle[1] * rows[:, 0])
@@ -161,8 +168,8 @@ def _mecanum(robot: DeployedRobot) -> DriveController | None:
     yaw = reach * turns + middle[0] * aside - middle[1]
     own = np.stack([np.ones(4), aside, yaw], axis=-1)
     parameters = (*_joints(order), *_kinematics(robot, reach, middle))
-    made = wheels.drive(MECANUM, robot, own, parameters)
-    return made if made.off <= MOST else None
+    controller = wheels.drive(MECANUM, robot, own, parameters)
+    return controller if controller.off <= MOST else None
 
 
 def _joints(order: Int[np.ndarray, "4"]) -> tuple[Parameter, ...]:

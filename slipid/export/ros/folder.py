@@ -1,6 +1,4 @@
-"""README.md of a ROS 2 folder: what each file is for, how sure a number is, the wheels' order.
-
-A ROS 2 folder of an identified robot: drive controller, localization, parameters of a node.
+"""A ROS 2 folder of an identified robot: drive controller, localization, parameters, README.
 
 All numbers are written so that they read back to the last bit.
 """
@@ -13,12 +11,11 @@ import numpy as np
 from slipid.export.description import (
     PROVENANCES,
     VERDICTS,
-    WARNED_VERDICTS,
     gains_origin,
     header,
     in_markdown,
     number_rows,
-    verdict_text,
+    verdict_markdown,
 )
 from slipid.export.ros import localization, node
 from slipid.export.ros import localization as noise
@@ -38,12 +35,14 @@ from slipid.robot.deployed import DeployedRobot
 
 @dataclass(frozen=True)
 class ReadmeContent:
-    """What the README is about.
+    """Content of the README.
 
     Attributes:
-        drive: the drive controller; None where none fits.
-        errs: floor by floor; worst: on the worst floor, of encoders and of slipid.
-        files: what each file is for, by its path.
+        robot: the robot.
+        drive: drive controller; None where none fits.
+        errs: errors of odometry on each floor.
+        worst: errors on the worst floor.
+        files: use of each file, by its path.
     """
 
     robot: DeployedRobot
@@ -54,7 +53,7 @@ class ReadmeContent:
 
 
 def readme(folder: ReadmeContent) -> str:
-    """The whole text."""
+    """Return the whole text."""
     parts = (_head, _files, _wheels, _odometry, _floors_and_loads, _numbers, _left_out)
     return "\n".join(line for part in parts for line in part(folder)) + "\n"
 
@@ -86,7 +85,7 @@ def _files(folder: ReadmeContent) -> Iterator[str]:
 
 
 def _wheels(folder: ReadmeContent) -> Iterator[str]:
-    """Order, places and directions."""
+    """Yield order, places and directions of the wheels."""
     robot, drive = folder.robot, folder.drive
     yield from ("## Wheels", "")
     yield (
@@ -116,7 +115,7 @@ def _wheels(folder: ReadmeContent) -> Iterator[str]:
 
 
 def _odometry(folder: ReadmeContent) -> Iterator[str]:
-    """Stds on every floor."""
+    """Yield the stds of odometry on every floor."""
     yield from ("## Odometry", "")
     robot, speed = folder.robot, top_speed(folder.robot)
     lines = []
@@ -139,7 +138,7 @@ def _stds(variances: Sequence[float]) -> str:
 
 
 def _floors_and_loads(folder: ReadmeContent) -> Iterator[str]:
-    """Labels and the names that parameters have for them."""
+    """Yield labels and the names that parameters have for them."""
     yield from ("## Floors and load set-ups", "")
     record = folder.robot.record
     loads = tuple(load.name for load in record.loads)
@@ -153,14 +152,13 @@ def _floors_and_loads(folder: ReadmeContent) -> Iterator[str]:
 
 
 def _numbers(folder: ReadmeContent) -> Iterator[str]:
-    """Every number, with its origin."""
+    """Yield every number with its origin."""
     yield from ("## Numbers", "")
     yield "Where each comes from; `slipid.yaml` has them to the last digit."
     lines = []
     for row in number_rows(folder.robot):
-        text = verdict_text(row.verdict)
-        sure = f"**{text}**" if row.verdict in WARNED_VERDICTS else text
-        known = (short(row.value), row.unit, interval(row.interval90), sure, row.provenance)
+        number = (short(row.value), row.unit, interval(row.interval90))
+        known = (*number, verdict_markdown(row.verdict), row.provenance)
         lines.append((f"`{row.path}`", row.entry, row.about, *known))
     head = ("robot.json", "", "", "value", "unit", "90 % interval", "verdict", "provenance")
     yield from ("", *table(head, lines), "", "What the verdicts mean:", "")
@@ -214,7 +212,7 @@ USES: Mapping[str, str] = {
     "slipid_parameters.yaml": "their declaration for generate_parameter_library: types, "
     "descriptions with verdicts, validators; the defaults are the numbers themselves",
 }
-"""Use of each file that is not of a single floor."""
+"""Use of each file that is not about a single floor."""
 _FLOOR = (
     "covariances of the drive controller and process noise of `robot_localization.yaml` on this "
     "floor: give it after those files, it overrides them"
@@ -222,7 +220,7 @@ _FLOOR = (
 
 
 def ros2_files(robot: DeployedRobot) -> dict[str, str]:
-    """Text of the files of a ROS 2 folder by their paths in it, for the robot's load set-up.
+    """Return the text of the files of a ROS 2 folder by path, for the robot's load set-up.
 
     There is no drive controller where none of ros2_controllers has the robot's kinematics.
     """
@@ -257,7 +255,7 @@ def ros2_files(robot: DeployedRobot) -> dict[str, str]:
 def _of_floors(
     robot: DeployedRobot, drive: DriveController | None, errs: tuple[OdometryErrors, ...]
 ) -> Iterator[tuple[str, Sequence[str]]]:
-    """A file per floor with what differs on it."""
+    """Yield a file per floor with the parameters that differ on it."""
     names = identifiers(robot.labels, "floor")
     for name, e in zip(names, errs, strict=True):
         parts: list[tuple[str, tuple[Parameter, ...]]] = [
@@ -271,7 +269,7 @@ def _of_floors(
 def _covariances(
     robot: DeployedRobot, drive: DriveController, e: OdometryErrors
 ) -> tuple[Parameter, ...]:
-    """The diagonals of a drive controller on a floor, with how they came about."""
+    """Return the diagonals of a drive controller on a floor, with their derivation."""
     speed = top_speed(robot)
     own, slip = (", ".join(map(short, axes)) for axes in (e.effect, e.slip))
     pose = (

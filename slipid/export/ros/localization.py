@@ -1,20 +1,18 @@
-"""What odometry errs by on each floor, as the variances that ROS messages and filters take.
+"""Errors of odometry on each floor as variances for ROS messages, and filter parameters.
 
-On a way d [m] an error grows by a part that stays the same (effect e [per m]) and one that comes
-anew (process q [per sqrt(m)]), so that its variance is (e d)^2 + q^2 d. Odometry that believes its
-encoders errs by the slip of its wheels as well: its e^2 is effect^2 + slip^2, slip being the root
-mean square, over directions of travel, of what the contact model says the wheels slip by. Which way
-a robot goes is not known to a constant covariance, so x and y both get the larger of along and
-across. A heading that is off carries the robot sideways: with e_w and q_w of the yaw, by
-(e_w d^2 / 2)^2 + q_w^2 d^3 / 3.
+Over a path length d [m] an error grows by a part that stays the same (effect e [per m]) and one
+that is drawn anew (process q [per sqrt(m)]), so that its variance is (e d)^2 + q^2 d. Odometry that
+ignores slip also has the slip of its wheels as an error: its e^2 is effect^2 + slip^2, slip being
+the root mean square over directions of travel of the contact model's slip. A constant covariance
+does not know the direction of travel, so x and y both get the larger of along and across. A wrong
+heading carries the robot sideways: with e_w and q_w of the yaw, by (e_w d^2 / 2)^2 + q_w^2 d^3 / 3.
 
-ROS drive controllers put one constant diagonal into every message, which no true covariance of
-odometry is; it is taken at `DISTANCE_M`, and for twists at the highest speed that the fit has seen.
+ROS drive controllers put one constant diagonal into every message, which is not a true covariance
+of odometry; it is taken at `DISTANCE_M`, and for twists at the highest speed of the fitted runs.
 
-Parameters of robot_localization's extended Kalman filter for the odometry of a robot.
-
-Its state is x, y, z, roll, pitch, yaw, their rates in the body frame, and accelerations ahead,
-sideways and up; it adds process noise times the time that has passed.
+The filter is robot_localization's extended Kalman filter for the odometry of a robot. Its state is
+x, y, z, roll, pitch, yaw, their rates in the body frame, and accelerations ahead, sideways and up;
+it adds process noise times the elapsed time.
 
 Source: github.com/cra-ros-pkg/robot_localization, params/ekf.yaml, `Ekf::predict`.
 """
@@ -33,26 +31,27 @@ from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
 from slipid.robot.controller import Limits
 from slipid.robot.deployed import DeployedRobot, RobotArrays
-from slipid.robot.record import Axes
+from slipid.robot.record import Axes, axes_of
 
 DISTANCE_M = 1.0
-"""Way since the pose was last set right for which constant variances are."""
+"""Path length since the last correction of the pose for which constant variances hold [m]."""
 PERIOD_S = 0.02
-"""Time between two messages of odometry for which they are."""
+"""Time between two messages of odometry for which they hold [s]."""
 UNKNOWN = 1e6
-"""Variance of what wheels do not tell: height, roll and pitch."""
-WAYS = 24
-"""Directions of travel over which slip is averaged."""
+"""Variance of height, roll and pitch, which wheels do not measure."""
+DIRECTIONS = 24
+"""Number of directions of travel over which slip is averaged."""
 
 
 @dataclass(frozen=True)
 class OdometryErrors:
-    """What odometry errs by on a floor, along, across and in yaw.
+    """Errors of odometry on a floor, along, across and in yaw.
 
     Attributes:
-        process: [m/sqrt(m)], [m/sqrt(m)], [rad/sqrt(m)].
-        effect: what the contact model misses all the way; slip: of wheels, which encoders do not
-            see; both [m/m], [m/m], [rad/m].
+        floor: name of the floor.
+        process: std of random errors [m/sqrt(m)], [m/sqrt(m)], [rad/sqrt(m)].
+        effect: std of the contact model's effects [m/m], [m/m], [rad/m].
+        slip: slip of the wheels, which encoders do not measure [m/m], [m/m], [rad/m].
     """
 
     floor: str
@@ -62,98 +61,93 @@ class OdometryErrors:
 
     @property
     def stays(self) -> Axes:
-        """What stays the same all the way of odometry that believes its encoders, per metre."""
-        return _axes(np.hypot(self.effect, self.slip))
+        """Error per metre that stays the same, of odometry that ignores slip."""
+        return axes_of(np.hypot(self.effect, self.slip))
 
     def without_slip(self) -> "OdometryErrors":
-        """Of odometry that estimates slip, and so errs by what the contact model misses."""
+        """Return the errors of odometry that estimates slip: those of the contact model."""
         return replace(self, slip=(0.0, 0.0, 0.0))
 
     def pose(self, distance: float) -> Axes:
-        """Variance of x, y and heading after a way [m^2, m^2, rad^2]."""
+        """Return the variance of x, y and heading after a path length [m^2, m^2, rad^2]."""
         e, q = np.asarray(self.stays), np.asarray(self.process)
         along, across, yaw = (e * distance) ** 2 + q**2 * distance
         across += (e[2] * distance**2 / 2) ** 2 + q[2] ** 2 * distance**3 / 3
         place = max(along, across)
-        return _axes(np.array([place, place, yaw]))
+        return axes_of(np.array([place, place, yaw]))
 
     def twist(self, speed: float, period: float) -> Axes:
-        """Variance of the velocity over one period, (e v)^2 + q^2 v / period, at a speed [m/s]."""
+        """Return the variance of the velocity over one period, (e v)^2 + q^2 v / period."""
         e, q = np.asarray(self.stays), np.asarray(self.process)
         return _level((e * speed) ** 2 + q**2 * speed / period)
 
     def walk(self, speed: float, distance: float) -> Axes:
-        """Variance per second of a random walk that is e d off after a way d, e^2 d v."""
+        """Return the variance per second of a random walk that errs by e d after d: e^2 d v."""
         return _level(np.asarray(self.stays) ** 2 * distance * speed)
 
 
 def odometry_errors(robot: DeployedRobot) -> tuple[OdometryErrors, ...]:
-    """Errors of odometry on each floor, in the robot's order."""
+    """Return the errors of odometry on each floor, in the robot's order."""
     slip = np.asarray(_slip(robot.arrays, jnp.asarray(top_speed(robot))))
     process, effect = np.asarray(robot.process), np.asarray(robot.effect)
     return tuple(
-        OdometryErrors(name, _axes(process[k]), _axes(effect[k]), _axes(slip[k]))
+        OdometryErrors(name, axes_of(process[k]), axes_of(effect[k]), axes_of(slip[k]))
         for k, name in enumerate(robot.labels)
     )
 
 
 def worst(errs: tuple[OdometryErrors, ...]) -> OdometryErrors:
-    """Errors on the floor on which the place is least known after `DISTANCE_M`."""
+    """Return the errors on the floor with the largest position error after `DISTANCE_M`."""
     return max(errs, key=lambda e: e.pose(DISTANCE_M)[0])
 
 
 def top_speed(robot: DeployedRobot) -> float:
-    """Rim speed up to which the fit has seen the robot [m/s]."""
+    """Return the highest rim speed of the fitted runs [m/s]."""
     return float(robot.highest[0] * robot.frame.radius)
 
 
 def diagonal(planar: Axes) -> tuple[float, ...]:
-    """Variances of x, y, z, roll, pitch and yaw."""
+    """Return the variances of x, y, z, roll, pitch and yaw."""
     x, y, yaw = planar
     return (x, y, UNKNOWN, UNKNOWN, UNKNOWN, yaw)
 
 
 @eqx.filter_jit
 def _slip(robot: RobotArrays, speed: Float[Array, ""]) -> Float[Array, "floor 3"]:
-    """Root mean square of what encoders err by per metre, along, across and in yaw."""
-    angle = jnp.linspace(0.0, 2 * jnp.pi, WAYS, endpoint=False)
-    way = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(WAYS)], axis=-1)
-    rim = speed * way @ robot.forward.T
+    """Return the root mean square slip per metre, along, across and in yaw."""
+    angle = jnp.linspace(0.0, 2 * jnp.pi, DIRECTIONS, endpoint=False)
+    twist = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(DIRECTIONS)], axis=-1)
+    rim = speed * twist @ robot.forward.T
 
     def one(floor: ContactSurface) -> Array:
         return jax.vmap(lambda r: contact.equilibrium(r, robot.frame, floor, robot.rest))(rim)
 
-    miss = way - jax.vmap(one)(robot.floors) / speed
-    along = jnp.sum(miss * way, axis=-1)
-    across = miss[..., 1] * way[:, 0] - miss[..., 0] * way[:, 1]
-    return jnp.sqrt(jnp.mean(jnp.stack([along, across, miss[..., 2]], axis=-1) ** 2, axis=1))
-
-
-def _axes(row: Float[np.ndarray, "3"]) -> Axes:
-    along, across, yaw = (float(x) for x in row)
-    return along, across, yaw
+    slip = twist - jax.vmap(one)(robot.floors) / speed
+    along = jnp.sum(slip * twist, axis=-1)
+    across = slip[..., 1] * twist[:, 0] - slip[..., 0] * twist[:, 1]
+    return jnp.sqrt(jnp.mean(jnp.stack([along, across, slip[..., 2]], axis=-1) ** 2, axis=1))
 
 
 def _level(row: Float[np.ndarray, "3"]) -> Axes:
-    """The same errors with the larger of along and across for both."""
-    return _axes(np.array([row[:2].max(), row[:2].max(), row[2]]))
+    """Return the same errors with the larger of along and across for both."""
+    return axes_of(np.array([row[:2].max(), row[:2].max(), row[2]]))
 
 
 NODE = "ekf_filter_node"
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 STATE = (*_POSE, *(f"v{name}" for name in _POSE), "ax", "ay", "az")
 FUSED = ("vx", "vy", "vyaw")
-"""What the filter takes from odometry: its pose is the sum of the same velocities."""
+"""States that the filter takes from odometry, whose pose is the sum of the same velocities."""
 HELD = 1e-6
-"""Process noise of what `two_d_mode` holds at zero."""
+"""Process noise of the states that `two_d_mode` keeps at zero."""
 ACCELERATION = 0.01
-"""Process noise of accelerations, which nothing here measures: the package's own default."""
+"""Process noise of accelerations, which nothing measures here: the package's own default."""
 
 
 def filter_parameters(
     robot: DeployedRobot, errs: OdometryErrors, odometry: str, whose: str
 ) -> tuple[Parameter, ...]:
-    """All parameters, for odometry on a topic that is of `whose` kind and errs like this."""
+    """Return all parameters for odometry on a topic, of `whose` kind and with these errors."""
     about = (
         f"Odometry of {whose}. Velocities only are fused: its pose is their sum, and would count "
         "twice. Order: " + ", ".join(STATE) + "."
@@ -175,7 +169,7 @@ def filter_parameters(
 
 
 def process_noise(robot: DeployedRobot, errs: OdometryErrors) -> Parameter:
-    """Process noise on a floor, 15 x 15 as rows."""
+    """Return the process noise on a floor, 15 x 15 as rows."""
     matrix, most = np.diag(_diagonal(robot, errs)), float(Limits().acceleration)
     about = (
         f"On '{errs.floor}'. Pose: what stays the same all the way and so is no noise of single "
@@ -189,7 +183,7 @@ def process_noise(robot: DeployedRobot, errs: OdometryErrors) -> Parameter:
 
 
 def _diagonal(robot: DeployedRobot, errs: OdometryErrors) -> Float[np.ndarray, " state"]:
-    """Per second: pose as `OdometryErrors.walk`, velocities as (a T)^2 per period T."""
+    """Return process noise per second: `OdometryErrors.walk`, and (a T)^2 per period T."""
     pose = errs.walk(top_speed(robot), DISTANCE_M)
     change = float(Limits().acceleration) * float(robot.frame.radius)
     speed, turn = change**2 * PERIOD_S, (change / float(robot.frame.base)) ** 2 * PERIOD_S

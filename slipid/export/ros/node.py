@@ -1,6 +1,6 @@
-"""Parameters of a node `slipid`: the robot's numbers by the paths that robot.json has for them.
+"""Parameters of a node `slipid`: the robot's numbers by their paths in robot.json.
 
-Floors and load set-ups go by `identifiers`. Arrays per wheel are in the order of robot.json;
+Floors and load set-ups are named by `identifiers`. Arrays per wheel are in the order of robot.json;
 matrices are rows one after another.
 """
 
@@ -26,7 +26,7 @@ _ZEROS = Check("lower_element_bounds<>", (0.0,))
 
 
 def node_parameters(robot: DeployedRobot) -> tuple[Parameter, ...]:
-    """All parameters, those of a group together."""
+    """Return all parameters, those of a group together."""
     return (*_choices(robot), *_numbers(robot), *_shape(robot), *_errors(robot), *_controls(robot))
 
 
@@ -49,7 +49,7 @@ def _choices(robot: DeployedRobot) -> Iterator[Parameter]:
 
 
 def _numbers(robot: DeployedRobot) -> Iterator[Parameter]:
-    """Every number of the record; those of a group stand together as they are declared."""
+    """Yield every number of the record; those of a group stand together as they are declared."""
     floors = dict(zip(robot.labels, identifiers(robot.labels, "floor"), strict=True))
     names = [load.name for load in robot.record.loads]
     loads = dict(zip(names, identifiers(names, "load"), strict=True))
@@ -61,15 +61,12 @@ def _numbers(robot: DeployedRobot) -> Iterator[Parameter]:
             return f"{part}.{floors[e.surface]}.{last}"
         return quantity if e.load is None else f"{quantity}.{loads[e.load]}"
 
-    found = [(name(e), e) for e in declared_numbers(robot.record)]
-    order = {group: k for k, group in enumerate(dict.fromkeys(_group(n) for n, _ in found))}
-    for called, e in sorted(found, key=lambda pair: order[_group(pair[0])]):
+    named = [(name(e), e) for e in declared_numbers(robot.record)]
+    groups = [n.rpartition(".")[0] for n, _ in named]
+    order = {group: k for k, group in enumerate(dict.fromkeys(groups))}
+    for called, e in sorted(named, key=lambda pair: order[pair[0].rpartition(".")[0]]):
         number = robot.record.parameters[e.path]
         yield Parameter(called, number.value, _about(e, number), tuple(_checks(e)))
-
-
-def _group(name: str) -> str:
-    return name.rpartition(".")[0]
 
 
 def _about(e: Entry, number: RecordedNumber) -> str:
@@ -100,7 +97,7 @@ def _bounds(d: Declaration, several: bool) -> Iterator[Check]:
 
 
 def _shape(robot: DeployedRobot) -> Iterator[Parameter]:
-    """Wheels and kinematics."""
+    """Yield the parameters of wheels and kinematics."""
     wheels, count = robot.record.wheels, robot.wheels
     size, both = (Check("fixed_size<>", (count,)),), (Check("fixed_size<>", (2 * count,)),)
     yield Parameter("wheels.gear_ratio", wheels.gear_ratio, _GEAR, (Check("gt<>", (0.0,)),))
@@ -116,7 +113,7 @@ def _shape(robot: DeployedRobot) -> Iterator[Parameter]:
 
 
 def _errors(robot: DeployedRobot) -> Iterator[Parameter]:
-    """Parameters of the model's error, and of the conditions the robot was seen in."""
+    """Yield the parameters of the model's errors, and of the range of the fitted runs."""
     three, two = (Check("fixed_size<>", (3,)), _ZEROS), (Check("fixed_size<>", (2,)),)
     for k, name in enumerate(identifiers(robot.labels, "floor")):
         yield _flat(f"errors.{name}.process", robot.process[k], _PROCESS, three)
@@ -129,12 +126,12 @@ def _errors(robot: DeployedRobot) -> Iterator[Parameter]:
     yield Parameter("seen.highest_current", current, _HIGHEST, (_ZERO,))
     curve = (Check("fixed_size<>", (2 * robot.wheels,)),)
     yield _flat("seen.wheel_curve", robot.wheel_curve, _CURVE, curve)
-    for name, told in asdict(robot.record.sensors).items():
-        yield Parameter(f"seen.{name}", bool(told), f"whether it was so in the logs: {name}")
+    for name, value in asdict(robot.record.sensors).items():
+        yield Parameter(f"seen.{name}", bool(value), f"whether it was so in the logs: {name}")
 
 
 def _controls(robot: DeployedRobot) -> Iterator[Parameter]:
-    """Gains and limits, which may be changed while the node runs."""
+    """Yield gains and limits, which may be changed while the node runs."""
     gains = Gains.of(robot)
     for e in entries(gains):
         about = f"{e.declaration.doc} {e.declaration.symbol} [{e.declaration.unit}]"

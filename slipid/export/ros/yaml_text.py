@@ -1,6 +1,6 @@
-"""YAML of ROS 2 parameters, and of their declaration as `generate_parameter_library` reads it.
+"""YAML of ROS 2 parameters, and their declaration for `generate_parameter_library`.
 
-The declaration is a tree of names whose leaves say type, default, description, whether the
+The declaration is a tree of names whose leaves state type, default, description, whether the
 parameter is read-only, and validators by name with their arguments.
 """
 
@@ -28,10 +28,12 @@ class Parameter:
     """One parameter of a node.
 
     Attributes:
-        name: with a point between the names of groups.
-        about: one paragraph, empty where the one before it says all.
-        checks: validators; read_only: it can be set at the start only.
-        per_line: how many entries of an array stand on a line, 0 for as many as fit.
+        name: name, with a point between the names of groups.
+        value: value, which is the default in a declaration.
+        about: one paragraph, empty where the one before it covers it.
+        checks: validators.
+        read_only: whether it can be set at the start only.
+        per_line: entries of an array per line, 0 for as many as fit.
     """
 
     name: str
@@ -43,18 +45,18 @@ class Parameter:
 
     @property
     def type(self) -> str:
-        """Its type as declarations call it."""
+        """Its type in declarations."""
         several = isinstance(self.value, tuple)
         one = self.value[0] if isinstance(self.value, tuple) else self.value
         return _TYPES[type(one)] + "_array" * several
 
 
 _Leaf = Callable[[Parameter, str, str], Iterator[str]]
-"""Lines of a parameter, of its own name and an indent."""
+"""Lines of a parameter, for its own name and an indent."""
 
 
 def scalar(value: Scalar) -> str:
-    """A value that YAML 1.1 and 1.2 read back as the same one, to the last bit.
+    """Return a value that YAML 1.1 and 1.2 read back unchanged, to the last bit.
 
     Floats have a point, and a sign in the exponent: `1e-05` and `1.0e6` would be words.
     """
@@ -71,12 +73,12 @@ def scalar(value: Scalar) -> str:
 
 
 def comment(lines: Sequence[str]) -> list[str]:
-    """Lines as comments."""
+    """Return lines as comments."""
     return [f"# {line}".rstrip() for line in lines]
 
 
 def nodes(parts: Sequence[tuple[str, Sequence[Parameter]]]) -> list[str]:
-    """Parameters of nodes by the names of the nodes; those of a group must stand together."""
+    """Return the parameters of nodes by the nodes' names; those of a group must stand together."""
     lines: list[str] = []
     for node, parameters in parts:
         lines += ["", f"{node}:", "  ros__parameters:", *_nested(parameters, 2, _valued)]
@@ -84,7 +86,7 @@ def nodes(parts: Sequence[tuple[str, Sequence[Parameter]]]) -> list[str]:
 
 
 def declaration(namespace: str, parameters: Sequence[Parameter]) -> list[str]:
-    """Their declaration, the defaults being their values."""
+    """Return the declaration of parameters with their values as defaults."""
     return ["", f"{namespace}:", *_nested(parameters, 1, _declared)]
 
 
@@ -125,7 +127,7 @@ def _declared(parameter: Parameter, name: str, indent: str) -> Iterator[str]:
 
 
 def _key(parameter: Parameter, name: str, indent: str) -> Iterator[str]:
-    """Name and value, an array over several lines where it is long."""
+    """Yield name and value, an array over several lines where it is long."""
     value = parameter.value
     if not isinstance(value, tuple):
         yield f"{indent}{name}: {scalar(value)}"

@@ -1,4 +1,4 @@
-"""What an experiment can recover: what `slipid selftest` does."""
+"""Test what an experiment can recover: the work of `slipid selftest`."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -29,25 +29,25 @@ from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.lab.selftest/1"
 CHANCE = 1e-3
-"""Probability below which errors this large, or so many intervals without the truth, are no chance.
+"""Probability below which large errors, or intervals without the truth, are not taken for chance.
 
 A number whose intervals fail this is wrong, whatever its verdict says.
 """
 LEAST_CONVERGED = 0.75
-"""Least part of the fits that must converge."""
+"""Least share of the fits that must converge."""
 ORDER = ("identified", "weak", "not_identified", "at_bound")
 
 
 def selftest(
     config_path: Path, data: Path | None, out: Path, count: int, seed: int, report: Reporter
 ) -> Content:
-    """What an experiment can recover, by making it with known truth and fitting that.
+    """Return what an experiment can recover, by simulating it with known truth and fitting that.
 
     Args:
-        data: logs of the experiment, whose wheel motion is taken; without them a plan is made.
+        data: logs of the experiment, whose wheel motion is taken; without them a plan is simulated.
         out: folder for selftest.json and the replicates, which a later call goes on from.
-        count: replicates.
-        seed: of truths and noise.
+        count: number of replicates.
+        seed: seed of truths and noise.
     """
     setup_jax(quiet=True)
     config = read_config(config_path)
@@ -75,7 +75,7 @@ def selftest(
 
 
 def planned_task(config: Config, report: Reporter) -> ConfigFitTask:
-    """Job of an experiment that nobody has driven yet: the grid of the config's `[selftest]`.
+    """Return the fit task of an experiment that nobody has driven: the grid of `[selftest]`.
 
     Channels are those that the config's layouts name; every load set-up of the config is driven on
     every floor.
@@ -106,7 +106,7 @@ def planned_task(config: Config, report: Reporter) -> ConfigFitTask:
 
 
 def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
-    """Paths that must be recovered: the config's, else what the channels promise.
+    """Return paths that must be recovered: the config's, else those the channels should identify.
 
     Raises:
         DataError: a pattern of the config matches nothing that is fitted.
@@ -131,7 +131,7 @@ def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
 
 
 def summary(made: Sequence[Replicate], wanted: Sequence[str]) -> Content:
-    """Error, coverage, verdict and whether it was recovered, of everything that was compared.
+    """Return error, coverage, verdict and recovery of everything that was compared.
 
     Returns:
         `parameters` (ratios included), `curves`, `predictions`, `failed` (wanted and not
@@ -170,7 +170,7 @@ def summary(made: Sequence[Replicate], wanted: Sequence[str]) -> Content:
 
 
 def number_summary(found: Sequence[NumberRecovery]) -> Content:
-    """One number over all replicates.
+    """Return one number over all replicates.
 
     `recovered` is yes where most fits call it identified, roughly where they call it weak, no where
     they say that they do not know it, and wrong where errors are larger than the fits say.

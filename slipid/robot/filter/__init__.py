@@ -1,1 +1,1 @@
-"""Parts of the estimator: wheels, floors under them, what fits miss, the pose and its fixes."""
+"""Parts of the estimator: wheels, floors under them, effects of floors, the pose and its fixes."""

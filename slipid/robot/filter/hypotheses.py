@@ -1,11 +1,11 @@
-"""Which floors may lie under the wheels of a robot at once, all wheels together.
+"""Hypotheses of the floors under the wheels of a robot, all wheels together.
 
-Floors to the power of wheels grows fast: 625 ways for four wheels on five floors. The edge of a
-floor is nearly straight on the scale of a robot, so going around the robot from wheel to wheel the
-floor changes at most twice: every way has one floor, or two with neighbouring wheels on each side.
-That leaves 125 of the 625 and 21 of three wheels' 27. Three floors at once, where patches meet at a
-corner, are taken for the nearest of these or for "unknown". A floor that nobody drove on is under
-all wheels or under none.
+The number of assignments, floors to the power of wheels, grows fast: 625 for four wheels on five
+floors. The edge of a floor is nearly straight on the scale of a robot, so going around the robot
+from wheel to wheel the floor changes at most twice: every hypothesis has one floor, or two with
+neighbouring wheels on each side. That leaves 125 of the 625, and 21 of three wheels' 27. Three
+floors at once, where patches meet at a corner, fall to the nearest of these or to "unknown". A
+floor without a run is under all wheels or under none.
 """
 
 import itertools
@@ -18,17 +18,17 @@ from jaxtyping import Bool, Int
 from slipid.robot.deployed import RobotArrays
 
 CHANGES = 2
-"""Changes of floor around the robot, from wheel to wheel, that count as possible."""
+"""Largest number of changes of floor around the robot, from wheel to wheel."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """Ways in which the wheels may stand.
+    """All hypotheses of the floors under a robot.
 
     Attributes:
         under: number of the floor under each wheel.
         beside: for each wheel and floor, the hypothesis that has this floor under this wheel and
-            the others as they are; as many as there are hypotheses where there is none.
+            the others unchanged; the number of hypotheses where there is none.
         uniform: for each floor, the hypothesis that has it under all wheels.
         on: whether the floor is under the wheel.
     """
@@ -43,7 +43,7 @@ class Hypotheses:
 
 
 def hypotheses_of(robot: RobotArrays) -> Hypotheses:
-    """Ways in which the wheels of a robot may stand on the floors it knows."""
+    """Return the hypotheses of a robot on the floors that it knows."""
     return _hypotheses(robot.around, robot.unseen, CHANGES)
 
 
@@ -51,19 +51,19 @@ def hypotheses_of(robot: RobotArrays) -> Hypotheses:
 def _hypotheses(around: tuple[int, ...], unseen: tuple[bool, ...], changes: int) -> Hypotheses:
     wheels, floors = len(around), len(unseen)
     driven = [k for k in range(floors) if not unseen[k]]
-    ways = list(itertools.product(driven, repeat=wheels))
-    ways += [(k,) * wheels for k in range(floors) if unseen[k]]
-    under = np.array([way for way in ways if _changes(way, around) <= changes])
-    number = {tuple(way): k for k, way in enumerate(under.tolist())}
+    rows = list(itertools.product(driven, repeat=wheels))
+    rows += [(k,) * wheels for k in range(floors) if unseen[k]]
+    under = np.array([row for row in rows if _changes(row, around) <= changes])
+    number = {tuple(row): k for k, row in enumerate(under.tolist())}
 
-    def beside(way: list[int], wheel: int, floor: int) -> int:
-        return number.get((*way[:wheel], floor, *way[wheel + 1 :]), len(under))
+    def beside(row: list[int], wheel: int, floor: int) -> int:
+        return number.get((*row[:wheel], floor, *row[wheel + 1 :]), len(under))
 
     return Hypotheses(
         under=under,
         beside=np.array(
             [
-                [[beside(way, wheel, floor) for floor in range(floors)] for way in under.tolist()]
+                [[beside(row, wheel, floor) for floor in range(floors)] for row in under.tolist()]
                 for wheel in range(wheels)
             ]
         ),
@@ -72,6 +72,6 @@ def _hypotheses(around: tuple[int, ...], unseen: tuple[bool, ...], changes: int)
     )
 
 
-def _changes(way: tuple[int, ...], around: tuple[int, ...]) -> int:
-    """How often the floor changes on the way around the robot."""
-    return sum(way[a] != way[b] for a, b in zip(around, around[1:] + around[:1], strict=True))
+def _changes(row: tuple[int, ...], around: tuple[int, ...]) -> int:
+    """Return the number of changes of floor around the robot."""
+    return sum(row[a] != row[b] for a, b in zip(around, around[1:] + around[:1], strict=True))

@@ -1,13 +1,14 @@
-"""Pose and its covariance, with what the fit says the model misses carried along.
+"""Filter of the pose and its covariance, with the errors of the model as further states.
 
-Process noise and effects that stay for a while grow the covariance; the effects, the floors'
-friction and a gyro's bias are further unknowns that pose fixes and rest correct. Friction counts
-where wheels stand on several floors: on one it moves no robot, so that runs on one floor each
-leave it open. Which floors are under the wheels is in doubt as the hypotheses scatter, and what is
-wrongly believed stays wrong for a while:
+Process noise and effects grow the covariance. The effects, the floors' friction and a gyro's bias
+are unknowns that pose fixes and rests correct. Friction counts where wheels stand on several
+floors; on one floor it moves no robot, so runs on one floor each leave it undetermined. Uncertainty
+about the floors is the scatter of the hypotheses, and an error of the belief persists for a while:
 
     S = sum_c p_c (xi_c - xi) (xi_c - xi)^T = L L^T,   xi_true = xi + L d,   d ~ N(0, 1)
     d <- k d + sqrt(1 - k^2) noise,   k = exp(-far / doubt_m)
+
+with `far` the path length of the step.
 """
 
 from dataclasses import replace
@@ -34,17 +35,17 @@ from slipid.robot.filter.pose_fix import (
 from slipid.robot.interface import Readings, Settings
 
 CREEP_SPEED = 0.05
-"""Speed up to which no fit has seen how a robot turns [m/s]."""
+"""Speed below which no fitted run shows how a robot turns [m/s]."""
 
 
 class _StepMotion(eqx.Module):
-    """Where the body goes in a step, and what pushes it off.
+    """Motion of the body in a step with its derivatives.
 
     Attributes:
-        speed: at which the effects of floors count, that of wheels that do not slip [m/s].
-        slope: d twist / d nuisance, the gyro's bias left out.
-        axes: along, across and yaw as columns in the body frame.
-        share: of the load on each floor.
+        speed: speed of wheels without slip, by which effects of floors count [m/s].
+        axes: directions along, across and in yaw, as columns in the body frame.
+        slope: derivative of the twist by the nuisance states without the gyro's bias.
+        share: share of the load on each floor.
         by_gyro: whether yaw is measured.
     """
 
@@ -56,13 +57,13 @@ class _StepMotion(eqx.Module):
 
 
 class PoseFilter(eqx.Module):
-    """Filter of the pose."""
+    """Filter of the pose and its covariance."""
 
     robot: RobotArrays
     settings: Settings
 
     def init(self, pose: Float[Array, "3"], std: tuple[float, float] = (0.0, 0.0)) -> PoseState:
-        """At rest at a pose [m, m, rad], known this well [m], [rad]."""
+        """Return the state at rest at a pose [m, m, rad] with stds [m], [rad]."""
         place, turn = std
         begin, bias = jnp.asarray([place, place, turn]), jnp.asarray([self.settings.gyro_bias_std])
         floors = len(self.robot.labels)
@@ -86,34 +87,36 @@ class PoseFilter(eqx.Module):
     def mapped(
         self, now: PoseState, floor: Floor, hypotheses: Int[np.ndarray, "hypothesis wheel"]
     ) -> tuple[Float[Array, "3 3"], Float[Array, "sample hypothesis"]]:
-        """Root of the pose's covariance, and what a map supports at poses drawn from it."""
+        """Return the root of the pose's covariance, and a map's support at poses drawn from it."""
         root, floors = cholesky_root(now.covariance[:3, :3]), len(self.robot.labels)
         return root, floor.supports(now.pose, root, self.robot.places, hypotheses, floors)
 
     def step(
         self, old: PoseState, motion: BodyMotion, gyro: Array, z: Readings, tick: TimeStep
     ) -> tuple[PoseState, Float[Array, "3"], Float[Array, "3 3"]]:
-        """Pose a time step later, and the twist that took it there.
+        """Return the pose one time step later, the twist that led there, and a factor on distances.
 
-        The third is what a pose fix leaves of how far another pose is from it, in the body's axes.
+        The factor is the share of another pose's distance that a pose fix leaves, in the body's
+        axes.
 
         Args:
-            old, tick: the state before the step, and the step.
-            motion: what the floors say of it.
-            gyro: yaw rate, NaN without one [rad/s].
-            z: for its pose fix.
+            old: state before the step.
+            motion: motion by the floor filter.
+            gyro: yaw rate, NaN without a gyro [rad/s].
+            z: readings, for their pose fix.
+            tick: the time step.
         """
         dt = tick.dt
-        way = self._way(motion, gyro)
+        body = self._step_motion(motion, gyro)
         old = self._forgotten(old, motion, tick)
-        free = motion.twist + way.slope @ old.nuisance[:-1]  # however slow: creeping adds up
+        free = motion.twist + body.slope @ old.nuisance[:-1]  # also for slow creep, which adds up
         old = replace(old, history=old.history.at[:, 0].add(dt))
         twist = free.at[2].set(self._turned(old, free[2], gyro))
         pose = compose(old.pose, advance(twist, dt) + motion.jump)
         still = jnp.where(tick.moves, 0.0, jnp.minimum(old.still + dt, 1e3))
         old = replace(old, history=history_after_jump(old, motion, self.robot.frame.base))
-        new = replace(self._grow(old, pose, way, tick), still=still)
-        new = self._rest(self._turns(new, way, gyro, free[2], tick), gyro)
+        new = replace(self._grow(old, pose, body, tick), still=still)
+        new = self._rest(self._turns(new, body, gyro, free[2], tick), gyro)
         begun, ended = jnp.concatenate([jnp.zeros(1), new.pose, free[2:]]), new.far[None]
         entry = jnp.concatenate([begun, new.noise.reshape(-1), ended])
         history = jnp.where(dt > 0, jnp.roll(old.history, 1, axis=0).at[0].set(entry), old.history)
@@ -121,12 +124,12 @@ class PoseFilter(eqx.Module):
         world = axes_rotation(new.pose[2])
         return new, twist, world.T @ left @ world
 
-    def _way(self, motion: BodyMotion, gyro: Array) -> _StepMotion:
+    def _step_motion(self, motion: BodyMotion, gyro: Array) -> _StepMotion:
         share = self.robot.rest @ motion.under
-        speed, axes = motion.course.speed, motion.course.axes
+        speed, axes = motion.rolled.speed, motion.rolled.axes
         std = speed * share[:, None] * motion.left
         by_effect = (std[:, :, None] * axes.T).reshape(-1, 3).T
-        # by the way, so that a robot that stands has none
+        # per metre, so that a robot at rest has none
         per_metre = motion.scatter / jnp.maximum(speed**2, 1e-12)
         doubt = speed * axes @ cholesky_root(axes.T @ per_metre @ axes)
         return _StepMotion(
@@ -138,10 +141,10 @@ class PoseFilter(eqx.Module):
         )
 
     def _forgotten(self, old: PoseState, motion: BodyMotion, tick: TimeStep) -> PoseState:
-        """With effects as far as they stay the same over the step, their variance as it was."""
+        """Return the state with effects decorrelated over the step, their variance unchanged."""
         f = self.robot
         speed = length(motion.twist[:2]) + f.frame.base * jnp.abs(motion.twist[2])
-        far = speed * tick.dt  # what is truly left behind
+        far = speed * tick.dt  # true path length of the step
         left = jnp.prod(1 - motion.under, axis=0)
         now = travel_direction(motion.rolling, f.frame.base)
         toward, keep = effect_correlation(old.toward, now, left, far)
@@ -159,53 +162,54 @@ class PoseFilter(eqx.Module):
         return replace(old, nuisance=kept * old.nuisance, covariance=covariance, toward=toward)
 
     def _turned(self, old: PoseState, free: Array, gyro: Array) -> Array:
-        """Yaw rate: the gyro's less its bias; over its delay, as the contact model goes on from it.
+        """Return the yaw rate by the gyro less its bias, brought forward by the contact model.
 
-        `free` is the contact model's [rad/s]; the history is as old as after the step.
+        Over the gyro's delay the contact model's change of yaw rate is added. `free` is the contact
+        model's yaw rate [rad/s]; ages in the history are those after the step.
         """
         then = self._then(old, free)
         return jnp.where(jnp.isfinite(gyro), free + gyro - old.nuisance[-1] - then, free)
 
     def _then(self, now: PoseState, free: Array) -> Array:
-        """Yaw rate of the contact model at the time of the gyro's reading [rad/s]."""
+        """Return the yaw rate of the contact model at the time of the gyro's reading [rad/s]."""
         delay = self.settings.gyro_delay_s
         if not isinstance(delay, jax.core.Tracer) and float(delay) == 0.0:
-            return free  # code that is exported for one robot goes without the search
+            return free  # exported code of one robot then omits the search
         return jnp.where(delay == 0.0, free, nearest(now.history, delay)[4])
 
     def _turns(
-        self, now: PoseState, way: _StepMotion, gyro: Array, free: Array, tick: TimeStep
+        self, now: PoseState, body: _StepMotion, gyro: Array, free: Array, tick: TimeStep
     ) -> PoseState:
-        """Compare a gyro with the contact model while the robot moves.
+        """Return the state after a gyro's comparison with the contact model of a moving robot.
 
-        The gyro reads the model's yaw rate, what pushes it off, and its own bias, so that it tells
-        of both and of whatever pushes the body sideways together with them:
+        The gyro reads the model's yaw rate, its errors, and its own bias, so that it informs about
+        both, and about sideways errors that are correlated with them:
 
             gyro = (twist + slope nuisance)_yaw + bias + noise
 
-        The noise is the gyro's and that of the model per root of the distance; a reading far from
-        what is believed counts less, as do all while wheels speed up, which the equilibrium does
-        not know. Only heading and bias learn from it: what pushes the body is considered and stays
-        as it is (Schmidt 1966), since the floors are told by the same gyro.
+        The noise is that of the gyro and of the model per root of the distance. A reading far from
+        the expected value counts less, as do all while wheels accelerate, since the equilibrium
+        lacks inertia. Only heading and bias are updated: the model's errors are considered and keep
+        their values (Schmidt 1966), since the same gyro already informs the belief about floors.
         """
         dt, cov = jnp.maximum(tick.dt, 1e-3), now.covariance
-        look = jnp.concatenate([jnp.zeros(3), way.slope[2], jnp.ones(1)])
-        told = (way.speed > CREEP_SPEED) & jnp.isfinite(gyro) & (tick.dt > 0)
-        gap = jnp.where(told, gyro - now.nuisance[-1] - self._then(now, free), 0.0)
-        walk = (way.share @ self.robot.process[:, 2] ** 2) * way.speed / dt
+        look = jnp.concatenate([jnp.zeros(3), body.slope[2], jnp.ones(1)])
+        usable = (body.speed > CREEP_SPEED) & jnp.isfinite(gyro) & (tick.dt > 0)
+        gap = jnp.where(usable, gyro - now.nuisance[-1] - self._then(now, free), 0.0)
+        walk = (body.share @ self.robot.process[:, 2] ** 2) * body.speed / dt
         noise = (self.settings.gyro_std**2 + walk) * (
             1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2
         )
         var = look @ cov @ look + noise
         var = var * jnp.maximum(gap**2 / (9.0 * var), 1.0)
-        learns = told * jnp.zeros(len(cov)).at[jnp.array([2, -1])].set(1.0)
+        learns = usable * jnp.zeros(len(cov)).at[jnp.array([2, -1])].set(1.0)
         return _scalar_update(now, look, gap, var, learns)
 
     def _rest(self, now: PoseState, gyro: Array) -> PoseState:
-        """Learn the gyro's bias while the robot rests.
+        """Return the state with the gyro's bias updated while the robot rests.
 
-        A reading that differs from what is known is a robot that creeps on an edge or is turned by
-        hand, no bias.
+        A reading that differs much from the known bias means that the robot creeps on an edge or is
+        turned by hand, and does not change the bias.
         """
         cov = now.covariance
         gap = gyro - now.nuisance[-1]
@@ -214,23 +218,23 @@ class PoseFilter(eqx.Module):
         look, learns = jnp.zeros(len(cov)).at[-1].set(1.0), jnp.broadcast_to(rests, len(cov))
         return _scalar_update(now, look, jnp.where(rests, gap, 0.0), var, learns.astype(float))
 
-    def _grow(self, old: PoseState, pose: Array, way: _StepMotion, tick: TimeStep) -> PoseState:
-        """At the pose after the step, with the covariance and what came into it."""
+    def _grow(self, old: PoseState, pose: Array, body: _StepMotion, tick: TimeStep) -> PoseState:
+        """Return the state at the pose after the step, with its grown covariance."""
         f, s, dt = self.robot, self.settings, tick.dt
         world = axes_rotation(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))
         gone = pose[:2] - old.pose[:2]
         # yaw comes from the gyro, not from the floor
-        keep = jnp.where(way.by_gyro, jnp.array([1.0, 1.0, 0.0]), jnp.ones(3))
-        far = way.speed * dt
-        push = world @ (keep[:, None] * way.slope)
-        drift = jnp.array([[0.0], [0.0], [1.0]]) * jnp.where(way.by_gyro, -dt, 0.0)
+        keep = jnp.where(body.by_gyro, jnp.array([1.0, 1.0, 0.0]), jnp.ones(3))
+        far = body.speed * dt
+        push = world @ (keep[:, None] * body.slope)
+        drift = jnp.array([[0.0], [0.0], [1.0]]) * jnp.where(body.by_gyro, -dt, 0.0)
         turned = jnp.array([[1.0, 0.0, -gone[1]], [0.0, 1.0, gone[0]], [0.0, 0.0, 1.0]])
         by = jnp.concatenate([turned, push * dt, drift], axis=1)  # d pose / d (pose, nuisance)
-        grown = (way.share @ f.process**2) * far
-        floor_axes = world @ (keep[:, None] * way.axes)
+        grown = (body.share @ f.process**2) * far
+        floor_axes = world @ (keep[:, None] * body.axes)
         noise = (floor_axes * grown) @ floor_axes.T
-        noise = noise.at[2, 2].add(jnp.where(way.by_gyro, (s.gyro_std * dt) ** 2, 0.0))
-        rows = by @ old.covariance  # what is not the pose stays as it is
+        noise = noise.at[2, 2].add(jnp.where(body.by_gyro, (s.gyro_std * dt) ** 2, 0.0))
+        rows = by @ old.covariance  # rows of the pose; the others stay
         pose_rows = jnp.concatenate([rows @ by.T + noise, rows[:, 3:]], axis=1)
         rest = jnp.concatenate([rows[:, 3:].T, old.covariance[3:, 3:]], axis=1)
         return replace(
@@ -239,21 +243,24 @@ class PoseFilter(eqx.Module):
             covariance=jnp.concatenate([pose_rows, rest]),
             noise=old.noise + noise,
             far=old.far + far,
-            push=jnp.where(far > 1e-6, push / jnp.maximum(way.speed, 1e-9), old.push),
+            push=jnp.where(far > 1e-6, push / jnp.maximum(body.speed, 1e-9), old.push),
         )
 
 
 def _scalar_update(
     now: PoseState, look: Array, gap: Array, var: Array, learns: Float[Array, " unknown"]
 ) -> PoseState:
-    """Corrected by a reading that differs by `gap` from `look` times what is unknown.
+    """Return the state corrected by one reading.
 
-    What does not learn keeps its value, and its covariance with what does is right (Joseph's form).
+    Unknowns that are not updated keep their values, and their covariance with the others stays
+    right (Joseph's form).
 
     Args:
-        now: before the reading.
-        look: derivative of the reading by pose and nuisance; gap: measured less predicted.
-        var: of the gap; learns: 1 for each unknown that learns, else 0.
+        now: state before the reading.
+        look: derivative of the reading by pose and nuisance.
+        gap: measured less predicted reading.
+        var: variance of the gap.
+        learns: 1 for each unknown that is updated, else 0.
     """
     by = now.covariance @ look
     gain = learns * by / var
@@ -268,15 +275,15 @@ def _scalar_update(
 
 
 def axes_rotation(heading: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Turns a covariance of a body's motion from its axes to the world's."""
+    """Return the matrix that turns a body's motion from its axes to the world's."""
     c, s = jnp.cos(heading), jnp.sin(heading)
     return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def cholesky_root(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Lower triangular root of a covariance of ways per metre or of poses.
+    """Return the lower triangular root of a covariance of poses, or of motions per metre.
 
-    It has 0.1 mm/m, or 0.1 mm and 0.1 mrad, more, so that there is one.
+    It is computed with 0.1 mm/m, or 0.1 mm and 0.1 mrad, added, so that it always exists.
     """
     a = jnp.sqrt(m[0, 0] + 1e-8)
     b, d = m[1, 0] / a, m[2, 0] / a

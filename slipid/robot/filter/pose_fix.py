@@ -1,4 +1,4 @@
-"""The pose with what is unknown beside it, and what late news make of both and of their history."""
+"""Pose state of the estimator, and its corrections by pose fixes, maps and late evidence."""
 
 from dataclasses import replace
 
@@ -12,28 +12,28 @@ from slipid.robot.filter.floor_filter import BodyMotion
 from slipid.robot.interface import Readings
 
 HISTORY = 48
-"""Steps a delayed measurement may reach back."""
+"""Number of steps that a delayed measurement may reach back."""
 TRUST = 0.25
-"""Part of the evidence for floors that counts for the pose: one map is wrong in many steps."""
+"""Power of the floors' evidence on the pose: one wrong map affects many steps."""
 
 
 class PoseState(eqx.Module):
-    """Pose, what else is unknown, and how sure both are.
+    """Pose, nuisance states, and their covariance.
 
     Attributes:
         pose: x, y [m], heading [rad].
-        nuisance: effects of every floor along, across and in yaw beyond what is told of them, in
-            stds left, by how much its log friction is off, the doubt d [1], then the gyro's bias
+        nuisance: effects of every floor along, across and in yaw beyond their estimates, in
+            remaining stds, errors of their log frictions, belief errors d [1], then the gyro's bias
             [rad/s].
-        covariance: of pose and nuisance [units of both].
-        toward: direction of travel that counts as taken, see `slipid.robot.filter.effects`.
-        still: for how long the robot has stood [s].
-        noise: covariance that has come into the pose over the history [m, m, rad, each times each].
-        far: way over the history [m].
-        push: d pose / d nuisance per metre of the last way, the gyro's bias left out [m/m, m/m,
-            rad/m].
+        covariance: covariance of pose and nuisance [units of both].
+        toward: settled direction of travel, see `slipid.robot.filter.effects`.
+        still: time for which the robot has stood [s].
+        noise: covariance added to the pose over the history [m, m, rad, each times each].
+        far: path length over the history [m].
+        push: derivative of the pose by the nuisance per metre of the last motion, without the
+            gyro's bias [m/m, m/m, rad/m].
         history: last steps, the newest first: age [s], pose [m, m, rad], yaw rate of the contact
-            model [rad/s], noise and way until then.
+            model [rad/s], noise and path length until then.
     """
 
     pose: Float[Array, "3"]
@@ -48,7 +48,10 @@ class PoseState(eqx.Module):
 
 
 def apply_fix(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3"]]:
-    """Corrected by a pose fix of some time ago, if there is one, and what it leaves of a gap."""
+    """Return the state corrected by a pose fix, if there is one, and the factor on distances.
+
+    The factor is the share of another pose's distance that the fix leaves.
+    """
     age = jnp.where(jnp.isfinite(z.fix_age) & (z.fix_age >= 0), z.fix_age, 0.0)
     has = (
         jnp.all(jnp.isfinite(z.fix))
@@ -58,9 +61,10 @@ def apply_fix(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3
         & (age < now.history[-1, 0] + 1e-6)
     )
     std = jnp.clip(z.fix_std, 1e-4, 10.0)
-    kept = now.pose, now.nuisance, now.covariance, now.history, jnp.eye(3)
-    found = jax.lax.cond(has, lambda: _corrected(now, z.fix, std, age), lambda: kept)
-    pose, nuisance, covariance, history, left = found
+    same = now.pose, now.nuisance, now.covariance, now.history, jnp.eye(3)
+    pose, nuisance, covariance, history, left = jax.lax.cond(
+        has, lambda: _corrected(now, z.fix, std, age), lambda: same
+    )
     new = replace(now, pose=pose, nuisance=nuisance, covariance=covariance, history=history)
     return new, left
 
@@ -68,12 +72,12 @@ def apply_fix(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3
 def _corrected(
     now: PoseState, fix: Array, std: Array, age: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Pose, nuisance, covariance and history after a fix of the pose as it was `age` ago [s].
+    """Return pose, nuisance, covariance, history and the factor on distances after a pose fix.
 
-    The last is what is left of how far another pose is from this one. What nuisance has done since
-    then is as on the last way. The noise that came in since then, a covariance of the pose, the fix
-    has not seen: it is set aside. What the pose no longer holds of it, a later fix having seen it,
-    is so much noise of this one.
+    The fix is of the pose `age` ago [s]. Since then nuisance is assumed to act as on the last
+    motion. The fix does not include the noise added since then, a covariance of the pose, so it is
+    set aside. The part of it that the pose no longer contains, because a later fix removed it,
+    counts as noise of this fix.
     """
     pose, cov, history = now.pose, now.covariance, now.history
     then = nearest(history, age)
@@ -90,7 +94,7 @@ def _corrected(
     noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2) + since - held
     rows = look @ cov
     total = rows @ look.T + noise
-    # a fix far from what is believed counts less, yet counts
+    # a fix far from the expected pose counts less, but still counts
     far = gap @ _inverse(total) @ gap
     total = total + noise * jnp.maximum(far / 9.0 - 1.0, 0.0)
     gain = rows.T @ _inverse(total)
@@ -108,14 +112,15 @@ def apply_map(
     supports: Float[Array, "sample hypothesis"],
     motion: BodyMotion,
 ) -> tuple[PoseState, Float[Array, "3 3"]]:
-    """Corrected by what is believed of the floors, where a map has them elsewhere.
+    """Return the state corrected by the belief about floors, where a map has them elsewhere.
 
-    The second is what it leaves of how far another pose is from this one, in the world's axes.
+    The second result is the share of another pose's distance that it leaves, in the world's axes.
 
     Args:
-        now: pose and covariance; root: of the pose's covariance, as the poses were drawn.
+        now: pose and covariance.
+        root: root of the pose's covariance with which poses were drawn.
         supports: probability of every hypothesis at every pose drawn, see `Floor.supports`.
-        motion: what is believed of the hypotheses, before this step's evidence and after.
+        motion: belief over the hypotheses before this step's evidence and after it.
     """
     share = supports / jnp.maximum(jnp.mean(supports, axis=0), 1e-12)
     weight = (share @ motion.known) / jnp.maximum(share @ motion.before, 1e-12)
@@ -141,20 +146,20 @@ def apply_map(
 def history_after_jump(
     old: PoseState, motion: BodyMotion, base: Float[Array, ""]
 ) -> Float[Array, "entry 15"]:
-    """The history once news of the floors has moved the pose: what it knows of before moves too.
+    """Return the history after late evidence on the floors moved the pose.
 
-    The ways of what was and of what is believed went apart until now, at the rate at which the two
-    differ now. So of a jump J a part was already true a way s ago,
+    The poses of the old and the new belief diverged until now, at the rate at which the two differ
+    now. So of a jump J a part was already true a path length s ago,
 
-        1 - s (j . J) / |J|^2,   j how much further they go apart per metre of the way
+        1 - s (j . J) / |J|^2,   j their divergence per metre
 
-    between none of it and the whole, yaw as rim speed. Else a fix of before the news would have
-    moved the pose by the jump once more.
+    limited to between none and all of it, yaw as rim speed. Otherwise a fix of an earlier time
+    would move the pose by the jump once more.
     """
     scale = jnp.stack([jnp.ones(()), jnp.ones(()), base])
-    jump, apart = scale * motion.jump, scale * motion.news
+    jump, apart = scale * motion.jump, scale * motion.correction
     rate = apart @ jump / jnp.maximum(jump @ jump, 1e-18)
-    since = (old.far - old.history[:, 14]) / jnp.maximum(motion.course.speed, 1e-6)
+    since = (old.far - old.history[:, 14]) / jnp.maximum(motion.rolled.speed, 1e-6)
     part = jnp.clip(1 - rate * since, 0.0, 1.0)
     c, s = jnp.cos(old.pose[2]), jnp.sin(old.pose[2])
     x, y, yaw = motion.jump
@@ -165,17 +170,17 @@ def history_after_jump(
 def shifted(
     history: Float[Array, "entry 15"], pose: Float[Array, "3"], change: Float[Array, "entry 3"]
 ) -> Float[Array, "entry 15"]:
-    """History of a pose that was off by so much, a turn about where it is now."""
+    """Return the history of a pose that was off by these changes, turning about the pose now."""
     back = history[:, 1:3] - pose[:2]
     moved = change[:, :2] + change[:, 2:] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
     return history.at[:, 1:3].add(moved).at[:, 3].add(change[:, 2])
 
 
 def _given(cov: Float[Array, "unknown unknown"]) -> Float[Array, "3 3"]:
-    """Covariance of the pose, were all else known.
+    """Return the covariance of the pose if everything else were known.
 
-    No more than that can be set aside of the pose alone: what is known of the rest has part in the
-    remainder, and with more taken off, the whole would be no covariance.
+    No more than that can be set aside from the pose alone: its remainder is correlated with the
+    other unknowns, and with more taken off, the whole would not be a covariance.
     """
 
     def known(k: Int[Array, ""], c: Array) -> Array:
@@ -187,7 +192,7 @@ def _given(cov: Float[Array, "unknown unknown"]) -> Float[Array, "3 3"]:
 
 
 def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """As much of a covariance as another one can hold.
+    """Return the largest multiple, at most 1, of a covariance that another one contains.
 
     The largest eigenvalue of their quotient is at most the eighth root of the trace of its eighth
     power, and at least 1 / 1.15 of that.
@@ -200,9 +205,10 @@ def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Arra
 
 
 def rebased(now: PoseState) -> PoseState:
-    """With noise and way counted from the oldest entry of the history.
+    """Return the state with noise and path length counted from the oldest entry of the history.
 
-    They, and ages instead of times, stay small however long a robot drives: 32 bits hold them.
+    They, and ages instead of times, stay small however long a robot drives, so that 32 bits
+    suffice.
     """
     first = now.history[-1, 5:]
     history = now.history.at[:, 5:].add(-first)
@@ -212,11 +218,11 @@ def rebased(now: PoseState) -> PoseState:
 
 
 def nearest(history: Array, age: Array | float) -> Array:
-    """Entry nearest to an age: age, pose, yaw rate of the contact model, noise and way."""
+    """Return the entry nearest to an age: age, pose, model's yaw rate, noise and path length."""
     return history[jnp.argmin(jnp.abs(history[:, 0] - age))]
 
 
 def _inverse(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Inverse of a positive definite matrix by the adjugate."""
+    """Return the inverse of a positive definite matrix by the adjugate."""
     rows = jnp.stack([jnp.cross(m[1], m[2]), jnp.cross(m[2], m[0]), jnp.cross(m[0], m[1])], axis=1)
     return rows / jnp.maximum(m[0] @ rows[:, 0], 1e-30)

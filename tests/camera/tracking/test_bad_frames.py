@@ -7,8 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from slipid.camera.tracking.outliers import jumps
-from slipid.camera.tracking.track import Flag
+from slipid.camera.tracking.track import Flag, jumps
 from tests.helpers.made_drives import round_trip, starts_and_stops
 from tests.helpers.made_videos import Body
 from tests.helpers.tracked import STAGE, errors, tracked

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.camera.frames.frame import grey_of
+from slipid.camera.frame import grey_of
 from slipid.camera.opencv import read_picture
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.detections import Detections

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -9,10 +11,15 @@ from slipid.data.check.sanity import findings
 from tests.helpers.real_sets import REAL_SETS, skid_runs, two_sides
 
 
+@cache
+def runs_of(real, folder):
+    return real.read(folder)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("real", REAL_SETS, ids=lambda s: s.name)
 def test_no_false_alarm(real, real_data):
-    found = findings(real.read(real_data), real.robot(), real.mass_kg)
+    found = findings(runs_of(real, real_data), real.robot(), real.mass_kg)
     assert [f for f in found if f.severity != "note"] == []
 
 
@@ -20,7 +27,7 @@ def test_no_false_alarm(real, real_data):
 @pytest.mark.parametrize("real", REAL_SETS, ids=lambda s: s.name)
 def test_a_part_of_the_runs_raises_none_either(real, real_data):
     """Every third run raises no alarm either, since thresholds are not tuned to whole sets."""
-    runs = real.read(real_data)
+    runs = runs_of(real, real_data)
     for first in range(3):
         part = runs.subset(np.arange(first, len(runs), 3))
         found = findings(part, real.robot(), real.mass_kg)

@@ -107,7 +107,7 @@ def test_without_a_wish_it_predicts_every_floor(folder):
     done = design(folder, "--runs", 2)
     assert done.exit_code == 0, done.output
     assert "prediction of every floor" in done.stdout
-    assert "chosen runs tell as much as the 2021 paper's grid (36 runs)" in done.stdout
+    assert "chosen runs are worth the 2021 paper's grid (36 runs)" in done.stdout
     if "deg/s" in done.stdout:
         assert "soft was never driven turning" in done.stdout
 

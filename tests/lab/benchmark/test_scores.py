@@ -1,6 +1,6 @@
 """What a prediction is worth, and how folds are put together, against plain formulas."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -8,8 +8,14 @@ from sklearn.metrics import roc_auc_score
 
 from slipid.fit.variances import DEGREES
 from slipid.lab.benchmark.scores import FoldScore, scored
-from slipid.lab.benchmark.summary import Bootstrap, MeanInterval, RowSummary, area, summary
-from slipid.lab.benchmark.tuning import sentence
+from slipid.lab.benchmark.summary import (
+    Bootstrap,
+    MeanInterval,
+    RowSummary,
+    area,
+    sentence,
+    summary,
+)
 from slipid.predict.score import forecast
 from slipid.predict.slip_model import PredictedRun, path_of
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
@@ -222,7 +228,7 @@ def test_a_row_that_is_absent_in_one_fold_is_absent():
 
 def test_rows_outlive_their_files():
     row = rows([0.1, 0.2])
-    assert FoldScore.of_json(row.to_json()) == row
+    assert FoldScore.of_json(asdict(row)) == row
 
 
 def ends(value, low=None, high=None, behind=None):

@@ -39,7 +39,7 @@ def testsite(tmp_path_factory):
 
 def test_recorded_runs_need_no_data_folder(testsite):
     assert len(testsite.logged) == len(testsite.job.dataset) == 120
-    assert set(testsite.setups) == {"firm", "soft", "soft@moved"}
+    assert {fact.floor for fact in testsite.facts} == {"firm", "soft", "soft@moved"}
     assert testsite.spec.determines_twist
     assert {fact.floor for fact in testsite.facts} == {"firm", "soft", "soft@moved"}
 
@@ -47,7 +47,7 @@ def test_recorded_runs_need_no_data_folder(testsite):
 def test_a_part_of_the_runs_has_every_floor_and_speed(testsite):
     few = testsite.thinned(30)
     assert len(few.logged) == len(few.job.dataset) == len(few.facts) == 30
-    assert set(few.setups) == set(testsite.setups)
+    assert {fact.floor for fact in few.facts} == {fact.floor for fact in testsite.facts}
     assert {round(fact.speed, 2) for fact in few.facts} == {0.1, 0.2}
     assert testsite.thinned(500) is testsite
 

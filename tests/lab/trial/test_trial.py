@@ -110,7 +110,7 @@ def test_a_circle_is_round_an_eight_goes_both_ways_round_and_one_path_turns():
 
 def test_the_way_that_is_left_of_a_path_ends_with_it():
     path = reference.rectangle()
-    left = [float(path.left(t)) for t in (0.0, *np.asarray(path.marks), 99.0)]
+    left = [float(path.remaining(t)) for t in (0.0, *np.asarray(path.marks), 99.0)]
     np.testing.assert_allclose(left, [2.6, 1.7, 1.3, 0.4, 0.0, 0.0], atol=1e-6)
 
 
@@ -187,7 +187,7 @@ class Perfect:
         return Measurement(wheel_angle=self.angle, current=np.full(3, 0.5))
 
 
-def pilot(deployed, preview=0.0):
+def control_loop(deployed, preview=0.0):
     gains = replace(Gains(), preview=jnp.asarray(preview))
     return ControlLoop(Odometry(deployed), Controller(deployed, gains))
 
@@ -198,7 +198,7 @@ def test_encoders_close_every_path_without_slip(deployed, name):
     start = (0.2, 0.1, -1.0)
     path = reference.PATHS[name](0.2).moved(start)
     course = closed_loop.run_closed_loop(
-        pilot(deployed, 0.05), path, Perfect(deployed, start), start
+        control_loop(deployed, 0.05), path, Perfect(deployed, start), start
     )
     found = closed_loop.path_metrics(course)
     assert found.finished
@@ -211,7 +211,9 @@ def test_encoders_close_every_path_without_slip(deployed, name):
 def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(deployed):
     start = (0.2, 0.1, -1.0)
     path = reference.rectangle().moved(start)
-    course = closed_loop.run_closed_loop(pilot(deployed), path, Perfect(deployed, start), start)
+    course = closed_loop.run_closed_loop(
+        control_loop(deployed), path, Perfect(deployed, start), start
+    )
     found = closed_loop.path_metrics(course)
     assert found.finished
     assert found.closure_mm < 5
@@ -230,7 +232,7 @@ def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
     for preview in (0.0, 0.2):
         plant = Perfect(deployed, start, late=4)
         far.append(
-            closed_loop.run_closed_loop(pilot(deployed, preview), path, plant, start)
+            closed_loop.run_closed_loop(control_loop(deployed, preview), path, plant, start)
             .pose[:, 0]
             .max()
         )
@@ -243,7 +245,7 @@ def test_metrics_see_a_robot_that_travels_only_part_of_its_way(deployed):
     start = (0.0, 0.0, 0.0)
     path = reference.rectangle()
     course = closed_loop.run_closed_loop(
-        pilot(deployed), path, Perfect(deployed, start, 0.8), start
+        control_loop(deployed), path, Perfect(deployed, start, 0.8), start
     )
     found = closed_loop.path_metrics(course)
     assert found.along_track_mm[0] == pytest.approx(-180, abs=12)
@@ -257,7 +259,7 @@ def test_of_a_curve_the_first_quarter_is_judged(deployed):
     start = (0.0, 0.0, 0.0)
     path = reference.circle(0.35)
     course = closed_loop.run_closed_loop(
-        pilot(deployed), path, Perfect(deployed, start, 0.8), start
+        control_loop(deployed), path, Perfect(deployed, start, 0.8), start
     )
     found = closed_loop.path_metrics(course)
     assert found.sides_mm[0] == pytest.approx(350 * np.sqrt(2), rel=0.01)
@@ -269,9 +271,9 @@ def test_of_a_curve_the_first_quarter_is_judged(deployed):
 def test_a_robot_that_does_not_move_has_its_whole_way_left(deployed):
     path = reference.rectangle()
     plant = Perfect(deployed, (0.0, 0.0, 0.0), 0.0)
-    course = closed_loop.run_closed_loop(pilot(deployed), path, plant, (0.0, 0.0, 0.0))
+    course = closed_loop.run_closed_loop(control_loop(deployed), path, plant, (0.0, 0.0, 0.0))
     assert closed_loop.path_metrics(course).closure_mm < 5  # its encoders say that it has arrived
-    course = replace(course, own=np.zeros_like(course.own))
+    course = replace(course, path_time=np.zeros_like(course.path_time))
     found = closed_loop.path_metrics(course)
     assert not found.finished
     assert found.closure_mm == pytest.approx(2600, abs=1)
@@ -281,7 +283,7 @@ def test_the_distance_from_a_path_is_from_its_line():
     line = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
     places = np.array([[0.37, 0.2], [1.3, 0.63], [1.3, 1.4], [0.5, 0.0]])
     np.testing.assert_allclose(
-        closed_loop._from_line(places, line), [0.2, 0.3, 0.5, 0.0], atol=1e-12
+        closed_loop._distance_from_line(places, line), [0.2, 0.3, 0.5, 0.0], atol=1e-12
     )
 
 
@@ -333,18 +335,20 @@ def test_rows_of_published_laws_are_made_for_the_robot_and_believe_its_encoders(
         (0.01 * jnp.arange(shape.wheels), 0.02 * jnp.arange(shape.wheels)),
     )
     known = deploy_known(robot, highest_speed=7.5)
-    pilots = {
+    loops = {
         name: control_loop_of(known, ROWS[name])
         for name in ("goswami_padhy", "goswami_padhy_gradient", "indiveri")
     }
-    for pilot in pilots.values():
-        assert not pilot.estimator.curve
-        assert values(pilot.controller.gains) == values(replace(Gains(), preview=jnp.zeros(())))
-    law = pilots["indiveri"].controller.law
+    for control_loop in loops.values():
+        assert not control_loop.estimator.curve
+        assert values(control_loop.controller.gains) == values(
+            replace(Gains(), preview=jnp.zeros(()))
+        )
+    law = loops["indiveri"].controller.law
     np.testing.assert_allclose(law.matrix, known.forward / known.frame.radius, atol=1e-9)
     assert law.gains.tolist() == [1.5, 1.5]
     assert float(law.limit) == 13.0
-    swarm, gradient = (np.asarray(p.controller.law.gains) for p in list(pilots.values())[:2])
+    swarm, gradient = (np.asarray(p.controller.law.gains) for p in list(loops.values())[:2])
     np.testing.assert_allclose(swarm, gradient, atol=1e-3)
     assert swarm.tolist()[:2] == [5.0, 5.0]  # the edge of what the paper's swarm may take
     assert 4.0 < swarm[2] < 4.999
@@ -355,9 +359,9 @@ def test_rows_of_published_laws_are_made_for_the_robot_and_believe_its_encoders(
 def test_published_laws_close_the_rectangle_without_slip(deployed, row):
     start = (0.2, 0.1, -1.0)
     path = reference.rectangle().moved(start)
-    pilot = control_loop_of(deployed, ROWS[row], Settings())
+    control_loop = control_loop_of(deployed, ROWS[row], Settings())
     found = closed_loop.path_metrics(
-        closed_loop.run_closed_loop(pilot, path, Perfect(deployed, start), start)
+        closed_loop.run_closed_loop(control_loop, path, Perfect(deployed, start), start)
     )
     assert found.finished
     assert found.closure_mm < 5
@@ -547,7 +551,7 @@ def test_a_controller_is_told_another_map_than_the_true_one(tmp_path, deployed, 
         return tr._tasks(tmp_path, tr.TrialOptions(**wish, **more))
 
     plain, other = jobs()[0], jobs(told_map=tmp_path / "told.toml")[0]
-    assert plain.told is plain.floor
+    assert plain.known_map is plain.floor
     assert other.kept.folder != plain.kept.folder
     middle = np.array([[0.0, 0.5], [0.9, 0.5]])
 
@@ -555,7 +559,7 @@ def test_a_controller_is_told_another_map_than_the_true_one(tmp_path, deployed, 
         return [floor.surfaces[int(k)] for k in floor.at(middle)]
 
     assert named(other.floor) == named(plain.floor) == labels[:2]
-    assert named(other.told) == labels[1::-1]
+    assert named(other.known_map) == labels[1::-1]
 
     class Told(Exception):
         pass
@@ -686,7 +690,7 @@ def test_the_summary_is_of_medians_over_starts_with_intervals():
 
 def test_live_readings_are_as_the_sensors_log_them():
     live = SitePlant(uniform("firm"), "as_built", (0.0, 0.0, 0.0), 1, gyro=False)
-    forward = live.plant.machine.wheel_from_twist @ np.array([0.2, 0.0, 0.0])
+    forward = live.plant.robot.wheel_from_twist @ np.array([0.2, 0.0, 0.0])
     for _ in range(20):
         reading = live.step(forward)
     tick = 2 * np.pi / (2000 * 16)

@@ -157,8 +157,8 @@ def test_networks_say_nothing_beyond_what_they_were_taught():
     x = np.random.default_rng(0).uniform([-1, -1, -3], [1, 1, 1], (100, 3))
     y = np.stack([x[:, 0] * x[:, 1], x[:, 2] ** 2], axis=1)
     networks = NetworkSet.grown(x, y, np.ones(100), np.arange(100) % 2 == 0, EXACT)
-    assert np.allclose(networks.say(x), y)
-    far = networks.say(np.full((1, 3), 50.0))
+    assert np.allclose(networks.output(x), y)
+    far = networks.output(np.full((1, 3), 50.0))
     # the corner where both are largest was not seen, nor squares beyond one on this side
     assert far[0] == pytest.approx([y[:, 0].max(), x[:, 2].max() ** 2], abs=1e-6)
 
@@ -238,12 +238,12 @@ def test_a_robot_at_rest_learns_nothing_of_its_floor(classes):
     assert np.abs(said.path).max() == 0.0
 
 
-def test_a_single_floor_needs_no_telling():
+def test_a_single_floor_needs_no_classifier():
     runs = [run for run in RUNS if run.floor == "ice"]
     method = GmdhClass().fit(runs, ROBOTINO)
     new = slipping(2.2, "ice", seed=9).with_floor(False)
     (said,) = method.predict([new.signals], ROBOTINO)
-    assert method.telling is None
+    assert method.classifier is None
     assert error(said, new) < 0.02 * 0.8
     assert np.array_equal(said.floors["ice"], np.ones(40))
     assert 18 <= method.numbers == method.floors["ice"].numbers

@@ -17,8 +17,6 @@ from slipid.lab.systems.motion.features import (
 from slipid.lab.systems.motion.learners import (
     PASSES,
     BoostedTrees,
-    Boosting,
-    NetworkShape,
     NeuralNetwork,
 )
 from slipid.predict.slip_model import ByFloor, Run, path_of
@@ -123,7 +121,7 @@ def test_boosted_trees_come_as_near_to_two_levels_as_their_rate_lets_them():
     there, back = (
         slipping(angle, [ratio, 0.0, 0.0]) for angle, ratio in ((0.0, -0.2), (np.pi, 0.4))
     )
-    method = BoostedTrees(boosting=Boosting(0.1, 4, 20)).fit([there] * 8 + [back] * 8, ROBOTINO)
+    method = BoostedTrees(rate=0.1, leaves=4, trees=20).fit([there] * 8 + [back] * 8, ROBOTINO)
     said = method.predict([there.signals, back.signals], ROBOTINO)
     # every tree takes a tenth of what is left away from the mean of the two
     left = 0.9**20
@@ -140,7 +138,7 @@ def test_boosted_trees_come_as_near_to_two_levels_as_their_rate_lets_them():
 def test_trees_heed_windows_in_proportion_to_their_weight():
     # at a tenth of the usual speed slip is another; it counts 0.05 as much
     fast, slow = slipping(0.0, [-0.1, 0.0, 0.0]), slipping(0.0, [0.5, 0.0, 0.0], 0.025)
-    stump = BoostedTrees(boosting=Boosting(0.1, 2, 1))
+    stump = BoostedTrees(rate=0.1, leaves=2, trees=1)
     method = stump.fit([fast] * 30 + [slow] * 20, ROBOTINO)
     assert 0.6 * 50 * 8 < method.windows < 0.65 * 50 * 8
 
@@ -159,9 +157,7 @@ def test_a_neural_network_learns_how_slip_turns_with_the_direction():
 
 
 def test_the_numbers_of_a_network_are_its_weights():
-    method = NeuralNetwork(shape=NetworkShape((5, 4), 0.1)).fit(
-        [slipping(0.0, [0.1, 0.0, 0.0])], ROBOTINO
-    )
+    method = NeuralNetwork(hidden=(5, 4), alpha=0.1).fit([slipping(0.0, [0.1, 0.0, 0.0])], ROBOTINO)
     parts = (*method.network.coefs_, *method.network.intercepts_)
     assert method.numbers == sum(part.size for part in parts)
     assert NeuralNetwork().numbers == 0

@@ -24,14 +24,14 @@ def test_slip_is_flagged_by_the_gyro_or_by_all_currents_but_not_by_the_encoders(
     method = ReinaDeterministic(limits=SlipThresholds(0.01, 0.05, 0.4, 0.8), slip=0.5)
     encoder = np.array([5.0, 5.0, 5.0, 0.0])
     current, gyro = np.array([0.2, 1.1, 0.2, 0.2]), np.array([0.3, 0.3, 1.2, 0.3])
-    assert (method._answer(Indicators(encoder, current, gyro)) >= 1.0).tolist() == [
+    assert (method._moving_score(Indicators(encoder, current, gyro)) >= 1.0).tolist() == [
         False,
         True,
         True,
         False,
     ]
     # without a gyro the encoders take its place
-    assert (method._answer(Indicators(encoder, current, None)) >= 1.0).tolist() == [
+    assert (method._moving_score(Indicators(encoder, current, None)) >= 1.0).tolist() == [
         True,
         True,
         True,
@@ -109,7 +109,7 @@ def test_where_nothing_slipped_the_path_is_that_of_the_encoders(method):
 
 
 @pytest.mark.parametrize("method", BOTH, ids=lambda method: method.name)
-def test_where_all_slips_all_is_flagged(method):
+def test_where_all_slips_all_is_threshold(method):
     runs = [made_run(straight(a), straight(a) * 0.5, current=np.ones((40, 3))) for a in (0.3, 1.1)]
     rng = np.random.default_rng(0)
     runs = [

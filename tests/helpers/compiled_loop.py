@@ -1,4 +1,4 @@
-"""A pilot's step compiled for a robot's computer, on flat arrays: what its time is measured with.
+"""A control loop's step compiled for a robot's computer, on flat arrays, to measure its time.
 
 One leaf costs a compiled call least to dispatch.
 """
@@ -74,43 +74,43 @@ class Flat(Generic[Tree]):
         return tree
 
 
-class CompiledPilot(Generic[State]):
-    """A pilot's step on numpy arrays, cheapest to call: (state, measurement, dt) to both arrays.
+class CompiledLoop(Generic[State]):
+    """A control loop's step on numpy arrays: (state, measurement, dt) to both arrays.
 
-    The robot's numbers and the path become constants of the compiled code, and one flat array goes
-    in and one comes out; handing over the pilot's leaves at every call costs 100 us, and making the
-    named types 10. `states`, `measurements` and `outputs` say where the numbers lie. Where
-    `jax_cpu_enable_async_dispatch` is off before JAX starts, nothing waits for another thread
-    (8 us less, more on a busy machine).
+    It is the cheapest to call. The robot's numbers and the path become constants of the compiled
+    code, and one flat array goes in and one comes out; passing the loop's leaves at every call
+    costs 100 us, and making the named types 10. `states`, `measurements` and
+    `outputs` describe the arrays. With `jax_cpu_enable_async_dispatch` off before JAX starts,
+    nothing waits for another thread (8 us less, more on a busy machine).
 
     Attributes:
         states, measurements, outputs: order of the numbers of each flat array.
         call: the step.
     """
 
-    def __init__(self, pilot: ControlLoop[State], path: Path):
-        """Prepare a pilot for a path as it lies for the start; the first call compiles."""
-        self.pilot = pilot
-        begin, nothing = pilot.init(), Readings.nothing(pilot.controller.robot.wheels)
-        said = eqx.filter_eval_shape(pilot.step, path, begin, nothing, 0.0)[1]
+    def __init__(self, control_loop: ControlLoop[State], path: Path):
+        """Prepare a control loop for a path as it lies for the start; the first call compiles."""
+        self.loop = control_loop
+        begin, nothing = control_loop.init(), Readings.nothing(control_loop.controller.robot.wheels)
+        said = eqx.filter_eval_shape(control_loop.step, path, begin, nothing, 0.0)[1]
         self.states, self.measurements, self.outputs = Flat(begin), Flat(nothing), Flat(said)
         self.call = self._call(path)
 
     def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> Float[np.ndarray, " state"]:
         """Flat state of a robot at rest at a pose [m, m, rad]."""
-        return np.asarray(self.states.ravel(self.pilot.init(pose)))
+        return np.asarray(self.states.ravel(self.loop.init(pose)))
 
     def _call(
         self, path: Path
     ) -> Callable[[np.ndarray, np.ndarray, float], tuple[np.ndarray, np.ndarray]]:
         size = self.states.size
         last = size + self.measurements.size
-        given = np.zeros(last + 1, np.asarray(self.pilot.init().time).dtype)
+        given = np.zeros(last + 1, np.asarray(self.loop.init().time).dtype)
 
         def step(flat: Array) -> Array:
             state = self.states.unravel(flat[:size])
             z = self.measurements.unravel(flat[size:last])
-            new, said = self.pilot.step(path, state, z, flat[last])
+            new, said = self.loop.step(path, state, z, flat[last])
             return jnp.concatenate([self.states.ravel(new), self.outputs.ravel(said)])
 
         run = jax.jit(step)
