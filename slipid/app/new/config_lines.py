@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
+from textwrap import TextWrapper
 
 import numpy as np
 
@@ -77,7 +77,7 @@ class ConfigBlock:
         return "\n".join(out)
 
     @property
-    def asked(self) -> tuple[str, ...]:
+    def open_questions(self) -> tuple[str, ...]:
         """Every open question of the table."""
         lines = (f"{line.key}: {line.question}" for line in self.lines if line.question)
         return (*self.questions, *lines)
@@ -104,25 +104,11 @@ def _question_lines(question: str) -> str:
 
 def wrapped(text: str, width: int) -> list[str]:
     """Return text in lines of at most `width` characters; existing line breaks stay."""
-    out: list[str] = []
-    for line in text.splitlines() or [""]:
-        if len(line) <= width:
-            out.append(line)
-            continue
-        here = ""
-        for word in line.split(" "):
-            if here and len(here) + 1 + len(word) > width:
-                out.append(here)
-                here = word
-            else:
-                here = f"{here} {word}" if here else word
-        out.append(here)
-    return out
-
-
-def all_questions(blocks: Iterable[ConfigBlock]) -> tuple[str, ...]:
-    """Return every open question of a config, in order."""
-    return tuple(question for block in blocks for question in block.asked)
+    wrapper = TextWrapper(width, break_long_words=False, break_on_hyphens=False)
+    lines = text.splitlines() or [""]
+    return [
+        part for line in lines for part in (wrapper.wrap(line) if len(line) > width else [line])
+    ]
 
 
 _ARROWS = "↑↖←↙↓↘→↗"
@@ -154,7 +140,7 @@ def drawing(robot: Geometry) -> str:
     which it rolls at a positive speed, and the letter of the motor that it shares with other
     wheels.
     """
-    lines = ["seen from above, arrows: the way of a positive wheel speed", ""]
+    lines = ["seen from above, arrows: direction of a positive wheel speed", ""]
     lines += _picture(_grid_wheels(robot))
     lines += [
         "",

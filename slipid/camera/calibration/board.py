@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.opencv import marker_dictionary, opencv, size_of
+from slipid.camera.opencv import marker_count, marker_dictionary, opencv, size_of
 from slipid.support.errors import DataError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
@@ -181,11 +181,6 @@ def board_of(size: str, square_m: float, marker_m: float, dictionary: str, legac
     if not (by and columns.strip().isdecimal() and rows.strip().isdecimal()):
         raise DataError(f"--board {size}; expected squares along x and y, such as 7x5")
     return Board(int(columns), int(rows), square_m, marker_m, dictionary, legacy)
-
-
-def marker_count(dictionary: str) -> int:
-    """Return the number of markers in a dictionary."""
-    return len(marker_dictionary(dictionary).bytesList)
 
 
 def view_of(board: Board, picture: Picture) -> View:

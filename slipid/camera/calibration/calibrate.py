@@ -7,13 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.calibration.board import (
-    LEAST_CORNERS,
-    Board,
-    Picture,
-    named_pictures,
-    view_of,
-)
+from slipid.camera.calibration.board import LEAST_CORNERS, Board, Picture, named_pictures, view_of
 from slipid.camera.calibration.lens import fit_robustly
 from slipid.camera.calibration.place import FloorFit, fit_place, fit_place_robustly, uncertainty
 from slipid.camera.calibration.points import FloorPoints, read_points
