@@ -71,7 +71,6 @@ def test_xla_gets_only_flags_that_it_knows_and_that_are_not_set(monkeypatch):
         assert jax_setup.os.environ["XLA_FLAGS"] == after
 
 
-@pytest.mark.xfail(strict=False)  # until the last of them has a name of its own
 def test_a_class_name_stands_for_one_class():
     paths = Path(slipid.__file__).parent.rglob("*.py")
     trees = (ast.parse(path.read_text(encoding="utf-8")) for path in paths)
