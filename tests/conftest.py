@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from contextlib import suppress
+from ctypes import CDLL
 from ctypes.util import find_library
 from pathlib import Path
 
@@ -16,13 +18,17 @@ from slipid.support.jax_setup import one_blas_thread, plain_loops
 ROOT = Path(__file__).resolve().parents[1]
 GOLDENS = Path(__file__).with_name("goldens")
 LONG = (
-    *("test_cli", "test_calibration", "test_notebooks", "test_folds", "test_public"),
-    *("test_every_drive", "test_recovery", "test_result", "test_estimator", "test_consistency"),
-    "test_trial",
+    *("test_cli", "test_real_fit", "test_crossing", "test_demo", "test_recovery", "test_folds"),
+    *("test_every_drive", "test_optimise", "test_notebooks", "test_consistency", "test_c_steps"),
+    *("test_left_out", "test_real_logs", "test_plant", "test_c_folder", "test_estimator"),
+    *("test_likelihood", "test_ensemble", "test_simulate", "test_public", "test_calibration"),
+    *("test_result", "test_trial"),
 )
-"""Files that take longest."""
+"""Files that take longest, the longest first."""
 MANY = 1_000_000
 """Objects that were made since garbage was collected, from which on it is again."""
+MOST_MB = 1300.0
+"""Memory after a file from which on a worker forgets what was compiled."""
 
 # Set in the environment, so that commands and notebooks started by a test share them. The cache is
 # what keeps the second run of the suite short: most of the first is compilation.
@@ -114,22 +120,60 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(items):
     """Files that take longest come first, so that two workers end together."""
-    items.sort(key=lambda item: item.path.stem not in LONG)
+    place = {name: k for k, name in enumerate(LONG)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(LONG)))
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _room_for_compiled_code():
-    """After a file garbage is collected, and compiled code forgotten, before it is too much.
+def _room_for_compiled_code(request):
+    """After a file garbage is collected, and what its functions keep is let go.
 
     Tracing makes many objects that live long, and looking through them all again and again took a
     sixth of the suite: garbage is collected between files alone, and only after files that made
-    many objects, for a look takes a second. Compiled functions hold memory
-    maps; at vm.max_map_count (65 530 by default) the next compilation is a segmentation fault.
+    many objects, for a look takes a second; or where memory runs short.
     """
     gc.disable()
     yield
+    for made in vars(request.module).values():  # problems and fits
+        clear = getattr(made, "cache_clear", None)
+        if clear and made.__module__ == request.module.__name__:
+            clear()
     if gc.get_count()[0] > MANY:
         gc.collect()
+    _make_room(MOST_MB)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown():
+    """Within a file memory may grow more before what tests of it share is compiled again."""
+    yield
+    _make_room(1.5 * MOST_MB)
+
+
+_taken = 0.0
+"""Memory that was left when room was last made [MB]."""
+
+
+def _make_room(most_mb: float) -> None:
+    """Forget what was compiled where it is too much; it comes back from the cache on disk.
+
+    Compiled functions hold memory, and memory maps as well: at vm.max_map_count (65 530 by default)
+    the next compilation is a segmentation fault.
+    """
+    global _taken
     maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > 15_000:
+    is_full = _resident_mb() > max(most_mb, _taken + 0.2 * most_mb)
+    if is_full or (maps.exists() and maps.read_bytes().count(b"\n") > 15_000):
         jax.clear_caches()
+        gc.collect()
+        with suppress(OSError, AttributeError):
+            CDLL(None).malloc_trim(0)
+        _taken = _resident_mb()
+
+
+def _resident_mb() -> float:
+    """Memory that this process holds [MB]; 0 where the system does not say."""
+    statm = Path("/proc/self/statm")
+    if not statm.exists():
+        return 0.0
+    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -1,1 +1,1 @@
-"""What a notebook imports as `slipid`: a fit and a posterior with their pictures and next steps."""
+"""Public functions of `import slipid`: fit, check, simulate, drive, export and track."""

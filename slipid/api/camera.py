@@ -3,7 +3,7 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from slipid.camera.frames.source import open_source
+from slipid.camera.frame_source import open_source
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.target import Target, read_targets
 from slipid.camera.tracking.tracking import LoneMarker, TrackingResult
@@ -39,7 +39,7 @@ def track(
     """
     above = camera if isinstance(camera, OverheadCamera) else OverheadCamera.load(camera)
     source = open_source(str(video), fps, None if times is None else Path(times))
-    above.of_size(source.image_px, source.name)
+    above.lens.check_size(source.image_px, source.name)
     # results stay in memory: nobody resumes from this folder
     with TemporaryDirectory() as folder, Reporter(quiet=quiet) as report:
         bodies: tuple[Target, ...]

@@ -1,4 +1,4 @@
-"""Fit a robot to runs: what `fit` and `check` take, in the words of a notebook."""
+"""Fit a robot to runs, with priors and choices as a notebook writes them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -42,19 +42,19 @@ def fit(
 ) -> Fit:
     """Fit motors, floors, wheel loads and camera to runs, end to end.
 
-    Names of numbers are paths such as `motor.resistance` or `surface.gray.creep`; `*` and `?`
-    stand for any text. What is not named keeps its declared prior or value.
+    Names of numbers are paths such as `motor.resistance` or `surface.gray.creep`; `*` and `?` stand
+    for any text. Numbers that are not named keep their declared prior or value.
 
     Args:
-        runs: of `read_runs`, each on one floor.
-        robot: that drove them, such as `Robot.omni(...)`.
-        priors: what is known of a number before; the number is fitted.
+        runs: runs from `read_runs`, each on one floor.
+        robot: robot that drove them, such as `Robot.omni(...)`.
+        priors: prior knowledge of numbers, which are then fitted.
         fixed: numbers that keep a value [SI].
-        start: values the search begins with [SI].
-        free: numbers that are fitted with their declared priors, where they are not by default.
-        image_centre: where the camera's tilt and distortion are zero [m].
+        start: start values of the search [SI].
+        free: numbers that are fitted with their declared priors although they are not by default.
+        image_centre: place where the camera's tilt and distortion are zero [m].
         windows_per_piece: how finely runs are cut.
-        seed: of the draws behind the bands of slip curves.
+        seed: seed of the draws behind the bands of slip curves.
         quiet: show no progress.
 
     Raises:
@@ -82,7 +82,7 @@ def fit_task_of(
     windows_per_piece: int = 4,
     seed: int = 0,
 ) -> FitTask:
-    """What is to be fitted; arguments as of `fit`."""
+    """Return the fit task of runs and choices; arguments as in `fit`."""
     full = robot_for_runs(robot, runs, image_centre)
     choices = [*fixed_viscosities(runs), *stated_sizes(full, float(full.body.mass))]
     choices += [Choice(path, free=True) for path in free]
@@ -97,5 +97,5 @@ def fit_task_of(
 
 
 def _json_numbers(value: Numbers) -> float | list[float]:
-    """A number, or a list of them, as JSON holds them."""
+    """Return a number, or a list of them, as JSON holds them."""
     return np.asarray(value, float).tolist()

@@ -1,7 +1,4 @@
-"""A deployed robot that drives on its own model: is the path kept, and does it know where it is?
-
-A deployed robot in the forms that robots load.
-"""
+"""Drive a deployed robot on its own model, and export it in the forms that robots load."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,21 +26,26 @@ from slipid.support.progress import Reporter
 
 @dataclass(frozen=True, eq=False)
 class DriveResult:
-    """One closed-loop run; `print` says what became of the path.
+    """One closed-loop run; `print` shows how well the path was kept.
 
     Attributes:
-        course: path, true and believed poses, commands and estimates, a row per period.
-        floor: the map it was driven on.
-        metrics: what became of the path, from true poses.
+        run: path, true and believed poses, commands and estimates, a row per period.
+        floor: map of the floor.
+        metrics: path errors by the true poses.
     """
 
-    course: closed_loop.ClosedLoopRun
+    run: closed_loop.ClosedLoopRun
     floor: FloorMap
     metrics: closed_loop.PathMetrics
 
+    @property
+    def course(self) -> closed_loop.ClosedLoopRun:
+        """Older name of `run`."""
+        return self.run
+
     def __str__(self) -> str:
         m = self.metrics
-        ended = "ends" if m.finished else "was given up, with the way that was left it ends"
+        ended = "ends" if m.finished else "was given up, with the remaining path it ends"
         return (
             f"{ended} {m.closure_mm:.0f} mm from where it should, turned by "
             f"{m.heading_error_deg:+.1f} deg; {m.cross_track_rmse_mm:.0f} mm beside the path (rms)"
@@ -66,30 +68,34 @@ def drive(
 
     Args:
         robot: a fit's or a posterior's `deploy()`, or `DeployedRobot.load`.
-        controller: as of `slipid trial`: `encoder`, `contact`, `contact_map`, `contact_gyro`, ...
+        controller: a controller of `slipid trial`: `encoder`, `contact`, `contact_map`,
+            `contact_gyro`, ...
         map: file of a floor map; patches of the robot's floors by default.
-        path: `rectangle`, `circle`, `eight` or `turning`; speed: along it [m/s].
-        start: which of twenty poses on the map.
-        seed: of the sensors' noise.
+        path: `rectangle`, `circle`, `eight` or `turning`.
+        speed: speed along it [m/s].
+        start: number of one of twenty start poses on the map.
+        seed: seed of the sensors' noise.
 
     Raises:
         ValueError: no such controller or start, or wheels that have no controller.
-        DataError: no such path or map, a speed beyond what the fit has seen, or a floor that the
-            robot does not know.
+        DataError: no such path or map, a speed beyond those of the fit, or a floor that the robot
+            does not know.
     """
     if not robot.steers:
         raise ValueError(NO_CONTROLLER)
-    course = path_of(path, speed, robot)
+    reference = path_of(path, speed, robot)
     floor = twin_floor(robot) if map is None else read_map(Path(map))
     require_known_surfaces(floor, robot, str(map))
-    places = starts(20, floor, course)
+    places = starts(20, floor, reference)
     if controller not in ROWS or not 0 <= start < len(places):
         names = ", ".join(ROWS)
         raise ValueError(f"controller '{controller}' from start {start}; expected {names}; 0 to 19")
     row, begin = ROWS[controller], places[start]
     plant = twin_plant(robot, floor, begin, seed, actuator_model_of(robot, gyro=row.gyro))
     loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
-    driven = closed_loop.run_closed_loop(loop, course.moved(begin).after_rest(REST_S), plant, begin)
+    driven = closed_loop.run_closed_loop(
+        loop, reference.moved(begin).after_rest(REST_S), plant, begin
+    )
     return DriveResult(driven, floor, closed_loop.path_metrics(driven))
 
 
@@ -103,21 +109,22 @@ def export(
     speed: float = 0.2,
     map: Path | str | None = None,
 ) -> Exported:
-    """Write a robot to a folder: robot.json, a README, checksums, and what is made of it.
+    """Write a robot to a folder: robot.json, a README, checksums, and the exported forms.
 
     Args:
-        robot: a fit's or a posterior's `deploy()`, or `DeployedRobot.load`; `on(...)` leaves
-            floors out.
-        folder: that is new, empty, or an older export, which is then replaced.
+        robot: a fit's or a posterior's `deploy()`, or `DeployedRobot.load`; `on(...)` leaves floors
+            out.
+        folder: a new or empty folder, or an older export, which is then replaced.
         to: `c` (C99 of the very steps of estimator and controller), `ros2` (parameters by the names
             of ros2_controllers and robot_localization), `stablehlo`, `table` (Markdown and CSV).
-        controller: as of `slipid trial`.
-        path: that the example in C follows; speed: along it [m/s].
-        map: file of a floor map, for `contact_map`, which is told one.
+        controller: a controller of `slipid trial`.
+        path: path that the example in C follows.
+        speed: speed along it [m/s].
+        map: file of a floor map, for `contact_map`, which needs one.
 
     Raises:
-        DataError: no such form, controller or path, a step that has no form in C, or other files
-            lie there.
+        DataError: no such form, controller or path, a step that has no form in C, or a folder with
+            other files.
     """
     file = None if map is None else Path(map)
     options = ExportOptions(tuple(to), controller, path, speed, map=file)

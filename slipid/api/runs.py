@@ -1,7 +1,4 @@
-"""What runs hold and can tell, before anything is fitted.
-
-A robot whose every number is known: its runs, to learn on, and what it does with a command.
-"""
+"""Check runs before a fit, simulate runs with known numbers, and predict steady motions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,11 +24,11 @@ from slipid.support.content import Content
 
 @dataclass(frozen=True, eq=False)
 class LogCheck:
-    """What runs hold and can be expected to tell; `print` shows it, `check[path]` is one number.
+    """Content of runs and expected verdicts; `print` shows it, `check[path]` is one number.
 
     Attributes:
-        content: runs by floor, channels, what the reader repaired.
-        result: verdicts that can be expected, and what stays open.
+        content: runs by floor, channels, repairs of the reader.
+        result: expected verdicts, and what stays unknown.
     """
 
     content: Content
@@ -41,7 +38,7 @@ class LogCheck:
         return text_of(show_check, self.content | self.result.to_json())
 
     def __getitem__(self, path: str) -> Estimate:
-        """What is to be expected of one number; KeyError where there is none of this name."""
+        """Return the expected estimate of one number; raise `KeyError` for an unknown path."""
         return self.result.parameters[path]
 
 
@@ -53,18 +50,18 @@ def check(
     fixed: Mapping[str, Numbers] | None = None,
     free: Sequence[str] = (),
 ) -> LogCheck:
-    """Look before you fit: arguments and errors as of `fit`, which takes far longer."""
+    """Check runs before a fit, which takes far longer; arguments and errors as in `fit`."""
     task = fit_task_of(runs, robot, priors or {}, fixed or {}, {}, free)
     return LogCheck(overview(task), expected(task, task.problem()))
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRuns:
-    """Made runs and what is true of them.
+    """Simulated runs and their truth.
 
     Attributes:
-        runs: as `read_runs` would give them.
-        robot: that drove them, a three-wheeled Robotino; no fit sees it.
+        runs: the runs, as `read_runs` would return them.
+        robot: robot that drove them, a three-wheeled Robotino; no fit sees it.
     """
 
     runs: Runs
@@ -87,19 +84,22 @@ def simulate_runs(
     voltage: bool = True,
     seed: int = 0,
 ) -> SimulatedRuns:
-    """Drive a grid of runs with known numbers, seen by noisy sensors as those of a real Robotino.
+    """Simulate a grid of runs with known numbers and with sensor noise like a real Robotino's.
+
+    Its older name `made_runs` still works.
 
     Args:
-        floors: their names; `firm` and `soft` have numbers of their own, others the declared ones.
-        headings: evenly spread, on every floor at every speed.
-        speeds: [m/s].
-        turns: curved runs beside them, at every speed.
-        truth: numbers that are to be others, by path [SI].
+        floors: names of the floors; `firm` and `soft` have numbers of their own, others the
+            declared ones.
+        headings: number of headings, evenly spread, on every floor at every speed.
+        speeds: speeds [m/s].
+        turns: number of curved runs beside them, at every speed.
+        truth: other true numbers, by path [SI].
         current, voltage: whether those of the motors are logged.
-        seed: of the noise.
+        seed: seed of the noise.
 
     Raises:
-        ValueError: no such number; names those there are.
+        ValueError: no such number; the message lists those there are.
     """
     drives = known.heading_grid([(floor, "as_built") for floor in floors], headings, speeds, turns)
     robot = known.true_robot(drives, truth)
@@ -118,11 +118,11 @@ class SteadyMotion:
     """Steady motions, a row per command.
 
     Attributes:
-        twist: of the body, x [m/s], y [m/s], yaw rate [rad/s].
-        wheel_speed: that the command asks for [rad/s].
-        slip: 1 - v / (r w) of every wheel along its drive; of one that stands it is no number.
-        torque: of the traction at every wheel, positive where it drives [N m].
-        current: of every motor, positive where it drives [A].
+        twist: twist of the body: x [m/s], y [m/s], yaw rate [rad/s].
+        wheel_speed: commanded speed of each wheel [rad/s].
+        slip: 1 - v / (r w) of every wheel along its drive; NaN for a wheel that stands.
+        torque: torque of the traction at every wheel, positive where it drives [N m].
+        current: current of every motor, positive where it drives [A].
     """
 
     twist: Float[np.ndarray, "command 3"]
@@ -135,11 +135,13 @@ class SteadyMotion:
 def steady_motion(
     robot: Robot, floor: str, command: Sequence[Sequence[float]] | np.ndarray, load: str = ""
 ) -> SteadyMotion:
-    """Steady motion of a robot whose wheels keep the speeds that commands ask for.
+    """Return the steady motion of a robot whose wheels keep the commanded speeds.
+
+    Its older name `move` still works.
 
     Args:
-        robot: with its numbers, such as `fit.robot`.
-        floor: name.
+        robot: robot with its numbers, such as `fit.robot`.
+        floor: name of the floor.
         command: body twists x [m/s], y [m/s], yaw rate [rad/s], a row each.
         load: name of the load set-up, the first one by default.
 
@@ -162,11 +164,11 @@ def _steady(
     def one(row: Float[Array, "3"]) -> tuple[Array, ...]:
         driven = robot.geometry.forward() @ row / frame.radius
         speed = robot.geometry.at_wheels(driven)
-        way, stands = jnp.sign(speed), jnp.abs(speed) < 1e-6
+        direction, stands = jnp.sign(speed), jnp.abs(speed) < 1e-6
         xi = twist(robot, frame, speed, floor, load)
         torque = wheel_torque(robot, frame, xi, speed, floor, load)
         rim = jnp.where(stands, jnp.nan, frame.radius * frame.drive_share * speed)
         current = motor_current(robot, frame, xi, driven, floor, load) * jnp.sign(driven)
-        return xi, speed, 1 - frame.hold @ xi / rim, torque * way, current
+        return xi, speed, 1 - frame.hold @ xi / rim, torque * direction, current
 
     return jax.vmap(one)(command)

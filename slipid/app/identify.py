@@ -128,7 +128,7 @@ def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
     if config["sha256"] == task.config.hash and data["hash"] == task.data_hash:
         return None
     other = "other logs" if config["sha256"] == task.config.hash else f"another {config['name']}"
-    return f"{out} holds a fit of {other}; it is replaced when this one is done"
+    return f"{out} has a fit of {other}; it is replaced when this one is done"
 
 
 def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:
@@ -165,10 +165,9 @@ def optimised(
 ) -> tuple[Problem, Optimum]:
     """Return the optimum of a task and the problem it belongs to, starting from `task.problem()`.
 
-    Windows are cut again, which makes another problem, where the fitted lag is far from the
-    expected
-    one (see `FitTask.cutting_robot`). The fit continues from the checkpoint of this very task, and
-    every round is kept there.
+    Windows are cut again, which makes another problem, where the fitted lag differs from the
+    expected one (see `FitTask.cutting_robot`). The fit continues from the checkpoint of this very
+    task, and every round is kept there.
     """
     optimum = _optimised(task, problem, _restored(kept, report), kept, report)
     robot = task.cutting_robot(problem.space.tree(optimum.state.z))

@@ -57,6 +57,20 @@ class Lens:
             return flat.reshape(np.shape(pixels))
         return ideal_points(flat, self.matrix, self.distortion).reshape(np.shape(pixels))
 
+    def check_size(self, image_px: tuple[int, int], source: Path | str) -> None:
+        """Check that images have the size at which the lens was calibrated.
+
+        Raises:
+            DataError: they have another; a smaller image may be a part of the picture or shrunk.
+        """
+        if tuple(image_px) != tuple(self.image_px):
+            w, h = self.image_px
+            raise DataError(
+                f"{source}: images of {image_px[0]} x {image_px[1]} pixels, but the camera was "
+                f"calibrated at {w} x {h}; expected the same resolution: record at it, or "
+                "calibrate at this one"
+            )
+
 
 @dataclass(frozen=True, eq=False)
 class OverheadCamera:
@@ -132,20 +146,6 @@ class OverheadCamera:
             depth = (height_m - self.place[2]) / rays[..., 2:]
             xy = self.place[:2] + depth * rays[..., :2]
         return np.asarray(np.where(depth > 0, xy, np.nan))
-
-    def of_size(self, image_px: tuple[int, int], source: Path | str) -> None:
-        """Check that images have the size at which the camera was calibrated.
-
-        Raises:
-            DataError: they have another; a smaller image may be a part of the picture or shrunk.
-        """
-        if tuple(image_px) != tuple(self.lens.image_px):
-            w, h = self.lens.image_px
-            raise DataError(
-                f"{source}: images of {image_px[0]} x {image_px[1]} pixels, but the camera was "
-                f"calibrated at {w} x {h}; expected the same resolution: record at it, or "
-                "calibrate at this one"
-            )
 
     def to_json(self) -> Content:
         """Return the content of a camera file, as `load` reads it."""

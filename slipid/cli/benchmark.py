@@ -17,9 +17,7 @@ def benchmark(
     out: Out = Path("out/benchmark"),
     quick: Annotated[
         bool,
-        typer.Option(
-            "--quick", help="Some of the runs, one fold of headings, floors that are told."
-        ),
+        typer.Option("--quick", help="Some of the runs, one fold of headings, given floors."),
     ] = False,
     rows: Annotated[
         str | None, typer.Option(metavar="NAMES", help="Rows, by commas; all by default.")
@@ -28,14 +26,14 @@ def benchmark(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Every published slip system on the same logs, beside slipid: one table, with intervals.
+    """Run every published slip system on the same logs beside slipid: one table, with intervals.
 
-    The folder of --data has those of the public data sets: robotino2022, robotino2021, drive_skid,
-    borealtc; what is absent is left out. Recorded runs of the virtual test site are always there.
-    It takes about 17 minutes on two cores, --quick about two, and three the first time. Rows are
-    published systems by name, such as ojeda_gyro or quann_slip; a wrong name is answered by all.
-    Writes benchmark.json and benchmark.html. What is done is kept: called again after an interrupt
-    it goes on from there. The exit code is 1 where anything failed.
+    The folder of --data has the folders of the public data sets: robotino2022, robotino2021,
+    drive_skid, borealtc; absent ones are skipped. Recorded runs of the virtual test site are always
+    included. It takes about 17 minutes on two cores, --quick about two, and three the first time.
+    Rows are published systems by name, such as ojeda_gyro or quann_slip; a wrong name lists all of
+    them. Writes benchmark.json and benchmark.html. An interrupted benchmark is continued from what
+    is done. The exit code is 1 where anything failed.
     """
     from slipid.lab.benchmark.benchmark import benchmark as run
     from slipid.lab.benchmark.plots import benchmark_pictures
@@ -56,11 +54,11 @@ def benchmark(
         for row in protocol.values()
     ]
     others = [*found["floors"].values(), found["rectangle"] or {}]
-    felt = [row for one in others for row in one.get("rows", [])]
+    floor_rows = [row for one in others for row in one.get("rows", [])]
     failed = [
         *found["unread"],
         *(row for row in every if row["failed"]),
         *(one for one in others if "failed" in one),
-        *(row for row in felt if row["absent"]),
+        *(row for row in floor_rows if row["absent"]),
     ]
     return 1 if failed else 0

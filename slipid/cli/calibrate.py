@@ -86,8 +86,8 @@ def calibrate(
 
     The lens comes from PICTURE... or --camera, the floor from --floor or --points. The world's
     origin is on the floor below the middle of the lying board, x along its columns, y up its rows,
-    z up; or as the points say. Without any calibration, --metres-per-pixel and --lens-height make
-    a camera that looks straight down: origin in the middle of the picture, x right, y up.
+    z up; or as the points say. Without any calibration, --metres-per-pixel and --lens-height make a
+    camera that looks straight down: origin in the middle of the picture, x right, y up.
 
     A point h above the floor, seen from a height H, appears H / (H - h) times as far from the point
     below the lens as it is: with H = 2.4 m and h = 0.25 m lengths read on the floor would be 11.6 %

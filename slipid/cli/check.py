@@ -1,4 +1,4 @@
-"""`slipid check`: what logs can tell, before any fit."""
+"""`slipid check`: what logs can identify, before any fit."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,11 +18,11 @@ def check(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Read and validate logs; say what is wrong and what they can tell before anything is fitted.
+    """Read and validate logs; report errors, and what a fit can be expected to identify.
 
-    Exit code 1 where logs and config do not go together.
+    Exit code 1 where logs and config contradict each other.
     """
-    from slipid.app import check as job
+    from slipid.app import check as checks
     from slipid.app.config import BenchMotors, read_config
     from slipid.report.estimates import show_check
 
@@ -30,7 +30,7 @@ def check(
     if isinstance(wanted.content.robot, BenchMotors):
         return bench(wanted, data, out, json, quiet)
     with Reporter(quiet=quiet) as report:
-        logs, found = job.check(config, data, out, report)
+        logs, found = checks.check(config, data, out, report)
         if out is not None:
             from slipid.plots.fit import raw_plots
 
@@ -41,7 +41,7 @@ def check(
 
 
 def bench(config: "Config", data: Path, out: Path | None, json: str | None, quiet: bool) -> int:
-    """The same for motors on a bench."""
+    """Check the logs of motors on a bench."""
     from slipid.app.bench import check_bench
     from slipid.report.estimates import show_bench_check
 

@@ -1,4 +1,4 @@
-"""What commands share: types of their options, exit codes, JSON for programs."""
+"""Shared by all commands: option types, exit codes, and JSON output for programs."""
 
 import functools
 import os
@@ -39,7 +39,7 @@ Words = ParamSpec("Words")
 
 
 def executor_of(jobs: int | None) -> "Executor":
-    """So many processes, by default one for every core; this one where that is one."""
+    """Return an executor with `jobs` processes, by default one per core; 1 means this process."""
     from slipid.support.executor import InProcess, Processes
 
     count = jobs or os.cpu_count() or 1
@@ -47,14 +47,14 @@ def executor_of(jobs: int | None) -> "Executor":
 
 
 def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
-    """Bad input is one message and exit code 2, an interrupt 130; neither is a traceback."""
+    """Turn bad input into one message and exit code 2, an interrupt into exit code 130."""
 
     @functools.wraps(command)
     def run(*args: Words.args, **options: Words.kwargs) -> None:
         try:
             code = command(*args, **options)
         except KeyboardInterrupt:
-            typer.echo("interrupted; called again, it goes on from what was kept, if any", err=True)
+            typer.echo("interrupted; the next call goes on from what was kept, if any", err=True)
             raise typer.Exit(130) from None
         except DataError as error:
             typer.echo(str(error), err=True)
@@ -65,7 +65,7 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
 
 
 def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:
-    """`guarded`, of a command that has nothing to say of a motor on a bench: it says so first.
+    """Like `guarded`, for a command that does not apply to a motor on a bench and says so first.
 
     The config, or the folder of a result, is the first path among the arguments of a command.
     """
@@ -85,7 +85,7 @@ def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:
 
 
 def is_bench(path: Path) -> bool:
-    """Whether a config, or the folder of a result, is of a motor on a bench."""
+    """Return True where a config, or the folder of a result, is of a motor on a bench."""
     import tomllib
 
     if path.is_dir():
@@ -94,7 +94,7 @@ def is_bench(path: Path) -> bool:
         path = path / "config.toml"
     try:
         robot = tomllib.loads(path.read_text(encoding="utf-8")).get("robot")
-    except (OSError, ValueError):  # the command itself says what is wrong with it
+    except (OSError, ValueError):  # the command itself reports the error
         return False
     return isinstance(robot, dict) and robot.get("drive") == "motor"
 
@@ -106,9 +106,10 @@ def emit(
     out: Path | None = None,
     written: Sequence[str] = (),
 ) -> None:
-    """Show a result to people, with the files written to `out`; as JSON where `--json` says so.
+    """Print a result for people with the files written to `out`; write JSON where `--json` says so.
 
-    That is a file, written whole or not at all, or `-`: stdout, which then has nothing else.
+    The JSON goes to a file, which is written whole or not at all, or for `-` to stdout, which then
+    has nothing else.
     """
     from slipid.report.page import Page
     from slipid.support.files import json_text, write_json

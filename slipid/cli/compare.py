@@ -14,15 +14,15 @@ def compare(
     data: DataFolder,
     out: Out,
     folds: Annotated[
-        str, typer.Option("--folds", metavar="NAMES", help="What is left out, by commas.")
+        str, typer.Option("--folds", metavar="NAMES", help="Kinds of held-out runs, by commas.")
     ] = "sectors,speeds,random",
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Say which slip model is right for each floor, or that the data cannot tell.
+    """Say which slip model is right for each floor, or that the data cannot decide it.
 
     Every model is fitted without some runs and judged on them. Writes comparison.json and a
-    picture; finished folds are kept and not done again.
+    picture; finished folds are kept and not fitted again.
     """
     from slipid.app.compare import compare as run
     from slipid.plots.compare import compare_plot

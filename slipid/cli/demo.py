@@ -1,4 +1,4 @@
-"""`slipid demo`: logs of the virtual test site, the main job on them, and how near it came."""
+"""`slipid demo`: identify a robot from logs of the virtual test site, and show the truth."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from slipid.app.identify import IdentifyResult
 
 PARTS = ("fit", "unseen")
-"""What is fitted, and what is predicted: folders, and configs `testsite_<part>.toml`."""
+"""Folders of the runs to fit and to predict; their configs are `testsite_<part>.toml`."""
 
 
 @guarded
@@ -26,11 +26,11 @@ def demo(
         str, typer.Option(metavar="NAME", help="recorded, or mujoco to drive the logs anew.")
     ] = "recorded",
     seed: Annotated[
-        int | None, typer.Option("--seed", min=0, help="Of the runs that are driven anew.")
+        int | None, typer.Option("--seed", min=0, help="Seed of runs that are driven anew.")
     ] = None,
     quiet: Quiet = False,
 ) -> int:
-    """The whole job on logs of the virtual test site, small: a folder to look at."""
+    """Run the whole chain on small logs of the virtual test site: a folder to look at."""
     with Reporter(quiet=quiet) as report, executor_of(None) as executor:
         done, found, truth = run(out, plant, seed, executor, report)
     from slipid.report.estimates import show_truth, show_validation
@@ -50,10 +50,10 @@ def demo(
 def run(
     out: Path, plant: str, seed: int | None, executor: "Executor", report: Reporter
 ) -> tuple["IdentifyResult", Content, Content]:
-    """Logs of the test site, identify, predict unseen runs: the fit, what validate says, the truth.
+    """Return a fit to logs of the test site, the predictions of unseen runs, and the truth.
 
     Raises:
-        DataError: no such plant, a seed for what is recorded, or MuJoCo is missing.
+        DataError: no such plant, a seed for recorded logs, or MuJoCo is missing.
     """
     from slipid.app.logs import packaged_config, unpack
     from slipid.cli.identify import run as identify

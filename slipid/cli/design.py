@@ -30,16 +30,16 @@ def design(
     ] = None,
     runs: Annotated[int, typer.Option(min=1, max=1000, help="How many to propose.")] = 12,
     headings: Annotated[
-        str | None, typer.Option(metavar="LIST", help="Of candidates, as 0,45,90, in deg.")
+        str | None, typer.Option(metavar="LIST", help="Headings of candidates, as 0,45,90, in deg.")
     ] = None,
     speeds: Annotated[
-        str | None, typer.Option(metavar="LIST", help="Of candidates, as 0.1,0.2, in m/s.")
+        str | None, typer.Option(metavar="LIST", help="Speeds of candidates, as 0.1,0.2, in m/s.")
     ] = None,
     turns: Annotated[
         str | None, typer.Option(metavar="LIST", help="Turning rates, as -40,0,40, in deg/s.")
     ] = None,
     distance: Annotated[
-        float | None, typer.Option(metavar="M", help="Of every run, in m; as driven by default.")
+        float | None, typer.Option(metavar="M", help="Length of a run, in m; as driven by default.")
     ] = None,
     floor: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Floor that can be driven on.")
@@ -50,7 +50,7 @@ def design(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Propose the next runs: those that shrink a parameter or a prediction most.
+    """Propose the next runs: those that most reduce the uncertainty of a parameter or a prediction.
 
     Writes design.json, design.png and design_commands.csv to OUT.
     """
@@ -60,8 +60,8 @@ def design(
     from slipid.report.answers import show_design
     from slipid.support.jax_setup import setup_jax
 
-    ways = headings, speeds, turns, distance
-    wanted = DesignOptions(parameter or (), predict or (), runs, *ways, floor or (), load or ())
+    motions = headings, speeds, turns, distance
+    wanted = DesignOptions(parameter or (), predict or (), runs, *motions, floor or (), load or ())
     with Reporter(quiet=quiet) as report:
         setup_jax(quiet=True)
         fit = load_fit(out)
@@ -74,7 +74,7 @@ def design(
 
 
 def write(found: "Design", out: Path) -> list[str]:
-    """Write a design; where it proposes no runs, files of an earlier one do not stay."""
+    """Write a design; files of an earlier one are removed where it proposes no runs."""
     from slipid.infer.design.proposal import commands
     from slipid.plots.design import design_figure
     from slipid.plots.drawing import save

@@ -1,4 +1,4 @@
-"""`slipid export`: a folder for a robot, in the forms that the field uses."""
+"""`slipid export`: a folder for a robot, in the forms that robots load."""
 
 from pathlib import Path
 from typing import Annotated
@@ -44,7 +44,7 @@ def export(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Write robot.json and what is made of it to a folder: C99, ROS 2, StableHLO, tables of gains.
+    """Write robot.json and its exported forms to a folder: C99, ROS 2, StableHLO, tables of gains.
 
     The folder has a README, and the checksum of every file. With --check nothing is written, and
     exit code 2 says that a byte was changed.

@@ -1,4 +1,4 @@
-"""`slipid identify`: the fit, end to end."""
+"""`slipid identify`: fit a robot to its logs."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -64,7 +64,7 @@ def run(
     profiles: Sequence[str] = (),
     anyway: bool = False,
 ) -> "IdentifyResult":
-    """The fit and its pictures; arguments as of `slipid.app.identify.identify`.
+    """Return the fit and write its pictures; arguments as in `slipid.app.identify.identify`.
 
     Raises:
         DataError: config or logs are wrong; nothing was written then.
@@ -81,7 +81,7 @@ def run(
     try:
         warning = done.trust.warning
         drawn += identify_plots(done.fit, done.task.dataset, out, warning)
-    except DataError as error:  # the numbers are written; a run too short to draw spoils none
+    except DataError as error:  # the numbers are written even if a run is too short to draw
         report.line(f"no more pictures: {error}")
     if done.profiles:
         drawn.append(save(profile_figure(done.profiles), out / "profile.png"))
@@ -91,7 +91,7 @@ def run(
 def bench(
     config: "Config", data: Path, out: Path, profile: Sequence[str], json: str | None, quiet: bool
 ) -> int:
-    """The same for motors on a bench."""
+    """Identify motors on a bench."""
     from slipid.app.bench import identify_bench
     from slipid.plots.bench import bench_plots
     from slipid.report.estimates import show_bench

@@ -42,11 +42,11 @@ for command in (
     app.command(command.__name__.rstrip("_"))(command)  # map is a word of Python
 
 AGAIN_S = 0.05
-"""After which an interrupt is sent again that Python had to ignore."""
+"""Time after which an interrupt that Python had to ignore is sent again [s]."""
 
 
 def main() -> None:
-    """Entry point of the `slipid` command."""
+    """Run the `slipid` command."""
     sys.unraisablehook = _interrupt_again
     app()
 
@@ -58,7 +58,7 @@ def _interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
     """
     if lost.exc_type is KeyboardInterrupt:
         again = threading.Timer(AGAIN_S, _thread.interrupt_main)
-        again.daemon = True  # a command that has ended by then is left in peace
+        again.daemon = True  # a command that has ended by then is not disturbed
         again.start()
     else:
         sys.__unraisablehook__(lost)

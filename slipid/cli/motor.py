@@ -1,4 +1,4 @@
-"""`slipid motor`: a motor on a bench, from a single file."""
+"""`slipid motor`: identify a motor on a bench from a single file."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,18 +19,18 @@ def motor(
         str | None, typer.Option(metavar="NAME[:UNIT]", help="Column of the time, in s.")
     ] = None,
     voltage: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="Across the motor, in V.")
+        str | None, typer.Option(metavar="NAME[:UNIT]", help="Voltage across the motor, in V.")
     ] = None,
     current: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="In A; I:mA for others.")
+        str | None, typer.Option(metavar="NAME[:UNIT]", help="Current in A; I:mA for others.")
     ] = None,
     speed: Annotated[
         str | None,
-        typer.Option(metavar="NAME[:UNIT]", help="Of the motor shaft, in rad/s; w:rpm for others."),
+        typer.Option(metavar="NAME[:UNIT]", help="Speed of the shaft, in rad/s; w:rpm for others."),
     ] = None,
     angle: Annotated[
         str | None,
-        typer.Option(metavar="NAME[:UNIT]", help="Of the motor shaft, in rad, for the speed."),
+        typer.Option(metavar="NAME[:UNIT]", help="Angle of the shaft, in rad, for the speed."),
     ] = None,
     duty: Annotated[
         str | None, typer.Option(metavar="NAME[:UNIT]", help="Share of the bus voltage; d:% too.")
@@ -42,16 +42,17 @@ def motor(
         bool, typer.Option("--unsigned", help="The current is a magnitude.")
     ] = False,
     delimiter: Annotated[
-        str | None, typer.Option(metavar="CHARACTER", help="Between cells; guessed by default.")
+        str | None,
+        typer.Option(metavar="CHARACTER", help="Text between cells; guessed by default."),
     ] = None,
     out: MaybeOut = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Resistance, back-EMF, friction, inertia and more of a motor, from voltage, current and speed.
+    """Identify a motor's resistance, back-EMF, friction and inertia from voltage, current, speed.
 
     Columns that are not named are guessed. Several motors: names by commas. The speed must be that
-    of the motor shaft: no log shows that it was columns_used behind a gear. With --out it writes
+    of the motor shaft: no log shows that it was taken behind a gear. With --out it writes
     motor.json and a picture. Exit code 1 where the model does not explain the log.
     """
     from slipid.app.bench import read_motor_log
@@ -83,7 +84,7 @@ def motor(
 
 
 def _given(columns: dict[str, str | None]) -> "dict[str, GivenColumns]":
-    """What was named, by channel."""
+    """Return the columns named on the command line, by channel."""
     from slipid.data.reading.motor_layout import given_columns
 
     given = {channel: text for channel, text in columns.items() if text is not None}

@@ -1,4 +1,4 @@
-"""`slipid new`: a config for a robot that nobody has described yet."""
+"""`slipid new`: write a config for a new robot."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -29,7 +29,7 @@ def new(
         typer.Option(
             "--from",
             metavar="LOG",
-            help="A log (CSV, Parquet, bag) or a folder of logs to look into; asks nothing.",
+            help="A log (CSV, Parquet, bag) or a folder of logs to read; asks nothing.",
         ),
     ] = None,
     drive: Annotated[Text, _text("omni, mecanum, skid, differential or general.")] = None,
@@ -53,7 +53,7 @@ def new(
         Text, _text("General: x,y of the wheels, as '0.2,0.1; 0.2,-0.1'.", _WHEELS)
     ] = None,
     directions_deg: Annotated[
-        Text, _text("General: ways that the wheels roll, as 0,0.", _WHEELS)
+        Text, _text("General: directions of the wheels, as 0,0.", _WHEELS)
     ] = None,
     rollers_deg: Annotated[Text, _text("General: rollers to these, as 45,none.", _WHEELS)] = None,
     yes: Annotated[
@@ -61,7 +61,7 @@ def new(
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False,
 ) -> int:
-    """Write a commented config for your robot: asks for it, or looks into its logs (--from)."""
+    """Write a commented config for your robot: asks for it, or reads its logs (--from)."""
     from slipid.app.new.config_text import new_config, refuse_existing
     from slipid.app.new.draft import template_draft
     from slipid.app.new.propose import propose
@@ -98,7 +98,7 @@ def new(
 
 
 def _ask(asks: str, default: str, wrong: str) -> str:
-    """A person's answer."""
+    """Return the user's answer."""
     from slipid.support.errors import DataError
 
     if wrong:
@@ -109,13 +109,13 @@ def _ask(asks: str, default: str, wrong: str) -> str:
         if wrong:
             raise DataError(f"{asks}: {wrong}") from None
         raise DataError(
-            f"{asks}: no answer; expected one, an option that says it (slipid new --help), "
+            f"{asks}: no answer; expected one, an option with it (slipid new --help), "
             "or --yes for the defaults"
         ) from None
 
 
 def _show(config: "NewConfig", out: Path, data: str) -> None:
-    """The robot as it was understood, what is still open, and what comes next."""
+    """Print the robot as it was understood, the open questions, and the next command."""
     typer.echo(f"\n{config.drawing}\n")
     if config.questions:
         typer.echo(f'{out} has open questions, lines that begin with "# ?":')
@@ -125,5 +125,5 @@ def _show(config: "NewConfig", out: Path, data: str) -> None:
     else:
         typer.echo(f"{out} is complete; run")
     typer.echo(f"  slipid check {out} --data {data}")
-    typer.echo("or, before anything is driven, see what a plan of runs would tell:")
+    typer.echo("or, before anything is driven, see what a plan of runs would identify:")
     typer.echo(f"  slipid selftest {out}")

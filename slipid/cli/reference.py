@@ -1,4 +1,4 @@
-"""`slipid reference`: what a config may say, from the models that check it."""
+"""`slipid reference`: every key of a config, from the models that check configs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -24,7 +24,7 @@ def reference(
         ),
     ] = None,
 ) -> int:
-    """Every key, channel, unit and parameter, with its default and what it means (Markdown)."""
+    """Print every key, channel, unit and parameter, with its default and its meaning (Markdown)."""
     from slipid.app.config import read_config
     from slipid.app.reference.page import reference
 

@@ -1,4 +1,4 @@
-"""`slipid sample`: the posterior of a fit."""
+"""`slipid sample`: sample the posterior of a fit."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,12 +14,12 @@ from slipid.support.progress import Reporter
 def sample(
     out: OutFolder,
     data: Annotated[
-        Path | None, typer.Option("--data", metavar="DIR", help="Where the logs are now.")
+        Path | None, typer.Option("--data", metavar="DIR", help="Folder of the logs, if it moved.")
     ] = None,
     draws: Annotated[
-        int, typer.Option("--draws", min=10, help="Kept of each of four ensembles.")
+        int, typer.Option("--draws", min=10, help="Draws kept of each of four ensembles.")
     ] = 400,
-    most: Annotated[int, typer.Option("--most", min=40, help="Blocks before it gives up.")] = 400,
+    most: Annotated[int, typer.Option("--most", min=40, help="Largest number of blocks.")] = 400,
     block: Annotated[
         int, typer.Option("--block", min=1, hidden=True, help="Steps that are kept together.")
     ] = 20,
@@ -27,7 +27,7 @@ def sample(
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Posterior of a fit by emcee: honest intervals, posterior.nc; goes on after an interrupt."""
+    """Sample the posterior of a fit by emcee for honest intervals; continues after an interrupt."""
     from slipid.report.estimates import show_sample
     from slipid.support.files import read_json
 
@@ -44,7 +44,7 @@ def sample(
         report.stage("drawing")
         drawn = posterior_plots(done.posterior, out)
     content = read_json(out / "identified.json", "what sample wrote")
-    told = done.posterior.parameters.values(), done.about, content["messages"]
+    shown = done.posterior.parameters.values(), done.about, content["messages"]
     written = (*done.written, *robot, *(path.name for path in drawn))
-    emit(json, content, lambda page: show_sample(page, *told), out, written)
+    emit(json, content, lambda page: show_sample(page, *shown), out, written)
     return 0 if done.posterior.converged else 1

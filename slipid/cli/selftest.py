@@ -1,4 +1,4 @@
-"""`slipid selftest`: what an experiment can recover."""
+"""`slipid selftest`: test what an experiment can recover."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,15 +17,15 @@ def selftest(
         typer.Option("--data", metavar="DIR", help="Logs whose wheel motion is taken, if any."),
     ] = None,
     out: Out = Path("selftest_out"),
-    replicates: Annotated[int, typer.Option(min=1, help="Made experiments.")] = 8,
-    seed: Annotated[int, typer.Option(min=0, help="Of truths and noise.")] = 0,
+    replicates: Annotated[int, typer.Option(min=1, help="Number of simulated experiments.")] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of truths and noise.")] = 0,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    r"""Make this very experiment with known truth, fit it, and say what it recovers.
+    r"""Simulate this very experiment with known truth, fit it, and report what it recovers.
 
     Without --data it is the plan of \[selftest] in the config. Writes selftest.json; goes on from
-    the replicates that are done. Exit code 1 where a number that is wanted is not recovered.
+    the replicates that are done. Exit code 1 where a wanted number is not recovered.
     """
     from slipid.lab.selftest.experiment import selftest as run
     from slipid.report.estimates import show_selftest

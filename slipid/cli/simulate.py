@@ -1,4 +1,4 @@
-"""`slipid simulate`: logs from the virtual test site."""
+"""`slipid simulate`: make logs on the virtual test site."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def simulate(
     config: ConfigFile, out: Out, jobs: Jobs = None, json: Json = None, quiet: Quiet = False
 ) -> int:
-    r"""Logs from the virtual test site, whose physics is MuJoCo's; needs slipid\[testsite].
+    r"""Make logs on the virtual test site, whose physics is MuJoCo's; needs slipid\[testsite].
 
     Writes logs, a config that identifies them, floor maps, and the truth in a folder of its own.
     Runs that are done are kept and not driven again.
@@ -33,17 +33,17 @@ def simulate(
 
 
 def show(page: "Page", found: Content, plan: "SimulationPlan", out: Path) -> None:
-    """Print how much was driven, and what to do with it."""
+    """Print how much was driven, and the next command."""
     from slipid.lab.testsite.config import can_identify
 
     page.line(f"{len(found['runs'])} runs, {found['driven']} of them driven now")
     if found["pace"] is not None:
         page.line(f"{found['seconds']:.0f} s at {found['pace']:.1f} times real time")
-    page.line(f"truth, which nothing reads that fits: {out / 'truth'}")
-    jobs = {}
+    page.line(f"truth, which no fit reads: {out / 'truth'}")
     if can_identify(plan):
-        jobs[out / "robot.toml"] = (out / "logs", out / "result")
+        page.line(
+            f"  slipid identify {out / 'robot.toml'} --data {out / 'logs'} --out {out / 'result'}"
+        )
     if "robotino2022" in plan.content.formats:
-        jobs[Path("configs/robotino2022.toml")] = (out / "robotino2022", out / "result2022")
-    for config, (data, result) in jobs.items():
-        page.line(f"  slipid identify {config} --data {data} --out {result}")
+        data, result = out / "robotino2022", out / "result2022"
+        page.line(f"  slipid identify configs/robotino2022.toml --data {data} --out {result}")

@@ -74,7 +74,7 @@ def track(
     Every frame has a row with pose and covariance, or with the reason why it was rejected; nothing
     is interpolated. The exit code is 1 where the poses should not be used as they are.
     """
-    from slipid.camera.frames.source import open_source
+    from slipid.camera.frame_source import open_source
     from slipid.camera.overhead import OverheadCamera
     from slipid.camera.tracking import tracking
     from slipid.camera.tracking.target import read_targets
@@ -85,7 +85,7 @@ def track(
         part = _region(region)
         frames = open_source(source, fps, times, seconds)
         tracking.check_outputs(frames, out, preview)
-        above.of_size(frames.image_px, frames.name)
+        above.lens.check_size(frames.image_px, frames.name)
         if targets is not None:
             bodies = read_targets(targets)
         elif marker_size is None or marker_height is None:

@@ -1,4 +1,4 @@
-"""`slipid trial`: the 2021 paper's rectangle, or another path, with every controller."""
+"""`slipid trial`: drive the 2021 paper's rectangle, or another path, with every controller."""
 
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +23,7 @@ def trial(
         typer.Option(
             "--told-map",
             metavar="FILE",
-            help="Map that controllers with one are told; the true one by default.",
+            help="Map that is given to controllers with a map; the true one by default.",
         ),
     ] = None,
     controllers: Annotated[
@@ -44,15 +44,15 @@ def trial(
 ) -> int:
     """Drive the 2021 paper's rectangle, or another path, with every controller, and judge them.
 
-    Gains are those set by hand, or tuned ones of an older robot.json that are better than those.
-    Writes trial.json and trial.png to OUT; runs that are done are kept and not driven again.
+    Gains are those set by hand, or tuned ones of an older robot.json that are better. Writes
+    trial.json and trial.png to OUT; runs that are done are kept and not driven again.
     """
     from slipid.lab.trial.plots import trial_plot
     from slipid.lab.trial.trial import TrialOptions, controller_names
     from slipid.lab.trial.trial import trial as run
     from slipid.report.answers import show_trial
 
-    wish = TrialOptions(
+    options = TrialOptions(
         plant=plant,
         map=map,
         told_map=told_map,
@@ -64,7 +64,7 @@ def trial(
         tuned_gains=tuned_gains,
     )
     with Reporter(quiet=quiet) as report, executor_of(jobs) as executor:
-        done = run(out, wish, executor, report)
+        done = run(out, options, executor, report)
         report.stage("drawing")
         trial_plot(done.content, done.paths, done.wanted, done.floor, out / "trial.png")
     emit(json, done.content, lambda page: show_trial(page, done.content, out))

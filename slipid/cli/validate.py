@@ -1,4 +1,4 @@
-"""`slipid validate`: open-loop prediction of runs."""
+"""`slipid validate`: predict runs open loop."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet =
 
 
 def run(out: Path, data: Path, report: Reporter) -> Content:
-    """Content of the validation file, and pictures; arguments as of `job.validate.validate`."""
+    """Write pictures and return the validation file; as in `slipid.app.compare.validate`."""
     from slipid.app.compare import validate
     from slipid.plots.fit import validate_plots
 

@@ -78,9 +78,14 @@ def multi_floor_runs(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Mul
     floor, counts = (np.concatenate([getattr(c, f) for c in cut]) for f in ("floor", "counts"))
     first = np.cumsum([0, *(len(c.runs) for c in cut)])
     run = np.concatenate([c.windows.run + k for c, k in zip(cut, first, strict=False)])
-    rows = [part for k in np.unique(run) for part in _parts(np.flatnonzero(run == k))]
-    rows = [row for row in rows if counts[row].any()]
-    at, there = _padded(rows)
+    rows = []
+    for k in np.unique(run):
+        mine = np.flatnonzero(run == k)
+        parts = np.array_split(mine, -(-len(mine) // MOST_WINDOWS))
+        rows += [part for part in parts if counts[part].any()]
+    longest = max(len(row) for row in rows)
+    at = np.array([np.pad(row, (0, longest - len(row)), mode="edge") for row in rows])
+    original = np.arange(longest) < np.array([[len(row)] for row in rows])
     w = _joined([c.windows for c in cut], run)
     whole = replace(
         w.segments(at[:, 0]),
@@ -88,7 +93,7 @@ def multi_floor_runs(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> Mul
         **{name: getattr(w, name)[at, 0] for name in _PER_WINDOW},
     )
     names = tuple(name for c in cut for name in c.runs)
-    return MultiFloorRuns(whole, floor[at, 0], counts[at, 0] & there, names)
+    return MultiFloorRuns(whole, floor[at, 0], counts[at, 0] & original, names)
 
 
 _PER_WINDOW = ("dt", "turn", "speed_change", "current", "voltage", "current_var", "voltage_var")
@@ -119,20 +124,6 @@ def _short(data: Runs, radius: float, lag: float) -> Windows:
         length = np.clip((t[-1] - t[0]) / MOST_WINDOWS, SHORTEST, LONGEST)
         each.append(windows(data.subset([k]), radius, lag, per_segment=1, longest=float(length)))
     return _joined(each, np.repeat(np.arange(len(each)), [len(w) for w in each]))
-
-
-def _parts(windows_of_run: Int[np.ndarray, " window"]) -> list[Int[np.ndarray, " part"]]:
-    """Return the windows of a run in parts of at most `MOST_WINDOWS`."""
-    return np.array_split(windows_of_run, -(-len(windows_of_run) // MOST_WINDOWS))
-
-
-def _padded(
-    rows: Sequence[Int[np.ndarray, " _"]],
-) -> tuple[Int[np.ndarray, "row longest"], Bool[np.ndarray, "row longest"]]:
-    """Return rows padded to one length with their last number, and a mask of the originals."""
-    longest = max(len(row) for row in rows)
-    at = np.array([np.pad(row, (0, longest - len(row)), mode="edge") for row in rows])
-    return at, np.array([np.arange(longest) < len(row) for row in rows])
 
 
 def _joined(each: Sequence[Windows], run: Int[np.ndarray, " segment"]) -> Windows:
@@ -180,10 +171,10 @@ class MultiFloorBatch(eqx.Module):
     counts: Float[Array, "segment window"]
 
     @staticmethod
-    def of(multi_floor_runs: MultiFloorRuns, robot: Robot) -> "MultiFloorBatch":
+    def of(runs: MultiFloorRuns, robot: Robot) -> "MultiFloorBatch":
         """Return the batch of runs for a robot."""
-        b = lk.batch(multi_floor_runs.windows, robot, multi_floor_runs.floor)
-        return MultiFloorBatch(b, jnp.asarray(multi_floor_runs.counts, float))
+        b = lk.batch(runs.windows, robot, runs.floor)
+        return MultiFloorBatch(b, jnp.asarray(runs.counts, float))
 
     def as_if_on(self, floor: int) -> "MultiFloorBatch":
         """Return the same runs as if all wheels had always stood on one floor."""
@@ -193,11 +184,11 @@ class MultiFloorBatch(eqx.Module):
     def residuals(self, robot: Robot, p: lk.Predicted) -> dict[str, Array]:
         """Return predicted less measured motion and, where they are logged, currents."""
         b = self.batch
-        gap = lk.motion_residual(robot, b, p)
-        out = {MULTI_FLOOR_MOTION: gap * jnp.repeat(self.counts, 3, axis=1)}
+        motion = lk.motion_residual(robot, b, p)
+        out = {MULTI_FLOOR_MOTION: motion * jnp.repeat(self.counts, 3, axis=1)}
         if b.has_current:
             amps = lk.predicted_current(robot, b, p.motor_force) - b.current
-            out[MULTI_FLOOR_CURRENT] = (amps * self.counts[..., None]).reshape(len(gap), -1)
+            out[MULTI_FLOOR_CURRENT] = (amps * self.counts[..., None]).reshape(len(motion), -1)
         return out
 
     def log_jacobian(self, robot: Robot) -> Float[Array, " segment"]:

@@ -61,41 +61,36 @@ def fit_multi_floor(
     """
     whole = problem.with_multi_floor(multi_floor)
     start = replace(whole.carried_over(optimum.state, problem), round=0)
-    on_one, number = (
-        len(problem.windows),
-        np.unique(multi_floor.windows.run, return_inverse=True)[1],
-    )
-    odd = number % 2 == 1
+    odd = np.unique(multi_floor.windows.run, return_inverse=True)[1] % 2 == 1
     objective, every = whole.objective, np.ones(len(odd))
-    assert objective.multi_floor is not None, "runs over several floors"
+    batch = objective.multi_floor
+    assert batch is not None, "runs over several floors"
 
-    def off(
-        multi_floor: MultiFloorBatch, *judged: tuple[FitState, Float[np.ndarray, " run"]]
+    def errors(
+        of: MultiFloorBatch, *judged: tuple[FitState, Float[np.ndarray, " run"]]
     ) -> WindowErrors:
-        """Errors, each run by the state that judges it with weight 1 and the others with 0."""
-        found = [
-            (residuals_at(objective.space, multi_floor, jnp.asarray(s.z)), w) for s, w in judged
-        ]
-        return window_errors(multi_floor, found)
+        """Return the errors of runs, each by the state that judges it with weight 1."""
+        found = [(residuals_at(objective.space, of, jnp.asarray(s.z)), w) for s, w in judged]
+        return window_errors(of, found)
 
     learnt = optimise(whole, start=start, tell=tell, most_rounds=most_rounds, tolerance=tolerance)
     after = None
     if odd.any() and not odd.all():
         parts = []
         for half in (odd, ~odd):
-            keep = np.concatenate([np.ones(on_one), ~half])
+            keep = np.concatenate([np.ones(len(problem.windows)), ~half])
             other = optimise(whole, keep=keep, start=start, most_rounds=_ROUNDS)
             parts.append((other.state, half.astype(float)))
-        after = off(objective.multi_floor, *parts)
+        after = errors(batch, *parts)
     end = (learnt.state, every)
     return MultiFloorFit(
         problem=whole,
         optimum=learnt,
-        before=off(objective.multi_floor, (start, every)),
+        before=errors(batch, (start, every)),
         after=after,
-        learnt=off(objective.multi_floor, end),
+        learnt=errors(batch, end),
         as_if={
-            floor: off(objective.multi_floor.as_if_on(k), end)
+            floor: errors(batch.as_if_on(k), end)
             for k, floor in enumerate(whole.robot.surfaces.labels)
         },
     )

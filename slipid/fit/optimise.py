@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from slipid.fit import likelihood as lk
 from slipid.fit.hierarchy import effect_variances, pooled
-from slipid.fit.multi_floor import MULTI_FLOOR_MOTION, MultiFloorBatch
+from slipid.fit.multi_floor import MULTI_FLOOR_MOTION
 from slipid.fit.noise import SHARED
 from slipid.fit.problem import (
     CREEPS,
@@ -24,9 +24,8 @@ from slipid.fit.problem import (
     log_jacobian,
     without_effects,
 )
-from slipid.fit.shared_effects import EffectPosterior, marginal_residuals
+from slipid.fit.shared_effects import Posteriors, marginal_residuals
 from slipid.fit.variances import Blocks, Objective, Search, Square, fitted_covariance, scoring_step
-from slipid.model.robot import Robot
 
 _REFUSED = 12
 """Number of steps that the solver may refuse in a round."""
@@ -112,28 +111,27 @@ def one_round(
     electric = problem.electric(state.z, log_v)
     residual, _, motor_force = linear(objective, jnp.asarray(state.z), electric)
     before = state.shared(len(problem.windows))
-    seen = problem.weighed(residual, log_v, keep, before)
-    held = LeastSquaresInputs(
+    weighed = problem.weighed(residual, log_v, keep, before)
+    root = weighed.whitening.root
+    fixed = RoundInputs(
         objective=objective,
         z=jnp.asarray(state.z),
         mask=jnp.asarray(mask),
-        root=seen.whitening.root,
-        effects=seen.effects,
+        root=root,
+        effects=weighed.effects,
         prior_std=objective.prior_std(log_v),
         electric=electric,
         motor_force=motor_force,
         slope=log_jacobian(objective, state.z, electric, keep)[1],
     )
-    z = np.asarray(levenberg(held, LimitedLevenberg(steps)))
+    z = np.asarray(levenberg(fixed, LimitedLevenberg(steps)))
     electric = problem.electric(z, log_v)
     whole, jacobian, motor_force = linear(objective, jnp.asarray(z), electric)
-    effect = effects_given(seen.effects, seen.whitening.root["motion"], whole["motion"])
+    effect = effects_given(weighed.effects, root["motion"], whole["motion"])
     # weights and effects depend on each other: half a step, or they can oscillate for ever
     effect = 0.5 * (effect + before) if state.round else effect
-    residual, voltage = (
-        without_effects(objective, whole, effect),
-        problem.voltage_information(z, log_v, motor_force),
-    )
+    residual = without_effects(objective, whole, effect)
+    voltage = problem.voltage_information(z, log_v, motor_force)
     if scoring:
         spread = fitted_covariance(objective, jacobian, log_v, jnp.asarray(keep))
     for _ in range(scoring):
@@ -150,7 +148,7 @@ def one_round(
     information = np.asarray(problem.precision(jacobian, log_v, keep))
     covariance = np.linalg.inv(information)
     if scoring:
-        weight, motion = seen.whitening.weight["motion"], (whole["motion"], jacobian["motion"])
+        weight, motion = weighed.whitening.weight["motion"], (whole["motion"], jacobian["motion"])
         found = effect_variances(objective, motion, weight, covariance, np.asarray(log_v))
         found[objective.pooled] = pooled(information, z, objective, np.asarray(log_v))
         log_v = jnp.asarray(found)
@@ -194,10 +192,8 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
             state = one_round(independent, state, keep, mask, steps=steps, scoring=0)
             tell(state)
         residual, _ = independent.linear(state.z, problem.electric(state.z, state.log_variance))
-        weight = problem.whitening(residual, state.log_variance, problem.full_weight).weight[
-            "motion"
-        ]
-        cost = -np.log(np.asarray(weight))  # the loss up to a factor and a constant
+        found = problem.whitening(residual, state.log_variance, problem.full_weight)
+        cost = -np.log(np.asarray(found.weight["motion"]))  # the loss up to a factor and a constant
         for number, label in enumerate(labels):
             mine = float(np.sum(cost[(floors == number) & (keep[: len(floors)] > 0)]))
             if mine < best[number]:
@@ -216,14 +212,14 @@ def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
     amps = w.current.ravel() if w.current_is_signed else (w.current.ravel() * np.sign(speed))
     wm = speed * float(problem.robot.motor.gear_ratio)
     a, *_ = np.linalg.lstsq(np.stack([amps, wm], -1), w.voltage.ravel(), rcond=None)
-    place = problem.space.slices
+    slices = problem.space.slices
     for path, value in (("motor.resistance", a[0]), ("motor.back_emf", a[1])):
-        if path in place and value > 0:
-            z[place[path]] = np.log(value)
+        if path in slices and value > 0:
+            z[slices[path]] = np.log(value)
     return z
 
 
-class LeastSquaresInputs(eqx.Module):
+class RoundInputs(eqx.Module):
     """Quantities that stay fixed while the solver moves the numbers from z.
 
     Attributes:
@@ -242,7 +238,7 @@ class LeastSquaresInputs(eqx.Module):
     z: Float[Array, " free"]
     mask: Float[Array, " free"]
     root: Blocks
-    effects: tuple[EffectPosterior, ...]
+    effects: Posteriors
     prior_std: Float[Array, " free"]
     electric: lk.ElectricNoise
     motor_force: lk.MotorForce
@@ -266,7 +262,7 @@ class LimitedLevenberg(optx.LevenbergMarquardt):
         self,
         fn: Any,
         y: Array,
-        args: LeastSquaresInputs,
+        args: RoundInputs,
         options: Any,
         state: Any,
         tags: frozenset[object],
@@ -277,45 +273,36 @@ class LimitedLevenberg(optx.LevenbergMarquardt):
 
 
 @eqx.filter_jit
-def levenberg(held: LeastSquaresInputs, solver: LimitedLevenberg) -> Float[Array, " free"]:
+def levenberg(fixed: RoundInputs, solver: LimitedLevenberg) -> Float[Array, " free"]:
     """Return the search vector after the solver's steps with fixed whitening."""
-    start = jnp.zeros_like(held.z)
-    found = optx.least_squares(_stacked, solver, start, held, max_steps=None, throw=False)
-    return _at(held, found.value)
+    start = jnp.zeros_like(fixed.z)
+    found = optx.least_squares(_stacked, solver, start, fixed, max_steps=None, throw=False)
+    return _at(fixed, found.value)
 
 
-def _multi_floor_residuals(of: MultiFloorBatch, robot: Robot, given: Robot) -> Blocks:
-    """Return residuals of runs over several floors, whose currents move electric numbers only.
-
-    Friction moves the equilibrium that currents come from, so that it is solved for them, too.
-    """
-    motion = {
-        MULTI_FLOOR_MOTION: of.residuals(robot, lk.predict(robot, of.batch))[MULTI_FLOOR_MOTION]
-    }
-    return of.residuals(given, lk.predict(given, of.batch)) | motion
-
-
-def _at(held: LeastSquaresInputs, y: Array) -> Array:
+def _at(fixed: RoundInputs, y: Array) -> Array:
     """Return the search vector of a step in prior stds."""
-    return held.z + held.mask * held.prior_std * y
+    return fixed.z + fixed.mask * fixed.prior_std * y
 
 
-def _stacked(y: Array, held: LeastSquaresInputs) -> Array:
+def _stacked(y: Array, fixed: RoundInputs) -> Array:
     """Return the whitened residuals of all blocks and of the prior."""
-    objective, space = held.objective, held.objective.space
-    z = _at(held, y)
-    robot, given = space.tree(z), space.tree(jnp.where(space.electric, z, held.z))
+    objective, space = fixed.objective, fixed.objective.space
+    z = _at(fixed, y)
+    robot, given = space.tree(z), space.tree(jnp.where(space.electric, z, fixed.z))
     motion = lk.motion_residual(robot, objective.batch, lk.predict(robot, objective.batch))
     # currents and voltages given the motion of the round's start
-    electric = lk.electric_residuals(given, objective.batch, held.motor_force, held.electric)
+    electric = lk.electric_residuals(given, objective.batch, fixed.motor_force, fixed.electric)
     blocks = {"motion": motion} | electric
-    if objective.multi_floor is not None:
-        blocks |= _multi_floor_residuals(objective.multi_floor, robot, given)
-    white = {k: jnp.einsum("nij,nj->ni", held.root[k], r) for k, r in blocks.items()}
-    parts = [
-        marginal_residuals(held.effects, w) if k == "motion" else w.ravel()
-        for k, w in white.items()
-    ]
+    if (of := objective.multi_floor) is not None:
+        # here, too, currents move electric numbers only; friction is one of them, and it moves the
+        # equilibrium that currents come from
+        blocks |= of.residuals(given, lk.predict(given, of.batch))
+        of_robot = of.residuals(robot, lk.predict(robot, of.batch))
+        blocks[MULTI_FLOOR_MOTION] = of_robot[MULTI_FLOOR_MOTION]
+    white = {k: jnp.einsum("nij,nj->ni", fixed.root[k], r) for k, r in blocks.items()}
+    rest = [w.ravel() for k, w in white.items() if k != "motion"]
+    parts = [marginal_residuals(fixed.effects, white["motion"]), *rest]
     # the slope of the log Jacobian adds slope . z to the log posterior
-    mean = space.prior_mean + held.prior_std**2 * held.slope
-    return jnp.concatenate([*parts, (z - mean) / held.prior_std])
+    mean = space.prior_mean + fixed.prior_std**2 * fixed.slope
+    return jnp.concatenate([*parts, (z - mean) / fixed.prior_std])

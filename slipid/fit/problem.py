@@ -19,7 +19,7 @@ from slipid.fit import variances
 from slipid.fit.multi_floor import MULTI_FLOOR_CURRENT, MultiFloorBatch, MultiFloorRuns
 from slipid.fit.noise import POOLED, SHARED, electric_noise, noise
 from slipid.fit.shared_effects import (
-    EffectPosterior,
+    Posteriors,
     effect_posteriors,
     effects_by_floor,
     marginal_residuals,
@@ -115,12 +115,11 @@ class Problem:
         self.noise = noise(windows, self.robot, multi_floor)
         shared, self.speeds_and_loads = effects_by_floor(windows, self.robot, self.noise)
         kinds = np.array([c.kind for c in self.noise.components])
+        batch = None if multi_floor is None else MultiFloorBatch.of(multi_floor, self.robot)
         self.objective = Objective(
             space=self.space,
             batch=lk.batch(windows, self.robot),
-            multi_floor=None
-            if multi_floor is None
-            else MultiFloorBatch.of(multi_floor, self.robot),
+            multi_floor=batch,
             blocks=self.noise.blocks,
             shared=shared,
             typical=jnp.asarray(2 * np.log(self.noise.typical)),
@@ -132,9 +131,8 @@ class Problem:
     @property
     def full_weight(self) -> Float[np.ndarray, " segment"]:
         """Weight 1 for every segment, those of runs over several floors last."""
-        return np.ones(
-            len(self.windows) + (0 if self.multi_floor is None else len(self.multi_floor.counts))
-        )
+        more = () if self.multi_floor is None else self.multi_floor.counts
+        return np.ones(len(self.windows) + len(more))
 
     def carried_over(self, state: FitState, of: "Problem") -> FitState:
         """Return the state of another problem with the same numbers as a state of this problem."""
@@ -185,16 +183,10 @@ class Problem:
         return _weighed(self.objective, residual, *where)
 
     def loss(
-        self,
-        z: Vector,
-        log_v: Vector,
-        keep: Vector,
-        seen: "WeighedResiduals",
-        electric: lk.ElectricNoise,
+        self, z: Vector, log_v: Vector, keep: Vector, at: "WeighedResiduals", e: lk.ElectricNoise
     ) -> float:
         """Return minus the log posterior of numbers and variances, less constants."""
-        nll = float(seen.loss)
-        nll -= float(log_jacobian(self.objective, z, electric, keep)[0])
+        nll = float(at.loss) - float(log_jacobian(self.objective, z, e, keep)[0])
         prior_std = np.asarray(self.objective.prior_std(log_v))
         deviation = (np.asarray(z) - self.space.prior_mean) / prior_std
         nll += float(np.log(prior_std).sum())
@@ -224,7 +216,7 @@ class WeighedResiduals(NamedTuple):
     """
 
     whitening: Whitening
-    effects: tuple[EffectPosterior, ...]
+    effects: Posteriors
     loss: Array
 
 
@@ -232,15 +224,13 @@ class WeighedResiduals(NamedTuple):
 def _weighed(
     objective: Objective, residual: Blocks, log_v: Array, keep: Array, effect: Array
 ) -> WeighedResiduals:
-    found = variances.whitening(
-        objective.blocks, without_effects(objective, residual, effect), log_v, keep
-    )
+    own, motion = without_effects(objective, residual, effect), residual["motion"]
+    found = variances.whitening(objective.blocks, own, log_v, keep)
     root = found.root["motion"]
     posteriors = effect_posteriors(objective.shared, log_v, root)
-    coefs = marginal_residuals(posteriors, jnp.einsum("nij,nj->ni", root, residual["motion"]))[
-        residual["motion"].size :
-    ]
-    log_det = sum(jnp.sum(jnp.log(jnp.diagonal(posterior.factor))) for posterior in posteriors)
+    rows = marginal_residuals(posteriors, jnp.einsum("nij,nj->ni", root, motion))
+    coefs = rows[motion.size :]
+    log_det = sum(jnp.sum(jnp.log(jnp.diagonal(p.factor))) for p in posteriors)
     return WeighedResiduals(found, posteriors, found.loss + 0.5 * jnp.sum(coefs**2) + log_det)
 
 
@@ -255,7 +245,7 @@ def without_effects(objective: Objective, residual: Blocks, effect: Array) -> Bl
 
 
 @eqx.filter_jit
-def effects_given(posteriors: tuple[EffectPosterior, ...], root: Array, motion: Array) -> Array:
+def effects_given(posteriors: Posteriors, root: Array, motion: Array) -> Array:
     """Return the conditional mean of the shared effects (segment, 3) given motion residuals."""
     return mean_effects(posteriors, jnp.einsum("nij,nj->ni", root, motion))
 
@@ -312,11 +302,11 @@ def fixed_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None
     With one speed they cannot be distinguished from creep, and a wrong split of the two is wrong at
     every other speed.
     """
-    seen: dict[str, list[float]] = {}
+    driven: dict[str, list[float]] = {}
     for k in range(len(data)) if runs is None else runs:
-        seen.setdefault(data.logs[k].surface or "unknown", []).append(float(data.speed[k]))
+        driven.setdefault(data.logs[k].surface or "unknown", []).append(float(data.speed[k]))
     out = []
-    for floor, speeds in seen.items():
+    for floor, speeds in driven.items():
         known = np.asarray(speeds)[np.isfinite(speeds)]
         if len(known) == len(speeds) and known.max() < 1.3 * max(known.min(), 1e-3):
             names = (f"surface.{floor}.{name}" for name in ("slide_viscosity", "roller_viscosity"))

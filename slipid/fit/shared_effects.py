@@ -82,14 +82,13 @@ class TravelConditions:
     @staticmethod
     def of(w: Windows, robot: Robot) -> "TravelConditions":
         """Return the conditions of windows according to the encoders."""
-        far = travel(w, robot)[0]
-        moved = encoder_increments(w, robot)[..., :2].sum(axis=1)
-        straight = np.hypot(*moved.T)
-        moves = straight > 0.2 * far.sum(axis=1)
-        speed = np.log(np.maximum(straight / w.dt.sum(axis=1), 1e-3))
+        displacement = encoder_increments(w, robot)[..., :2].sum(axis=1)
+        chord = np.hypot(*displacement.T)
+        moves = chord > 0.2 * travel(w, robot)[0].sum(axis=1)
+        speed = np.log(np.maximum(chord / w.dt.sum(axis=1), 1e-3))
         rounded = np.round(speed / _SPEED) * _SPEED
         return TravelConditions(
-            np.where(moves, np.arctan2(moved[:, 1], moved[:, 0]), np.nan),
+            np.where(moves, np.arctan2(displacement[:, 1], displacement[:, 0]), np.nan),
             tuple(SpeedAndLoad(float(s), load) for s, load in zip(rounded, w.load, strict=True)),
             robot.geometry.mirror(),
         )
@@ -102,7 +101,7 @@ class TravelConditions:
 
     def around(self) -> Float[np.ndarray, "3 segment harmonic"]:
         """Return the root of the kernel over directions for the three axes; zero on the spot."""
-        mirrored_correlation = 0.0 if self.mirror is None else OTHER_SIDE
+        mirrored = 0.0 if self.mirror is None else OTHER_SIDE
         wave = 1 / LENGTH**2
         k = np.arange(1, _HARMONICS + 1)
         angle = np.nan_to_num(self.direction - (self.mirror or 0.0))[:, None] * k
@@ -110,39 +109,30 @@ class TravelConditions:
         constant = np.full((len(angle), 1), np.sqrt(ive(0, wave)))
         even = np.concatenate([constant, size * np.cos(angle)], axis=1)
         odd = size * np.sin(angle)
-        more, less = np.sqrt(1 + mirrored_correlation), np.sqrt(1 - mirrored_correlation)
+        more, less = np.sqrt(1 + mirrored), np.sqrt(1 - mirrored)
         of_even, of_odd = (more, less, less), (less, more, more)
-        root = [
-            np.concatenate([a * even, b * odd], axis=1)
-            for a, b in zip(of_even, of_odd, strict=True)
-        ]
+        scales = zip(of_even, of_odd, strict=True)
+        root = [np.concatenate([a * even, b * odd], axis=1) for a, b in scales]
         return np.stack(root) * np.isfinite(self.direction)[:, None]
 
-    def basis(
-        self, speeds_and_loads: tuple[SpeedAndLoad, ...]
-    ) -> Float[np.ndarray, "3 segment coef"]:
+    def basis(self, known: tuple[SpeedAndLoad, ...]) -> Float[np.ndarray, "3 segment coef"]:
         """Return the root of the kernel: effects of unit coefficients, from known speeds and loads.
 
         Its rows have the norm of those of `around`, less where speed and load differ from the known
         ones.
         """
-        if not speeds_and_loads:
+        if not known:
             return np.zeros((len(AXES), len(self.speed_and_load), 0))
-        known = np.array([[a.near(b) for b in speeds_and_loads] for a in speeds_and_loads])
-        root = np.linalg.cholesky(known + 1e-9 * np.eye(len(speeds_and_loads)))
-        correlation = {
-            speed_and_load: np.array([speed_and_load.near(b) for b in speeds_and_loads])
-            for speed_and_load in set(self.speed_and_load)
-        }
-        share = {
-            speed_and_load: np.linalg.solve(root, row)
-            for speed_and_load, row in correlation.items()
-        }
-        of_pace = np.array(
-            [share[speed_and_load] for speed_and_load in self.speed_and_load]
-        ).reshape(-1, len(speeds_and_loads))
-        whole = np.einsum("pc,apd->apcd", of_pace, self.around())
-        return np.asarray(whole.reshape(len(AXES), len(self.speed_and_load), -1))
+
+        def correlation(one: SpeedAndLoad) -> np.ndarray:
+            return np.array([one.near(other) for other in known])
+
+        whole = np.array([correlation(one) for one in known])
+        root = np.linalg.cholesky(whole + 1e-9 * np.eye(len(known)))
+        share = {one: np.linalg.solve(root, correlation(one)) for one in set(self.speed_and_load)}
+        of_segment = np.array([share[one] for one in self.speed_and_load]).reshape(-1, len(known))
+        basis = np.einsum("pc,apd->apcd", of_segment, self.around())
+        return np.asarray(basis.reshape(len(AXES), len(self.speed_and_load), -1))
 
 
 class SharedEffects(eqx.Module):
@@ -177,7 +167,8 @@ def effects_by_floor(
     w: Windows, robot: Robot, noise: NoiseModel
 ) -> tuple[tuple[SharedEffects, ...], SpeedsAndLoads]:
     """Return the shared effects of every floor, and the speeds and loads it was driven with."""
-    conditions, moved, place = TravelConditions.of(w, robot), effects(w, robot), noise.names.index
+    conditions, moved = TravelConditions.of(w, robot), effects(w, robot)
+    number = {name: k for k, name in enumerate(noise.names)}
     floors, found, speeds_and_loads = np.asarray(w.surface), [], {}
     for floor in robot.surfaces.labels:
         mine = np.flatnonzero(floors == floor)
@@ -185,17 +176,17 @@ def effects_by_floor(
         speeds_and_loads[floor] = tuple(dict.fromkeys(here.speed_and_load))
         names = sessions_on(w, floor)
         session = np.array([w.session[k] for k in mine])[:, None] == np.asarray(names)
-        kinds = [
-            [f"{kind}.{floor}.{axis}" for axis in AXES] for kind in ("run", "neighbours", "session")
+        numbers = [
+            [number.get(f"{kind}.{floor}.{axis}", -1) for axis in AXES]
+            for kind in ("run", "neighbours", "session")
         ]
-        number = [[place(n) if n in noise.names else -1 for n in row] for row in kinds]
         found.append(
             SharedEffects(
                 segments=jnp.asarray(mine),
                 effect=jnp.asarray(moved[mine]),
                 near=jnp.asarray(here.basis(speeds_and_loads[floor])),
                 session=jnp.asarray(session[:, : len(names) if len(names) > 1 else 0], float),
-                numbers=jnp.asarray(number),
+                numbers=jnp.asarray(numbers),
             )
         )
     return tuple(found), speeds_and_loads
@@ -218,14 +209,16 @@ class EffectPosterior(eqx.Module):
 
     def coefs(self, white: Float[Array, "segment m"]) -> Float[Array, " coefs"]:
         """Return the mean coefficients u^ given whitened residuals of all segments."""
-        projected = jnp.einsum("nma,nm->an", self.span, white[self.segments])
-        return cho_solve(
-            (self.factor, True), jnp.einsum("anq,an->aq", self.root, projected).ravel()
-        )
+        effect = jnp.einsum("nma,nm->an", self.span, white[self.segments])
+        return cho_solve((self.factor, True), jnp.einsum("anq,an->aq", self.root, effect).ravel())
 
     def effects(self, coefs: Float[Array, " coefs"]) -> Float[Array, "run 3"]:
         """Return the effects S u along, across and in yaw."""
         return jnp.einsum("anq,aq->na", self.root, coefs.reshape(3, -1))
+
+
+Posteriors = tuple[EffectPosterior, ...]
+"""Posteriors of the shared effects of every floor."""
 
 
 @eqx.filter_jit
@@ -233,7 +226,7 @@ def effect_posteriors(
     shared: tuple[SharedEffects, ...],
     log_v: Float[Array, " variance"],
     white: Float[Array, "segment m m"],
-) -> tuple[EffectPosterior, ...]:
+) -> Posteriors:
     """Return the posterior of the effects of every floor, for whitening roots of all segments."""
 
     def posterior(of: SharedEffects) -> EffectPosterior:
@@ -249,59 +242,46 @@ def effect_posteriors(
 
 
 def marginal_residuals(
-    posteriors: tuple[EffectPosterior, ...], white: Float[Array, "segment m"]
+    posteriors: Posteriors, white: Float[Array, "segment m"]
 ) -> Float[Array, " rows"]:
     """Return whitened residuals less the mean shared effects, followed by the coefficients.
 
     Their square is the quadratic form of the marginal likelihood.
     """
-    coefs = [posterior.coefs(white) for posterior in posteriors]
-    for posterior, u in zip(posteriors, coefs, strict=True):
-        moved = jnp.einsum("nma,na->nm", posterior.span, posterior.effects(u))
-        white = white.at[posterior.segments].add(-moved)
+    coefs = [p.coefs(white) for p in posteriors]
+    for p, u in zip(posteriors, coefs, strict=True):
+        white = white.at[p.segments].add(-jnp.einsum("nma,na->nm", p.span, p.effects(u)))
     return jnp.concatenate([white.ravel(), *coefs])
 
 
 @eqx.filter_jit
 def mean_effects(
-    posteriors: tuple[EffectPosterior, ...], white: Float[Array, "segment m"]
+    posteriors: Posteriors, white: Float[Array, "segment m"]
 ) -> Float[Array, "segment 3"]:
     """Return the conditional mean of the shared effects of every segment."""
     out = jnp.zeros((len(white), len(AXES)))
-    for posterior in posteriors:
-        out = out.at[posterior.segments].set(posterior.effects(posterior.coefs(white)))
+    for p in posteriors:
+        out = out.at[p.segments].set(p.effects(p.coefs(white)))
     return out
 
 
 @eqx.filter_jit
-def effect_covariances(
-    posteriors: tuple[EffectPosterior, ...], count: int
-) -> Float[Array, "segment 3 3"]:
+def effect_covariances(posteriors: Posteriors, count: int) -> Float[Array, "segment 3 3"]:
     """Return the covariance of every segment's shared effects, given the numbers of the model."""
     out = jnp.zeros((count, len(AXES), len(AXES)))
-    for posterior in posteriors:
-        axes, runs, _ = posterior.root.shape
-        rows = jnp.einsum("ab,anq->nabq", jnp.eye(axes), posterior.root).reshape(runs * axes, -1)
-        half = jax.scipy.linalg.solve_triangular(posterior.factor, rows.T, lower=True)
+    for p in posteriors:
+        axes, runs, _ = p.root.shape
+        rows = jnp.einsum("ab,anq->nabq", jnp.eye(axes), p.root).reshape(runs * axes, -1)
+        half = jax.scipy.linalg.solve_triangular(p.factor, rows.T, lower=True)
         half = half.reshape(-1, runs, axes)
-        out = out.at[posterior.segments].set(jnp.einsum("kna,knb->nab", half, half))
+        out = out.at[p.segments].set(jnp.einsum("kna,knb->nab", half, half))
     return out
 
 
-def marginal_slopes(
-    posteriors: tuple[EffectPosterior, ...], white: Float[Array, "segment m free"]
-) -> Float[Array, "rows free"]:
-    """Return `marginal_residuals` of every column."""
-    return jax.vmap(lambda column: marginal_residuals(posteriors, column), in_axes=-1, out_axes=-1)(
-        white
-    )
-
-
-def mean_effect_slopes(
-    posteriors: tuple[EffectPosterior, ...], white: Float[Array, "segment m free"]
-) -> Float[Array, "segment 3 free"]:
-    """Return `mean_effects` of every column."""
-    return jax.vmap(lambda column: mean_effects(posteriors, column), in_axes=-1, out_axes=-1)(white)
+marginal_slopes = jax.vmap(marginal_residuals, in_axes=(None, -1), out_axes=-1)
+"""Function that returns `marginal_residuals` of every column (segment, m, free)."""
+mean_effect_slopes = jax.vmap(mean_effects, in_axes=(None, -1), out_axes=-1)
+"""Function that returns `mean_effects` of every column (segment, m, free)."""
 
 
 class EffectForecast(NamedTuple):
@@ -319,7 +299,7 @@ class EffectForecast(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class EffectTable:
+class FittedEffects:
     """Effects that neighbouring runs on a floor were found to share.
 
     Attributes:
@@ -351,7 +331,7 @@ class EffectTable:
 
 
 def forecast_effects(
-    found: Mapping[str, EffectTable], w: Windows, robot: Robot, free: int
+    found: Mapping[str, FittedEffects], w: Windows, robot: Robot, free: int
 ) -> EffectForecast:
     """Return the effects expected in runs on any floor; zero where a floor has no table."""
     n, axes = len(w), len(AXES)
@@ -361,9 +341,7 @@ def forecast_effects(
     conditions, floors = TravelConditions.of(w, robot), np.asarray(w.surface)
     for floor, one in found.items():
         mine = np.flatnonzero(floors == floor)
-        if not len(mine):
-            continue
-        here = conditions.subset(mine)
-        for whole, part in zip(out, one.forecast(here), strict=True):
-            whole[mine] = part
+        if len(mine):
+            for whole, part in zip(out, one.forecast(conditions.subset(mine)), strict=True):
+                whole[mine] = part
     return out

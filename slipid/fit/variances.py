@@ -17,7 +17,7 @@ from slipid.fit import likelihood as lk
 from slipid.fit.multi_floor import MULTI_FLOOR_CURRENT, MULTI_FLOOR_MOTION, MultiFloorBatch
 from slipid.fit.noise import Components, electric_noise
 from slipid.fit.shared_effects import (
-    EffectPosterior,
+    Posteriors,
     SharedEffects,
     effect_covariances,
     effect_posteriors,
@@ -120,7 +120,7 @@ def voltage_information(
         at = lk.ElectricNoise(noise.voltage_std, scatter, noise.resistance)
         return lk.electric_residuals(robot, b, motor_force, at)["voltage"], lk.voltage_spread(b, at)
 
-    # every residual depends on its own scatter only
+    # every residual depends on its own scatter only: one product gives all derivatives
     (r, spread), (more, wider) = jax.jvp(scaled, (noise.scatter,), (jnp.ones_like(noise.scatter),))
     variance, m, wider = noise.voltage_std**2, r.shape[1], wider / spread
     weight = (DEGREES + m) / (DEGREES + jnp.sum(r**2, axis=1, keepdims=True) / variance)
@@ -170,25 +170,20 @@ def precision(
     for k, half in whitened(objective.blocks, jacobian, log_v, keep).items():
         flat = half.reshape(-1, half.shape[-1])
         if k == "motion" and not alone:
-            posteriors = expected_posteriors(objective, log_v, keep)
-            flat = marginal_slopes(posteriors, half)
+            flat = marginal_slopes(expected_posteriors(objective, log_v, keep), half)
         total += flat.T @ flat
         of_motion += flat.T @ flat if k in MOTION_BLOCKS else 0.0
-    return (
-        total if objective.joint else _cut(total, of_motion, jnp.asarray(objective.space.electric))
-    )
+    if objective.joint:
+        return total
+    return _cut(total, of_motion, jnp.asarray(objective.space.electric))
 
 
-def expected_posteriors(
-    objective: Objective, log_v: Vector, keep: Vector
-) -> tuple[EffectPosterior, ...]:
+def expected_posteriors(objective: Objective, log_v: Vector, keep: Vector) -> Posteriors:
     """Return the posteriors of shared effects, given residuals whitened by `whitened`."""
-    block = objective.blocks["motion"]
-    roots = inverse_root(block.covariance(jnp.asarray(log_v)))
+    block, log_v = objective.blocks["motion"], jnp.asarray(log_v)
     factor = expected(block.count) * jnp.asarray(keep)[block.segments]
-    return effect_posteriors(
-        objective.shared, jnp.asarray(log_v), roots * jnp.sqrt(factor)[:, None, None]
-    )
+    roots = inverse_root(block.covariance(log_v)) * jnp.sqrt(factor)[:, None, None]
+    return effect_posteriors(objective.shared, log_v, roots)
 
 
 def expected(m: Array | float | int) -> Any:
@@ -256,10 +251,10 @@ def scoring_step(
     _, weights, _ = whitening(objective.blocks, residual, log_v, keep)
     score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])
     for k, r in residual.items():
-        noise, mine = objective.blocks[k], _own_share(k, voltage)
+        noise = objective.blocks[k]
         root = inverse_root(noise.covariance(log_v))
         inverse = jnp.einsum("nji,njk->nik", root, root)
-        base, which = _scaled_base(noise.base, mine), noise.which
+        base, which = _scaled_base(noise, k, voltage), noise.which
         v = jnp.exp(log_v)[which]
         vr, kept = jnp.einsum("nij,nj->ni", inverse, r), keep[noise.segments]
         fit = jnp.einsum("ni,ncij,nj->nc", vr, base, vr) * weights[k][:, None]
@@ -268,14 +263,12 @@ def scoring_step(
         lost = jnp.einsum("nij,ncij->nc", spent, base)
         slope = 0.5 * v * (fit + kept[:, None] * (lost - trace))
         if voltage is not None and k == "current":
-            by_scatter = jnp.einsum("ni,nci->nc", voltage.slope, noise.single)
-            slope += v * kept[:, None] * by_scatter
+            slope += v * kept[:, None] * jnp.einsum("ni,nci->nc", voltage.slope, noise.single)
         score = score.at[which].add(slope)
         if voltage is not None and k == "voltage":
             steeper = steeper.at[which].add((kept * jnp.sum(voltage.steeper, axis=1))[:, None])
-        if k in (MULTI_FLOOR_MOTION, MULTI_FLOOR_CURRENT) or (
-            voltage is not None and k == "current"
-        ):
+        others = () if voltage is None else ("current",)
+        if k in (MULTI_FLOOR_MOTION, MULTI_FLOOR_CURRENT, *others):
             # the curvature grows where a log variance falls: the slope is in proportion to it
             steeper = steeper.at[which].add(-slope)
     score -= (log_v - objective.typical) / VARIANCE_SPREAD**2
@@ -292,7 +285,7 @@ def information(
     """Return the expected information of the log variances, prior included (variance, variance)."""
     info = jnp.eye(log_v.shape[0]) / VARIANCE_SPREAD**2
     for k, noise in noises.items():
-        base, which = _scaled_base(noise.base, _own_share(k, voltage)), noise.which
+        base, which = _scaled_base(noise, k, voltage), noise.which
         root = inverse_root(noise.covariance(log_v))
         vb = jnp.einsum("nji,njk,nckl->ncil", root, root, base)
         v = jnp.exp(log_v)[which]
@@ -300,35 +293,23 @@ def information(
         cross *= v[:, :, None] * v[:, None, :]
         kept = jnp.asarray(keep)[noise.segments, None, None]
         info = info.at[which[:, :, None], which[:, None, :]].add(kept * cross)
-    return (
-        info
-        if voltage is None
-        else info + _scatter_information(noises["current"], log_v, keep, voltage)
-    )
-
-
-def _scatter_information(
-    noise: Components, log_v: Vector, keep: Vector, voltage: VoltageInformation
-) -> Array:
-    """Return the voltages' information about log variances through the currents' scatter."""
+    if voltage is None:
+        return info
+    # voltages also depend on the scatter of the currents
+    noise = noises["current"]
     grown = jnp.exp(log_v)[noise.which][..., None] * noise.single
     kept = jnp.asarray(keep)[noise.segments]
     cross = jnp.einsum("n,ni,nci,ndi->ncd", kept, voltage.information, grown, grown)
-    info = jnp.zeros((log_v.shape[0],) * 2)
-    return info.at[noise.which[:, :, None], noise.which[:, None, :]].add(cross)
+    through = jnp.zeros_like(info)
+    return info + through.at[noise.which[:, :, None], noise.which[:, None, :]].add(cross)
 
 
-def _own_share(block: str, voltage: VoltageInformation | None) -> Array | None:
-    """Return the share of a block's own noise in its residual variance, None for all of it."""
-    return voltage.share if voltage is not None and block == "voltage" else None
-
-
-def _scaled_base(base: Array, own: Array | None) -> Array:
-    """Return covariance components scaled by the share of their noise in the residuals."""
-    if own is None:
-        return base
-    root = jnp.sqrt(own)
-    return base * root[:, None, :, None] * root[:, None, None, :]
+def _scaled_base(noise: Components, block: str, voltage: VoltageInformation | None) -> Array:
+    """Return a block's covariance components, scaled by their noise's share in its residuals."""
+    if voltage is None or block != "voltage":
+        return noise.base
+    root = jnp.sqrt(voltage.share)
+    return noise.base * root[:, None, :, None] * root[:, None, None, :]
 
 
 def inverse_root(v: Float[Array, "segment m m"]) -> Float[Array, "segment m m"]:

@@ -1,1 +1,1 @@
-"""Pictures of results, a file per subject."""
+"""Pictures of results, one file per subject."""

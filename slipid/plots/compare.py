@@ -1,4 +1,4 @@
-"""Slip models side by side: their errors, and who wins on which floor or cannot be told."""
+"""Pictures of slip models side by side: their errors and the best model on every floor."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -37,41 +37,41 @@ WORDS = {
 
 
 def compare_plot(found: Content, out: Path) -> Path:
-    """Draw the answer to the first question of comparison.json."""
+    """Write a picture of the ranking by the first question of comparison.json."""
     question, answer = next(iter(found["questions"].items()))
     made = compare_figure(answer["floors"], SHOWN.get(question, question))
     return drawing.save(made, out / "comparison.png")
 
 
 def compare_figure(floors: Content, which: str) -> Figure:
-    """Distance to the best model in predictive density, and end-point error, a column per floor.
+    """Draw the predictive density less the best model's and the end-point error, by floor.
 
     Args:
-        floors: of one question of comparison.json.
-        which: runs that were left out, in words.
+        floors: floors of one question of comparison.json.
+        which: held-out runs in words.
     """
     models = list(next(iter(floors.values()))["models"])
     made = drawing.figure(
         2.3 + 2.6 * max(len(floors), 2),
         2.6 + 0.52 * len(models),
-        f"Which slip model is right? Runs it has not seen ({which}) decide\n"
-        "star: best; shaded: the data cannot tell it from the best",
+        f"Slip models ranked by held-out runs ({which})\n"
+        "star: best; shaded: not significantly worse than the best",
     )
     axes = made.subplots(2, len(floors), sharey=True, squeeze=False)
     for column, (floor, answer) in enumerate(floors.items()):
         density, error = axes[:, column]
-        titled(density, floor, answer["runs"])
+        _set_title(density, floor, answer["runs"])
         _density(density, answer["models"])
         errors = {model: 100 * one["endpoint_error"] for model, one in answer["models"].items()}
         stds = [200 * (one["endpoint_error_se"] or 0.0) for one in answer["models"].values()]
-        bars(error, errors, stds)
+        _bars(error, errors, stds)
         error.set_xlabel("mean end-point error\n[% of displacement], less is better")
         for k, one in enumerate(answer["models"].values()):
             if one["verdict"] in ("best", "tied"):
                 for ax in (density, error):
                     ax.axhspan(k - 0.5, k + 0.5, color=TIED, zorder=0)
     for row in (0, 1):
-        axes[row, 0].set_yticks(range(len(models)), worded(models))
+        axes[row, 0].set_yticks(range(len(models)), _readable(models))
     axes[0, 0].set_ylim(len(models) - 0.4, -0.6)
     made.supxlabel(
         "error bars: two standard errors, runs of one 30-degree sector of headings counted as one",
@@ -86,7 +86,7 @@ def _density(ax: Axes, models: Content) -> None:
     ax.set_xlabel("log density less the best's\n[nats per run], more is better")
     reach: list[float] = []
     for k, (model, one) in enumerate(models.items()):
-        at, bar, colour = one["difference"], 2 * (one["se_clustered"] or 0.0), colour_of(model)
+        at, bar, colour = one["difference"], 2 * (one["se_clustered"] or 0.0), _colour_of(model)
         ax.errorbar(at, k, xerr=bar, fmt="none", ecolor=colour, elinewidth=1.6)
         mark, size = ("*", 13.0) if one["verdict"] == "best" else ("o", 5.0)
         ax.plot(at, k, mark, ms=size, color=colour, mew=0)
@@ -96,47 +96,48 @@ def _density(ax: Axes, models: Content) -> None:
     ax.set_xlim(min(reach) - spare, max(reach) + spare)
 
 
-def ladder_figure(found: Content, which: str) -> Figure:
-    """Mean end-point error of every model on every floor of a validation file, a bar each.
+def validation_figure(found: Content, which: str) -> Figure:
+    """Draw the mean end-point error of every model on every floor of a validation file.
 
     Args:
-        which: runs these are, in words.
+        found: content of the file.
+        which: its runs in words.
     """
     floors = found["summary"]
     models = list(next(iter(floors.values())))
     width = 2.7 * len(floors) + 2.4
-    title = f"How far from the camera's end each model ends, open loop; {which}"
+    title = f"End-point errors of open-loop predictions against the camera; {which}"
     made = drawing.figure(max(width, 8.8), 1.7 + 0.32 * len(models), title)
     axes = made.subplots(1, len(floors), sharey=True, squeeze=False)[0]
     for ax, (floor, by) in zip(axes, floors.items(), strict=True):
-        bars(ax, {model: 100 * by[model]["endpoint_error_mean"] for model in models})
-        titled(ax, floor, by[models[0]]["runs"])
+        _bars(ax, {model: 100 * by[model]["endpoint_error_mean"] for model in models})
+        _set_title(ax, floor, by[models[0]]["runs"])
         ax.set_xlabel("mean end-point error\n[% of the camera's displacement]")
-    axes[0].set_yticks(range(len(models)), worded(models))
+    axes[0].set_yticks(range(len(models)), _readable(models))
     axes[0].invert_yaxis()
     return made
 
 
-def worded(models: Sequence[str]) -> list[str]:
-    """Names of models for people."""
+def _readable(models: Sequence[str]) -> list[str]:
+    """Return the names of models for people."""
     return [WORDS.get(model, model.replace("_", " ")) for model in models]
 
 
-def titled(ax: Axes, floor: str, runs: int) -> None:
-    """Name a panel by its floor and the number of runs."""
+def _set_title(ax: Axes, floor: str, runs: int) -> None:
+    """Title a panel with its floor and the number of runs."""
     ax.set_title(f"{floor.replace('@', ', load ')}\n{runs} runs", fontsize=10)
 
 
-def colour_of(model: str) -> str:
-    """Colour of a model: only the identified one stands out."""
+def _colour_of(model: str) -> str:
+    """Return the colour of a model; only the identified one stands out."""
     return drawing.BLUE if model == "identified" else "#a8a8a8"
 
 
-def bars(ax: Axes, error: Mapping[str, float], half: Sequence[float] | None = None) -> None:
-    """A bar per model with its number, and half the length of its error bar."""
+def _bars(ax: Axes, error: Mapping[str, float], half: Sequence[float] | None = None) -> None:
+    """Draw a bar per model with its number; `half` is half the length of each error bar."""
     drawing.plain(ax)
     ax.grid(False, axis="y")
-    values, colours = list(error.values()), [colour_of(model) for model in error]
+    values, colours = list(error.values()), [_colour_of(model) for model in error]
     drawn = ax.barh(
         range(len(values)), values, 0.75, color=colours, xerr=half, error_kw={"elinewidth": 0.9}
     )

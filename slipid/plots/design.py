@@ -1,4 +1,4 @@
-"""Picture of proposed runs: where to drive next, and how fast uncertainty falls."""
+"""Picture of proposed runs: their commands, and the uncertainty over the number of runs."""
 
 import math
 from collections import Counter
@@ -21,7 +21,7 @@ CURVES = (
 
 
 def design_figure(found: Design) -> Figure:
-    """Proposed runs by floor and load on what was driven (left), uncertainty by runs (right)."""
+    """Draw proposed and driven runs by floor and load (left), and uncertainty over runs (right)."""
     setups = list(dict.fromkeys((d.surface, d.load) for d in found.runs))
     columns = min(len(setups), 2 if len(setups) < 5 else 3)
     rows = math.ceil(len(setups) / columns)
@@ -35,8 +35,8 @@ def design_figure(found: Design) -> Figure:
         _commands(ax, found, setup, mine, order)
     for spare in axes[len(setups) :]:
         spare.remove()
-    words = "numbers: in which order (x3: three times)\nbent or round arrows: turning as it runs"
-    left.supxlabel(f"{words}\ngray dots: driven already", fontsize=9, color=drawing.SHADE)
+    words = "numbers: order of the runs (x3: three times)\nbent or round arrows: runs with a turn"
+    left.supxlabel(f"{words}\ngray dots: runs of the fit", fontsize=9, color=drawing.SHADE)
     _falling(right.subplots(), found.content["runs_saved"]["paper_grid"])
     return made
 
@@ -61,13 +61,13 @@ def _commands(
     mine: Counter[PlannedRun],
     order: dict[PlannedRun, int],
 ) -> None:
-    """Commanded velocities of one floor and load."""
+    """Draw the commanded velocities of one floor and load."""
     floor, load = setup
-    seen = found.validity[floor]
+    driven = found.validity[floor]
     reach = 1.4 * max(d.speed or abs(d.turn) * found.base_radius for d in mine)
-    if load in seen.loads:
-        angle = np.radians(seen.headings_deg)
-        for speed in seen.speeds:
+    if load in driven.loads:
+        angle = np.radians(driven.headings_deg)
+        for speed in driven.speeds:
             x, y = speed * np.cos(angle), speed * np.sin(angle)
             ax.plot(x, y, ".", color="#bbbbbb", ms=3.5, mew=0)
     for d, times in mine.items():
@@ -81,24 +81,24 @@ def _commands(
 
 
 def _arrow(ax: Axes, d: PlannedRun, base: float, beyond: float) -> tuple[float, float]:
-    """Arrow to the commanded velocity, bent where it turns, an arc on the spot.
+    """Draw an arrow to the commanded velocity, bent for a turn, an arc for a turn on the spot.
 
     Returns:
-        the place of its label, `beyond` [m/s] the tip.
+        the position of its label, `beyond` [m/s] the tip.
     """
-    colour, way = _colour(d), float(np.sign(d.turn))
+    colour, sign = _colour(d), float(np.sign(d.turn))
     style = {"arrowstyle": "-|>", "color": colour, "lw": 1.5, "shrinkA": 0, "shrinkB": 0}
     if d.speed:
-        style["connectionstyle"] = f"arc3,rad={0.25 * way}"
+        style["connectionstyle"] = f"arc3,rad={0.25 * sign}"
         end, start = (float(d.command[0]), float(d.command[1])), (0.0, 0.0)
-        side = d.heading + 0.12 * way
+        side = d.heading + 0.12 * sign
         place = (d.speed + beyond) * np.array([np.cos(side), np.sin(side)])
     else:
         size = abs(d.turn) * base
-        style["connectionstyle"] = f"arc3,rad={0.9 * way}"
+        style["connectionstyle"] = f"arc3,rad={0.9 * sign}"
         low, high = (0.0, -size), (0.0, size)
-        start, end = (low, high) if way > 0 else (high, low)
-        place = np.array([way * (size + 1.3 * beyond), 0.0])
+        start, end = (low, high) if sign > 0 else (high, low)
+        place = np.array([sign * (size + 1.3 * beyond), 0.0])
     ax.annotate("", end, start, arrowprops=style)
     return float(place[0]), float(place[1])
 
@@ -110,7 +110,7 @@ def _colour(d: PlannedRun) -> str:
 
 
 def _falling(ax: Axes, saved: Content) -> None:
-    """Uncertainty against runs, from nothing."""
+    """Draw the uncertainty over the number of runs, without earlier data."""
     for key, colour, style, label in CURVES:
         curve = saved["curves"][key]
         std = np.sqrt(curve["criterion"])
@@ -118,12 +118,12 @@ def _falling(ax: Axes, saved: Content) -> None:
     end = math.sqrt(saved["criterion"])
     ax.axhline(end, color=drawing.INK, lw=0.8, ls=":")
     ax.plot(saved["grid_runs"], end, "o", color=drawing.ORANGE, ms=6)
-    told = "more than as many"
+    worth = "worth more than as many"
     if saved["greedy_runs"]:
         last = math.sqrt(saved["curves"]["greedy"]["criterion"][-1])
         ax.plot(saved["greedy_runs"], last, "o", color=drawing.BLUE, ms=6)
-        told = f"as much as {saved['greedy_runs']}"
-    title = f"from no run at all: the grid's {saved['grid_runs']} runs tell\n{told} chosen ones"
+        worth = f"worth {saved['greedy_runs']}"
+    title = f"without earlier data: the grid's {saved['grid_runs']} runs are\n{worth} chosen ones"
     ax.set_title(title, fontsize=11)
     ax.set(xscale="log", yscale="log", xlabel="runs")
     ax.set(ylabel="uncertainty (1: the present fit)")

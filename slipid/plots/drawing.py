@@ -1,4 +1,4 @@
-"""What all pictures share: a figure that needs no display, colours for any eyes, whole files."""
+"""Parts shared by all pictures: figures without a display, colours, atomic files."""
 
 import io
 import math
@@ -14,30 +14,30 @@ from slipid.support.files import write_bytes
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 INK, SHADE = "#222222", "#888888"
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, "#56B4E9", "#E69F00")
-"""Okabe and Ito's colours: told apart with any colour vision."""
+"""Okabe and Ito's colours, distinct for any colour vision."""
 STYLES = tuple(zip(SERIES, ("o", "^", "s", "D", "v", "P"), strict=True))
-"""A colour and a marker for each series."""
+"""Colour and marker of each series."""
 
 
 def figure(width: float, height: float, title: str) -> Figure:
-    """Empty figure [inch] that says at the top what one should see."""
+    """Return an empty figure [inch] with a title that states its message."""
     made = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(made)
     made.suptitle(title, fontsize=13, x=0.01, ha="left", color=INK)
     return made
 
 
-def warned(made: Figure, text: str) -> None:
+def add_warning(made: Figure, text: str) -> None:
     """Put a warning above the title of a figure, in its colour."""
     title = made.get_suptitle()
     made.suptitle(f"{text}\n{title}", fontsize=13, x=0.01, ha="left", color=ORANGE)
 
 
 def panels(count: int, width: float, height: float, title: str) -> tuple[Figure, list[Axes]]:
-    """Figure with `count` plain panels of one size [inch], in rows of at most four."""
+    """Return a figure with `count` plain panels of one size [inch], in rows of at most four."""
     columns = min(count, 4 if count != 5 else 3)
     rows = math.ceil(count / columns)
-    # a single panel still leaves the title room
+    # a single panel leaves room for the title
     made = figure(max(width * columns, 8.8), height * rows + 0.6, title)
     axes = list(made.subplots(rows, columns, squeeze=False).flat)
     for spare in axes[count:]:
@@ -48,7 +48,7 @@ def panels(count: int, width: float, height: float, title: str) -> tuple[Figure,
 
 
 def plain(axes: Axes) -> None:
-    """Light grid, no box."""
+    """Give axes a light grid and no box."""
     axes.grid(color="#dddddd", lw=0.6)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
@@ -56,18 +56,18 @@ def plain(axes: Axes) -> None:
 
 
 def png(made: Figure) -> bytes:
-    """The figure as a PNG file."""
+    """Return the content of a PNG file of the figure."""
     buffer = io.BytesIO()
     made.savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()
 
 
 def save(made: Figure, path: Path) -> Path:
-    """Write the figure as PNG, whole or not at all."""
+    """Write the figure as PNG atomically; return the path."""
     write_bytes(path, png(made))
     return path
 
 
 def save_all(figures: Mapping[str, Figure | None], out: Path) -> list[Path]:
-    """Write figures under their names with `.png`; the files of those that there are."""
+    """Write figures under their names with `.png`, except missing ones; return the files."""
     return [save(made, out / f"{name}.png") for name, made in figures.items() if made is not None]

@@ -1,9 +1,4 @@
-"""Raw signals of a data set as pictures, one per floor and load: look before you fit.
-
-Load shares on a drawing of the robot from above.
-
-Pictures of a result, as PNG files.
-"""
+"""Pictures of logs before a fit and of its result: raw signals, load shares, files of all."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,29 +12,28 @@ from slipid.data.runs import Runs
 from slipid.infer.result import Fit
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.plots import drawing
-from slipid.plots.drawing import figure, save, save_all, warned
+from slipid.plots.drawing import add_warning, figure, save, save_all
 from slipid.plots.measured_windows import MeasuredWindows, measured_windows
-from slipid.plots.motion import heading_figure, path_figure
+from slipid.plots.motion import heading_figure, path_figure, runs_by_setup
 from slipid.plots.wheels import current_figure, curve_figure
 from slipid.predict.validation import Validation
 
 
 def raw_plots(data: Runs, out: Path) -> list[Path]:
-    """`plot_runs` of each floor and load set-up; PNG files."""
-    groups: dict[tuple[str, str], list[int]] = {}
-    for k, log in enumerate(data.logs):
-        groups.setdefault((log.surface or "unknown", log.load), []).append(k)
+    """Write the picture `plot_runs` of each floor and load set-up; return the files."""
     return [
         save(plot_runs(data, runs, f"{floor}, {load}"), out / f"raw_{floor}_{load}.png")
-        for (floor, load), runs in sorted(groups.items())
+        for (floor, load), runs in sorted(runs_by_setup(data).items())
     ]
 
 
 def plot_runs(data: Runs, runs: Sequence[int] | None = None, title: str = "as logged") -> Figure:
-    """Paths, wheel speeds and currents of runs, all on one another.
+    """Draw paths, wheel speeds and currents of runs on top of one another.
 
     Args:
-        runs: numbers of those that are shown; all by default.
+        data: all runs.
+        runs: numbers of the runs that are drawn, all by default.
+        title: title of the picture.
     """
     runs = range(len(data)) if runs is None else runs
     wheels = data.wheel_angle.shape[1]
@@ -67,7 +61,7 @@ def plot_runs(data: Runs, runs: Sequence[int] | None = None, title: str = "as lo
 
 
 def load_figure(fit: Fit) -> Figure | None:
-    """Share of the weight on each wheel, one robot per load set-up; None where all are fixed."""
+    """Draw the share of the weight on each wheel by load set-up; return None if all are fixed."""
     loads = fit.robot.body.loads
     found = [fit.parameters[f"robot.load_share@{load}"] for load in loads]
     if all(e.interval90 is None for e in found):
@@ -82,7 +76,7 @@ def load_figure(fit: Fit) -> Figure | None:
 
 
 def _robot(ax: Axes, fit: Fit, estimate: Estimate) -> None:
-    """One robot; x ahead points up, y to the left."""
+    """Draw one robot from above, with x up and y to the left."""
     shape = fit.robot.geometry
     base, radius = float(shape.base_radius), float(shape.wheel_radius)
     place = np.asarray(shape.place) * base
@@ -96,8 +90,8 @@ def _robot(ax: Axes, fit: Fit, estimate: Estimate) -> None:
     for k, (p, angle) in enumerate(zip(place, angles, strict=True)):
         along = np.array([np.cos(angle), np.sin(angle)])
         side = np.array([-along[1], along[0]]) * 0.35 * radius
-        ways = (radius * along + side, radius * along - side)
-        corners = [_up(p + way) for way in (*ways, -ways[0], -ways[1])]
+        ends = (radius * along + side, radius * along - side)
+        corners = [_up(p + corner) for corner in (*ends, -ends[0], -ends[1])]
         size = reach * 0.62 * np.sqrt(share[k])
         ax.add_patch(Circle(_up(p), size, fc=drawing.BLUE, alpha=0.25, ec="none"))
         ax.add_patch(Polygon(corners, fc=drawing.INK, ec="none"))
@@ -107,15 +101,15 @@ def _robot(ax: Axes, fit: Fit, estimate: Estimate) -> None:
     where = f"{abs(ahead):.0f} mm {'ahead of' if ahead > 0 else 'behind'} the middle"
     if abs(left) >= 0.5:
         where += f" and {abs(left):.0f} mm to the {'left' if left > 0 else 'right'}"
-    said = f"cross: centre of weight, {where}"
-    ax.text(0, -2.3 * reach, said, ha="center", fontsize=9, color=drawing.ORANGE)
+    text = f"cross: centre of weight, {where}"
+    ax.text(0, -2.3 * reach, text, ha="center", fontsize=9, color=drawing.ORANGE)
     ax.set(xlim=(-2.2 * reach, 2.2 * reach), ylim=(-2.4 * reach, 1.6 * reach), aspect="equal")
     ax.grid(False)
     ax.axis("off")
 
 
 def _up(p: np.ndarray | Sequence[float]) -> tuple[float, float]:
-    """Body x, y on a page where ahead is up and left is left."""
+    """Return a body position x, y on a page with x up and y to the left."""
     return -float(p[1]), float(p[0])
 
 
@@ -127,49 +121,46 @@ def _words(k: int, estimate: Estimate) -> str:
     return text
 
 
-PATHS = (
-    "Where the encoders say the robot went (dotted), where the fitted robot says (blue),\n"
-    "and where the camera saw it (gray): "
-)
+PATHS = "Paths by the encoders (dotted), by the fitted robot (blue)\nand by the camera (gray): "
 
 
 PICTURES: dict[str, Callable[[Fit, Runs, MeasuredWindows], Figure | None]] = {
-    "slip_by_heading": lambda fit, data, pieces: heading_figure(fit.robot, pieces),
-    "paths": lambda fit, data, pieces: path_figure(
-        fit.contact, data, pieces.groups, PATHS + "runs of the fit"
+    "slip_by_heading": lambda fit, data, measured: heading_figure(fit.robot, measured),
+    "paths": lambda fit, data, measured: path_figure(
+        fit.contact, data, measured.groups, PATHS + "runs of the fit"
     ),
-    "slip_by_torque": lambda fit, data, pieces: curve_figure(fit, pieces),
-    "current_by_traction": lambda fit, data, pieces: current_figure(pieces),
-    "load_share": lambda fit, data, pieces: load_figure(fit),
+    "slip_by_torque": lambda fit, data, measured: curve_figure(fit, measured),
+    "current_by_traction": lambda fit, data, measured: current_figure(measured),
+    "load_share": lambda fit, data, measured: load_figure(fit),
 }
 """Pictures of a fit by name."""
 
 
 def identify_plots(fit: Fit, data: Runs, out: Path, warning: str | None = None) -> list[Path]:
-    """Files of all `PICTURES` that the runs, those of the fit, have something for.
+    """Write all `PICTURES` that the runs of the fit have data for; return the files.
 
-    What is said of a fit that is not to be used stands in the title of each.
+    A warning, for a fit that is not to be trusted, is added to the title of each.
     """
-    pieces = measured_windows(fit.robot, data, fit.channels.windows)
-    made = {name: draw(fit, data, pieces) for name, draw in PICTURES.items()}
+    measured = measured_windows(fit.robot, data, fit.channels.windows)
+    made = {name: draw(fit, data, measured) for name, draw in PICTURES.items()}
     if warning is not None:
         for figure in filter(None, made.values()):
-            warned(figure, warning)
+            add_warning(figure, warning)
     return save_all(made, out)
 
 
 def picture(fit: Fit, data: Runs, name: str) -> Figure:
-    """One picture by name; ValueError where there is none, or the runs have nothing for it."""
+    """Return one picture by name; raise `ValueError` if it is unknown or the runs lack its data."""
     if name not in PICTURES:
         raise ValueError(f"no picture '{name}'; there are {', '.join(PICTURES)}")
     made = PICTURES[name](fit, data, measured_windows(fit.robot, data, fit.channels.windows))
     if made is None:
-        raise ValueError(f"picture '{name}': the runs have nothing for it")
+        raise ValueError(f"picture '{name}': the runs lack the data for it")
     return made
 
 
 def validate_plots(fit: Fit, data: Runs, found: Validation, out: Path) -> list[Path]:
-    """Files of how well runs are predicted, as the validation found, and some of their paths."""
+    """Write pictures of a validation's errors and of some predicted paths; return the files."""
     names = {log.surface or "unknown": None for log in data.logs}
     order = [(floor, load) for floor in sorted(names) for load in fit.robot.body.loads]
     figures = {

@@ -1,4 +1,4 @@
-"""What pictures compare: what camera and ammeters saw of a piece of a run, and the prediction."""
+"""Measured and predicted slip, currents and torques of segments of runs, for pictures."""
 
 from dataclasses import dataclass
 
@@ -16,53 +16,55 @@ from slipid.model.robot import Robot
 from slipid.predict.slip_model import body_twist
 
 STRAIGHT = 0.98
-"""Part of the encoders' path that must be displacement for a piece to have a direction."""
-LEAST_WAY = 0.05
-"""Way of a wheel's rim below which its slip is noise [m]."""
+"""Smallest displacement over path length, by the encoders, of a straight segment."""
+SHORTEST_PATH = 0.05
+"""Path length of a wheel's rim below which its slip is noise [m]."""
 TURNING = 0.5
-"""Encoder yaw per distance from which on a piece is a turn [rad/m]."""
+"""Yaw per path length, by the encoders, from which a segment is a turn [rad/m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredWindows:
-    """Pieces of a few seconds; angles in the body frame, everything a mean over the piece.
+    """Means over segments of a few seconds, with angles in the body frame.
 
-    What is of a wheel is of all wheels of a drive: their mean, of loads and torques the sum.
+    Values of a drive are means over its wheels, or sums of their loads and torques.
 
     Attributes:
-        group: index into `groups` of each piece.
-        groups: (floor, load set-up), from the least slip to the most.
-        speed: of the body as commanded, else by the encoders [m/s], to 0.01.
-        heading: direction of travel by the encoders [deg], 0..360.
-        straight: the piece has one direction and does not turn.
-        slip, drift, yaw: measured by the camera against the encoders: length lost [1], sideways
-            angle [deg], turn per encoder metre [deg/m].
-        wheel_speed: [rad/s]; wheel_slip: measured, 1 - (rim speed over the floor) / (r w); nan for
-            a wheel that hardly turned.
-        sideways: speed across the wheel over its rim speed.
-        share: of the weight on the wheel in motion.
-        amps: measured current [A], None where not logged; amps_model: predicted.
-        torque: predicted traction torque at the wheel [N m]; dragged: that of the drag along the
-            drive, which the motor bears beside it.
-        unsigned: the log has magnitudes of currents only.
+        group: index into `groups` of each segment.
+        groups: (floor, load set-up), from the smallest slip to the largest.
+        speed: commanded speed of the body, else by the encoders, to 0.01 [m/s].
+        heading: direction of travel by the encoders, 0 to 360 [deg].
+        straight: True if the segment has one direction and no turn.
+        slip: 1 - camera's displacement along the encoders' direction over the encoders' [1].
+        drift: sideways angle of the camera's displacement to the encoders' [deg].
+        yaw: yaw by camera less encoders, per encoder path length [deg/m].
+        wheel_speed: speed of the wheel [rad/s].
+        wheel_slip: 1 - (speed over the floor) / (rim speed), nan for a wheel that hardly turned.
+        sideways: speed across the wheel over its rim speed [1].
+        share: share of the weight on the wheel in motion.
+        amps: measured current, None if not logged [A].
+        amps_model: predicted current [A].
+        torque: predicted traction torque at the wheel [N m].
+        drag_torque: torque of the drag along the drive that the motor bears as well [N m].
+        unsigned: True if only magnitudes of currents were logged.
     """
 
     group: np.ndarray
     groups: tuple[tuple[str, str], ...]
-    speed: Float[np.ndarray, " piece"]
-    heading: Float[np.ndarray, " piece"]
-    straight: Bool[np.ndarray, " piece"]
-    slip: Float[np.ndarray, " piece"]
-    drift: Float[np.ndarray, " piece"]
-    yaw: Float[np.ndarray, " piece"]
-    wheel_speed: Float[np.ndarray, "piece drive"]
-    wheel_slip: Float[np.ndarray, "piece drive"]
-    sideways: Float[np.ndarray, "piece drive"]
-    share: Float[np.ndarray, "piece drive"]
-    amps: Float[np.ndarray, "piece drive"] | None
-    amps_model: Float[np.ndarray, "piece drive"]
-    torque: Float[np.ndarray, "piece drive"]
-    dragged: Float[np.ndarray, "piece drive"]
+    speed: Float[np.ndarray, " segment"]
+    heading: Float[np.ndarray, " segment"]
+    straight: Bool[np.ndarray, " segment"]
+    slip: Float[np.ndarray, " segment"]
+    drift: Float[np.ndarray, " segment"]
+    yaw: Float[np.ndarray, " segment"]
+    wheel_speed: Float[np.ndarray, "segment drive"]
+    wheel_slip: Float[np.ndarray, "segment drive"]
+    sideways: Float[np.ndarray, "segment drive"]
+    share: Float[np.ndarray, "segment drive"]
+    amps: Float[np.ndarray, "segment drive"] | None
+    amps_model: Float[np.ndarray, "segment drive"]
+    torque: Float[np.ndarray, "segment drive"]
+    drag_torque: Float[np.ndarray, "segment drive"]
     unsigned: bool
 
 
@@ -73,13 +75,13 @@ def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWind
     b, dt = lk.batch(w, robot), w.dt[..., None]
     shape = robot.geometry
     torque = np.asarray(shape.at_drives(curves.wheel_states(robot, b)[1]))
-    amps, dragged = (np.asarray(x) for x in _borne(robot, b))
+    amps, drag_torque = (np.asarray(x) for x in _borne(robot, b))
     inverse, frame = np.asarray(shape.pseudo_inverse()) * radius, shape.frame()
-    free = (w.turn @ inverse.T).sum(axis=1)
-    far = np.linalg.norm((w.turn @ inverse.T)[..., :2], axis=-1).sum(axis=1)
+    encoder = (w.turn @ inverse.T).sum(axis=1)
+    length = np.linalg.norm((w.turn @ inverse.T)[..., :2], axis=-1).sum(axis=1)
     true = (body_twist(w, robot) * dt).sum(axis=1)
-    ahead = np.hypot(free[:, 0], free[:, 1])
-    u = free[:, :2] / np.maximum(ahead, 1e-9)[:, None]
+    ahead = np.hypot(encoder[:, 0], encoder[:, 1])
+    u = encoder[:, :2] / np.maximum(ahead, 1e-9)[:, None]
     along = (u * true[:, :2]).sum(axis=1)
     across = u[:, 0] * true[:, 1] - u[:, 1] * true[:, 0]
     time = w.dt.sum(axis=1)
@@ -92,7 +94,7 @@ def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWind
         return np.asarray(shape.at_drives(jnp.asarray(of_wheels)) / shape.at_drives(ones))
 
     rim = radius * w.turn.sum(axis=1)
-    safe = np.where(np.abs(rim) > LEAST_WAY, rim, np.nan)
+    safe = np.where(np.abs(rim) > SHORTEST_PATH, rim, np.nan)
     pairs = list(zip(w.surface, w.load, strict=True))
     slip = 1.0 - along / np.maximum(ahead, 1e-9)
     floor = np.asarray(w.surface)
@@ -102,12 +104,14 @@ def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWind
     return MeasuredWindows(
         group=np.array([groups.index(p) for p in pairs]),
         groups=groups,
-        speed=np.round(np.where(np.isfinite(wanted), wanted, far / time), 2),
+        speed=np.round(np.where(np.isfinite(wanted), wanted, length / time), 2),
         heading=np.degrees(np.arctan2(u[:, 1], u[:, 0])) % 360.0,
-        straight=(ahead > STRAIGHT * far) & (np.abs(free[:, 2]) < TURNING * far) & (far > 0.05),
+        straight=(ahead > STRAIGHT * length)
+        & (np.abs(encoder[:, 2]) < TURNING * length)
+        & (length > 0.05),
         slip=slip,
         drift=np.degrees(np.arctan2(across, along)),
-        yaw=np.degrees(true[:, 2] - free[:, 2]) / np.maximum(ahead, 1e-9),
+        yaw=np.degrees(true[:, 2] - encoder[:, 2]) / np.maximum(ahead, 1e-9),
         wheel_speed=whole(lk.wheel_speed(robot, b)),
         wheel_slip=1.0 - (true @ np.asarray(shape.forward()).T) / safe,
         sideways=mean(np.abs(true @ (frame.roll / frame.drive_share[:, None]).T)) / np.abs(safe),
@@ -115,7 +119,7 @@ def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWind
         amps=whole(w.current) if w.has_current else None,
         amps_model=whole(amps),
         torque=whole(torque),
-        dragged=whole(dragged),
+        drag_torque=whole(drag_torque),
         unsigned=not w.current_is_signed,
     )
 
@@ -123,11 +127,14 @@ def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWind
 def by_heading(
     robot: Robot, surface: str, load: str, speed: float, heading: Float[np.ndarray, " heading"]
 ) -> Float[np.ndarray, "heading 3"]:
-    """Predicted slip [1], sideways angle [deg] and turn [deg/m] of straight commands.
+    """Return predicted slip [1], sideways angle [deg] and yaw [deg/m] of straight commands.
 
     Args:
-        speed: of the body without slip [m/s].
-        heading: of the command in the body frame [deg].
+        robot: robot with its contact law.
+        surface: name of the floor.
+        load: name of the load set-up.
+        speed: speed of the body without slip [m/s].
+        heading: headings of the command in the body frame [deg].
     """
     angle = np.radians(heading)
     wanted = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1) * speed
@@ -143,7 +150,7 @@ def by_heading(
 
 @jax.jit
 def _borne(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
-    """Predicted currents [A], and torques of the drag along the drive [N m]."""
+    """Return predicted currents [A], and torques of the drag along the drive [N m]."""
     motor_force = lk.predict(robot, b).motor_force
     force = robot.surfaces.friction[b.surface] * robot.body.mass * model.GRAVITY
     drag = robot.motor.rolling_drag * motor_force[..., 1]

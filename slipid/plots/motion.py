@@ -1,6 +1,7 @@
-"""Pictures of the motion: slip and drift against heading, predicted against measured paths."""
+"""Pictures of motion: slip and drift over heading, and predicted beside measured paths."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,25 +18,29 @@ from slipid.predict.predictive import ForceBalance
 from slipid.predict.slip_models import FloorModels
 
 ROWS = (
-    ("slip", "slip: way lost [%]"),
+    ("slip", "slip: path length lost [%]"),
     ("drift", "sideways drift [deg]\n(left positive)"),
     ("yaw", "yaw drift [deg per m]\n(counter-clockwise positive)"),
 )
 MOST_SPEEDS = 4
+"""Largest number of speeds that are drawn."""
 RAYS, LOOPS = 16, 3
-"""Runs drawn per panel of paths: straight ones, others."""
+"""Number of straight runs, and of other runs, in a panel of paths."""
 LEAST_OCTANTS = 5
-"""Eighths of the circle in which a floor must have been driven for a picture by heading."""
+"""Number of octants with runs on a floor for which it is drawn over heading."""
 
 
-def heading_figure(robot: Robot, seen: MeasuredWindows) -> Figure | None:
-    """Slip and drift against the direction of travel, a column per floor and load set-up.
+def heading_figure(robot: Robot, measured: MeasuredWindows) -> Figure | None:
+    """Draw slip and drift over the direction of travel, a column per floor and load set-up.
 
-    None where no floor was driven straight in most directions.
+    Returns:
+        None if no floor has straight runs in most directions.
     """
-    octant = (seen.heading // 45.0).astype(int)
-    ways = [octant[seen.straight & (seen.group == g)] for g in range(len(seen.groups))]
-    columns = [g for g, found in enumerate(ways) if len(np.unique(found)) >= LEAST_OCTANTS]
+    octant = (measured.heading // 45.0).astype(int)
+    driven = (
+        octant[measured.straight & (measured.group == g)] for g in range(len(measured.groups))
+    )
+    columns = [g for g, found in enumerate(driven) if len(np.unique(found)) >= LEAST_OCTANTS]
     if not columns:
         return None
     made = drawing.figure(
@@ -45,9 +50,9 @@ def heading_figure(robot: Robot, seen: MeasuredWindows) -> Figure | None:
         "dots: camera against encoders; lines: predicted by the force balance",
     )
     axes = made.subplots(3, len(columns), sharex=True, sharey="row", squeeze=False)
-    speeds = _speeds(seen)
+    speeds = _speeds(measured)
     for column, g in enumerate(columns):
-        _headings(robot, seen, g, speeds, list(axes[:, column]))
+        _headings(robot, measured, g, speeds, list(axes[:, column]))
     for row, (_, label) in enumerate(ROWS):
         axes[row, 0].set_ylabel(label)
     handles = [
@@ -58,10 +63,10 @@ def heading_figure(robot: Robot, seen: MeasuredWindows) -> Figure | None:
     return made
 
 
-def _speeds(seen: MeasuredWindows) -> list[float]:
-    """The speeds driven, at most `MOST_SPEEDS`, each a tenth away from the next."""
+def _speeds(measured: MeasuredWindows) -> list[float]:
+    """Return at most `MOST_SPEEDS` driven speeds, each a tenth away from the next."""
     found: list[float] = []
-    values, counts = np.unique(seen.speed[seen.straight], return_counts=True)
+    values, counts = np.unique(measured.speed[measured.straight], return_counts=True)
     for v in values[np.argsort(-counts)]:
         if v > 0 and all(abs(v - u) > 0.1 * max(u, v) + 0.005 for u in found):
             found.append(float(v))
@@ -69,59 +74,65 @@ def _speeds(seen: MeasuredWindows) -> list[float]:
 
 
 def _headings(
-    robot: Robot, seen: MeasuredWindows, g: int, speeds: list[float], axes: Sequence[Axes]
+    robot: Robot, measured: MeasuredWindows, g: int, speeds: list[float], axes: Sequence[Axes]
 ) -> None:
-    surface, load = seen.groups[g]
-    mine = seen.straight & (seen.group == g)
-    nearest = np.argmin(np.abs(seen.speed[:, None] - np.asarray(speeds)), axis=1)
+    surface, load = measured.groups[g]
+    mine = measured.straight & (measured.group == g)
+    nearest = np.argmin(np.abs(measured.speed[:, None] - np.asarray(speeds)), axis=1)
     heading = np.linspace(0.0, 360.0, 181)
     for k, (colour, marker) in enumerate(drawing.STYLES[: len(speeds)]):
         picked = mine & (nearest == k)
         if not picked.any():
             continue
         lines = by_heading(robot, surface, load, speeds[k], heading)
-        measured = (100 * seen.slip, seen.drift, seen.yaw)
-        for row, ax in enumerate(axes):
-            x, y = seen.heading[picked], measured[row][picked]
+        for row, values in enumerate((100 * measured.slip, measured.drift, measured.yaw)):
+            x, y, ax = measured.heading[picked], values[picked], axes[row]
             ax.plot(x, y, marker, ms=3.6, color=colour, alpha=0.5, mew=0)
             ax.plot(heading, lines[:, row] * (100.0 if row == 0 else 1.0), color=colour, lw=1.6)
     for ax in axes:
         drawing.plain(ax)
         ax.axhline(0.0, color=drawing.INK, lw=0.8)
-    axes[0].set_title(named(surface, load, seen.groups))
+    axes[0].set_title(named(surface, load, measured.groups))
     axes[-1].set(xlabel="direction of travel [deg]\n(0 ahead, 90 left)", xticks=range(0, 361, 90))
 
 
 def named(surface: str, load: str, groups: Sequence[tuple[str, str]]) -> str:
-    """Title of a panel; the load only where set-ups differ."""
+    """Return the title of a panel, with the load set-up if there are several."""
     several = len({other for _, other in groups}) > 1
     return f"{surface}, load {load}" if several else surface
+
+
+def runs_by_setup(data: Runs) -> dict[tuple[str, str], list[int]]:
+    """Return the numbers of the runs of each floor and load set-up."""
+    groups: dict[tuple[str, str], list[int]] = {}
+    for k, log in enumerate(data.logs):
+        groups.setdefault((log.surface or "unknown", log.load), []).append(k)
+    return groups
 
 
 def path_figure(
     model: ForceBalance, data: Runs, order: Sequence[tuple[str, str]], title: str
 ) -> Figure:
-    """Some runs per floor and load, started at one point with the robot looking to the right.
+    """Draw some runs per floor and load, from one start with the robot facing right.
 
     Args:
-        model: what predicts, told by neighbouring runs as in the table of errors.
-        order: of the panels, (floor, load set-up).
-        title: says whether the fit has seen these runs.
+        model: slip model that predicts, with shared effects as in the table of errors.
+        data: the runs.
+        order: order of the panels, (floor, load set-up).
+        title: title that names the set of runs.
     """
-    groups: dict[tuple[str, str], list[int]] = {}
-    for k, log in enumerate(data.logs):
-        groups.setdefault((log.surface or "unknown", log.load), []).append(k)
+    groups = runs_by_setup(data)
     names = [name for name in order if name in groups]
     paths = _paths(model, data)
     made, axes = drawing.panels(len(names), 3.7, 4.3, title)
     for ax, (surface, load) in zip(axes, names, strict=True):
         runs = groups[surface, load]
         shown = [paths[k] for k in _spread(data, runs)]
-        for three in shown:
-            _ray(ax, three)
+        for run in shown:
+            _ray(ax, run)
         errors = _errors([paths[k] for k in runs])
         ax.set_title(f"{named(surface, load, names)}\n{errors}", fontsize=10)
-        reach = 1.08 * max(float(np.abs(p).max()) for three in shown for p in three)
+        reach = 1.08 * max(float(np.abs(p).max()) for run in shown for p in run)
         ax.set_aspect("equal")
         ax.set(xlim=(-reach, reach), xlabel="ahead of the start [m]")
         ax.set(ylim=(-reach, reach), ylabel="left of the start [m]")
@@ -135,7 +146,7 @@ def path_figure(
 
 
 def _spread(data: Runs, runs: list[int]) -> list[int]:
-    """Some runs, evenly over headings and of the most common speed where there are headings."""
+    """Return some runs, evenly over headings and of the most common speed if they have headings."""
     heading, speed, most = data.heading[runs], data.speed[runs], LOOPS
     if np.isfinite(heading).all():
         values, counts = np.unique(np.round(speed, 3), return_counts=True)
@@ -148,9 +159,17 @@ def _spread(data: Runs, runs: list[int]) -> list[int]:
     return [runs[k] for k in at]
 
 
-def _paths(model: ForceBalance, data: Runs) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Measured, predicted and encoder path (edge, 2) of every run, from the origin, x ahead."""
-    out: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = [None] * len(data)
+class _Paths(NamedTuple):
+    """Paths (edge, 2) of a run from the origin, starting along x."""
+
+    measured: np.ndarray
+    predicted: np.ndarray
+    encoder: np.ndarray
+
+
+def _paths(model: ForceBalance, data: Runs) -> dict[int, _Paths]:
+    """Return the paths of every run by its number."""
+    out: dict[int, _Paths] = {}
     robot = model.robot
     for w in replay.replay_windows(data, robot):
         tracks = model.tracks(w)
@@ -162,26 +181,23 @@ def _paths(model: ForceBalance, data: Runs) -> list[tuple[np.ndarray, np.ndarray
             first = tracks.measured[n, 0]
             c, s = np.cos(first[2] - yaw), np.sin(first[2] - yaw)
             back = np.array([[c, s], [-s, c]])
-            out[int(k)] = tuple(
-                (p[n, :, :2] - first[:2]) @ back.T
-                for p in (tracks.measured, tracks.predicted, encoder.predicted)
-            )
-    return [p for p in out if p is not None]
+            every = (tracks.measured, tracks.predicted, encoder.predicted)
+            out[int(k)] = _Paths(*((p[n, :, :2] - first[:2]) @ back.T for p in every))
+    return out
 
 
-def _errors(paths: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> str:
-    """Mean distance of the ends over the camera's displacement, of prediction and encoders."""
-    ends = np.array([[p[-1] for p in three] for three in paths])
+def _errors(paths: Sequence[_Paths]) -> str:
+    """Return a text with the mean end-point errors over displacement, of model and encoders."""
+    ends = np.array([[p[-1] for p in run] for run in paths])
     chord = np.maximum(np.linalg.norm(ends[:, 0], axis=1), 1e-9)
-    gap = np.linalg.norm(ends[:, 1:] - ends[:, :1], axis=2) / chord[:, None]
-    own, encoder = 100 * gap.mean(axis=0)
+    error = np.linalg.norm(ends[:, 1:] - ends[:, :1], axis=2) / chord[:, None]
+    model, encoder = 100 * error.mean(axis=0)
     count = f"{len(paths)} runs" if len(paths) > 1 else "1 run"
-    return f"{count}: end off by {own:.1f} % (encoders {encoder:.1f} %)"
+    return f"{count}: end off by {model:.1f} % (encoders {encoder:.1f} %)"
 
 
-def _ray(ax: Axes, paths: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-    measured, predicted, encoder = paths
-    ax.plot(*encoder.T, ":", color=drawing.ORANGE, lw=1.0)
-    ax.plot(*measured.T, color=drawing.INK, lw=3.2, alpha=0.35, solid_capstyle="round")
-    ax.plot(*predicted.T, color=drawing.BLUE, lw=1.2)
-    ax.plot(*predicted[-1], "o", color=drawing.BLUE, ms=3.5)
+def _ray(ax: Axes, paths: _Paths) -> None:
+    ax.plot(*paths.encoder.T, ":", color=drawing.ORANGE, lw=1.0)
+    ax.plot(*paths.measured.T, color=drawing.INK, lw=3.2, alpha=0.35, solid_capstyle="round")
+    ax.plot(*paths.predicted.T, color=drawing.BLUE, lw=1.2)
+    ax.plot(*paths.predicted[-1], "o", color=drawing.BLUE, ms=3.5)

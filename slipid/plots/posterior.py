@@ -1,4 +1,4 @@
-"""How well numbers are known: draws and profile likelihoods beside the curvature at the fit."""
+"""Pictures of uncertainty: draws and profile likelihoods beside the curvature at the fit."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,16 +12,16 @@ from slipid.infer.verdicts.profile import RISE, Profile
 from slipid.plots import drawing
 
 PANELS = 6
-"""Pairs of numbers drawn."""
+"""Largest number of pairs of numbers that are drawn."""
 
 
 def posterior_plots(found: Posterior, out: Path) -> list[Path]:
-    """Files of all `PICTURES`."""
+    """Write all `PICTURES`; return the files."""
     return drawing.save_all({f"posterior_{k}": draw(found) for k, draw in PICTURES.items()}, out)
 
 
 def interval_figure(found: Posterior) -> Figure:
-    """90 % intervals of draws and of the fit's curvature, in prior standard deviations."""
+    """Draw 90 % intervals of draws and of the fit's curvature, in prior standard deviations."""
     fit, z = found.fit, found.flat
     chosen = np.flatnonzero(fit.space.where(lambda e: e.session is None)).tolist()
     mean, std = fit.verdict_space.prior_mean[chosen], fit.verdict_space.prior_std[chosen]
@@ -31,8 +31,8 @@ def interval_figure(found: Posterior) -> Figure:
     made = drawing.figure(
         8.8,
         1.6 + 0.2 * len(chosen),
-        "What the data say of each number, against what was known before\n"
-        "(0: prior mean; gray band: its 90 %)",
+        "Posterior of each number relative to its prior\n"
+        "(0: prior mean; gray band: its 90 % interval)",
     )
     ax = made.subplots()
     drawing.plain(ax)
@@ -52,14 +52,14 @@ def interval_figure(found: Posterior) -> Figure:
 
 
 def pair_figure(found: Posterior) -> Figure:
-    """The pairs of numbers whose draws are furthest from an ellipse."""
+    """Draw the pairs of numbers whose draws are furthest from an ellipse."""
     fit, z = found.fit, found.flat
-    pairs = bent(z)
+    pairs = curved_pairs(z)
     made, axes = drawing.panels(
         len(pairs),
         2.9,
         2.7,
-        "Numbers that trade off along a bent valley: draws (dots)\n"
+        "Numbers that trade off along a curved valley: draws (dots)\n"
         "and the 90 % ellipse of the curvature at the fit",
     )
     some = z[:: max(1, len(z) // 1500)]
@@ -75,8 +75,8 @@ PICTURES = {"intervals": interval_figure, "pairs": pair_figure}
 """Pictures of a posterior by name."""
 
 
-def bent(z: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of coordinates, those where a square explains most of the other one first.
+def curved_pairs(z: np.ndarray) -> list[tuple[int, int]]:
+    """Return pairs of coordinates, those first where a square of one explains most of the other.
 
     Each coordinate appears once.
     """
@@ -84,7 +84,7 @@ def bent(z: np.ndarray) -> list[tuple[int, int]]:
     linear = t.T @ t / len(t)
     square = t**2 - 1
     cubic = (t**3).mean(axis=0)
-    square = square - t * cubic  # what the square has beyond the line
+    square = square - t * cubic  # the part of the square orthogonal to the line
     square /= square.std(axis=0) + 1e-300
     strength = np.abs(square.T @ t / len(t)) * (1 - np.eye(len(linear)))
     found: list[tuple[int, int]] = []
@@ -103,12 +103,12 @@ def _ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray) -> None:
 
 
 def profile_figure(found: Sequence[Profile]) -> Figure:
-    """One panel per number: how fast the fit gets worse when the number is held elsewhere."""
+    """Draw a panel per number: the rise of the loss when the number is held elsewhere."""
     made, axes = drawing.panels(
         len(found),
         5.4,
         4.4,
-        "How much worse the logs fit when a number is held elsewhere and all others are refitted",
+        "Rise of the loss when a number is held elsewhere and all others are refitted",
     )
     for ax, profile in zip(axes, found, strict=True):
         _panel(ax, profile)

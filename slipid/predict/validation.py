@@ -101,9 +101,9 @@ class Validation:
 
     def plot(self) -> "Figure":
         """Plot the end-point errors of every model."""
-        from slipid.plots.compare import ladder_figure
+        from slipid.plots.compare import validation_figure
 
-        return ladder_figure(self.to_json(), self.which)
+        return validation_figure(self.to_json(), self.which)
 
     @property
     def summary(self) -> dict[str, dict[str, FloorSummary]]:

@@ -1,4 +1,4 @@
-"""Which model is right, what to drive next, and how the robot is best driven, as tables."""
+"""Tables of comparisons of slip models, proposed runs, exports and trials of controllers."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from slipid.deploy.export import Exported
 
 SHOWN = 3
-"""Goals of a design that have a column of their own."""
+"""Largest number of goals of a design with a column of their own."""
 
 
 def show_comparison(page: Page, found: Content) -> None:
-    """Write the content of comparison.json: a line per model, a column per floor, sentences."""
+    """Write comparison.json: a row per model, a column per floor, and sentences."""
     for question, answer in found["questions"].items():
         page.line(
             f"{question} left out: log density less the best's ± clustered standard error (nats "
             "per run), mean end-point error (%), ends in the 90 % region (%)"
         )
-        page.table(_ladder(answer))
+        page.table(_ranking(answer))
         for one in answer["floors"].values():
             page.line(one["sentence"])
             low, high = one["band90"]
@@ -50,8 +50,8 @@ def show_comparison(page: Page, found: Content) -> None:
         )
 
 
-def _ladder(answer: Content) -> Table:
-    """Table of one question."""
+def _ranking(answer: Content) -> Table:
+    """Return the table of one question."""
     floors = answer["floors"]
     made = table(())
     made.add_column("model", no_wrap=True)
@@ -59,31 +59,32 @@ def _ladder(answer: Content) -> Table:
         made.add_column(Text(name), justify="right", no_wrap=True)
     made.add_column("fit [s]", justify="right", no_wrap=True)
     for model, spent in answer["cost"].items():
-        cells = [_judged(one["models"][model]) for one in floors.values()]
+        cells = [_ranked(one["models"][model]) for one in floors.values()]
         made.add_row(model, *cells, _numbers(spent["numbers"]), f"{spent['fit_s']:.1f}")
     return made
 
 
-def _judged(m: Content) -> str:
+def _ranked(m: Content) -> str:
+    """Return a cell: log density less the best's, end-point error and coverage [%]."""
     colour = {"best": "bold green", "tied": "green"}.get(m["verdict"], "default")
     se = m["se_clustered"]
     if m["verdict"] == "best":
-        apart = "best"
+        difference = "best"
     else:
-        apart = f"{m['difference']:.1f} ± {'?' if se is None else format(se, '.1f')}"
-    far, inside = 100 * m["endpoint_error"], 100 * m["coverage90"]
-    return f"[{colour}]{apart}[/{colour}] {far:5.1f} {inside:3.0f}"
+        difference = f"{m['difference']:.1f} ± {'?' if se is None else format(se, '.1f')}"
+    error, inside = 100 * m["endpoint_error"], 100 * m["coverage90"]
+    return f"[{colour}]{difference}[/{colour}] {error:5.1f} {inside:3.0f}"
 
 
 def _numbers(count: dict[str, int]) -> str:
-    """Fitted numbers of a floor, and of all floors together."""
+    """Return the count of fitted numbers per floor, and of those shared by all floors."""
     floors = sorted({n for floor, n in count.items() if floor != "shared"})
     own = f"{floors[0]}" if len(floors) == 1 else f"{floors[0]}-{floors[-1]}"
     return f"{own} + {count['shared']}" if count["shared"] else own
 
 
 def show_design(page: Page, found: Content) -> None:
-    """Write the content of design.json: runs to drive next, what they shrink, what they save."""
+    """Write design.json: runs to drive next, expected stds, and savings over grids."""
     if found["runs"]:
         page.table(_runs(found))
         rest = len([g for g in found["goals"] if g["reachable"]]) - SHOWN
@@ -95,7 +96,7 @@ def show_design(page: Page, found: Content) -> None:
 
 
 def _runs(found: Content) -> Table:
-    """Table of proposed runs."""
+    """Return the table of proposed runs."""
     goals = [g for g in found["goals"] if g["reachable"]][:SHOWN]
     names = ("run", "floor", "load", "heading", "m/s", "turn", "m", "seconds")
     made = table(names, right=[n for n in names if n not in ("floor", "load")])
@@ -122,25 +123,25 @@ def _uncertain(std: float, unit: str) -> str:
 
 
 def _saving(s: Content) -> str:
-    """One sentence on runs saved."""
-    whole = f"{s['name']} ({s['grid_runs']} runs)"
-    if s["greedy_runs"] is None:
-        return f"from nothing: no fewer chosen runs tell as much as {whole}"
+    """Return a sentence on runs saved."""
+    grid, count = f"{s['name']} ({s['grid_runs']} runs)", s["greedy_runs"]
+    if count is None:
+        return f"without earlier data: no fewer chosen runs are worth {grid}"
     worse = s["criterion_random_order"] / s["criterion"]
     return (
-        f"from nothing: {s['greedy_runs']} chosen runs tell as much as {whole}: {s['ratio']:.0%}; "
-        f"the first {s['greedy_runs']} of it in random order leave {worse:.2g} times the variance"
+        f"without earlier data: {count} chosen runs are worth {grid}: {s['ratio']:.0%}; the first "
+        f"{count} of it in random order leave {worse:.2g} times the variance"
     )
 
 
 def show_export(page: Page, done: Exported) -> None:
-    """Write what is in a folder for a robot, and what must be known of its numbers."""
+    """Write the files in a folder for a robot, and warnings about its numbers."""
     page.line(f"in {done.folder}: README.md, robot.json, {', '.join(f'{x}/' for x in done.forms)}")
     page.notes(done.warnings)
 
 
 def show_trial(page: Page, found: Content, out: Path) -> None:
-    """Write what every controller came to, medians over the starts."""
+    """Write the errors of every controller, medians over the starts."""
     numbers = (
         "closure",
         "of encoders'",
@@ -167,10 +168,10 @@ def show_trial(page: Page, found: Content, out: Path) -> None:
     page.table(made)
     best = found["closes_best"]
     if best is None:
-        page.line(f"not told apart by these starts: {', '.join(found['not_told_apart'])}")
+        page.line(f"not distinguished by these starts: {', '.join(found['not_told_apart'])}")
     else:
         page.line(f"closes best: {best} ({found['controllers'][best]})")
     count = min(row["runs"] for row in found["summary"].values())
-    page.line("worse: part of the starts from which it closes worse than encoders do")
+    page.line("worse: share of the starts with a larger closure error than encoders")
     page.line(f"medians of {count} starts; 90 % intervals and every run: {out / 'trial.json'}")
     page.line(f"look at: {out / 'trial.png'}")

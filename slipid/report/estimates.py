@@ -1,7 +1,4 @@
-"""Numbers as tables: before a fit, after it, and beside the truth or the camera.
-
-What is known of motors on a bench, as tables.
-"""
+"""Tables of numbers: before a fit, after it, and beside the truth or the camera."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,11 +19,13 @@ if TYPE_CHECKING:
     from slipid.infer.verdicts.profile import Profile
 
 RECOVERED = {"yes": "green", "roughly": "yellow", "no": "red", "wrong": "magenta"}
-"""Colours of what a self-test says."""
+"""Colours of the verdicts of a self-test."""
+OPEN_RATIOS = "\nratios of numbers that the logs may not determine one by one"
+"""Title of the table of ratios."""
 
 
 def estimates(items: "Iterable[Estimate]", title: str) -> Table:
-    """Table of estimates; numbers of single sessions and defaults are left to the files."""
+    """Return a table of estimates without numbers of single sessions and defaults."""
     columns = ("parameter", "value", "unit", "90 % interval", "verdict", "from")
     made = table(columns, title, right=("value",))
     for e in items:
@@ -46,7 +45,7 @@ def estimates(items: "Iterable[Estimate]", title: str) -> Table:
 
 
 def rows_of(e: "Estimate") -> list[tuple[str, float, tuple[float, float] | None]]:
-    """Label, value and interval of a scalar, or of each entry of a vector."""
+    """Return label, value and interval of a scalar, or of each entry of a vector."""
     if not e.labels:
         return [("", e.value, e.interval90)]
     intervals = e.interval90 or [None] * len(e.labels)
@@ -56,7 +55,7 @@ def rows_of(e: "Estimate") -> list[tuple[str, float, tuple[float, float] | None]
 def show_sample(
     page: Page, numbers: "Iterable[Estimate]", about: Content, messages: Iterable[str]
 ) -> None:
-    """Write what the draws of a posterior say, and what sample.json says of how they were made."""
+    """Write the numbers of a posterior, and the convergence of its chains from sample.json."""
     worst = about["worst"]
     page.table(estimates(numbers, f"{about['draws']} draws"))
     page.notes(messages)
@@ -82,50 +81,50 @@ def show_posterior(page: Page, found: "Posterior") -> None:
 
 
 def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None:
-    """Write the numbers of a fit, what the logs leave open, and how the fit ended."""
+    """Write the numbers of a fit, their profiles, its warnings and how it ended."""
     page.table(estimates(fit.parameters.values(), f"{len(fit.runs)} runs, {fit.rounds} rounds"))
     if fit.derived:
-        page.table(estimates(fit.derived.values(), "\nknown as ratios, or not even so"))
+        page.table(estimates(fit.derived.values(), OPEN_RATIOS))
     for profile in profiles:
         page.line(f"profile: {profile.sentence}")
     page.notes(fit.messages)
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
 
 
-def show_trust(page: Page, judged: "TrustReport") -> None:
-    """Write how the fit predicts its own runs, open loop, and how far it may be trusted."""
-    if judged.floors:
+def show_trust(page: Page, found: "TrustReport") -> None:
+    """Write the open-loop errors of the fit on its own runs, and the trust in it."""
+    if found.floors:
         made = table(("surface", "end / path", "encoders alone"))
-        for name, e in judged.floors.items():
+        for name, e in found.floors.items():
             made.add_row(name, percent(e.model), percent(e.encoders))
-        page.line(f"open loop from their first pose on, {judged.runs} of the fitted runs:")
+        page.line(f"open loop from the first pose on, {found.runs} of the fitted runs:")
         page.table(made)
-    page.line(f"verdict: {judged.trust}")
+    page.line(f"verdict: {found.trust}")
 
 
 _COMMANDED = ("commanded headings", r"and speeds \[m/s]")
 
 
-STRANGE_RATE = 3e-4
-"""Difference of the rates of two clocks that no quartz has [1]."""
+LARGEST_DRIFT = 3e-4
+"""Difference of the rates of two clocks above that of any quartz [1]."""
 
 
 def _clocks(clocks: Mapping[str, Content]) -> str:
-    """Of the clocks of poses that had their own, how far off they were and how sure that is."""
+    """Return a sentence on the offsets of pose clocks and their intervals."""
     offsets = [clock["offset_s"] for clock in clocks.values()]
     wide = [0.5 * (high - low) for low, high in (c["offset_interval90_s"] for c in clocks.values())]
     rate = max((clock["drift"] for clock in clocks.values()), key=abs)
-    strange = f"; rates differ by up to {1e6 * rate:+.0f} ppm: is the video's frame rate right?"
+    question = f"; rates differ by up to {1e6 * rate:+.0f} ppm: is the video's frame rate right?"
     by = ", ".join(sorted({clock["told_by"] for clock in clocks.values()}))
     return (
         f"clock of the poses, from the motion ({by}): {min(offsets):+.3f} to {max(offsets):+.3f} s "
         f"from the robot's in {len(clocks)} runs; 90 % intervals +- {1e3 * min(wide):.1f} to "
-        f"{1e3 * max(wide):.1f} ms{strange if abs(rate) > STRANGE_RATE else ''}"
+        f"{1e3 * max(wide):.1f} ms{question if abs(rate) > LARGEST_DRIFT else ''}"
     )
 
 
 def show_check(page: Page, found: Content) -> None:
-    """Write the content of check.json; what is wrong comes first."""
+    """Write check.json, with its findings first."""
     page.findings(found["findings"])
     groups = table((*("surface", "load", "session", "runs", "minutes"), *_COMMANDED))
     for row in found["groups"]:
@@ -135,7 +134,7 @@ def show_check(page: Page, found: Content) -> None:
             Text(row["session"]),
             str(row["runs"]),
             f"{row['seconds'] / 60:.1f}",
-            str(row["headings"] or ""),  # nothing was commanded, or a turn on the spot
+            str(row["headings"] or ""),  # 0 without commands, or for turns on the spot
             " ".join(f"{v:g}" for v in row["speeds"]),
         )
     page.table(groups)
@@ -146,12 +145,12 @@ def show_check(page: Page, found: Content) -> None:
         page.line(f"repaired in {count} runs: {note}")
     before = table(
         ("parameter", "unit", "std after / before", "verdict"),
-        "before any fit: what the logs can be expected to tell, by the least telling of the floors "
-        "that a fit starts from",
+        "before any fit: expected information of the logs, for the least informative of the "
+        "floors that a fit starts from",
     )
     for path, e in (found["parameters"] | found["derived"]).items():
         if e["ratio"] is not None and "session_yaw" not in path:
-            # more than 1: what motion leaves open is more than the prior of what currents tell
+            # above 1 where the motion's uncertainty widens the prior of an electric number
             shown = f"{min(e['ratio'], 1.0):.3f}"
             before.add_row(Text(path), e["unit"], shown, verdict(e["verdict"]))
     page.table(before)
@@ -159,7 +158,7 @@ def show_check(page: Page, found: Content) -> None:
 
 
 def show_validation(page: Page, found: Content) -> None:
-    """Write the summary of a validation file: one row per floor and model."""
+    """Write the summary of a validation file, one row per floor and model."""
     columns = ("surface", "model", "end / chord", "median", "end / path", "length", "heading")
     made = table((*columns, "in 90 %", "runs"))
     for surface, models in found["summary"].items():
@@ -181,7 +180,7 @@ def show_validation(page: Page, found: Content) -> None:
 
 @dataclass(frozen=True)
 class TruthRow:
-    """Truth against estimate of one number."""
+    """True and estimated value of one number."""
 
     path: str
     label: str
@@ -193,12 +192,12 @@ class TruthRow:
 
     @property
     def inside(self) -> bool:
-        """Whether the 90 % interval holds the truth."""
+        """True if the 90 % interval contains the truth."""
         return self.interval[0] <= self.truth <= self.interval[1]
 
 
 def compared(fit: "Fit", truth: Content) -> list[TruthRow]:
-    """Every number that was fitted beside its truth, as far as truth.json has one."""
+    """Return every fitted number beside its truth, if truth.json has one."""
     rows = []
     for e in fit.parameters.values():
         if e.verdict == "fixed" or e.path not in truth:
@@ -212,7 +211,7 @@ def compared(fit: "Fit", truth: Content) -> list[TruthRow]:
 
 
 def show_truth(page: Page, fit: "Fit", truth: Content) -> None:
-    """Write `compared`, and how many intervals hold the truth."""
+    """Write `compared`, and the count of intervals that contain the truth."""
     rows = compared(fit, truth)
     columns = ("parameter", "truth", "identified", "unit", "90 % interval", "truth in it", "")
     made = table(columns, right=("truth", "identified"))
@@ -228,9 +227,9 @@ def show_truth(page: Page, fit: "Fit", truth: Content) -> None:
         )
     page.table(made)
     page.line(
-        f"{sum(r.inside for r in rows)} of {len(rows)} intervals hold the truth: the logs come "
-        "from another physics (MuJoCo's rollers) than the model's, and intervals know of that only "
-        "what runs and floors show by disagreeing\n"
+        f"{sum(r.inside for r in rows)} of {len(rows)} intervals contain the truth: the logs come "
+        "from another physics (MuJoCo's rollers) than the model's, and intervals include that only "
+        "as far as runs and floors disagree\n"
     )
 
 
@@ -238,7 +237,7 @@ def show_selftest(page: Page, found: Content) -> None:
     """Write the content of selftest.json."""
     numbers = table(
         ("parameter", "unit", "error", "of truth", "z rms", "in 90 %", "verdict", "recovered"),
-        f"{found['replicates']} made experiments like this one ({found['runs']} runs), "
+        f"{found['replicates']} simulated experiments like this one ({found['runs']} runs), "
         f"{found['converged']} fits converged",
     )
     for path, e in found["parameters"].items():
@@ -254,7 +253,7 @@ def show_selftest(page: Page, found: Content) -> None:
             verdict(e["recovered"], RECOVERED) + (" *" if path in found["wanted"] else ""),
         )
     page.table(numbers)
-    page.line("* wanted; wrong: errors larger than the fits say\n")
+    page.line("* wanted; wrong: errors larger than the fits' intervals allow\n")
     floors = table(
         ("surface", "slip curve off by", "at most", "in its band", "prediction off by", "encoders")
     )
@@ -275,14 +274,14 @@ def show_selftest(page: Page, found: Content) -> None:
 
 
 def show_bench(page: Page, fit: BenchFit, taken: Sequence[str] = ()) -> None:
-    """Write the numbers of motors, what the logs leave open, and how the fits ended."""
+    """Write the numbers of motors, their warnings and how the fits ended."""
     if taken:
         page.line(f"columns: {'; '.join(taken)}")
     rows = sum(len(r.time) for f in fit.fits for r in f.records)
     motors = f"{len(fit.fits)} motors, " if len(fit.fits) > 1 else ""
     page.table(estimates(fit.parameters.values(), f"{motors}{rows} rows; everything at the shaft"))
     if fit.derived:
-        page.table(estimates(fit.derived.values(), "\nknown as ratios, or not even so"))
+        page.table(estimates(fit.derived.values(), OPEN_RATIOS))
     page.notes(fit.messages)
     ended = "converged" if fit.converged else "NOT converged"
     model = "" if fit.good or not fit.converged else "; the model does NOT explain the log"
@@ -290,7 +289,7 @@ def show_bench(page: Page, fit: BenchFit, taken: Sequence[str] = ()) -> None:
 
 
 def show_bench_check(page: Page, found: Content) -> None:
-    """Write the content of check.json of motors."""
+    """Write check.json of motors."""
     columns = (
         "log",
         "rows",
@@ -310,7 +309,7 @@ def show_bench_check(page: Page, found: Content) -> None:
         made.add_row(Text(row["name"]), str(row["rows"]), f"{row['seconds']:.1f}", rate, *spans)
     page.table(made)
     before = table(
-        ("parameter", "unit", "std after / before", "verdict"), "\nwhat the logs can tell"
+        ("parameter", "unit", "std after / before", "verdict"), "\nexpected information of the logs"
     )
     for path, e in found["parameters"].items():
         if e["ratio"] is not None:

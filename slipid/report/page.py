@@ -1,4 +1,4 @@
-"""A page of text, and what its tables share."""
+"""A page of text for people, with the common style of its tables."""
 
 from collections.abc import Callable, Iterable, Sequence
 from io import StringIO
@@ -20,22 +20,22 @@ COLOUR = {
 }
 
 SEVERITY = {"wrong": "bold red", "suspicious": "yellow", "note": "dim"}
-"""Colours of what a check of logs and config says."""
+"""Colours of findings of a check."""
 WIDTH = 140
-"""Of text that no terminal shows [characters]."""
+"""Width of text outside a terminal [character]."""
 Shown = TypeVar("Shown")
 
 
 class Page:
-    """Text for people, on standard output or kept: tables, and sentences that are not wrapped.
+    """Text for people, printed or kept: tables, and sentences without line breaks.
 
     Args:
-        kept: whether the text is kept for `text` instead of printed.
+        kept: True to keep the text for `text` instead of printing it.
     """
 
     def __init__(self, kept: bool = False) -> None:
         self._console = Console(highlight=False)
-        if kept:  # a notebook claims to be a terminal with colours, and shows what is to be kept
+        if kept:  # rich takes a notebook for a terminal with colours, and would print there
             self._console = Console(
                 highlight=False,
                 width=WIDTH,
@@ -43,12 +43,12 @@ class Page:
                 force_terminal=False,
                 force_jupyter=False,
             )
-        elif not self._console.is_terminal:  # a file or a pipe has no width: do not wrap
+        elif not self._console.is_terminal:  # a file or a pipe has no width
             self._console = Console(highlight=False, width=WIDTH)
 
     @property
     def text(self) -> str:
-        """What was written to a page that keeps it; lines end without blanks."""
+        """Text of a page that keeps it; lines end without blanks."""
         written = self._console.file
         lines = written.getvalue().splitlines() if isinstance(written, StringIO) else []
         return "\n".join(line.rstrip() for line in lines)
@@ -60,28 +60,28 @@ class Page:
         self._console.print(text, markup=False, soft_wrap=True)
 
     def notes(self, sentences: Iterable[str]) -> None:
-        """Sentences a reader must know."""
+        """Write warnings."""
         for sentence in sentences:
             self.line(f"note: {sentence}")
 
     def findings(self, found: Iterable[Content]) -> None:
-        """What was found wrong, in colour, and what was not checked."""
+        """Write findings of a check with their remedies, in the colour of their severity."""
         for one in found:
             remedy = f"\n    {one['remedy']}" if one["remedy"] else ""
             where = f" (in {listed(one['runs'])})" if one["runs"] else ""
-            said = Text.assemble((f"{one['severity']}: ", SEVERITY[one["severity"]]))
-            self._console.print(said.append(f"{one['found']}{where}{remedy}"), soft_wrap=True)
+            text = Text.assemble((f"{one['severity']}: ", SEVERITY[one["severity"]]))
+            self._console.print(text.append(f"{one['found']}{where}{remedy}"), soft_wrap=True)
 
 
 def text_of(show: Callable[[Page, Shown], None], found: Shown) -> str:
-    """The text that a function writes to a page about something."""
+    """Return the text that `show` writes to a page about `found`."""
     page = Page(kept=True)
     show(page, found)
     return page.text
 
 
 def table(columns: Sequence[str], title: str | None = None, right: Sequence[str] = ()) -> Table:
-    """Table without lines; the columns named in `right` are numbers."""
+    """Return an empty table without lines; the columns named in `right` are right-aligned."""
     made = Table(title=title, title_justify="left", show_edge=False, pad_edge=False, box=None)
     for name in columns:
         made.add_column(name, justify="right" if name in right else "left")
@@ -89,11 +89,11 @@ def table(columns: Sequence[str], title: str | None = None, right: Sequence[str]
 
 
 def verdict(word: str, colour: dict[str, str] = COLOUR) -> str:
-    """A verdict in its colour."""
+    """Return a verdict in its colour."""
     shade = colour.get(word, "dim")
     return f"[{shade}]{word.replace('_', ' ')}[/{shade}]"
 
 
 def percent(x: float | None) -> str:
-    """A share, with two places; nothing where it is not known."""
+    """Return a share in percent with two places, "" if it is unknown."""
     return "" if x is None else f"{100 * x:.2f} %"

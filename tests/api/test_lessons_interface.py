@@ -1,4 +1,4 @@
-"""What a notebook has beside fits: made runs, steady motion, a check, a comparison, a drive."""
+"""The public interface beside fits: simulated runs, steady motion, check, comparison, drive."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import slipid as sl
 
 
 @pytest.mark.slow
-def test_made_runs_have_the_channels_and_the_truth_that_were_asked_for():
+def test_simulated_runs_have_the_requested_channels_and_truth():
     slippery = {"surface.gray.creep": 0.4}
     made = sl.made_runs(["gray"], headings=3, speeds=[0.2], turns=0, truth=slippery, current=False)
     log = made.runs.logs[0]
@@ -67,7 +67,7 @@ def test_a_comparison_ranks_every_model_on_left_out_runs(fit):
 
 
 @pytest.mark.slow
-def test_a_proposal_has_the_runs_that_were_asked_for(fit):
+def test_a_proposal_has_the_requested_runs(fit):
     proposal = fit.design("surface.soft.creep", runs=2)
     assert len(proposal.runs) == 2
     assert str(proposal).startswith("run,floor,load,vx_m_s")
@@ -77,10 +77,10 @@ def test_a_proposal_has_the_runs_that_were_asked_for(fit):
 
 
 @pytest.mark.slow
-def test_a_drive_says_what_became_of_its_path(fit):
+def test_a_closed_loop_run_prints_its_path_errors(fit):
     robot = fit.deploy()
     found = sl.drive(robot, "encoder", start=1, seed=2)
-    assert found.course.pose.shape == found.course.estimated_pose.shape
+    assert found.run.pose.shape == found.run.estimated_pose.shape
     assert f"{found.metrics.closure_mm:.0f} mm from where it should" in str(found)
     with pytest.raises(ValueError, match="controller 'magic' from start 0; expected encoder"):
         sl.drive(robot, "magic")
@@ -95,8 +95,8 @@ def test_a_drive_on_a_map_of_ones_own_is_on_that_map(fit, tmp_path):
     there.write_text(f'schema = "slipid.map/1"\nbase = "soft"\nextent_m = {far}\ncell_m = 0.1\n')
     found = sl.drive(robot, "contact_map", map=there, path="circle", speed=0.1)
     assert found.floor.surfaces == ("soft",)
-    assert found.course.path.duration > 20
-    seen = found.course.estimate.surface_probability[-1]
+    assert found.run.path.duration > 20
+    seen = found.run.estimate.surface_probability[-1]
     assert seen[:, robot.labels.index("soft")].min() > 0.8
     there.write_text(there.read_text().replace("soft", "ice"))
     with pytest.raises(sl.DataError, match=r"lab\.toml: no surface 'ice'; identified"):

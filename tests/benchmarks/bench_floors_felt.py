@@ -1,21 +1,20 @@
-"""Which floor a skid-steer robot feels by currents and a gyro alone, without a pose.
+"""Floor of a skid-steer robot by currents and a gyro alone, without a pose.
 
     make bench
     .venv/bin/python -m pytest -s -o python_files='bench_*.py' tests/benchmarks/bench_floors_felt.py
 
 (about three minutes of one processor). The runs of "borealtc": a Husky on five floors, 6.5 rows a
 second, currents without a sign. Prints how often slipid's floor filter and the classifiers beside
-it name the right floor of runs that none of them was fitted to, by the seconds heard, and which
-floors slipid named. Without a pose the numbers of a floor are only those that make its currents and
-its turning; they are no identification, and frictions count in units of the motors' unknown torque
-constant.
+it name the right floor of held-out runs, by the seconds of signals, and which floors slipid named.
+Without a pose the parameters of a floor only reproduce its currents and its turning; they are no
+identification, and frictions are in units of the motors' unknown torque constant.
 """
 
 from pathlib import Path
 
 import pytest
 
-from slipid.lab.benchmark.floors.part import FOLDER, husky_table
+from slipid.lab.benchmark.floors.husky import FOLDER, husky_table
 from tests.benchmarks.quick import QUICK
 
 

@@ -102,7 +102,7 @@ def _profile(surface: str) -> list[float]:
     site = Site()
     run = straight(surface, "as_built", 1.0, 0.2, 0.5)
     plant = SimulatedRobot(site, run.map, "as_built")
-    wanted = (site.machine.wheel_from_twist @ np.array([0.1, 0.1, 0.0])).tolist()
+    wanted = (site.robot.wheel_from_twist @ np.array([0.1, 0.1, 0.0])).tolist()
     spent = [0.0, 0.0, 0.0]
     engine, motors, look = plant._step, plant.drive.step, plant._look
 
@@ -282,8 +282,8 @@ def test_what_biases_load_shares() -> None:
 
 def test_currents_on_mixed_surfaces() -> None:
     """Wheels of a pair on two surfaces: does each draw the current of the floor beneath it?"""
-    machine = replace(RobotBuild(), centres_m={"as_built": (0.0, 0.0)})
-    site = Site(machine=machine)
+    robot = replace(RobotBuild(), centres_m={"as_built": (0.0, 0.0)})
+    site = Site(robot=robot)
     seeds = range(quick(6, 2))
 
     def currents(floor: FloorMap | None, surface: str | None, speed: float) -> np.ndarray:

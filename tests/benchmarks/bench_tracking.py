@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slipid.camera.frames.source import open_source
+from slipid.camera.frame_source import open_source
 from slipid.camera.overhead import Lens, OverheadCamera
 from slipid.camera.tracking.tracking import LoneMarker, track
 from slipid.data.floor_map import uniform
@@ -101,7 +101,7 @@ def test_accuracy_on_the_test_site(tmp_path, speed):
 
     camera, site = SiteCamera(), Site()
     try:
-        studio = Studio(site, "as_built", uniform(next(iter(site.grounds))), camera, seed=5)
+        studio = Studio(site, "as_built", uniform(next(iter(site.surfaces))), camera, seed=5)
     except DataError as error:
         pytest.skip(str(error))
     at = np.arange(0, 3, 0.01)
@@ -109,7 +109,7 @@ def test_accuracy_on_the_test_site(tmp_path, speed):
     true = {
         "time": at,
         "pose": np.array([path(t) for t in at]),
-        "wheel_angle": np.zeros((len(at), len(site.machine.wheel_azimuths_deg))),
+        "wheel_angle": np.zeros((len(at), len(site.robot.wheel_azimuths_deg))),
     }
     frames = np.arange(0.1, quick(2.8, 0.6), camera.frame_s)
     film(studio, true, frames, tmp_path / "run.avi")
@@ -119,9 +119,9 @@ def test_accuracy_on_the_test_site(tmp_path, speed):
     )
     above = OverheadCamera(lens, camera.rotation, camera.place)
     source = open_source(str(tmp_path / "run.avi"))
-    machine = site.machine
-    yaw = float(np.radians(machine.marker_yaw_deg))
-    marker = LoneMarker(machine.marker_size_m, machine.marker_height_m, 0, yaw=yaw)
+    robot = site.robot
+    yaw = float(np.radians(robot.marker_yaw_deg))
+    marker = LoneMarker(robot.marker_size_m, robot.marker_height_m, 0, yaw=yaw)
     done = track(
         *(source, above, (marker.target(source),), tmp_path / "kept", Reporter(quiet=True))
     ).tracks[0]

@@ -19,7 +19,7 @@ def test_pixels_are_those_of_the_lens_written_out():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.7, 0.7, (50, 2)), rng.uniform(0, 0.5, 50)])
     away = (points - STAGE.place) @ STAGE.rotation.T
-    np.testing.assert_allclose(STAGE.camera.pixels(points), STAGE.lens.seen(away), atol=1e-6)
+    np.testing.assert_allclose(STAGE.camera.pixels(points), STAGE.lens.project(away), atol=1e-6)
 
 
 @pytest.mark.parametrize("height", [0.0, 0.25, -0.1])
@@ -53,9 +53,9 @@ def test_a_file_keeps_all_of_a_camera(tmp_path):
     again = OverheadCamera.load(tmp_path / "camera.json")
     assert again.to_json() == STAGE.camera.to_json()
     assert again.height == 2.2
-    again.of_size((640, 360), "v.avi")
+    again.lens.check_size((640, 360), "v.avi")
     with pytest.raises(DataError, match=r"1280 x 720 pixels, but the camera was calibrated at 640"):
-        again.of_size((1280, 720), "v.avi")
+        again.lens.check_size((1280, 720), "v.avi")
 
 
 def test_a_lens_without_a_floor_is_no_overhead_camera(tmp_path):

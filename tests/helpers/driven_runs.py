@@ -10,30 +10,30 @@ from slipid.lab.systems.motion.ward_iagnemma_filter import FilterNoise
 from slipid.predict.slip_model import Run
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
-MACHINES = pytest.mark.parametrize("machine", [ROBOTINO, HUSKY], ids=["omni", "skid"])
+MACHINES = pytest.mark.parametrize("spec", [ROBOTINO, HUSKY], ids=["omni", "skid"])
 FLOOR = ForceLaw(rise=15.0, rolling=0.15, turning=0.1, drag=3.0)
 TRUE = FilterNoise(0.03, (0.003, 0.004, 0.002), 0.02, 0.03)
 
 
-def held(rolling: np.ndarray, law: ForceLaw, machine=ROBOTINO, seconds: float = 20.0) -> np.ndarray:
+def held(rolling: np.ndarray, law: ForceLaw, spec=ROBOTINO, seconds: float = 20.0) -> np.ndarray:
     """Twist of a robot whose wheels have long turned as the rolling twist says."""
-    dynamics = Dynamics.of(machine, law)
-    q = np.atleast_2d(rolling) * machine.size
+    dynamics = Dynamics.of(spec, law)
+    q = np.atleast_2d(rolling) * spec.size
     each = np.ones(len(q))
     step = dynamics.step(q, law.rolling * each, q @ dynamics.rims.T, seconds * each)
-    return step.speeds / machine.size
+    return step.speeds / spec.size
 
 
-def driven(law: ForceLaw, seed: int, machine=ROBOTINO, **more) -> Run:
+def driven(law: ForceLaw, seed: int, spec=ROBOTINO, **more) -> Run:
     """A run of 4 s with two twists that the wheels keep, the body moving by the law."""
     rng = np.random.default_rng(seed)
-    rolling = rng.uniform([-0.3, -0.3, -0.5], [0.3, 0.3, 0.5], (2, 3)) * [1, machine is ROBOTINO, 1]
+    rolling = rng.uniform([-0.3, -0.3, -0.5], [0.3, 0.3, 0.5], (2, 3)) * [1, spec is ROBOTINO, 1]
     twice = np.repeat(rolling, 20, axis=0)
-    true = np.repeat(held(rolling, law, machine), 20, axis=0)
-    return made_run(twice, true, machine=machine, name=f"made{seed}", **more)
+    true = np.repeat(held(rolling, law, spec), 20, axis=0)
+    return made_run(twice, true, spec=spec, name=f"made{seed}", **more)
 
 
-def scattered(count: int, gyro: bool, noise: Noise = TRUE) -> list[Run]:
+def scattered(count: int, gyro: bool, noise: FilterNoise = TRUE) -> list[Run]:
     """Runs as the filter believes in: rho, bias and twists scatter as its noise says."""
     rng = np.random.default_rng(0)
     dynamics, dt = Dynamics.of(ROBOTINO, FLOOR), np.full(count, 0.1)

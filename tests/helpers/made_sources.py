@@ -1,4 +1,4 @@
-"""Pictures that a test holds as a source of frames, and as a video file."""
+"""Pictures of a test as a source of frames, and as a video file."""
 
 from __future__ import annotations
 
@@ -9,31 +9,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from slipid.camera.frames.frame import Frame
+from slipid.camera.frame import Frame, FrameSource
 from tests.helpers.made_videos import FPS
 
 
 @dataclass(frozen=True, eq=False)
-class InMemory:
+class InMemory(FrameSource):
     """Frames that a test holds, as a source."""
 
     pictures: Sequence[np.ndarray]
     times: np.ndarray
-    name: str = "made.avi"
-    identity: str = "made"
-    exact: bool = False
 
     @classmethod
     def even(cls, pictures: Sequence[np.ndarray], fps: float = FPS) -> InMemory:
-        return cls(pictures, np.arange(len(pictures)) / fps)
-
-    @property
-    def image_px(self) -> tuple[int, int]:
-        return self.pictures[0].shape[1], self.pictures[0].shape[0]
-
-    @property
-    def count(self) -> int:
-        return len(self.pictures)
+        size, times = pictures[0].shape[::-1], np.arange(len(pictures)) / fps
+        return cls("made.avi", size, len(pictures), False, "made", pictures, times)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
         for k in range(first, len(self.pictures)):

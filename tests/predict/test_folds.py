@@ -380,7 +380,7 @@ def test_a_fold_is_kept_whole_and_only_for_the_job_it_is_of(tmp_path):
 
 @pytest.mark.slow
 def test_compare_goes_on_where_it_was_and_ends_the_same(tmp_path, logs):
-    write_logs(logs, true_robot(PLAN), tmp_path / "logs", tmp_path / "true_robot")
+    write_logs(logs, true_robot(PLAN), tmp_path / "logs", tmp_path / "truth")
     (tmp_path / "my.toml").write_text(packaged_config("robotino.toml"), encoding="utf-8")
     out = tmp_path / "out"
     words = ("compare", tmp_path / "my.toml", "--data", tmp_path / "logs", "--out", out)

@@ -28,6 +28,8 @@ from tests.helpers.stepped import stepped
 
 DT = 0.05
 FIRM = floor([[0]])
+corrected, given = jax.jit(apply_fix), jax.jit(_given)
+solve = eqx.filter_jit(FloorFilter.solve)
 ROUND = ((0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (-0.2, 0.0, 0.0), (0.1, -0.15, 0.3))
 
 
@@ -91,9 +93,9 @@ def test_a_floor_that_changes_within_a_step_moves_the_pose_by_what_was_travelled
     est = Estimator(robot, sure)
     run = partial(stepped(est), dt=DT)
     w = rolling(robot, (0.2, 0.05, 0.1))
-    near, amps = FloorFilter(robot, sure).solve(jnp.zeros((8, 3)), w)
+    near, amps = solve(FloorFilter(robot, sure), jnp.zeros((8, 3)), w)
     for _ in range(5):
-        near, amps = FloorFilter(robot, sure).solve(near, w)
+        near, amps = solve(FloorFilter(robot, sure), near, w)
     state = est.init()
     for _ in range(10):
         state, said = run(state, Measurement(wheel_speed=w, current=amps[0]).filled(3))
@@ -126,7 +128,7 @@ def test_what_a_late_fix_sets_aside_leaves_a_covariance(own):
         a, b, way = rng.normal(size=(3, 3)), rng.normal(size=(12, 12)), rng.normal(size=(3, 12))
         rest, alone = b @ b.T, own * (a @ a.T + 0.1 * np.eye(3))
         cov = np.block([[way @ rest @ way.T + alone, way @ rest], [rest @ way.T, rest]])
-        np.testing.assert_allclose(_given(jnp.asarray(cov)), alone, atol=1e-6 * own)
+        np.testing.assert_allclose(given(jnp.asarray(cov)), alone, atol=1e-6 * own)
         now = replace(
             start,
             pose=jnp.array([8.0, 4.0, 0.0]),
@@ -134,7 +136,7 @@ def test_what_a_late_fix_sets_aside_leaves_a_covariance(own):
             noise=jnp.asarray(cov[:3, :3]),
             history=start.history.at[:, 0].set(1.0),
         )
-        values = np.linalg.eigvalsh(apply_fix(now, late)[0].covariance)
+        values = np.linalg.eigvalsh(corrected(now, late)[0].covariance)
         assert values[0] > -1e-9 * values[-1]
 
 
@@ -150,7 +152,7 @@ def test_a_late_fix_after_news_of_the_floors_does_not_count_the_hand_over_twice(
     run = stepped(est)
     w, near = rolling(robot, (0.2, 0.05, 0.1)), jnp.zeros((8, 3))
     for _ in range(8):  # hypotheses settle
-        near, amps = FloorFilter(robot, sure).solve(near, w)
+        near, amps = solve(FloorFilter(robot, sure), near, w)
     state, steps, late = est.init(std=(0.01, 0.02)), 40, 10
     state = eqx.tree_at(lambda s: s.floors.twist, sure_of(state, 0, 8), near)
     for k in range(steps + 3):  # what was taken for the first floor is the second
@@ -290,30 +292,42 @@ def squared(pose, cov, truth):
 
 
 @cache
-def runs(gyro, fixes, count=200):
-    """Squared errors of the pose, of a fix at every step, and of gyro readings at rest.
-
-    Robots drawn from what a fit says that the model misses, on a floor that is known; with `fixes`
-    every twentieth is heard.
-    """
+def driven(count=200):
+    """Function of whether a gyro is there and whether fixes are heard; see `runs`."""
     whole, sure = deployed(process=1.0, run=1.0, current=1.0), Settings(gyro_bias_std=0.005)
-    twin = Twin(whole, FIRM, ActuatorModel(gyro=gyro, smooth=True, voltage=False))
+    twin = Twin(whole, FIRM, ActuatorModel(gyro=True, smooth=True, voltage=False))
     est, commands, std = Estimator(whole.on("firm"), sure), path(whole), jnp.array([0.002, 0.004])
     wide = std[jnp.array([0, 0, 1])]
 
-    def one(key):
+    def after(state, z, fix, heard):
+        """State and estimate without the fix, and, if it is heard, with it."""
+        nothing = jax.tree.map(
+            lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(est.step, state, z, DT)
+        )
+
+        def one(now):
+            fix, is_there = now
+            z_now = replace(z, fix=fix, fix_std=jnp.where(jnp.isnan(fix[0]), jnp.nan, std))
+            return jax.lax.cond(
+                is_there, lambda: est.step(state, z_now, DT), lambda: nothing
+            )  # compiled once for both
+
+        fixes = jnp.stack([jnp.full(3, jnp.nan), fix])
+        both = jax.lax.map(one, (fixes, jnp.stack([jnp.asarray(True), heard])))
+        new = jax.tree.map(lambda x: jnp.where(heard, x[1], x[0]), both[0])
+        return new, jax.tree.map(lambda x: x[0], both[1])
+
+    def one(key, gyro, fixes):
         def step(carry, now):
             true, state = carry
             command, number, off = now
             true, z = twin.step(true, command, twin.noise(key, number))
+            z = replace(z, gyro=jnp.where(gyro, z.gyro, jnp.nan))
             turned = z.gyro - state.place.nuisance[-1]
             by_rest = turned**2 / (state.place.covariance[-1, -1] + sure.gyro_std**2)
-            new, said = est.step(state, z, DT)
             fix = true.pose + wide * off
+            new, said = after(state, z, fix, fixes & (number % 20 == 0))
             by_fix = squared(said.pose, said.covariance + jnp.diag(wide**2), fix)
-            if fixes:
-                heard = jnp.where(number % 20 == 0, fix, jnp.nan)
-                new, _ = est.step(state, replace(z, fix=heard, fix_std=std), DT)
             return (true, new), (squared(said.pose, said.covariance, true.pose), by_fix, by_rest)
 
         off = jax.random.normal(jax.random.fold_in(key, 7), (len(commands), 3))
@@ -322,7 +336,17 @@ def runs(gyro, fixes, count=200):
         return jax.lax.scan(step, begin, (commands, steps, off))[1]
 
     keys = jax.random.split(jax.random.key(21), count)
-    return [np.asarray(x) for x in jax.jit(lambda k: jax.lax.map(one, k))(keys)]
+    every = jax.jit(lambda gyro, fixes: jax.lax.map(lambda key: one(key, gyro, fixes), keys))
+    return lambda gyro, fixes: every(jnp.asarray(gyro), jnp.asarray(fixes))
+
+
+def runs(gyro, fixes):
+    """Squared errors of the pose, of a fix at every step, and of gyro readings at rest.
+
+    Robots drawn from what a fit says that the model misses, on a floor that is known; with `fixes`
+    every twentieth is heard.
+    """
+    return [np.asarray(x) for x in driven()(gyro, fixes)]
 
 
 def within(values, freedom):

@@ -37,6 +37,7 @@ LIMITS = Limits()
 DT = 0.05
 KINDS = ("contact", "curve")
 CHESS = Floor.of("abc", np.add.outer(np.arange(9), np.arange(9)) % 3, (-1.0, -1.0), 0.25, "abc")
+solve = eqx.filter_jit(FloorFilter.solve)
 BAD = (np.nan, np.inf, -np.inf, 1e300, -1e300, 1e-310, 0.0, -1.0, 1e9, 3e7, 50.0)
 
 
@@ -462,7 +463,7 @@ def test_a_robot_that_starts_at_once_learns_its_gyro_bias_from_the_contact_model
     one = robot().on("b")
     est, there = Estimator(one), FloorFilter(one, Settings())
     state, true, twist = est.init(), 0.0, jnp.zeros((1, 3))
-    turns = jax.jit(lambda near, w: there.solve(near, w))
+    turns = partial(solve, there)
     run = stepped(est)
     for k in range(500):
         speed = wheels([0.2 * np.cos(0.01 * k), 0.2 * np.sin(0.01 * k), 0.0])
@@ -502,14 +503,14 @@ def test_a_robot_at_rest_turns_as_its_gyro_says_less_the_bias():
 @pytest.mark.slow
 def test_the_observer_takes_a_constant_disturbance_out():
     """A body that does what it is asked to but for a constant: what is wanted comes about."""
-    f = robot()
+    f, step = robot(), eqx.filter_jit(Controller.step)
     for gain, left in ((0.0, 1.0), (1.0, 0.0)):
         con = Controller(f, Gains.at((0.0, 0.0, 0.0, gain, 0.0)))
         reference = jnp.array([0.0, 0.0, 0.0, 0.1, 0.05, 0.0])
         off, state, twist = np.array([-0.04, 0.02, 0.1]), con.init(), np.zeros(3)
         for _ in range(120):
             said = estimate(f, twist=jnp.asarray(twist))
-            state, command = con.step(state, reference, said, DT)
+            state, command = step(con, state, reference, said, DT)
             twist = np.asarray(f.inverse @ (f.frame.radius * command)) + off
         np.testing.assert_allclose(twist, [0.1, 0.05, 0.0] + left * off, atol=1e-3)
 

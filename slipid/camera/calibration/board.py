@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.opencv import marker_dictionary, opencv, read_picture
+from slipid.camera.opencv import marker_count, marker_dictionary, opencv, size_of
 from slipid.support.errors import DataError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
@@ -26,16 +26,7 @@ class Picture:
     @property
     def image_px(self) -> tuple[int, int]:
         """Width and height [pixel]."""
-        return int(self.image.shape[1]), int(self.image.shape[0])
-
-
-def read_named(path: Path) -> Picture:
-    """Return the picture in a file.
-
-    Raises:
-        DataError: the file is absent, empty or not a picture.
-    """
-    return Picture(path, read_picture(path))
+        return size_of(self.image)
 
 
 def named_pictures(words: Sequence[str]) -> list[Path]:
@@ -64,20 +55,6 @@ def named_pictures(words: Sequence[str]) -> list[Path]:
                 raise DataError(f"{word}: no file has such a name; expected pictures")
         named.update(dict.fromkeys(files))
     return list(named)
-
-
-def check_same_size(first: Picture, other: Picture) -> None:
-    """Check that two pictures have the same size.
-
-    Raises:
-        DataError: they differ.
-    """
-    if first.image_px != other.image_px:
-        (w, h), (width, height) = first.image_px, other.image_px
-        raise DataError(
-            f"{other.path}: {width} x {height} pixels, but {first.path} has {w} x {h}; expected "
-            "pictures of one camera at one resolution"
-        )
 
 
 LARGEST_M = 1.0
@@ -204,11 +181,6 @@ def board_of(size: str, square_m: float, marker_m: float, dictionary: str, legac
     if not (by and columns.strip().isdecimal() and rows.strip().isdecimal()):
         raise DataError(f"--board {size}; expected squares along x and y, such as 7x5")
     return Board(int(columns), int(rows), square_m, marker_m, dictionary, legacy)
-
-
-def marker_count(dictionary: str) -> int:
-    """Return the number of markers in a dictionary."""
-    return len(marker_dictionary(dictionary).bytesList)
 
 
 def view_of(board: Board, picture: Picture) -> View:

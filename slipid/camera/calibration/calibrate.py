@@ -7,19 +7,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.calibration.board import (
-    LEAST_CORNERS,
-    Board,
-    named_pictures,
-    read_named,
-    view_of,
-)
+from slipid.camera.calibration.board import LEAST_CORNERS, Board, Picture, named_pictures, view_of
 from slipid.camera.calibration.lens import fit_robustly
 from slipid.camera.calibration.place import FloorFit, fit_place, fit_place_robustly, uncertainty
 from slipid.camera.calibration.points import FloorPoints, read_points
 from slipid.camera.calibration.quality import Quality, quality_of
 from slipid.camera.calibration.report import floor_report, lens_report, scale_std, straight_report
 from slipid.camera.calibration.views import not_detected, usable
+from slipid.camera.opencv import read_picture, size_of
 from slipid.camera.overhead import Lens, OverheadCamera, read_camera
 from slipid.support.content import Content
 from slipid.support.errors import DataError
@@ -57,7 +52,7 @@ def lens_from_pictures(words: Sequence[str], board: Board, k3: bool) -> Calibrat
     Raises:
         DataError: a file is not a picture, or the views do not determine a lens.
     """
-    views = usable(board, [read_named(path) for path in named_pictures(words)])
+    views = usable(board, [Picture(path, read_picture(path)) for path in named_pictures(words)])
     fit = fit_robustly(views.views, views.image_px, k3)
     quality = quality_of(fit, k3)
     report = lens_report(quality, views.left_out) | {"board": str(board)}
@@ -100,13 +95,8 @@ def on_board(lens: CalibratedLens, board: Board, picture: Path, height_m: float)
     Raises:
         DataError: the picture is of another size than the lens, or shows no board, or too little.
     """
-    taken = read_named(picture)
-    if taken.image_px != tuple(lens.lens.image_px):
-        (width, height), (w, h) = taken.image_px, lens.lens.image_px
-        raise DataError(
-            f"{picture}: {width} x {height} pixels, but the lens was calibrated at {w} x {h}; "
-            "expected the same resolution: take the picture at it, or calibrate at this one"
-        )
+    taken = Picture(picture, read_picture(picture))
+    lens.lens.check_size(taken.image_px, picture)
     view = view_of(board, taken)
     if not len(view.pixels):
         raise not_detected(board, [taken])
@@ -145,7 +135,7 @@ def straight_camera(
     picture: Path, metres_per_pixel: float, height_m: float, turn_deg: float, size_std: float | None
 ) -> OverheadCamera:
     """Return an uncalibrated camera that looks straight down, with the size of a picture."""
-    image_px = read_named(picture).image_px
+    image_px = size_of(read_picture(picture))
     camera = OverheadCamera.straight_down(image_px, metres_per_pixel, height_m, turn_deg)
     report = {"floor": straight_report(camera), "poor": []}
     return replace(camera, scale_std=size_std, report=report)

@@ -10,17 +10,13 @@ from slipid.camera.calibration.board import (
     Board,
     Picture,
     View,
-    check_same_size,
-    marker_count,
     view_of,
 )
-from slipid.camera.opencv import dictionary_names, marker_dictionary, opencv
+from slipid.camera.opencv import marker_count, visible_markers
 from slipid.support.errors import DataError
 
 SEARCHED = 3
 """Number of pictures searched for another board: a few suffice, and there are many dictionaries."""
-NEARLY = 0.8
-"""Part of the largest number of markers with which a smaller dictionary is preferred."""
 ENOUGH = 4
 """Number of markers that are hardly detected by chance."""
 LEAST_VIEWS = 6
@@ -45,7 +41,12 @@ def usable(board: Board, pictures: Sequence[Picture]) -> UsableViews:
         DataError: the pictures differ in size, or none shows the board, or too few.
     """
     for other in pictures[1:]:
-        check_same_size(pictures[0], other)
+        if other.image_px != pictures[0].image_px:
+            (w, h), (width, height) = pictures[0].image_px, other.image_px
+            raise DataError(
+                f"{other.path}: {width} x {height} pixels, but {pictures[0].path} has {w} x {h}; "
+                "expected pictures of one camera at one resolution"
+            )
     views = [view_of(board, picture) for picture in pictures]
     if not any(len(view.pixels) for view in views):
         raise not_detected(board, pictures)
@@ -110,17 +111,10 @@ def _instead(board: Board, pictures: Sequence[Picture]) -> str:
     """Return what pictures show instead of the board, and what to do."""
     if other := _other_board(board, board.dictionary, pictures):
         return other
-    markers = {
-        name: {number for picture in pictures for number in _markers(name, picture)}
-        for name in dictionary_names()
-    }
-    # a large dictionary contains smaller ones, and detects a few more markers by chance
-    most = max(len(numbers) for numbers in markers.values())
-    likely = [name for name, numbers in markers.items() if len(numbers) >= NEARLY * most]
-    name = min(likely, key=marker_count)
+    markers = visible_markers([picture.image for picture in pictures])
+    name, numbers = markers.dictionary, markers.numbers
     if other := _other_board(board, name, pictures):
         return other
-    numbers = sorted(markers[name])
     if len(numbers) < ENOUGH:
         return (
             "and found no markers of any dictionary: expected a board that is sharp, evenly lit, "
@@ -153,10 +147,3 @@ def _other_board(board: Board, dictionary: str, pictures: Sequence[Picture]) -> 
                     f"--dictionary {dictionary} {option}"
                 )
     return None
-
-
-def _markers(dictionary: str, picture: Picture) -> list[int]:
-    """Return the numbers of a dictionary's markers in a picture."""
-    detector = opencv().aruco.ArucoDetector(marker_dictionary(dictionary))
-    numbers = detector.detectMarkers(picture.image)[1]
-    return [] if numbers is None else [int(n) for n in np.ravel(numbers)]

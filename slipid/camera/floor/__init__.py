@@ -1,1 +1,1 @@
-"""Floor maps from pictures: which surface each cell of a floor looks like."""
+"""Floor maps from pictures: the surface that each cell of a floor resembles."""

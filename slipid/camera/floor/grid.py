@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from slipid.camera.opencv import marker_dictionary, opencv
+from slipid.camera.opencv import Mask, marker_dictionary, opencv
 from slipid.camera.overhead import OverheadCamera
 from slipid.support.errors import DataError
 
@@ -62,7 +62,7 @@ class Grid:
         """Return x and y [m] of cell corners; 0, 0 is the lowest corner of the first cell."""
         return np.array([self.low_x, self.low_y]) + corners * self.cell
 
-    def inside(self, polygon: Float[np.ndarray, "corner 2"]) -> Bool[np.ndarray, "row column"]:
+    def inside(self, polygon: Float[np.ndarray, "corner 2"]) -> Mask:
         """Return the cells whose middle lies in a polygon [m]."""
         return filled(self.steps(polygon), self.rows, self.columns)
 
@@ -80,19 +80,17 @@ class Rectified:
 
     grid: Grid
     colour: UInt8[np.ndarray, "row column 3"]
-    in_view: Bool[np.ndarray, "row column"]
+    in_view: Mask
     pixels: Float[np.ndarray, "row column 2"]
 
-    def of_picture(self, mask: Bool[np.ndarray, "y x"]) -> Bool[np.ndarray, "row column"]:
+    def of_picture(self, mask: Bool[np.ndarray, "y x"]) -> Mask:
         """Return the cells whose pixel is set in a mask of the picture."""
         across, down = (np.nan_to_num(np.rint(self.pixels[..., k])).astype(int) for k in (0, 1))
         height, width = mask.shape
         return mask[down.clip(0, height - 1), across.clip(0, width - 1)] & self.in_view
 
 
-def filled(
-    polygon: Float[np.ndarray, "corner 2"], rows: int, columns: int
-) -> Bool[np.ndarray, "row column"]:
+def filled(polygon: Float[np.ndarray, "corner 2"], rows: int, columns: int) -> Mask:
     """Return the points of a grid that lie in a polygon of columns and rows."""
     cv2 = opencv()
     mask = np.zeros((rows, columns), np.uint8)
@@ -176,9 +174,7 @@ def rectified(picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, grid:
     return Rectified(grid, colour, in_view, pixels)
 
 
-def _before_lens(
-    camera: OverheadCamera, points: Float[np.ndarray, "row column 3"]
-) -> Bool[np.ndarray, "row column"]:
+def _before_lens(camera: OverheadCamera, points: Float[np.ndarray, "row column 3"]) -> Mask:
     """Return which places lie before the lens, and within the angle that its picture covers.
 
     The distortion of a lens is a polynomial: far outside the picture it folds back into it.

@@ -28,11 +28,12 @@ class Features:
     """Features of every cell by which surfaces are distinguished.
 
     Attributes:
-        look: lightness L, a and b of CIELAB, and texture; each surface has its own spread of them.
+        appearance: lightness L, a and b of CIELAB, and texture; each surface has its own spread of
+            them.
         rgb: linear red, green and blue, 0 to 1.
     """
 
-    look: Float[np.ndarray, "row column 4"]
+    appearance: Float[np.ndarray, "row column 4"]
     rgb: Float[np.ndarray, "row column 3"]
 
 
@@ -115,7 +116,7 @@ class Illumination:
         count = len(_powers()) - 1
         return cls(np.zeros(count), np.zeros((count, 3)))
 
-    def appearance(
+    def rgb_of(
         self, colours: Float[np.ndarray, "surface 3"], at: Float[np.ndarray, "place 2"]
     ) -> Float[np.ndarray, "surface place 3"]:
         """Return the linear RGB of surfaces at places, whose x and y go from -1 to 1."""
@@ -187,7 +188,7 @@ def _weights(samples: ColourSamples, fit: LitColours) -> Float[np.ndarray, "plac
 
     Noise grows with the light, and samples that fit badly count little.
     """
-    expected = fit.illumination.appearance(fit.colours, samples.at)
+    expected = fit.illumination.rgb_of(fit.colours, samples.at)
     own = expected[samples.surface, np.arange(len(samples.surface))]
     scale = 1 / (GRAY + 0.5 * (own + samples.rgb))
     error = np.abs((samples.rgb - own) * scale).max(axis=1)

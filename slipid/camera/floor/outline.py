@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import Labels, Mask, opencv
 
 FITTED = 6
 """Number of steps from which on a part of a border gets a fitted line."""
@@ -24,13 +24,11 @@ class PatchOutline:
     """
 
     label: int
-    cells: Bool[np.ndarray, "row column"]
+    cells: Mask
     rings: tuple[Float[np.ndarray, "_ 2"], ...]
 
 
-def outlines_of(
-    labels: Int[np.ndarray, "row column"], tolerance: float
-) -> tuple[PatchOutline, ...]:
+def outlines_of(labels: Labels, tolerance: float) -> tuple[PatchOutline, ...]:
     """Return all connected patches of labels from 0 on, the largest first.
 
     Args:
@@ -57,7 +55,7 @@ def signed_area(ring: Float[np.ndarray, "corner 2"]) -> float:
     return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
 
 
-def _rings(cells: Bool[np.ndarray, "row column"]) -> list[Int[np.ndarray, "_ 2"]]:
+def _rings(cells: Mask) -> list[Int[np.ndarray, "_ 2"]]:
     """Return the cell corners along each edge of a connected patch, the outer edge first.
 
     Corners are one step apart. OpenCV's contours run through the middles of pixels. On a grid twice
@@ -88,7 +86,7 @@ def _corners(fine: Int[np.ndarray, "point 2"]) -> Int[np.ndarray, "corner 2"]:
     return whole[(whole != np.roll(whole, 1, axis=0)).any(axis=1)]
 
 
-def _junctions(labels: Int[np.ndarray, "row column"]) -> Bool[np.ndarray, "row1 column1"]:
+def _junctions(labels: Labels) -> Bool[np.ndarray, "row1 column1"]:
     """Return the cell corners that stay fixed: where borders meet, and the corners of the map."""
     wide = np.pad(labels, 1, constant_values=-2)
     a, b, c, d = wide[:-1, :-1], wide[:-1, 1:], wide[1:, 1:], wide[1:, :-1]
@@ -99,7 +97,7 @@ def _junctions(labels: Int[np.ndarray, "row column"]) -> Bool[np.ndarray, "row1 
 
 
 def _simplified(
-    ring: Int[np.ndarray, "step 2"], fixed: Bool[np.ndarray, "row column"], tolerance: float
+    ring: Int[np.ndarray, "step 2"], fixed: Mask, tolerance: float
 ) -> Float[np.ndarray, "corner 2"]:
     """Return a ring of few corners.
 

@@ -80,7 +80,7 @@ def read_palette(path: Path) -> Palette:
 
 @dataclass(frozen=True)
 class ProposedSurface:
-    """A surface found without a config, and points on it.
+    """A surface proposed without a config, and points on it.
 
     Attributes:
         name: name for the config.

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int
 
 from slipid.camera.floor.grid import RobotShape
 from slipid.camera.floor.light import Features, features_of
@@ -21,7 +20,8 @@ from slipid.camera.floor.surfaces import (
     learnt,
     without_small_patches,
 )
-from slipid.camera.frames.source import still
+from slipid.camera.frame_source import still
+from slipid.camera.opencv import Labels
 from slipid.camera.overhead import OverheadCamera
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -85,7 +85,7 @@ def map_of(path: Path, camera: OverheadCamera, options: MapOptions, report: Repo
 def _segmented(features: Features, region: FloorRegion, seeds: Seeds) -> Segmentation:
     """Return the surface of each cell; cells that resemble none of them are unknown."""
     surfaces = learnt(features, region.visible, seeds)
-    costs = surfaces.costs(features.look)
+    costs = surfaces.costs(features.appearance)
     labels = labelled(costs, region.visible)
     labels = without_small_patches(labels, region.visible, NARROW)
     return Segmentation(np.where(labels == len(costs), UNKNOWN, labels), costs, surfaces)
@@ -110,9 +110,7 @@ def _seeds_around(points: MarkedCells, features: Features, region: FloorRegion) 
     return Seeds(np.array(colours, float), cells)
 
 
-def check_all_present(
-    source: FloorPicture, names: tuple[str, ...], labels: Int[np.ndarray, "row column"]
-) -> None:
+def check_all_present(source: FloorPicture, names: tuple[str, ...], labels: Labels) -> None:
     """Raise `DataError` where no cell has one of the surfaces of a config."""
     absent = [name for k, name in enumerate(names) if not (labels == k).any()]
     if absent:

@@ -1,17 +1,17 @@
-"""Points on surfaces, proposed by patches of uniform look.
+"""Points on surfaces, proposed by patches of uniform appearance.
 
 A patch is followed across slow changes of the light to its edges. Without a config, patches far
-apart are compared after removing the illumination estimated from those found similar so far, and
-similar ones become one surface. With a config that names surfaces by colour alone, patches are
-matched with those colours: colours alone are a poor start, for light changes them by more than they
-differ, but patches that match a colour well show how the floor is lit, and then more of them match.
+apart are compared after removing the illumination estimated from those recognised as similar so
+far, and similar ones become one surface. With a config that names surfaces by colour alone, patches
+are matched with those colours: colours alone are a poor start, for light changes them by more than
+they differ, but patches that match a colour well show how the floor is lit, and then more match.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from slipid.camera.floor.light import (
     ColourSamples,
@@ -23,7 +23,7 @@ from slipid.camera.floor.light import (
     lab_of,
 )
 from slipid.camera.floor.surfaces import COARSE, MarkedCells, positions, thinned
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import Labels, Mask, opencv
 from slipid.support.errors import DataError
 
 JOIN = (5.0, 7.0, 8.0, 8.0, 8.0)
@@ -49,26 +49,24 @@ CLEARER = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Patches of uniform look in the thinned picture.
+    """Patches of uniform appearance in the thinned picture.
 
     Attributes:
-        look: L, a, b and texture of each patch.
+        appearance: L, a, b and texture of each patch.
         row, column: cell of the whole picture farthest from the patch's edge.
         cells: number of cells of the whole picture in each patch.
         samples: samples of the light in all patches; `surface` is the number of the patch.
     """
 
-    look: Float[np.ndarray, "patch 4"]
+    appearance: Float[np.ndarray, "patch 4"]
     row: Int[np.ndarray, " patch"]
     column: Int[np.ndarray, " patch"]
     cells: Int[np.ndarray, " patch"]
     samples: ColourSamples
 
 
-def proposed(
-    features: Features, visible: Bool[np.ndarray, "row column"], count: int | None
-) -> MarkedCells:
-    """Return points on surfaces found without a config, the largest surface first.
+def proposed(features: Features, visible: Mask, count: int | None) -> MarkedCells:
+    """Return points on surfaces proposed without a config, the largest surface first.
 
     Args:
         features: features of every cell.
@@ -81,7 +79,7 @@ def proposed(
     patches = patches_of(features, visible)
     if len(patches.row) < max(1, count or 1):
         raise DataError(
-            f"{len(patches.row)} patches of one look, too few for {count or 1} surfaces; expected "
+            f"{len(patches.row)} uniform patches, too few for {count or 1} surfaces; expected "
             "a picture of a floor: mark surfaces in a config, or name fewer with --surfaces"
         )
     own = _clusters(patches, count)
@@ -95,12 +93,12 @@ def proposed(
     return MarkedCells(patches.row[chosen], patches.column[chosen], rank[own[chosen]])
 
 
-def patches_of(features: Features, visible: Bool[np.ndarray, "row column"]) -> Patches:
-    """Return patches of connected cells between which the look changes slowly."""
+def patches_of(features: Features, visible: Mask) -> Patches:
+    """Return patches of connected cells between which the appearance changes slowly."""
     cv2 = opencv()
     step = max(1, round(np.sqrt(visible.size / (2 * COARSE))))
     few, some = thinned(features, step), visible[step // 2 :: step, step // 2 :: step]
-    soft = cv2.GaussianBlur(few.look[..., :3], (0, 0), 1.2)
+    soft = cv2.GaussianBlur(few.appearance[..., :3], (0, 0), 1.2)
     across, down = (cv2.Sobel(soft, cv2.CV_32F, i, 1 - i, scale=0.125) for i in (1, 0))
     slope = np.sqrt((across**2 + down**2).sum(axis=-1))
     flat = some & (slope < max(0.9, 1.5 * float(np.median(slope[some]))))
@@ -112,9 +110,9 @@ def patches_of(features: Features, visible: Bool[np.ndarray, "row column"]) -> P
     kept = [k for k in range(1, count) if area[k] >= LEAST_PART * some.sum()]
     peak = [int(np.argmax(np.where(parts == k, inner, -1))) for k in kept]
     rows, columns = np.unravel_index(np.array(peak, int), parts.shape)
-    look = [np.median(few.look[parts == k], axis=0) for k in kept]
+    appearance = [np.median(few.appearance[parts == k], axis=0) for k in kept]
     return Patches(
-        np.array(look, float).reshape(-1, 4),
+        np.array(appearance, float).reshape(-1, 4),
         np.minimum(rows * step + step // 2, visible.shape[0] - 1),
         np.minimum(columns * step + step // 2, visible.shape[1] - 1),
         np.array([area[k] * step**2 for k in kept], int),
@@ -122,9 +120,7 @@ def patches_of(features: Features, visible: Bool[np.ndarray, "row column"]) -> P
     )
 
 
-def _samples(
-    few: Features, parts: Int[np.ndarray, "row column"], kept: Sequence[int]
-) -> ColourSamples:
+def _samples(few: Features, parts: Labels, kept: Sequence[int]) -> ColourSamples:
     """Return samples spread evenly over every kept patch."""
     own = np.full(parts.max() + 1, -1)
     own[list(kept)] = np.arange(len(kept))
@@ -146,7 +142,7 @@ def _clusters(patches: Patches, count: int | None) -> Int[np.ndarray, " patch"]:
     """Return the surface of each patch, by hierarchical clustering of their colours.
 
     At first each patch is a surface of its own: the change of light within patches is enough to
-    compare them, and those found similar then give a better estimate of the light.
+    compare them, and those recognised as similar then give a better estimate of the light.
     """
     from scipy.cluster.hierarchy import fcluster, linkage
 
@@ -158,7 +154,7 @@ def _clusters(patches: Patches, count: int | None) -> Int[np.ndarray, " patch"]:
         start = LitColours(Illumination.uniform(), _means(grouped))
         plain = _evenly(lab_of(_relit(fit_illumination(grouped, start).illumination, samples)))
         middle = [np.median(plain[samples.surface == k], axis=0) for k in range(len(own))]
-        rough = TEXTURE * patches.look[:, 3:]
+        rough = TEXTURE * patches.appearance[:, 3:]
         tree = linkage(np.concatenate([np.array(middle), rough], axis=1), "average")
         own = fcluster(tree, near, "distance") - 1
     if count is None:
@@ -178,15 +174,13 @@ def _relit(illumination: Illumination, samples: ColourSamples) -> Float[np.ndarr
     plain = illumination.true_colours(samples.rgb, samples.at)
     veil = basis_at(samples.at) @ illumination.veil
     clearest = samples.at[[int(np.argmin(veil.sum(axis=1)))]]
-    return illumination.appearance(plain, clearest)[:, 0]
+    return illumination.rgb_of(plain, clearest)[:, 0]
 
 
 def matched(
-    features: Features,
-    visible: Bool[np.ndarray, "row column"],
-    colours: Float[np.ndarray, "surface 3"],
+    features: Features, visible: Mask, colours: Float[np.ndarray, "surface 3"]
 ) -> MarkedCells:
-    """Return the middles of patches that look most like one of some colours [linear RGB]."""
+    """Return the middles of patches that match one of some colours best [linear RGB]."""
     patches = patches_of(features, visible)
     count = len(patches.row)
     own = np.full(count, -1)
@@ -196,7 +190,7 @@ def matched(
     fit = LitColours(Illumination.uniform(), np.concatenate([colours, _means(samples)]))
     for near in MATCH:
         expected = _exposed(colours, fit.colours[: len(colours)], np.unique(own[own >= 0]))
-        own = _nearest(patches, fit.illumination.appearance(expected, samples.at), near)
+        own = _nearest(patches, fit.illumination.rgb_of(expected, samples.at), near)
         # a patch without a match still shows, by its own colour, how the light changes within it
         each = np.where(own >= 0, own, len(colours) + np.arange(count))
         fit = fit_illumination(replace(samples, surface=each[samples.surface]), fit)
@@ -209,7 +203,7 @@ def _exposed(
     fitted: Float[np.ndarray, "surface 3"],
     matched: Int[np.ndarray, " match"],
 ) -> Float[np.ndarray, "surface 3"]:
-    """Return fitted colours of matched surfaces, and given colours, as bright, of the others."""
+    """Return the fitted colours of matched surfaces, and given ones of equal brightness else."""
     if not len(matched):
         return given
     brighter = np.median(fitted[matched].sum(axis=1) / given[matched].sum(axis=1))

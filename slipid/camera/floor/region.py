@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from slipid.camera.floor.grid import (
     LEAST_CELLS,
@@ -23,6 +23,7 @@ from slipid.camera.floor.grid import (
 from slipid.camera.floor.light import Features, lab_of, linear_of_code
 from slipid.camera.floor.palette import Palette, Places, Polygon
 from slipid.camera.floor.surfaces import MarkedCells, Seeds
+from slipid.camera.opencv import Mask, size_of
 from slipid.camera.overhead import OverheadCamera
 from slipid.support.errors import DataError
 
@@ -46,11 +47,6 @@ class FloorPicture:
     picture: UInt8[np.ndarray, "y x 3"]
     camera: OverheadCamera
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height [pixel]."""
-        return self.picture.shape[1], self.picture.shape[0]
-
 
 @dataclass(frozen=True, eq=False)
 class FloorRegion:
@@ -64,8 +60,8 @@ class FloorRegion:
     """
 
     floor: Rectified
-    requested: Bool[np.ndarray, "row column"]
-    visible: Bool[np.ndarray, "row column"]
+    requested: Mask
+    visible: Mask
     robots: tuple[DetectedRobot, ...]
 
 
@@ -84,7 +80,7 @@ def requested_region(
         DataError: another resolution than the camera's, or a region without visible floor.
     """
     picture, camera = source.picture, source.camera
-    camera.of_size(source.size, source.path)
+    camera.lens.check_size(size_of(picture), source.path)
     grid = grid_over(_extent(source, palette.region), cell or pixel_size(camera), source.path)
     floor = rectified(picture, camera, grid)
     requested = floor.in_view.copy()
@@ -131,13 +127,11 @@ def _extent(source: FloorPicture, region: Polygon | None) -> Extent:
     return Extent(*(float(v) for v in (*low, *high)))
 
 
-def _cells(
-    source: FloorPicture, floor: Rectified, polygon: Polygon
-) -> Bool[np.ndarray, "row column"]:
+def _cells(source: FloorPicture, floor: Rectified, polygon: Polygon) -> Mask:
     """Return the cells in a polygon."""
     if polygon.at_m is not None:
         return floor.grid.inside(np.array(polygon.at_m))
-    width, height = source.size
+    width, height = size_of(source.picture)
     return floor.of_picture(filled(np.array(polygon.at_px), height, width))
 
 
@@ -162,7 +156,7 @@ def seeds_of(
             colours[k] = np.median(features.rgb[own.row, own.column], axis=0)
         else:
             colours[k] = linear_of_code(palette.palette[name])
-            _check_present(source, name, palette, features.look[region.visible][:, :3])
+            _check_present(source, name, palette, features.appearance[region.visible][:, :3])
     return Seeds(colours, marked)
 
 
@@ -172,7 +166,7 @@ def _marked(
     """Return row and column of the marked points of entry `k` of a config."""
     grid = region.floor.grid
     given = np.array(marked.at_px or marked.at_m, float)
-    width, height = source.size
+    width, height = size_of(source.picture)
     if marked.at_px is not None:
         out = ~((given >= -0.5) & (given < [width - 0.5, height - 0.5])).all(axis=1)
         _refuse(source, given[out], k, f"outside the picture of {width} x {height} pixels")

@@ -5,21 +5,21 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
 
 from slipid.camera.floor.grid import DetectedRobot, Rectified
 from slipid.camera.floor.light import Features, code_of_linear
 from slipid.camera.floor.outline import PatchOutline, outlines_of, signed_area
 from slipid.camera.floor.palette import Palette
 from slipid.camera.floor.region import FloorPicture, FloorRegion
-from slipid.camera.floor.surfaces import UNKNOWN, Surfaces
-from slipid.camera.frames.source import is_picture
+from slipid.camera.floor.surfaces import UNKNOWN, Costs, Surfaces
+from slipid.camera.frame_source import is_picture
+from slipid.camera.opencv import Labels, Mask
 from slipid.data.geojson_map import Patch, VectorMap
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 
 HARDLY, NOT = 5.0, 3.5
-"""Difference of looks below which surfaces are hardly, or not, distinguishable [spreads].
+"""Difference of appearance below which surfaces are hardly, or not, distinguishable [spreads].
 
 One surface under two names comes out at about 3.2: each name takes one side of its noise.
 """
@@ -35,10 +35,10 @@ TOLERANCE = 0.6
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """Surface of each cell, the cost of every surface in each cell, and the surfaces' looks."""
+    """Surface of each cell, the cost of every surface in each cell, and their appearance."""
 
-    labels: Int[np.ndarray, "row column"]
-    costs: Float32[np.ndarray, "surface row column"]
+    labels: Labels
+    costs: Costs
     surfaces: Surfaces
 
 
@@ -58,7 +58,7 @@ class PictureMap:
 
     vector: VectorMap
     floor: Rectified
-    labels: Int[np.ndarray, "row column"]
+    labels: Labels
     robots: tuple[DetectedRobot, ...]
     warnings: tuple[str, ...]
     poor: tuple[str, ...]
@@ -154,37 +154,32 @@ def map_from(
 def _similar(
     surfaces: Surfaces, names: tuple[str, ...], present: list[int], low: float, high: float
 ) -> list[str]:
-    """Return sentences about pairs of surfaces whose looks differ by `low` to `high` spreads.
+    """Return sentences about pairs of surfaces whose appearances differ by `low` to `high` spreads.
 
     The difference is the median over the picture.
     """
-    looks = surfaces.looks((24, 24)).reshape(len(names), -1, 4)
+    appearances = surfaces.appearances((24, 24)).reshape(len(names), -1, 4)
     sentences = []
     for one, other in combinations(present, 2):
         spread = np.maximum(surfaces.spread[one], surfaces.spread[other])
-        difference = float(np.median(np.linalg.norm((looks[one] - looks[other]) / spread, axis=1)))
+        difference = float(
+            np.median(np.linalg.norm((appearances[one] - appearances[other]) / spread, axis=1))
+        )
         if low <= difference < high:
             sentences.append(
                 f"{names[one]} and {names[other]} {'cannot' if high <= NOT else 'can hardly'} be "
-                f"distinguished: their looks differ by {difference:.1f} spreads of one surface; "
-                "mark more points on them, or give them one name"
+                f"distinguished: they differ by {difference:.1f} spreads of one surface; mark more "
+                "points on them, or give them one name"
             )
     return sentences
 
 
-def _unknown_share(
-    labels: Int[np.ndarray, "row column"], requested: Bool[np.ndarray, "row column"]
-) -> float:
+def _unknown_share(labels: Labels, requested: Mask) -> float:
     """Return the part of the requested cells whose surface is unknown."""
     return float((labels[requested] < 0).mean())
 
 
-def _patch(
-    one: PatchOutline,
-    region: FloorRegion,
-    names: tuple[str, ...],
-    costs: Float32[np.ndarray, "surface row column"],
-) -> Patch:
+def _patch(one: PatchOutline, region: FloorRegion, names: tuple[str, ...], costs: Costs) -> Patch:
     """Return a patch in metres, the outer ring anticlockwise and holes clockwise.
 
     Its confidence is by how much worse the next best surface explains it than its own, as the
@@ -205,7 +200,7 @@ def _patch(
 def _vector(
     source: FloorPicture,
     region: FloorRegion,
-    labels: Int[np.ndarray, "row column"],
+    labels: Labels,
     patches: tuple[Patch, ...],
     colours: dict[str, str],
 ) -> VectorMap:

@@ -1,4 +1,4 @@
-"""Looks of each surface, learnt together with the illumination from a few marked cells or colours.
+"""Appearance of each surface, learnt with the illumination from a few marked cells or colours.
 
 In turn, every cell gets the surface that it resembles most under the illumination so far, and the
 cells that are clear give better colours, spreads and illumination. A cell's neighbours count as
@@ -8,7 +8,7 @@ well, so that surfaces form patches with clean edges.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 
 from slipid.camera.floor.light import (
     ColourSamples,
@@ -18,7 +18,7 @@ from slipid.camera.floor.light import (
     fit_illumination,
     lab_of,
 )
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import Labels, Mask, opencv
 
 ROUNDS = 10
 STEADY = 3e-4
@@ -34,6 +34,8 @@ OUTLIER = 60.0
 """Cost above which a cell belongs to none of the surfaces [squared spreads]."""
 CLEAR = 16.0
 """Cost below which a cell clearly belongs to its surface [squared spreads]."""
+Costs = Float32[np.ndarray, "surface row column"]
+"""Cost of every surface in every cell [squared spreads]."""
 UNKNOWN = -1
 """Label of cells without a surface."""
 COUPLING = 3.0
@@ -68,7 +70,7 @@ class MarkedCells:
             np.concatenate([self.surface, other.surface]),
         )
 
-    def surroundings(self, visible: Bool[np.ndarray, "row column"]) -> "MarkedCells":
+    def surroundings(self, visible: Mask) -> "MarkedCells":
         """Return the visible cells around each of these, with its surface."""
         steps = np.arange(-AROUND, AROUND + 1, 2)
         down, across = (step.ravel() for step in np.meshgrid(steps, steps))
@@ -90,7 +92,7 @@ class Seeds:
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Learnt looks of every surface.
+    """Learnt appearance of every surface.
 
     Attributes:
         lit: colours and the illumination.
@@ -102,12 +104,12 @@ class Surfaces:
     texture: Float[np.ndarray, " surface"]
     spread: Float[np.ndarray, "surface 4"]
 
-    def looks(self, shape: tuple[int, int]) -> Float32[np.ndarray, "surface row column 4"]:
+    def appearances(self, shape: tuple[int, int]) -> Float32[np.ndarray, "surface row column 4"]:
         """Return the L, a, b and texture that each surface would have in every cell."""
         cv2 = opencv()
         rows, columns = min(shape[0], 48), min(shape[1], 48)
         at = positions((rows, columns))
-        coarse = lab_of(self.lit.illumination.appearance(self.lit.colours, at))
+        coarse = lab_of(self.lit.illumination.rgb_of(self.lit.colours, at))
         out = np.empty((len(coarse), *shape, 4), np.float32)
         size = (shape[1], shape[0])
         for k, lab in enumerate(coarse.reshape(-1, rows, columns, 3).astype(np.float32)):
@@ -115,16 +117,14 @@ class Surfaces:
             out[k, ..., 3] = self.texture[k]
         return out
 
-    def costs(
-        self, look: Float[np.ndarray, "row column 4"]
-    ) -> Float32[np.ndarray, "surface row column"]:
+    def costs(self, appearance: Float[np.ndarray, "row column 4"]) -> Costs:
         """Return how badly each surface explains each cell [squared spreads], limited above.
 
-        A wide spread costs as well: a surface that may look like anything explains nothing.
+        A wide spread costs as well: a surface that may have any appearance explains nothing.
         """
-        out = np.empty((len(self.spread), *look.shape[:2]), np.float32)
-        for k, expected in enumerate(self.looks(look.shape[:2])):
-            off = (look - expected) / self.spread[k].astype(np.float32)
+        out = np.empty((len(self.spread), *appearance.shape[:2]), np.float32)
+        for k, expected in enumerate(self.appearances(appearance.shape[:2])):
+            off = (appearance - expected) / self.spread[k].astype(np.float32)
             wide = 2 * np.log(self.spread[k] / LEAST_SPREAD).sum()
             rough = np.minimum(off[..., 3] ** 2, 6.0)  # edges and dirt are rough as well
             out[k] = (off[..., :3] ** 2).sum(axis=-1) + rough + wide
@@ -138,18 +138,18 @@ def positions(shape: tuple[int, int]) -> Float[np.ndarray, "place 2"]:
     return 2 * np.stack([x.ravel(), y.ravel()], axis=-1) / size - 1
 
 
-def learnt(features: Features, visible: Bool[np.ndarray, "row column"], seeds: Seeds) -> Surfaces:
-    """Return the looks of the surfaces in a picture."""
+def learnt(features: Features, visible: Mask, seeds: Seeds) -> Surfaces:
+    """Return the appearance of the surfaces in a picture."""
     step = max(1, round(np.sqrt(visible.size / COARSE)))
     few, some = thinned(features, step), visible[step // 2 :: step, step // 2 :: step]
-    shape = few.look.shape[:2]
+    shape = few.appearance.shape[:2]
     row, column = seeds.marked.row // step, seeds.marked.column // step
     marked = np.minimum(row, shape[0] - 1) * shape[1] + np.minimum(column, shape[1] - 1)
     surfaces = _start(few, marked, seeds)
-    flat = _flat(few.look) & some
+    flat = _flat(few.appearance) & some
     before = np.full(shape, -1)
     for _ in range(ROUNDS):
-        costs = surfaces.costs(few.look)
+        costs = surfaces.costs(few.appearance)
         labels = labelled(costs, some)
         if np.mean(labels != before) < STEADY:
             break
@@ -167,31 +167,35 @@ def thinned(features: Features, step: int) -> Features:
         return features
     cv2 = opencv()
     cut = slice(step // 2, None, step)
-    look, rgb = (
-        cv2.GaussianBlur(one, (0, 0), 0.4 * step)[cut, cut] for one in (features.look, features.rgb)
+    appearance, rgb = (
+        cv2.GaussianBlur(one, (0, 0), 0.4 * step)[cut, cut]
+        for one in (features.appearance, features.rgb)
     )
-    return Features(look, rgb)
+    return Features(appearance, rgb)
 
 
-def _flat(look: Float[np.ndarray, "row column 4"]) -> Bool[np.ndarray, "row column"]:
+def _flat(appearance: Float[np.ndarray, "row column 4"]) -> Mask:
     """Return cells whose neighbours look about the same; colours along edges are mixed."""
     cv2 = opencv()
-    lab = np.ascontiguousarray(look[..., :3])
+    lab = np.ascontiguousarray(appearance[..., :3])
     kernel = np.ones((3, 3), np.uint8)
     change = (cv2.dilate(lab, kernel) - cv2.erode(lab, kernel)).max(axis=-1)
     return np.asarray(change < max(8.0, 1.5 * float(np.median(change))))
 
 
 def _start(few: Features, marked: Int[np.ndarray, " seed"], seeds: Seeds) -> Surfaces:
-    """Return the looks of the surfaces by the seeds alone."""
+    """Return the appearance of the surfaces by the seeds alone."""
     start = LitColours(Illumination.uniform(), seeds.colours)
-    texture = np.full(len(seeds.colours), float(np.median(few.look[..., 3])))
+    texture = np.full(len(seeds.colours), float(np.median(few.appearance[..., 3])))
     spread = np.tile(MOST_SPREAD, (len(seeds.colours), 1))
     spread[:, 3] = 100.0  # a colour alone says nothing about texture
     if not len(marked):
         return Surfaces(start, texture, spread)
-    rgb, rough = few.rgb.reshape(-1, 3)[marked].astype(float), few.look[..., 3].ravel()[marked]
-    at, own = positions(few.look.shape[:2])[marked], seeds.marked.surface
+    rgb, rough = (
+        few.rgb.reshape(-1, 3)[marked].astype(float),
+        few.appearance[..., 3].ravel()[marked],
+    )
+    at, own = positions(few.appearance.shape[:2])[marked], seeds.marked.surface
     for k in np.unique(own):
         texture[k], spread[k, 3] = np.median(rough[own == k]), MOST_SPREAD[3]
     fit = fit_illumination(ColourSamples(at, rgb, own, np.ones(len(at))), start)
@@ -205,7 +209,7 @@ def _updated(
     marked: Int[np.ndarray, " seed"],
     seeds: Seeds,
 ) -> Surfaces:
-    """Return the looks of the surfaces by the labelled cells and by the marked ones."""
+    """Return the appearance of the surfaces by the labelled cells and by the marked ones."""
     cells = np.flatnonzero(labels >= 0)
     cells = cells[:: 1 + len(cells) // SAMPLES]
     if not len(cells):
@@ -216,30 +220,31 @@ def _updated(
     # every surface contributes to the illumination, however small it is
     weight = 1 / np.sqrt(count[own])
     weight[len(weight) - len(marked) :] *= 3
-    at, look = positions(few.look.shape[:2])[cells], few.look.reshape(-1, 4)[cells]
+    at, appearance = (
+        positions(few.appearance.shape[:2])[cells],
+        few.appearance.reshape(-1, 4)[cells],
+    )
     samples = ColourSamples(at, few.rgb.reshape(-1, 3)[cells].astype(float), own, weight)
     fit = fit_illumination(samples, surfaces.lit)
     texture, spread = surfaces.texture.copy(), surfaces.spread.copy()
-    for k in np.unique(own):  # robustly, around the expected look
+    for k in np.unique(own):  # robustly, around the expected appearance
         mine = own == k
-        texture[k] = np.median(look[mine, 3])
-        expected = lab_of(fit.illumination.appearance(fit.colours[k : k + 1], at[mine])[0])
-        off = np.abs(look[mine] - np.column_stack([expected, np.full(mine.sum(), texture[k])]))
+        texture[k] = np.median(appearance[mine, 3])
+        expected = lab_of(fit.illumination.rgb_of(fit.colours[k : k + 1], at[mine])[0])
+        off = np.abs(
+            appearance[mine] - np.column_stack([expected, np.full(mine.sum(), texture[k])])
+        )
         spread[k] = np.clip(1.5 * np.median(off, axis=0), LEAST_SPREAD, MOST_SPREAD)
     return Surfaces(fit, texture, spread)
 
 
-def labelled(
-    costs: Float32[np.ndarray, "surface row column"], visible: Bool[np.ndarray, "row column"]
-) -> Int[np.ndarray, "row column"]:
+def labelled(costs: Costs, visible: Mask) -> Labels:
     """Return the surface of each cell; a number above the last marks cells that fit none."""
     outlier = np.full((1, *visible.shape), OUTLIER, np.float32)
     return smoothed(np.concatenate([costs, outlier]), visible)
 
 
-def smoothed(
-    costs: Float32[np.ndarray, "surface row column"], visible: Bool[np.ndarray, "row column"]
-) -> Int[np.ndarray, "row column"]:
+def smoothed(costs: Costs, visible: Mask) -> Labels:
     """Return labels of low cost that agree with their neighbours.
 
     Mean field of a Potts model: each cell holds a share of every surface and is drawn towards the
@@ -257,9 +262,7 @@ def smoothed(
     return np.where(visible, np.argmin(total, axis=0), UNKNOWN)
 
 
-def without_small_patches(
-    labels: Int[np.ndarray, "row column"], visible: Bool[np.ndarray, "row column"], width: int
-) -> Int[np.ndarray, "row column"]:
+def without_small_patches(labels: Labels, visible: Mask, width: int) -> Labels:
     """Return labels in which small or narrow patches became part of the nearest other patch.
 
     Along an edge of two surfaces their mixed colour may look like a third: a narrow line of it.
@@ -289,9 +292,7 @@ def without_small_patches(
     return np.where(visible, _nearest(labels, large & visible), UNKNOWN)
 
 
-def _nearest(
-    labels: Int[np.ndarray, "row column"], kept: Bool[np.ndarray, "row column"]
-) -> Int[np.ndarray, "row column"]:
+def _nearest(labels: Labels, kept: Mask) -> Labels:
     """Return, in every cell, the label of the nearest kept cell; unchanged where none is kept."""
     from scipy.ndimage import distance_transform_edt
 

@@ -7,11 +7,11 @@ from contextlib import closing
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
-from slipid.camera.frames.frame import Frame, FrameSource, read_ahead
-from slipid.camera.opencv import dictionary_names
-from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region
+from slipid.camera.frame import Frame, FrameSource, read_ahead
+from slipid.camera.opencv import Grey, visible_markers
+from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region, cut
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -110,7 +110,7 @@ def detect_all(
     if log.frame:
         report.line(f"going on from frame {len(log.frame)}")
     report.stage("tracking")
-    before: UInt8[np.ndarray, "row column"] | None = None
+    before: Grey | None = None
     known, saved = len(log.frame), clock.monotonic()
     # the last known frame is read again, to know whether the next one repeats it
     with closing(read_ahead(source.frames(max(0, known - 1)))) as frames:
@@ -140,7 +140,7 @@ def detect_all(
     return log.detections()
 
 
-def _others(grey: UInt8[np.ndarray, "row column"], tracker: MarkerTracker) -> str | None:
+def _others(grey: Grey, tracker: MarkerTracker) -> str | None:
     """Return advice where a picture shows markers, but none that is wanted; None otherwise."""
     wanted = ", ".join(map(str, sorted(tracker.ids)))
     visible = {d.id for d in tracker.detector.detect(grey, tracker.region)}
@@ -149,36 +149,17 @@ def _others(grey: UInt8[np.ndarray, "row column"], tracker: MarkerTracker) -> st
             f"marker {wanted} is in no frame so far, but {_numbers(others)}; expected --id "
             f"{others[0]}, or a file of targets"
         )
-    if (other := _visible_dictionary(grey, tracker.region)) is None:
+    markers = visible_markers([cut(grey, tracker.region)])
+    if not markers.numbers:
         return None
     return (
-        f"marker {wanted} is in no frame so far, but {_numbers(other.ids)} of the dictionary "
-        f"{other.name}; expected --dictionary {other.name}"
+        f"marker {wanted} is in no frame so far, but {_numbers(markers.numbers)} of the dictionary "
+        f"{markers.dictionary}; expected --dictionary {markers.dictionary}"
     )
 
 
 def _numbers(ids: Sequence[int]) -> str:
     return f"marker{'s' if len(ids) > 1 else ''} {', '.join(map(str, ids))}"
-
-
-@dataclass(frozen=True)
-class _VisibleDictionary:
-    """A dictionary, and the numbers of its markers in a picture."""
-
-    name: str
-    ids: list[int]
-
-
-def _visible_dictionary(
-    grey: UInt8[np.ndarray, "row column"], region: Region | None = None
-) -> _VisibleDictionary | None:
-    """Return the smallest of the dictionaries with most markers in a picture; None without any."""
-    ids = {
-        name: {d.id for d in MarkerDetector(name).detect(grey, region)}
-        for name in dictionary_names()
-    }
-    best = min(ids, key=lambda name: (-len(ids[name]), len(name), name))
-    return _VisibleDictionary(best, sorted(ids[best])) if ids[best] else None
 
 
 def only_marker(source: FrameSource, detector: MarkerDetector, region: Region | None = None) -> int:
@@ -188,7 +169,7 @@ def only_marker(source: FrameSource, detector: MarkerDetector, region: Region | 
         DataError: it shows none, or several.
     """
     counts: Counter[int] = Counter()
-    last: UInt8[np.ndarray, "row column"] | None = None
+    last: Grey | None = None
     with closing(read_ahead(source.frames())) as frames:
         for frame in frames:
             last = frame.grey
@@ -203,10 +184,10 @@ def only_marker(source: FrameSource, detector: MarkerDetector, region: Region | 
             f"{source.name}: {_numbers(often)} in view; expected --id for the robot's, or a file "
             "of targets"
         )
-    if last is not None and (other := _visible_dictionary(last, region)) is not None:
+    if last is not None and (markers := visible_markers([cut(last, region)])).numbers:
         raise DataError(
-            f"{source.name}: no marker of this dictionary, but {_numbers(other.ids)} of "
-            f"{other.name}; expected --dictionary {other.name}"
+            f"{source.name}: no marker of this dictionary, but {_numbers(markers.numbers)} of "
+            f"{markers.dictionary}; expected --dictionary {markers.dictionary}"
         )
     raise DataError(
         f"{source.name}: no marker of any dictionary in the first frames; expected one in view, "

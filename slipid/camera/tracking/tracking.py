@@ -6,14 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.camera.frames.frame import FrameSource, cut_off, read_ahead, uneven
-from slipid.camera.frames.video import Device
-from slipid.camera.opencv import marker_dictionary, opencv
+from slipid.camera.frame import FrameSource, cut_off, read_ahead, uneven
+from slipid.camera.frame_source import Device
+from slipid.camera.opencv import marker_count, opencv
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.detections import detect_all, only_marker
 from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region
-from slipid.camera.tracking.poses_file import check_writable, write_poses
-from slipid.camera.tracking.preview import check_drawable, write_preview
+from slipid.camera.tracking.outputs import (
+    check_drawable,
+    check_writable,
+    write_poses,
+    write_preview,
+)
 from slipid.camera.tracking.target import Marker, Target
 from slipid.camera.tracking.track import Flag, TrackedPoses, track_of
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
@@ -99,7 +103,7 @@ def track(
         DataError: frames of another size than the camera was calibrated at, no marker in any frame,
             times that do not increase.
     """
-    camera.of_size(source.image_px, source.name)
+    camera.lens.check_size(source.image_px, source.name)
     for target in targets:
         target.below(camera.height)
     ids = frozenset(number for target in targets for number in target.ids)
@@ -172,7 +176,7 @@ class LoneMarker:
             )
         if not np.isfinite(self.yaw):
             raise DataError(f"--marker-yaw {np.degrees(self.yaw):g}; expected an angle in degrees")
-        most = len(marker_dictionary(self.dictionary).bytesList) - 1
+        most = marker_count(self.dictionary) - 1
         if self.id is not None and self.id > most:
             raise DataError(f"--id {self.id}; expected 0 to {most} in {self.dictionary}")
 

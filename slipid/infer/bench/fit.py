@@ -1,21 +1,22 @@
-"""The numbers of one motor by the quasi-posterior of their moments.
+"""Fit of one motor: the maximum of the quasi-posterior of its moments.
 
 With the moments g of both equations, their scatter S and Gaussian priors in the search space z,
 
     -2 log pi(z) = g(z)^T S^-1 g(z) + |(z - mean) / std|^2 + const
 
-(Chernozhukov and Hong 2003: as good as a likelihood where the mean of g is what is known). Weights,
-S and z are found in turn. Its curvature J^T J, of the residuals in that sum, is the sandwich of
-robust statistics at once: intervals hold although noise is neither white nor Gaussian nor known.
+(Chernozhukov and Hong 2003: it may replace a likelihood if only the mean of g is known). Weights, S
+and z are updated in turn. The curvature J^T J of the residuals in that sum equals the sandwich of
+robust statistics: intervals are valid although noise is neither white nor Gaussian nor known.
 
-Why not least squares or a Kalman smoother? The current is a noisy input: least squares has R too
-small by the part of the noise in the current's variance, and a smoother that knows better needs the
-spectra of three noises and what the voltage did between rows. Here no noise has to be known.
+Least squares and Kalman smoothers are unsuitable because the current is a noisy input: least
+squares underestimates R by the share of noise in the current's variance, and a smoother needs the
+spectra of three noises and the voltage between rows. The moments need neither.
 """
 
 import fnmatch
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,8 +29,8 @@ from slipid.infer.bench.moments import (
     MomentSums,
     cell_length,
     celled,
+    correlation_cells,
     grouped,
-    memory,
     scatter,
     start,
     sums,
@@ -49,27 +50,49 @@ from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
 from slipid.search_space import Choice, Space
 
 ROUNDS = 30
-"""Of weights, scatter and numbers, at most."""
+"""Largest number of updates of weights, scatter and numbers."""
 SETTLED = 0.02
-"""It stops when no number moves by more of its std in a round."""
+"""Largest change of a number in a round of a converged fit [std]."""
 CONSTANT_S = 2e-3
-"""Std of the electrical time constant before anything is seen [s]."""
-ASKED = (len(VOLTS) - 1, len(AMPS))
-"""Moments of each equation: that along a magnitude is left to the mechanical one."""
+"""Prior std of the electrical time constant [s]."""
+MOMENTS = (len(VOLTS) - 1, len(AMPS))
+"""Number of moments of each equation; only the mechanical one uses the sign of a magnitude."""
+
+
+class Equation(NamedTuple):
+    """One of the two equations of a motor, at the fitted numbers.
+
+    Attributes:
+        channel: `voltage` or `current`.
+        unit: unit of the channel.
+        windows: windows of the records.
+        sums: weights and residuals.
+    """
+
+    channel: str
+    unit: str
+    windows: BenchWindows
+    sums: MomentSums
 
 
 @dataclass(frozen=True, eq=False)
 class MotorFit:
-    """What a fit of one motor found.
+    """Fit of one motor.
 
     Attributes:
-        label: of the motor, "" where it is the only one.
-        space: free and fixed numbers, priors. `choices`: what the user wanted.
-        z, covariance: at the optimum, in the search space.
-        volts, amps: windows of both equations, None without voltage.
-        volts_sums, amps_sums: their weights and residuals.
-        remember: time over which residuals are correlated [s].
-        stretches: how many such times were seen.
+        label: label of the motor, "" for a single one.
+        records: runs of the motor.
+        space: free and fixed numbers with their priors.
+        choices: user's choices.
+        z: search vector at the optimum.
+        covariance: its covariance.
+        equations: the electrical equation, absent without voltage, and the mechanical one.
+        noise: noise of the sensors.
+        correlation_time: time over which residuals are correlated [s].
+        independent_times: length of the records over the correlation time.
+        converged: True if the numbers settled.
+        reason: sentence on how the fit ended.
+        rounds: number of rounds.
     """
 
     label: str
@@ -78,26 +101,23 @@ class MotorFit:
     choices: tuple[Choice, ...]
     z: Float[np.ndarray, " free"]
     covariance: Float[np.ndarray, "free free"]
-    volts: BenchWindows | None
-    amps: BenchWindows
-    volts_sums: MomentSums | None
-    amps_sums: MomentSums
+    equations: tuple[Equation, ...]
     noise: SensorNoise
-    remember: float
-    stretches: float
+    correlation_time: float
+    independent_times: float
     converged: bool
     reason: str
     rounds: int
 
     @property
     def motor(self) -> BenchMotor:
-        """The numbers found."""
+        """Motor with the fitted numbers."""
         found: BenchMotor = self.space.tree(jnp.asarray(self.z)).motor
         return found
 
     @property
     def has_voltage(self) -> bool:
-        return self.volts is not None
+        return len(self.equations) > 1
 
     @property
     def period(self) -> float:
@@ -106,7 +126,7 @@ class MotorFit:
 
 
 class _EquationSums(eqx.Module):
-    """Sums of one equation, nothing where it has no windows."""
+    """Sums of one equation, zero without windows."""
 
     constant: Array
     slope: Array
@@ -120,7 +140,7 @@ class _EquationSums(eqx.Module):
 
 
 class _Objective(eqx.Module):
-    """What the numbers are sought with: sums of both equations, S^-1/2, priors."""
+    """Sums of both equations, S^-1/2 and priors: the arguments of the search."""
 
     space: Space
     volts: _EquationSums
@@ -128,7 +148,7 @@ class _Objective(eqx.Module):
     root: Array
 
     def tangents(self) -> "_Objective":
-        """The same, whose slopes are what decides how sure the numbers are."""
+        """Return the objective with tangents as slopes, which determine the uncertainty."""
         slopes = self.volts.tangent, self.amps.tangent
         return eqx.tree_at(lambda h: (h.volts.slope, h.amps.slope), self, slopes)
 
@@ -136,13 +156,13 @@ class _Objective(eqx.Module):
 def fit_motor(
     records: Sequence[BenchRecord], choices: Sequence[Choice] = (), label: str = ""
 ) -> MotorFit:
-    """Fit one motor to its records, of which all or none have voltages."""
+    """Fit one motor to its records, either all with voltages or none."""
     amps, volts = mechanical(records), electrical(records, 0.0)
     first = _first(volts, amps, all(r.signed for r in records))
     scaled = [*_scaled(records, float(first.resistance)), *choices]
     space = Space(BenchRoot(BenchMotor()), scaled)
     z = space.vector(BenchRoot(first))
-    # what is not free, or has a start of the user's, keeps it
+    # numbers with a start value of the user keep it
     z = np.where(_chosen(space, choices), space.start, z)
     zero, moved, rounds = 0.0, np.inf, 0
     while moved >= SETTLED and rounds < ROUNDS:
@@ -150,14 +170,17 @@ def fit_motor(
         if abs(float(motor.current_offset) - zero) > 0.02 * BRUSH_CURRENT:
             zero = float(motor.current_offset)
             volts = electrical(records, zero)
-        v = None if volts is None else sums(volts, np.asarray(motor.volts()), ASKED[0])
-        a = sums(amps, np.asarray(motor.amps()), ASKED[1])
-        s, remember, stretches = _scatter(volts, v, amps, a)
+        v = None if volts is None else sums(volts, np.asarray(motor.volts()), MOMENTS[0])
+        a = sums(amps, np.asarray(motor.amps()), MOMENTS[1])
+        equations = [Equation("current", "A", amps, a)]
+        if volts is not None and v is not None:
+            equations.insert(0, Equation("voltage", "V", volts, v))
+        s, correlation_time, independent_times = _scatter(equations)
         new, covariance = _solved(space, z, v, a, s)
         moved = float(np.max(np.abs(new - z) / np.sqrt(np.diag(covariance)), initial=0.0))
         z, rounds = new, rounds + 1
     settled = moved < SETTLED and bool(np.isfinite(z).all())
-    reason = f"no number moved {SETTLED:g} of its std in round {rounds}"
+    reason = f"no number changed by {100 * SETTLED:g} % of its std in round {rounds}"
     return MotorFit(
         label=label,
         records=tuple(records),
@@ -165,13 +188,10 @@ def fit_motor(
         choices=tuple(choices),
         z=z,
         covariance=covariance,
-        volts=volts,
-        amps=amps,
-        volts_sums=v,
-        amps_sums=a,
+        equations=tuple(equations),
         noise=noise_of(records),
-        remember=remember,
-        stretches=stretches,
+        correlation_time=correlation_time,
+        independent_times=independent_times,
         converged=settled,
         reason=reason if settled else f"{rounds} rounds without settling",
         rounds=rounds,
@@ -179,15 +199,15 @@ def fit_motor(
 
 
 def _first(volts: BenchWindows | None, amps: BenchWindows, signed: bool) -> BenchMotor:
-    """Where the search starts: both equations by themselves, what is negative left at its start."""
+    """Return start values from each equation by itself; negative ones keep their defaults."""
     usual = BenchMotor()
     r, c, drop, slow, one = float(usual.resistance), float(usual.back_emf), 0.0, 0.0, 0.0
     if volts is not None:
-        found = start(volts, ASKED[0], list(range(ASKED[0])))
+        found = start(volts, MOMENTS[0])
         r, c = (float(x) if x > 0 else y for x, y in zip(found, (r, c), strict=False))
         drop, slow, one = map(float, found[2:5])
-    # a magnitude's zero and friction are one signal: least squares shares it between both
-    k = start(amps, ASKED[1], list(range(ASKED[1] if signed else ASKED[1] - 1)))
+    # the zero of a magnitude and friction have the same signal, so the zero is left out
+    k = start(amps, MOMENTS[1] if signed else MOMENTS[1] - 1)
     torque = (usual.rotor_inertia, usual.coulomb_friction, usual.viscous_friction)
     j, tau, b = (float(x) * c if x > 0 else float(y) for x, y in zip(k, torque, strict=False))
     zero = float(k[3])
@@ -198,7 +218,7 @@ def _first(volts: BenchWindows | None, amps: BenchWindows, signed: bool) -> Benc
 
 
 def _scaled(records: Sequence[BenchRecord], resistance: float) -> list[Choice]:
-    """Priors that go with the size of the motor: a time constant, and tenths of what was seen."""
+    """Return priors scaled to the motor: its time constant, a tenth of its largest signals."""
     amps = 0.1 * max(float(np.abs(r.current).max()) for r in records)
     chosen = [Choice("motor.current_offset", prior_mean=0.0, prior_std=max(amps, 1e-6))]
     known = [r.voltage for r in records if r.voltage is not None]
@@ -210,36 +230,35 @@ def _scaled(records: Sequence[BenchRecord], resistance: float) -> list[Choice]:
 
 
 def _chosen(space: Space, choices: Sequence[Choice]) -> np.ndarray:
-    """Coordinates that the user gave a start."""
+    """Return a mask of the coordinates with a start value of the user."""
     wanted = [c.pattern for c in choices if c.start is not None]
     return space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in wanted))
 
 
 def _scatter(
-    volts: BenchWindows | None, v: MomentSums | None, amps: BenchWindows, a: MomentSums
+    equations: Sequence[Equation],
 ) -> tuple[Float[np.ndarray, "moment moment"], float, float]:
-    """Scatter of all moments; time that residuals remember [s], and how many such there are."""
-    pairs = [(amps, a)] if volts is None or v is None else [(volts, v), (amps, a)]
-    length = cell_length([w for w, _ in pairs])
-    parts = [celled(s.moments, w, length) for w, s in pairs]
+    """Return the scatter of all moments, the correlation time [s], and the count of such times."""
+    length = cell_length([e.windows for e in equations])
+    parts = [celled(e.sums.moments, e.windows, length) for e in equations]
     count = max(len(p) for p in parts)
     g = np.concatenate([np.pad(p, ((0, count - len(p)), (0, 0))) for p in parts], axis=1)
-    left = [celled(s.residual[:, None], w, length)[:, 0] for w, s in pairs]
-    lags = 2 * max(memory(x) for x in left) + 2
-    groups = np.concatenate([grouped(s, w) for w, s in pairs], axis=1)
+    residuals = [celled(e.sums.residual[:, None], e.windows, length)[:, 0] for e in equations]
+    lags = 2 * max(correlation_cells(x) for x in residuals) + 2
+    groups = np.concatenate([grouped(e.sums, e.windows) for e in equations], axis=1)
     return widened(scatter(g, lags), groups), lags * length / 2, count / lags
 
 
 def _solved(
     space: Space, z: np.ndarray, v: MomentSums | None, a: MomentSums, s: np.ndarray
 ) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"]]:
-    """Optimum of the quasi-posterior with weights and scatter held, and its covariance."""
+    """Return the optimum at fixed weights and scatter, and its covariance."""
     std = np.sqrt(np.maximum(np.diag(s), 1e-300))
-    # signals may all be alike, as in a log at one speed: their moments then say one thing only
+    # signals may be collinear, as in a log at one speed; then S is singular without the 1e-9
     root = np.linalg.inv(np.linalg.cholesky(s / std / std[:, None] + 1e-9 * np.eye(len(s)))) / std
     if v is None:
-        root = np.concatenate([np.zeros((len(root), ASKED[0])), root], axis=1)
-    volts, amps = _EquationSums.of(v, ASKED[0], len(VOLTS)), _EquationSums.of(a, *a.slope.shape)
+        root = np.concatenate([np.zeros((len(root), MOMENTS[0])), root], axis=1)
+    volts, amps = _EquationSums.of(v, MOMENTS[0], len(VOLTS)), _EquationSums.of(a, *a.slope.shape)
     found, tangent = _searched(jnp.asarray(z), _Objective(space, volts, amps, jnp.asarray(root)))
     jacobian = np.asarray(tangent)
     return np.asarray(found), np.linalg.inv(jacobian.T @ jacobian)
@@ -247,14 +266,14 @@ def _solved(
 
 @eqx.filter_jit
 def _searched(z: Float[Array, " free"], held: _Objective) -> tuple[Array, Array]:
-    """Optimum, and the Jacobian of the residuals there."""
+    """Return the optimum, and the Jacobian of the residuals there."""
     solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
     found = optx.least_squares(_residuals, solver, z, args=held, max_steps=200, throw=False)
     return found.value, jax.jacfwd(_residuals)(found.value, held.tangents())
 
 
 def _residuals(z: Float[Array, " free"], held: _Objective) -> Float[Array, " residual"]:
-    """S^-1/2 g and what the prior says."""
+    """Return S^-1/2 g and the residuals of the prior."""
     motor = held.space.tree(z).motor
     pairs = (held.volts, motor.volts()), (held.amps, motor.amps())
     g = jnp.concatenate([block.constant - block.slope @ k for block, k in pairs])

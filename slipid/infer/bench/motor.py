@@ -1,17 +1,16 @@
-"""What a motor on a bench is made of, and its two equations for a short stretch of time.
+"""Model and records of a motor on a bench: its two equations for a short window of time.
 
-With <x> for the mean and [x] for the mean slope of a signal over a stretch of time,
+With <x> for the mean and [x] for the mean slope of a signal over a window,
 
     <U> = R <I> + C_e <w> + U_b s(<I> - I_0) + L_a [I] + U_0 - R I_0      s(i) = tanh(i / 0.05 A)
     <I> = (J [w] + tau_c tanh(<w> / w0) + b <w>) / C_e + I_0              w0 = 2.5 rad/s
 
-where everything is at the motor shaft, and the torque per current is the back-EMF constant, as
-energy demands. Where the ammeter shows magnitudes its zero goes with the motion: sign(w) I_0.
+where everything is at the motor shaft, and the torque constant equals the back-EMF constant by
+conservation of energy. If the ammeter shows magnitudes, its zero has the sign of the motion:
+sign(w) I_0.
 
-Both are linear in their coefficients, which are what the numbers of a motor make of them. Column by
-column the signals are those of `VOLTS` and `AMPS`.
-
-What a bench logs of one motor: time, voltage, current and speed, at the shaft.
+Both equations are linear in coefficients, which are functions of the numbers of the motor. The
+signals that they multiply are listed in `VOLTS` and `AMPS`.
 """
 
 from collections.abc import Sequence
@@ -25,17 +24,17 @@ from jaxtyping import Array, Float
 from slipid.parameter import parameter
 
 BRUSH_CURRENT = 0.05
-"""Current over which the drop of the brushes turns, as in `model.motor` [A]."""
+"""Current scale of the change of sign of the brushes' drop, as in `model.motor` [A]."""
 REST = 2.5
-"""Shaft speed over which friction turns, as in `model.motor` [rad/s]."""
+"""Shaft speed scale of the change of sign of friction, as in `model.motor` [rad/s]."""
 VOLTS = ("current", "speed", "sign of the current", "slope of the current", "one", "along")
-"""Signals of the electrical equation; the last is the direction that a magnitude was given."""
+"""Signals of the electrical equation; the last is the sign that magnitudes were given."""
 AMPS = ("slope of the speed", "sign of the speed", "speed", "along")
 """Signals of the mechanical equation."""
 
 
 class BenchMotor(eqx.Module):
-    """A brushed DC motor with its load, and the zeros of both meters; priors are weak."""
+    """A brushed DC motor with its load and the zeros of both meters, with weak priors."""
 
     resistance: Array = parameter(
         "ohm", "R", "winding resistance", start=1.0, lower=0.0, spread=2.0
@@ -58,20 +57,20 @@ class BenchMotor(eqx.Module):
     voltage_offset: Array = parameter("V", "U_0", "zero of the voltmeter", start=0.0, spread=1.0)
 
     def volts(self) -> Float[Array, " 6"]:
-        """Coefficients of `VOLTS`."""
+        """Return the coefficients of `VOLTS`."""
         r, zero = self.resistance, -self.resistance * self.current_offset
         return jnp.stack(
             [r, self.back_emf, self.brush_drop, self.inductance, self.voltage_offset, zero]
         )
 
     def amps(self) -> Float[Array, " 4"]:
-        """Coefficients of `AMPS`."""
+        """Return the coefficients of `AMPS`."""
         torque = jnp.stack([self.rotor_inertia, self.coulomb_friction, self.viscous_friction])
         return jnp.append(torque / self.back_emf, self.current_offset)
 
 
 class BenchRoot(eqx.Module):
-    """Root of the tree, so that the names begin with `motor`."""
+    """Root of the parameter tree, so that names begin with `motor`."""
 
     motor: BenchMotor
 
@@ -81,12 +80,13 @@ class BenchRecord:
     """One run of one motor.
 
     Attributes:
-        name: of the log; `sha256`: of its file.
-        time: [s], increasing.
-        voltage: across the motor, or its mean over the PWM [V]; None where it was not logged.
-        current: [A]; with the sign of the speed where the ammeter shows magnitudes.
-        speed: of the motor shaft [rad/s].
-        signed: False where the ammeter shows magnitudes.
+        name: name of the log.
+        sha256: hash of its file.
+        time: time of each row, increasing [s].
+        voltage: voltage across the motor, or its mean over the PWM; None if not logged [V].
+        current: current, with the sign of the speed if the ammeter shows magnitudes [A].
+        speed: speed of the motor shaft [rad/s].
+        signed: False if the ammeter shows magnitudes.
     """
 
     name: str
@@ -105,7 +105,13 @@ class BenchRecord:
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Std of what changes from row to row, quantisation included: [V] or None, [A], [rad/s]."""
+    """Std of white noise of each sensor, quantisation included.
+
+    Attributes:
+        voltage: noise of the voltmeter, None without one [V].
+        current: noise of the ammeter [A].
+        speed: noise of the speed [rad/s].
+    """
 
     voltage: float | None
     current: float
@@ -113,7 +119,7 @@ class SensorNoise:
 
 
 def noise_of(records: Sequence[BenchRecord]) -> SensorNoise:
-    """Noise of the sensors over all records of a motor."""
+    """Return the noise of the sensors over all records of a motor."""
     volts = [r.voltage for r in records if r.voltage is not None]
     return SensorNoise(
         noise(volts) if volts else None,
@@ -123,9 +129,10 @@ def noise_of(records: Sequence[BenchRecord]) -> SensorNoise:
 
 
 def noise(signals: Sequence[Float[np.ndarray, " row"]]) -> float:
-    """Std of white noise, from second differences, at least that of rounding to the smallest step.
+    """Return the std of white noise from second differences, at least that of rounding.
 
-    For white noise (x_k-1 - 2 x_k + x_k+1) / sqrt(6) has its std; a median lets go of jumps.
+    For white noise (x_k-1 - 2 x_k + x_k+1) / sqrt(6) has its std; the median ignores jumps.
+    Rounding is to the smallest step between rows.
     """
     bent = np.concatenate([np.diff(x, 2) for x in signals]) / np.sqrt(6)
     steps = np.abs(np.concatenate([np.diff(x) for x in signals]))

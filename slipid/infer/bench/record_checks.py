@@ -1,4 +1,4 @@
-"""What is wrong with a log of a motor, said before numbers are made of it."""
+"""Checks of a motor's logs before a fit: wrong units, signs and columns are refused."""
 
 from collections.abc import Sequence
 
@@ -10,19 +10,19 @@ from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
 from slipid.support.errors import DataError
 
 FEWEST_WINDOWS = 30
-"""Of either equation, below which nothing is fitted."""
+"""Smallest number of windows of an equation for a fit."""
 SURE = 5.0
-"""Stds by which a coefficient has the wrong sign, from which a column is wrong."""
+"""Size of a coefficient of the wrong sign above which a column is wrong [std]."""
 FAST = 3000.0
-"""Shaft speed that no brushed motor has [rad/s]."""
+"""Shaft speed above that of any brushed motor [rad/s]."""
 POWER = 2e4
-"""U^2 / R above which a current is rather in milliamperes [W]."""
+"""Power U^2 / R at standstill above which the current is rather in milliamperes [W]."""
 
 
-def check_records(records: Sequence[BenchRecord], label: str, units_said: bool = False) -> None:
-    """DataError where the records cannot be what they are said to be; what to do stands in it.
+def check_records(records: Sequence[BenchRecord], label: str, unit_known: bool = False) -> None:
+    """Raise `DataError`, with a remedy, if the records contradict their columns' meanings.
 
-    `units_said`: the unit of the current is not doubted, whatever comes of it.
+    With `unit_known` the unit of the current is not checked.
     """
     where = records[0].name + (f", motor {label}" if label else "")
     speed = np.concatenate([r.speed for r in records])
@@ -38,10 +38,10 @@ def check_records(records: Sequence[BenchRecord], label: str, units_said: bool =
         _signed(where, speed, current)
     amps, volts = mechanical(records), electrical(records, 0.0)
     if amps.usable.sum() < FEWEST_WINDOWS:
-        found = f"{amps.usable.sum()} short stretches in which the shaft turns steadily"
+        found = f"the log has {amps.usable.sum()} short windows in which the shaft turns"
         _fail(where, found, f"at least {FEWEST_WINDOWS}: a longer log, or more rows a second")
     _signs(where, records, volts, amps)
-    if volts is not None and not units_said:
+    if volts is not None and not unit_known:
         _milliamperes(where, records, volts)
 
 
@@ -50,7 +50,7 @@ def _fail(where: str, found: str, expected: str) -> None:
 
 
 def _signed(where: str, speed: np.ndarray, current: np.ndarray) -> None:
-    """Refuse a magnitude that is said to have a sign."""
+    """Refuse magnitudes of a current that is configured as signed."""
     back = speed < -0.2 * float(np.abs(speed).max())
     level = 0.1 * float(np.abs(current).max())
     negative = (current < -level).mean()
@@ -67,24 +67,24 @@ def _signed(where: str, speed: np.ndarray, current: np.ndarray) -> None:
 def _signs(
     where: str, records: Sequence[BenchRecord], volts: BenchWindows | None, amps: BenchWindows
 ) -> None:
-    """Refuse columns that are exchanged or reversed, by signs no motor has.
+    """Refuse exchanged or reversed columns, by coefficients of the wrong sign.
 
     Inertia makes the current rise with acceleration, and back-EMF the voltage with speed.
     """
-    # magnitudes were given their sign by the speed, which proves nothing
+    # the sign of a magnitude comes from the speed, so it is no evidence
     inertia = _sure(amps, 0) if all(r.signed for r in records) else 0.0
     if volts is None:
         if inertia < -SURE:
             found = "the shaft speeds up against its current"
             _fail(where, found, "current and speed of one sign (turn one of them: scale -1)")
         return
-    usual = sum(float(np.sum(r.voltage * r.speed)) for r in records if r.voltage is not None)
+    along = sum(float(np.sum(r.voltage * r.speed)) for r in records if r.voltage is not None)
     back, through = _sure(volts, 1), _sure(volts, 0)
     if inertia < -SURE:
-        column = "current" if usual > 0 else "speed"
+        column = "current" if along > 0 else "speed"
         found = f"the {column} has the wrong sign: the shaft speeds up against its current"
         _fail(where, found, f"the {column} times -1")
-    if usual < 0 and back < -SURE:
+    if along < 0 and back < -SURE:
         _fail(where, "the voltage has the wrong sign: it opposes the speed", "the voltage times -1")
     if back < -SURE and through > 0:
         found = "the voltage falls with speed: voltage and current look exchanged"
@@ -92,9 +92,9 @@ def _signs(
 
 
 def _sure(w: BenchWindows, column: int) -> float:
-    """A coefficient over its std, with nothing known but the equation."""
+    """Return a coefficient over its std, from the equation alone without priors."""
     signals = w.even.signals.shape[1] - (w.even.signals.shape[1] == 6)
-    found = start(w, signals, list(range(signals)))
+    found = start(w, signals)
     s = sums(w, found, signals)
     inverse = np.linalg.pinv(s.tangent[:, :signals], rcond=1e-10)
     std = np.sqrt(np.diag(inverse @ scatter(s.moments, 8) @ inverse.T))
@@ -102,13 +102,12 @@ def _sure(w: BenchWindows, column: int) -> float:
 
 
 def _milliamperes(where: str, records: Sequence[BenchRecord], volts: BenchWindows) -> None:
-    found = start(volts, 5, list(range(5)))
+    found = start(volts, 5)
     highest = max(float(np.abs(r.voltage).max()) for r in records if r.voltage is not None)
     if 0 < found[0] < highest**2 / POWER and _sure(volts, 0) > SURE:
         heat = highest**2 / found[0] / 1e3
-        said = f"a resistance of {found[0]:.2g} ohm at {highest:.3g} V, {heat:.0f} kW at standstill"
         _fail(
             where,
-            said,
+            f"a resistance of {found[0]:.2g} ohm at {highest:.3g} V, {heat:.0f} kW at standstill",
             "the current in amperes (I:mA for mA; else I:A, or a prior of motor.resistance)",
         )

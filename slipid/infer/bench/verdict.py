@@ -1,17 +1,16 @@
-"""What residuals still go with: speed, current or time, where they should go with nothing.
+"""Verdicts on motors of a bench: numbers with intervals, misfits, and remedies.
 
-What may be said of a motor on a bench: numbers with verdicts, and what would tell more.
+A misfit is a dependence of residuals on speed, current or time.
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from jaxtyping import Int
 
-from slipid.infer.bench.fit import MotorFit
-from slipid.infer.bench.moments import MomentSums, cell_length, celled
-from slipid.infer.bench.windows import BenchWindows
+from slipid.infer.bench.fit import Equation, MotorFit
+from slipid.infer.bench.moments import cell_length, celled
 from slipid.infer.fit_file import SCHEMA, number_json
 from slipid.infer.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
@@ -20,20 +19,29 @@ from slipid.support.content import Content
 from slipid.support.files import hash_of
 
 BINS = 8
-"""Of about as many windows."""
+"""Number of bins of about equal counts of windows."""
 SURE = 5.0
-"""Stds by which the mean of a bin is not 0."""
+"""Smallest mean of a bin that is a misfit [std]."""
 MATTERS = 0.01
-"""Part of the range of the voltage, or of the current, from which a mean matters to people."""
+"""Smallest mean of a bin that is a misfit, over the range of the voltage or the current."""
 FEWEST = 5
-"""Stretches of time in a bin by which its scatter is judged, at least."""
+"""Smallest number of cells of time in a bin for an estimate of its scatter."""
 LONG_S = 0.3
-"""Memory of residuals from which a reader is told [s]."""
+"""Correlation time of residuals above which a message mentions it [s]."""
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """Where the model is off most: so much of a channel, at this value of another one."""
+    """Largest mean residual of a channel over bins of speed, current or time.
+
+    Attributes:
+        channel: `voltage` or `current`.
+        unit: unit of the channel.
+        off: mean residual in the bin [unit].
+        over: quantity that is binned.
+        at: range of the bin with its unit.
+        sure: size of the mean residual [std].
+    """
 
     channel: str
     unit: str
@@ -47,71 +55,64 @@ class Misfit:
         return (
             f"the {self.channel} is {abs(self.off):.2g} {self.unit} "
             f"{'above' if self.off > 0 else 'below'} the model's at {self.at} ({self.over}, "
-            f"{self.sure:.0f} stds): the motor has something that the model lacks, and intervals "
+            f"{self.sure:.0f} stds): the motor has an effect that the model lacks, and intervals "
             "are wider for it"
         )
 
 
 def misfits(fit: MotorFit) -> tuple[Misfit, ...]:
-    """The worst of each equation, if it is sure and matters."""
-    pairs = [("current", "A", fit.amps, fit.amps_sums)]
-    if fit.volts is not None and fit.volts_sums is not None:
-        pairs.insert(0, ("voltage", "V", fit.volts, fit.volts_sums))
-    found = (_worst(fit, *pair) for pair in pairs)
-    return tuple(m for m in found if m is not None)
+    """Return the largest misfit of each equation, if it is significant and large enough."""
+    return tuple(m for e in fit.equations if (m := _worst(fit, e)) is not None)
 
 
-def _worst(fit: MotorFit, channel: str, unit: str, w: BenchWindows, s: MomentSums) -> Misfit | None:
-    """Largest mean of a bin, in its stds, over speed, current and time."""
-    size = MATTERS * float(np.ptp(w.both.left))
+def _worst(fit: MotorFit, equation: Equation) -> Misfit | None:
+    """Return the largest mean of a bin [std] over speed, current and time."""
+    w = equation.windows
+    size = MATTERS * float(np.ptp(w.both.measured))
     best: Misfit | None = None
     used = np.flatnonzero(w.usable)
-    time = w.time, w.time
     for over, (odd, even), what in (
         ("speed", (w.odd.speed, w.even.speed), "rad/s"),
         ("current", (w.odd.current, w.even.current), "A"),
-        ("time", time, "s"),
+        ("time", (w.time, w.time), "s"),
     ):
-        # a window is put by the rows that its residual is not of, or noise would sort residuals
+        # bins depend on the rows that a residual is not computed from, or noise would sort them
         bins = [np.array_split(used[np.argsort(v[used], kind="stable")], BINS) for v in (odd, even)]
         for one, other in zip(*bins, strict=True):
-            off, sure = _mean(fit, w, s, one, other)
+            off, sure = _mean(fit, equation, one, other)
             if abs(off) > size and sure > max(SURE, 0.0 if best is None else best.sure):
                 at = f"{odd[one].min():.3g} to {odd[one].max():.3g} {what}"
-                best = Misfit(channel, unit, off, over, at, sure)
+                best = Misfit(equation.channel, equation.unit, off, over, at, sure)
     return best
 
 
 def _mean(
-    fit: MotorFit,
-    w: BenchWindows,
-    s: MomentSums,
-    even: Int[np.ndarray, " some"],
-    odd: Int[np.ndarray, " some"],
+    fit: MotorFit, equation: Equation, even: Int[np.ndarray, " some"], odd: Int[np.ndarray, " some"]
 ) -> tuple[float, float]:
-    """Weighted mean of residuals of even and odd rows of some windows, and its size in stds.
+    """Return the weighted mean residual of even and odd rows of some windows, and its size [std].
 
-    Cells of the length of the residuals' memory count as independent.
+    Cells as long as the residuals' correlation time count as independent.
     """
+    w, s = equation.windows, equation.sums
     weight, sum_ = np.zeros(len(w.time)), np.zeros(len(w.time))
-    for asked, some in ((s.even, even), (s.odd, odd)):
-        weight[some] += asked.weight[some]
-        sum_[some] += asked.weight[some] * asked.residual[some]
+    for half, some in ((s.even, even), (s.odd, odd)):
+        weight[some] += half.weight[some]
+        sum_[some] += half.weight[some] * half.residual[some]
     total = float(weight.sum())
     if total <= 0:
         return 0.0, 0.0
     off = float(sum_.sum()) / total
-    length = max(fit.remember, cell_length([w]))
+    length = max(fit.correlation_time, cell_length([w]))
     away = celled((sum_ - weight * off)[:, None], w, length)
     square = away[:, 0] ** 2
-    # too few stretches of time to judge by, or one that outweighs the others
+    # too few cells of time for an estimate, or one that outweighs the others
     if np.count_nonzero(square) < FEWEST or square.max() > square.sum() / 2:
         return 0.0, 0.0
     return off, abs(off) * total / float(np.sqrt(square.sum()))
 
 
 ROWS_ELECTRICAL, ROWS_MECHANICAL = 2.0, 6.0
-"""Rows in one time constant, L/R and J R / C_e^2, for inductance and inertia to be told."""
+"""Smallest number of rows in a time constant, L/R or J R / C_e^2, that determines the number."""
 _OF = {
     "voltage": tuple(
         f"motor.{name}"
@@ -122,12 +123,12 @@ _OF = {
         for name in ("coulomb_friction", "viscous_friction", "rotor_inertia", "current_offset")
     ),
 }
-"""Numbers of the equation that is about each channel."""
+"""Numbers of the equation of each channel."""
 ONE_POINT = 0.05
-"""Range of the speed, over its largest, below which a log shows one point."""
+"""Range of the speed over its largest value below which a log shows one operating point."""
 SLOW_S = 1.0
-"""Time between rows from which its unit is doubted [s]."""
-_CURES = (
+"""Time between rows above which a message questions its unit [s]."""
+_REMEDIES = (
     (("motor.inductance",), "log faster, several rows in L/R, with steps of the voltage"),
     (("motor.rotor_inertia",), "speed up and slow down, over some tenths of a second"),
     (
@@ -138,20 +139,21 @@ _CURES = (
     (("motor.resistance",), "let more current flow: load the shaft, or speed it up harder"),
     (("motor.back_emf",), "turn at several speeds"),
     (("motor.brush_drop",), "let small and large currents flow, both ways"),
-    (("motor.viscous_friction",), "turn faster: so far it hardly matters"),
+    (("motor.viscous_friction",), "turn faster: at these speeds it has little effect"),
 )
-"""Quantities that must all occur, and what helps; the first that fits counts."""
+"""Quantities that must all occur, and their remedy; the first match counts."""
 
 
 @dataclass(frozen=True, eq=False)
 class BenchFit:
-    """What is known of the motors of a bench.
+    """Fitted numbers of the motors of a bench, with verdicts.
 
     Attributes:
-        fits: of each motor.
-        parameters, derived: numbers, and quotients of them, by path, with `@label` of a motor.
-        messages: what a reader must know, one sentence each.
-        misfits: what the models lack, by label.
+        fits: fit of each motor.
+        parameters: numbers by path, with `@label` of a motor.
+        derived: quotients of numbers by path, with `@label` of a motor.
+        messages: warnings, one sentence each.
+        misfits: misfits by label.
     """
 
     fits: tuple[MotorFit, ...]
@@ -166,17 +168,16 @@ class BenchFit:
 
     @property
     def good(self) -> bool:
-        """Whether the fits settled and explain the logs."""
+        """True if the fits converged and explain the logs."""
         return self.converged and not any(self.misfits.values())
 
     @property
     def reason(self) -> str:
-        """How the fits ended, for people."""
-        said = [f"{f.label}: {f.reason}" if f.label else f.reason for f in self.fits]
-        return "; ".join(said)
+        """Sentence on how the fits ended."""
+        return "; ".join(f"{f.label}: {f.reason}" if f.label else f.reason for f in self.fits)
 
     def to_json(self) -> Content:
-        """Content of identified.json."""
+        """Return the content of identified.json."""
         runs = dict.fromkeys((r.name, r.sha256) for f in self.fits for r in f.records)
         return {
             "schema": SCHEMA,
@@ -195,7 +196,7 @@ class BenchFit:
 
 
 def bench_fit(fits: Sequence[MotorFit]) -> BenchFit:
-    """Estimates, verdicts and messages of fitted motors."""
+    """Return the estimates, verdicts and messages of fitted motors."""
     parameters: dict[str, Estimate] = {}
     ratios: dict[str, Estimate] = {}
     messages: list[str] = []
@@ -205,13 +206,12 @@ def bench_fit(fits: Sequence[MotorFit]) -> BenchFit:
         slow = _too_slow(f)
         voltage = f.has_voltage
         numbers = estimates(f.space, f.choices, f.z, f.covariance, voltage, members(flat))
-        doubted = {path for m in found[f.label] for path in _OF[m.channel]}
-        for e in (_judged(f, e, slow, doubted) for e in numbers):
-            parameters[_labelled(e.path, f.label)] = replace(e, path=_labelled(e.path, f.label))
-        for e in derived(f.space, f.z, f.covariance, voltage):
-            e = _judged(f, e, slow, doubted)
-            path = "/".join(_labelled(p, f.label) for p in e.path.split("/"))
-            ratios[path] = replace(e, path=path)
+        misfitted = {path for m in found[f.label] for path in _OF[m.channel]}
+        quotients = derived(f.space, f.z, f.covariance, voltage)
+        for into, estimated in ((parameters, numbers), (ratios, quotients)):
+            for e in estimated:
+                path = "/".join(_labelled(p, f.label) for p in e.path.split("/"))
+                into[path] = replace(_with_verdict(f, e, slow, misfitted), path=path)
         own = [*slow.values(), *sentences(flat), *(m.text for m in found[f.label]), *_remarks(f)]
         messages += [f"{f.label}: {text}" if f.label else text for text in own]
     return BenchFit(tuple(fits), parameters, ratios, tuple(messages), found)
@@ -222,23 +222,23 @@ def _labelled(path: str, label: str) -> str:
 
 
 def _flat(f: MotorFit) -> tuple[FlatDirection, ...]:
-    """Directions that stay open, with what a bench can do about them."""
+    """Return the flat directions, with remedies for a bench."""
     found = flat_directions(f.space, f.covariance, has_current=True, has_voltage=f.has_voltage)
-    return tuple(replace(one, remedy=_cure(one.paths, f.has_voltage)) for one in found)
+    return tuple(replace(one, remedy=_remedy(one.paths, f.has_voltage)) for one in found)
 
 
-def _cure(paths: Sequence[str], has_voltage: bool) -> str:
+def _remedy(paths: Sequence[str], has_voltage: bool) -> str:
     electrical = {"motor.resistance", "motor.back_emf", "motor.brush_drop", "motor.inductance"}
     if not has_voltage and {*paths} & (electrical | {"motor.voltage_offset"}):
         return VOLTAGE
-    for needed, text in _CURES:
+    for needed, text in _REMEDIES:
         if {*paths} >= {*needed}:
             return text
     return "turn both ways, at several speeds, with more and less current"
 
 
 def _too_slow(f: MotorFit) -> dict[str, str]:
-    """Numbers whose transients fall between the rows, with a sentence for each."""
+    """Return numbers whose transients fall between the rows, with a sentence for each."""
     m, rows, slow = f.motor, f.period, {}
     if not f.has_voltage:
         return {}
@@ -258,8 +258,9 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
 
 
 def _one_point(f: MotorFit) -> bool:
-    """Whether speed and voltage keep to one value each."""
-    used = f.amps.both.speed[f.amps.usable]
+    """Return True if the speed keeps to one value."""
+    amps = f.equations[-1].windows
+    used = amps.both.speed[amps.usable]
     return float(np.ptp(np.quantile(used, (0.02, 0.98)))) < ONE_POINT * float(np.abs(used).max())
 
 
@@ -267,59 +268,61 @@ def _time(seconds: float) -> str:
     return f"{1e3 * seconds:.2g} ms" if seconds < 1 else f"{seconds:.2g} s"
 
 
-def _judged(f: MotorFit, e: Estimate, slow: Collection[str], doubted: Collection[str]) -> Estimate:
-    """The verdict, less what rows are too slow for, what may be 0, and what a misfit disputes."""
+def _with_verdict(
+    f: MotorFit, e: Estimate, slow: Collection[str], misfitted: Collection[str]
+) -> Estimate:
+    """Return an estimate with a weaker verdict for slow rows, a value near 0, or a misfit."""
     if (e.path in slow or _one_point(f)) and e.verdict not in ("fixed", "not_identified"):
         return replace(e, verdict="not_identified", provenance="borrowed")
     small = e.path == "motor.inductance" and e.std is not None and e.value < FROM_ZERO * e.std
-    if e.verdict == "identified" and (small or {*e.path.split("/")} & {*doubted}):
+    if e.verdict == "identified" and (small or {*e.path.split("/")} & {*misfitted}):
         return replace(e, verdict="weak")
     return e
 
 
 def _remarks(f: MotorFit) -> list[str]:
-    """Further things that a reader must know."""
-    said = []
+    """Return further warnings."""
+    found = []
     if _one_point(f):
-        said.append(
-            "speed and voltage keep to one value: nothing can be told apart there: turn at several "
-            "speeds, both ways, and speed up and slow down"
+        found.append(
+            "speed and voltage keep to one value, which determines no single number: turn at "
+            "several speeds, both ways, and speed up and slow down"
         )
     if not f.has_voltage:
-        said.append(
-            "without a voltage neither resistance nor back-EMF is known: friction and inertia are "
-            f"known over the back-EMF only; {VOLTAGE}"
+        found.append(
+            "without a voltage neither resistance nor back-EMF is identified, and friction and "
+            f"inertia only relative to the back-EMF; {VOLTAGE}"
         )
     if not all(r.signed for r in f.records):
-        said.append(
-            "currents are magnitudes: they were given the sign of the speed, stretches in which "
-            "the motor may brake were left out, and the zero of the ammeter looks like friction"
+        found.append(
+            "currents are magnitudes: they were given the sign of the speed, windows in which the "
+            "motor may brake were left out, and the zero of the ammeter looks like friction"
         )
     if f.period > SLOW_S:
-        said.append(
-            f"rows are {f.period:.3g} s apart: if the time is in milliseconds, say so (t:ms); "
-            "inertia and inductance come from it"
+        found.append(
+            f"rows are {f.period:.3g} s apart: if the time is in milliseconds, set its unit (t:ms);"
+            " inertia and inductance depend on it"
         )
-    if f.remember > LONG_S:
-        said.append(
-            f"residuals remember {f.remember:.2g} s: the intervals count {f.stretches:.0f} "
-            "stretches of that length, not the rows"
+    if f.correlation_time > LONG_S:
+        found.append(
+            f"residuals are correlated over {f.correlation_time:.2g} s: the intervals count "
+            f"{f.independent_times:.0f} independent times of that length, not the rows"
         )
     if "motor.rotor_inertia" in f.space.slices:
-        said.append("motor.rotor_inertia is that of the rotor with everything that turned with it")
-    return said
+        found.append("motor.rotor_inertia is that of the rotor with everything that turned with it")
+    return found
 
 
 def _about(f: MotorFit) -> Content:
-    """How one motor was fitted."""
-    kept = [w.usable.mean() for w in (f.volts, f.amps) if w is not None]
+    """Return how one motor was fitted, for identified.json."""
+    windows = [e.windows for e in f.equations]
     return {
         "rounds": f.rounds,
         "reason": f.reason,
         "row_period_s": f.period,
-        "noise": {"voltage": f.noise.voltage, "current": f.noise.current, "speed": f.noise.speed},
-        "memory_s": f.remember,
-        "windows": [len(w.time) for w in (f.volts, f.amps) if w is not None],
-        "usable": [float(np.round(k, 3)) for k in kept],
+        "noise": asdict(f.noise),
+        "memory_s": f.correlation_time,
+        "windows": [len(w.time) for w in windows],
+        "usable": [float(np.round(w.usable.mean(), 3)) for w in windows],
         "misfit": [m.text for m in misfits(f)],
     }

@@ -1,4 +1,4 @@
-"""Short windows of a record, each of which is measured twice.
+"""Short windows of a record, each measured twice: by its even and by its odd rows.
 
 No derivative of a noisy signal is taken. With a kernel c(t) over a window, of integral 1, each
 equation is integrated, <x> = int c x dt and [x] = int c (dx/dt) dt. For signals that are straight
@@ -7,10 +7,10 @@ lines between rows both are sums over the rows l of the window, whatever the ker
     <x> = sum_l c_l (t_l+1 - t_l) (x_l + x_l+1) / 2        [x] = sum_l c_l (x_l+1 - x_l)
 
 One sum goes over the even rows of a window, another over the odd ones. Their sensor noises are
-independent, so that a residual of one can be asked whether it goes with the signals of the other.
+independent, so that the residual of one can be correlated with the signals of the other.
 
-Left out are windows in which time jumps, those in which the voltage jumps, with some rows after it:
-nobody knows when it did between two rows, and the current was not a straight line there.
+Windows with a gap in time are left out, as are those with a jump of the voltage inside or shortly
+before them: its time between two rows is unknown, and the current is no straight line there.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,34 +22,38 @@ from jaxtyping import Bool, Float, Int
 from slipid.infer.bench.motor import BRUSH_CURRENT, REST, BenchRecord
 
 ELECTRICAL_S, MECHANICAL_S = 3e-3, 1e-2
-"""Half the length of a window, about a time constant of small motors: transients are seen [s]."""
+"""Half the length of windows of each equation, about a time constant of small motors [s]."""
 LEAST, ENOUGH = 2, 8
-"""Half the length in rows: at least, for the odd rows to show a slope; and where it is not all
-noise, for which no window is made longer than a mechanical one."""
+"""Half the length of a window: smallest, for odd rows to give a slope, and desired [row]; windows
+are never made longer than those of the mechanical equation for it."""
 MOST = 20_000
-"""Windows of one record, at most."""
+"""Largest number of windows of one record."""
 WIDE = 4
-"""Length of the stretch that tells the sign of a small current, over a window."""
+"""Length of the window from which the sign of a small current is taken, over that of a window."""
 STRAY = 1.5
-"""Times the usual length, above which a window spans a gap between rows."""
+"""Duration of a window over its nominal one above which it spans a gap between rows."""
 JUMP = 6.0
-"""Robust stds of the voltage's steps from which one is a jump."""
+"""Step of the voltage between rows above which it is a jump [robust std]."""
 SETTLED_S, SETTLED_ROWS = 5e-3, 4
-"""After a jump of the voltage currents follow a straight line between rows again [s], [rows];
-the shorter of both."""
+"""Time after a jump of the voltage until currents are straight lines between rows [s], [row]; the
+shorter one counts."""
 BRAKES = 4.0
-"""Robust stds of the slope of the speed from which a motor may be braking."""
+"""Deceleration of the shaft above which the motor may be braking [robust std]."""
 
 
 @dataclass(frozen=True, eq=False)
 class HalfSignals:
-    """What the even, or the odd, rows say of every window: signals of an equation, and its left.
+    """Signals of every window from its even, or from its odd, rows.
 
-    With the means of speed [rad/s] and current [A].
+    Attributes:
+        signals: signals that the coefficients of an equation multiply.
+        measured: left side of the equation, the mean voltage [V] or current [A].
+        speed: mean speed [rad/s].
+        current: mean current [A].
     """
 
     signals: Float[np.ndarray, "window column"]
-    left: Float[np.ndarray, " window"]
+    measured: Float[np.ndarray, " window"]
     speed: Float[np.ndarray, " window"]
     current: Float[np.ndarray, " window"]
 
@@ -59,10 +63,11 @@ class BenchWindows:
     """Windows of one equation, one after the other.
 
     Attributes:
-        even, odd: what both halves of the rows say.
-        time: middle of each [s], from the first row of its record.
-        record: number of the record that it is of.
-        usable: False where the equation does not hold, at rest, or may not.
+        even: signals from even rows.
+        odd: signals from odd rows.
+        time: middle of each window, from the first row of its record [s].
+        record: number of the record.
+        usable: False where the equation does not or may not hold, as at rest.
     """
 
     even: HalfSignals
@@ -73,37 +78,37 @@ class BenchWindows:
 
     @property
     def both(self) -> HalfSignals:
-        """Means of the two halves."""
+        """Means of both halves."""
         pairs = zip(vars(self.even).values(), vars(self.odd).values(), strict=True)
         return HalfSignals(*((a + b) / 2 for a, b in pairs))
 
 
 def electrical(records: Sequence[BenchRecord], zero: float) -> BenchWindows | None:
-    """Windows of the electrical equation [V], None without voltages.
+    """Return windows of the electrical equation [V], None without voltages.
 
-    `zero` is what the ammeter shows without a current, for the signs of small ones [A].
+    `zero` is the reading of the ammeter without a current, for the signs of small currents [A].
     """
     parts = []
     for k, r in enumerate(records):
-        if (measured := r.voltage) is None:
+        if (voltage := r.voltage) is None:
             return None
         at = _WindowPlaces(r, ELECTRICAL_S)
 
         def half(
-            row: "_HalfKernel", r: BenchRecord = r, measured: np.ndarray = measured
+            kernel: "_HalfKernel", r: BenchRecord = r, voltage: np.ndarray = voltage
         ) -> HalfSignals:
-            current, speed = row.mean(r.current), row.mean(r.speed)
-            along = np.ones(len(speed)) if r.signed else np.sign(row.longer(r.speed))
-            sign = np.tanh((row.longer(r.current) - zero * along) / BRUSH_CURRENT)
-            known = current, speed, sign, row.slope(r.current), np.ones(len(sign)), along
-            return HalfSignals(np.stack(known, 1), row.mean(measured), speed, current)
+            current, speed = kernel.mean(r.current), kernel.mean(r.speed)
+            along = np.ones(len(speed)) if r.signed else np.sign(kernel.long_mean(r.speed))
+            sign = np.tanh((kernel.long_mean(r.current) - zero * along) / BRUSH_CURRENT)
+            known = current, speed, sign, kernel.slope(r.current), np.ones(len(sign)), along
+            return HalfSignals(np.stack(known, 1), kernel.mean(voltage), speed, current)
 
         parts.append(_cut(r, k, at, half))
     return _joined(parts)
 
 
 def mechanical(records: Sequence[BenchRecord]) -> BenchWindows:
-    """Windows of the mechanical equation [A]; at rest friction is a reaction, and unknown."""
+    """Return windows of the mechanical equation [A]; at rest friction is unknown."""
     parts = []
     for k, r in enumerate(records):
         at = _WindowPlaces(r, MECHANICAL_S)
@@ -111,9 +116,11 @@ def mechanical(records: Sequence[BenchRecord]) -> BenchWindows:
         moving = np.abs(rows.mean(axis=1)) > 2 * REST
         along = np.ones(len(rows)) if r.signed else np.sign(rows.mean(axis=1))
 
-        def half(row: "_HalfKernel", r: BenchRecord = r, along: np.ndarray = along) -> HalfSignals:
-            current, speed = row.mean(r.current), row.mean(r.speed)
-            known = row.slope(r.speed), np.tanh(speed / REST), speed, along
+        def half(
+            kernel: "_HalfKernel", r: BenchRecord = r, along: np.ndarray = along
+        ) -> HalfSignals:
+            current, speed = kernel.mean(r.current), kernel.mean(r.speed)
+            known = kernel.slope(r.speed), np.tanh(speed / REST), speed, along
             return HalfSignals(np.stack(known, 1), current, speed, current)
 
         parts.append(_cut(r, k, at, half, moving))
@@ -121,7 +128,7 @@ def mechanical(records: Sequence[BenchRecord]) -> BenchWindows:
 
 
 class _WindowPlaces:
-    """Where windows of a record are: middles [row] and half the length [rows]."""
+    """Positions of the windows of a record: middles and half the length [row]."""
 
     def __init__(self, r: BenchRecord, half_s: float):
         half_s = max(half_s, min(ENOUGH * r.period, MECHANICAL_S))
@@ -133,29 +140,29 @@ class _WindowPlaces:
 
 
 class _HalfKernel:
-    """Kernel of every second row of the windows, which begins `first` rows inside them."""
+    """Kernel over every second row of the windows, starting `first` rows inside them."""
 
     def __init__(self, r: BenchRecord, at: _WindowPlaces, first: int):
-        self.at = at.middle[:, None] + np.arange(first - at.half, at.half - first + 1, 2)
+        self.rows = at.middle[:, None] + np.arange(first - at.half, at.half - first + 1, 2)
         reach = WIDE * at.half
         wide = at.middle[:, None] + np.arange(first - reach, reach - first + 1, 2)
         self.wide = np.clip(wide, first, len(r.time) - 1)
-        time = r.time[self.at]
+        time = r.time[self.rows]
         middle = (time[:, 1:] + time[:, :-1]) / 2 - r.time[at.middle][:, None]
         kernel = np.cos(0.5 * np.pi * middle / (time[:, -1:] - time[:, :1])) ** 2
         self.step = np.diff(time, axis=1)
         self.kernel = kernel / (kernel * self.step).sum(axis=1, keepdims=True)
 
     def mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, " window"]:
-        x = signal[self.at]
+        x = signal[self.rows]
         return np.asarray((self.kernel * self.step * (x[:, 1:] + x[:, :-1]) / 2).sum(axis=1))
 
-    def longer(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, " window"]:
-        """Mean over a longer stretch of the same half of the rows, which tells a sign."""
+    def long_mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, " window"]:
+        """Return the mean over a longer window of the same half of the rows, for a sign."""
         return np.asarray(signal[self.wide].mean(axis=1))
 
     def slope(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, " window"]:
-        return np.asarray((self.kernel * np.diff(signal[self.at], axis=1)).sum(axis=1))
+        return np.asarray((self.kernel * np.diff(signal[self.rows], axis=1)).sum(axis=1))
 
 
 def _cut(
@@ -165,11 +172,11 @@ def _cut(
     half: Callable[[_HalfKernel], HalfSignals],
     usable: Bool[np.ndarray, " window"] | None = None,
 ) -> BenchWindows:
-    """Windows of one record."""
+    """Return the windows of one record."""
     even, odd = halves = _HalfKernel(r, at, 0), _HalfKernel(r, at, 1)
     usable = np.ones(len(at.middle), bool) if usable is None else usable
     if not r.signed:
-        # a magnitude was given the sign of the speed: wrong where the motor brakes
+        # magnitudes have the sign of the speed, which is wrong if the motor brakes
         speed, slope = (sum(getattr(h, k)(r.speed) for h in halves) for k in ("mean", "slope"))
         faster = slope * np.sign(speed)
         spread = 1.4826 * np.median(np.abs(faster)) if len(faster) else 0.0
@@ -181,12 +188,12 @@ def _cut(
 def _jumps(
     r: BenchRecord, half: int, middle: Int[np.ndarray, " window"]
 ) -> Bool[np.ndarray, " window"]:
-    """Windows in which, or shortly before which, the voltage jumps between two rows."""
+    """Return a mask of the windows in which, or shortly before which, the voltage jumps."""
     if r.voltage is None:
         return np.zeros(len(middle), bool)
     step = np.diff(r.voltage)
     away = np.abs(step - np.median(step))
-    # of a signal that mostly stands still the median is 0: a thousandth of its range is no jump
+    # a mostly constant signal has median 0; steps below a thousandth of its range are no jumps
     jump = away > JUMP * max(1.4826 * float(np.median(away)), 1e-3 * float(np.ptp(r.voltage)))
     rows = int(np.clip(round(SETTLED_S / r.period), 1, SETTLED_ROWS))
     count = np.concatenate([[0], np.cumsum(jump)])
@@ -194,7 +201,7 @@ def _jumps(
 
 
 def _joined(parts: Sequence[BenchWindows]) -> BenchWindows:
-    """Windows of several records, one after the other."""
+    """Return the windows of several records, one after the other."""
 
     def halves(found: Sequence[HalfSignals]) -> HalfSignals:
         return HalfSignals(

@@ -7,15 +7,15 @@ from dataclasses import asdict
 from itertools import zip_longest
 from typing import Protocol
 
-from slipid.lab.benchmark.floors.part import HuskyFloorTask, RobotinoFloorTask, husky_classifiers
+from slipid.lab.benchmark.floors.husky import HuskyFloorTask, husky_classifiers
+from slipid.lab.benchmark.floors.robotino import RobotinoFloorTask
 from slipid.lab.benchmark.protocols import PROTOCOLS, splits
 from slipid.lab.benchmark.rectangle import CONTROLLERS, RectangleTask
 from slipid.lab.benchmark.rows import ROWS
 from slipid.lab.benchmark.scores import FoldScore
 from slipid.lab.benchmark.sets import SOURCES, is_available
 from slipid.lab.benchmark.slipid_rows import NAME
-from slipid.lab.benchmark.summary import RowSummary, summary
-from slipid.lab.benchmark.tuning import reading
+from slipid.lab.benchmark.summary import RowSummary, reading, summary
 from slipid.lab.benchmark.work import OWN_MAP, QUICK_KIND, BenchmarkOptions, FoldTask, data_of
 from slipid.support.checkpoint import versions
 from slipid.support.content import Content
@@ -31,131 +31,135 @@ Tables = dict[str, dict[str, dict[str, RowSummary]]]
 
 
 class BenchmarkTask(Protocol):
-    """A part of the work, which keeps what it finds."""
+    """A part of the benchmark's work that keeps its results."""
 
     @property
     def name(self) -> str:
-        """Of the part."""
+        """Name of the task."""
         ...
 
     def run(self) -> str:
-        """Do what is not kept yet; the name of the part."""
+        """Compute the results that are not kept yet, and return the task's name."""
         ...
 
 
-def benchmark(wish: BenchmarkOptions, executor: Executor, report: Reporter) -> Content:
-    """Run every row on every data set that is there, and write benchmark.json.
+def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -> Content:
+    """Run every row on every available data set, and write benchmark.json.
 
-    What is done is kept, and not done again; a row that fails is said, and stops no other.
+    Kept results are not computed again; a row that fails is reported, and the others go on.
 
     Raises:
-        DataError: no such folder or row.
+        DataError: the data folder or a row does not exist.
     """
     began = time.monotonic()
     setup_jax(quiet=True)
-    _known(wish)
-    sources = [source for source in SOURCES if is_available(source, wish.data)]
+    _check(options)
+    sources = [source for source in SOURCES if is_available(source, options.data)]
     for source in SOURCES:
         if source not in sources:
-            report.line(f"skipped: {source.name}: no folder {wish.data / source.folder}")
-    writable(wish.out)
+            report.line(f"skipped: {source.name}: no folder {options.data / source.folder}")
+    writable(options.out)
     report.stage("reading logs")
     unread: dict[str, str] = {}
     each = []
     for source in sources:
         try:
-            each.append(tasks_of(wish, source.name))
-        except Exception as error:  # other data sets are there all the same
+            each.append(tasks_of(options, source.name))
+        except Exception as error:  # other data sets are used all the same
             unread[source.name] = FoldScore.of_error(error).absent
             report.line(f"skipped: {source.name}: {unread[source.name]}")
-    pieces = in_turn(each)
-    felt = [part for part in (HuskyFloorTask(wish), RobotinoFloorTask(wish)) if part.is_asked]
-    rectangle = RectangleTask(wish)
-    # the Robotino's floors come last: they take the fits that were made for its headings
-    parts: list[BenchmarkTask] = [*pieces, *felt]
-    if not wish.quick and set(CONTROLLERS) & set(wish.only or CONTROLLERS):
-        parts.insert(0, rectangle)
-    report.stage(f"{len(parts)} parts")
-    results(executor, work, {part.name: part for part in parts}, report)
-    driven = rectangle.drive(executor, report) if rectangle in parts else None
+    folds = alternating(each)
+    floors = [
+        task for task in (HuskyFloorTask(options), RobotinoFloorTask(options)) if task.is_requested
+    ]
+    rectangle = RectangleTask(options)
+    # the Robotino's floors come last: they reuse the fits of its headings
+    tasks: list[BenchmarkTask] = [*folds, *floors]
+    if not options.quick and set(CONTROLLERS) & set(options.only or CONTROLLERS):
+        tasks.insert(0, rectangle)
+    report.stage(f"{len(tasks)} parts")
+    results(executor, run_task, {task.name: task for task in tasks}, report)
+    closed_loop = rectangle.drive(executor, report) if rectangle in tasks else None
     report.stage("comparing")
-    tables = tables_of(pieces)
+    tables = tables_of(folds)
     content = {
         "schema": SCHEMA,
-        "quick": wish.quick,
+        "quick": options.quick,
         "unread": unread,
-        "sets": {name: _set(wish, name, protocols) for name, protocols in tables.items()},
+        "sets": {name: _set(options, name, protocols) for name, protocols in tables.items()},
         "protocols": {name: p.about for name, p in PROTOCOLS.items()},
-        "floors": {part.name: part.table() for part in felt},
-        "rectangle": driven,
+        "floors": {task.name: task.table() for task in floors},
+        "rectangle": closed_loop,
         "reading": reading(tables),
         "seconds": round(time.monotonic() - began, 1),
         "versions": versions(),
     }
     report.stage("writing")
-    write_json(wish.out / "benchmark.json", content)
+    write_json(options.out / "benchmark.json", content)
     return content
 
 
-def tasks_of(wish: BenchmarkOptions, name: str) -> list[FoldTask]:
-    """All folds that a source is split into."""
-    data = data_of(wish, name)
+def tasks_of(options: BenchmarkOptions, name: str) -> list[FoldTask]:
+    """Return the tasks of all folds of a source."""
+    data = data_of(options, name)
     found = []
     for kind in data.source.kinds:
-        if (wish.quick and kind != QUICK_KIND) or (kind == "all" and data.crossing is None):
+        if (options.quick and kind != QUICK_KIND) or (kind == "all" and data.crossing is None):
             continue
-        folds = splits(data.facts, kind)
-        found += [FoldTask(wish, name, kind, f.fold) for f in folds[: 1 if wish.quick else None]]
+        folds = splits(data.facts, kind)[: 1 if options.quick else None]
+        found += [FoldTask(options, name, kind, split.fold) for split in folds]
     return found
 
 
-def in_turn(each: Sequence[Sequence[FoldTask]]) -> list[FoldTask]:
-    """Pieces of all sources by turns.
+def alternating(each: Sequence[Sequence[FoldTask]]) -> list[FoldTask]:
+    """Return the tasks of all sources in turn.
 
-    What one process has compiled for a source lies in the cache when another comes to it.
+    Functions compiled for a source are then in the cache when another process needs them.
     """
-    return [piece for row in zip_longest(*each) for piece in row if piece is not None]
+    return [task for row in zip_longest(*each) for task in row if task is not None]
 
 
-def work(part: BenchmarkTask) -> str:
-    """Do a part."""
-    return part.run()
+def run_task(task: BenchmarkTask) -> str:
+    """Run a task and return its name."""
+    return task.run()
 
 
-def _known(wish: BenchmarkOptions) -> None:
-    if not wish.data.is_dir():
+def _check(options: BenchmarkOptions) -> None:
+    """Raise `DataError` if the data folder or a requested row does not exist."""
+    if not options.data.is_dir():
         raise DataError(
-            f"{wish.data}: no such folder; expected the folder of the data sets (--data)"
+            f"{options.data}: no such folder; expected the folder of the data sets (--data)"
         )
     classifiers = [method.name for method in husky_classifiers()]
     every = list(dict.fromkeys([NAME, OWN_MAP, *ROWS, *classifiers, *CONTROLLERS]))
-    for name in wish.only:
+    for name in options.only:
         if name not in every:
             raise DataError(
                 f"no row '{name}'{did_you_mean(name, every)}; expected some of {', '.join(every)}"
             )
 
 
-def tables_of(pieces: Sequence[FoldTask]) -> Tables:
-    """Summaries of what was kept of all pieces."""
+def tables_of(tasks: Sequence[FoldTask]) -> Tables:
+    """Return summaries of the kept scores of all tasks."""
     folds: dict[tuple[str, str], dict[str, list[FoldScore]]] = {}
-    for piece in pieces:
-        for (protocol, name), row in piece.rows().items():
-            folds.setdefault((piece.source, protocol), {}).setdefault(name, []).append(row)
-    tables: Tables = {}
-    for source in dict.fromkeys(piece.source for piece in pieces):
-        tables[source] = {
+    for task in tasks:
+        for (protocol, name), score in task.rows().items():
+            folds.setdefault((task.source, protocol), {}).setdefault(name, []).append(score)
+    return {
+        source: {
             protocol: summary(folds[source, protocol], NAME)
             for protocol in PROTOCOLS
             if (source, protocol) in folds
         }
-    return tables
+        for source in dict.fromkeys(task.source for task in tasks)
+    }
 
 
 def _set(
-    wish: BenchmarkOptions, name: str, protocols: Mapping[str, Mapping[str, RowSummary]]
+    options: BenchmarkOptions, name: str, protocols: Mapping[str, Mapping[str, RowSummary]]
 ) -> Content:
-    data = data_of(wish, name)
+    """Return the content of a data set in benchmark.json."""
+    data = data_of(options, name)
     return {
         "about": data.source.about,
         "over": data.source.over,

@@ -10,24 +10,24 @@ from slipid.plots import drawing
 from slipid.support.content import Content
 
 TICKS = [m * 10.0**k for k in range(-2, 4) for m in (1, 2, 5)]
-"""Of a logarithmic axis of errors [%]."""
+"""Tick positions of a logarithmic axis of errors [%]."""
 OWN = "slipid"
-"""Rows whose names begin with it are drawn in colour."""
+"""Prefix of the names of rows that are highlighted."""
 
 
 def benchmark_pictures(found: Content) -> dict[str, bytes]:
-    """A picture in the bytes of a PNG file for every data set of benchmark.json, by its name."""
+    """Return the bytes of a PNG file for every data set of benchmark.json, by its name."""
     made = {n: benchmark_figure(one, found["protocols"], n) for n, one in found["sets"].items()}
     return {name: drawing.png(figure) for name, figure in made.items() if figure is not None}
 
 
 def benchmark_figure(one: Content, about: Content, name: str) -> Figure | None:
-    """A panel per protocol of one data set: mean end-point error with its 90 % interval.
+    """Return a panel per protocol of one data set: mean end-point error with its 90 % interval.
 
     Args:
-        one: of a data set in benchmark.json.
-        about: protocols in words.
-        name: of the data set.
+        one: content of a data set in benchmark.json.
+        about: descriptions of the protocols.
+        name: name of the data set.
     """
     protocols = {
         protocol: ends

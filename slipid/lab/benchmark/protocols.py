@@ -1,4 +1,4 @@
-"""What is left out, and what methods are told: the questions that every row is asked."""
+"""Protocols of the benchmark: held-out runs, and the information that methods are given."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,112 +14,112 @@ from slipid.predict.folds import FoldKey, speeds
 from slipid.predict.slip_model import Run
 
 FOLDS = 2
-"""Parts into which headings and sectors are dealt; every other sector is left out together."""
+"""Number of parts of headings and sectors; every other sector is held out together."""
 SPEEDS = 2
-"""Parts of speeds, where there are many."""
+"""Number of parts of speeds, where there are many."""
 INNER = 1
-"""Parts of the training runs that are left out in turn while a method picks its settings."""
-LEAST_FITTED, LEAST_JUDGED = 8, 3
-"""Runs without which nothing is fitted, and nothing judged."""
+"""Number of parts of the training runs that are held back in turn to pick settings."""
+LEAST_TRAINING, LEAST_HELD_OUT = 8, 3
+"""Smallest numbers of training runs and of held-out runs of a split."""
 ALL = -1
-"""Fold of a split that leaves nothing out."""
+"""Fold of the split without held-out runs."""
 Labels = Int[np.ndarray, " run"]
 
 
 class BenchmarkProtocol(NamedTuple):
-    """A question.
+    """Protocol of the benchmark.
 
     Attributes:
-        split: how runs are split for it.
-        told: whether floors are told.
-        about: the question in a sentence.
-        strange: whether slipid's estimator is told that there may be floors that it has not seen;
-            other rows cannot make use of that.
+        split: kind of split of the runs.
+        floor_known: the floor of each run is given to methods.
+        about: description in words.
+        unseen_floors: slipid's estimator is given that there may be floors without training runs;
+            other rows have no such option.
     """
 
     split: str
-    told: bool
+    floor_known: bool
     about: str
-    strange: bool = False
+    unseen_floors: bool = False
 
 
 PROTOCOLS: dict[str, BenchmarkProtocol] = {
-    "known_floor": BenchmarkProtocol("headings", True, "new headings on a floor that is told"),
-    "unknown_floor": BenchmarkProtocol("headings", False, "new headings, the floor is not told"),
+    "known_floor": BenchmarkProtocol("headings", True, "new headings on a known floor"),
+    "unknown_floor": BenchmarkProtocol("headings", False, "new headings on an unknown floor"),
     "sectors": BenchmarkProtocol(
-        "sectors", True, "left-out sectors of 60 degrees, the floor is told"
+        "sectors", True, "left-out sectors of 60 degrees on a known floor"
     ),
-    "speeds": BenchmarkProtocol("speeds", True, "a left-out speed, the floor is told"),
-    "new_floor": BenchmarkProtocol("floors", False, "a floor that no method has seen", True),
-    "two_floors": BenchmarkProtocol("all", False, "runs from one floor to another, not told where"),
+    "speeds": BenchmarkProtocol("speeds", True, "a left-out speed on a known floor"),
+    "new_floor": BenchmarkProtocol("floors", False, "a floor without training runs", True),
+    "two_floors": BenchmarkProtocol("all", False, "runs from one floor to another, floors unknown"),
 }
 
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """One fold: numbers of the runs that are fitted and of those that are judged.
+    """One fold of a kind of split.
 
     Attributes:
-        kind: how runs were split; fold: number of the part that is left out.
+        kind: kind of split.
+        fold: index of the held-out part.
+        training: indices of the training runs.
+        held_out: indices of the held-out runs.
     """
 
     kind: str
     fold: int
-    fitted: Int[np.ndarray, " some"]
-    judged: Int[np.ndarray, " others"]
-
-    @property
-    def name(self) -> str:
-        return self.kind if self.fold == ALL else f"{self.kind}_{self.fold}"
+    training: Int[np.ndarray, " some"]
+    held_out: Int[np.ndarray, " others"]
 
     @property
     def protocols(self) -> tuple[str, ...]:
-        """Questions that its runs are asked."""
+        """Protocols that use this kind of split."""
         return tuple(name for name, p in PROTOCOLS.items() if p.split == self.kind)
 
 
 def base_of(floor: str) -> str:
-    """Name of a floor without that of the load set-up that follows it."""
+    """Return the name of a floor without that of the load set-up that follows it."""
     return floor.partition("@")[0]
 
 
 def facts_of(data: Runs, base_radius: float) -> list[FoldKey]:
-    """Facts of all runs; a robot that cannot drive sideways has the direction (speed, turning)."""
+    """Return the facts of all runs; the direction of a skid steer is that of (speed, turning)."""
     out = compared.fold_keys(data)
     for k, log in enumerate(data.logs):
         if log.wheels == 2 and np.isfinite(data.speed[k]) and log.twist_command is not None:
             ahead = float(np.median(log.twist_command[:, 0]))
-            aside = base_radius * float(data.turn[k])
-            way = float(np.degrees(np.arctan2(aside, ahead)))
-            out[k] = replace(out[k], heading_deg=way, speed=float(np.hypot(ahead, aside)))
+            turning = base_radius * float(data.turn[k])
+            heading = float(np.degrees(np.arctan2(turning, ahead)))
+            out[k] = replace(out[k], heading_deg=heading, speed=float(np.hypot(ahead, turning)))
     return out
 
 
 def facts_of_run(run: Run) -> FoldKey:
-    """Facts of a run as methods are given it."""
+    """Return the facts of a run."""
     return FoldKey(run.floor, float(np.degrees(run.heading)), run.speed)
 
 
 def headings(facts: Sequence[FoldKey]) -> Labels:
-    """Parts dealt at random by heading, so that one heading is in one part on every floor.
+    """Return random parts by heading, with one heading in the same part on every floor.
 
-    Runs without a heading are dealt one by one.
+    Runs without a heading are assigned one by one.
     """
-    way = np.array([f.heading_deg for f in facts])
-    known = np.isfinite(way)
-    bins = np.where(known, np.round(np.where(known, way, 0.0) / 5.0) % 72, 72 + np.arange(len(way)))
+    heading = np.array([f.heading_deg for f in facts])
+    known = np.isfinite(heading)
+    bins = np.round(np.where(known, heading, 0.0) / 5.0) % 72
+    bins = np.where(known, bins, 72 + np.arange(len(heading)))
     number = np.unique(bins, return_inverse=True)[1]
     return np.random.default_rng(0).permutation(number.max() + 1)[number] % FOLDS
 
 
 def sectors(facts: Sequence[FoldKey]) -> Labels:
-    """Parts of every other sector of directions; -1 of runs without a direction."""
+    """Return parts of every other sector of directions; -1 for runs without a direction."""
     sector = compared.sectors(facts)
     return np.where(sector < 0, sector, sector % FOLDS)
 
 
 def floors(facts: Sequence[FoldKey]) -> Labels:
-    """Parts of one floor each."""
+    """Return parts of one floor each."""
     return np.unique([base_of(f.floor) for f in facts], return_inverse=True)[1]
 
 
@@ -132,9 +132,10 @@ KINDS: dict[str, Callable[[Sequence[FoldKey]], Labels]] = {
 
 
 def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
-    """Folds of a kind; none where a part or what is left without it has too few runs.
+    """Return the folds of a kind, without those that have too few training or held-out runs.
 
-    Runs of part -1 are always fitted. A floor that is left without a run is not judged.
+    Runs of part -1 are training runs in all folds. Runs on floors without training runs are not
+    held out, unless the split is by floors.
     """
     everybody = np.arange(len(facts))
     if kind == "all":
@@ -143,21 +144,22 @@ def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
     where = np.array([f.floor for f in facts])
     found = []
     for fold in sorted(set(part.tolist()) - {-1}):
-        fitted, judged = everybody[part != fold], everybody[part == fold]
+        training, held_out = everybody[part != fold], everybody[part == fold]
         if kind != "floors":
-            judged = judged[np.isin(where[judged], where[fitted])]
-        if len(fitted) >= LEAST_FITTED and len(judged) >= LEAST_JUDGED:
-            found.append(Split(kind, fold, fitted, judged))
+            held_out = held_out[np.isin(where[held_out], where[training])]
+        if len(training) >= LEAST_TRAINING and len(held_out) >= LEAST_HELD_OUT:
+            found.append(Split(kind, fold, training, held_out))
     return found
 
 
 def inner(runs: Sequence[Run], kind: str) -> Labels:
-    """Part of every training run for picking settings, of the kind that methods are judged by.
+    """Return the part of every training run for picking settings, by the protocol's kind of split.
 
     The `INNER` largest parts of the training runs are held back in turn and numbered from 0; all
-    other runs have -1, or after random dealing `INNER`, and stay. Headings are dealt where the
-    training runs have fewer than two parts of the kind, and so always for sectors: every other one
-    is missing already, and without one more the gap would be three times as wide as is asked about.
+    other runs have -1, or `INNER` after a random assignment, and stay. The parts are by headings
+    if the training runs have fewer than two parts of the kind, and so always for sectors: every
+    other one is missing already, and with one more missing the gap would be three times as wide as
+    that of the protocol.
     """
     facts = [facts_of_run(run) for run in runs]
     for name in dict.fromkeys((kind if kind in KINDS else "headings", "headings")):

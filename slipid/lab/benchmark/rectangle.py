@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from slipid.deploy.deploy import ROBOT, robot_of_force_balance
-from slipid.lab.benchmark import slipid_rows
 from slipid.lab.benchmark.scores import FoldScore
+from slipid.lab.benchmark.slipid_rows import fit_slipid
 from slipid.lab.benchmark.work import OF_FITS, BenchmarkOptions, data_of, problem_of
 from slipid.lab.trial import trial
 from slipid.robot.record import LogSensors
@@ -20,7 +20,7 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 SOURCE = "testsite"
-"""Data set whose robot drives."""
+"""Data set of the robot."""
 CONTROLLERS = (
     "encoder",
     "goswami_padhy",
@@ -36,55 +36,62 @@ STARTS = 8
 
 @dataclass(frozen=True)
 class RectangleTask:
-    """The part of the work that identifies the robot which is then driven."""
+    """Identification of the test site's robot, and its closed-loop runs.
 
-    wish: BenchmarkOptions
+    Attributes:
+        options: options of the benchmark.
+        name: name of the task.
+    """
+
+    options: BenchmarkOptions
     name: str = "rectangle"
 
     @property
     def folder(self) -> Path:
-        """Where the robot and its trial lie."""
-        return self.wish.out / self.name
+        """Folder of the robot and its trial."""
+        return self.options.out / self.name
 
     def run(self) -> str:
-        """Identify the robot of the test site from all its runs; the name of the part."""
+        """Identify the robot of the test site from all its runs, and return the task's name."""
         setup_jax(quiet=True)
         self._failure.unlink(missing_ok=True)
         try:
             self._identify()
-        except Exception as error:  # other parts are done all the same
+        except Exception as error:  # other tasks are done all the same
             write_json(self._failure, {"failed": FoldScore.of_error(error).absent})
         return self.name
 
     @property
     def _failure(self) -> Path:
-        """Where it is kept why there is no robot."""
+        """File with the reason why there is no robot."""
         return self.folder / "failed.json"
 
     def _identify(self) -> None:
-        data = data_of(self.wish, SOURCE)
+        """Fit slipid to all runs, and write robot.json."""
+        data = data_of(self.options, SOURCE)
         code = source_hash(*OF_FITS)
         key = key_of(data.job.config.hash, data.job.data_hash, code)
         everybody = np.arange(len(data.logged))
         kept = Checkpoint(self.folder, key)
-        own = slipid_rows.fit_slipid(data.job, problem_of(self.wish, SOURCE), everybody, kept)
+        fit = fit_slipid(data.job, problem_of(self.options, SOURCE), everybody, kept)
         sensors = LogSensors(current_is_signed=data.logged.current_is_signed, voltage=True)
-        robot_of_force_balance(own.contact, own.highest_speed, own.trend, sensors).save(
+        robot_of_force_balance(fit.contact, fit.highest_speed, fit.trend, sensors).save(
             self.folder / ROBOT
         )
 
     def drive(self, executor: Executor, report: Reporter) -> Content:
-        """Drive all controllers on the virtual test site, or where MuJoCo is missing on the twin.
+        """Run all controllers on the virtual test site, or on the twin if MuJoCo is missing.
 
         Returns:
-            What `slipid trial` writes, or why there is nothing.
+            Content that `slipid trial` writes, or the reason why there is none.
         """
         if self._failure.is_file():
             return read_json(self._failure, "why there is no robot")
         plant = "testsite" if find_spec("mujoco") is not None else "twin"
-        asked = [name for name in CONTROLLERS if not self.wish.only or name in self.wish.only]
+        only = self.options.only or CONTROLLERS
+        controllers = [name for name in CONTROLLERS if name in only]
         try:
-            wish = trial.TrialOptions(plant, controllers=tuple(asked), starts=STARTS)
+            wish = trial.TrialOptions(plant, controllers=tuple(controllers), starts=STARTS)
             return trial.trial(self.folder, wish, executor, report).content
-        except Exception as error:  # all else is written all the same
+        except Exception as error:  # the rest is written all the same
             return {"failed": FoldScore.of_error(error).absent}

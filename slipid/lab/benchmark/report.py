@@ -1,7 +1,4 @@
-"""The tables of the benchmark on a terminal.
-
-The benchmark as one page of HTML, with its pictures inside.
-"""
+"""Tables of the benchmark on a terminal, and on one page of HTML with embedded pictures."""
 
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
@@ -26,21 +23,21 @@ COLUMNS: Mapping[str, tuple[str, float, int]] = {
     "floor_accuracy": ("floor, %", 100.0, 0),
     "energy_error": ("energy, %", 100.0, 0),
 }
-"""Heading, factor and places of each number of a row."""
+"""Heading, factor and decimal places of each number of a row."""
 ENDS = ("endpoint_error", "behind")
-"""Numbers that are shown with their 90 % interval."""
+"""Numbers with a 90 % interval."""
 ON_THE_PAGE = ("length_error", "twist_error")
-"""Numbers for which a terminal is too narrow."""
+"""Numbers on the page only, as a terminal is too narrow for them."""
 
 
 def show_benchmark(page: Page, found: Content) -> None:
-    """Write every table, best rows first, and what they say."""
+    """Write every table, best rows first, and their summary in sentences."""
     for name, one in found["sets"].items():
         for protocol, rows in one["protocols"].items():
             about = found["protocols"][protocol]
             title = f"\n{name}: {about}; end points over the {one['over']}"
             brief = [number for number in shown(rows) if number not in ON_THE_PAGE]
-            head = ("row", *headings(brief), *COSTS[1:])
+            head = ("row", *(COLUMNS[name][0] for name in brief), *COSTS[1:])
             made = table(head, title, right=head[1:])
             for row, content in ranked(rows):
                 made.add_row(Text(row), *cells(content, brief), *costs(content)[1:])
@@ -49,8 +46,8 @@ def show_benchmark(page: Page, found: Content) -> None:
             page.table(made)
             page.notes(absent(rows))
     for name, one in others(found):
-        if one.said:
-            page.line(f"\n{name}: {one.said}")
+        if one.failure:
+            page.line(f"\n{name}: {one.failure}")
             continue
         made = table(one.head, f"\n{one.title}", right=one.head[1:])
         for of_row in one.body:
@@ -65,28 +62,23 @@ COSTS = ("numbers", "fit, s", "step, us")
 
 
 def ranked(rows: Content) -> list[tuple[str, Content]]:
-    """Rows that are there, the least end-point error first."""
+    """Return the rows with results, the least end-point error first."""
     there = [(name, one) for name, one in rows.items() if one["endpoint_error"] is not None]
     return sorted(there, key=lambda item: item[1]["endpoint_error"][0])
 
 
 def shown(rows: Content) -> list[str]:
-    """Numbers that some row has."""
+    """Return the names of numbers that some row has."""
     return [name for name in COLUMNS if any(row[name] is not None for row in rows.values())]
 
 
-def headings(numbers: Sequence[str]) -> list[str]:
-    """Of numbers by their names."""
-    return [COLUMNS[name][0] for name in numbers]
-
-
 def cells(row: Content, numbers: Sequence[str]) -> list[str]:
-    """Numbers of a row in words."""
+    """Return the formatted numbers of a row."""
     return [in_words(name, row[name]) for name in numbers]
 
 
 def in_words(name: str, value: Sequence[float] | None) -> str:
-    """A number, with its interval where it is one of `ENDS`; nothing where it is not known."""
+    """Return a formatted number, with its interval if it is one of `ENDS`, or an empty string."""
     if value is None:
         return ""
     _, factor, places = COLUMNS[name]
@@ -96,14 +88,14 @@ def in_words(name: str, value: Sequence[float] | None) -> str:
 
 
 def costs(row: Content) -> list[str]:
-    """Fitted numbers, seconds to fit, microseconds a step."""
+    """Return number of parameters, seconds to fit, and microseconds per step."""
     fit, step = row["fit_s"], row["step_us"]
     seconds = "< 0.1" if fit < 0.1 else f"{fit:.1f}" if fit < 10 else f"{fit:.0f}"
     return [str(row["numbers"]), seconds, f"{step:.1f}" if step < 10 else f"{step:.0f}"]
 
 
 def absent(rows: Content) -> list[str]:
-    """Why rows are not in a table or not to be trusted, rows of one reason together."""
+    """Return the reasons why rows are absent or did not converge, rows of one reason together."""
     why: dict[str, list[str]] = {}
     for name, row in rows.items():
         if row["unconverged"]:
@@ -114,18 +106,25 @@ def absent(rows: Content) -> list[str]:
 
 
 class ExtraTable(NamedTuple):
-    """A part of benchmark.json that is one table, or why there is none."""
+    """A part of benchmark.json that is one table.
+
+    Attributes:
+        title: title of the table.
+        head: headings of the columns.
+        body: rows of the table.
+        failure: reason why there is no table, or an empty string.
+    """
 
     title: str
     head: tuple[str, ...]
     body: list[tuple[str, ...]]
-    said: str = ""
+    failure: str = ""
 
 
 def others(found: Content) -> list[tuple[str, ExtraTable]]:
-    """Tables beside those of the data sets, by their names."""
+    """Return the tables besides those of the data sets, by their names."""
     parts: list[tuple[str, Content, Callable[[Content], ExtraTable]]]
-    parts = [(name, one, felt) for name, one in found["floors"].items()]
+    parts = [(name, one, classifiers) for name, one in found["floors"].items()]
     if found["rectangle"] is not None:
         parts.append(("rectangle", found["rectangle"], rectangle))
     return [
@@ -134,28 +133,28 @@ def others(found: Content) -> list[tuple[str, ExtraTable]]:
     ]
 
 
-def rectangle(driven: Content) -> ExtraTable:
-    """Controllers of the trial, the least closure error first."""
+def rectangle(trial: Content) -> ExtraTable:
+    """Return the table of the trial's controllers, the least closure error first."""
     plant = {"testsite": "the virtual test site", "twin": "the identified model itself"}
-    runs = min(row["runs"] for row in driven["summary"].values())
-    title = f"rectangle on {plant[driven['plant']]}, {runs} starts, medians with 90 % intervals"
+    runs = min(row["runs"] for row in trial["summary"].values())
+    title = f"rectangle on {plant[trial['plant']]}, {runs} starts, medians with 90 % intervals"
     head = ("controller", "closure, mm", "of encoders', %", "finished, %", "cross-track, mm")
-    rows = sorted(driven["summary"].items(), key=lambda item: item[1]["closure_error_median"])
+    rows = sorted(trial["summary"].items(), key=lambda item: item[1]["closure_error_median"])
     body: list[tuple[str, ...]] = []
     for name, row in rows:
         low, high = row["interval90"]["closure_error_median"]
         ratio = row.get("to_encoder", {}).get("closure_error_median")
-        said = "" if ratio is None else f"{100 * ratio['value']:.0f}"
+        relative = "" if ratio is None else f"{100 * ratio['value']:.0f}"
         if ratio is not None and name != "encoder":
-            said += " [{:.0f}, {:.0f}]".format(*(100 * x for x in ratio["interval90"]))
+            relative += " [{:.0f}, {:.0f}]".format(*(100 * x for x in ratio["interval90"]))
         closure = f"{row['closure_error_median']:.0f} [{low:.0f}, {high:.0f}]"
         finished, cross = f"{100 * row['finished_share']:.0f}", f"{row['cross_track_rmse']:.0f}"
-        body.append((name, closure, said, finished, cross))
+        body.append((name, closure, relative, finished, cross))
     return ExtraTable(title, head, body)
 
 
-def felt(found: Content) -> ExtraTable:
-    """Classifiers: how often they are right, by the time heard; the best at the end first."""
+def classifiers(found: Content) -> ExtraTable:
+    """Return the table of classifiers' accuracies by seconds, the best after the last first."""
     chance = f"always naming the commonest floor is right in {100 * found['chance']:.0f} %"
     title = f"{found['about']}; {found['runs']} runs; {chance}"
     if lost := [f"{row['name']}: {row['absent']}" for row in found["rows"] if row["absent"]]:
@@ -174,8 +173,8 @@ def felt(found: Content) -> ExtraTable:
     return ExtraTable(title, head, body)
 
 
-def picked(rows: Content) -> list[str]:
-    """Settings that cross-validation picked in each fold, of the rows that have some."""
+def settings_lines(rows: Content) -> list[str]:
+    """Return the settings picked by cross-validation in each fold, for rows that have some."""
     return [
         f"{name}: {'; '.join(dict.fromkeys(row['settings']))}"
         for name, row in rows.items()
@@ -189,11 +188,11 @@ LEGEND = (
     "Minus slipid's: the difference on the same runs, below zero where the row is better. "
     "Length: of the chord or the path. Heading: at the end. "
     "Twist: root mean square in windows of half a second. "
-    "In 90 %: how many ends lie in the row's own 90 % region. "
+    "In 90 %: share of ends in the row's own 90 % region. "
     "Slip AUC: area under the receiver operating characteristic of slip detection. "
-    "Floor: part of the time in which the right floor is named, or rightly none. "
+    "Floor: share of the time in which the true floor is named, or rightly none. "
     "Energy: error of the electric energy of a run. "
-    "Numbers: how many are fitted. Fit, step: time to fit once, and to predict one step of a run."
+    "Numbers: fitted parameters. Fit, step: time of one fit, and to predict one step of a run."
 )
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 92rem; margin: 2rem auto }
@@ -208,18 +207,18 @@ tr.own { background: #fdeee3; font-weight: 600 } .note { color: #666; font-size:
 
 
 def write_page(found: Content, pictures: Mapping[str, bytes], out: Path) -> Path:
-    """Write the page of a benchmark's content below a folder; arguments as of `page`."""
+    """Write the page of a benchmark's content below a folder and return its path."""
     path = out / PAGE
     write_bytes(path, page(found, pictures).encode())
     return path
 
 
 def page(found: Content, pictures: Mapping[str, bytes]) -> str:
-    """The whole page: what it says, then a picture and the tables of every data set.
+    """Return the whole page: summary, then a picture and the tables of every data set.
 
     Args:
         found: content of benchmark.json.
-        pictures: PNG files by the name of the data set they show.
+        pictures: PNG files by the name of their data set.
     """
     parts = [
         "<!doctype html><html lang='en'><meta charset='utf-8'>",
@@ -238,33 +237,37 @@ def page(found: Content, pictures: Mapping[str, bytes]) -> str:
         parts += _set(found, name, one, pictures.get(name))
     for name, other in others(found):
         parts.append(f"<h2>{escape(name.replace('_', ' '))}</h2>")
-        parts.append(f"<p>{escape(other.said or other.title)}</p>")
-        if not other.said:
+        parts.append(f"<p>{escape(other.failure or other.title)}</p>")
+        if not other.failure:
             parts.append(html_table(other.head, other.body))
-    parts.append(f"<p class='note'>{_versions(found)}</p></html>")
+    names = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+    note = escape(f"{names}; this call took {found['seconds']:.0f} s")
+    parts.append(f"<p class='note'>{note}</p></html>")
     return "\n".join(parts)
 
 
 def _set(found: Content, name: str, one: Content, drawn: bytes | None) -> list[str]:
     parts = [f"<h2>{escape(name)}</h2><p>{escape(one['about'])}; {one['runs']} runs</p>"]
     if drawn is not None:
-        parts.append(picture(drawn, f"End-point errors on {name}"))
+        data = b64encode(drawn).decode()
+        title = escape(f"End-point errors on {name}")
+        parts.append(f"<img alt='{title}' src='data:image/png;base64,{data}'>")
     for protocol, rows in one["protocols"].items():
         title = f"{protocol.replace('_', ' ')}: {found['protocols'][protocol]}"
         parts.append(f"<h3>{escape(title)}</h3>")
         numbers = shown(rows)
-        head = ("row", *headings(numbers), *COSTS)
+        head = ("row", *(COLUMNS[name][0] for name in numbers), *COSTS)
         body = [(row, *cells(content, numbers), *costs(content)) for row, content in ranked(rows)]
         parts.append(html_table(head, body))
         parts += [f"<p class='note'>{escape(line)}</p>" for line in absent(rows)]
-        if lines := picked(rows):
+        if lines := settings_lines(rows):
             parts.append("<details class='note'><summary>settings picked, fold by fold</summary>")
             parts += [*(f"<div>{escape(line)}</div>" for line in lines), "</details>"]
     return parts
 
 
 def html_table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
-    """A table whose first column names the row; slipid's own rows stand out."""
+    """Return a table whose first column names the row, with slipid's own rows highlighted."""
     lines = [
         "<div class='wide'><table><tr>",
         *(f"<th>{escape(cell)}</th>" for cell in head),
@@ -274,14 +277,3 @@ def html_table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
         own = " class='own'" if row[0].startswith(("slipid", "contact")) else ""
         lines.append(f"<tr{own}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
     return "".join([*lines, "</table></div>"])
-
-
-def picture(png: bytes, said: str) -> str:
-    """A picture inside the page, with what it shows in words."""
-    data = b64encode(png).decode()
-    return f"<img alt='{escape(said)}' src='data:image/png;base64,{data}'>"
-
-
-def _versions(found: Content) -> str:
-    said = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
-    return escape(f"{said}; this call took {found['seconds']:.0f} s")

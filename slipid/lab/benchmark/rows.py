@@ -1,4 +1,4 @@
-"""The rows of the benchmark's tables: every published system, in the order of its year or so."""
+"""Rows of the benchmark's tables: every published system, roughly by its year."""
 
 from slipid.lab.paper2021.deployed_form import paper_rows
 from slipid.lab.systems.motion.gmdh import GmdhClass, GmdhOne
@@ -8,14 +8,15 @@ from slipid.lab.systems.motion.quann import QuannEnergy, QuannSlip
 from slipid.lab.systems.motion.reina import ReinaDeterministic, ReinaFuzzy
 from slipid.lab.systems.motion.ward_iagnemma import WardIagnemma
 from slipid.predict.kinematics import Corrected, Encoder, HeadingLookup
-from slipid.predict.slip_model import ByFloor, RobotSpec, SlipModel
+from slipid.predict.slip_model import RobotSpec, SlipModel
+from slipid.predict.slip_models import ByFloor
 
 KINEMATIC = ("effective_track", "instantaneous_centres")
-"""Rows for wheels that do not determine the twist."""
+"""Names of the rows for wheels that do not determine the twist."""
 
 
 def _every() -> list[SlipModel]:
-    """All methods, unfitted; those that handle floors themselves as they are."""
+    """Return all methods, unfitted, fitted floor by floor unless they handle floors themselves."""
     of_one_floor: list[SlipModel] = [
         *(Corrected(name) for name in KINEMATIC),
         ReinaDeterministic(),
@@ -34,11 +35,11 @@ def _every() -> list[SlipModel]:
 
 
 ROWS = tuple(method.name for method in _every())
-"""Their names."""
+"""Names of all rows."""
 
 
 def rows(spec: RobotSpec) -> list[SlipModel]:
-    """Methods for a robot, unfitted; those that lack a channel they need are among them."""
+    """Return the methods for a robot, unfitted, including those whose channels are missing."""
     every = _every()
     if spec.determines_twist:
         every = [method for method in every if method.name not in KINEMATIC]

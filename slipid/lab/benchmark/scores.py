@@ -1,11 +1,7 @@
-"""Scores of the benchmark's predictions, against poses that the models have not seen.
-
-What a row of the benchmark came to in one fold, or why it is not there.
-"""
+"""Scores of the benchmark's predictions against poses of held-out runs."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -26,9 +22,9 @@ from slipid.predict.slip_model import (
 from slipid.support.content import Content
 
 SLIPS = 0.2
-"""A robot slips where its twist is off that of its wheels by more than this part of the latter."""
+"""Smallest relative difference between the twists of body and wheels that counts as slip."""
 STANDS = 0.02
-"""Rim speed below which a window says nothing of slip [m/s]."""
+"""Rim speed below which a window is not used for slip detection [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -36,17 +32,19 @@ class RunScore:
     """Errors of a prediction of one run.
 
     Attributes:
-        name, floor: of the run; the floor with the load set-up.
-        cluster: runs of one cluster share their errors.
-        endpoint_error: distance of predicted and true end over the chord, or over the path.
-        length_error: relative, of the chord, or of the path driven.
-        heading_error_deg: at the end, at most 180.
+        name: name of the run.
+        floor: floor of the run, with the load set-up.
+        cluster: cluster of runs with correlated errors.
+        endpoint_error: distance of predicted and true end over the chord, or over the path length.
+        length_error: relative error of the chord, or of the path length.
+        heading_error_deg: heading error at the end, at most 180 [deg].
         twist_error: rms of the windows' twist errors, a yaw rate times the base radius [m/s].
-        covered90: whether the end lies in the 90 % region; None without one.
-        scores, slips: of each window, how sure the method is of slip, and whether there was any.
-        floor_right: part of the time in which the most probable floor was the right one; None of
-            methods that tell no floors.
-        energy_error: of the whole run's electric energy, relative; None where it is not predicted.
+        covered90: the true end lies in the 90 % region; None without a region.
+        scores: slip score of each window.
+        slips: true slip of each window.
+        floor_right: share of the time in which the most probable floor is the true one; None for
+            methods without floor probabilities.
+        energy_error: relative error of the run's electric energy; None if it is not predicted.
     """
 
     name: str
@@ -62,93 +60,92 @@ class RunScore:
     floor_right: float | None
     energy_error: float | None
 
-    def to_json(self) -> Content:
-        return asdict(self)
 
-
-def scored(run: Run, said: PredictedRun, spec: RobotSpec, over: Over) -> RunScore:
-    """Score of a prediction of a run."""
+def scored(run: Run, predicted: PredictedRun, spec: RobotSpec, over: Over) -> RunScore:
+    """Return the score of a prediction of a run."""
     true = relative_to_start(run.pose)
-    cov = None if said.end_covariance is None else said.end_covariance[None]
-    (end,) = scores(said.path[None], true[None], cov, said.freedom)
+    cov = None if predicted.end_covariance is None else predicted.end_covariance[None]
+    (end,) = scores(predicted.path[None], true[None], cov, predicted.freedom)
     first = groups(run.signals.dt, WINDOW_S)
-    off, slip, slips = _windows(run, said, spec, first)
+    off, slip, slips = _windows(run, predicted, spec, first)
     return RunScore(
         name=run.signals.name,
         floor=run.floor,
         cluster=int(clusters([float(np.degrees(run.heading))])[0]),
         endpoint_error=end.endpoint_error if over == "chord" else end.endpoint_error_over_path,
-        length_error=abs(_length(said.path, over) / max(_length(true, over), 1e-9) - 1),
+        length_error=abs(_length(predicted.path, over) / max(_length(true, over), 1e-9) - 1),
         heading_error_deg=end.heading_error_deg,
         twist_error=off,
         covered90=end.covered90,
         scores=[float(f"{x:.4g}") for x in slip.tolist()],
         slips=slips.tolist(),
-        floor_right=_floor_right(run, said),
-        energy_error=_energy_error(run, said, spec),
+        floor_right=_floor_right(run, predicted),
+        energy_error=_energy_error(run, predicted, spec),
     )
 
 
 def _length(path: Float[np.ndarray, "edge 3"], over: Over) -> float:
-    """Straight-line displacement, or length of the path [m]."""
+    """Return the chord, or the path length [m]."""
     return (chords if over == "chord" else lengths)(path[None])[0]
 
 
 def _windows(
-    run: Run, said: PredictedRun, spec: RobotSpec, first: np.ndarray
+    run: Run, predicted: PredictedRun, spec: RobotSpec, first: np.ndarray
 ) -> tuple[float, Float[np.ndarray, " window"], Bool[np.ndarray, " window"]]:
-    """Rms twist error [m/s]; how sure the method is of slip, and where there was any."""
+    """Return the rms twist error [m/s], and slip score and true slip of the moving windows."""
     edges = np.append(first, len(run.signals))
     dt = np.diff(np.concatenate([[0.0], np.cumsum(run.signals.dt)])[edges])[:, None]
     true = body_increments(run.pose[edges]) / dt * spec.size
-    told = body_increments(said.path[edges]) / dt * spec.size
-    # joined as the paths are, so that a method that says what encoders say sees no slip at all
+    estimate = body_increments(predicted.path[edges]) / dt * spec.size
+    # integrated like the paths, so that the path of encoders has a slip score of exactly 0
     by_wheels = path_of(run.signals.rolling(spec), run.signals.dt)
     rolling = body_increments(by_wheels[edges]) / dt * spec.size
     size = np.linalg.norm(rolling, axis=1)
-    moves = size > STANDS
+    moving = size > STANDS
     most = np.maximum(size, STANDS)
     slips = np.linalg.norm(true - rolling, axis=1) > SLIPS * most
-    if said.slipping is None:
-        score = np.round(np.linalg.norm(told - rolling, axis=1) / most, 6)
+    if predicted.slipping is None:
+        score = np.round(np.linalg.norm(estimate - rolling, axis=1) / most, 6)
     else:
-        score = np.add.reduceat(said.slipping * run.signals.dt, first) / dt[:, 0]
-    off = float(np.sqrt(np.mean(np.sum((told - true) ** 2, axis=1))))
-    return off, score[moves], slips[moves]
+        score = np.add.reduceat(predicted.slipping * run.signals.dt, first) / dt[:, 0]
+    off = float(np.sqrt(np.mean(np.sum((estimate - true) ** 2, axis=1))))
+    return off, score[moving], slips[moving]
 
 
-def _floor_right(run: Run, said: PredictedRun) -> float | None:
-    if said.floors is None or run.signals.floor is not None or run.floor == "unknown":
+def _floor_right(run: Run, predicted: PredictedRun) -> float | None:
+    if predicted.floors is None or run.signals.floor is not None or run.floor == "unknown":
         return None
-    names = list(said.floors)
-    best = np.argmax(np.stack([said.floors[name] for name in names]), axis=0)
+    names = list(predicted.floors)
+    best = np.argmax(np.stack([predicted.floors[name] for name in names]), axis=0)
     known = {base_of(name) for name in names}
-    # a floor that nobody has seen is rightly called unknown
+    # the right answer for a floor without training runs is unknown
     true = base_of(run.floor) if base_of(run.floor) in known else "unknown"
     right = np.array([base_of(names[k]) == true for k in best])
     return float((right * run.signals.dt).sum() / run.signals.dt.sum())
 
 
-def _energy_error(run: Run, said: PredictedRun, spec: RobotSpec) -> float | None:
-    if said.power is None or run.signals.current is None:
+def _energy_error(run: Run, predicted: PredictedRun, spec: RobotSpec) -> float | None:
+    if predicted.power is None or run.signals.current is None:
         return None
     spent = float((run.signals.power(spec) * run.signals.dt).sum())
-    return abs(float((said.power * run.signals.dt).sum()) / max(spent, 1e-9) - 1)
+    return abs(float((predicted.power * run.signals.dt).sum()) / max(spent, 1e-9) - 1)
 
 
 @dataclass(frozen=True)
 class FoldScore:
-    """A method in one fold of one protocol.
+    """Scores of a method in one fold of one protocol.
 
     Attributes:
-        runs: that it predicted.
-        absent: why there are none: a channel that it needs and these logs lack, or what failed.
-        failed: whether that is a failure.
-        settings: that cross-validation picked, in words; tried: how many.
-        numbers: how many were fitted.
-        tune_s, fit_s: that it took to pick the settings, and to fit once [s].
-        step_us: to predict one step of one run [microseconds].
-        converged: of a fit that goes in rounds.
+        runs: scores of the held-out runs.
+        absent: reason why there are none: a channel that these logs lack, or an error.
+        failed: the reason is an error.
+        settings: settings picked by cross-validation, in words.
+        tried: number of settings that were compared.
+        numbers: number of fitted parameters.
+        tune_s: time to pick the settings [s].
+        fit_s: time of one fit [s].
+        step_us: time to predict one step of one run [microseconds].
+        converged: the fit converged.
     """
 
     runs: tuple[RunScore, ...] = ()
@@ -162,21 +159,19 @@ class FoldScore:
     step_us: float = 0.0
     converged: bool = True
 
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
-
     @classmethod
-    def of_json(cls, content: dict[str, Any]) -> "FoldScore":
+    def of_json(cls, content: Content) -> "FoldScore":
+        """Return the score whose fields were written as JSON."""
         return cls(**{**content, "runs": tuple(RunScore(**run) for run in content["runs"])})
 
     @classmethod
     def lacking(cls, channels: Iterable[str]) -> "FoldScore":
-        """Of a method that needs what was not logged."""
+        """Return the result of a method whose channels were not logged."""
         words = {"twist": "wheels that drive sideways", "command": "a commanded twist"}
         named = [words.get(name, f"a {name}") for name in sorted(channels)]
         return cls(absent=f"needs {' and '.join(named)}")
 
     @classmethod
     def of_error(cls, error: Exception) -> "FoldScore":
-        """Of a method that ended in an error."""
+        """Return the result of a method that raised an error."""
         return cls(absent=f"{type(error).__name__}: {error}".splitlines()[0][:300], failed=True)

@@ -1,4 +1,4 @@
-"""The logs of the benchmark: public data sets below a folder, and recorded runs that ship."""
+"""Logs of the benchmark: public data sets below a folder, and recorded runs of the package."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,15 +22,7 @@ from slipid.support.progress import Reporter
 from slipid.support.toml_file import text_of
 
 Over = Literal["chord", "path"]
-"""What end-point errors are divided by: the straight way to the end, or the way driven."""
-
-
-@dataclass(frozen=True)
-class CurrentColumns:
-    """Columns of currents that a config leaves out of the fit, and methods hear all the same."""
-
-    columns: tuple[str, ...]
-    signed: bool
+"""Denominator of end-point errors: the distance from start to end, or the path length."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +30,16 @@ class LogSource:
     """One set of logs.
 
     Attributes:
-        name: of the set; about: for people.
-        folder: below the data folder; empty for the recorded runs that ship with slipid.
-        config: name of the config that ships with slipid.
-        kinds: of splits it is for, see `slipid.lab.benchmark.protocols`.
-        over: what end-point errors are divided by.
+        name: name of the set.
+        about: description of the set.
+        folder: folder below the data folder; empty for the recorded runs of the package.
+        config: name of the packaged config.
+        kinds: kinds of splits, see `slipid.lab.benchmark.protocols`.
+        over: denominator of end-point errors.
         poses_per_step: see `slipid.lab.benchmark.steps.run_batches`.
-        currents: columns that methods hear beside what the config reads.
-        crossing: runs from one floor to another: their glob and the file of their map.
+        currents: columns of currents that the config leaves out of the fit, for other methods.
+        current_is_signed: these currents have a sign.
+        crossing: glob of the runs from one floor to another, and the file of their map.
     """
 
     name: str
@@ -55,7 +49,8 @@ class LogSource:
     kinds: tuple[str, ...]
     over: Over = "chord"
     poses_per_step: int = POSES_PER_STEP
-    currents: CurrentColumns | None = None
+    currents: tuple[str, ...] = ()
+    current_is_signed: bool = False
     crossing: tuple[str, str] | None = None
 
 
@@ -84,7 +79,8 @@ SOURCES = (
         config="warthog.toml",
         kinds=("headings", "speeds", "floors"),
         over="path",
-        currents=CurrentColumns(("il", "ir"), signed=True),
+        currents=("il", "ir"),
+        current_is_signed=True,
     ),
     LogSource(
         name="husky",
@@ -93,7 +89,7 @@ SOURCES = (
         config="husky.toml",
         kinds=("headings",),
         over="path",
-        currents=CurrentColumns(("il", "ir"), signed=False),
+        currents=("il", "ir"),
     ),
     LogSource(
         name="testsite",
@@ -110,10 +106,12 @@ class DataSet:
     """The runs of a source.
 
     Attributes:
-        source: where they are from.
-        job: as slipid fits them; logged: the same runs, with all that was logged.
-        facts: what splits go by, run by run.
-        crossing: runs over several floors, where there are some; map: of these floors.
+        source: source of the logs.
+        job: task of slipid's fit to the runs.
+        logged: the same runs with all logged channels.
+        facts: facts of each run for splits.
+        crossing: runs over several floors, or None.
+        map: map of these floors, or None.
     """
 
     source: LogSource
@@ -125,15 +123,17 @@ class DataSet:
 
     @property
     def spec(self) -> RobotSpec:
-        """The robot as its config has it."""
+        """The robot by its config."""
         return RobotSpec.of(Space(self.job.robot, self.job.choices).template)
 
     def thinned(self, most: int) -> "DataSet":
-        """At most so many runs, evenly taken from every floor and speed."""
+        """Return at most so many runs, evenly taken from every floor and speed."""
         count = len(self.logged)
         if count <= most:
             return self
-        order = np.lexsort([np.round([f.speed for f in self.facts], 3), np.array(self.setups)])
+        order = np.lexsort(
+            [np.round([f.speed for f in self.facts], 3), np.array([f.floor for f in self.facts])]
+        )
         keep = np.sort(order[np.linspace(0, count - 1, most).round().astype(int)])
         logged = self.logged.subset(keep)
         facts = tuple(self.facts[k] for k in keep)
@@ -143,26 +143,21 @@ class DataSet:
 
     @property
     def crossing_hash(self) -> str:
-        """Of the runs over several floors and their map."""
+        """Hash of the runs over several floors and of their map."""
         logs = [] if self.crossing is None else [(x.name, x.sha256) for x in self.crossing.logs]
         return hash_of([*logs, ("map", repr(self.map))])
 
-    @property
-    def setups(self) -> list[str]:
-        """Floor of each run, and its load set-up where that is not the main one."""
-        return [f.floor for f in self.facts]
-
 
 def is_available(source: LogSource, data: Path) -> bool:
-    """Whether a source's folder is there; the recorded runs always are."""
+    """Return True if a source's folder exists; the recorded runs are always available."""
     return not source.folder or (data / source.folder).is_dir()
 
 
 def read_set(source: LogSource, data: Path, out: Path, report: Reporter) -> DataSet:
-    """Read the runs of a source; what ships with slipid is unpacked below `out`.
+    """Read the runs of a source; recorded runs of the package are unpacked below `out`.
 
     Raises:
-        DataError: files of it are wrong.
+        DataError: its files cannot be read.
     """
     path = packaged_path(source.config)
     config = parsed(path, text_of(path))
@@ -177,7 +172,7 @@ def read_set(source: LogSource, data: Path, out: Path, report: Reporter) -> Data
             for one in sections
             for part in ("fit", "unseen")
         ]
-    logged, _ = read_dataset(_hearing(config, source.currents), sections, root, report)
+    logged, _ = read_dataset(_with_currents(config, source), sections, root, report)
     job = _job(config, logged, source)
     facts = facts_of(logged, float(job.robot.geometry.base_radius))
     crossing, floor = None, None
@@ -189,27 +184,27 @@ def read_set(source: LogSource, data: Path, out: Path, report: Reporter) -> Data
     return DataSet(source, job, logged, tuple(facts), crossing, floor)
 
 
-def _hearing(config: Config, currents: CurrentColumns | None) -> Config:
-    """The config, with columns of currents in its layouts."""
-    if currents is None:
+def _with_currents(config: Config, source: LogSource) -> Config:
+    """Return the config with additional columns of currents in its layouts."""
+    if not source.currents:
         return config
     layouts = {}
     for name, layout in config.content.layouts.items():
         columns = layout["columns"]
         assert isinstance(columns, dict)
-        told = {"columns": list(currents.columns), "unit": "A"}
+        channel = {"columns": list(source.currents), "unit": "A"}
         layouts[name] = {
             **layout,
-            "columns": {**columns, "current": told},
-            "current_is_signed": currents.signed,
+            "columns": {**columns, "current": channel},
+            "current_is_signed": source.current_is_signed,
         }
     return replace(config, content=config.content.model_copy(update={"layouts": layouts}))
 
 
 def _job(config: Config, logged: Runs, source: LogSource) -> ConfigFitTask:
-    """What slipid fits of these runs: currents only where its config reads them."""
+    """Return the task of slipid's fit to runs, with currents only if its config reads them."""
     fitted = logged
-    if source.currents is not None:
+    if source.currents:
         logs = [replace(log, current=None, current_fresh=None) for log in logged.logs]
         fitted = collect(logs, logged.session)
     return fit_task(config, fitted, (), Reporter(quiet=True))

@@ -1,4 +1,4 @@
-"""slipid's own rows: the force balance where the floor is told, its estimator where it is not."""
+"""slipid's own rows: the force balance on known floors, and its estimator on unknown ones."""
 
 import time
 from collections.abc import Sequence
@@ -34,13 +34,13 @@ from slipid.support.checkpoint import Checkpoint
 
 NAME = "slipid"
 TOLERANCE = 0.1
-"""A fit is done when nothing moves by more than this part of its std: runs scatter far more."""
+"""Largest change of a parameter in a converged fit, in its std: runs scatter far more."""
 STEPS = 16
-"""Estimators drive a number of steps that is a multiple of it, so that few shapes are compiled."""
+"""Divisor of the number of steps of an estimator, so that few shapes are compiled."""
 TOGETHER = 32
-"""Runs that an estimator drives in one call."""
+"""Number of runs in one call of an estimator."""
 LONGEST_S = 0.25
-"""Longer steps are driven in several: what lasts more than half a second is no step to it [s]."""
+"""Longest step of an estimator [s]; longer ones are split, as it rejects those of half a second."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,17 +48,18 @@ class SlipidFit:
     """slipid fitted to some runs of a data set.
 
     Attributes:
-        contact: the force balance as it forecasts.
-        job: of all runs of the data set.
-        seen: which of its floors were fitted, by number.
-        highest_speed: of the wheels in these runs [rad/s].
-        trend: of their currents, see `slipid.infer.slip_curves.current_trend`.
-        seconds: that the fit took; converged: whether it did.
+        contact: force balance with its forecasts.
+        job: fit task of all runs of the data set.
+        floors: indices of the fitted floors.
+        highest_speed: highest wheel speed in these runs [rad/s].
+        trend: trend of their currents, see `slipid.infer.slip_curves.current_trend`.
+        seconds: duration of the fit [s].
+        converged: True if the fit converged.
     """
 
     contact: ForceBalance
     job: ConfigFitTask
-    seen: tuple[int, ...]
+    floors: tuple[int, ...]
     highest_speed: float
     trend: tuple[float, float]
     seconds: float
@@ -66,12 +67,12 @@ class SlipidFit:
 
     @property
     def numbers(self) -> int:
-        """How many numbers were fitted."""
+        """Number of fitted parameters."""
         return self.contact.space.size
 
     @cached_property
     def deployed(self) -> DeployedRobot:
-        """The robot as it is deployed, on all floors of the data set."""
+        """The deployed robot on all floors of the data set."""
         signed = self.job.dataset.current_is_signed
         return robot_of_force_balance(
             self.contact, self.highest_speed, self.trend, LogSensors(signed)
@@ -79,15 +80,14 @@ class SlipidFit:
 
 
 def fit_slipid(
-    job: ConfigFitTask, problem: Problem, fitted: np.ndarray, kept: Checkpoint
+    job: ConfigFitTask, problem: Problem, training: np.ndarray, kept: Checkpoint
 ) -> SlipidFit:
-    """The force balance fitted to some runs of a job.
+    """Return the force balance fitted to some runs of a fit task, or the kept result.
 
-    What was kept of this very fit is not done again. Fits of one `job.problem()` share what was
-    compiled for it.
+    Fits of one `job.problem()` share its compiled functions.
     """
-    problem = problem_of_runs(problem, job.choices, job.dataset, fitted)
-    keep = np.isin(problem.windows.run, fitted).astype(float)
+    problem = problem_of_runs(problem, job.choices, job.dataset, training)
+    keep = np.isin(problem.windows.run, training).astype(float)
     if (found := kept.load("fit")) is None:
         began = time.perf_counter()
         most = job.settings.rounds
@@ -102,30 +102,26 @@ def fit_slipid(
         assert found is not None
     covariance, seconds, converged = (found.pop(k) for k in ("covariance", "seconds", "converged"))
     contact = force_balance_of(problem, FitState.of(found), covariance, keep)
-    speed, trend = _seen(problem, contact, keep)
-    seen = {job.dataset.logs[k].surface for k in fitted.tolist()}
-    rows = tuple(k for k, name in enumerate(contact.robot.surfaces.labels) if name in seen)
-    return SlipidFit(contact, job, rows, speed, trend, float(seconds), bool(converged))
+    robot, w = contact.robot, problem.windows.segments(np.flatnonzero(keep > 0))
+    names = {job.dataset.logs[k].surface for k in training.tolist()}
+    return SlipidFit(
+        contact=contact,
+        job=job,
+        floors=tuple(k for k, name in enumerate(robot.surfaces.labels) if name in names),
+        highest_speed=float(np.abs(w.turn / w.dt[..., None]).max()),
+        trend=current_trend(robot, lk.batch(w, robot)) if w.has_current else (0.0, 0.0),
+        seconds=float(seconds),
+        converged=bool(converged),
+    )
 
 
-def _seen(
-    problem: Problem, contact: ForceBalance, keep: Float[np.ndarray, " piece"]
-) -> tuple[float, tuple[float, float]]:
-    """Highest wheel speed [rad/s] and trend of currents in the pieces that count."""
-    w = problem.windows.segments(np.flatnonzero(keep > 0))
-    speed = float(np.abs(w.turn / w.dt[..., None]).max())
-    if not w.has_current:
-        return speed, (0.0, 0.0)
-    return speed, current_trend(contact.robot, lk.batch(w, contact.robot))
-
-
-def forecast(own: SlipidFit, cut: RunBatch, spec: RobotSpec) -> list[PredictedRun]:
-    """What the force balance says of runs whose floors it is told, with the electric power."""
-    w = cut.windows
-    tracks, cov = own.contact.ends(w)
-    robot = own.contact.robot
+def forecast(fit: SlipidFit, batch: RunBatch, spec: RobotSpec) -> list[PredictedRun]:
+    """Return the force balance's predictions of runs on known floors, with electric power."""
+    w = batch.windows
+    tracks, cov = fit.contact.ends(w)
+    robot = fit.contact.robot
     paths = body_poses(robot, w, tracks.predicted)
-    power = _power(own, w, spec) if own.job.dataset.current is not None else None
+    power = _power(fit, w, spec) if fit.job.dataset.current is not None else None
     return [
         PredictedRun(
             path=relative_to_start(paths[k]),
@@ -133,13 +129,13 @@ def forecast(own: SlipidFit, cut: RunBatch, spec: RobotSpec) -> list[PredictedRu
             freedom=DEGREES,
             power=None if power is None else power[k],
         )
-        for k in range(len(cut.runs))
+        for k in range(len(batch.runs))
     ]
 
 
-def _power(own: SlipidFit, w: Any, spec: RobotSpec) -> np.ndarray:
-    """Electric power of all motors by the currents that the force balance predicts [W]."""
-    robot = own.contact.robot
+def _power(fit: SlipidFit, w: Any, spec: RobotSpec) -> np.ndarray:
+    """Return the electric power of all motors by the predicted currents [W]."""
+    robot = fit.contact.robot
     b = lk.batch(w, robot)
     amps = np.abs(np.asarray(_currents(robot, b)))
     shaft = np.abs(spec.gear_ratio * w.turn / w.dt[..., None])
@@ -153,68 +149,62 @@ def _currents(robot: Any, b: lk.Batch) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class FloorKnowledge:
-    """What an estimator knows of where it drives.
+    """Knowledge of an estimator about the floors of its runs.
 
     Attributes:
-        told: whether the floor of each run is told: then it is the only one there is.
-        strange: whether there may be floors on which nobody drove.
-        map: of the floors; the estimator then starts at the first pose of the body, in its frame.
+        floor_known: the floor of each run is given; it is then the estimator's only floor.
+        unseen_floors: there may be floors without training runs.
+        map: map of the floors; the estimator then starts at the first pose of the body in it.
     """
 
-    told: bool = False
-    strange: bool = False
+    floor_known: bool = False
+    unseen_floors: bool = False
     map: FloorMap | None = None
 
 
 def estimator_runs(
-    own: SlipidFit, cuts: Sequence[RunBatch], data: Runs, place: FloorKnowledge
+    fit: SlipidFit, batches: Sequence[RunBatch], data: Runs, floors: FloorKnowledge
 ) -> list[PredictedRun]:
-    """What the estimator says of runs, in the order of the cuts, which are of these data.
+    """Return the estimator's predictions of runs of some data, in the order of the batches.
 
-    It hears currents only if it was fitted to some.
+    It uses currents only if it was fitted to currents.
     """
-    runs = [(run, cut.numbers[k]) for cut in cuts for k, run in enumerate(cut.runs)]
+    runs = [run for batch in batches for run in batch.runs]
+    logs = [data.logs[k] for batch in batches for k in batch.numbers]
     out: dict[int, PredictedRun] = {}
-    alone = {
-        n: data.logs[number].surface if place.told else None for n, (_, number) in enumerate(runs)
-    }
-    kinds = [(data.logs[number].load, alone[n]) for n, (_, number) in enumerate(runs)]
+    kinds = [(log.load, log.surface if floors.floor_known else None) for log in logs]
     for load, only in dict.fromkeys(kinds):
         mine = [n for n, kind in enumerate(kinds) if kind == (load, only)]
-        estimator = _estimator(own, load, only, place, runs[mine[0]][0].floor == "unknown")
-        heard = [runs[n][0].signals for n in mine]
-        if own.job.dataset.current is None:
-            heard = [replace(one, current=None) for one in heard]
-        said = replay(estimator, heard, _starts(runs, mine, place.map))
-        out.update(zip(mine, said, strict=True))
+        estimator = _estimator(fit, load, only, floors, runs[mine[0]].floor == "unknown")
+        signals = [runs[n].signals for n in mine]
+        if fit.job.dataset.current is None:
+            signals = [replace(one, current=None) for one in signals]
+        start = np.zeros((len(mine), 3))
+        if floors.map is not None:
+            start = np.stack([runs[n].pose[0] for n in mine])
+        out.update(zip(mine, replay(estimator, signals, start), strict=True))
     return [out[n] for n in range(len(runs))]
 
 
 def _estimator(
-    own: SlipidFit, load: str, only: str | None, place: FloorKnowledge, several: bool
+    fit: SlipidFit, load: str, only: str | None, floors: FloorKnowledge, several: bool
 ) -> Estimator:
-    """The estimator of a fit, for all floors that were fitted, or only one."""
-    whole = own.deployed
-    # a floor that nobody has seen has no numbers
-    rows = own.seen if only is None else (whole.labels.index(only),)
+    """Return the estimator of a fit for all fitted floors, or for only one."""
+    whole = fit.deployed
+    # floors without training runs have no parameters
+    rows = fit.floors if only is None else (whole.labels.index(only),)
     robot = DeployedRobot.of(whole.record.on(rows), load)
-    if place.strange:
+    if floors.unseen_floors:
         robot = robot.with_unseen()
     settings = Settings.of(robot)
-    if several or place.map is not None:
+    if several or floors.map is not None:
         settings = replace(settings, further_floor_penalty=MIXED_FLOORS_PENALTY)
-    known = None if place.map is None else floor_of(place.map, robot.labels)
+    known = None if floors.map is None else floor_of(floors.map, robot.labels)
     return Estimator(robot, settings, known)
 
 
-def _starts(runs: Sequence[Any], mine: Sequence[int], floor: FloorMap | None) -> np.ndarray:
-    if floor is None:
-        return np.zeros((len(mine), 3))
-    return np.stack([runs[n][0].pose[0] for n in mine])
-
-
 class _ReplayRows(eqx.Module):
-    """What an estimator hears, row by row of every run; NaN where there is nothing."""
+    """Inputs of an estimator, row by row of every run; NaN where a channel has no value."""
 
     angle: Float[Array, "run row drive"]
     current: Float[Array, "run row drive"]
@@ -223,17 +213,17 @@ class _ReplayRows(eqx.Module):
 
 
 @eqx.filter_jit
-def _driven(
+def _replayed(
     estimator: Estimator, start: Float[Array, "run 3"], rows: _ReplayRows
 ) -> tuple[Array, Array, Array]:
-    """Poses, covariances of the place and probabilities of floors under the robot, row by row."""
+    """Return poses, covariances of the place and floor probabilities under the robot, by row."""
     nothing = Readings.nothing(estimator.robot.drives)
 
     def step(state: Any, row: _ReplayRows) -> Any:
         z = replace(nothing, wheel_angle=row.angle, current=row.current, gyro=row.gyro)
-        state, seen = estimator.step(state, z, row.dt)
-        floors = jnp.mean(seen.surface_probability, axis=0)
-        return state, (seen.pose, seen.covariance[:2, :2], floors)
+        state, estimate = estimator.step(state, z, row.dt)
+        floors = jnp.mean(estimate.surface_probability, axis=0)
+        return state, (estimate.pose, estimate.covariance[:2, :2], floors)
 
     def one(pose: Array, of_run: _ReplayRows) -> Any:
         return jax.lax.scan(step, estimator.init(pose), of_run)[1]
@@ -244,23 +234,21 @@ def _driven(
 def replay(
     estimator: Estimator, runs: Sequence[RunSignals], start: np.ndarray
 ) -> list[PredictedRun]:
-    """Estimates of runs from their signals, from poses (run, 3) on.
+    """Return the estimates of runs from their signals, from start poses (run, 3).
 
-    The first row is the wheels' first angle, in which no time passes. Steps longer than `LONGEST_S`
-    are driven in equal parts.
+    The first row is the wheels' first angle, with no time before it. Steps longer than `LONGEST_S`
+    are split into equal parts.
     """
     parts = [np.ceil(run.dt / LONGEST_S - 1e-9).astype(int).clip(1) for run in runs]
     longest = max(int(part.sum()) for part in parts)
     longest = -(-longest // STEPS) * STEPS + 1
-    drives = estimator.robot.drives
+    shape, labels = (TOGETHER, longest), estimator.robot.labels
     known = [k for k, unseen in enumerate(estimator.robot.unseen) if not unseen]
     out: list[PredictedRun] = []
     for first in range(0, len(runs), TOGETHER):
         some = range(first, min(first + TOGETHER, len(runs)))
-        angle = np.full((TOGETHER, longest, drives), np.nan)
-        current = np.full((TOGETHER, longest, drives), np.nan)
-        gyro, dt = np.full((TOGETHER, longest), np.nan), np.zeros((TOGETHER, longest))
-        begin = np.zeros((TOGETHER, 3))
+        angle, current = np.full((2, *shape, estimator.robot.drives), np.nan)
+        gyro, dt, begin = np.full(shape, np.nan), np.zeros(shape), np.zeros((TOGETHER, 3))
         begin[: len(some)] = start[first : first + TOGETHER]
         for n, k in enumerate(some):
             run, part = runs[k], parts[k]
@@ -272,22 +260,22 @@ def replay(
                 current[n, rows] = np.repeat(run.current, part, axis=0)
             if run.gyro is not None:
                 gyro[n, rows] = np.repeat(run.gyro, part)
-        heard = _ReplayRows(*(jnp.asarray(x) for x in (angle, current, gyro, dt)))
-        pose, cov, floors = (np.asarray(x) for x in _driven(estimator, jnp.asarray(begin), heard))
+        inputs = _ReplayRows(*(jnp.asarray(x) for x in (angle, current, gyro, dt)))
+        pose, cov, floors = map(np.asarray, _replayed(estimator, jnp.asarray(begin), inputs))
         for n, k in enumerate(some):
             ends = np.cumsum(parts[k])
             path = np.concatenate([begin[n][None], pose[n, ends]])
-            under = {estimator.robot.labels[row]: floors[n, ends, row] for row in known}
-            said = PredictedRun(
+            under = {labels[row]: floors[n, ends, row] for row in known}
+            predicted = PredictedRun(
                 path=relative_to_start(path),
                 end_covariance=turned_covariance(cov[n, ends[-1]], -float(begin[n, 2])),
                 floors=under | {NO_FLOOR: 1.0 - sum(under.values())},
             )
-            out.append(said)
+            out.append(predicted)
     return out
 
 
 def turned_covariance(cov: Float[np.ndarray, "2 2"], angle: float) -> Float[np.ndarray, "2 2"]:
-    """Covariance of a plane vector that was turned by an angle [rad]."""
+    """Return the covariance of a plane vector after a turn by an angle [rad]."""
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return turn @ cov @ turn.T

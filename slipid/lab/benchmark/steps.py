@@ -1,5 +1,6 @@
-"""Runs in short steps with true body poses, as every method of the benchmark is given them."""
+"""Runs in short steps with true body poses, the input of every method of the benchmark."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -11,21 +12,21 @@ from slipid.data.runs import Runs
 from slipid.data.wheel_signals import integral, interpolate
 from slipid.data.windows import Windows
 from slipid.model.robot import Robot
-from slipid.predict import open_loop as replay
+from slipid.predict import open_loop
 from slipid.predict.slip_model import Run, RunSignals, turned
 
 POSES_PER_STEP = 3
-"""Poses in each step, where there are enough: a step is hardly shorter than the noise of two."""
+"""Poses in each step, if there are enough: the noise of two poses is nearly as long as a step."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunBatch:
-    """Some runs in equally many steps.
+    """Some runs with the same number of steps.
 
     Attributes:
-        numbers: of the runs in their data set.
-        runs: as methods are given them, floors not told.
-        windows: of the same runs; the last pieces may be repeated.
+        numbers: index of each run in its data set.
+        runs: the runs, with floors unknown to methods.
+        windows: windows of the same runs; the last segments may be repeated.
     """
 
     numbers: tuple[int, ...]
@@ -34,34 +35,40 @@ class RunBatch:
 
 
 def run_batches(data: Runs, robot: Robot, poses_per_step: int = POSES_PER_STEP) -> list[RunBatch]:
-    """All runs in steps, from where the wheels have moved a centimetre to the last pose.
+    """Return all runs in steps, from one centimetre of wheel motion to the last pose.
 
-    The robot's camera says how true poses follow from logged ones, and how late they are. Nearly
-    all runs have the same number of steps, so that few shapes are compiled; it is a power of two.
+    The robot's camera model turns logged poses into true ones, and has their lag. Nearly all runs
+    have the same number of steps, a power of two, so that few shapes are compiled.
     """
     poses = [int(data.fresh[data.rows(k)].sum()) for k in range(len(data))]
-    usual = _steps(float(np.quantile(poses, 0.1)), poses_per_step)
-    steps = [min(usual, _steps(float(count), poses_per_step)) for count in poses]
-    return [_cut(data, robot, w) for w in replay.whole_runs(data, robot, steps)]
+    usual = _step_count(float(np.quantile(poses, 0.1)), poses_per_step)
+    steps = [min(usual, _step_count(float(count), poses_per_step)) for count in poses]
+    return [_batch(data, robot, w) for w in open_loop.whole_runs(data, robot, steps)]
 
 
-def _steps(poses: float, poses_per_step: int) -> int:
-    """Number of steps that so many poses allow."""
+def in_order(batches: Sequence[RunBatch]) -> list[Run]:
+    """Return the runs of all batches in the order of their data set."""
+    runs = {k: run for one in batches for k, run in zip(one.numbers, one.runs, strict=True)}
+    return [runs[k] for k in sorted(runs)]
+
+
+def _step_count(poses: float, poses_per_step: int) -> int:
+    """Return the number of steps that so many poses allow."""
     return 2 ** max(1, int(np.floor(np.log2(max(0.8 * poses / poses_per_step, 2.0)))))
 
 
-def _cut(data: Runs, robot: Robot, w: Windows) -> RunBatch:
+def _batch(data: Runs, robot: Robot, w: Windows) -> RunBatch:
     numbers = tuple(dict.fromkeys(w.run.tolist()))
-    pose = body_poses(robot, w, np.asarray(replay.corrected(robot, jnp.asarray(w.pose))))
+    pose = body_poses(robot, w, np.asarray(open_loop.corrected(robot, jnp.asarray(w.pose))))
     runs = []
-    for piece, k in enumerate(numbers):
+    for n, k in enumerate(numbers):
         log = data.logs[k]
-        edges = w.start[piece] + np.concatenate([[0.0], np.cumsum(w.dt[piece])]) - w.lag
+        edges = w.start[n] + np.concatenate([[0.0], np.cumsum(w.dt[n])]) - w.lag
         signals = RunSignals(
             name=log.name,
-            dt=w.dt[piece],
-            turn=w.turn[piece],
-            current=w.current[piece] if w.has_current else None,
+            dt=w.dt[n],
+            turn=w.turn[n],
+            current=w.current[n] if w.has_current else None,
             current_is_signed=w.current_is_signed,
             load=log.load,
             gyro=None if log.gyro is None else _mean(log, log.gyro[:, None], edges)[:, 0],
@@ -69,8 +76,8 @@ def _cut(data: Runs, robot: Robot, w: Windows) -> RunBatch:
         )
         run = Run(
             signals=signals,
-            pose=pose[piece],
-            floor=w.surface[piece],
+            pose=pose[n],
+            floor=w.surface[n],
             load=log.load,
             heading=float(data.heading[k]),
             speed=float(data.speed[k]),
@@ -82,16 +89,16 @@ def _cut(data: Runs, robot: Robot, w: Windows) -> RunBatch:
 def _mean(
     log: Log, x: Float[np.ndarray, "row column"], edges: Float[np.ndarray, " edge"]
 ) -> Float[np.ndarray, "step column"]:
-    """Mean over time between edges [s]."""
+    """Return the mean over time between edges [s]."""
     inside = np.clip(edges, log.time[0], log.time[-1])
     total = np.diff(interpolate(log.time, integral(log.time, x), inside), axis=0)
     return np.asarray(total / np.maximum(np.diff(inside), 1e-9)[:, None])
 
 
 def body_poses(
-    robot: Robot, w: Windows, marker: Float[np.ndarray, "piece edge 3"]
-) -> Float[np.ndarray, "piece edge 3"]:
-    """Poses of the body from those of its marker in corrected metres."""
+    robot: Robot, w: Windows, marker: Float[np.ndarray, "segment edge 3"]
+) -> Float[np.ndarray, "segment edge 3"]:
+    """Return poses of the body from those of its marker in true metres."""
     yaws = {s: float(robot.camera.yaw(robot.session_index(s))) for s in set(w.session)}
     out = marker.copy()
     out[..., 2] -= np.array([yaws[s] for s in w.session])[:, None]

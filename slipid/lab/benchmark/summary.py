@@ -1,4 +1,7 @@
-"""Folds put together: means over runs, intervals by resampling, and differences run by run."""
+"""Summaries of all folds: means over runs, intervals by resampling, differences run by run.
+
+`reading` says in sentences where slipid is ahead, where it is not, and by how much.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,12 +11,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from slipid.lab.benchmark.scores import FoldScore, RunScore
+from slipid.lab.benchmark.slipid_rows import NAME
 
+NAMED = 4
+"""Largest number of rows that a sentence names."""
 DRAWS = 1000
-"""Of the bootstrap."""
+"""Number of draws of the bootstrap."""
 INTERVAL = (0.05, 0.95)
 FEW = 2
-"""Clusters on a floor below which its runs are resampled one by one."""
+"""Number of clusters on a floor below which its runs are resampled one by one."""
 Weights = Float[np.ndarray, "draw run"]
 
 
@@ -27,21 +33,26 @@ class MeanInterval(NamedTuple):
 
 @dataclass(frozen=True)
 class RowSummary:
-    """A row in one protocol of one data set; attributes as of `RunScore` where they are its means.
+    """Row of a method in one protocol of one data set.
 
-    Means are over the runs of each floor, then over floors. What a method does not say is None.
+    Attributes that are not listed are means of those of `RunScore`, over the runs of each floor and
+    then over floors; None if the method does not predict them.
 
     Attributes:
         floors: mean end-point error of each floor, with its load set-up.
-        behind: end-point error less that of slipid, the same runs resampled in both; None of
-            slipid itself, and where it is not there.
+        behind: end-point error less that of slipid on the same resampled runs; None for slipid
+            itself, and without slipid.
         slip_auc: area under the receiver operating characteristic of slip detection, by windows;
-            None where robots always or never slip.
-        runs: how many.
-        numbers, tune_s, fit_s, step_us: median over folds.
-        settings: that were picked in each fold.
-        unconverged: folds in which a fit in rounds did not come to rest.
-        absent: why there are no runs, see `FoldScore`.
+            None if all windows slip, or none.
+        runs: number of runs.
+        numbers: number of fitted parameters, median over folds.
+        tune_s: time to pick the settings, median over folds [s].
+        fit_s: time of one fit, median over folds [s].
+        step_us: time to predict one step of one run, median over folds [microseconds].
+        settings: settings picked in each fold.
+        unconverged: number of folds whose fit did not converge.
+        absent: reason why there are no runs, see `FoldScore`.
+        failed: the reason is an error.
     """
 
     endpoint_error: MeanInterval | None = None
@@ -66,12 +77,14 @@ class RowSummary:
 
 
 def summary(folds: Mapping[str, Sequence[FoldScore]], reference: str) -> dict[str, RowSummary]:
-    """Every row by its folds; the reference is the row that the others are compared with.
+    """Return the summary of every row by its folds, compared with the reference row.
 
-    A row that is absent in some fold is absent altogether: its runs would be others.
+    A row that is absent in some fold is absent altogether: its runs would differ.
     """
-    there = {name: each for name, each in folds.items() if each and not any(r.absent for r in each)}
-    done = {name: [run for row in each for run in row.runs] for name, each in there.items()}
+    present = {
+        name: each for name, each in folds.items() if each and not any(r.absent for r in each)
+    }
+    done = {name: [run for row in each for run in row.runs] for name, each in present.items()}
     out: dict[str, RowSummary] = {}
     first = next(iter(done.values()), [])
     if first:
@@ -80,21 +93,22 @@ def summary(folds: Mapping[str, Sequence[FoldScore]], reference: str) -> dict[st
         for name, runs in done.items():
             assert [run.name for run in runs] == [run.name for run in first]
             rival = None if name == reference else base
-            out[name] = _summary(there[name], runs, rival, weights)
+            out[name] = _summary(present[name], runs, rival, weights)
     for name, each in folds.items():
         if name not in out:
-            said = next((row for row in each if row.absent), FoldScore(absent="no run"))
-            out[name] = RowSummary(absent=said.absent, failed=any(row.failed for row in each))
+            why = next((row.absent for row in each if row.absent), "no run")
+            out[name] = RowSummary(absent=why, failed=any(row.failed for row in each))
     return {name: out[name] for name in folds}
 
 
 @dataclass(frozen=True, eq=False)
 class Bootstrap:
-    """Runs resampled with replacement, whole clusters of a floor at a time if there are enough.
+    """Runs resampled with replacement, in whole clusters of a floor if there are enough.
 
     Attributes:
-        floor: number of the floor of each run; names: of the floors.
-        draws: how often each run counts in each draw; the first draw is the runs as they are.
+        floor: index of the floor of each run.
+        names: names of the floors.
+        draws: weight of each run in each draw; the first draw is the runs as they are.
     """
 
     floor: Int[np.ndarray, " run"]
@@ -103,14 +117,14 @@ class Bootstrap:
 
     @classmethod
     def of(cls, runs: Sequence[RunScore]) -> "Bootstrap":
-        """Runs by their clusters; a run whose cluster is negative is one by itself."""
+        """Return draws of runs by clusters; a run with a negative cluster is its own cluster."""
         sector = np.array([run.cluster for run in runs])
         alone = -1 - np.arange(len(runs))
         return cls.by([run.floor for run in runs], np.where(sector < 0, alone, sector))
 
     @classmethod
     def by(cls, floors: Sequence[str], cluster: np.ndarray) -> "Bootstrap":
-        """Whatever is on these floors and in these clusters, one of each."""
+        """Return draws of items on these floors and in these clusters."""
         names = tuple(dict.fromkeys(floors))
         floor = np.array([names.index(name) for name in floors])
         rng = np.random.default_rng(0)
@@ -118,22 +132,22 @@ class Bootstrap:
         for k in range(len(names)):
             mine = np.flatnonzero(floor == k)
             kinds, of = np.unique(cluster[mine], return_inverse=True)
-            if len(kinds) < FEW:  # clusters too few to say how they scatter
+            if len(kinds) < FEW:  # too few clusters to estimate their scatter
                 kinds, of = mine, np.arange(len(mine))
             picked = rng.multinomial(len(kinds), np.full(len(kinds), 1 / len(kinds)), DRAWS)
             draws[1:, mine] = picked[:, of]
         return cls(floor, names, draws)
 
     def mean(self, x: Float[np.ndarray, " run"]) -> Float[np.ndarray, " draw"]:
-        """Mean over floors of means over runs, in every draw; runs that are nan do not count."""
+        """Return the mean over floors of means over runs, in every draw, without NaN."""
         return np.nanmean([self.on(x, k) for k in range(len(self.names))], axis=0)
 
     def over_all(self, x: Float[np.ndarray, " run"]) -> Float[np.ndarray, " draw"]:
-        """Mean over all runs, whatever their floor, in every draw."""
+        """Return the mean over all runs, whatever their floor, in every draw."""
         return np.asarray(self.draws @ x / np.maximum(self.draws.sum(axis=1), 1e-12))
 
     def on(self, x: Float[np.ndarray, " run"], floor: int) -> Float[np.ndarray, " draw"]:
-        """Mean over the runs on a floor, in every draw."""
+        """Return the mean over the runs on a floor, in every draw."""
         mine = (self.floor == floor) & np.isfinite(x)
         w = self.draws[:, mine]
         total = w.sum(axis=1)
@@ -141,7 +155,7 @@ class Bootstrap:
 
 
 def mean_interval(draws: Float[np.ndarray, " draw"]) -> MeanInterval:
-    """The first draw, and the interval that the others span."""
+    """Return the first draw with the interval of the others."""
     low, high = np.nanquantile(draws[1:], INTERVAL)
     return MeanInterval(float(draws[0]), float(low), float(high))
 
@@ -186,7 +200,7 @@ def _summary(
 
 
 def _auc(runs: Sequence[RunScore], by: Bootstrap) -> MeanInterval | None:
-    """Area under the curve of slip detection over all windows, in a part of the draws."""
+    """Return the area under the curve of slip detection over all windows, in some of the draws."""
     score = np.concatenate([run.scores for run in runs])
     slips = np.concatenate([np.asarray(run.slips, bool) for run in runs])
     if slips.all() or not slips.any():
@@ -201,10 +215,61 @@ def area(
     positive: Bool[np.ndarray, " window"],
     weight: Float[np.ndarray, " window"],
 ) -> float:
-    """Weighted probability that a positive has a higher score than a negative; ties count half."""
+    """Return the weighted probability of a higher score of positives; ties count half."""
     values, at = np.unique(score, return_inverse=True)
     up = np.bincount(at, weight * positive, len(values))
     down = np.bincount(at, weight * ~positive, len(values))
     both = up.sum() * down.sum()
     below = np.cumsum(down) - down
     return float(up @ (below + 0.5 * down) / both) if both > 0 else float("nan")
+
+
+def reading(tables: Mapping[str, Mapping[str, Mapping[str, RowSummary]]]) -> list[str]:
+    """Return a sentence for each protocol of each data set."""
+    return [
+        sentence(name, protocol, found)
+        for name, protocols in tables.items()
+        for protocol, found in protocols.items()
+    ]
+
+
+def sentence(name: str, protocol: str, found: Mapping[str, RowSummary]) -> str:
+    """Return the comparison of slipid's end-point error with the others' in one table."""
+    head = f"{name}, {protocol.replace('_', ' ')}: "
+    slipid = found.get(NAME)
+    if slipid is None or slipid.endpoint_error is None:
+        why = "not requested" if slipid is None else slipid.absent
+        return f"{head}slipid has no row ({why})"
+    mine = _percent(slipid.endpoint_error)
+    errors = {
+        row: s.endpoint_error
+        for row, s in found.items()
+        if s.endpoint_error is not None and not row.startswith(NAME)
+    }
+    if not errors:
+        return f"{head}slipid errs by {mine}; nothing to compare it with"
+    order = sorted(errors, key=lambda row: errors[row].value)
+    behind = {row: b for row in order if (b := found[row].behind) is not None}
+    ahead = [row for row, b in behind.items() if b.high < 0]
+    if ahead:
+        also = f" (and {len(ahead) - 1} more)" if len(ahead) > 1 else ""
+        return (
+            f"{head}{ahead[0]}{also} is ahead of slipid: {_percent(errors[ahead[0]])} against "
+            f"{mine}, {_points(behind[ahead[0]])}"
+        )
+    best = order[0]
+    text = f"{head}slipid errs by {mine}, the best other row, {best}, by {_percent(errors[best])}"
+    tied = [row for row, b in behind.items() if b.low <= 0 <= b.high]
+    if tied:
+        more = f" and {len(tied) - NAMED} more" if len(tied) > NAMED else ""
+        return f"{text}; not told apart from {', '.join(tied[:NAMED])}{more}"
+    return f"{text}, {_points(behind[best])}" if best in behind else text
+
+
+def _percent(x: MeanInterval) -> str:
+    return f"{100 * x.value:.1f} %"
+
+
+def _points(x: MeanInterval) -> str:
+    """Return a difference in points of percent, with its interval."""
+    return f"{100 * x.value:+.1f} points [{100 * x.low:+.1f}, {100 * x.high:+.1f}]"

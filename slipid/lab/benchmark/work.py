@@ -1,8 +1,8 @@
-"""One split of one data set: slipid and every row fitted to its runs, and judged on the others."""
+"""Tasks of the benchmark: slipid and every row fitted and scored in one fold of one data set."""
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -13,9 +13,9 @@ from slipid.fit.problem import Problem
 from slipid.lab.benchmark import slipid_rows
 from slipid.lab.benchmark.protocols import PROTOCOLS, BenchmarkProtocol, Split, base_of, splits
 from slipid.lab.benchmark.rows import rows
-from slipid.lab.benchmark.scores import FoldScore, RunScore, scored
+from slipid.lab.benchmark.scores import FoldScore, scored
 from slipid.lab.benchmark.sets import SOURCES, DataSet, LogSource, read_set
-from slipid.lab.benchmark.steps import RunBatch, run_batches
+from slipid.lab.benchmark.steps import RunBatch, in_order, run_batches
 from slipid.lab.benchmark.tuning import tuned
 from slipid.lab.systems.motion.features import common
 from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, SlipModel
@@ -26,7 +26,7 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 OWN_MAP = "slipid_map"
-"""slipid's estimator, told the map of the floors."""
+"""Row of slipid's estimator with the map of the floors."""
 
 
 OF_FITS = (
@@ -35,22 +35,22 @@ OF_FITS = (
 )
 """Packages and modules that slipid's fits depend on."""
 OF_ROWS = ("lab/systems", "lab/paper2021", "lab/benchmark", "robot", "deploy")
-"""Packages that all rows depend on beside these."""
+"""Packages that all rows depend on besides these."""
 QUICK_RUNS = 60
-"""Runs of each data set, where a part is enough."""
+"""Number of runs of each data set in a quick benchmark."""
 QUICK_KIND = "headings"
-"""The kind of split that is asked for then."""
+"""Kind of split in a quick benchmark."""
 
 
 @dataclass(frozen=True)
 class BenchmarkOptions:
-    """What is asked of a benchmark.
+    """Options of a benchmark.
 
     Attributes:
         data: folder of the data sets.
         out: folder to write to.
-        only: names of rows; all where there are none.
-        quick: whether a part is enough: some runs, one fold of headings, floors that are told.
+        only: names of the requested rows; all if empty.
+        quick: some of the runs, one fold of headings, and known floors only.
     """
 
     data: Path
@@ -61,9 +61,16 @@ class BenchmarkOptions:
 
 @dataclass(frozen=True)
 class FoldTask:
-    """One split of one data set."""
+    """One fold of one data set.
 
-    wish: BenchmarkOptions
+    Attributes:
+        options: options of the benchmark.
+        source: name of the data set.
+        kind: kind of split.
+        fold: index of the fold.
+    """
+
+    options: BenchmarkOptions
     source: str
     kind: str
     fold: int
@@ -73,238 +80,217 @@ class FoldTask:
         return f"{self.source}/{self.kind}_{self.fold}"
 
     def run(self) -> str:
-        """Fit and judge whatever is not kept yet; its name."""
+        """Fit and score all rows that are not kept yet, and return the task's name."""
         setup_jax(quiet=True)
-        kept = kept_of(self, fit=False)
+        kept = checkpoint_of(self, fit=False)
         missing = [key for key in keys_of(self) if not _is_done(kept.load_json("_".join(key)))]
         if missing:
             try:
-                scene: FoldData | FoldScore = _scene(self)
-            except Exception as error:  # other pieces are done all the same
-                scene = FoldScore.of_error(error)
+                data: FoldData | FoldScore = _fold_data(self)
+            except Exception as error:  # other tasks are done all the same
+                data = FoldScore.of_error(error)
             for protocol, name in missing:
-                row = scene if isinstance(scene, FoldScore) else _row(scene, protocol, name)
-                kept.save_json("_".join((protocol, name)), row.to_json())
+                score = data if isinstance(data, FoldScore) else _score(data, protocol, name)
+                kept.save_json("_".join((protocol, name)), asdict(score))
         return self.name
 
     def rows(self) -> dict[tuple[str, str], FoldScore]:
-        """What is kept of it, by protocol and row."""
-        kept = kept_of(self, fit=False)
+        """Return the kept scores by protocol and row."""
+        kept = checkpoint_of(self, fit=False)
         found = {key: kept.load_json("_".join(key)) for key in keys_of(self)}
-        return {
-            key: FoldScore.of_json(content) for key, content in found.items() if content is not None
-        }
+        return {key: FoldScore.of_json(one) for key, one in found.items() if one is not None}
 
 
 def _is_done(content: Content | None) -> bool:
-    """Whether a row is kept; one that failed is tried again."""
+    """Return True if a row is kept; a failed one is tried again."""
     return content is not None and not content["failed"]
 
 
 def source_of(name: str) -> LogSource:
-    """A source by its name."""
+    """Return a source by its name."""
     return next(source for source in SOURCES if source.name == name)
 
 
 @lru_cache(maxsize=8)
-def data_of(wish: BenchmarkOptions, source: str) -> DataSet:
-    """Runs of a source, read once in every process."""
-    found = read_set(source_of(source), wish.data, wish.out, Reporter(quiet=True))
-    return found.thinned(QUICK_RUNS) if wish.quick else found
+def data_of(options: BenchmarkOptions, source: str) -> DataSet:
+    """Return the runs of a source, read once in every process."""
+    found = read_set(source_of(source), options.data, options.out, Reporter(quiet=True))
+    return found.thinned(QUICK_RUNS) if options.quick else found
 
 
 @lru_cache(maxsize=8)
-def problem_of(wish: BenchmarkOptions, source: str) -> Problem:
-    """Fitting problem of all runs of a source, made and compiled once in every process."""
-    return data_of(wish, source).job.problem()
+def problem_of(options: BenchmarkOptions, source: str) -> Problem:
+    """Return the fitting problem of all runs of a source, made once in every process."""
+    return data_of(options, source).job.problem()
 
 
-def split_of(piece: FoldTask) -> Split:
-    """The fold of a piece."""
-    found = splits(data_of(piece.wish, piece.source).facts, piece.kind)
-    return next(split for split in found if split.fold == piece.fold)
+def split_of(task: FoldTask) -> Split:
+    """Return the fold of a task."""
+    found = splits(data_of(task.options, task.source).facts, task.kind)
+    return next(split for split in found if split.fold == task.fold)
 
 
-def kept_of(piece: FoldTask, fit: bool) -> Checkpoint:
-    """Where the parts of a piece are kept: its fit, or what rows say."""
-    data = data_of(piece.wish, piece.source)
+def checkpoint_of(task: FoldTask, fit: bool) -> Checkpoint:
+    """Return the checkpoint of slipid's fit in a task, or of its scores."""
+    data = data_of(task.options, task.source)
     more = () if fit else (data.crossing_hash, source_hash(*OF_ROWS))
-    split = split_of(piece)
+    split = split_of(task)
     marks = data.job.config.hash, data.job.data_hash, source_hash(*OF_FITS)
-    key = key_of(*marks, split.fitted, split.judged, *more)
-    # in a folder of its own: what was kept of other work stays
-    return Checkpoint(piece.wish.out / "kept" / piece.name / key[:12], key)
+    key = key_of(*marks, split.training, split.held_out, *more)
+    # the folder depends on the key, so that results of other settings stay
+    return Checkpoint(task.options.out / "kept" / task.name / key[:12], key)
 
 
-def keys_of(piece: FoldTask) -> list[tuple[str, str]]:
-    """Protocols and rows that a piece is asked for, slipid's own rows first.
+def keys_of(task: FoldTask) -> list[tuple[str, str]]:
+    """Return the protocols and rows of a task, slipid's own rows first.
 
-    Where there is one floor only, there is nothing to be found out about it.
+    Protocols with unknown floors need more than one floor.
     """
-    wish, data, split = piece.wish, data_of(piece.wish, piece.source), split_of(piece)
+    options, data, split = task.options, data_of(task.options, task.source), split_of(task)
     own = [slipid_rows.NAME] + ([OWN_MAP] if split.kind == "all" else [])
     every = own + [method.name for method in rows(data.spec)]
-    wanted = [name for name in every if not wish.only or name in wish.only]
-    several = len({base_of(f.floor) for f in data.facts}) > 1
-    asked = [p for p in split.protocols if PROTOCOLS[p].told or (several and not wish.quick)]
-    return [(protocol, name) for protocol in asked for name in wanted]
+    names = [name for name in every if not options.only or name in options.only]
+    several = len({base_of(f.floor) for f in data.facts}) > 1 and not options.quick
+    protocols = [p for p in split.protocols if PROTOCOLS[p].floor_known or several]
+    return [(protocol, name) for protocol in protocols for name in names]
 
 
 @dataclass(frozen=True, eq=False)
 class FoldData:
-    """All that rows of one split have in common.
+    """Runs and slipid's fit that all rows of one fold share.
 
     Attributes:
-        data, split: runs, and which of them are fitted and judged.
-        own: slipid's fit, or why there is none.
-        fitted: training runs; cuts: of the runs that are judged; runs: the same, as a list.
-        judged: the data set that the cuts are of.
+        data: the data set.
+        fit: slipid's fit, or the reason why there is none.
+        training: training runs, with known floors.
+        batches: held-out runs.
+        held_out: logs of the held-out runs.
     """
 
     data: DataSet
-    split: Split
-    own: slipid_rows.SlipidFit | FoldScore
-    fitted: tuple[Run, ...]
-    cuts: tuple[RunBatch, ...]
-    judged: Runs
+    fit: slipid_rows.SlipidFit | FoldScore
+    training: tuple[Run, ...]
+    batches: tuple[RunBatch, ...]
+    held_out: Runs
 
     @property
     def runs(self) -> list[Run]:
-        return [run for one in self.cuts for run in one.runs]
+        """The held-out runs."""
+        return [run for batch in self.batches for run in batch.runs]
 
 
-def _scene(piece: FoldTask) -> FoldData:
-    """Runs in the true metres of the camera that slipid fitted to the training runs.
+def _fold_data(task: FoldTask) -> FoldData:
+    """Return the runs in true metres of the camera model that slipid fitted to training runs.
 
-    Where slipid cannot be fitted, in those of the camera as the config has it.
+    If slipid cannot be fitted, the camera model is that of the config.
     """
-    data, split = data_of(piece.wish, piece.source), split_of(piece)
-    own: slipid_rows.SlipidFit | FoldScore
+    data, split = data_of(task.options, task.source), split_of(task)
+    fit: slipid_rows.SlipidFit | FoldScore
     try:
-        problem = problem_of(piece.wish, piece.source)
-        own = slipid_rows.fit_slipid(data.job, problem, split.fitted, kept_of(piece, fit=True))
-        robot = own.contact.robot
-    except Exception as error:  # other rows are judged all the same
-        own = FoldScore.of_error(error)
+        kept = checkpoint_of(task, fit=True)
+        problem = problem_of(task.options, task.source)
+        fit = slipid_rows.fit_slipid(data.job, problem, split.training, kept)
+        robot = fit.contact.robot
+    except Exception as error:  # other rows are scored all the same
+        fit = FoldScore.of_error(error)
         robot = Space(data.job.robot, data.job.choices).template
-    per_step = data.source.poses_per_step
-    judged = data.logged.subset(split.judged) if split.kind != "all" else data.crossing
-    assert judged is not None
-    fitted = _in_order(
-        run_batches(data.logged.subset(split.fitted), robot, per_step), data, split.fitted
-    )
-    cuts = tuple(run_batches(judged, robot, per_step))
+
+    def batches(numbers: np.ndarray) -> list[RunBatch]:
+        found = run_batches(data.logged.subset(numbers), robot, data.source.poses_per_step)
+        return [_with_facts(batch, data, numbers) for batch in found]
+
+    training = tuple(run.with_floor(True) for run in in_order(batches(split.training)))
     if split.kind != "all":
-        cuts = tuple(_named(one, data, split.judged) for one in cuts)
-    return FoldData(data, split, own, tuple(fitted), cuts, judged)
+        held_out = data.logged.subset(split.held_out)
+        return FoldData(data, fit, training, tuple(batches(split.held_out)), held_out)
+    assert data.crossing is not None
+    crossing = run_batches(data.crossing, robot, data.source.poses_per_step)
+    return FoldData(data, fit, training, tuple(crossing), data.crossing)
 
 
-def _named(one: RunBatch, data: DataSet, numbers: np.ndarray) -> RunBatch:
-    """The cut with what splits go by: floors with loads, commanded directions and speeds."""
-    facts = [data.facts[numbers[k]] for k in one.numbers]
+def _with_facts(batch: RunBatch, data: DataSet, numbers: np.ndarray) -> RunBatch:
+    """Return the batch with the facts of splits: floors with loads, commanded motion."""
+    facts = [data.facts[numbers[k]] for k in batch.numbers]
     runs = [
         replace(run, floor=f.floor, heading=float(np.radians(f.heading_deg)), speed=f.speed)
-        for run, f in zip(one.runs, facts, strict=True)
+        for run, f in zip(batch.runs, facts, strict=True)
     ]
-    return replace(one, runs=tuple(runs))
+    return replace(batch, runs=tuple(runs))
 
 
-def _in_order(cuts: Sequence[RunBatch], data: DataSet, numbers: np.ndarray) -> list[Run]:
-    """All runs of some cuts, floors told, in the order of the data set."""
-    found = {
-        k: run.with_floor(True)
-        for one in cuts
-        for k, run in zip(one.numbers, _named(one, data, numbers).runs, strict=True)
-    }
-    return [found[k] for k in sorted(found)]
-
-
-def _row(scene: FoldData, protocol: str, name: str) -> FoldScore:
-    """What a row is worth in a protocol, or why it is not in the table."""
-    asked = PROTOCOLS[protocol]
-    runs = [run.with_floor(asked.told) for run in scene.runs]
+def _score(data: FoldData, protocol: str, name: str) -> FoldScore:
+    """Return the score of a row in a protocol, or the reason why it is absent."""
+    rules = PROTOCOLS[protocol]
+    runs = [run.with_floor(rules.floor_known) for run in data.runs]
     try:
         if name in (slipid_rows.NAME, OWN_MAP):
-            return _own(scene, asked, runs, name)
-        method = next(m for m in rows(scene.data.spec) if m.name == name)
-        if lacks := method.needs - channels_of(runs, scene.data.spec):
+            return _slipid(data, rules, runs, name)
+        method = next(m for m in rows(data.data.spec) if m.name == name)
+        if lacks := method.needs - channels_of(runs, data.data.spec):
             return FoldScore.lacking(lacks)
-        return _published(scene, asked, runs, method)
-    except Exception as error:  # a row that fails must not stop the rest
+        return _published(data, rules, runs, method)
+    except Exception as error:  # other rows are scored all the same
         return FoldScore.of_error(error)
 
 
 def channels_of(runs: Sequence[Run], spec: RobotSpec) -> frozenset[Channel]:
-    """What all these runs have beside encoders."""
+    """Return the channels besides encoders that all runs have."""
     twist: frozenset[Channel] = frozenset({"twist"} if spec.determines_twist else ())
     return common(runs) | twist
 
 
 def _published(
-    scene: FoldData, asked: BenchmarkProtocol, runs: list[Run], method: SlipModel
+    data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], method: SlipModel
 ) -> FoldScore:
-    spec = scene.data.spec
-    fitted = [run.with_floor(asked.told) for run in scene.fitted]
+    """Return the score of a published method."""
+    spec = data.data.spec
+    training = [run.with_floor(protocol.floor_known) for run in data.training]
     began = time.perf_counter()
-    found = tuned(method, fitted, spec, asked.split)
-    chosen = time.perf_counter()
-    done = found.method.fit(fitted, spec)
+    found = tuned(method, training, spec, protocol.split)
+    picked = time.perf_counter()
+    fitted = found.method.fit(training, spec)
     ended = time.perf_counter()
-    said, each = _timed(lambda: done.predict([run.signals for run in runs], spec), runs)
-    return FoldScore(
-        runs=_judged(scene, runs, said),
+    score = _timed(data, runs, lambda: fitted.predict([run.signals for run in runs], spec))
+    return replace(
+        score,
         settings=found.settings,
         tried=found.tried,
-        numbers=done.numbers,
-        tune_s=chosen - began,
-        fit_s=ended - chosen,
-        step_us=each,
+        numbers=fitted.numbers,
+        tune_s=picked - began,
+        fit_s=ended - picked,
     )
 
 
-def _own(scene: FoldData, asked: BenchmarkProtocol, runs: list[Run], name: str) -> FoldScore:
-    own = scene.own
-    if isinstance(own, FoldScore):
-        return own
-    if name == OWN_MAP and scene.data.map is None:
+def _slipid(data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], name: str) -> FoldScore:
+    """Return the score of slipid: its estimator on unknown floors or with a gyro, else its fit."""
+    fit, known = data.fit, protocol.floor_known
+    if isinstance(fit, FoldScore):
+        return fit
+    if name == OWN_MAP and data.data.map is None:
         return FoldScore.lacking(["map"])
-
+    floor_map = data.data.map if name == OWN_MAP else None
+    floors = slipid_rows.FloorKnowledge(known, protocol.unseen_floors, floor_map)
     has_gyro = all(run.signals.gyro is not None for run in runs)
-    place = slipid_rows.FloorKnowledge(
-        asked.told, asked.strange, scene.data.map if name == OWN_MAP else None
-    )
-
-    drives = not asked.told or has_gyro
 
     def predict() -> list[PredictedRun]:
-        if drives:
-            return slipid_rows.estimator_runs(own, scene.cuts, scene.judged, place)
-        spec = scene.data.spec
-        return [said for one in scene.cuts for said in slipid_rows.forecast(own, one, spec)]
+        if not known or has_gyro:
+            return slipid_rows.estimator_runs(fit, data.batches, data.held_out, floors)
+        forecasts = [slipid_rows.forecast(fit, b, data.data.spec) for b in data.batches]
+        return [run for of_batch in forecasts for run in of_batch]
 
     predict()  # compiles
-    said, each = _timed(predict, runs)
-    return FoldScore(
-        runs=_judged(scene, runs, said),
-        numbers=own.numbers,
-        fit_s=own.seconds,
-        step_us=each,
-        converged=own.converged,
-    )
-
-
-def _judged(
-    scene: FoldData, runs: Sequence[Run], said: Sequence[PredictedRun]
-) -> tuple[RunScore, ...]:
-    spec, over = scene.data.spec, scene.data.source.over
-    return tuple(scored(run, one, spec, over) for run, one in zip(runs, said, strict=True))
+    score = _timed(data, runs, predict)
+    return replace(score, numbers=fit.numbers, fit_s=fit.seconds, converged=fit.converged)
 
 
 def _timed(
-    predict: Callable[[], list[PredictedRun]], runs: Sequence[Run]
-) -> tuple[list[PredictedRun], float]:
-    """What is predicted, and microseconds per step of it."""
+    data: FoldData, runs: Sequence[Run], predict: Callable[[], list[PredictedRun]]
+) -> FoldScore:
+    """Return the scores of predictions, and the time for one step."""
     began = time.perf_counter()
-    said = predict()
+    predicted = predict()
+    took = time.perf_counter() - began
+    spec, over = data.data.spec, data.data.source.over
+    scores = [scored(run, one, spec, over) for run, one in zip(runs, predicted, strict=True)]
     steps = sum(len(run.signals) for run in runs)
-    return said, 1e6 * (time.perf_counter() - began) / max(steps, 1)
+    return FoldScore(runs=tuple(scores), step_us=1e6 * took / max(steps, 1))

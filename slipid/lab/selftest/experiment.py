@@ -1,4 +1,4 @@
-"""What an experiment can recover: what `slipid selftest` does."""
+"""Test what an experiment can recover: the work of `slipid selftest`."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -29,25 +29,25 @@ from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.lab.selftest/1"
 CHANCE = 1e-3
-"""Probability below which errors this large, or so many intervals without the truth, are no chance.
+"""Probability below which large errors, or intervals without the truth, are not taken for chance.
 
 A number whose intervals fail this is wrong, whatever its verdict says.
 """
 LEAST_CONVERGED = 0.75
-"""Least part of the fits that must converge."""
+"""Least share of the fits that must converge."""
 ORDER = ("identified", "weak", "not_identified", "at_bound")
 
 
 def selftest(
     config_path: Path, data: Path | None, out: Path, count: int, seed: int, report: Reporter
 ) -> Content:
-    """What an experiment can recover, by making it with known truth and fitting that.
+    """Return what an experiment can recover, by simulating it with known truth and fitting that.
 
     Args:
-        data: logs of the experiment, whose wheel motion is taken; without them a plan is made.
+        data: logs of the experiment, whose wheel motion is taken; without them a plan is simulated.
         out: folder for selftest.json and the replicates, which a later call goes on from.
-        count: replicates.
-        seed: of truths and noise.
+        count: number of replicates.
+        seed: seed of truths and noise.
     """
     setup_jax(quiet=True)
     config = read_config(config_path)
@@ -75,7 +75,7 @@ def selftest(
 
 
 def planned_task(config: Config, report: Reporter) -> ConfigFitTask:
-    """Job of an experiment that nobody has driven yet: the grid of the config's `[selftest]`.
+    """Return the fit task of an experiment that nobody has driven: the grid of `[selftest]`.
 
     Channels are those that the config's layouts name; every load set-up of the config is driven on
     every floor.
@@ -106,7 +106,7 @@ def planned_task(config: Config, report: Reporter) -> ConfigFitTask:
 
 
 def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
-    """Paths that must be recovered: the config's, else what the channels promise.
+    """Return paths that must be recovered: the config's, else those the channels should identify.
 
     Raises:
         DataError: a pattern of the config matches nothing that is fitted.
@@ -116,7 +116,7 @@ def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
     paths = [e.path for e in problem.space.free] + [e.path for e in ratios]
     given = config.content.selftest.wanted
     patterns = ["surface.*.creep"]
-    if problem.robot.geometry.determines_twist:  # else runs hardly tell where the weight is
+    if problem.robot.geometry.determines_twist:  # other drives hardly show where the weight is
         patterns += ["surface.*.roller_drag", "robot.load_share@*"]
     patterns += ["surface.*.friction/motor.back_emf"] if w.has_current else []
     patterns += ["motor.resistance", "motor.back_emf"] if w.has_current and w.has_voltage else []
@@ -130,22 +130,23 @@ def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
     return tuple(p for p in paths if any(matching([p], pattern) for pattern in chosen))
 
 
-def summary(made: Sequence[Replicate], wanted: Sequence[str]) -> Content:
-    """Error, coverage, verdict and whether it was recovered, of everything that was compared.
+def summary(replicates: Sequence[Replicate], wanted: Sequence[str]) -> Content:
+    """Return error, coverage, verdict and recovery of everything that was compared.
 
     Returns:
         `parameters` (ratios included), `curves`, `predictions`, `failed` (wanted and not
         recovered), `recovered`.
     """
-    first = made[0]
+    first = replicates[0]
     numbers = {
-        path: number_summary([one.parameters[path] for one in made]) for path in first.parameters
+        path: number_summary([one.parameters[path] for one in replicates])
+        for path in first.parameters
     }
-    curves = {floor: [one.curves[floor] for one in made] for floor in first.curves}
+    curves = {floor: [one.curves[floor] for one in replicates] for floor in first.curves}
     failed = [p for p in wanted if numbers[p]["recovered"] in ("no", "wrong")]
-    converged = sum(one.converged for one in made)
+    converged = sum(one.converged for one in replicates)
     return {
-        "replicates": len(made),
+        "replicates": len(replicates),
         "converged": converged,
         "parameters": numbers,
         "curves": {
@@ -158,19 +159,19 @@ def summary(made: Sequence[Replicate], wanted: Sequence[str]) -> Content:
         },
         "predictions": {
             floor: {
-                model: float(np.mean([one.predictions[floor][model] for one in made]))
+                model: float(np.mean([one.predictions[floor][model] for one in replicates]))
                 for model in models
             }
             for floor, models in first.predictions.items()
         },
         "wanted": list(wanted),
         "failed": failed,
-        "recovered": not failed and converged >= LEAST_CONVERGED * len(made),
+        "recovered": not failed and converged >= LEAST_CONVERGED * len(replicates),
     }
 
 
 def number_summary(found: Sequence[NumberRecovery]) -> Content:
-    """One number over all replicates.
+    """Return one number over all replicates.
 
     `recovered` is yes where most fits call it identified, roughly where they call it weak, no where
     they say that they do not know it, and wrong where errors are larger than the fits say.

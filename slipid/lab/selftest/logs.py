@@ -1,11 +1,10 @@
-"""A Robotino whose every number is known, what it drives, and the sensors that see it.
-
-Logs made from a robot whose every number is known: for selftests and tests of recovery.
+"""Simulate logs of a Robotino whose every number is known, for self tests and tests of recovery.
 
 Straight and turning runs of a grid like a Robotino's under an overhead camera. The noise is the one
-the likelihood assumes (camera, process growing with distance, run effects, current level per run);
-on top of it come the traps of real logs it does not know of: ticks, quantised unsigned currents
-with ripple, quantised voltages, repeated camera frames, uneven rows, a delayed and ramped start.
+the likelihood assumes (camera, process growing with distance, run effects, current level per run).
+Added to it are difficulties of real logs that the likelihood does not know: ticks, quantised
+unsigned currents with ripple, quantised voltages, repeated camera frames, uneven rows, a delayed
+and ramped start.
 """
 
 import hashlib
@@ -30,7 +29,7 @@ from slipid.search_space import Choice, Space
 
 
 def true_numbers(robot: Robot) -> dict[str, float | list[float]]:
-    """Every number of a robot by its path, as plain values."""
+    """Return every number of a robot by its path, as plain values."""
     return {e.path: np.asarray(e.get(robot)).tolist() for e in entries(robot)}
 
 
@@ -45,7 +44,7 @@ _FLOORS = {
     "scrub": (0.001, 0.002),
     "lead": (0.0015, 0.0045),
 }
-"""Of the floors firm and soft."""
+"""Numbers of the floors firm and soft."""
 TRUTH: dict[str, float | tuple[float, ...]] = {
     "robot.mass": 12.0,
     "robot.load_share@as_built": (0.29, 0.42, 0.29),
@@ -62,11 +61,11 @@ TRUTH: dict[str, float | tuple[float, ...]] = {
     **{f"surface.firm.{name}": firm for name, (firm, _) in _FLOORS.items()},
     **{f"surface.soft.{name}": soft for name, (_, soft) in _FLOORS.items()},
 }
-"""Numbers of the default robot [SI], the rest as declared; of the size found on real logs."""
+"""Numbers of the default robot [SI], of the size found on real logs; the rest are as declared."""
 
 
 def nominal_robot(drives: Sequence[PlannedRun]) -> Robot:
-    """Robotino at declared starts that knows the floors, loads and sessions of a plan."""
+    """Return a Robotino at declared start values with the floors, loads and sessions of a plan."""
     return build(
         omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0),
         sorted({d.surface for d in drives}),
@@ -78,7 +77,7 @@ def nominal_robot(drives: Sequence[PlannedRun]) -> Robot:
 def true_robot(
     drives: Sequence[PlannedRun], values: Mapping[str, float | Sequence[float]] | None = None
 ) -> Robot:
-    """Robotino with the numbers of `TRUTH`, or others; what the plan does not need is left out."""
+    """Return a Robotino with the numbers of `TRUTH`, or with others where given."""
     robot = nominal_robot(drives)
     known = {e.path for e in entries(robot)}
     values = {**TRUTH, **(values or {})}
@@ -91,34 +90,34 @@ def heading_grid(
     speeds: Sequence[float] = (0.1, 0.2),
     turns: int = 2,
 ) -> tuple[PlannedRun, ...]:
-    """Every heading at every speed on every (floor, load), and `turns` curved runs of each."""
+    """Return runs at every heading and speed on every (floor, load), and `turns` curves of each."""
     drives = []
     for surface, load in setups:
         for speed in speeds:
-            ways = 2 * np.pi * np.arange(headings) / headings
-            drives += [PlannedRun(surface, load, float(way), speed) for way in ways]
-            ways = 2 * np.pi * (np.arange(turns) + 0.5) / max(turns, 1)
+            angles = 2 * np.pi * np.arange(headings) / headings
+            drives += [PlannedRun(surface, load, float(angle), speed) for angle in angles]
+            angles = 2 * np.pi * (np.arange(turns) + 0.5) / max(turns, 1)
             drives += [
-                PlannedRun(surface, load, float(way), speed, turn=(-1) ** k * 4.0 * speed)
-                for k, way in enumerate(ways)
+                PlannedRun(surface, load, float(angle), speed, turn=(-1) ** k * 4.0 * speed)
+                for k, angle in enumerate(angles)
             ]
     return tuple(drives)
 
 
 def turning_grid(
-    setups: Sequence[tuple[str, str]], ways: int, speeds: Sequence[float], base_radius: float
+    setups: Sequence[tuple[str, str]], count: int, speeds: Sequence[float], base_radius: float
 ) -> tuple[PlannedRun, ...]:
-    """Runs of wheels that do not drive sideways, on every (floor, load).
+    """Return runs of wheels that do not drive sideways, on every (floor, load).
 
-    Between straight ahead and turning on the spot `ways` of each speed, evenly around the circle of
-    (ahead, turn times base radius [m]).
+    Each speed has `count` runs between straight ahead and turning on the spot, evenly around the
+    circle of (ahead, turn times base radius [m]).
     """
     drives = []
     for surface, load in setups:
         for speed in speeds:
-            for way in 2 * np.pi * np.arange(ways) / ways:
+            for angle in 2 * np.pi * np.arange(count) / count:
                 # rounded: the cosine of a right angle is not quite zero
-                ahead, turn = (round(speed * float(f(way)), 9) for f in (np.cos, np.sin))
+                ahead, turn = (round(speed * float(f(angle)), 9) for f in (np.cos, np.sin))
                 back = 0.0 if ahead >= 0 else np.pi
                 drives.append(PlannedRun(surface, load, back, abs(ahead), turn=turn / base_radius))
     return tuple(drives)
@@ -126,15 +125,20 @@ def turning_grid(
 
 @dataclass(frozen=True)
 class SimulatedSensors:
-    """How the logs are disturbed; stds by the names of `slipid.fit.noise.noise`.
+    """Disturbances of simulated logs, with stds by the names of `slipid.fit.noise.noise`.
 
     Attributes:
-        std: of every variance component; `floor` in a name stands for every floor without its own.
-        ripple: of the current from row to row [A]; voltage_noise: [V].
-        current_step, voltage_step: of the converters [A], [V]; ticks: per turn of the motor.
-        row_period, frame_period: of the log and the camera [s].
-        delay, ramp: from command to motion, and to full speed [s].
-        wobble: of the wheel's angle, as time [s]; a real speed loop is never quite still.
+        std: std of every variance component; `floor` in a name stands for every floor without its
+            own.
+        ripple: ripple of the current from row to row [A].
+        voltage_noise: noise of the voltage [V].
+        current_step, voltage_step: steps of the converters [A], [V].
+        ticks: encoder ticks per turn of the motor.
+        row_period, frame_period: time between rows and between camera frames [s].
+        delay, ramp: time from command to motion, and from there to full speed [s].
+        wobble: oscillation of the wheel's angle, as time [s]; a real speed loop is never quite
+            still.
+        has_voltage: whether voltages are logged.
         signed: whether currents have their sign.
     """
 
@@ -165,7 +169,7 @@ class SimulatedSensors:
     signed: bool = False
 
     def of(self, name: str) -> float:
-        """Std of a variance component, 0 for one that these logs are made without."""
+        """Return the std of a variance component; 0 for one that these logs do not have."""
         head, _, last = name.partition(".")
         of_any_floor = f"{head}.floor.{last.split('.')[-1]}"
         return self.std.get(name, self.std.get(of_any_floor, 0.0))
@@ -174,7 +178,7 @@ class SimulatedSensors:
 def simulate_logs(
     robot: Robot, drives: Sequence[PlannedRun], seed: int, sensors: SimulatedSensors | None = None
 ) -> list[Log]:
-    """Logs of a plan, in memory, of a robot that knows the plan's floors, loads and sessions."""
+    """Return logs of a plan, driven by a robot with the plan's floors, loads and sessions."""
     return _LogSimulator(
         robot, drives, sensors or SimulatedSensors(), np.random.default_rng(seed)
     ).logs()
@@ -182,7 +186,7 @@ def simulate_logs(
 
 @dataclass(frozen=True, eq=False)
 class _LogSimulator:
-    """Makes the logs of all drives at once; arrays are (run, row or step, ...)."""
+    """Simulates the logs of all runs at once; arrays are (run, row or step, ...)."""
 
     robot: Robot
     drives: Sequence[PlannedRun]
@@ -229,7 +233,7 @@ class _LogSimulator:
         return out
 
     def wheels(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
-        """Times and true wheel angles."""
+        """Return times and true wheel angles."""
         s, n, j = self.sensors, len(self.drives), np.asarray(self.robot.geometry.forward())
         radius = float(self.robot.geometry.wheel_radius)
         want = np.stack([d.command for d in self.drives]) @ j.T / radius
@@ -248,26 +252,26 @@ class _LogSimulator:
         speed: Float[np.ndarray, "run step wheel"],
         xi: Float[np.ndarray, "run step 3"],
     ) -> Float[np.ndarray, "run row 3"]:
-        """Body poses with process noise and run effects, centred on the origin of the camera."""
+        """Return body poses with process noise and run effects, centred on the camera's origin."""
         s, shape, rng = self.sensors, self.robot.geometry, self.random
         back = np.asarray(shape.pseudo_inverse())
         step = speed * dt[..., None] * float(shape.wheel_radius) @ back.T
-        far = np.linalg.norm(step[..., :2], axis=-1)[..., None]
-        u = np.where(far > 0, step[..., :2] / np.maximum(far, 1e-12), [1.0, 0.0])
-        far = far[..., 0] + np.abs(step[..., 2]) * float(shape.base_radius)
+        distance = np.linalg.norm(step[..., :2], axis=-1)[..., None]
+        u = np.where(distance > 0, step[..., :2] / np.maximum(distance, 1e-12), [1.0, 0.0])
+        distance = distance[..., 0] + np.abs(step[..., 2]) * float(shape.base_radius)
         drawn = []
         for part in AXES:
             grown, level = (
                 np.array([s.of(f"{kind}.{d.surface}.{part}") for d in self.drives])[:, None]
                 for kind in ("process", "run")
             )
-            noise = grown * np.sqrt(far) * rng.normal(size=far.shape)
-            drawn.append(noise + level * far * rng.normal(size=(len(far), 1)))
+            noise = grown * np.sqrt(distance) * rng.normal(size=distance.shape)
+            drawn.append(noise + level * distance * rng.normal(size=(len(distance), 1)))
         along, across, yaw = drawn
         x, y = u[..., 0], u[..., 1]
         extra = np.stack([x * along - y * across, y * along + x * across, yaw], -1)
-        start = np.zeros((len(far), 3))
-        start[:, 2] = rng.uniform(-0.1, 0.1, len(far))
+        start = np.zeros((len(distance), 3))
+        start[:, 2] = rng.uniform(-0.1, 0.1, len(distance))
         pose = np.array(_paths(jnp.asarray(xi + extra / dt[..., None]), jnp.asarray(dt), start))
         pose[..., :2] -= 0.5 * (pose[:, -1:, :2] + pose[:, :1, :2])
         return pose
@@ -275,7 +279,7 @@ class _LogSimulator:
     def camera(
         self, time: Float[np.ndarray, "run row"], pose: Float[np.ndarray, "run row 3"]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Logged poses and whether each row brings a new frame."""
+        """Return logged poses, and whether each row has a new frame."""
         robot, s, rng = self.robot, self.sensors, self.random
         fresh, marker = np.ones(time.shape, bool), np.empty_like(pose)
         for k, t in enumerate(time):
@@ -283,7 +287,7 @@ class _LogSimulator:
             frames += rng.uniform(0, s.frame_period)
             newest = np.searchsorted(frames, t) - 1
             fresh[k, 1:] = np.diff(newest) > 0
-            at = t - float(robot.camera.lag)  # every new frame is that old
+            at = t - float(robot.camera.lag)  # age of every new frame
             marker[k] = interpolate(t, pose[k], at)
         session = [robot.session_index(d.session) for d in self.drives]
         yaw = np.array([float(robot.camera.yaw(k)) for k in session])
@@ -297,7 +301,7 @@ class _LogSimulator:
     def electric(
         self, speed: Float[np.ndarray, "run step wheel"], amps: Float[np.ndarray, "run step wheel"]
     ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-        """Logged currents or their magnitudes [A], voltages [V] and reported speeds [rad/s]."""
+        """Return logged currents or magnitudes [A], voltages [V] and reported speeds [rad/s]."""
         s, motor, rng = self.sensors, self.robot.motor, self.random
         level = np.array([s.of(f"current.{d.surface}.run") for d in self.drives])[:, None, None]
         amps = amps + level * rng.normal(size=(len(amps), 1, amps.shape[2])) * (speed != 0)
@@ -314,7 +318,7 @@ class _LogSimulator:
 
 @jax.jit
 def _twists(robot: Robot, speed: Array, floor: Array, load: Array) -> tuple[Array, Array]:
-    """Body twists and signed motor currents of every step of every run."""
+    """Return body twists and signed motor currents of every step of every run."""
     frame = robot.geometry.frame()
 
     def one(w: Array, f: Array, s: Array) -> tuple[Array, Array]:
@@ -329,7 +333,7 @@ _paths = jax.jit(jax.vmap(path))
 
 @jax.jit
 def _as_logged(robot: Robot, pose: Array, yaw: Array) -> Array:
-    """What the camera logs of true body poses."""
+    """Return the camera's poses for true body poses."""
 
     def one(body: Array, psi: Array) -> Array:
         return robot.camera.logged(compose(body, jnp.stack([*robot.camera.marker_place, psi])))
@@ -338,6 +342,6 @@ def _as_logged(robot: Robot, pose: Array, yaw: Array) -> Array:
 
 
 def _row_means(x: Float[np.ndarray, "run step wheel"]) -> Float[np.ndarray, "run row wheel"]:
-    """What a sensor reads at the rows between steps: the mean of the two steps that meet there."""
+    """Return readings at the rows between steps: the mean of the two steps that meet there."""
     ends = np.concatenate([x[:, :1], x, x[:, -1:]], axis=1)
     return 0.5 * (ends[:, 1:] + ends[:, :-1])

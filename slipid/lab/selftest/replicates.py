@@ -1,15 +1,10 @@
-"""Windows as a robot with known numbers would have filled them, noise included.
-
-Wheel motion, floors, loads, sessions and sampling are those of the windows given; poses, currents
-and voltages are what the likelihood's own model makes of them. So a fit of the result shows what
-this very experiment tells, and only what is wrong with the model itself is out of sight.
-
-What this very experiment can recover: made with known truth, fitted, compared, again and again.
+"""Simulate an experiment with known truth and fit it, again and again, to see what it recovers.
 
 A replicate draws true numbers from what is plausible before the logs, fills the windows of the
-experiment with what a robot of these numbers would have shown, noise included, and fits them from
-the usual start. The noise is the likelihood's own at typical variances: the test tells what the
-experiment can tell if the model is right, not whether it is.
+experiment with the readings that a robot of these numbers would give, noise included, and fits them
+from the usual start. Wheel motion, floors, loads, sessions and sampling are those of the given
+windows. The noise is the likelihood's own at typical variances: the test shows what the experiment
+can recover if the model is right, and cannot show an error of the model itself.
 
 Source: simulation-based calibration in small (Talts et al. 2018, arXiv:1804.06788).
 """
@@ -47,16 +42,17 @@ from slipid.support.progress import Reporter
 def simulate_windows(
     truth: Robot, w: Windows, rng: np.random.Generator, std: Mapping[str, float]
 ) -> Windows:
-    """The windows with poses, currents and voltages as a robot gives them, plus noise.
+    """Return the windows with simulated poses, currents and voltages, noise included.
 
-    Every piece starts at the pose it has. The scatter of the current is of the one that flows, and
-    voltages follow it; `current_var` comes on top, is the ammeter's, and no voltage sees it.
+    Every segment starts at the pose it has. The current's scatter is in the current that flows, and
+    voltages follow it; `current_var` comes on top as the ammeter's noise, which no voltage shows.
 
     Args:
-        truth: knows the floors, loads and sessions of the windows.
-        w: what was driven; what it does not have is not made.
-        std: of the variance components by name (`fit.noise`); a name without its floor stands for
-            every floor, those left out are zero.
+        truth: robot with the floors, loads and sessions of the windows.
+        w: windows that were driven; channels that they lack are not simulated.
+        rng: random numbers of the noise.
+        std: std of the variance components by name (`fit.noise`); a name without its floor stands
+            for every floor, and missing ones are zero.
     """
     b = lk.batch(w, truth)
     increment, amps, start = (np.asarray(x) for x in _predicted(truth, b, jnp.asarray(w.pose)))
@@ -89,34 +85,34 @@ def _predicted(robot: Robot, b: lk.Batch, pose: Array) -> tuple[Array, Array, Ar
 
 
 @jax.jit
-def _logged(robot: Robot, pose: Float[Array, "piece edge 3"]) -> Float[Array, "piece edge 3"]:
+def _logged(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Float[Array, "segment edge 3"]:
     return jax.vmap(jax.vmap(robot.camera.logged))(pose)
 
 
 def _component_std(std: Mapping[str, float], w: Windows, kind: str, part: str) -> np.ndarray:
-    """Std of a component of every piece, by its floor (piece,)."""
+    """Return the std of a variance component for every segment, by its floor (segment,)."""
     usual = std.get(f"{kind}.{part}", 0.0)
     return np.array([std.get(f"{kind}.{floor}.{part}", usual) for floor in w.surface])
 
 
 def _process(
     truth: Robot, w: Windows, rng: np.random.Generator, std: Mapping[str, float]
-) -> Float[np.ndarray, "piece window 3"]:
-    """Displacements that the model does not explain, growing with distance."""
-    far, u = travel(w, truth)
-    total, shared = np.zeros((*far.shape, 3)), _shared(truth, w, rng, std)
+) -> Float[np.ndarray, "segment window 3"]:
+    """Return random displacements beyond the model, which grow with distance."""
+    distance, u = travel(w, truth)
+    total, shared = np.zeros((*distance.shape, 3)), _shared(truth, w, rng, std)
     for k, (axis, name) in enumerate(zip(axes(u), AXES, strict=True)):
-        grown = _component_std(std, w, "process", name)[:, None] * np.sqrt(far)
+        grown = _component_std(std, w, "process", name)[:, None] * np.sqrt(distance)
         own = _component_std(std, w, "run", name) * rng.normal(size=len(w)) + shared[:, k]
-        step = grown * rng.normal(size=far.shape) + own[:, None] * far
+        step = grown * rng.normal(size=distance.shape) + own[:, None] * distance
         total += (axis @ step[..., None]).reshape(total.shape)
     return total
 
 
 def _shared(
     truth: Robot, w: Windows, rng: np.random.Generator, std: Mapping[str, float]
-) -> Float[np.ndarray, "piece 3"]:
-    """Effects that neighbouring runs, and runs of one session, share."""
+) -> Float[np.ndarray, "segment 3"]:
+    """Return random effects that neighbouring runs, and runs of one session, share."""
     components = noise(w, truth)
     named = [
         std.get(c.name, std.get(f"{c.kind}.{c.what}", 0.0) if c.kind in SHARED else 0.0)
@@ -132,9 +128,9 @@ def _shared(
 
 
 FILE = "replicates"
-"""File of the replicates that are done, which a later call goes on from."""
+"""File of finished replicates, from which a later call continues."""
 SCATTER, MOST = 0.5, 0.5
-"""True numbers scatter by this part of their prior's std, which counts up to `MOST` [search]."""
+"""True numbers scatter by `SCATTER` times their prior's std, which counts up to `MOST` [search]."""
 
 
 @dataclass(frozen=True)
@@ -142,11 +138,11 @@ class NumberRecovery:
     """One number of a replicate, or a short vector: truth against estimate, entry by entry.
 
     Attributes:
-        unit, labels: as of `Estimate`.
-        truth, value: [unit].
+        unit, labels: as in `Estimate`.
+        truth, value: true and estimated values [unit].
         inside: whether the 90 % interval holds the truth.
         z: estimate less truth, in stds of the estimate, in the search space.
-        verdict: of the fit.
+        verdict: verdict of the fit.
     """
 
     unit: str
@@ -160,7 +156,7 @@ class NumberRecovery:
 
 @dataclass(frozen=True)
 class CurveRecovery:
-    """Largest gap in slip to the true curve, and how much of that lies in the 90 % band."""
+    """Largest gap in slip to the true curve, and the share of that curve in the 90 % band."""
 
     gap: float
     inside: float
@@ -168,12 +164,12 @@ class CurveRecovery:
 
 @dataclass(frozen=True)
 class Replicate:
-    """One made experiment and what its fit found.
+    """One simulated experiment and its fit.
 
     Attributes:
         parameters: numbers and ratios by path.
-        curves: by floor.
-        predictions: by floor and model, distance of predicted ends over the true chord.
+        curves: slip curves by floor.
+        predictions: distance of predicted ends over the true chord, by floor and slip model.
         converged, reason: how the fit ended.
     """
 
@@ -190,10 +186,10 @@ _FILE = TypeAdapter(list[Replicate])
 def plausible(
     config: Config, choices: Sequence[Choice], problem: Problem
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and scatter of the true numbers, in the search space.
+    """Return centre and scatter of the true numbers, in the search space.
 
-    The centre is the prior's, the scatter half its std; what `[selftest.truth]` gives is exactly
-    that.
+    The centre is the prior's and the scatter half its std. Numbers in `[selftest.truth]` have
+    exactly the value given there.
 
     Raises:
         DataError: a truth for a number that does not exist, is fixed, or cannot have it.
@@ -226,13 +222,13 @@ def replicates(
     kept: Checkpoint,
     report: Reporter,
 ) -> list[Replicate]:
-    """Replicates until there are `count`; those that are kept are not repeated.
+    """Return `count` replicates; those in the checkpoint are not simulated again.
 
     Args:
-        choices: as the problem was given.
-        problem: of its windows; what is compiled for it serves every replicate.
-        seed: with the replicate's number the seed of truth and noise.
-        kept: those that are done; every new one is added.
+        choices: choices of the problem.
+        problem: problem of the experiment; its compiled functions serve every replicate.
+        seed: seed of truth and noise, together with the replicate's number.
+        kept: checkpoint with the finished replicates, to which every new one is added.
     """
     center, scatter = plausible(config, choices, problem)
     std = dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True))
@@ -248,8 +244,8 @@ def replicates(
     for k in range(len(found), count):
         rng = np.random.default_rng([seed, k])
         z = center + scatter * rng.standard_normal(len(center))
-        made = simulate_windows(problem.space.tree(jnp.asarray(z)), problem.windows, rng, std)
-        this = problem.of(made)
+        windows = simulate_windows(problem.space.tree(jnp.asarray(z)), problem.windows, rng, std)
+        this = problem.of(windows)
         end = optimise(this, most_rounds=fit.rounds, tolerance=fit.tolerance, tell=tell)
         found.append(recovery(this, choices, z, end))
         kept.save_json(FILE, [asdict(one) for one in found])
@@ -260,18 +256,18 @@ def replicates(
 def recovery(
     problem: Problem, choices: Sequence[Choice], true: Float[np.ndarray, " free"], end: Optimum
 ) -> Replicate:
-    """The end of a fit beside its truth: every free number, every ratio, curves, predictions."""
+    """Compare the end of a fit with its truth: numbers, ratios, curves, predictions."""
     space, volt = problem.space, problem.windows.has_voltage
     z, covariance = end.state.z, end.covariance
     truth = space.tree(jnp.asarray(true))
     off = (z - true) / np.sqrt(np.diag(covariance))
     values = {e.path: np.atleast_1d(np.asarray(e.get(truth), float)) for e in space.free}
     flat = members(flat_directions(space, covariance, problem.windows.has_current, volt))
-    judged = {e.path for e in space.free if e.session is None}
+    shared = {e.path for e in space.free if e.session is None}
     numbers = {
         e.path: _number(e, values[e.path], off[space.slices[e.path]])
         for e in estimates(space, choices, z, covariance, volt, flat)
-        if e.path in judged
+        if e.path in shared
     }
     known = {e.path: e.value for e in derived(space, true, covariance, volt)}
     for e in derived(space, z, covariance, volt):
@@ -304,7 +300,7 @@ def _number(e: Estimate, truth: np.ndarray, score: np.ndarray) -> NumberRecovery
 def _curves(
     problem: Problem, truth: Robot, z: np.ndarray, covariance: np.ndarray
 ) -> dict[str, CurveRecovery]:
-    """Largest gap in slip to the true curve of every floor, and how much lies in the band."""
+    """Return how well the slip curve of every floor was recovered."""
     found = curves(problem.space, z, draws(z, covariance, 200, 0), problem.batch)
     out = {}
     for floor, curve in found.items():
@@ -315,9 +311,10 @@ def _curves(
 
 
 def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, float]]:
-    """Distance of predicted ends from the true one over the true chord, mean per floor.
+    """Return the mean distance of predicted ends from the true ones over the true chord, per floor.
 
-    Of the experiment's own pieces without any noise: what the numbers' errors alone cost.
+    The runs are those of the experiment without any noise, so that only the errors of the numbers
+    count.
     """
     start = jnp.zeros((len(w), 3))
 
@@ -327,15 +324,17 @@ def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, 
     true = ends(contact_increments(truth, lk.batch(w, truth)))
     back = np.asarray(truth.geometry.pseudo_inverse())
     twist = (w.turn / w.dt[..., None]) @ (back * float(truth.geometry.wheel_radius)).T
-    said = {
+    predicted_ends = {
         "identified": ends(contact_increments(found, lk.batch(w, found))),
         "encoder": ends(as_increments(twist, w, truth)),
     }
     chord, floor = np.linalg.norm(true, axis=1), np.asarray(w.surface)
-    far = chord > 0.1 * np.median(chord)  # those that turn on the spot have none
+    travels = chord > 0.1 * np.median(chord)  # turns on the spot have no chord
     out: dict[str, dict[str, float]] = {}
     for name in dict.fromkeys(w.surface):
-        if (mine := far & (floor == name)).any():
-            gaps = {model: np.linalg.norm(end - true, axis=1) for model, end in said.items()}
+        if (mine := travels & (floor == name)).any():
+            gaps = {
+                model: np.linalg.norm(end - true, axis=1) for model, end in predicted_ends.items()
+            }
             out[name] = {m: float(np.mean((gap / chord)[mine])) for m, gap in gaps.items()}
     return out

@@ -1,4 +1,4 @@
-"""The config of `slipid simulate`, and the one with which `slipid identify` fits its logs."""
+"""The config of `slipid simulate`, and the config with which `slipid identify` fits its logs."""
 
 import json
 import re
@@ -22,7 +22,7 @@ from slipid.support.errors import DataError
 from slipid.support.toml_file import checked, mapping_of
 
 RESERVED = ("one_surface", "two_surfaces", "wheel_load")
-"""Folders of the 2022 layout."""
+"""Folder names of the 2022 layout, which no load set-up may have."""
 _IDENTIFY_CONFIG = """\
 # Identifies the robot of these logs:
 #   slipid identify {name} --data logs --out result
@@ -62,10 +62,12 @@ format = "tracked"
 
 @dataclass(frozen=True, eq=False)
 class SimulationPlan:
-    """What is to be simulated.
+    """Everything that a simulation drives and films.
 
     Attributes:
-        hash: of the config and of the map files it names.
+        hash: hash of the config and of the map files it names.
+        content: the config.
+        site: robot, sensors and surfaces.
         maps: floors with several surfaces, by name.
         runs: name and run of each.
         filmed: names of the runs that are filmed.
@@ -80,14 +82,14 @@ class SimulationPlan:
 
 
 def plan(path: Path, text: str) -> SimulationPlan:
-    """Plan of a config; the path is for messages, and maps lie beside it.
+    """Return the plan in a config text; the path is for messages, and map files lie beside it.
 
     Raises:
-        DataError: wrong in the text or in a map it names; every mistake on a line.
+        DataError: mistakes in the text or in a map it names, each on a line.
     """
     mapping = mapping_of(path, text)
     surfaces = mapping.get("surfaces", {})
-    if isinstance(surfaces, dict):  # a surface that slipid knows is changed, not made anew
+    if isinstance(surfaces, dict):  # keys that the config leaves out keep slipid's own values
         known = {
             name: {**asdict(SURFACES[name]), **given}
             for name, given in surfaces.items()
@@ -96,8 +98,8 @@ def plan(path: Path, text: str) -> SimulationPlan:
         mapping = {**mapping, "surfaces": {**surfaces, **known}}
     content = checked(path, mapping, SimulationContent)
     robot = content.robot, content.motor, content.speed_loop, content.sensors
-    grounds = {**SURFACES, **content.surfaces}
-    site = Site(*robot, grounds, content.command_delay_s, content.acceleration_m_s2)
+    surfaces = {**SURFACES, **content.surfaces}
+    site = Site(*robot, surfaces, content.command_delay_s, content.acceleration_m_s2)
     maps, everything = {}, list[ex.SiteRun]()
     for name, given in content.maps.items():
         with _naming(f"{path}: maps.{name}"):
@@ -124,29 +126,29 @@ def plan(path: Path, text: str) -> SimulationPlan:
 def _check(
     path: Path, content: SimulationContent, site: Site, maps: Mapping[str, terrain.FloorMap]
 ) -> None:
-    """DataError where parts of a config do not go together."""
-    for load in site.machine.centres_m:
+    """Raise `DataError` where parts of a config contradict each other."""
+    for load in site.robot.centres_m:
         if not re.fullmatch("[A-Za-z0-9_-]+", load) or load in RESERVED:
             raise DataError(
                 f"{path}: robot.centres_m: load '{load}'; expected letters, digits, _ and -, "
                 f"none of {', '.join(RESERVED)}"
             )
     for k, runs in enumerate(content.runs, 1):
-        _refuse_unknown(path, f"runs[{k}].load", runs.load, site.machine.centres_m)
+        _refuse_unknown(path, f"runs[{k}].load", runs.load, site.robot.centres_m)
         if isinstance(runs, MapRuns):
             _refuse_unknown(path, f"runs[{k}].map", runs.map, maps)
         else:
-            _refuse_unknown(path, f"runs[{k}].surface", runs.surface, site.grounds)
+            _refuse_unknown(path, f"runs[{k}].surface", runs.surface, site.surfaces)
     for name, floor in maps.items():
-        if name in site.grounds:
+        if name in site.surfaces:
             raise DataError(f"{path}: maps.{name}: also the name of a surface; expected another")
         for surface in floor.surfaces:
-            _refuse_unknown(path, f"maps.{name}", surface, site.grounds)
-        colours = [site.grounds[s].colour.lower() for s in floor.surfaces]
+            _refuse_unknown(path, f"maps.{name}", surface, site.surfaces)
+        colours = [site.surfaces[s].colour.lower() for s in floor.surfaces]
         if len(set(colours)) < len(colours):
             raise DataError(f"{path}: maps.{name}: two surfaces have one colour; expected others")
     if "robotino2022" in content.formats:
-        robot, sensors = site.machine, site.sensors
+        robot, sensors = site.robot, site.sensors
         fits = len(robot.wheel_azimuths_deg) == 3 and robot.gear_ratio == 16
         fits &= site.motor.ticks_per_revolution == 2000 and not sensors.current_is_signed
         if not fits:
@@ -157,13 +159,18 @@ def _check(
 
 
 def _hash(content: SimulationContent, site: Site, maps: Mapping[str, terrain.FloorMap]) -> str:
-    """Of all that decides what is driven and logged; videos may be asked for later."""
-    said = content.model_dump(mode="json", exclude={"video", "camera"})
+    """Return a hash of everything that decides what is driven and logged; videos are left out."""
+    config = content.model_dump(mode="json", exclude={"video", "camera"})
     floors = {
         name: [f.surfaces, f.corner, f.cell, f.cells.shape, sha256(f.cells.tobytes()).hexdigest()]
         for name, f in maps.items()
     }
-    everything = {"said": said, "site": asdict(site), "maps": floors, "slipid": version("slipid")}
+    everything = {
+        "said": config,
+        "site": site.to_json(),
+        "maps": floors,
+        "slipid": version("slipid"),
+    }
     return sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()
 
 
@@ -176,7 +183,7 @@ def _refuse_unknown(path: Path, where: str, name: str, choices: Collection[str])
 
 @contextmanager
 def _naming(what: str) -> Iterator[None]:
-    """Says of which part of the config an error is that does not know."""
+    """Name the part of the config in errors that lack it."""
     try:
         yield
     except DataError:
@@ -186,18 +193,18 @@ def _naming(what: str) -> Iterator[None]:
 
 
 def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
-    """Text of a config for `slipid identify` that fits the logs in slipid's own columns.
+    """Return a config text for `slipid identify` that fits the logs in slipid's own columns.
 
-    With `by_video` the poses in the logs are passed over, for those that are tracked in videos.
+    With `by_video` the poses are those tracked in the videos, and not those in the logs.
     """
-    machine, sensors = plan.site.machine, plan.site.sensors
+    robot, sensors = plan.site.robot, plan.site.sensors
     measured = 0.0015 * float(np.random.default_rng([plan.content.seed, 2]).normal())
     more = [channel for channel in OPTIONAL if getattr(sensors, channel)]
-    columns = own_columns(len(machine.wheel_azimuths_deg), more)
+    columns = own_columns(len(robot.wheel_azimuths_deg), more)
     beside, scale, lag = "", sensors.camera_scale, 0.05
     if by_video:
         columns = {name: c for name, c in columns.items() if not name.startswith("pose_")}
-        beside = _TRACKED_LAYOUT.format(size=machine.marker_size_m, height=machine.marker_height_m)
+        beside = _TRACKED_LAYOUT.format(size=robot.marker_size_m, height=robot.marker_height_m)
         scale, lag = 1.0, 0.0
     one = {(run.load, run.surface) for _, run in plan.runs if run.surface is not None}
     where = [(load, surface, 'surface = "folder"') for load, surface in sorted(one)]
@@ -208,11 +215,11 @@ def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
         for load, name, floor in where
     )
     return _IDENTIFY_CONFIG.format(
-        azimuths=list(machine.wheel_azimuths_deg),
-        base=machine.base_radius_m,
-        radius=machine.wheel_radius_m,
-        gear=machine.gear_ratio,
-        mass=machine.mass_kg,
+        azimuths=list(robot.wheel_azimuths_deg),
+        base=robot.base_radius_m,
+        radius=robot.wheel_radius_m,
+        gear=robot.gear_ratio,
+        mass=robot.mass_kg,
         ticks=plan.site.motor.ticks_per_revolution,
         signed=str(sensors.current_is_signed).lower(),
         columns="\n".join(f"{name} = {_inline(c)}" for name, c in columns.items()),
@@ -225,7 +232,7 @@ def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
 
 
 def _map_sets(plan: SimulationPlan) -> list[tuple[str, str]]:
-    """Load and map of runs over several floors, where runs on one floor tell of each and the load.
+    """Return load and map of runs over several floors that also have runs on each floor alone.
 
     Whatever steered them, the camera logs their poses in the frame of the map.
     """
@@ -240,7 +247,7 @@ def _map_sets(plan: SimulationPlan) -> list[tuple[str, str]]:
 
 
 def all_filmed(plan: SimulationPlan) -> bool:
-    """Whether every run that a config for `slipid identify` reads has a video."""
+    """Return True where every run that `slipid identify` reads has a video."""
     mapped = {f"{load}/{name}/" for load, name in _map_sets(plan)}
     read = [
         n for n, r in plan.runs if r.surface is not None or n.rpartition("/")[0] + "/" in mapped
@@ -249,7 +256,7 @@ def all_filmed(plan: SimulationPlan) -> bool:
 
 
 def _inline(value: object) -> str:
-    """A value as TOML."""
+    """Return a value as TOML."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{k} = {_inline(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list):
@@ -258,5 +265,5 @@ def _inline(value: object) -> str:
 
 
 def can_identify(plan: SimulationPlan) -> bool:
-    """Whether there are logs in slipid's own columns that a fit can use."""
+    """Return True where logs in slipid's own columns have runs on one surface for a fit."""
     return "slipid" in plan.content.formats and any(r.surface is not None for _, r in plan.runs)

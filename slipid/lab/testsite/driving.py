@@ -1,4 +1,4 @@
-"""What is driven, twists one after the other or way-points, and what truly happens then."""
+"""Drive a robot by timed twists or way-points, and record its true motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,21 +12,21 @@ from slipid.lab.testsite.plant import TIMESTEP, SimulatedRobot, heading_of
 from slipid.lab.testsite.site import Site
 
 PERIOD = 0.05
-"""Between two commands to the robot [s]."""
+"""Time between two commands to the robot [s]."""
 REACHED_M = 0.02
 """Distance at which a way-point counts as reached [m]."""
 BodyTwist = tuple[float, float, float]
-"""Ahead, left [m/s], turn [rad/s]."""
+"""Speed ahead and to the left [m/s], and turn rate [rad/s]."""
 
 
 @dataclass(frozen=True)
 class TimedTwists:
-    """Twists one after the other, each for so many seconds; none of the sensors is asked."""
+    """Twists one after the other, each for some seconds, without any feedback."""
 
     legs: tuple[tuple[BodyTwist, float], ...]
 
     def command(self, time: float) -> BodyTwist | None:
-        """Twist at a time, None when it is over."""
+        """Return the twist at a time; None after the last."""
         for twist, seconds in self.legs:
             if time < seconds - 1e-9:
                 return twist
@@ -36,12 +36,12 @@ class TimedTwists:
 
 @dataclass(frozen=True)
 class Waypoints:
-    """Places one after the other, without turning; a pose is believed.
+    """Places to reach one after the other, without turning, by a fed-back pose.
 
     Attributes:
         places: x, y [m] in the frame of the pose.
-        speed: [m/s].
-        by: the pose that is believed: `encoders` from the start on, or `camera` (the true one).
+        speed: speed between them [m/s].
+        by: the fed-back pose: `encoders` counts from the start, `camera` is the true one.
     """
 
     places: tuple[tuple[float, float], ...]
@@ -51,15 +51,15 @@ class Waypoints:
 
 @dataclass(frozen=True)
 class SiteRun:
-    """One run.
+    """One run on the test site.
 
     Attributes:
-        surface: what its log says it drove on, None where that is for others to find out.
+        surface: surface named in its log; None where a fit must find out.
         load: name of the load set-up.
         program: `TimedTwists` or `Waypoints`.
         start: x, y [m], heading [rad].
-        floor: which surface lies where, None for `surface` everywhere.
-        place: name of the floor, in file names.
+        floor: map of the floor; None for `surface` everywhere.
+        place: name of the floor in file names.
     """
 
     surface: str | None
@@ -76,20 +76,20 @@ class SiteRun:
 
     @property
     def map(self) -> FloorMap:
-        """The floor."""
+        """Map of the floor."""
         return self.floor if self.floor is not None else uniform(str(self.surface))
 
 
 def straight(
     surface: str, load: str, heading: float, speed: float, distance: float, turn: float = 0.0
 ) -> SiteRun:
-    """A constant command that starts so that a robot without slip is in the middle halfway.
+    """Return a run at a constant command whose middle is the origin if there is no slip.
 
     Args:
         heading: direction of the commanded motion in the body frame [rad].
-        speed: [m/s]; 0 turns on the spot.
+        speed: commanded speed [m/s]; 0 turns on the spot.
         distance: commanded length [m], arc of the rim where it only turns.
-        turn: [rad/s].
+        turn: commanded turn rate [rad/s].
     """
     seconds = distance / (speed or abs(turn) * 0.125)
     twist = (speed * float(np.cos(heading)), speed * float(np.sin(heading)), turn)
@@ -99,7 +99,7 @@ def straight(
 
 
 def named_runs(runs: Sequence[SiteRun], jitter: float, seed: int) -> list[tuple[str, SiteRun]]:
-    """Runs with names `<load>/<folder>/runNNN`, each put down by hand: its heading is not exact."""
+    """Return runs named `<load>/<folder>/runNNN`, with jittered headings as if placed by hand."""
     rng = np.random.default_rng(seed)
     counts: dict[str, int] = {}
     out = []
@@ -114,17 +114,20 @@ def named_runs(runs: Sequence[SiteRun], jitter: float, seed: int) -> list[tuple[
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """What truly happened, a row per time step.
+    """True motion of a run, a row per time step.
 
     Attributes:
         time: time since the end of the settling [s].
         pose: pose of the body: x, y [m], heading [rad].
-        yaw_rate: [rad/s].
-        wheel_angle, wheel_speed, wheel_command: [rad], [rad/s], [rad/s].
-        current, voltage: those of the motors, signed along the drive direction [A], [V].
+        yaw_rate: yaw rate of the body [rad/s].
+        wheel_angle: angle of each wheel [rad].
+        wheel_speed: speed of each wheel [rad/s].
+        wheel_command: commanded speed of each wheel [rad/s].
+        current: current of each motor, signed along the drive direction [A].
+        voltage: voltage of each motor, signed along the drive direction [V].
         bus: voltage of the supply [V].
         sinkage: depth to which each wheel has sunk [m].
-        twist_command: what was sent to the robot at this time: [m/s, m/s, rad/s].
+        twist_command: twist that was sent to the robot at this time [m/s, m/s, rad/s].
     """
 
     time: Float[np.ndarray, " step"]
@@ -145,16 +148,16 @@ class RimSpeeds:
 
     def __init__(self, site: Site, plant: SimulatedRobot):
         self.plant, self.delay = plant, site.command_delay_s
-        self.slew = site.acceleration * plant.dt / site.machine.wheel_radius_m
+        self.slew = site.acceleration * plant.dt / site.robot.wheel_radius_m
         self.speed = self._wanted = np.zeros(len(plant.wheel_dof))
         self._waiting: list[tuple[float, Float[np.ndarray, " wheel"]]] = []
 
     def send(self, command: Float[np.ndarray, " wheel"]) -> None:
-        """A command [rad/s] sets out."""
+        """Send a command [rad/s], which arrives after the delay."""
         self._waiting.append((self.plant.time + self.delay, command))
 
     def follow(self) -> Float[np.ndarray, " wheel"]:
-        """Speeds [rad/s] to be kept over the next time step."""
+        """Return the wheel speeds to keep over the next time step [rad/s]."""
         while self._waiting and self._waiting[0][0] <= self.plant.time + 1e-9:
             self._wanted = self._waiting.pop(0)[1]
         self.speed = self.speed + np.clip(self._wanted - self.speed, -self.slew, self.slew)
@@ -162,14 +165,14 @@ class RimSpeeds:
 
 
 def drive(run: SiteRun, site: Site, seed: int, timestep: float = TIMESTEP) -> Trace:
-    """Drive one run; arguments as of `SimulatedRobot`.
+    """Drive one run and return its trace; arguments as in `SimulatedRobot`.
 
     Raises:
         DataError: MuJoCo is missing, or the simulation became unstable.
     """
     plant = SimulatedRobot(site, run.map, run.load, run.start, seed, timestep)
     recorder, rims = _Recorder(plant), RimSpeeds(site, plant)
-    back = np.linalg.pinv(site.machine.wheel_from_twist)
+    back = np.linalg.pinv(site.robot.wheel_from_twist)
     believed, sent, goal = np.zeros(3), np.zeros(3), 0
     before = plant.wheel_angle
     program = run.program
@@ -185,7 +188,7 @@ def drive(run: SiteRun, site: Site, seed: int, timestep: float = TIMESTEP) -> Tr
         if twist is None:
             break
         sent = np.array(twist)
-        rims.send(site.machine.wheel_from_twist @ sent)
+        rims.send(site.robot.wheel_from_twist @ sent)
         for _ in range(round(PERIOD / plant.dt)):
             recorder.record(rims.follow(), sent)
             plant.step(rims.speed.tolist())
@@ -197,35 +200,35 @@ def drive(run: SiteRun, site: Site, seed: int, timestep: float = TIMESTEP) -> Tr
 def _towards(
     program: Waypoints, goal: int, pose: Float[np.ndarray, "3"], time: float
 ) -> tuple[int, BodyTwist | None]:
-    """The next way-point, and the twist towards it in the body frame.
+    """Return the number of the next way-point, and the twist towards it in the body frame.
 
-    It is given up after thrice the time without slip and 10 s.
+    The twist is None at the end, or after 10 s and three times the duration without slip.
     """
     while goal < len(program.places):
-        far = np.array(program.places[goal]) - pose[:2]
-        size = float(np.hypot(*far))
-        if size > REACHED_M:
+        offset = np.array(program.places[goal]) - pose[:2]
+        distance = float(np.hypot(*offset))
+        if distance > REACHED_M:
             break
         goal += 1
-    corners = np.array([program.places[-1], *program.places])  # at least as long as the way
+    corners = np.array([program.places[-1], *program.places])  # at least as long as the path
     longest = 10.0 + 3 * float(np.hypot(*np.diff(corners, axis=0).T).sum()) / program.speed
     if goal == len(program.places) or time > longest:
         return goal, None
-    speed = min(program.speed, max(0.05, 2.0 * size))
+    speed = min(program.speed, max(0.05, 2.0 * distance))
     c, s = np.cos(pose[2]), np.sin(pose[2])
-    x, y = speed * far / size
+    x, y = speed * offset / distance
     return goal, (float(c * x + s * y), float(c * y - s * x), 0.0)
 
 
 def _moved(pose: Float[np.ndarray, "3"], step: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Pose after a small displacement in the body frame."""
+    """Return the pose after a small displacement in the body frame."""
     middle = pose[2] + 0.5 * step[2]
     c, s = np.cos(middle), np.sin(middle)
     return pose + np.array([c * step[0] - s * step[1], s * step[0] + c * step[1], step[2]])
 
 
 class _Recorder:
-    """Rows of a trace while they come: the engine's state as it is, made sense of at the end."""
+    """Collects the engine's state row by row, and turns it into a trace at the end."""
 
     def __init__(self, plant: SimulatedRobot):
         self.plant = plant
@@ -252,6 +255,6 @@ class _Recorder:
             current=amps,
             voltage=volts,
             bus=bus,
-            sinkage=np.maximum(self.plant.machine.wheel_radius_m - height, 0.0),
+            sinkage=np.maximum(self.plant.robot.wheel_radius_m - height, 0.0),
             twist_command=sent,
         )

@@ -1,4 +1,4 @@
-"""The robot on a floor, a millisecond at a time; MuJoCo does the mechanics."""
+"""The robot on a floor, advanced in milliseconds; MuJoCo does the mechanics."""
 
 from types import ModuleType
 
@@ -16,13 +16,13 @@ TIMESTEP = 1e-3
 SETTLING = 0.4
 """Time for which a robot stands still before anything is recorded [s]."""
 LOOKUP_STEPS = 5
-"""Time steps between two looks at what is beneath the rollers."""
+"""Time steps between two lookups of the floor beneath the rollers."""
 CREEP = 0.02
 """Speed at which an added force has reached 0.7 of its size [m/s]."""
 
 
 def engine() -> ModuleType:
-    """The mujoco module; DataError where it is not installed."""
+    """Return the mujoco module; raise `DataError` where it is not installed."""
     try:
         import mujoco
     except ImportError:
@@ -33,7 +33,7 @@ def engine() -> ModuleType:
 
 
 def heading_of(quaternion: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
-    """Angle about the vertical of a quaternion w, x, y, z [rad]."""
+    """Return the angle about the vertical of a quaternion w, x, y, z [rad]."""
     w, x, y, z = np.moveaxis(np.asarray(quaternion), -1, 0)
     return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
@@ -42,10 +42,12 @@ class SimulatedRobot:
     """A robot standing on a floor.
 
     Args:
-        floor: of surfaces that the site has the physics of.
+        site: the robot's build, its sensors and the surfaces.
+        floor: map of surfaces that the site knows.
         load: name of the load set-up.
-        seed: seed of how the wheels stand at first, and of the floor's unevenness.
-        timestep: [s].
+        start: x, y [m], heading [rad].
+        seed: seed of the wheels' first angles and of the floor's unevenness.
+        timestep: time step of the engine [s].
     """
 
     def __init__(
@@ -57,20 +59,20 @@ class SimulatedRobot:
         seed: int = 0,
         timestep: float = TIMESTEP,
     ):
-        self.machine, self.dt = site.machine, timestep
+        self.robot, self.dt = site.robot, timestep
         mujoco = engine()
         # warnings are counted by the engine, for `check`; else it writes a file where it runs
         mujoco.set_mju_user_warning(lambda text: None)
         self._step = mujoco.mj_step
         self.model = mujoco.MjModel.from_xml_string(
-            mjcf(self.machine, load, timestep, ribs(floor, site.grounds, start))
+            mjcf(self.robot, load, timestep, ribs(floor, site.surfaces, start))
         )
         self.data = mujoco.MjData(self.model)
         rng = np.random.default_rng(seed)
         self._find(site.motor)
-        self._lay(Terrain(floor, site.grounds, start, rng))
+        self._lay(Terrain(floor, site.surfaces, start, rng))
         self.drive = WheelDrives(
-            site.motor, site.loop, self.machine.gear_ratio, len(self.wheel_dof), timestep
+            site.motor, site.loop, self.robot.gear_ratio, len(self.wheel_dof), timestep
         )
         self._place(start, rng)
         self._count = 0
@@ -81,22 +83,22 @@ class SimulatedRobot:
 
     @property
     def time(self) -> float:
-        """Since the end of the settling [s]."""
+        """Time since the end of the settling [s]."""
         return self._count * self.dt
 
     @property
     def pose(self) -> Pose:
-        """X, y [m], heading [rad, between -pi and pi] of the body."""
+        """Pose of the body: x, y [m], heading [rad, between -pi and pi]."""
         q = self.data.qpos
         return float(q[0]), float(q[1]), float(heading_of(q[3:7]))
 
     @property
     def wheel_angle(self) -> Float[np.ndarray, " wheel"]:
-        """Since the end of the settling [rad]."""
+        """Angle of each wheel since the end of the settling [rad]."""
         return self.data.qpos[self.wheel_at] - self.angle_at_start
 
     def step(self, wanted: list[float]) -> None:
-        """One time step with these wheel speeds wanted [rad/s]."""
+        """Advance by one time step with these commanded wheel speeds [rad/s]."""
         d = self.data
         if self._count % LOOKUP_STEPS == 0:
             self._look()
@@ -108,7 +110,7 @@ class SimulatedRobot:
         self._step(self.model, d)
 
     def check(self) -> None:
-        """DataError where the engine lost the robot: it starts again from somewhere and goes on."""
+        """Raise `DataError` where the engine became unstable: it resets the robot and goes on."""
         mujoco = engine()
         kinds = [f"mjWARN_BAD{what}" for what in ("QPOS", "QVEL", "QACC")]
         numbers = [int(getattr(mujoco.mjtWarning, kind)) for kind in kinds]
@@ -120,31 +122,31 @@ class SimulatedRobot:
             )
 
     def _find(self, motor: MotorBuild) -> None:
-        """Addresses of wheels and rollers in the engine's arrays."""
-        m, count = self.model, len(self.machine.wheel_azimuths_deg)
+        """Look up wheels and rollers in the engine's arrays, and set the motors' properties."""
+        m, count = self.model, len(self.robot.wheel_azimuths_deg)
         joints = [m.joint(f"wheel{k}") for k in range(count)]
         self.wheel_dof = np.array([j.dofadr[0] for j in joints])
         self.wheel_at = np.array([j.qposadr[0] for j in joints])
         self.wheel_body = np.array([m.body(f"wheel{k}").id for k in range(count)])
-        each = [(k, j) for k in range(count) for j in range(self.machine.rollers)]
+        each = [(k, j) for k in range(count) for j in range(self.robot.rollers)]
         self._roller = np.array([m.geom(f"roller{k}_{j}").id for k, j in each])
         mounts = [m.joint(f"mount{k}_{j}") for k, j in each]
         self._axle_dof = np.array([m.joint(f"roller{k}_{j}").dofadr[0] for k, j in each])
         self._mount = np.array([j.id for j in mounts])
         self._mount_dof = np.array([j.dofadr[0] for j in mounts])
-        m.dof_armature[self.wheel_dof] = motor.rotor_inertia_kg_m2 * self.machine.gear_ratio**2
+        m.dof_armature[self.wheel_dof] = motor.rotor_inertia_kg_m2 * self.robot.gear_ratio**2
         m.dof_frictionloss[self.wheel_dof] = motor.coulomb_nm
         m.dof_damping[self.wheel_dof] = motor.viscous_nms
 
     def _lay(self, terrain: Terrain) -> None:
-        """Contact parameters of every kind of floor."""
+        """Store the contact parameters of every kind of floor."""
         self.terrain = terrain
         kinds = terrain.kinds
         self._friction = np.array([[g.friction, 0.003, f * g.rolling_m] for g, f in kinds])
         self._contact = np.array([[max(g.settling_s, 2 * self.dt), 1.0] for g, _ in kinds])
-        mount = self.machine.mount_n_m
+        mount = self.robot.mount_n_m
         self._shear = np.array([1 / (1 / mount + f / g.shear_n_m) for g, f in kinds])
-        self._damping = 1.4 * np.sqrt(self._shear * self.machine.roller_mass_kg)
+        self._damping = 1.4 * np.sqrt(self._shear * self.robot.roller_mass_kg)
         self._resists = any(g.compaction or g.body_drag_n for g, _ in kinds)
         self._beneath = np.full(len(self._roller), -1)
         self._low = np.full(len(self._roller), -1)
@@ -172,21 +174,21 @@ class SimulatedRobot:
             m.geom_solref[geoms] = self._contact[which]
             m.jnt_stiffness[self._mount[new]] = self._shear[which]
             m.dof_damping[self._mount_dof[new]] = self._damping[which]
-        low = place[:, 2] < 0.5 * self.machine.wheel_radius_m
+        low = place[:, 2] < 0.5 * self.robot.wheel_radius_m
         if (low != self._low).any():
             self._low = low
-            m.dof_frictionloss[self._axle_dof] = np.where(low, self.machine.roller_friction_nm, 0.0)
+            m.dof_frictionloss[self._axle_dof] = np.where(low, self.robot.roller_friction_nm, 0.0)
 
     def _resist(self) -> None:
-        """Compaction at sunk wheels and drag on the body, as a wrench on the chassis."""
+        """Apply compaction at sunk wheels and drag on the body, as a wrench on the chassis."""
         d = self.data
         vx, vy, _, _, _, turn = d.qvel[:6].tolist()
         x0, y0, z0 = d.qpos[:3].tolist()
         places = d.xpos[self.wheel_body]
         beneath = [self.terrain.kinds[k][0] for k in self.terrain.at(places[:, :2]).tolist()]
         fx = fy = moment = 0.0
-        for (x, y, z), ground in zip(places.tolist(), beneath, strict=True):
-            hard = ground.compaction * max(self.machine.wheel_radius_m - z, 0.0) ** 1.5
+        for (x, y, z), surface in zip(places.tolist(), beneath, strict=True):
+            hard = surface.compaction * max(self.robot.wheel_radius_m - z, 0.0) ** 1.5
             ux, uy = vx - turn * (y - y0), vy + turn * (x - x0)
             size = hard / (ux * ux + uy * uy + CREEP**2) ** 0.5
             fx -= size * ux

@@ -1,7 +1,4 @@
-"""DC motors on one supply, and the speed loop that is built into the robot.
-
-The robot as a MuJoCo model: chassis, omni wheels with passive rollers, floor.
-"""
+"""Build of the test site's robot: DC motors, wheel speed loop, and its MuJoCo model."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field
@@ -22,8 +19,8 @@ class MotorBuild:
 
     Attributes:
         resistance_ohm, inductance_h: resistance and inductance of the winding.
-        back_emf_vs: [V s/rad], which is its torque per current as well.
-        rotor_inertia_kg_m2: at the motor shaft.
+        back_emf_vs: back-EMF constant, equal to the torque constant [V s/rad].
+        rotor_inertia_kg_m2: inertia at the motor shaft.
         coulomb_nm, viscous_nms: friction at the wheel [N m], [N m s].
         efficiency: efficiency of the gear while the motor drives.
         supply_v, supply_ohm: voltage and resistance of the battery that all motors share; its
@@ -48,10 +45,10 @@ class SpeedLoop:
     """The built-in controller of wheel speed, at the engine's time step.
 
     Attributes:
-        kind: `pi`; `feed_forward` (proportional, and the back-EMF of the wanted speed); `cascade`
-            (PI to a current, and a current loop below it).
+        kind: `pi`; `feed_forward` (proportional, and the back-EMF of the commanded speed);
+            `cascade` (PI to a current, and a current loop below it).
         gain: gain of the error in motor speed [V s/rad]; in a cascade [A s/rad].
-        integral: per second of it [V/rad]; in a cascade [A/rad].
+        integral: gain of its integral [V/rad]; in a cascade [A/rad].
         current_gain: gain of the cascade's inner loop [V/A].
         current_limit_a: limit of the cascade's current.
         filter_s: time constant of the measured speed.
@@ -66,7 +63,7 @@ class SpeedLoop:
 
 
 class WheelDrives:
-    """Currents [A] and voltages [V] of all wheels, a step of `dt` [s] at a time."""
+    """Currents [A] and voltages [V] of all motors, advanced by steps of `dt` [s]."""
 
     def __init__(
         self, motor: MotorBuild, loop: SpeedLoop, gear_ratio: float, wheels: int, dt: float
@@ -83,11 +80,11 @@ class WheelDrives:
         self._ticks: list[int] | None = None
 
     def step(self, wanted: list[float], angle: list[float], speed: list[float]) -> list[float]:
-        """Torques at the wheels [N m] over one step.
+        """Return the torques at the wheels over one step [N m].
 
         Args:
-            wanted: wheel speeds [rad/s].
-            angle: angles of the wheels [rad]; the loop sees whole ticks of it.
+            wanted: commanded wheel speeds [rad/s].
+            angle: angles of the wheels [rad], of which the loop sees whole ticks.
             speed: speeds of the wheels [rad/s], for the back-EMF.
         """
         m = self.motor
@@ -97,8 +94,8 @@ class WheelDrives:
         out = []
         drawn = 0.0
         for k, target in enumerate(wanted):
-            seen = (ticks[k] - before[k]) * self._per_tick / self.dt
-            self._speed[k] += self._blend * (seen - self._speed[k])
+            measured = (ticks[k] - before[k]) * self._per_tick / self.dt
+            self._speed[k] += self._blend * (measured - self._speed[k])
             volts = self._voltage(k, target * self.gear, self._speed[k] * self.gear)
             turning = speed[k] * self.gear
             settled = (volts - m.back_emf_vs * turning) / m.resistance_ohm
@@ -111,48 +108,49 @@ class WheelDrives:
         return out
 
     def _voltage(self, k: int, wanted: float, measured: float) -> float:
-        """The loop's wish within the bus voltage; where that ends the integral is held."""
+        """Return the loop's voltage within the bus voltage; the integral is held at the limit."""
         loop, m = self.loop, self.motor
         error = wanted - measured
         stored = self._integral[k] + loop.integral * error * self.dt
         if loop.kind == "pi":
-            wish = loop.gain * error + stored
+            volts = loop.gain * error + stored
         elif loop.kind == "feed_forward":
-            wish = loop.gain * error + m.back_emf_vs * wanted
+            volts = loop.gain * error + m.back_emf_vs * wanted
         else:
             amps = loop.gain * error + stored
             held = min(max(amps, -loop.current_limit_a), loop.current_limit_a)
             stored = stored if held == amps else self._integral[k]
-            wish = (
+            volts = (
                 m.resistance_ohm * held
                 + m.back_emf_vs * measured
                 + loop.current_gain * (held - self.current[k])
             )
-        volts = min(max(wish, -self.bus), self.bus)
-        if volts == wish:
+        limited = min(max(volts, -self.bus), self.bus)
+        if limited == volts:
             self._integral[k] = stored
-        return volts
+        return limited
 
 
 @dataclass(frozen=True, config=CLOSED)
 class RobotBuild:
-    """What the robot is made of; by default like a Robotino 2.
+    """Dimensions and masses of the robot; by default like a Robotino 2.
 
     Attributes:
         mass_kg: mass of the whole robot.
         centres_m: x, y of the centre of mass of every load set-up.
         centre_height_m: height of the centre of mass above the wheel axes.
         wheel_azimuths_deg: azimuths of the wheel centres; each drives 90 deg further.
-        base_radius_m, wheel_radius_m: [m].
+        base_radius_m: distance from the middle to the wheel centres.
+        wheel_radius_m: radius of the wheels.
         gear_ratio: turns of the motor per turn of the wheel.
         rollers: number of rollers of one wheel, in two staggered rows; even.
         roller_radius_m, roller_mass_kg: radius and mass of one roller.
         row_offset_m: distance of each row from the middle of the wheel.
         mount_n_m: stiffness of a roller's mount along the wheel's rim [N/m].
         roller_friction_nm: friction of a roller's bearing.
-        wheel_mass_kg: without rollers.
+        wheel_mass_kg: mass of a wheel without rollers.
         body_radius_m: radius of the chassis, for pictures.
-        marker_height_m, marker_size_m: height of the camera's marker above the floor, its edge.
+        marker_height_m, marker_size_m: height of the camera's marker above the floor, and its edge.
         marker_yaw_deg: heading of the marker less the body's.
     """
 
@@ -212,40 +210,40 @@ class RobotBuild:
 
     @property
     def wheel_from_twist(self) -> Float[np.ndarray, "wheel 3"]:
-        """Wheel speed [rad/s] of a body that rolls without slip, per twist."""
+        """Matrix from the twist of a body that rolls without slip to wheel speeds [rad/s]."""
         azimuth = np.radians(self.wheel_azimuths_deg)
         ahead = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=1)
         turn = np.full((len(azimuth), 1), self.base_radius_m)
         return np.concatenate([ahead, turn], axis=1) / self.wheel_radius_m
 
     def load_share(self, load: str) -> Float[np.ndarray, " wheel"]:
-        """Share of the weight on each wheel at rest, from statics (least squares beyond three)."""
+        """Return the share of the weight on each wheel, by statics (least squares beyond three)."""
         count = len(self.wheel_azimuths_deg)
         level = np.concatenate([np.ones((1, count)), self.places.T])
         return np.linalg.lstsq(level, np.array([1.0, *self.centres_m[load]]), rcond=None)[0]
 
 
 def mjcf(
-    machine: RobotBuild,
+    robot: RobotBuild,
     load: str,
     timestep: float,
     ribs: Sequence[tuple[float, float, float, float]] = (),
     looks: str = "",
     floor_looks: str = "",
 ) -> str:
-    """MuJoCo's XML of the robot at the origin of a flat floor.
+    """Return MuJoCo's XML of the robot at the origin of a flat floor.
 
     Rollers carry the contact parameters (they have priority over the floor), so that `plant` can
-    give each those of the surface beneath it.
+    give each roller those of the surface beneath it.
 
     Args:
-        load: whose centre of mass it has.
-        ribs: x, lowest y, highest y, height [m] of every rib.
+        load: load set-up, which sets the centre of mass.
+        ribs: x, lowest y, highest y, height of every rib [m].
         looks: XML of assets, for pictures.
         floor_looks: XML attributes of the floor's plane.
     """
-    m = machine
-    # the chassis makes up for wheels that are not spread evenly
+    m = robot
+    # place the chassis so that chassis and wheels together have the centre of mass
     wheels = (m.mass_kg - m.own_mass_kg) * m.places.mean(axis=0)
     x, y = (m.mass_kg * np.array(m.centres_m[load]) - wheels) / m.own_mass_kg
     inertia = m.own_mass_kg * np.array([0.012, 0.012, 0.016])
@@ -272,7 +270,7 @@ def mjcf(
 
 
 def _body_geoms(m: RobotBuild) -> str:
-    """Body and marker, for pictures: nothing touches them."""
+    """Return XML of body and marker, for pictures; nothing collides with them."""
     from_axis = m.marker_height_m - m.wheel_radius_m
     half, edge = 0.5 * m.marker_size_m, 0.62 * m.marker_size_m
     nothing = 'contype="0" conaffinity="0" mass="0"'
@@ -289,10 +287,11 @@ def _body_geoms(m: RobotBuild) -> str:
 
 
 def _wheel(m: RobotBuild, k: int) -> str:
+    """Return XML of a wheel with its rollers."""
     azimuth = np.radians(m.wheel_azimuths_deg[k])
     x, y = m.places[k]
     ring = m.wheel_radius_m - m.roller_radius_m
-    # straight rollers bridge the gap to the next row where both are as low as one in the middle
+    # half a roller's length: its end is as high as the end of the next row's roller
     step = np.pi / m.rollers
     half = ring * (1 - np.cos(step)) / np.sin(step)
     parts = [

@@ -1,4 +1,4 @@
-"""What a config of `slipid simulate` can hold: floors, runs, and the numbers of the site."""
+"""Sections of a `slipid simulate` config: floors, runs, and the numbers of the site."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,11 +18,11 @@ Speed = Annotated[float, Field(gt=0, le=3)]
 Speeds = Annotated[list[Speed], Field(min_length=1)]
 Distance = Annotated[float, Field(gt=0, le=100)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
-"""Of surfaces, loads and maps: they name files and folders."""
+"""Name of a surface, load or map, which also names files and folders."""
 
 
 class FileMap(Section):
-    """A floor map's file, beside the config."""
+    """Floor map in a file beside the config."""
 
     kind: Literal["file"]
     file: str
@@ -77,12 +77,12 @@ class HeadingRuns(SurfaceRuns):
     distance_m: Distance = 0.7
 
     def runs(self) -> list[SiteRun]:
-        ways = np.radians(self.first_deg + np.arange(0.0, 360.0, self.step_deg)).tolist()
-        return [self.straight(a, v, self.distance_m) for v in self.speeds_m_s for a in ways]
+        headings = np.radians(self.first_deg + np.arange(0.0, 360.0, self.step_deg)).tolist()
+        return [self.straight(a, v, self.distance_m) for v in self.speeds_m_s for a in headings]
 
 
 class CurveRuns(SurfaceRuns):
-    """Arcs, to the left and to the right in turn."""
+    """Arcs, alternately to the left and to the right."""
 
     kind: Literal["curves"] = "curves"
     count: int = Field(4, ge=1, le=10_000)
@@ -90,11 +90,11 @@ class CurveRuns(SurfaceRuns):
     distance_m: Distance = 0.7
 
     def runs(self) -> list[SiteRun]:
-        ways = (2 * np.pi * (np.arange(self.count) + 0.5) / self.count).tolist()
+        headings = (2 * np.pi * (np.arange(self.count) + 0.5) / self.count).tolist()
         return [
             self.straight(a, v, self.distance_m, (-1) ** k * 4.0 * v)
             for v in self.speeds_m_s
-            for k, a in enumerate(ways)
+            for k, a in enumerate(headings)
         ]
 
 
@@ -127,7 +127,7 @@ class MapRuns(Section):
 
 
 class WanderRuns(MapRuns):
-    """Random way-points on a map."""
+    """Runs through random way-points on a map."""
 
     kind: Literal["wander"] = "wander"
     count: int = Field(8, ge=1, le=10_000)
@@ -154,7 +154,7 @@ class WanderRuns(MapRuns):
 class RectangleRuns(MapRuns):
     """The 2021 paper's 900 x 400 mm rectangle on a map: ahead, right, back, left, without turning.
 
-    With `encoders` the corners are those of the robot's own frame at the start.
+    With `encoders` the corners are in the robot's own frame at the start.
     """
 
     kind: Literal["rectangle"] = "rectangle"

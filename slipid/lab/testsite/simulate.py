@@ -1,6 +1,6 @@
-"""What sensors and the overhead camera make of the truth: a log that errs like real ones.
+"""Simulate logs on the virtual test site in parallel, with sensor errors like real ones.
 
-`slipid simulate`: logs from the virtual test site, in parallel, with the truth apart.
+The truth is written apart from the logs.
 """
 
 import hashlib
@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from contextlib import closing, nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,7 @@ from slipid.support.progress import Reporter
 
 
 def log_of(trace: Trace, site: Site, run: SiteRun, name: str, seed: int) -> Log:
-    """The log of a run, by its name and the seed of its noise."""
+    """Return the log of a run, by its name and the seed of its noise."""
     s, rng = site.sensors, np.random.default_rng([seed, 1])
     count = int(trace.time[-1] / s.row_s) + 1
     uneven = s.row_s * (1 + s.row_jitter * rng.uniform(-1, 1, count))
@@ -39,7 +39,7 @@ def log_of(trace: Trace, site: Site, run: SiteRun, name: str, seed: int) -> Log:
     time = time[time <= trace.time[-1]]
     at = np.searchsorted(trace.time, time + 1e-9) - 1
     whole = np.floor(trace.wheel_angle[at] / site.tick) * site.tick
-    quantum = s.speed_step / site.machine.gear_ratio
+    quantum = s.speed_step / site.robot.gear_ratio
     speed = np.round(s.speed_gain * _averaged(trace.wheel_speed, at, 5) / quantum) * quantum
     width = max(1, round(s.average_s / (trace.time[1] - trace.time[0])))
     amps = s.amperes(_averaged(trace.current, at, width), rng)
@@ -75,7 +75,7 @@ def log_of(trace: Trace, site: Site, run: SiteRun, name: str, seed: int) -> Log:
 def _averaged(
     x: Float[np.ndarray, "step wheel"], at: np.ndarray, width: int
 ) -> Float[np.ndarray, "row wheel"]:
-    """Mean of so many steps up to each row."""
+    """Return the mean of the last `width` steps at each row."""
     total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
     first = np.maximum(at + 1 - width, 0)
     return (total[at + 1] - total[first]) / (at + 1 - first)[:, None]
@@ -84,28 +84,28 @@ def _averaged(
 def _camera(
     trace: Trace, site: Site, rng: np.random.Generator, time: Float[np.ndarray, " row"]
 ) -> tuple[Float[np.ndarray, "row 3"], Bool[np.ndarray, " row"]]:
-    """Marker poses as the rows hold them, and which rows bring a new frame."""
+    """Return the marker pose in each row, and which rows have a new frame."""
     s = site.sensors
     delay = s.lag_s - 0.5 * s.frame_s
-    first = -(s.lag_s + 3 * s.frame_s)  # so that there is one to be logged when it starts
+    first = -(s.lag_s + 3 * s.frame_s)  # so that the first row has a frame
     taken = np.arange(first, trace.time[-1] + s.frame_s, s.frame_s) + rng.uniform(0, s.frame_s)
     taken = taken[(rng.uniform(size=len(taken)) >= s.dropout) | (taken + delay <= 0.0)]
-    seen = interpolate(trace.time, trace.pose, taken)
-    seen[:, 2] += float(np.radians(site.machine.marker_yaw_deg))
-    seen[:, :2] += s.camera_noise_m * rng.normal(size=(len(taken), 2))
-    seen[:, 2] += s.camera_noise_rad * rng.normal(size=len(taken))
+    poses = interpolate(trace.time, trace.pose, taken)
+    poses[:, 2] += float(np.radians(site.robot.marker_yaw_deg))
+    poses[:, :2] += s.camera_noise_m * rng.normal(size=(len(taken), 2))
+    poses[:, 2] += s.camera_noise_rad * rng.normal(size=len(taken))
     wrong = rng.uniform(size=len(taken)) < s.outlier
-    seen[:, :2] += np.where(wrong[:, None], s.outlier_m * rng.normal(size=(len(taken), 2)), 0.0)
-    seen[:, :2] /= s.camera_scale
+    poses[:, :2] += np.where(wrong[:, None], s.outlier_m * rng.normal(size=(len(taken), 2)), 0.0)
+    poses[:, :2] /= s.camera_scale
     newest = np.searchsorted(taken + delay, time, side="right") - 1
     fresh = np.concatenate([[True], np.diff(newest) > 0])
-    return seen[newest], fresh
+    return poses[newest], fresh
 
 
 MANIFEST = "simulate.json"
 SCHEMA = "slipid.simulation/1"
 FOLDERS = {"slipid": "logs", "robotino2022": "robotino2022"}
-"""Folder below OUT of every format."""
+"""Folder of every log format, below the output folder."""
 TRUTH_STEP = 10
 """Time steps between rows of a stored truth."""
 
@@ -123,10 +123,10 @@ class SiteTask:
 
 
 def simulate(plan: SimulationPlan, out: Path, executor: Executor, report: Reporter) -> Content:
-    """Drive every run of a plan that is not there yet; what simulate.json holds.
+    """Drive every run of a plan that is not done yet; return the content of simulate.json.
 
-    A run's truth is written last: a run that has one is done. Called again after an interrupt it
-    goes on from there.
+    A run's truth is written last: a run that has one is done, and an interrupted simulation
+    continues from there.
 
     Raises:
         DataError: MuJoCo is missing, or the folder holds runs of another config.
@@ -164,13 +164,13 @@ def simulate(plan: SimulationPlan, out: Path, executor: Executor, report: Report
 def _film(
     tasks: Sequence[SiteTask], camera: SiteCamera, executor: Executor, report: Reporter
 ) -> None:
-    """Videos of the runs that have none yet, with the camera's numbers beside them."""
+    """Make the missing videos, with the camera file beside them."""
     todo = {task.name: (task, camera) for task in tasks if not _video_path(task).is_file()}
     if not todo:
         return
-    write_json(tasks[0].out / "video" / "camera.json", camera.as_dict())
+    write_json(tasks[0].out / "video" / "camera.json", camera.to_json())
     report.stage(f"filming {len(todo)} of {len(tasks)} runs")
-    # not in this process, even alone: what draws has to be chosen before MuJoCo is there
+    # never in this process: the drawing backend has to be chosen before MuJoCo is imported
     with Processes(1) if isinstance(executor, InProcess) else nullcontext(executor) as apart:
         results(apart, film_and_write, todo, report)
 
@@ -197,13 +197,13 @@ def _truth_path(task: SiteTask) -> Path:
 
 
 def drive_and_write(task: SiteTask) -> float:
-    """Drive one run and write its log and its truth; the seconds it drove."""
+    """Drive one run, write its log and its truth, and return its duration [s]."""
     try:
         trace = drive(task.run, task.site, task.seed)
-    except ValueError as error:  # also the engine's, of a robot that it cannot build
+    except ValueError as error:  # also from the engine, about a robot that it cannot build
         raise DataError(f"{task.name}: {error}") from error
     site = task.site
-    gear, ticks = site.machine.gear_ratio, site.motor.ticks_per_revolution
+    gear, ticks = site.robot.gear_ratio, site.motor.ticks_per_revolution
     log = log_of(trace, site, task.run, task.name, task.seed)
     for form in task.formats:
         write = own_csv if form == "slipid" else robotino2022_csv
@@ -214,12 +214,12 @@ def drive_and_write(task: SiteTask) -> float:
 
 
 def _seed(seed: int, k: int) -> int:
-    """Seed of a run that stays when runs are added behind it."""
+    """Return the seed of a run, which stays the same when runs are added behind it."""
     return int(np.random.SeedSequence(seed, spawn_key=(k,)).generate_state(1)[0])
 
 
 def _log_path(form: str, task: SiteTask) -> str:
-    """Where the log of a format lies."""
+    """Return the path of a log in the folder of a format."""
     if form == "slipid":
         return f"{task.name}.csv"
     load, folder, number = task.name.split("/")
@@ -230,11 +230,11 @@ def _log_path(form: str, task: SiteTask) -> str:
 
 
 def _truth_arrays(trace: Trace, run: SiteRun, site: Site) -> dict[str, np.ndarray]:
-    """What truly happened: poses, wheels, currents, and the surface under every wheel."""
+    """Return true poses, wheels, currents, and the surface under every wheel."""
     t = replace(trace, **{k: getattr(trace, k)[::TRUTH_STEP] for k in vars(trace)})
     c, s = np.cos(t.pose[:, 2]), np.sin(t.pose[:, 2])
     turned = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
-    places = t.pose[:, None, :2] + np.einsum("tij,wj->twi", turned, site.machine.places)
+    places = t.pose[:, None, :2] + np.einsum("tij,wj->twi", turned, site.robot.places)
     floor = run.map
     names = np.array(floor.surfaces)[floor.at(places)]
     keep = ("time", "pose", "wheel_angle", "wheel_speed", "current", "voltage", "bus", "sinkage")
@@ -242,13 +242,13 @@ def _truth_arrays(trace: Trace, run: SiteRun, site: Site) -> dict[str, np.ndarra
 
 
 def _write_truth(plan: SimulationPlan, out: Path) -> None:
-    """Maps, the truth about the robot, and a config that identifies it."""
+    """Write maps, the truth about the robot, and a config that identifies it."""
     site = plan.site
     for name, floor in plan.maps.items():
-        colours = {s: site.grounds[s].colour for s in floor.surfaces}
+        colours = {s: site.surfaces[s].colour for s in floor.surfaces}
         write_map(out / "maps" / f"{name}.toml", floor, colours)
-    known = {"schema": "slipid.truth/1", "parameters": truth(site), "site": asdict(site)}
-    write_json(out / "truth" / "truth.json", known)
+    content = {"schema": "slipid.truth/1", "parameters": truth(site), "site": site.to_json()}
+    write_json(out / "truth" / "truth.json", content)
     robot = out / "robot.toml"
     if can_identify(plan):
         texts = {robot: identify_config(plan)}
@@ -260,17 +260,17 @@ def _write_truth(plan: SimulationPlan, out: Path) -> None:
 
 
 def truth(site: Site) -> dict[str, Content]:
-    """Numbers of the site that a fit has as well, by their path names."""
-    machine, motor, sensors = site.machine, site.motor, site.sensors
+    """Return the numbers of the site that a fit has as well, by their path names."""
+    robot, motor, sensors = site.robot, site.motor, site.sensors
     found: dict[str, tuple[float | list[float], str]] = {
-        f"robot.load_share@{load}": (machine.load_share(load).tolist(), "1")
-        for load in machine.centres_m
+        f"robot.load_share@{load}": (robot.load_share(load).tolist(), "1")
+        for load in robot.centres_m
     }
     found |= {
         "motor.resistance": (motor.resistance_ohm, "ohm"),
         "motor.back_emf": (motor.back_emf_vs, "V*s/rad"),
         "camera.scale": (sensors.camera_scale, "1"),
         "camera.lag": (sensors.lag_s, "s"),
-        "camera.marker_yaw": (float(np.radians(machine.marker_yaw_deg)), "rad"),
+        "camera.marker_yaw": (float(np.radians(robot.marker_yaw_deg)), "rad"),
     }
     return {path: {"value": value, "unit": unit} for path, (value, unit) in found.items()}

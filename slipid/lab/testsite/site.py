@@ -1,7 +1,7 @@
-"""What stays the same from run to run: the robot, its sensors, the camera, the floors' physics."""
+"""Everything that stays the same from run to run: robot, sensors, camera, surfaces."""
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import asdict, field
 from typing import Annotated
 
 import numpy as np
@@ -11,33 +11,33 @@ from pydantic.dataclasses import dataclass
 
 from slipid.lab.testsite.robot_build import MotorBuild, RobotBuild, SpeedLoop
 from slipid.lab.testsite.surfaces import SURFACES, SurfacePhysics
+from slipid.support.content import Content
 from slipid.support.toml_file import CLOSED, NotNegative, Part, Positive
 
 Interval = Annotated[float, Field(ge=1e-3, le=1)]
-"""[s]."""
+"""Time between readings [s]."""
 Tilt = Annotated[float, Field(ge=-10, le=10)]
-"""[deg]."""
+"""Tilt of the camera about one axis [deg]."""
 
 
 @dataclass(frozen=True, config=CLOSED)
 class SiteSensors:
-    """How logs err.
+    """Errors of the logged sensors.
 
     Attributes:
         row_s, row_jitter: mean time between rows [s], and its spread as part of it.
         current_step_a, current_noise_a: step of the current's converter, and its noise [A].
-        current_is_signed: else magnitudes are logged, as most robots do.
-        speed_step, speed_gain: quantum of the reported motor speed [rad/s], and how much it reads
-            too high [1].
+        current_is_signed: whether currents have a sign; most robots log magnitudes.
+        speed_step, speed_gain: quantum of the reported motor speed [rad/s], and its gain error [1].
         voltage, duty, bus_voltage, gyro: whether these are logged.
-        voltage_step_v, voltage_noise_v: [V].
-        gyro_noise, gyro_bias: [rad/s]; the bias is drawn anew for every run.
-        average_s: over which currents and voltages are averaged before they are sampled [s].
-        frame_s, lag_s: between camera frames, and mean age of the pose in a row [s].
+        voltage_step_v, voltage_noise_v: step of the voltage's converter, and its noise [V].
+        gyro_noise, gyro_bias: noise of every row, and std of the bias, drawn for every run [rad/s].
+        average_s: time over which currents and voltages are averaged before they are sampled [s].
+        frame_s, lag_s: time between camera frames, and mean age of the pose in a row [s].
         camera_scale: true length over logged length; the camera of the 2022 logs has 1.117.
         camera_noise_m, camera_noise_rad: noise of every frame.
-        dropout: part of the frames that is lost.
-        outlier, outlier_m: part of the frames that is wrong, and by how much [m].
+        dropout: share of the frames that is lost.
+        outlier, outlier_m: share of the frames that is wrong, and std of their error [m].
     """
 
     row_s: Interval = 0.031
@@ -72,7 +72,7 @@ class SiteSensors:
     def amperes(
         self, true: Float[np.ndarray, "*batch"], rng: np.random.Generator
     ) -> Float[np.ndarray, "*batch"]:
-        """What ammeters give for true currents [A]."""
+        """Return the readings of ammeters at true currents [A]."""
         read = true + self.current_noise_a * rng.normal(size=true.shape)
         read = read if self.current_is_signed else np.abs(read)
         return np.round(read / self.current_step_a) * self.current_step_a
@@ -80,7 +80,7 @@ class SiteSensors:
     def volts(
         self, true: Float[np.ndarray, "*batch"], rng: np.random.Generator
     ) -> Float[np.ndarray, "*batch"]:
-        """What voltmeters give for true voltages [V]."""
+        """Return the readings of voltmeters at true voltages [V]."""
         read = true + self.voltage_noise_v * rng.normal(size=true.shape)
         return np.round(read / self.voltage_step_v) * self.voltage_step_v
 
@@ -90,23 +90,32 @@ class Site:
     """Everything that stays the same from run to run.
 
     Attributes:
-        machine, motor, loop: the robot; sensors: of its logs; grounds: every surface.
-        command_delay_s: from a command to the wheels.
-        acceleration: of the wheels' rims towards a new command [m/s^2].
+        robot: dimensions and masses of the robot.
+        motor: its motors.
+        loop: its controller of wheel speed.
+        sensors: errors of its logs.
+        surfaces: physics of every surface.
+        command_delay_s: delay from a command to the wheels.
+        acceleration: acceleration of the wheels' rims towards a new command [m/s^2].
     """
 
-    machine: RobotBuild = field(default_factory=RobotBuild)
+    robot: RobotBuild = field(default_factory=RobotBuild)
     motor: MotorBuild = field(default_factory=MotorBuild)
     loop: SpeedLoop = field(default_factory=SpeedLoop)
     sensors: SiteSensors = field(default_factory=SiteSensors)
-    grounds: Mapping[str, SurfacePhysics] = field(default_factory=lambda: dict(SURFACES))
+    surfaces: Mapping[str, SurfacePhysics] = field(default_factory=lambda: dict(SURFACES))
     command_delay_s: float = 0.12
     acceleration: float = 1.0
+
+    def to_json(self) -> Content:
+        """Return the site as the truth file has it, under the older names of two keys."""
+        content = asdict(self)
+        return {"machine": content.pop("robot"), "grounds": content.pop("surfaces"), **content}
 
     @property
     def tick(self) -> float:
         """Turn of a wheel from one tick of its encoder to the next [rad]."""
-        return 2 * np.pi / (self.motor.ticks_per_revolution * self.machine.gear_ratio)
+        return 2 * np.pi / (self.motor.ticks_per_revolution * self.robot.gear_ratio)
 
 
 @dataclass(frozen=True, config=CLOSED)
@@ -117,15 +126,15 @@ class SiteCamera:
         height_m: height of the lens above the floor.
         focal_px: focal length [pixel].
         width_px, height_px: size of the image.
-        centre_m: where on the floor it hangs above, x and y.
-        tilt_deg: about the image's x and y axes.
+        centre_m: x and y of the place above which it hangs.
+        tilt_deg: tilt about the image's x and y axes.
         distortion: k1, k2, p1, p2 of OpenCV's lens model.
         blur_px: std of the blur [pixel].
         noise: std of every pixel [grey levels of 255].
-        flicker: how much the light changes within some seconds, as a part of it.
-        exposure_s: how long a frame is exposed; what moves is seen twice, at both ends.
-        frame_s: between frames.
-        early_s: how long before the robot's log somebody starts it: its clock is then ahead by
+        flicker: relative change of the light within some seconds.
+        exposure_s: exposure time of a frame; moving things appear twice, at both ends.
+        frame_s: time between frames.
+        early_s: how much earlier than the robot's log it starts, which puts its clock ahead by
             that.
     """
 
@@ -165,11 +174,11 @@ class SiteCamera:
 
     @property
     def place(self) -> Float[np.ndarray, "3"]:
-        """Place of the lens in the world [m]."""
+        """Position of the lens in the world [m]."""
         return np.array([*self.centre_m, self.height_m])
 
-    def as_dict(self) -> dict[str, object]:
-        """What a tracker has to know."""
+    def to_json(self) -> Content:
+        """Return the camera file that `slipid track` reads."""
         return {
             "schema": "slipid.camera/1",
             "image_px": [self.width_px, self.height_px],

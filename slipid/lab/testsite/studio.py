@@ -1,4 +1,4 @@
-"""Frames of a run with marker, floor, perspective and a lens, as a video.
+"""Draw frames of a run with marker, floor, perspective and lens, and write them as a video.
 
 Drawing needs OpenGL without a screen: EGL, in software where there is no graphics card. Driving
 does not.
@@ -23,17 +23,17 @@ MARKER = 0
 """Number of the marker in ArUco's dictionary 4X4_50, as on the Robotino of the published frames."""
 
 DRAWN_SHARE = 1.12
-"""How much more is drawn than seen: the lens bends some of the outside into view."""
+"""Size of the drawing relative to the image: the lens bends some of the outside into view."""
 
 _SHIFT = 97
-"""Places to which the noise of a frame is shifted, along each edge [pixel]."""
+"""Number of random shifts of a frame's noise along each edge [pixel]."""
 
 
 class Studio:
-    """Draws frames of a robot on a floor; the seed is that of its pattern, the light and the noise.
+    """Draws frames of a robot on a floor; the seed is for floor pattern, light and noise.
 
     Raises:
-        DataError: OpenGL or OpenCV is not there.
+        DataError: OpenGL or OpenCV is missing.
     """
 
     def __init__(self, site: Site, load: str, floor: FloorMap, camera: SiteCamera, seed: int = 0):
@@ -41,7 +41,7 @@ class Studio:
         self.camera, self._rng, self._cv2 = camera, np.random.default_rng(seed), cv2
         (x, y), half = camera.centre_m, 0.65 * camera.height_m / camera.focal_px
         wide, high = half * camera.width_px, half * camera.height_px
-        x0, y0, x1, y1 = x - wide, y - high, x + wide, y + high  # what is seen, with a margin
+        x0, y0, x1, y1 = x - wide, y - high, x + wide, y + high  # the visible floor and a margin
         carpet = _carpet(floor, site, (x0, y0, x1, y1), self._rng)
         assets = {"floor.png": _png(cv2, carpet), "marker.png": _png(cv2, _marker(cv2))}
         fovy = np.degrees(2 * np.arctan(0.5 * DRAWN_SHARE * camera.height_px / camera.focal_px))
@@ -59,7 +59,7 @@ class Studio:
             '<material name="floor" texture="floor" specular="0"/>'
             '<material name="marker" texture="marker" specular="0"/></asset>'
         )
-        xml = mjcf(site.machine, load, 1e-3, looks=looks, floor_looks='rgba="0 0 0 0"')
+        xml = mjcf(site.robot, load, 1e-3, looks=looks, floor_looks='rgba="0 0 0 0"')
         extra = (
             f'<geom type="plane" pos="{0.5 * (x0 + x1)} {0.5 * (y0 + y1)} .0002" '
             f'size="{0.5 * (x1 - x0)} {0.5 * (y1 - y0)} .1" material="floor" contype="0" '
@@ -72,7 +72,7 @@ class Studio:
         self.model = mujoco.MjModel.from_xml_string(xml, assets)
         self.data = mujoco.MjData(self.model)
         self._forward = mujoco.mj_forward
-        count = range(len(site.machine.wheel_azimuths_deg))
+        count = range(len(site.robot.wheel_azimuths_deg))
         self._wheels = [self.model.joint(f"wheel{k}").qposadr[0] for k in count]
         try:
             self._renderer = mujoco.Renderer(self.model, height, width)
@@ -85,17 +85,17 @@ class Studio:
 
     @property
     def _size(self) -> tuple[int, int]:
-        """Width and height of what is drawn before the lens bends it [pixel]."""
+        """Width and height of the drawing before the lens bends it [pixel]."""
         return round(DRAWN_SHARE * self.camera.width_px), round(DRAWN_SHARE * self.camera.height_px)
 
     def close(self) -> None:
-        """Give the drawing context back."""
+        """Release the drawing context."""
         self._renderer.close()
 
     def frame(
         self, pose: Float[np.ndarray, "3"], wheel_angle: Float[np.ndarray, " wheel"]
     ) -> np.ndarray:
-        """Sharp image of the robot somewhere, through the lens: rows, columns, blue green red."""
+        """Return a sharp image of the robot through the lens: rows, columns, blue green red."""
         q = self.data.qpos
         q[:2], q[3], q[6] = pose[:2], np.cos(0.5 * pose[2]), np.sin(0.5 * pose[2])
         q[self._wheels] = wheel_angle
@@ -110,7 +110,7 @@ class Studio:
         pose_at: Callable[[float], Float[np.ndarray, "3"]],
         wheels_at: Callable[[float], Float[np.ndarray, " wheel"]],
     ) -> np.ndarray:
-        """Frame whose exposure is centred on a time, with smear, blur, light and noise."""
+        """Return a frame whose exposure is centred on a time, with smear, blur, light and noise."""
         c = self.camera
         ends = (-0.5, 0.5) if c.exposure_s > 0 else (0.0,)
         images = [
@@ -126,7 +126,7 @@ class Studio:
         return np.clip(image, 0, 255).astype(np.uint8)
 
     def _lens(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel of the drawing that each pixel of the image comes from."""
+        """Return the pixel of the drawing that each pixel of the image comes from."""
         c, cv2 = self.camera, self._cv2
         grid = np.stack(np.meshgrid(np.arange(c.width_px), np.arange(c.height_px)), -1)
         points = grid.reshape(-1, 1, 2).astype(np.float64)
@@ -146,7 +146,7 @@ def film(
     Args:
         true: time [s] (step,), pose (step, 3) and wheel_angle (step, wheel) of the run.
         frames: times of the video's frames [s].
-        path: where the video goes (.avi, Motion JPEG).
+        path: file of the video (.avi, Motion JPEG).
     """
     import cv2
 
@@ -177,7 +177,7 @@ def film(
 
 
 def _drawing_modules() -> tuple[ModuleType, ModuleType]:
-    """The modules mujoco, ready to draw without a screen, and cv2."""
+    """Return the modules mujoco, ready to draw without a screen, and cv2."""
     if os.name == "posix" and "DISPLAY" not in os.environ:
         os.environ.setdefault("MUJOCO_GL", "egl")
     try:
@@ -204,11 +204,11 @@ def _drawing_error(error: Exception) -> DataError:
 def _carpet(
     floor: FloorMap, site: Site, extent: tuple[float, float, float, float], rng: np.random.Generator
 ) -> np.ndarray:
-    """Picture of the floor: every surface in its colour, with a grain."""
+    """Return a picture of the floor: every surface in its colour, with a grain."""
     step = 0.002
     x = np.arange(extent[0], extent[2], step) + 0.5 * step
     y = np.arange(extent[1], extent[3], step) + 0.5 * step
-    colours = [bytes.fromhex(site.grounds[name].colour[1:]) for name in floor.surfaces]
+    colours = [bytes.fromhex(site.surfaces[name].colour[1:]) for name in floor.surfaces]
     table = np.array([list(colour) for colour in colours], float)
     picture = table[floor.at(np.stack(np.meshgrid(x, y), -1))]
     grain = rng.normal(size=picture.shape[:2]) + 0.7 * np.sin(2 * np.pi * y / 0.012)[:, None]
@@ -216,7 +216,7 @@ def _carpet(
 
 
 def _marker(cv2: ModuleType) -> np.ndarray:
-    """Picture of the marker, its top edge ahead: the texture's right is the body's front."""
+    """Return a picture of the marker, its top edge ahead: right is the body's front."""
     book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     drawn = np.rot90(cv2.aruco.generateImageMarker(book, MARKER, 480), -1)
     return np.repeat(drawn[..., None], 3, axis=2)

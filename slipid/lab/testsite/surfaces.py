@@ -1,4 +1,4 @@
-"""What a surface does to a roller, and what lies where on an uneven floor."""
+"""Physics of surfaces, and the uneven floor that a roller meets."""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -13,12 +13,13 @@ from slipid.data.wheel_signals import stretches
 from slipid.support.toml_file import CLOSED, Positive
 
 GRAVITY = 9.81
+"""Gravitational acceleration [m/s^2]."""
 LEVELS = 7
-"""Steps of the random unevenness of a floor."""
+"""Number of steps of the random unevenness of a floor."""
 ARENA = 1.6
 """Half of the edge of the square around the start in which one surface is uneven [m]."""
 GRID = 0.005
-"""Cells in which the floor is looked up [m], larger on the largest floors."""
+"""Cell size of the floor's lookup grid [m]; larger on the largest floors."""
 
 Pose = tuple[float, float, float]
 """x, y [m], heading [rad]."""
@@ -31,14 +32,14 @@ class SurfacePhysics:
     Attributes:
         friction: Coulomb coefficient of a roller on it [1].
         rolling_m: lever arm of the rolling friction, about both axes of a roller [m].
-        softness_m: how deep a wheel that carries a third of the robot sinks, about, whatever the
-            robot weighs [m].
+        softness_m: approximate sinkage of a wheel that carries a third of the robot, for any weight
+            of the robot [m].
         shear_n_m: horizontal stiffness of the floor beneath one roller [N/m].
         compaction: resistance of a sunk wheel per sinkage to the power of 1.5 [N/m^1.5].
         body_drag_n: resistance of what touches the body, against its motion, not its turning [N].
         rib_height_m, rib_distance_m: size of ribs along y [m]; by default there are none.
         unevenness: std of the logarithm of rolling friction and shear stiffness over the floor [1].
-        colour: in pictures.
+        colour: colour in pictures.
     """
 
     friction: Annotated[float, Field(gt=0, le=10)] = 0.8
@@ -70,7 +71,7 @@ SURFACES: dict[str, SurfacePhysics] = {
 
 
 class Terrain:
-    """The floor around a start in kinds: a surface at a level of its random unevenness.
+    """The floor around a start, divided into kinds: a surface at a level of its random unevenness.
 
     Attributes:
         kinds: surface of each kind, and the factor of its rolling friction.
@@ -79,11 +80,11 @@ class Terrain:
     def __init__(
         self,
         floor: FloorMap,
-        grounds: Mapping[str, SurfacePhysics],
+        surfaces: Mapping[str, SurfacePhysics],
         start: Pose,
         rng: np.random.Generator,
     ):
-        own = [grounds[name] for name in floor.surfaces]
+        own = [surfaces[name] for name in floor.surfaces]
         levels = np.linspace(-1.5, 1.5, LEVELS)
         self.kinds = [(g, np.exp(g.unevenness * v)) for g in own for v in levels]
         x0, y0, x1, y1 = arena(floor, start)
@@ -95,7 +96,7 @@ class Terrain:
         self._kinds = surface * LEVELS + _random_levels(x, y, rng)
 
     def at(self, xy: Float[np.ndarray, "place 2"]) -> Int[np.ndarray, " place"]:
-        """Kind at places [m], by number."""
+        """Return the number of the kind at places [m]."""
         column, row = ((xy - self._corner) * (1 / self._cell)).astype(np.intp).T
         rows, columns = self._kinds.shape
         return self._kinds[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
@@ -104,7 +105,7 @@ class Terrain:
 def _random_levels(
     x: Float[np.ndarray, " column"], y: Float[np.ndarray, " row"], rng: np.random.Generator
 ) -> np.ndarray:
-    """Levels of a smooth random field (row, column): plane waves of about a hand's width."""
+    """Return levels (row, column) of a smooth random field: plane waves of a hand's width."""
     waves = 6
     angle = rng.uniform(0, 2 * np.pi, waves)
     number = 2 * np.pi / rng.uniform(0.08, 0.3, waves)
@@ -118,7 +119,7 @@ def _random_levels(
 
 
 def arena(floor: FloorMap, start: Pose) -> tuple[float, float, float, float]:
-    """Lowest x, y, highest x, y [m] of where a floor is made: all of a map, or around the start."""
+    """Return lowest x, y, highest x, y of the floor [m]: a whole map, or a square at the start."""
     if len(floor.surfaces) > 1:
         return floor.extent
     x, y, _ = start
@@ -126,21 +127,21 @@ def arena(floor: FloorMap, start: Pose) -> tuple[float, float, float, float]:
 
 
 def ribs(
-    floor: FloorMap, grounds: Mapping[str, SurfacePhysics], start: Pose
+    floor: FloorMap, surfaces: Mapping[str, SurfacePhysics], start: Pose
 ) -> list[tuple[float, float, float, float]]:
-    """Ribs along y: x, lowest y, highest y, height [m] of each; none beyond `arena`."""
+    """Return x, lowest y, highest y and height of each rib along y within the arena [m]."""
     out: list[tuple[float, float, float, float]] = []
     left, low, right, high = arena(floor, start)
     fine = min(floor.cell, 0.02)
     y = np.arange(low + 0.5 * fine, high, fine)
     for number, name in enumerate(floor.surfaces):
-        ground = grounds[name]
-        if ground.rib_height_m <= 0:
+        surface = surfaces[name]
+        if surface.rib_height_m <= 0:
             continue
-        for x in np.arange(left, right, ground.rib_distance_m):
+        for x in np.arange(left, right, surface.rib_distance_m):
             on = floor.at(np.stack([np.full_like(y, x), y], 1)) == number
             out += [
-                (float(x), low + fine * float(a), low + fine * float(b), ground.rib_height_m)
+                (float(x), low + fine * float(a), low + fine * float(b), surface.rib_height_m)
                 for a, b in stretches(on)
             ]
     return out

@@ -19,11 +19,11 @@ from slipid.robot.twin import ActuatorModel
 from slipid.support.errors import DataError
 
 TUNING_STARTS = ((0.05, 0.0, 0.2), (0.0, 0.05, -0.2), (-0.05, 0.0, 0.2), (0.0, -0.05, -0.2))
-"""From where gains of published laws are rehearsed: beside the path's start [m, m, rad]."""
+"""Starts beside the path for which gains of published laws are tuned [m, m, rad]."""
 
 
 def _indiveri(robot: DeployedRobot) -> Law:
-    """The wheels as they were identified, and the gains that the pose loop has by hand."""
+    """Return Indiveri's law with the identified wheels and the hand-set gains of the pose loop."""
     numbers, wheels, gains = robot.record.parameters, robot.record.wheels, Gains()
     matrix = inverse_kinematics(
         np.asarray(robot.places),
@@ -35,26 +35,18 @@ def _indiveri(robot: DeployedRobot) -> Law:
     return Indiveri(jnp.asarray(matrix), both, jnp.asarray(Limits().wheel_speed))
 
 
-def _goswami_padhy(robot: DeployedRobot) -> Law:
-    return GoswamiPadhy(jnp.asarray(_tuned_gains("swarm")))
-
-
-def _goswami_padhy_gradient(robot: DeployedRobot) -> Law:
-    return GoswamiPadhy(jnp.asarray(_tuned_gains("gradient")))
-
-
 @cache
 def _tuned_gains(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
-    """Gains [1/s] on the first two sides of the rectangle; the others mirror them.
+    """Return gains tuned on the first two sides of the rectangle [1/s]; the others mirror them.
 
-    The ideal robot is late as every robot's twin is, so that gains are the same for all of them.
+    The ideal robot has the default delay of every twin, so that all robots share these gains.
     """
-    path, habits = rectangle(), ActuatorModel()
+    path, actuators = rectangle(), ActuatorModel()
     times, rows = np.arange(0.0, float(path.marks[1]), PERIOD), np.asarray(path.rows)
     own = STEP * np.arange(len(rows))
     reference = np.stack([np.interp(times, own, column) for column in rows.T], axis=1)
     task = TuningTask(
-        reference, np.array(TUNING_STARTS), habits.command_shares(), habits.lag_gain, PERIOD
+        reference, np.array(TUNING_STARTS), actuators.command_shares(), actuators.lag_gain, PERIOD
     )
     return tuple((by_swarm(task) if by == "swarm" else by_gradient(task)).tolist())
 
@@ -62,23 +54,27 @@ def _tuned_gains(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
 ROWS: Mapping[str, ControllerRow] = {
     **CONTROLLERS,
     "goswami_padhy": ControllerRow(
-        "encoder", "law of Goswami and Padhy, gains by a swarm", law=_goswami_padhy
+        "encoder",
+        "law of Goswami and Padhy, gains by a swarm",
+        law=lambda _: GoswamiPadhy(jnp.asarray(_tuned_gains("swarm"))),
     ),
     "goswami_padhy_gradient": ControllerRow(
-        "encoder", "and gains by the gradient", law=_goswami_padhy_gradient
+        "encoder",
+        "and gains by the gradient",
+        law=lambda _: GoswamiPadhy(jnp.asarray(_tuned_gains("gradient"))),
     ),
     "indiveri": ControllerRow(
         "encoder", "law of Indiveri, its limit keeps the direction", law=_indiveri
     ),
 }
-"""The rows of slipid and of the 2021 paper, then the published laws."""
+"""Controllers of slipid and of the 2021 paper, then the published laws."""
 
 
 def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
-    """The controllers among these that apply to a robot.
+    """Return the controllers among these that apply to a robot.
 
     Raises:
-        DataError: none does.
+        DataError: none applies.
     """
     kept = tuple(name for name in names if ROWS[name].drives(robot))
     if not kept:
@@ -108,7 +104,7 @@ def unused_gains(robot: DeployedRobot, forced: bool) -> str:
     if tuned is None:
         return ""
     if tuned.load != robot.load_setup:
-        return f"gains were tuned for load set-up {tuned.load}: driving with those set by hand"
+        return f"gains were tuned for load set-up {tuned.load}: driving with hand-set gains"
     if not (tuned.is_better or forced):
         return (
             f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "

@@ -1,52 +1,45 @@
-"""Particle swarm optimisation: particles remember, and are drawn to, the best places found so far.
-
-    v <- w v + c1 r1 (own best - x) + c2 r2 (best of all - x),   x <- x + v
-
-with r1, r2 uniform in [0, 1], drawn anew for every particle, coordinate and iteration.
-
-Nothing is tuned: inertia and pulls are those that Goswami and Padhy 2018 set.
-
-Liberties:
-
-- Particles start at rest, and evenly drawn over the box.
-- A coordinate that would leave the box stays on its edge, and rests there; its speed is at most
-  half of the box in an iteration.
-
-Source: Kennedy and Eberhart 1995, "Particle swarm optimization", ICNN, with the inertia of Shi and
-Eberhart 1998; sizes and settings of Goswami and Padhy 2018.
-
-Goswami and Padhy 2018: a tracking law with a Lyapunov function, its gains by a swarm.
+"""Goswami and Padhy 2018: a tracking law with a Lyapunov function, its gains by particle swarm.
 
 For a robot that drives sideways, with the errors e of its place in its own axes, and of its heading
 
     v = R(th)^T p_d' + (k1 e_x, k2 e_y),   W = W_d + k3 sin e_th
     V = (e_x^2 + e_y^2) / 2 + 1 - cos e_th,   V' = -k1 e_x^2 - k2 e_y^2 - k3 sin^2 e_th
 
-so that V falls for all positive gains, if the robot does at once what it is asked to.
+so that V falls for all positive gains, if the robot follows commands at once.
 
-Gains are tuned on an ideal robot that does it late: of those in [0, 5] the ones with the least
+Gains are tuned on an ideal robot with delay and lag: among gains in [0, 5] those with the least
 integral of V over a path that is begun beside it. For a robot that lags as the twin does k1 and k2
 end at the edge, 5, and k3 at 4.67.
 
 - row `goswami_padhy`: by a swarm of 30 particles in 50 iterations, inertia 0.7, c1 = c2 = 1.5.
 - row `goswami_padhy_gradient`: the same integral by its gradient, a quasi-Newton method in a box
-  (L-BFGS-B of scipy), which shows what the swarm leaves.
+  (L-BFGS-B of scipy), which shows how far the swarm stays from the optimum.
+
+In a particle swarm the particles are drawn to the best places found so far:
+
+    v <- w v + c1 r1 (own best - x) + c2 r2 (best of all - x),   x <- x + v
+
+with r1, r2 uniform in [0, 1], drawn anew for every particle, coordinate and iteration. Its settings
+are those of Goswami and Padhy 2018; nothing is tuned.
 
 Liberties:
 
 - The law is the form for robots that drive sideways, as it is quoted; the paper's own text was not
   at hand.
-- What is integrated is V, over the path of the trial begun from several places beside it, on a
+- The integrated cost is V, over the path of the trial begun from several places beside it, on a
   robot without slip whose twist follows commands by the twin's delay and lag. The paper's own
-  robot, path and cost are not made anew.
+  robot, path and cost are not reproduced.
 - All wheels follow alike, so that the twist follows as they do; limits of speed, acceleration and
   voltage are left out, and the pose is known. While gains are tuned the path does not wait.
-- It is steered once in a period, from the pose that the encoders believe in, as all rows are; what
-  it asks for is held to the limits of all rows.
-- The swarm's start and edges: `slipid.lab.trial.goswami_padhy`.
+- It is steered once in a period, from the pose that the encoders believe in, as all rows are; its
+  commands are held to the limits of all rows.
+- Particles start at rest, and evenly drawn over the box. A coordinate that would leave the box
+stays
+  on its edge, and rests there; its speed is at most half of the box in an iteration.
 
 Source: Goswami and Padhy 2018, a trajectory tracking law for a mobile robot with slip, its gains by
-particle swarm; known here by quotation only.
+particle swarm; known here by quotation only. Kennedy and Eberhart 1995, "Particle swarm
+optimization", ICNN, with the inertia of Shi and Eberhart 1998.
 """
 
 from collections.abc import Callable
@@ -60,17 +53,19 @@ from jaxtyping import Array, Float
 
 Places = Float[np.ndarray, "particle n"]
 Cost = Callable[[Places], Float[np.ndarray, " particle"]]
-"""Of every particle at once; what is no number counts as infinite."""
+"""Cost of every particle at once; NaN counts as infinite."""
 
 
 @dataclass(frozen=True)
 class Swarm:
-    """Size of a swarm, for how many iterations it moves, and what moves it.
+    """Size of a swarm, its number of iterations, and its settings.
 
     Attributes:
-        particles, iterations: how many.
+        particles: number of particles.
+        iterations: number of iterations.
         inertia: part of its speed that a particle keeps.
-        own, others: pulls to the best place that it has found, and that all have found.
+        own: weight of the best place of a particle.
+        others: weight of the best place of all particles.
     """
 
     particles: int = 30
@@ -82,14 +77,14 @@ class Swarm:
 
 @dataclass(frozen=True, eq=False)
 class SwarmResult:
-    """The best place of a swarm, and the least cost after its start and every iteration."""
+    """The best place of a swarm, and the least cost at its start and after every iteration."""
 
     place: Float[np.ndarray, " n"]
     history: Float[np.ndarray, " iteration"]
 
     @property
     def cost(self) -> float:
-        """At the best place."""
+        """Cost at the best place."""
         return float(self.history[-1])
 
 
@@ -100,13 +95,13 @@ def minimise(
     swarm: Swarm,
     seed: int = 0,
 ) -> SwarmResult:
-    """The least cost in a box that a swarm finds; the same seed finds the same.
+    """Return the least cost that a swarm finds in a box; the same seed finds the same.
 
     Args:
-        cost: what is minimised.
+        cost: function to minimise.
         low, high: edges of the box.
-        swarm: which moves in it.
-        seed: of all that is drawn.
+        swarm: settings of the swarm.
+        seed: seed of all random numbers.
     """
     rng, most = np.random.default_rng(seed), 0.5 * (high - low)
     x = rng.uniform(low, high, (swarm.particles, len(low)))
@@ -132,15 +127,15 @@ def _finite(cost: Float[np.ndarray, " particle"]) -> Float[np.ndarray, " particl
 
 
 Numbers = Array | np.ndarray
-"""The law is the same in jax, which drives, and in numpy, where many gains are tried at once."""
+"""Numbers of the law in jax, which drives, or in numpy, where many gains are tried at once."""
 LOW, HIGH = np.zeros(3), np.full(3, 5.0)
-"""Of the gains [1/s]."""
+"""Bounds of the gains [1/s]."""
 GAIN_STEP = 1e-4
-"""Of a gain, for central differences [1/s]."""
+"""Step of a gain for central differences [1/s]."""
 
 
 class PlaneVector(NamedTuple):
-    """Three numbers of the plane, each of any batch: a pose, an error, rates, a twist, or gains."""
+    """Three numbers of the plane, in any batch: a pose, an error, rates, a twist, or gains."""
 
     x: Numbers
     y: Numbers
@@ -148,30 +143,31 @@ class PlaneVector(NamedTuple):
 
 
 def in_body(v: PlaneVector, heading: Numbers) -> PlaneVector:
-    """What lies along the axes of the world, as a body at a heading [rad] sees it."""
+    """Return a vector in world axes in the axes of a body at a heading [rad]."""
     of = heading.__array_namespace__()
     c, s = of.cos(heading), of.sin(heading)
     return PlaneVector(c * v.x + s * v.y, c * v.y - s * v.x, v.yaw)
 
 
 def tracking_error(wanted: PlaneVector, pose: PlaneVector) -> PlaneVector:
-    """Wanted less true pose: place in the axes of the body [m, m], heading [rad]."""
+    """Return reference less true pose: place in the axes of the body [m, m], heading [rad]."""
     away = PlaneVector(wanted.x - pose.x, wanted.y - pose.y, wanted.yaw - pose.yaw)
     return in_body(away, pose.yaw)
 
 
 def lyapunov(e: PlaneVector) -> Numbers:
-    """V of errors; squared metres and radians are added as they are."""
+    """Return the function V of errors; squared metres and radians are added as they are."""
     return 0.5 * (e.x * e.x + e.y * e.y) + 1.0 - e.yaw.__array_namespace__().cos(e.yaw)
 
 
 def twist(gains: PlaneVector, e: PlaneVector, rates: PlaneVector, heading: Numbers) -> PlaneVector:
-    """Twist to ask for [m/s, m/s, rad/s].
+    """Return the commanded twist [m/s, m/s, rad/s].
 
     Args:
         gains: k1, k2, k3 [1/s].
-        e: errors; rates: of the path in the world [m/s, m/s, rad/s].
-        heading: of the body [rad].
+        e: errors of the pose.
+        rates: rates of the path in the world [m/s, m/s, rad/s].
+        heading: heading of the body [rad].
     """
     ahead, turn = in_body(rates, heading), e.yaw.__array_namespace__().sin(e.yaw)
     return PlaneVector(
@@ -185,11 +181,11 @@ class GoswamiPadhy(eqx.Module):
     gains: Float[Array, "3"]
 
     def __call__(self, reference: Float[Array, "6"], pose: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Twist to ask for [m/s, m/s, rad/s].
+        """Return the commanded twist [m/s, m/s, rad/s].
 
         Args:
             reference: pose and rates of the path in the world [m, m, rad, m/s, m/s, rad/s].
-            pose: that is believed [m, m, rad].
+            pose: believed pose [m, m, rad].
         """
         wanted, rates, here = (PlaneVector(*x) for x in (reference[:3], reference[3:], pose))
         return jnp.stack(
@@ -199,14 +195,15 @@ class GoswamiPadhy(eqx.Module):
 
 @dataclass(frozen=True, eq=False)
 class TuningTask:
-    """What gains are tried on: a path, begun beside it, by an ideal robot that follows late.
+    """Problem to tune gains on: a path begun beside it, by an ideal robot with delay and lag.
 
     Attributes:
         reference: pose and rates of the path, a row every period.
         begin: poses from which it is begun [m, m, rad].
-        shares: of the last commands, the newest first, in what arrives in every substep.
-        follow: part of the gap to what has arrived that the twist makes up in a substep.
-        period: between commands [s].
+        shares: weights of the last commands, newest first, in the command that arrives in each
+            substep.
+        follow: part of the gap to the arrived command that the twist closes in a substep.
+        period: time between commands [s].
     """
 
     reference: Float[np.ndarray, "step 6"]
@@ -216,10 +213,10 @@ class TuningTask:
     period: float
 
     def integrals(self, gains: Places) -> Float[np.ndarray, " particle"]:
-        """Of V over the path, of many gains at once, the mean of all starts [s]."""
+        """Return the mean over starts of the integral of V over the path [s], for many gains."""
         k, h = PlaneVector(*gains.T[..., None]), self.period / len(self.shares)
         pose = np.repeat(self.begin.T[:, None], len(gains), axis=1)
-        goes, total = np.zeros(pose.shape), np.zeros(pose.shape[1:])
+        velocity, total = np.zeros(pose.shape), np.zeros(pose.shape[1:])
         ring = np.zeros((self.shares.shape[1], *pose.shape))
         for row in self.reference:
             here = PlaneVector(*pose)
@@ -229,34 +226,34 @@ class TuningTask:
             ring[0] = twist(k, e, PlaneVector(*row[3:]), here.yaw)
             arrives = self.shares @ ring.reshape(len(ring), -1)
             for arrived in arrives.reshape(-1, *pose.shape):
-                goes = goes + self.follow * (arrived - goes)
-                pose = _next_pose(pose, goes, h)
+                velocity = velocity + self.follow * (arrived - velocity)
+                pose = _next_pose(pose, velocity, h)
         return self.period * total.mean(axis=1)
 
     def slope(self, gains: Float[np.ndarray, "3"]) -> tuple[float, Float[np.ndarray, "3"]]:
-        """The integral of V at some gains, and its derivative by them, by central differences."""
+        """Return the integral of V at some gains, and its derivative by central differences."""
         off = GAIN_STEP * np.eye(3)
         value = self.integrals(gains + np.concatenate([np.zeros((1, 3)), off, -off]))
         return float(value[0]), (value[1:4] - value[4:]) / (2 * GAIN_STEP)
 
 
 def _next_pose(
-    pose: Float[np.ndarray, "3 *batch"], goes: Float[np.ndarray, "3 *batch"], h: float
+    pose: Float[np.ndarray, "3 *batch"], velocity: Float[np.ndarray, "3 *batch"], h: float
 ) -> Float[np.ndarray, "3 *batch"]:
-    """Poses after a short time at constant twists, their chord at the heading half-way."""
-    x, y, turn = goes
+    """Return poses after a short time at constant twists, their chord at the heading half-way."""
+    x, y, turn = velocity
     middle = pose[2] + 0.5 * h * turn
     c, s = np.cos(middle), np.sin(middle)
     return pose + h * np.array([c * x - s * y, s * x + c * y, turn])
 
 
 def by_swarm(task: TuningTask, seed: int = 0) -> Float[np.ndarray, "3"]:
-    """Gains that a swarm finds [1/s]."""
+    """Return the gains that a swarm finds [1/s]."""
     return minimise(task.integrals, LOW, HIGH, Swarm(), seed).place
 
 
 def by_gradient(task: TuningTask) -> Float[np.ndarray, "3"]:
-    """Gains that the gradient leads to from the middle of the box [1/s]."""
+    """Return the gains that the gradient leads to from the middle of the box [1/s]."""
     from scipy.optimize import minimize
 
     box = list(zip(LOW, HIGH, strict=True))

@@ -6,20 +6,21 @@ from u, and n is across that line. Its speed follows from the speed of its centr
     r w (n . u) = n . (v + W z x b),   n . u = sin gamma
 
 a row of w = A xi for every wheel, of any number of wheels (the same as Gfrerrer 2008 derives by
-geometry). The loop asks for
+geometry). The loop commands
 
     v = R(th)^T (p_d' + k_p (p_d - p)),   W = W_d + k_th (th_d - th),   the turn in (-pi, pi]
     xi <- xi / max(1, max_i |A xi|_i / w_max)
 
-so that a robot whose wheels cannot be fast enough moves as it was asked to, only slower: while the
+so that a robot whose wheels are too slow moves in the commanded direction, only slower: while the
 path rests, errors fall along the same straight line whatever the limit is.
 
 Nothing is tuned: gains are those of the robot's own pose loop set by hand.
 
 Liberties:
 
-- Made from its equations as they are quoted; the paper's own text was not at hand, and what else it
-  has for wheels at their limit, beside one factor for place and heading together, is left out.
+- Implemented from its equations as they are quoted; the paper's own text was not at hand. Its other
+  measures for wheels at their limit, beside one factor for place and heading together, are left
+  out.
 - Gains are not those of a paper. With the same ones the row of the encoders differs by the limit,
   which all rows have once more after it, and by the sine of the turn: where no wheel is at its
   limit the two are nearly the same.
@@ -47,13 +48,14 @@ def inverse_kinematics(
     roller_angle: Float[np.ndarray, " wheel"],
     radius: Float[np.ndarray, " wheel"],
 ) -> Float[np.ndarray, "wheel 3"]:
-    """A: speed of each wheel without slip [rad/s] from the body's twist [m/s, m/s, rad/s].
+    """Return A: speed of each wheel without slip [rad/s] from the body's twist [m/s, m/s, rad/s].
 
     Args:
-        place: of the wheels' centres [m].
-        drive_angle: direction of travel of a positive speed [rad].
-        roller_angle: from the line along which rollers run freely to the drive direction [rad].
-        radius: [m].
+        place: centres of the wheels [m].
+        drive_angle: direction of travel at a positive speed [rad].
+        roller_angle: angle from the line along which rollers run freely to the drive direction
+            [rad].
+        radius: radius of each wheel [m].
 
     Raises:
         ValueError: rollers that run freely along the drive direction, or wheels that leave a motion
@@ -78,12 +80,12 @@ def inverse_kinematics(
 def pose_loop(
     gains: Float[Array, "2"], reference: Float[Array, "6"], pose: Float[Array, "3"]
 ) -> Float[Array, "3"]:
-    """Twist that the pose loop asks for [m/s, m/s, rad/s].
+    """Return the twist that the pose loop commands [m/s, m/s, rad/s].
 
     Args:
-        gains: of place and heading [1/s].
+        gains: gains of place and heading [1/s].
         reference: pose and rates of the path in the world [m, m, rad, m/s, m/s, rad/s].
-        pose: that is believed [m, m, rad].
+        pose: believed pose [m, m, rad].
     """
     vx, vy = reference[3:5] + gains[0] * (reference[:2] - pose[:2])
     off = reference[2] - pose[2]
@@ -93,20 +95,20 @@ def pose_loop(
 
 
 def within_limit(
-    asked: Float[Array, "3"], matrix: Float[Array, "wheel 3"], limit: Float[Array, ""]
+    twist: Float[Array, "3"], matrix: Float[Array, "wheel 3"], limit: Float[Array, ""]
 ) -> Float[Array, "3"]:
-    """A twist, or as much of it as leaves no wheel faster than a limit [rad/s]."""
-    over = jnp.max(jnp.abs(matrix @ asked)) / limit
-    return asked / jnp.maximum(over, 1.0)
+    """Return a twist, scaled down where a wheel would be faster than a limit [rad/s]."""
+    over = jnp.max(jnp.abs(matrix @ twist)) / limit
+    return twist / jnp.maximum(over, 1.0)
 
 
 class Indiveri(eqx.Module):
     """The law with its numbers.
 
     Attributes:
-        matrix: of `inverse_kinematics`.
-        gains: of place and heading [1/s].
-        limit: of the wheels [rad/s].
+        matrix: matrix of `inverse_kinematics`.
+        gains: gains of place and heading [1/s].
+        limit: highest speed of the wheels [rad/s].
     """
 
     matrix: Float[Array, "wheel 3"]
@@ -114,5 +116,5 @@ class Indiveri(eqx.Module):
     limit: Float[Array, ""]
 
     def __call__(self, reference: Float[Array, "6"], pose: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Twist to ask for; arguments as of `pose_loop`."""
+        """Return the commanded twist; arguments as in `pose_loop`."""
         return within_limit(pose_loop(self.gains, reference, pose), self.matrix, self.limit)

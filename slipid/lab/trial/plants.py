@@ -1,4 +1,4 @@
-"""The virtual test site as the plant of a trial, and robots that a posterior holds possible."""
+"""The virtual test site as the plant of a trial, and robots drawn from a posterior."""
 
 from functools import partial
 
@@ -17,13 +17,13 @@ from slipid.support.errors import DataError
 
 
 def refuse_unknown_to_site(floor: FloorMap, load: str, wheels: int) -> None:
-    """Refuse wheels, a load set-up or a surface that the virtual test site does not have."""
-    machine, other = Site().machine, "With --plant twin the identified model is driven itself"
-    has = len(machine.wheel_azimuths_deg)
+    """Raise `DataError` for wheels, a load set-up or a surface that the test site does not have."""
+    robot, other = Site().robot, "With --plant twin the identified model is driven itself"
+    has = len(robot.wheel_azimuths_deg)
     if wheels != has:
         raise DataError(f"the test site's robot has {has} wheels, the fit's {wheels}. {other}")
     for what, name, there in (
-        ("load set-up", load, machine.centres_m),
+        ("load set-up", load, robot.centres_m),
         *(("surface", name, SURFACES) for name in floor.surfaces),
     ):
         if name not in there:
@@ -33,12 +33,13 @@ def refuse_unknown_to_site(floor: FloorMap, load: str, wheels: int) -> None:
 
 
 class SitePlant:
-    """The virtual test site as a `slipid.robot.closed_loop.Plant`, with its delay and slew.
+    """The virtual test site as a plant of `slipid.robot.closed_loop`, with its delay and slew.
 
     Args:
-        floor: which surface lies where; load: name of the load set-up.
+        floor: map of the surfaces.
+        load: name of the load set-up.
         start: x, y [m], heading [rad].
-        seed: of unevenness, the wheels' first angles and noise.
+        seed: seed of unevenness, the wheels' first angles and noise.
         gyro: whether the robot has one.
     """
 
@@ -61,7 +62,7 @@ class SitePlant:
         return float(np.dot(drive.voltage, drive.current))
 
     def reset(self) -> Measurement:
-        """First readings, of the robot at rest at its start."""
+        """Return the first readings of the robot at rest at its start."""
         self.plant = self._new()
         self._rims = RimSpeeds(self._site, self.plant)
         self._rng = np.random.default_rng([self._seed, 1])
@@ -69,7 +70,7 @@ class SitePlant:
         return self._read(np.zeros((1, 2 * len(self.plant.wheel_dof))))
 
     def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Measurement:
-        """Readings one period later."""
+        """Return the readings one period later."""
         plant, drive, rows = self.plant, self.plant.drive, []
         self._rims.send(np.asarray(wheel_speed, float))
         for _ in range(round(PERIOD / plant.dt)):
@@ -79,7 +80,7 @@ class SitePlant:
         return self._read(np.array(rows[-width:]))
 
     def _read(self, recent: Float[np.ndarray, "step channel"]) -> Measurement:
-        """What the sensors make of the last currents and voltages, and of this moment."""
+        """Return sensor readings from recent currents and voltages and the present wheel angles."""
         s, rng, tick = self._site.sensors, self._rng, self._site.tick
         amps, volts = np.split(recent.mean(axis=0), 2)
         amps, volts = s.amperes(amps, rng), s.volts(volts, rng)
@@ -93,7 +94,7 @@ class SitePlant:
 
 
 def drawn_robot(robot: DeployedRobot, seed: int) -> DeployedRobot:
-    """A robot that the posterior holds possible; the robot itself where nothing was drawn."""
+    """Return a robot drawn from the posterior; the robot itself where the file has no draws."""
     count = robot.record.drawn
     if count == 0:
         return robot

@@ -1,4 +1,4 @@
-"""Picture of a trial: every controller's paths over the floor, and what they came to."""
+"""Picture of a trial: every controller's paths over the floor, and their errors."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +17,7 @@ from slipid.support.content import Content
 
 Paths = Mapping[str, np.ndarray]
 TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
-"""Of floors, in the order of the map."""
+"""Colours of floors, in the order of the map."""
 OTHERS, MARKED = "#56B4E9", "#D55E00"
 ERRORS = {
     "closure_error_median": "closure error [mm]",
@@ -29,41 +29,45 @@ ERRORS = {
 def trial_plot(
     content: Content, paths: Paths, wanted: np.ndarray, floor: FloorMap, path: Path
 ) -> Path:
-    """Paths of the start nearest to the medians over the map, all starts from one corner, errors.
+    """Draw the typical start's path over the map, all starts from one corner, and bars of errors.
 
     Args:
-        content: of trial.json.
-        paths: true poses (step, 3) by run, `CONTROLLER/startNN`; wanted: places (row, 2) [m].
-        floor: the map it was driven on.
-        path: of the picture.
+        content: content of trial.json.
+        paths: true poses (step, 3) by run, `CONTROLLER/startNN`.
+        wanted: places on the path (row, 2) [m].
+        floor: map that was driven on.
+        path: file of the picture.
     """
     names = list(content["summary"])
     rows = -(-len(names) // 3)
-    course = f"{content['path'].capitalize()} at {content['speed_m_s']:g} m/s"
-    title = f"{course} on the {content['plant']}: {_verdict(content)}"
-    made = figure(13.0, 3.1 * rows + 3.4, title)
-    grid = made.add_gridspec(rows + 1, 3, height_ratios=[1.0] * rows + [1.1])
+    path_name = f"{content['path'].capitalize()} at {content['speed_m_s']:g} m/s"
+    title = f"{path_name} on the {content['plant']}: {_verdict(content)}"
+    drawing = figure(13.0, 3.1 * rows + 3.4, title)
+    grid = drawing.add_gridspec(rows + 1, 3, height_ratios=[1.0] * rows + [1.1])
     one = _typical_start(content)
     for k, name in enumerate(names):
-        axes = made.add_subplot(grid[k // 3, k % 3])
+        axes = drawing.add_subplot(grid[k // 3, k % 3])
         _paths_panel(axes, name, content, paths, wanted, floor, one)
-    _legend(made, floor)
+    _legend(drawing, floor)
     for k, (key, label) in enumerate(ERRORS.items()):
-        _bars(made.add_subplot(grid[rows, k]), content["summary"], key, label)
-    return save(made, path)
+        _bars(drawing.add_subplot(grid[rows, k]), content["summary"], key, label)
+    return save(drawing, path)
 
 
 def _verdict(content: Content) -> str:
-    """Which controller closes best, if the starts tell it."""
+    """Return which controller closes best, if the starts can distinguish them."""
     best = content["closes_best"]
     if best is None:
-        return f"{', '.join(content['not_told_apart'])} are not told apart"
+        return f"{', '.join(content['not_told_apart'])} are not distinguished"
     ratio = content["summary"][best].get("to_encoder", {}).get("closure_error_median", {})
     return f"{best} closes best" + (f", {100 * ratio['value']:.0f} % of encoders'" if ratio else "")
 
 
 def _typical_start(content: Content) -> int:
-    """Start whose encoder run (else first controller's) is nearest to the median closure."""
+    """Return the start whose first controller's run is nearest to the median closure.
+
+    The encoders' run decides where there is one.
+    """
     first = "encoder" if "encoder" in content["summary"] else next(iter(content["summary"]))
     runs = [r for r in content["runs"] if r["controller"] == first]
     middle = content["summary"][first]["closure_error_median"]
@@ -79,7 +83,7 @@ def _paths_panel(
     floor: FloorMap,
     one: int,
 ) -> None:
-    """All starts of a controller laid on one another, the typical one over its floor."""
+    """Draw all starts of a controller laid on one another, the typical one over its floor."""
     runs = [r for r in content["runs"] if r["controller"] == name]
     own = [
         (paths[f"{name}/start{k:02d}"][:, :2] - r["start"][:2]) @ _rotation(r["start"][2])
@@ -107,8 +111,8 @@ def _paths_panel(
     axes.tick_params(labelsize=7)
 
 
-def _legend(made: Figure, floor: FloorMap) -> None:
-    """What tints and lines are."""
+def _legend(drawing: Figure, floor: FloorMap) -> None:
+    """Explain tints and lines."""
     patches = [
         Patch(facecolor=tint, edgecolor=SHADE, label=name)
         for name, tint in zip(floor.surfaces, TINTS, strict=False)
@@ -120,17 +124,17 @@ def _legend(made: Figure, floor: FloorMap) -> None:
             [], [], color=MARKED, lw=1.8, marker="o", ms=5, label="the start typical of encoders"
         ),
     ]
-    made.legend(handles=[*patches, *lines], loc="outside lower center", ncols=8, fontsize=8)
+    drawing.legend(handles=[*patches, *lines], loc="outside lower center", ncols=8, fontsize=8)
 
 
 def _rotation(heading: float) -> np.ndarray:
-    """Rotation from the axes of a pose to the site's."""
+    """Return the rotation from the axes of a pose to the site's."""
     c, s = np.cos(heading), np.sin(heading)
     return np.array([[c, -s], [s, c]])
 
 
 def _bars(axes: Axes, table: Content, key: str, label: str) -> None:
-    """Medians with their 90 % intervals."""
+    """Draw medians with their 90 % intervals."""
     names = list(table)
     value = np.array([table[n][key] for n in names])
     low, high = np.array([table[n]["interval90"][key] for n in names]).T

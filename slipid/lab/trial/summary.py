@@ -1,4 +1,4 @@
-"""What the runs of a trial came to, by controller."""
+"""Summaries of a trial's runs, by controller."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -9,17 +9,19 @@ from jaxtyping import Float
 from slipid.robot.closed_loop import PathMetrics
 
 Interval = tuple[float, float]
-"""90 %, by bootstrap over starts."""
+"""90 % interval, by bootstrap over starts."""
 
 
 @dataclass(frozen=True)
 class TrialRun:
-    """One run of one controller, judged.
+    """One run of one controller with its errors.
 
     Attributes:
-        controller: name of its row; start: pose [m, m, rad]; seed: of all that is drawn.
-        metrics: from true poses.
-        believed_error_mm: of the place it believes to be at in the end.
+        controller: name of the controller.
+        start: start pose [m, m, rad].
+        seed: seed of all random numbers.
+        metrics: path errors by the true poses.
+        believed_error_mm: error of the believed place at the end.
     """
 
     controller: str
@@ -29,14 +31,14 @@ class TrialRun:
     believed_error_mm: float
 
     def to_json(self) -> dict[str, object]:
-        """As trial.json has it."""
+        """Return the run as trial.json has it."""
         about = {"controller": self.controller, "start": list(self.start), "seed": self.seed}
         return {**about, **asdict(self.metrics), "believed_error_mm": self.believed_error_mm}
 
 
 @dataclass(frozen=True)
 class MedianRatio:
-    """Of a median to that of the controller `encoder`, its interval over the starts they share."""
+    """Ratio of a median to that of the controller `encoder`, and its interval over the starts."""
 
     value: float
     interval90: Interval
@@ -47,9 +49,12 @@ class ControllerSummary:
     """One controller over its starts.
 
     Attributes:
-        median: by name, see `columns`; what a plant does not know (the twin's energy) is left out.
-        finished_share: part of the runs that reached the end.
-        worse_share: part of the starts that it closes worse than the controller `encoder`.
+        median: medians by name, see `columns`; without those that a plant does not measure (the
+            twin's energy).
+        interval90: intervals of the medians by name.
+        runs: number of runs.
+        finished_share: share of the runs that reached the end.
+        worse_share: share of the starts that it closes worse than the controller `encoder`.
         to_encoder: ratios of medians; None without the controller `encoder`.
     """
 
@@ -61,7 +66,7 @@ class ControllerSummary:
     to_encoder: Mapping[str, MedianRatio] | None
 
     def to_json(self) -> dict[str, object]:
-        """As trial.json has it."""
+        """Return the summary as trial.json has it."""
         rest = asdict(self)
         if self.to_encoder is None:
             del rest["to_encoder"], rest["worse_share"]
@@ -72,40 +77,45 @@ Columns = Mapping[str, Float[np.ndarray, " run"]]
 
 
 def summaries(runs: Sequence[TrialRun], draws: int = 2000) -> dict[str, ControllerSummary]:
-    """Medians over starts of every controller, with 90 % bootstrap intervals."""
+    """Return medians over starts of every controller, with 90 % bootstrap intervals."""
     names = list(dict.fromkeys(run.controller for run in runs))
     of = {name: [run for run in runs if run.controller == name] for name in names}
     table = {name: columns(of[name]) for name in names}
     rng = np.random.default_rng(0)
     count = min(len(c["closure_error_median"]) for c in table.values())
     again = rng.integers(count, size=(draws, count))
+    base = table["encoder"]["closure_error_median"] if "encoder" in table else None
     out: dict[str, ControllerSummary] = {}
     for name, mine in table.items():
+        closes, worse = mine["closure_error_median"], None
+        if base is not None:
+            shared = min(len(closes), len(base))
+            worse = float(np.mean(closes[:shared] > base[:shared]))
         known = {k: v for k, v in mine.items() if np.all(np.isfinite(v))}
         out[name] = ControllerSummary(
             median={k: float(np.median(v)) for k, v in known.items()},
             interval90={k: _interval(np.median(v[again], axis=1)) for k, v in known.items()},
             runs=len(of[name]),
             finished_share=float(np.mean([run.metrics.finished for run in of[name]])),
-            worse_share=_worse_share(mine, table["encoder"]) if "encoder" in table else None,
+            worse_share=worse,
             to_encoder=_ratios(mine, table["encoder"], again) if "encoder" in table else None,
         )
     return out
 
 
 def best_controllers(runs: Sequence[TrialRun], draws: int = 2000) -> tuple[str, ...]:
-    """Controllers that may close best, the one with the lowest median first.
+    """Return the controllers that may close best, the one with the lowest median first.
 
-    Of the others they are those whose errors, start by start, are not larger for sure: the 90 %
-    bootstrap interval of the difference of medians over the starts that both drove has no more
-    than 0 at its lower end. One that left more runs unfinished than another does not close best.
+    The others are those whose errors, start by start, are not clearly larger: the 90 % bootstrap
+    interval of the difference of medians over the shared starts does not lie above 0. A controller
+    that left more runs unfinished than another does not close best.
     """
     names = list(dict.fromkeys(run.controller for run in runs))
     of = {name: [run for run in runs if run.controller == name] for name in names}
     unfinished = {name: sum(not run.metrics.finished for run in of[name]) for name in names}
-    able = [name for name in names if unfinished[name] == min(unfinished.values())]
-    closes = {name: np.array([run.metrics.closure_mm for run in of[name]]) for name in able}
-    best = min(able, key=lambda name: float(np.median(closes[name])))
+    complete = [name for name in names if unfinished[name] == min(unfinished.values())]
+    closes = {name: np.array([run.metrics.closure_mm for run in of[name]]) for name in complete}
+    best = min(complete, key=lambda name: float(np.median(closes[name])))
     count = min(len(v) for v in closes.values())
     again = np.random.default_rng(0).integers(count, size=(draws, count))
 
@@ -113,11 +123,11 @@ def best_controllers(runs: Sequence[TrialRun], draws: int = 2000) -> tuple[str, 
         gap = np.median(closes[name][again], axis=1) - np.median(closes[best][again], axis=1)
         return _interval(gap)[0] > 0
 
-    return (best, *(name for name in able if name != best and not surely_worse(name)))
+    return (best, *(name for name in complete if name != best and not surely_worse(name)))
 
 
 def columns(runs: Sequence[TrialRun]) -> Columns:
-    """What is judged of every run.
+    """Return the errors of every run by name.
 
     `first_side_along_track_mm` and `heading_error_deg` are the errors' sizes;
     `first_side_travelled` is the part of the first side. Of a curve, that is its first quarter.
@@ -136,11 +146,6 @@ def columns(runs: Sequence[TrialRun]) -> Columns:
         "seconds": np.array([x.seconds for x in m]),
         "believed_error_mm": np.array([run.believed_error_mm for run in runs]),
     }
-
-
-def _worse_share(mine: Columns, base: Columns) -> float:
-    pairs = zip(mine["closure_error_median"], base["closure_error_median"], strict=False)
-    return float(np.mean([a > b for a, b in pairs]))
 
 
 def _ratios(mine: Columns, base: Columns, again: np.ndarray) -> dict[str, MedianRatio]:

@@ -1,4 +1,4 @@
-"""`slipid trial`: the rectangle of the 2021 paper's figure 7, or another path, judged."""
+"""Trial of controllers on the rectangle of the 2021 paper's figure 7, or on another path."""
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
@@ -40,13 +40,13 @@ from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.trial/1"
 FOLDER = "trial"
-"""Finished runs, below OUT."""
+"""Folder of finished runs, below the result folder."""
 PLANTS = ("testsite", "twin")
 
 
 @dataclass(frozen=True, eq=False)
 class TrialTask:
-    """One run of one controller from one start; `told` is the floor map that it may be told."""
+    """One run of one controller from one start; `known_map` is the map that controllers may use."""
 
     name: str
     row: str
@@ -55,27 +55,28 @@ class TrialTask:
     seed: int
     plant: str
     floor: FloorMap
-    told: FloorMap
+    known_map: FloorMap
     robot: DeployedRobot
     settings: Settings
-    habits: ActuatorModel
+    actuators: ActuatorModel
     forced: bool
     kept: Checkpoint
 
 
 @dataclass(frozen=True)
 class TrialOptions:
-    """What is asked of a trial.
+    """Options of a trial.
 
     Attributes:
         plant: `testsite` (MuJoCo) or `twin` (the identified model itself, another draw of its
             numbers for every start).
         map: file of a floor map; None for patches of the identified floors.
-        told_map: file of the map that controllers with a map are told; None for the true one.
+        told_map: file of the map given to controllers with a map; None for the true one.
         controllers: names of `ROWS`.
+        path: name of `trajectory.PATHS`.
+        speed: speed along it [m/s].
+        starts: number of starts.
         load: name of the load set-up; None for the first.
-        path: name of `trajectory.PATHS`; speed: along it [m/s].
-        starts: how many.
         tuned_gains: whether tuned gains are taken that are no better than those set by hand.
     """
 
@@ -92,13 +93,14 @@ class TrialOptions:
 
 @dataclass(frozen=True, eq=False)
 class TrialResult:
-    """End of a trial.
+    """Result of a trial.
 
     Attributes:
-        content: of trial.json; runs: that it is of.
-        paths: true poses of every run by its name (step, 3); wanted: places from the origin
-            (row, 2) [m].
-        floor: the map it was driven on.
+        content: content of trial.json.
+        runs: runs that it summarises.
+        paths: true poses of every run by its name (step, 3).
+        wanted: places on the path from the origin (row, 2) [m].
+        floor: map that was driven on.
     """
 
     content: dict[str, Any]
@@ -108,38 +110,38 @@ class TrialResult:
     floor: FloorMap
 
 
-def trial(out: Path, wish: TrialOptions, executor: Executor, report: Reporter) -> TrialResult:
+def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter) -> TrialResult:
     """Drive every controller from every start, and write trial.json.
 
-    Runs that are done are kept, and not driven again as long as nothing they depend on changes.
+    Finished runs are kept, and not driven again as long as nothing they depend on changes.
 
     Raises:
         DataError: no fit, no such plant, controller, path, load or map, MuJoCo missing, floors that
-            the plant or the fit does not know, or a speed beyond what the fit has seen.
+            the plant or the fit does not know, or a speed beyond those of the fit.
     """
     setup_jax(quiet=True)
-    tasks = _tasks(out, wish)
+    tasks = _tasks(out, options)
     rows = tuple(dict.fromkeys(task.row for task in tasks))
-    if left := [name for name in wish.controllers if name not in rows]:
-        report.line(f"left out, for robots with three wheels: {', '.join(left)}")
-    if unused := unused_gains(tasks[0].robot, wish.tuned_gains):
+    if unsuited := [name for name in options.controllers if name not in rows]:
+        report.line(f"left out, for robots with three wheels: {', '.join(unsuited)}")
+    if unused := unused_gains(tasks[0].robot, options.tuned_gains):
         report.line(unused)
     todo = {task.name: task for task in tasks if _finished_run(task) is None}
     report.stage(f"driving {len(todo)} of {len(tasks)} runs")
     results(executor, drive, todo, report)
     driven = {task.name: found for task in tasks if (found := _finished_run(task)) is not None}
     runs = [run for run, _ in driven.values()]
-    table, able = summaries(runs), list(best_controllers(runs))
+    table, best = summaries(runs), list(best_controllers(runs))
     content = {
         "schema": SCHEMA,
-        "plant": wish.plant,
-        "map": "patches" if wish.map is None else str(wish.map),
-        "told_map": None if wish.told_map is None else str(wish.told_map),
-        "path": wish.path,
-        "speed_m_s": wish.speed,
-        "gains": _gains(tasks[0].robot, wish.tuned_gains),
-        "closes_best": None if len(able) > 1 else able[0],
-        "best_controllers": able,
+        "plant": options.plant,
+        "map": "patches" if options.map is None else str(options.map),
+        "told_map": None if options.told_map is None else str(options.told_map),
+        "path": options.path,
+        "speed_m_s": options.speed,
+        "gains": _gains(tasks[0].robot, options.tuned_gains),
+        "closes_best": None if len(best) > 1 else best[0],
+        "not_told_apart": best,
         "summary": {name: row.to_json() for name, row in table.items()},
         "controllers": {name: ROWS[name].about for name in rows},
         "runs": [run.to_json() for run in runs],
@@ -151,49 +153,48 @@ def trial(out: Path, wish: TrialOptions, executor: Executor, report: Reporter) -
     )
 
 
-def _tasks(out: Path, wish: TrialOptions) -> list[TrialTask]:
-    if wish.plant not in PLANTS:
-        raise DataError(f"no plant '{wish.plant}'; expected {' or '.join(PLANTS)}")
-    strange = [f" '{name}'" for name in wish.controllers if name not in ROWS]
-    if strange or not wish.controllers:
-        said = strange[0] if strange else ""
-        raise DataError(f"no controller{said}; expected some of {', '.join(ROWS)}")
-    robot = jax.tree.map(np.asarray, read_robot(out, wish.load))
-    path = path_of(wish.path, wish.speed, robot)
-    floor = twin_floor(robot) if wish.map is None else read_map(wish.map)
-    told = floor if wish.told_map is None else read_map(wish.told_map)
-    settings, habits = Settings.of(robot), actuator_model_of(robot, gyro=False)
-    if wish.plant == "testsite":  # it has the sensors it has, whatever the logs had
+def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
+    if options.plant not in PLANTS:
+        raise DataError(f"no plant '{options.plant}'; expected {' or '.join(PLANTS)}")
+    unknown = [f" '{name}'" for name in options.controllers if name not in ROWS]
+    if unknown or not options.controllers:
+        raise DataError(f"no controller{''.join(unknown[:1])}; expected some of {', '.join(ROWS)}")
+    robot = jax.tree.map(np.asarray, read_robot(out, options.load))
+    path = path_of(options.path, options.speed, robot)
+    floor = twin_floor(robot) if options.map is None else read_map(options.map)
+    known_map = floor if options.told_map is None else read_map(options.told_map)
+    settings, actuators = Settings.of(robot), actuator_model_of(robot, gyro=False)
+    if options.plant == "testsite":  # its sensors do not depend on those of the logs
         refuse_unknown_to_site(floor, robot.load_setup, robot.wheels)
-        settings, habits = replace(settings, current_is_signed=False), ActuatorModel()
+        settings, actuators = replace(settings, current_is_signed=False), ActuatorModel()
     else:
-        require_known_surfaces(floor, robot, str(wish.map))
-    if wish.told_map is not None:
-        require_known_surfaces(told, robot, str(wish.told_map))
-    if wish.tuned_gains:
+        require_known_surfaces(floor, robot, str(options.map))
+    if options.told_map is not None:
+        require_known_surfaces(known_map, robot, str(options.told_map))
+    if options.tuned_gains:
         check_gains(out, robot)
     key = key_of(
         *(
-            wish.plant,
-            wish.path,
-            wish.speed,
+            options.plant,
+            options.path,
+            options.speed,
             robot.load_setup,
-            _gains(robot, wish.tuned_gains),
+            _gains(robot, options.tuned_gains),
             settings,
-            habits,
+            actuators,
             *jax.tree.leaves(robot),
         ),
-        *(part for m in (floor, told) for part in (m.surfaces, m.corner, m.cell, m.cells)),
-        # runs of other code are not taken for this one's
+        *(part for m in (floor, known_map) for part in (m.surfaces, m.corner, m.cell, m.cells)),
+        # runs of another version of this code are not reused
         source_hash("robot", "model", "lab/testsite", "data", "deploy", "lab/trial"),
     )
-    # trials of other gains or floors lie beside this one, so that going back to them costs nothing
-    kept = Checkpoint(out / FOLDER / key[:12] / f"of{wish.starts}", key)
-    shared = wish.plant, floor, told, robot, settings, habits, wish.tuned_gains, kept
+    # trials with other gains or floors have folders of their own and stay reusable
+    kept = Checkpoint(out / FOLDER / key[:12] / f"of{options.starts}", key)
+    shared = options.plant, floor, known_map, robot, settings, actuators, options.tuned_gains, kept
     return [
         TrialTask(f"{row}/start{k:02d}", row, path, start, 1000 + k, *shared)
-        for row in applicable(wish.controllers, robot)
-        for k, start in enumerate(starts(wish.starts, floor, path))
+        for row in applicable(options.controllers, robot)
+        for k, start in enumerate(starts(options.starts, floor, path))
     ]
 
 
@@ -203,7 +204,7 @@ def _gains(robot: DeployedRobot, forced: bool) -> dict[str, float]:
 
 
 def _finished_run(task: TrialTask) -> tuple[TrialRun, np.ndarray] | None:
-    """A run and its true poses; None where it has not been driven yet."""
+    """Return a run and its true poses; None where it has not been driven yet."""
     run, path = task.kept.load_json(task.name), task.kept.load(task.name)
     return None if run is None or path is None else (typed(TrialRun, run), path["pose"])
 
@@ -218,29 +219,29 @@ def drive(task: TrialTask) -> None:
     if task.plant == "twin":
         truth = drawn_robot(robot, task.seed)
         plant = twin_plant(
-            truth, task.floor, task.start, task.seed, replace(task.habits, gyro=row.gyro)
+            truth, task.floor, task.start, task.seed, replace(task.actuators, gyro=row.gyro)
         )
     else:
         plant = SitePlant(task.floor, robot.load_setup, task.start, task.seed, row.gyro)
-    there = floor_of(task.told, robot.labels)
+    there = floor_of(task.known_map, robot.labels)
     loop = control_loop_of(robot, row, task.settings, task.forced, there)
-    course = closed_loop.run_closed_loop(loop, path, plant, task.start)
-    off = course.pose[-1] - course.estimated_pose[-1]
+    driven = closed_loop.run_closed_loop(loop, path, plant, task.start)
+    off = driven.pose[-1] - driven.estimated_pose[-1]
     run = TrialRun(
         controller=task.row,
         start=task.start,
         seed=task.seed,
-        metrics=closed_loop.path_metrics(course),
+        metrics=closed_loop.path_metrics(driven),
         believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
     )
-    # the path first: a run that has metrics is done
-    poses = {"time": course.time, "pose": course.pose, "believed": course.estimated_pose}
+    # the path first, because a run with metrics counts as finished
+    poses = {"time": driven.time, "pose": driven.pose, "believed": driven.estimated_pose}
     task.kept.save(task.name, poses)
     task.kept.save_json(task.name, asdict(run))
 
 
 def controller_names(text: str | None) -> tuple[str, ...]:
-    """Controllers of a list by commas, all of them by default."""
+    """Return the controllers in a list with commas, all of them by default."""
     if text is None:
         return tuple(ROWS)
     return tuple(dict.fromkeys(t.strip() for t in text.split(",") if t.strip()))

@@ -67,13 +67,13 @@ def test_gain_and_veil_are_fitted_with_the_colours():
     basis = basis_at(at).shape[1]
     true = Illumination(0.1 * rng.normal(size=basis) / 3, 0.02 * rng.normal(size=(basis, 3)) / 3)
     own = rng.integers(0, len(colours), len(at))
-    rgb = true.appearance(colours, at)[own, np.arange(len(at))]
+    rgb = true.rgb_of(colours, at)[own, np.arange(len(at))]
     rgb *= rng.normal(1, 0.02, rgb.shape)
     rgb[:150] = 0.9  # samples of no surface
     start = LitColours(Illumination.uniform(), colours * 0.8)
     fit = fit_illumination(ColourSamples(at, rgb, own, np.ones(len(at))), start)
-    fitted = fit.illumination.appearance(fit.colours, at)[own, np.arange(len(at))]
-    plain = true.appearance(colours, at)[own, np.arange(len(at))]
+    fitted = fit.illumination.rgb_of(fit.colours, at)[own, np.arange(len(at))]
+    plain = true.rgb_of(colours, at)[own, np.arange(len(at))]
     assert np.abs(fitted / plain - 1)[150:].mean() < 0.02
     back = fit.illumination.true_colours(fitted, at)
     np.testing.assert_allclose(back, fit.colours[own], atol=0.02)

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slipid.camera.frames.source import MEDIAN_FRAMES, still
-from slipid.camera.frames.video import Capture
+from slipid.camera.frame_source import MEDIAN_FRAMES, Capture, still
 from slipid.support.errors import DataError
 
 FLOOR = np.full((80, 120, 3), (40, 120, 200), np.uint8)

@@ -10,17 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from slipid.camera.frames.frame import (
-    DEPTH,
-    cut_off,
-    even_times,
-    grey_of,
-    read_ahead,
-    read_times,
-    uneven,
-)
-from slipid.camera.frames.source import open_source
-from slipid.camera.frames.video import Capture, Device
+from slipid.camera.frame import DEPTH, cut_off, even_times, grey_of, read_ahead, read_times, uneven
+from slipid.camera.frame_source import Capture, Device, open_source
 from slipid.support.errors import DataError
 from tests.helpers.made_sources import InMemory, write_video
 
@@ -204,14 +195,14 @@ def test_a_device_needs_an_end_and_has_its_own_times():
 
 
 def test_a_device_gives_frames_with_times_from_zero_on(tmp_path):
-    """A video in its place: what matters is the clock."""
+    """A video stands in for the device; the test is of the clock."""
     device = Device.at(str(write_video(tmp_path / "a.avi", pictures())), 100.0)
     frames = list(device.frames())
     assert [frame.index for frame in frames] == list(range(COUNT))
     assert frames[0].time == 0.0
     assert np.all(np.diff([frame.time for frame in frames]) > 0)
     assert device.image_px == (64, 48)
-    assert device.identity != device.identity
+    assert device.identity != Device.at(device.place, 100.0).identity
     assert len(list(replace(device, seconds=0.0).frames())) == 1
 
 

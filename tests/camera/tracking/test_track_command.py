@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from slipid.camera.tracking.poses_file import write_poses
+from slipid.camera.tracking.outputs import write_poses
 from slipid.camera.tracking.target import read_targets
 from tests.helpers.made_drives import round_trip
 from tests.helpers.made_sources import write_video

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from slipid.camera.frames.source import open_source
+from slipid.camera.frame_source import open_source
 from slipid.camera.tracking import detections, tracking
 from slipid.camera.tracking.detector import MarkerTracker
 from slipid.support.errors import DataError

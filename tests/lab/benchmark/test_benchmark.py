@@ -60,7 +60,7 @@ def test_one_command_makes_a_table_and_goes_on_from_what_was_kept(tmp_path, monk
     assert {name for name in after if after[name] != before[name]} == {"known_floor_encoder.json"}
 
     # in this process, where a row can be broken; the fit is kept
-    piece = FoldTask(
+    task = FoldTask(
         BenchmarkOptions(data, out, ("encoder", "paper_code"), quick=True),
         "testsite",
         "headings",
@@ -72,57 +72,58 @@ def test_one_command_makes_a_table_and_goes_on_from_what_was_kept(tmp_path, monk
         raise ZeroDivisionError("a wheel of size 0")
 
     monkeypatch.setattr("slipid.predict.kinematics.Encoder.predict", broken)
-    assert piece.run() == "testsite/headings_0"
-    left = {name: row for (_, name), row in piece.rows().items()}
+    assert task.run() == "testsite/headings_0"
+    left = {name: row for (_, name), row in task.rows().items()}
     assert left["encoder"] == FoldScore(absent="ZeroDivisionError: a wheel of size 0", failed=True)
-    assert len(left["paper_code"].runs) == len(split_of(piece).judged)
+    assert len(left["paper_code"].runs) == len(split_of(task).held_out)
 
 
-def test_every_part_of_every_kind_is_asked_or_one_of_headings_if_it_has_to_be_quick(tmp_path):
+def test_every_fold_of_every_kind_is_a_task_or_one_of_headings_if_quick(tmp_path):
     (tmp_path / "x").mkdir()
-    wish = BenchmarkOptions(tmp_path / "x", tmp_path / "out")
+    options = BenchmarkOptions(tmp_path / "x", tmp_path / "out")
     kinds = ("headings", "sectors", "speeds", "floors")
     every = [f"testsite/{kind}_{fold}" for kind in kinds for fold in (0, 1)]
-    assert [piece.name for piece in tasks_of(wish, "testsite")] == every
-    quick = tasks_of(replace(wish, quick=True), "testsite")
-    assert [piece.name for piece in quick] == ["testsite/headings_0"]
+    assert [task.name for task in tasks_of(options, "testsite")] == every
+    quick = tasks_of(replace(options, quick=True), "testsite")
+    assert [task.name for task in quick] == ["testsite/headings_0"]
     assert {protocol for protocol, _ in keys_of(quick[0])} == {"known_floor"}
 
 
-def test_where_there_is_one_floor_nobody_is_asked_which_it_is(tmp_path, monkeypatch):
+def test_a_single_floor_has_no_protocol_with_unknown_floors(tmp_path, monkeypatch):
     (tmp_path / "x").mkdir()
-    piece = FoldTask(
+    task = FoldTask(
         BenchmarkOptions(tmp_path / "x", tmp_path / "out", ("encoder",)), "testsite", "headings", 0
     )
-    assert keys_of(piece) == [("known_floor", "encoder"), ("unknown_floor", "encoder")]
-    data = data_of(piece.wish, "testsite")
+    assert keys_of(task) == [("known_floor", "encoder"), ("unknown_floor", "encoder")]
+    data = data_of(task.options, "testsite")
     alone = replace(data, facts=tuple(replace(f, floor="firm") for f in data.facts))
-    monkeypatch.setattr(benchmark_work, "data_of", lambda wish, source: alone)
-    assert keys_of(piece) == [("known_floor", "encoder")]
+    monkeypatch.setattr(benchmark_work, "data_of", lambda options, source: alone)
+    assert keys_of(task) == [("known_floor", "encoder")]
 
 
 def test_other_runs_over_several_floors_are_other_work_but_no_other_fit(tmp_path, monkeypatch):
     (tmp_path / "x").mkdir()
-    piece = FoldTask(BenchmarkOptions(tmp_path / "x", tmp_path / "out"), "testsite", "headings", 0)
-    data = data_of(piece.wish, "testsite")
-    rows, fit = (benchmark_work.kept_of(piece, fit=fit).key for fit in (False, True))
+    task = FoldTask(BenchmarkOptions(tmp_path / "x", tmp_path / "out"), "testsite", "headings", 0)
+    data = data_of(task.options, "testsite")
+    rows, fit = (benchmark_work.checkpoint_of(task, fit=fit).key for fit in (False, True))
     more = replace(data, crossing=data.logged.subset([0]))
-    monkeypatch.setattr(benchmark_work, "data_of", lambda wish, source: more)
-    assert benchmark_work.kept_of(piece, fit=False).key != rows
-    assert benchmark_work.kept_of(piece, fit=True).key == fit
+    monkeypatch.setattr(benchmark_work, "data_of", lambda options, source: more)
+    assert benchmark_work.checkpoint_of(task, fit=False).key != rows
+    assert benchmark_work.checkpoint_of(task, fit=True).key == fit
 
 
 def test_quick_work_does_not_overwrite_what_was_kept(tmp_path):
     (tmp_path / "x").mkdir()
-    wish = BenchmarkOptions(tmp_path / "x", tmp_path / "out", ("encoder",))
-    few = data_of(wish, "testsite").thinned(QUICK_RUNS)
-    assert len(few.logged) < len(data_of(wish, "testsite").logged)
+    options = BenchmarkOptions(tmp_path / "x", tmp_path / "out", ("encoder",))
+    few = data_of(options, "testsite").thinned(QUICK_RUNS)
+    assert len(few.logged) < len(data_of(options, "testsite").logged)
     whole, quick = (
-        FoldTask(replace(wish, quick=quick), "testsite", "headings", 0) for quick in (False, True)
+        FoldTask(replace(options, quick=quick), "testsite", "headings", 0)
+        for quick in (False, True)
     )
     assert whole.name == quick.name
     folders = {
-        benchmark_work.kept_of(p, fit=f).folder for p in (whole, quick) for f in (False, True)
+        benchmark_work.checkpoint_of(p, fit=f).folder for p in (whole, quick) for f in (False, True)
     }
     assert len(folders) == 4
 
@@ -145,7 +146,7 @@ def test_a_missing_folder_is_named(tmp_path):
 
 def test_a_split_that_cannot_be_read_fails_alone(tmp_path, monkeypatch):
     (tmp_path / "x").mkdir()
-    piece = FoldTask(
+    task = FoldTask(
         BenchmarkOptions(tmp_path / "x", tmp_path / "out", ("encoder",)), "testsite", "headings", 0
     )
 
@@ -153,19 +154,19 @@ def test_a_split_that_cannot_be_read_fails_alone(tmp_path, monkeypatch):
         raise OSError("disk on fire")
 
     with monkeypatch.context() as patch:
-        patch.setattr(benchmark_work, "_scene", broken)
-        piece.run()
-    rows = piece.rows()
+        patch.setattr(benchmark_work, "_fold_data", broken)
+        task.run()
+    rows = task.rows()
     assert {protocol for protocol, _ in rows} == {"known_floor", "unknown_floor"}
     assert all(row.failed and "disk on fire" in row.absent for row in rows.values())
 
     # what failed is tried again
-    monkeypatch.setattr(benchmark_work, "_scene", lambda piece: None)
+    monkeypatch.setattr(benchmark_work, "_fold_data", lambda task: None)
     monkeypatch.setattr(
-        benchmark_work, "_row", lambda scene, protocol, name: FoldScore.lacking(["gyro"])
+        benchmark_work, "_score", lambda data, protocol, name: FoldScore.lacking(["gyro"])
     )
-    piece.run()
-    assert {row.absent for row in piece.rows().values()} == {"needs a gyro"}
+    task.run()
+    assert {row.absent for row in task.rows().values()} == {"needs a gyro"}
 
 
 def test_a_data_set_that_cannot_be_read_stops_no_other(tmp_path, monkeypatch):

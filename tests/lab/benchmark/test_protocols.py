@@ -9,7 +9,8 @@ from slipid.lab.benchmark.protocols import PROTOCOLS, base_of, facts_of_run, inn
 from slipid.lab.benchmark.tuning import _loss, tuned
 from slipid.lab.systems.motion.quann import QuannEnergy
 from slipid.predict.folds import FoldKey
-from slipid.predict.slip_model import FEWEST, ByFloor, PredictedRun, RobotSpec, SlipModel, path_of
+from slipid.predict.slip_model import PredictedRun, RobotSpec, SlipModel, path_of
+from slipid.predict.slip_models import FEWEST, ByFloor
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 
@@ -24,42 +25,42 @@ def test_every_protocol_has_splits_of_its_kind():
 
 
 @pytest.mark.parametrize("kind", ["headings", "sectors", "speeds", "floors"])
-def test_runs_are_judged_once_and_never_fitted_then(kind):
+def test_runs_are_held_out_once_and_never_trained_on_then(kind):
     every = facts()
     found = splits(every, kind)
-    judged = np.concatenate([split.judged for split in found])
+    judged = np.concatenate([split.held_out for split in found])
     assert sorted(judged.tolist()) == list(range(len(every)))
     for split in found:
-        assert not set(split.judged.tolist()) & set(split.fitted.tolist())
-        assert len(split.judged) + len(split.fitted) == len(every)
+        assert not set(split.held_out.tolist()) & set(split.training.tolist())
+        assert len(split.held_out) + len(split.training) == len(every)
 
 
-def test_a_heading_that_is_left_out_is_seen_on_no_floor():
+def test_a_held_out_heading_is_trained_on_no_floor():
     every = facts()
     for split in splits(every, "headings"):
-        left_out = {every[k].heading_deg for k in split.judged}
-        assert not left_out & {every[k].heading_deg for k in split.fitted}
+        left_out = {every[k].heading_deg for k in split.held_out}
+        assert not left_out & {every[k].heading_deg for k in split.training}
 
 
 def test_sectors_of_sixty_degrees_are_left_out_whole():
     every = facts()
     for split in splits(every, "sectors"):
-        ways = {int(every[k].heading_deg // 60) for k in split.judged}
+        ways = {int(every[k].heading_deg // 60) for k in split.held_out}
         assert len(ways) == 3
-        assert not ways & {int(every[k].heading_deg // 60) for k in split.fitted}
+        assert not ways & {int(every[k].heading_deg // 60) for k in split.training}
 
 
 def test_a_floor_driven_at_one_speed_keeps_it():
     every = [*facts(), *facts(("table",), (0.1,))]
     for split in splits(every, "speeds"):
-        assert "table" not in {every[k].floor for k in split.judged}
+        assert "table" not in {every[k].floor for k in split.held_out}
 
 
 def test_a_load_driven_at_one_speed_keeps_it_and_a_floor_is_left_out_with_all_loads():
     every = [*facts(), *facts(("gray@moved",), (0.1,))]
     for split in splits(every, "speeds"):
-        assert "gray@moved" not in {every[k].floor for k in split.judged}
-    left_out = [{every[k].floor for k in split.judged} for split in splits(every, "floors")]
+        assert "gray@moved" not in {every[k].floor for k in split.held_out}
+    left_out = [{every[k].floor for k in split.held_out} for split in splits(every, "floors")]
     assert left_out == [{"gray", "gray@moved"}, {"green"}]
 
 
@@ -67,15 +68,15 @@ def test_many_speeds_are_two_halves():
     rng = np.random.default_rng(0)
     every = [FoldKey("grass", 0.0, float(v)) for v in rng.uniform(0.5, 3.0, 60)]
     found = splits(every, "speeds")
-    assert [abs(len(split.judged) - 30) < 3 for split in found] == [True, True]
-    fastest = [max(every[k].speed for k in split.judged) for split in found]
+    assert [abs(len(split.held_out) - 30) < 3 for split in found] == [True, True]
+    fastest = [max(every[k].speed for k in split.held_out) for split in found]
     assert fastest == sorted(fastest)
 
 
-def test_a_floor_nobody_else_has_is_not_judged_by_heading():
+def test_a_floor_with_one_heading_is_not_held_out_by_heading():
     lone = [FoldKey("ice", 0.0, 0.1)] * 3
     for split in splits([*facts(), *lone], "headings"):
-        assert not [k for k in split.judged if k >= len(facts())]
+        assert not [k for k in split.held_out if k >= len(facts())]
 
 
 def test_too_few_runs_are_no_split():
@@ -95,7 +96,7 @@ def runs(floors=("gray", "green"), slip=0.3):
     return out
 
 
-def test_inner_parts_are_of_the_kind_that_is_judged_by():
+def test_inner_parts_are_of_the_protocols_kind():
     training = runs()
     by_floor = inner(training, "floors")
     left_out = {run.floor for run, k in zip(training, by_floor, strict=True) if k == 0}
@@ -112,7 +113,7 @@ def test_inner_parts_are_of_the_kind_that_is_judged_by():
 def test_headings_are_held_back_where_every_other_sector_is_missing_already():
     every = runs()
     split = splits([facts_of_run(run) for run in every], "sectors")[0]
-    training = [every[k] for k in split.fitted]
+    training = [every[k] for k in split.training]
     assert inner(training, "sectors").tolist() == inner(training, "headings").tolist()
 
 
@@ -216,7 +217,7 @@ class Mean(Scaled):
         return replace(self, factor=float(slip / size))
 
 
-def test_a_method_by_floor_has_one_fit_for_all_where_nothing_is_told():
+def test_a_method_by_floor_has_one_fit_for_all_unknown_floors():
     told = ByFloor.of(Mean()).fit(runs(slip=0.5), ROBOTINO)
     untold = ByFloor.of(Mean()).fit([run.with_floor(False) for run in runs(slip=0.5)], ROBOTINO)
     way = made_run(straight(0.1), name="new")
@@ -272,7 +273,7 @@ def test_what_predicts_energy_is_tuned_by_it():
     assert ByFloor.of(QuannEnergy()).aim == "energy"
 
 
-def test_where_floors_are_not_told_each_load_has_a_fit_and_a_strange_one_that_of_the_usual():
+def test_with_unknown_floors_each_load_has_a_fit_and_a_new_load_that_of_the_usual():
     every = [run.with_floor(False) for run in runs(slip=0.5)]
     names = {"gray": "own", "green": "moved"}
 

@@ -28,29 +28,29 @@ def made():
     return simulate_runs(("firm", "soft"), headings=3, turns=0, seed=3)
 
 
-def own_of(made, current=True) -> SlipidFit:
+def fit_of(made, current=True) -> SlipidFit:
     """The robot that drove the runs, as if it had been fitted to them."""
 
     def ends(w):
         return SimpleNamespace(predicted=w.pose), np.tile(np.diag([4.0, 1.0]), (len(w), 1, 1))
 
-    own = object.__new__(SlipidFit)
+    fit = object.__new__(SlipidFit)
     dataset = SimpleNamespace(current=np.ones(1) if current else None)
     stub = {
         "contact": SimpleNamespace(ends=ends, robot=made.robot),
         "job": SimpleNamespace(dataset=dataset),
-        "seen": (0, 1),
+        "floors": (0, 1),
         "deployed": deployed(),
     }
     for name, value in stub.items():
-        object.__setattr__(own, name, value)
-    return own
+        object.__setattr__(fit, name, value)
+    return fit
 
 
-def test_where_the_floor_is_told_the_region_is_that_of_a_student_t(made):
+def test_on_a_known_floor_the_region_is_that_of_a_student_t(made):
     one = run_batches(made.runs, made.robot)[0]
     spec = RobotSpec.of(made.robot)
-    said = forecast(own_of(made, current=False), one, spec)
+    said = forecast(fit_of(made, current=False), one, spec)
     assert len(said) == len(one.runs)
     for run in said:
         assert run.end_covariance is not None
@@ -74,10 +74,10 @@ def driven(made, monkeypatch):
     return calls
 
 
-def labels(place, made, driven, current=True):
+def labels(floors, made, driven, current=True):
     """Floors of each estimator that is driven for some runs."""
-    cuts = run_batches(made.runs, made.robot)
-    said = estimator_runs(own_of(made, current), cuts, made.runs, place)
+    batches = run_batches(made.runs, made.robot)
+    said = estimator_runs(fit_of(made, current), batches, made.runs, floors)
     assert len(said) == len(made.runs)
     return [estimator.robot.labels for estimator, _ in driven]
 
@@ -85,13 +85,13 @@ def labels(place, made, driven, current=True):
 def test_an_estimator_has_the_floors_that_it_may_meet(made, driven):
     assert labels(FloorKnowledge(), made, driven) == [("firm", "soft")]
     driven.clear()
-    assert sorted(labels(FloorKnowledge(told=True), made, driven)) == [("firm",), ("soft",)]
+    assert sorted(labels(FloorKnowledge(floor_known=True), made, driven)) == [("firm",), ("soft",)]
     for estimator, heard in driven:
         assert {one.name for one in heard} == {
             log.name for log in made.runs.logs if log.surface == estimator.robot.labels[0]
         }
     driven.clear()
-    (found,) = labels(FloorKnowledge(strange=True), made, driven)
+    (found,) = labels(FloorKnowledge(unseen_floors=True), made, driven)
     assert found[:2] == ("firm", "soft")
     assert "unseen_1" in found
 
@@ -99,15 +99,15 @@ def test_an_estimator_has_the_floors_that_it_may_meet(made, driven):
 def test_only_a_robot_that_may_stand_on_several_floors_looks_for_them(made, driven):
     labels(FloorKnowledge(), made, driven)
     assert driven[0][0].settings.further_floor_penalty != MIXED_FLOORS_PENALTY
-    cuts = [
+    batches = [
         replace(one, runs=tuple(replace(run, floor="unknown") for run in one.runs))
         for one in run_batches(made.runs, made.robot)
     ]
-    estimator_runs(own_of(made), cuts, made.runs, FloorKnowledge())
+    estimator_runs(fit_of(made), batches, made.runs, FloorKnowledge())
     assert driven[1][0].settings.further_floor_penalty == MIXED_FLOORS_PENALTY
 
 
-def test_an_estimator_hears_currents_only_if_it_was_fitted_to_some(made, driven):
+def test_an_estimator_uses_currents_only_if_it_was_fitted_to_some(made, driven):
     labels(FloorKnowledge(), made, driven, current=True)
     labels(FloorKnowledge(), made, driven, current=False)
     (_, with_currents), (_, without) = driven

@@ -1,4 +1,4 @@
-"""Runs as methods are given them: what was heard, and where the body was in truth."""
+"""Runs as methods are given them: what was signals, and where the body was in truth."""
 
 from dataclasses import replace
 
@@ -18,10 +18,10 @@ def made():
 
 
 def test_every_run_is_there_once_in_equally_many_steps(made):
-    cuts = run_batches(made.runs, made.robot)
-    numbers = [k for one in cuts for k in one.numbers]
+    batches = run_batches(made.runs, made.robot)
+    numbers = [k for one in batches for k in one.numbers]
     assert sorted(numbers) == list(range(len(made.runs)))
-    steps = {len(run.signals) for one in cuts for run in one.runs}
+    steps = {len(run.signals) for one in batches for run in one.runs}
     assert len(steps) <= 2
     assert all(n & (n - 1) == 0 for n in steps)
 
@@ -39,7 +39,7 @@ def test_it_moves_as_the_robot_that_drove_it(made):
             assert found[:2] == pytest.approx(expected[:2], abs=0.015)
 
 
-def test_the_load_is_heard_and_gyro_and_command_are_means_over_each_step(made):
+def test_the_load_is_given_and_gyro_and_command_are_means_over_each_step(made):
     logs = [
         replace(
             log,
@@ -50,15 +50,15 @@ def test_the_load_is_heard_and_gyro_and_command_are_means_over_each_step(made):
         for log in made.runs.logs
     ]
     one = run_batches(collect(logs), made.robot)[0]
-    heard = one.runs[0].signals
-    assert heard.load == one.runs[0].load == "heavy"
-    assert heard.command is not None
-    assert heard.command == pytest.approx(np.tile([0.1, 0.2, 0.3], (len(heard), 1)))
+    signals = one.runs[0].signals
+    assert signals.load == one.runs[0].load == "heavy"
+    assert signals.command is not None
+    assert signals.command == pytest.approx(np.tile([0.1, 0.2, 0.3], (len(signals), 1)))
     # in the time of the wheels, which the camera lags
     lag = float(made.robot.camera.lag)
-    middle = one.windows.start[0] + np.cumsum(heard.dt) - 0.5 * heard.dt - lag
-    assert heard.gyro is not None
-    assert heard.gyro[1:] == pytest.approx(3.0 * middle[1:], abs=0.01)
+    middle = one.windows.start[0] + np.cumsum(signals.dt) - 0.5 * signals.dt - lag
+    assert signals.gyro is not None
+    assert signals.gyro[1:] == pytest.approx(3.0 * middle[1:], abs=0.01)
 
 
 def test_a_start_anywhere_is_the_origin():

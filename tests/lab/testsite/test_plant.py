@@ -1,4 +1,4 @@
-"""Physics of the virtual test site: what any plant must do, whatever its contact law."""
+"""Physics of the virtual test site that holds for any contact law."""
 
 from dataclasses import replace
 
@@ -35,10 +35,10 @@ STILL = [0.0, 0.0, 0.0]
 
 
 def standing(
-    surface: str, machine: RobotBuild = CENTRED, seed: int = 0, **more: SurfacePhysics
+    surface: str, robot: RobotBuild = CENTRED, seed: int = 0, **more: SurfacePhysics
 ) -> SimulatedRobot:
     grounds = {**EVEN, **more}
-    return SimulatedRobot(Site(machine, grounds=grounds), uniform(surface), "as_built", seed=seed)
+    return SimulatedRobot(Site(robot, surfaces=grounds), uniform(surface), "as_built", seed=seed)
 
 
 def loads(plant: SimulatedRobot) -> np.ndarray:
@@ -66,17 +66,17 @@ def body_step(trace: Trace) -> np.ndarray:
     return np.array([c * dx + s * dy, c * dy - s * dx, trace.pose[-1, 2] - trace.pose[0, 2]])
 
 
-def rolled(trace: Trace, machine: RobotBuild) -> np.ndarray:
+def rolled(trace: Trace, robot: RobotBuild) -> np.ndarray:
     """What the encoders say of it, integrated along the way."""
-    steps = np.diff(trace.wheel_angle, axis=0) @ np.linalg.pinv(machine.wheel_from_twist).T
+    steps = np.diff(trace.wheel_angle, axis=0) @ np.linalg.pinv(robot.wheel_from_twist).T
     heading = np.cumsum(steps[:, 2]) - 0.5 * steps[:, 2]
     c, s = np.cos(heading), np.sin(heading)
     x, y = c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]
     return np.array([x.sum(), y.sum(), steps[:, 2].sum()])
 
 
-def slip(trace: Trace, machine: RobotBuild) -> float:
-    far, wheels = body_step(trace)[:2], rolled(trace, machine)[:2]
+def slip(trace: Trace, robot: RobotBuild) -> float:
+    far, wheels = body_step(trace)[:2], rolled(trace, robot)[:2]
     return float(1 - np.hypot(*far) / np.hypot(*wheels))
 
 
@@ -136,7 +136,7 @@ def test_the_floor_carries_the_weight_as_statics_say():
 
 @pytest.mark.nightly
 def test_a_centred_robot_looks_the_same_from_every_wheel():
-    site = Site(machine=CENTRED, grounds=EVEN)
+    site = Site(robot=CENTRED, surfaces=EVEN)
     ends = []
     for k in range(3):
         way = 0.4 + 2 * np.pi * k / 3
@@ -153,7 +153,7 @@ def test_a_centred_robot_looks_the_same_from_every_wheel():
 @pytest.mark.slow
 def test_wheels_roll_where_the_floor_is_firm():
     site = Site()
-    back = np.linalg.pinv(site.machine.wheel_from_twist)
+    back = np.linalg.pinv(site.robot.wheel_from_twist)
     for run in sixths("firm"):
         trace = drive(run, site, 1)
         steady = (trace.time > 1.0) & (trace.time < 2.8)
@@ -182,12 +182,12 @@ def test_slip_grows_with_softness_and_depends_on_the_direction():
     found = {}
     for surface in ("firm", "medium", "soft"):
         runs = sixths(surface)
-        found[surface] = [slip(drive(run, site, 3), site.machine) for run in runs]
+        found[surface] = [slip(drive(run, site, 3), site.robot) for run in runs]
     assert 0.003 < np.mean(found["firm"]) < 0.03
     assert 0.1 < np.mean(found["medium"]) < 0.3
     assert 0.2 < np.mean(found["soft"]) < 0.55
     assert np.ptp(found["soft"]) > 0.1  # the centre of mass lies off the middle
-    level = [slip(drive(run, Site(machine=CENTRED), 3), CENTRED) for run in sixths("soft")]
+    level = [slip(drive(run, Site(robot=CENTRED), 3), CENTRED) for run in sixths("soft")]
     assert np.ptp(level) < 0.6 * np.ptp(found["soft"])
 
 
@@ -196,7 +196,7 @@ def test_ribs_shake_a_robot_and_do_not_hold_it():
     site = Site()
     smooth = {**SURFACES, "ribbed": replace(SURFACES["ribbed"], rib_height_m=0.0)}
     run = straight("ribbed", "as_built", 0.0, 0.2, 0.5)
-    over, flat = drive(run, site, 0), drive(run, Site(grounds=smooth), 0)
+    over, flat = drive(run, site, 0), drive(run, Site(surfaces=smooth), 0)
     assert body_step(over)[0] > 0.4
     shake = [np.std(np.diff(t.sinkage.mean(axis=1))) for t in (over, flat)]
     assert shake[0] > 2 * shake[1]
@@ -215,30 +215,30 @@ def test_ribs_lie_on_their_surface_only():
 def test_every_roller_feels_the_floor_beneath_it():
     cells = np.array([[0, 1]])
     floor = FloorMap(("firm", "soft"), cells, (-2.0, -2.0), 2.0)  # soft where x is above 0
-    plant = SimulatedRobot(Site(CENTRED, grounds=EVEN), floor, "as_built")
+    plant = SimulatedRobot(Site(CENTRED, surfaces=EVEN), floor, "as_built")
     x = plant.data.geom_xpos[plant.model.geom("roller0_0").id, 0]
     assert x > 0
     rolling = plant.model.geom_friction[:, 2]
     assert rolling[plant.model.geom("roller0_0").id] == pytest.approx(SURFACES["soft"].rolling_m)
     assert rolling[plant.model.geom("roller1_0").id] == pytest.approx(SURFACES["firm"].rolling_m)
-    sinkage = plant.machine.wheel_radius_m - plant.data.xpos[plant.wheel_body, 2]
+    sinkage = plant.robot.wheel_radius_m - plant.data.xpos[plant.wheel_body, 2]
     assert sinkage[0] > 2 * sinkage[1]
 
 
-def test_a_map_is_felt_up_to_its_edges():
+def test_a_map_acts_up_to_its_edges():
     cells = np.array([[0, 1]])
     floor = FloorMap(("firm", "soft"), cells, (-3.0, -3.0), 3.0)
-    plant = SimulatedRobot(Site(CENTRED, grounds=EVEN), floor, "as_built", (-2.8, 1.0, 0.0))
+    plant = SimulatedRobot(Site(CENTRED, surfaces=EVEN), floor, "as_built", (-2.8, 1.0, 0.0))
     places = np.stack([np.linspace(-3.5, 3.5, 90), np.full(90, 1.2)], axis=1)
     places = places[np.abs(places[:, 0]) > 0.01]  # looked up in cells of some millimetres
     np.testing.assert_array_equal(plant.terrain.at(places) // LEVELS, floor.at(places))
 
 
 def test_the_centre_of_mass_is_where_it_is_put_also_with_uneven_wheels():
-    machine = replace(
+    robot = replace(
         RobotBuild(), wheel_azimuths_deg=(0.0, 90.0, 210.0), centres_m={"as_built": (0.01, 0.01)}
     )
-    plant = standing("firm", machine)
+    plant = standing("firm", robot)
     mujoco.mj_comPos(plant.model, plant.data)
     x, y, _ = plant.pose
     centre = plant.data.subtree_com[plant.model.body("chassis").id, :2] - (x, y)
@@ -258,7 +258,7 @@ def test_compaction_and_body_drag_slow_a_robot():
     run = straight("soft", "as_built", 1.0, 0.2, 0.5)
     free = replace(EVEN["soft"], compaction=0.0, body_drag_n=0.0)
     far = [
-        np.hypot(*body_step(drive(run, Site(grounds={**EVEN, "soft": g}), 0))[:2])
+        np.hypot(*body_step(drive(run, Site(surfaces={**EVEN, "soft": g}), 0))[:2])
         for g in (free, replace(free, compaction=1e4), replace(free, body_drag_n=5.0))
     ]
     assert far[1] < 0.95 * far[0]
@@ -281,7 +281,7 @@ def test_what_is_added_to_the_engine_only_takes_energy():
 # motors
 
 
-def test_a_held_motor_draws_what_ohm_says_and_a_free_one_nothing():
+def test_a_held_motor_draws_current_by_ohms_law_and_a_free_one_none():
     motor = MotorBuild(supply_ohm=0.0, efficiency=1.0)
     loop = SpeedLoop(kind="pi", gain=100.0, integral=0.0, filter_s=0.0)
     held = WheelDrives(motor, loop, 16.0, 1, 1e-3)
@@ -377,7 +377,7 @@ def test_the_rectangle_is_driven_by_encoders_and_better_by_camera():
         trace = drive(RectangleRuns(map="zones", by=by).runs(floor, 0)[0], site, 0)
         closure[by] = np.hypot(*(trace.pose[-1, :2] - trace.pose[0, :2]))
         if by == "encoders":
-            np.testing.assert_allclose(rolled(trace, site.machine)[:2], 0.0, atol=0.05)
+            np.testing.assert_allclose(rolled(trace, site.robot)[:2], 0.0, atol=0.05)
     assert closure["camera"] < 0.05 < closure["encoders"]
 
 

@@ -1,4 +1,4 @@
-"""`slipid simulate`: files, seeds, interrupts, mistakes; and a camera whose frames can be read."""
+"""`slipid simulate`: files, seeds, interrupts, mistakes; and a camera with readable frames."""
 
 import hashlib
 import os
@@ -160,11 +160,11 @@ def test_another_config_does_not_mix_with_what_is_there(config, tmp_path):
         quietly(config, out)
 
 
-def test_known_surfaces_are_changed_and_others_made_anew(config):
+def test_known_surfaces_are_changed_and_others_are_new(config):
     found = plan(config, config.read_text())
-    assert found.site.grounds["soft"].friction == 0.7
-    assert found.site.grounds["soft"].rolling_m == SURFACES["soft"].rolling_m
-    assert found.site.grounds["snow"].friction == 0.3
+    assert found.site.surfaces["soft"].friction == 0.7
+    assert found.site.surfaces["soft"].rolling_m == SURFACES["soft"].rolling_m
+    assert found.site.surfaces["snow"].friction == 0.3
     assert [name for name, _ in found.runs] == [
         "moved/snow/run000",
         "moved/snow/run001",
@@ -416,16 +416,16 @@ def pixels(camera, points):
     return seen[:, 0]
 
 
-def corners(pose, machine, camera):
+def corners(pose, robot, camera):
     """Where the marker's corners should be seen, in ArUco's order; its top edge is ahead."""
-    yaw, half = pose[2] + np.radians(machine.marker_yaw_deg), 0.5 * machine.marker_size_m
+    yaw, half = pose[2] + np.radians(robot.marker_yaw_deg), 0.5 * robot.marker_size_m
     c, s = np.cos(yaw), np.sin(yaw)
     flat = half * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) @ np.array([[c, s], [-s, c]])
-    return pixels(camera, np.c_[flat + pose[:2], np.full(4, machine.marker_height_m)])
+    return pixels(camera, np.c_[flat + pose[:2], np.full(4, robot.marker_height_m)])
 
 
 @pytest.mark.slow
-def test_the_marker_is_seen_where_the_camera_says(studio):
+def test_the_marker_is_detected_where_the_camera_projects_it(studio):
     book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     detector = cv2.aruco.ArucoDetector(book)
     for k, pose in enumerate(([0.3, 0.2, 0.4], [-0.9, -0.4, 2.0], [0.0, 0.0, -1.0])):

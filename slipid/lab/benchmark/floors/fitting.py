@@ -1,26 +1,24 @@
-"""Numbers of floors by currents and turning alone: what makes them at the wheel speeds measured.
+"""ForceBalance parameters of floors from currents and turning alone, at the measured wheel speeds.
 
-Rows of one run at the same wheel speeds are one cell: accelerations, which the model does not know,
-cancel in its mean. For every floor
+Rows of one run at the same wheel speeds are one cell: accelerations, which are not modelled, cancel
+in its mean. For every floor
 
     min  sum_cells w_c^2 rho( ((I(w_c) - I_c) / 1 A)^2 + ((W(w_c) - gyro_c) / 0.2 rad/s)^2 ) + prior
 
 over the logarithms of friction, creep and rolling resistance, with I and W of the contact
-equilibrium and of the ammeter (`MeteredMotor`), rho a soft absolute value. Currents stay alike for
-seconds and differ from run to run: a cell of n rows counts as n / (1 + n / 20), and a run of many
-rows as one of `LONG`.
+equilibrium and of the ammeter (`MeteredMotor`), rho a soft absolute value. Currents are correlated
+for seconds and differ from run to run: a cell of n rows has the weight of n / (1 + n / 20), and a
+run of many rows that of `LONG`.
 
-What ammeters show of motors that also brake: nothing while they do.
-
-The Husky's ammeters measure what a motor takes from the battery. Where the ground pushes a wheel,
-as it does on the inner side of a turn, the motor brakes and the meter shows nothing. Over a row the
-current scatters, so the mean that is shown is that of a clipped normal variable,
+Ammeters. The Husky's ammeters measure the current that a motor takes from the battery. Where the
+ground pushes a wheel, as on the inner side of a turn, the motor brakes and the ammeter reads zero.
+Within a row the current scatters, so the mean reading is that of a clipped normal variable,
 
     E[max(I + n, 0)] = I Phi(I / s) + s phi(I / s),   n ~ N(0, s^2)
 
 with I the motor's current along its wheel's motion, Phi and phi the normal distribution and its
-density. The motor of one side may be stiffer than that of the other; what it draws more than the
-mean of all counts as its own friction.
+density. The motor of one side may be stiffer than that of the other; its excess over the mean
+current of all motors counts as its own friction.
 """
 
 from collections.abc import Sequence
@@ -39,18 +37,17 @@ from slipid.model.motor import Motor
 from slipid.model.robot import Robot, motor_current, twist
 
 FITTED = ("friction", "creep", "rolling_resistance")
-"""Of every floor, as logarithms."""
+"""Fitted parameters of every floor, as logarithms."""
 START = np.log([0.6, 0.15, 0.08])
-SPREAD = np.array([1.0, 1.0, 1.0])
-"""Of the priors of the logarithms."""
+"""Prior means of the logarithms; their prior std is one."""
 CURRENT_A, YAW_RATE = 1.0, 0.2
-"""By which misfits of currents and turning count [A], [rad/s]."""
+"""Units of the residuals of currents and turning [A], [rad/s]."""
 ALIKE, LONG = 20.0, 300.0
-"""Rows at the same speeds, and rows of a run, beyond which more of them tell little."""
+"""Rows at the same speeds, and rows of a run, above which more rows add little information."""
 CELLS = 512
-"""Of a floor at most; what is compiled has room for so many."""
+"""Largest number of cells of a floor, and their number in the compiled functions."""
 SAME_SPEED = 1e-3
-"""Wheel speeds nearer than this are the same [rad/s]."""
+"""Difference below which wheel speeds are the same [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +55,12 @@ class Cells:
     """Means of rows at the same wheel speeds.
 
     Attributes:
-        speed: of the wheels of each drive [rad/s]; current: of each motor [A].
-        gyro: yaw rate [rad/s], and 0 where none was heard.
-        weight: of each cell, for currents and for turning.
-        std: of the currents in the cell [A]; rows: how many.
+        speed: wheel speed of each drive [rad/s].
+        current: current of each motor [A].
+        gyro: yaw rate [rad/s], 0 where it is missing.
+        weight: weight of each cell, for currents and for turning.
+        std: standard deviation of the currents in the cell [A].
+        rows: number of rows.
     """
 
     speed: Float[np.ndarray, "cell drive"]
@@ -72,11 +71,11 @@ class Cells:
     rows: Float[np.ndarray, " cell"]
 
     @classmethod
-    def of(cls, felt: FloorSignals) -> "Cells":
-        """Cells of one run, of rows in which it moves."""
-        take = felt.moves & np.isfinite(felt.current).all(axis=1)
-        speed, amps = felt.speed[take], felt.current[take]
-        gyro = np.full(len(speed), np.nan) if felt.gyro is None else felt.gyro[take]
+    def of(cls, run: FloorSignals) -> "Cells":
+        """Return the cells of one run, from rows in which it moves."""
+        take = run.moving & np.isfinite(run.current).all(axis=1)
+        speed, amps = run.speed[take], run.current[take]
+        gyro = np.full(len(speed), np.nan) if run.gyro is None else run.gyro[take]
         same = np.round(speed / SAME_SPEED)
         first, cell, count = np.unique(
             same, axis=0, return_index=True, return_inverse=True, return_counts=True
@@ -84,41 +83,38 @@ class Cells:
         member = np.eye(len(first))[cell.ravel()].T / count[:, None]
         mean = member @ amps
         turning = np.isfinite(gyro)
-        heard = member @ turning
-        yaw = member @ np.where(turning, gyro, 0.0) / np.maximum(heard, 1e-9)
+        known = member @ turning
+        yaw = member @ np.where(turning, gyro, 0.0) / np.maximum(known, 1e-9)
         counts = 3 * count / (1 + count / ALIKE) / (1 + len(speed) / LONG)
         return cls(
             speed=speed[first],
             current=mean,
             gyro=yaw,
-            weight=np.sqrt(np.stack([counts, counts * heard], axis=1)),
+            weight=np.sqrt(np.stack([counts, counts * known], axis=1)),
             std=np.sqrt(np.maximum(member @ amps**2 - mean**2, 0.0)),
             rows=count.astype(float),
         )
 
     @classmethod
-    def joined(cls, felts: Sequence[FloorSignals]) -> "Cells":
-        """Cells of several runs."""
-        each = [cls.of(felt) for felt in felts]
-        names = ("speed", "current", "gyro", "weight", "std", "rows")
-        return cls(*(np.concatenate([getattr(one, name) for one in each]) for name in names))
+    def joined(cls, runs: Sequence[FloorSignals]) -> "Cells":
+        """Return the cells of several runs."""
+        each = [cls.of(run) for run in runs]
+        return cls(*(np.concatenate([getattr(c, f.name) for c in each]) for f in fields(cls)))
 
     def thinned(self, most: int) -> "Cells":
-        """At most so many, drawn at random, and filled up with cells that do not count."""
+        """Return exactly `most` cells: a random sample, or all and cells of zero weight."""
         rng = np.random.default_rng(0)
         take = np.sort(rng.permutation(len(self.rows))[:most])
-        fill = most - len(take)
-        names = ("speed", "current", "gyro", "weight", "std", "rows")
 
-        def filled(x: np.ndarray) -> np.ndarray:
-            return np.concatenate([x[take], np.zeros((fill, *x.shape[1:]))])
+        def padded(x: np.ndarray) -> np.ndarray:
+            return np.concatenate([x[take], np.zeros((most - len(take), *x.shape[1:]))])
 
-        return Cells(*(filled(getattr(self, name)) for name in names))
+        return Cells(*(padded(getattr(self, f.name)) for f in fields(self)))
 
 
-def scatter_of(felts: Sequence[FloorSignals]) -> float:
-    """Std of currents while wheel speeds are the same [A]."""
-    cells = Cells.joined(felts)
+def scatter_of(runs: Sequence[FloorSignals]) -> float:
+    """Return the std of currents at constant wheel speeds [A]."""
+    cells = Cells.joined(runs)
     several = cells.rows >= 5
     weight = cells.rows[several, None]
     return float(
@@ -126,27 +122,30 @@ def scatter_of(felts: Sequence[FloorSignals]) -> float:
     )
 
 
-def stiffness_of(felts: Sequence[FloorSignals]) -> Float[np.ndarray, " drive"]:
-    """Current that each drive takes more than the mean of all, going straight, median of runs [A].
+def stiffness_of(runs: Sequence[FloorSignals]) -> Float[np.ndarray, " drive"]:
+    """Return each drive's excess over the mean current in straight motion, median over runs [A].
 
-    Zero of robots whose drives have nothing in common, three omni wheels say.
+    It is zero for robots whose wheels never have equal speeds, such as one with three omni wheels.
     """
     found = []
-    for felt in felts:
-        fast = np.abs(felt.speed).min(axis=1) > 0.5
-        straight = fast & (np.ptp(felt.speed, axis=1) < 0.1)
+    for run in runs:
+        fast = np.abs(run.speed).min(axis=1) > 0.5
+        straight = fast & (np.ptp(run.speed, axis=1) < 0.1)
         if straight.sum() > 20:
-            mean = felt.current[straight].mean(axis=0)
+            mean = run.current[straight].mean(axis=0)
             found.append(mean - mean.mean())
-    return np.median(found, axis=0) if found else np.zeros(felts[0].speed.shape[1])
+    return np.median(found, axis=0) if found else np.zeros(runs[0].speed.shape[1])
 
 
-def fitted_floors(robot: Robot, felts: Sequence[FloorSignals]) -> Robot:
-    """The robot with numbers of all its floors, each by the runs on it."""
+def fitted_floors(robot: Robot, runs: Sequence[FloorSignals]) -> Robot:
+    """Return the robot with the parameters of each floor fitted to the runs on it."""
     for number, floor in enumerate(robot.surfaces.labels):
-        cells = Cells.joined([felt for felt in felts if felt.floor == floor]).thinned(CELLS)
-        left = _FloorMisfit(robot, number, cells)
-        logs = least_squares(left.gaps, START, left.slope, loss="soft_l1", max_nfev=30).x
+        cells = Cells.joined([run for run in runs if run.floor == floor]).thinned(CELLS)
+        misfit = _FloorMisfit(robot, number, cells)
+        solution = least_squares(
+            misfit.residuals, START, misfit.jacobian, loss="soft_l1", max_nfev=30
+        )
+        logs = solution.x
         robot = on_floor(robot, jnp.asarray(number), jnp.asarray(logs))
     return robot
 
@@ -157,9 +156,9 @@ def currents_off(
     speed: Float[np.ndarray, "row drive"],
     current: Float[np.ndarray, "row drive"],
 ) -> Float[np.ndarray, "row drive"]:
-    """How much more motors should draw on a floor, by its numbers, than they do in each row [A].
+    """Return the modelled less the measured currents in each row on a floor [A].
 
-    By what the fit has compiled.
+    The rows go through the compiled function of the fit.
     """
     logs = np.log([float(getattr(robot.surfaces, name)[number]) for name in FITTED])
     count, drives = speed.shape
@@ -171,13 +170,13 @@ def currents_off(
         every = Cells(
             w, amps, np.zeros(CELLS), np.ones((CELLS, 2)), np.ones_like(w), np.ones(CELLS)
         )
-        gaps = _FloorMisfit(robot, number, every).gaps(logs)[: CELLS * drives]
-        found.append(CURRENT_A * gaps.reshape(CELLS, drives)[:rows])
+        off = _FloorMisfit(robot, number, every).residuals(logs)[: CELLS * drives]
+        found.append(CURRENT_A * off.reshape(CELLS, drives)[:rows])
     return np.concatenate(found)
 
 
 def on_floor(robot: Robot, number: Array, logs: Float[Array, "3"]) -> Robot:
-    """The robot with other numbers of a floor, given as logarithms."""
+    """Return the robot with other parameters of a floor, given as logarithms."""
     stacks = {
         name: getattr(robot.surfaces, name).at[number].set(jnp.exp(logs[k]))
         for k, name in enumerate(FITTED)
@@ -188,7 +187,7 @@ def on_floor(robot: Robot, number: Array, logs: Float[Array, "3"]) -> Robot:
 def shown(
     robot: Robot, number: Array, speed: Float[Array, "row drive"]
 ) -> tuple[Float[Array, "row drive"], Float[Array, " row"]]:
-    """Currents that are shown [A] and yaw rates [rad/s] at wheel speeds on a floor."""
+    """Return ammeter readings [A] and yaw rates [rad/s] at wheel speeds on a floor."""
     frame, load = robot.geometry.frame(), jnp.zeros((), int)
 
     def one(w: Array) -> tuple[Array, Array]:
@@ -199,59 +198,61 @@ def shown(
 
 
 class _FloorMisfit:
-    """What numbers of a floor leave of currents and turning, with its derivative."""
+    """Residuals of currents and turning by the parameters of a floor, with their Jacobian."""
 
     def __init__(self, robot: Robot, number: int, cells: Cells):
         self.robot, self.number = robot, jnp.asarray(number)
         every = (cells.speed, cells.current, cells.gyro, cells.weight)
         self.cells = tuple(jnp.asarray(x) for x in every)
-        self.kept: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+        self.last: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
-    def gaps(self, logs: np.ndarray) -> np.ndarray:
-        return self._at(logs)[0]
+    def residuals(self, logs: np.ndarray) -> np.ndarray:
+        """Return the residuals."""
+        return self._both(logs)[0]
 
-    def slope(self, logs: np.ndarray) -> np.ndarray:
-        return self._at(logs)[1]
+    def jacobian(self, logs: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the residuals."""
+        return self._both(logs)[1]
 
-    def _at(self, logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Both at once: the solver asks for them one after the other."""
+    def _both(self, logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return both, computed together: the solver calls for one after the other."""
         key = logs.tobytes()
-        if key not in self.kept:
-            slope, gaps = _both(jnp.asarray(logs), self.robot, self.number, *self.cells)
-            self.kept = {key: (np.asarray(gaps), np.nan_to_num(np.asarray(slope)))}
-        return self.kept[key]
+        if key not in self.last:
+            slope, off = _with_jacobian(jnp.asarray(logs), self.robot, self.number, *self.cells)
+            self.last = {key: (np.asarray(off), np.nan_to_num(np.asarray(slope)))}
+        return self.last[key]
 
 
-def _gaps(
+def _residuals(
     logs: Array, robot: Robot, number: Array, w: Array, amps: Array, gyro: Array, weight: Array
 ) -> tuple[Array, Array]:
-    """Misfits of currents and turning, and how unusual the numbers are; twice."""
-    said, turn = shown(on_floor(robot, number, logs), number, w)
-    gaps = jnp.concatenate(
+    """Return the residuals of currents, turning and prior, as value and auxiliary output."""
+    modelled, turn = shown(on_floor(robot, number, logs), number, w)
+    off = jnp.concatenate(
         [
-            ((said - amps) / CURRENT_A * weight[:, :1]).ravel(),
+            ((modelled - amps) / CURRENT_A * weight[:, :1]).ravel(),
             (turn - gyro) / YAW_RATE * weight[:, 1],
-            (logs - START) / SPREAD,
+            logs - START,
         ]
     )
-    return gaps, gaps
+    return off, off
 
 
-_both = jax.jit(jax.jacfwd(_gaps, has_aux=True))
+_with_jacobian = jax.jit(jax.jacfwd(_residuals, has_aux=True))
 
 
 TURNING = 0.2
-"""Wheel speed beyond which friction is whole, as of `slipid.model.motor` [rad/s]."""
+"""Wheel speed above which friction has its full value, as in `slipid.model.motor` [rad/s]."""
 STEADY_A = 0.1
-"""Scatter of the current of a wheel that stands [A]."""
+"""Scatter of the current of a wheel at rest [A]."""
 
 
 class MeteredMotor(Motor):
-    """Motor as its ammeter shows it: `current` is never below zero.
+    """Motor with an ammeter, whose reading `current` is never negative.
 
     Attributes:
-        stiffness: current that each drive's motor takes more than the mean of all [A].
-        scatter: std of a current about its mean [A].
+        stiffness: excess of each drive's current over the mean of all [A].
+        scatter: standard deviation of a current about its mean [A].
     """
 
     stiffness: Float[Array, " drive"] = eqx.field(kw_only=True)
@@ -259,20 +260,20 @@ class MeteredMotor(Motor):
 
     @classmethod
     def of(cls, motor: Motor, stiffness: Array, scatter: Array) -> "MeteredMotor":
-        """A motor with its ammeter."""
+        """Return a motor with its ammeter."""
         same = {f.name: getattr(motor, f.name) for f in fields(Motor)}
         return cls(**same, stiffness=stiffness, scatter=scatter)
 
     def current(
         self, torque: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
     ) -> Float[Array, " *w"]:
-        """Mean current [A] that is shown of each drive at a wheel torque [N m]."""
-        way = jnp.tanh(wheel_speed / TURNING)
-        along = way * super().current(torque, wheel_speed) + jnp.abs(way) * self.stiffness
-        return clipped(along, STEADY_A + jnp.abs(way) * self.scatter)
+        """Return the mean reading of each drive's ammeter [A] at a wheel torque [N m]."""
+        sign = jnp.tanh(wheel_speed / TURNING)
+        along = sign * super().current(torque, wheel_speed) + jnp.abs(sign) * self.stiffness
+        return clipped(along, STEADY_A + jnp.abs(sign) * self.scatter)
 
 
 def clipped(mean: Array, std: Array) -> Array:
-    """Mean of a normal variable of which what is below zero counts as zero."""
+    """Return the mean of a normal variable whose negative values are set to zero."""
     z = mean / std
     return mean * norm.cdf(z) + std * norm.pdf(z)

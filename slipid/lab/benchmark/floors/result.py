@@ -1,4 +1,4 @@
-"""How often each classifier names the right floor, by the time that it has heard a run."""
+"""Results of floor classifiers: answers, accuracies by seconds of signals, and tables."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -11,34 +11,36 @@ from slipid.lab.benchmark.summary import Bootstrap, MeanInterval, mean_interval
 
 @dataclass(frozen=True)
 class Answer:
-    """What a classifier said at the end of a stretch.
+    """Answer of a classifier after some seconds of a stretch.
 
     Attributes:
-        run: that the stretch is of; floor: it was driven on.
-        seconds: that were heard.
-        said: the floor that was most probable.
-        probability: that the right one was given.
+        run: name of the run.
+        floor: true floor.
+        seconds: length of the signals used [s].
+        named: most probable floor.
+        probability: probability of the true floor.
     """
 
     run: str
     floor: str
     seconds: float
-    said: str
+    named: str
     probability: float
 
 
 @dataclass(frozen=True)
 class AfterSeconds:
-    """A classifier after hearing stretches for so long.
+    """Accuracy of a classifier after some seconds of every stretch.
 
     Attributes:
-        seconds: heard; stretches: how many.
-        accuracy: part of the stretches in which the most probable floor is the right one.
-        balanced: the same, the mean over floors of the part on each.
-        behind: accuracy less that of slipid, the same runs resampled; None of slipid itself.
-        by_floor: part on each floor.
-        log_score: mean log probability of the right floor; 0 is best, log of one over the number of
-            floors is what knowing nothing gives.
+        seconds: length of the signals used [s].
+        stretches: number of stretches.
+        accuracy: share of the stretches in which the most probable floor is the true one.
+        balanced: mean over floors of the share on each floor.
+        behind: accuracy less that of slipid on the same resampled runs; None for slipid itself.
+        by_floor: share on each floor.
+        log_score: mean log probability of the true floor; 0 is best, and equal probabilities give
+            the log of one over the number of floors.
     """
 
     seconds: float
@@ -52,17 +54,18 @@ class AfterSeconds:
 
 @dataclass(frozen=True)
 class ClassifierRow:
-    """A classifier.
+    """Row of a classifier in the table.
 
     Attributes:
-        name: of the row.
-        settings: that cross-validation picked in each fold, in words.
-        numbers: how many were fitted, median over folds.
-        after: by the time heard.
-        said: how often a floor was named on each, in percent, after the longest time.
-        fit_s, tune_s: to fit once and to pick settings [s], median over folds; row_us: to hear a
-            row, microseconds.
-        absent: why the row is empty.
+        name: name of the row.
+        settings: settings picked by cross-validation in each fold, in words.
+        numbers: number of fitted parameters, median over folds.
+        after: accuracy after each time.
+        said: confusion table after the longest time: how often each floor was named on each [%].
+        fit_s: time of one fit, median over folds [s].
+        tune_s: time to pick settings, median over folds [s].
+        row_us: time per row of signals, median over folds [microseconds].
+        absent: reason why the row is empty.
     """
 
     name: str
@@ -78,13 +81,14 @@ class ClassifierRow:
 
 @dataclass(frozen=True)
 class ClassifierTable:
-    """All classifiers on one set of runs.
+    """Table of all classifiers on one set of runs.
 
     Attributes:
-        about: the runs, for people.
-        runs, floors: how many, and which.
-        chance: accuracy of always naming the floor that most stretches are on.
-        rows: slipid's first.
+        about: description of the runs.
+        runs: number of runs.
+        floors: names of the floors.
+        chance: accuracy of always naming the floor with most stretches.
+        rows: rows of the classifiers, slipid's first.
     """
 
     about: str
@@ -94,37 +98,35 @@ class ClassifierTable:
     rows: tuple[ClassifierRow, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values."""
         return asdict(self)
 
 
 def after_seconds(
     answers: Sequence[Answer], rival: Sequence[Answer] | None
 ) -> tuple[AfterSeconds, ...]:
-    """A classifier by the time heard; `rival` said the same stretches in the same order."""
+    """Return accuracies by time, compared with a rival's answers to the same stretches in order."""
     out = []
     for seconds in sorted({a.seconds for a in answers}):
         take = [k for k, a in enumerate(answers) if a.seconds == seconds]
         mine = [answers[k] for k in take]
-        other = None if rival is None else [rival[k] for k in take]
-        out.append(_after(seconds, mine, other))
+        out.append(_after(mine, None if rival is None else [rival[k] for k in take]))
     return tuple(out)
 
 
-def _after(
-    seconds: float, answers: Sequence[Answer], rival: Sequence[Answer] | None
-) -> AfterSeconds:
-    right = np.array([a.said == a.floor for a in answers], dtype=float)
-    # whole runs are drawn anew, floor by floor
+def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> AfterSeconds:
+    """Return the accuracy by answers after the same time."""
+    right = np.array([a.named == a.floor for a in answers], dtype=float)
+    # whole runs are resampled, floor by floor
     run = np.unique([a.run for a in answers], return_inverse=True)[1]
     by = Bootstrap.by([a.floor for a in answers], run)
     behind = None
     if rival is not None:
         assert [(a.run, a.floor) for a in rival] == [(a.run, a.floor) for a in answers]
-        theirs = np.array([a.said == a.floor for a in rival], dtype=float)
+        theirs = np.array([a.named == a.floor for a in rival], dtype=float)
         behind = mean_interval(by.over_all(right - theirs))
     return AfterSeconds(
-        seconds=seconds,
+        seconds=answers[0].seconds,
         stretches=len(answers),
         accuracy=mean_interval(by.over_all(right)),
         balanced=mean_interval(by.mean(right)),
@@ -135,11 +137,11 @@ def _after(
 
 
 def confusion(answers: Sequence[Answer], seconds: float) -> dict[str, dict[str, float]]:
-    """On each floor, how often each was named after so long [%]."""
+    """Return how often each floor was named on each true floor after some seconds [%]."""
     mine = [a for a in answers if a.seconds == seconds]
-    names = sorted({a.floor for a in mine} | {a.said for a in mine})
+    names = sorted({a.floor for a in mine} | {a.named for a in mine})
     table: dict[str, dict[str, float]] = {}
     for floor in sorted({a.floor for a in mine}):
-        said = [a.said for a in mine if a.floor == floor]
-        table[floor] = {name: 100 * said.count(name) / len(said) for name in names}
+        named = [a.named for a in mine if a.floor == floor]
+        table[floor] = {name: 100 * named.count(name) / len(named) for name in names}
     return table

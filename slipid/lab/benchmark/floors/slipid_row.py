@@ -1,22 +1,20 @@
-"""A robot of which only the contact and the motors are known, as the floor filter drives it.
+"""slipid's own row: floors by currents and turning, and the estimator's floor filter.
 
-slipid's own row: numbers of floors by currents and turning, and the estimator's floor filter.
+The filter is the deployed one (`slipid.robot.estimator.Estimator`) with wheels, currents and the
+gyro. Besides the parameters of the floors it is given
 
-The filter is the one that is deployed (`slipid.robot.estimator.Estimator`); it hears wheels,
-currents and the gyro. What it is told here beside the floors' numbers:
+- the ammeter readings of braking motors (`slipid.lab.benchmark.floors.fitting`);
+- the scatter of currents on each floor, separately for straight motion, bends and turning on the
+  spot, which follow from the wheel speeds;
+- that all wheels are on one floor, which does not change.
 
-- what the ammeters show of a motor that brakes (`slipid.lab.benchmark.floors.fitting`);
-- how much currents scatter on each floor, apart for going straight, in bends and on the spot: the
-  robot knows which of them its wheels do;
-- that all wheels are on one floor, which stays.
+At its first row the wheels are taken to turn as measured, without a start from rest.
 
-At its first row it takes the wheels to turn as measured, and not to have stood before.
-
-The numbers of floors, motors and scatters are of the runs that are fitted. `SETTINGS`, `BENDS`,
-what meters show and the weights in `slipid.lab.benchmark.floors.fitting` are not picked by an inner
-cross-validation, as settings of other rows are: they were set by hand after about a hundred
-variants were compared by their cross-validated accuracy on `borealtc`. Its accuracy there is
-flattered by as much as that choice fits these very runs.
+Parameters of floors, motors and scatters come from the training runs. `SETTINGS`, `BENDS`, the
+model of the ammeters and the weights in `slipid.lab.benchmark.floors.fitting` are not picked by an
+inner cross-validation, as settings of other rows are: they were set by hand after about a hundred
+variants were compared by their cross-validated accuracy on `borealtc`. The accuracy there is
+optimistic by as much as that choice fits these very runs.
 """
 
 from collections.abc import Sequence
@@ -46,14 +44,14 @@ from slipid.robot.interface import Readings, Settings
 from slipid.robot.record import FloorRecord, LoadRecord, RobotRecord, Wheels
 
 HIGHEST_A, HIGHEST_SPEED = 100.0, 20.0
-"""Of what is measured; what is far above it is no reading [A], [rad/s]."""
+"""Limits of plausible measurements [A], [rad/s]."""
 
 
 def deployed(robot: Robot) -> DeployedRobot:
-    """The robot as it drives, its numbers as they are.
+    """Return the robot in its deployed form, with its parameters as they are.
 
-    What the floor filter does not use, a robot's uncertainty and what a fit has seen, is left at
-    values that limit nothing.
+    Fields that the floor filter does not use, such as the uncertainty and the ranges of a fit, have
+    values without effect.
     """
     shape = robot.geometry
     none = (0.0, 0.0, 0.0)
@@ -82,13 +80,13 @@ def deployed(robot: Robot) -> DeployedRobot:
 
 
 BENDS = (0.17, 0.45)
-"""L |W| / (|v| + L |W|) from which a robot goes in a bend, and on the spot."""
+"""Smallest L |W| / (|v| + L |W|) of a bend, and of turning on the spot."""
 TOGETHER = 64
-"""Runs that the filter hears in one call."""
+"""Number of runs in one call of the filter."""
 SHARED_ROWS = 20.0
-"""Rows that the scatter on a floor as a whole counts as, for that in each kind of motion."""
+"""Prior weight of a floor's overall scatter in that of each kind of motion, in rows."""
 MOST_ROWS = 150
-"""Of a run at most, for the scatter."""
+"""Largest number of rows of a run for the scatter."""
 SETTINGS = Settings(
     current_is_signed=False,
     forget_s=4.0,
@@ -99,17 +97,18 @@ SETTINGS = Settings(
     ammeter_std_a=0.1,
     gyro_std=0.08,
 )
-"""Currents of neighbouring rows are alike for seconds (`forget_s`), and one row alone is no mean of
-others (`filter_s`); `gyro_std` is about what the fits leave of the yaw rate."""
+"""Currents of neighbouring rows are correlated for seconds (`forget_s`), rows are not averaged
+(`filter_s`), and `gyro_std` is about the residual of the yaw rate in the fits."""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedFloors:
-    """What is known of floors.
+    """Fitted parameters of floors and motors.
 
     Attributes:
-        surfaces: their numbers; motor: with its ammeter.
-        std: of currents in each kind of motion on each floor [A].
+        surfaces: parameters of the floors.
+        motor: motor with its ammeter.
+        std: standard deviation of currents in each kind of motion on each floor [A].
     """
 
     surfaces: ContactSurface
@@ -122,10 +121,10 @@ class SlipidFloorClassifier(FloorClassifier):
     """slipid's floor filter.
 
     Attributes:
-        robot: as its maker has it, on no floor.
-        zero_a: what its ammeters show of wheels that stand [A].
-        settings: of the estimator.
-        fitted: None before.
+        robot: robot by its maker's data, without floors.
+        zero_a: reading of its ammeters for wheels at rest [A].
+        settings: settings of the estimator.
+        fitted: fitted parameters; None before a fit.
     """
 
     name: str = "slipid"
@@ -134,74 +133,74 @@ class SlipidFloorClassifier(FloorClassifier):
     settings: Settings = SETTINGS
     fitted: FittedFloors | None = field(default=None, repr=False)
 
-    def fit(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> "SlipidFloorClassifier":
-        labels = floors_of(felts)
-        seen = [self._heard(felt) for felt in felts]
+    def fit(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> "SlipidFloorClassifier":
+        labels = floors_of(runs)
+        runs = [self._zeroed(run) for run in runs]
         robot = self._on(labels)
         motor = MeteredMotor.of(
-            robot.motor, jnp.asarray(stiffness_of(seen)), jnp.asarray(scatter_of(seen))
+            robot.motor, jnp.asarray(stiffness_of(runs)), jnp.asarray(scatter_of(runs))
         )
-        robot = fitted_floors(replace(robot, motor=motor), seen)
-        std = _scatter(robot, seen, spec)
+        robot = fitted_floors(replace(robot, motor=motor), runs)
+        std = _scatter(robot, runs, spec)
         return replace(self, labels=labels, fitted=FittedFloors(robot.surfaces, motor, std))
 
-    def probability(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
+    def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
             raise ValueError(f"{self.name} was not fitted")
         plain = deployed(self._on(self.labels))
         robot = replace(plain, floors=self.fitted.surfaces, motor=self.fitted.motor)
         estimator = Estimator(robot, self.settings)
         std, out = jnp.asarray(self.fitted.std), []
-        rows = -(-max(len(felt) for felt in felts) // 8) * 8
-        for first in range(0, len(felts), TOGETHER):
-            some = [self._heard(felt) for felt in felts[first : first + TOGETHER]]
-            beliefs = np.asarray(_driven(estimator, std, _FilterRows.of(some, rows, spec)))
-            out += [beliefs[k, : len(felt)] for k, felt in enumerate(some)]
+        rows = -(-max(map(len, runs)) // 8) * 8
+        for first in range(0, len(runs), TOGETHER):
+            some = [self._zeroed(run) for run in runs[first : first + TOGETHER]]
+            beliefs = np.asarray(_beliefs(estimator, std, _FilterRows.of(some, rows, spec)))
+            out += [beliefs[k, : len(run)] for k, run in enumerate(some)]
         return [row[:, :-1] / row[:, :-1].sum(axis=1, keepdims=True) for row in out]
 
     @property
     def numbers(self) -> int:
-        """Three of each floor and its scatters, and those of the motors."""
+        """Number of fitted parameters: three of each floor, its scatters, those of the motors."""
         if self.fitted is None:
             return 0
         return 3 * len(self.labels) + self.fitted.std.size + len(self.fitted.motor.stiffness)
 
     def _on(self, labels: tuple[str, ...]) -> Robot:
-        """The robot on floors that have not been fitted."""
+        """Return the robot on floors that have not been fitted."""
         if self.robot is None:
-            raise ValueError(f"{self.name}: which robot? none was given")
+            raise ValueError(f"{self.name}: no robot was given")
         robot = self.robot.on(labels)
         none = jnp.zeros(len(labels))
-        # patches that lead and drag by the load are for soft floors under omni wheels
+        # lead and load exponent of the drag are for soft floors under omni wheels
         surfaces = replace(robot.surfaces, lead=none, drag_exponent=none + 1.0)
         return replace(robot, surfaces=surfaces)
 
-    def _heard(self, felt: FloorSignals) -> FloorSignals:
-        """The run with currents over the zero of the ammeters, and nothing below it."""
-        return replace(felt, current=np.maximum(np.abs(felt.current) - self.zero_a, 0.0))
+    def _zeroed(self, run: FloorSignals) -> FloorSignals:
+        """Return the run with currents above the zero of the ammeters, at least 0."""
+        return replace(run, current=np.maximum(np.abs(run.current) - self.zero_a, 0.0))
 
 
-def kinds(felt: FloorSignals, spec: RobotSpec) -> Int[np.ndarray, " row"]:
-    """How a robot goes in each row: 0 straight, 1 in a bend, 2 on the spot."""
-    x, y, yaw = felt.rolling(spec).T
+def kinds(run: FloorSignals, spec: RobotSpec) -> Int[np.ndarray, " row"]:
+    """Return the kind of motion in each row: 0 straight, 1 in a bend, 2 on the spot."""
+    x, y, yaw = run.rolling(spec).T
     turn = spec.base_radius * np.abs(yaw)
     return np.digitize(turn / np.maximum(np.hypot(x, y) + turn, 1e-9), BENDS)
 
 
 def _scatter(
-    robot: Robot, felts: Sequence[FloorSignals], spec: RobotSpec
+    robot: Robot, runs: Sequence[FloorSignals], spec: RobotSpec
 ) -> Float[np.ndarray, "kind floor"]:
-    """Std of currents about the model's on every floor, straight, in bends and on the spot [A]."""
+    """Return the std of current residuals on every floor in each kind of motion [A]."""
     count = len(BENDS) + 1
     std = np.ones((count, len(robot.surfaces.labels)))
     for k, floor in enumerate(robot.surfaces.labels):
         speed, current, kind = [], [], []
-        for felt in (felt for felt in felts if felt.floor == floor):
-            take = np.flatnonzero(felt.moves)
+        for run in (run for run in runs if run.floor == floor):
+            take = np.flatnonzero(run.moving)
             take = take[:: max(1, len(take) // MOST_ROWS)]
-            speed.append(felt.speed[take])
-            current.append(felt.current[take])
-            kind.append(kinds(felt, spec)[take])
+            speed.append(run.speed[take])
+            current.append(run.current[take])
+            kind.append(kinds(run, spec)[take])
         off = currents_off(robot, k, np.concatenate(speed), np.concatenate(current))
         squares, of_kind = (off**2).mean(axis=1), np.concatenate(kind)
         for n in range(count):
@@ -212,12 +211,14 @@ def _scatter(
 
 
 class _FilterRows(eqx.Module):
-    """What the filter hears, run by run and row by row.
+    """Inputs of the filter, run by run and row by row.
 
     Attributes:
-        speed, current, gyro: as of `FloorSignals`.
-        dt: how long each row stands for [s]; 0 of rows that a run is filled up with.
-        kind: how the robot goes, see `kinds`.
+        speed: wheel speed of each drive [rad/s].
+        current: current of each motor [A].
+        gyro: yaw rate [rad/s], NaN where it is missing.
+        dt: duration of each row [s]; 0 at rest and in rows of padding.
+        kind: kind of motion, see `kinds`.
     """
 
     speed: Float[Array, "*run row drive"]
@@ -227,41 +228,39 @@ class _FilterRows(eqx.Module):
     kind: Int[Array, "*run row"]
 
     @classmethod
-    def of(cls, felts: Sequence[FloorSignals], rows: int, spec: RobotSpec) -> "_FilterRows":
-        """Runs side by side, filled up to so many rows and to `TOGETHER` runs."""
-        drives = felts[0].speed.shape[1]
+    def of(cls, runs: Sequence[FloorSignals], rows: int, spec: RobotSpec) -> "_FilterRows":
+        """Return runs side by side, padded to so many rows and to `TOGETHER` runs."""
+        drives = runs[0].speed.shape[1]
         speed, current = np.zeros((2, TOGETHER, rows, drives))
         gyro, dt = np.full((TOGETHER, rows), np.nan), np.zeros((TOGETHER, rows))
         kind = np.zeros((TOGETHER, rows), dtype=int)
-        for k, felt in enumerate(felts):
-            n = len(felt)
-            speed[k, :n], current[k, :n] = felt.speed, felt.current
-            # a robot that stands feels nothing
-            dt[k, :n] = np.where(felt.moves, felt.dt, 0.0)
-            gyro[k, :n] = np.nan if felt.gyro is None else felt.gyro
-            kind[k, :n] = kinds(felt, spec)
+        for k, run in enumerate(runs):
+            n = len(run)
+            speed[k, :n], current[k, :n] = run.speed, run.current
+            # a robot at rest has no evidence on its floor
+            dt[k, :n] = np.where(run.moving, run.dt, 0.0)
+            gyro[k, :n] = np.nan if run.gyro is None else run.gyro
+            kind[k, :n] = kinds(run, spec)
         return cls(*(jnp.asarray(x) for x in (speed, current, gyro, dt, kind)))
 
 
 @eqx.filter_jit
-def _driven(
+def _beliefs(
     estimator: Estimator, std: Float[Array, "kind floor"], runs: _FilterRows
 ) -> Float[Array, "run row floor_or_none"]:
-    """Probability of every floor, and of none, under the robot after every row."""
+    """Return the probability of every floor, and of none of them, after every row."""
     nothing = Readings.nothing(estimator.robot.drives)
 
     def step(state: EstimatorState, row: _FilterRows) -> tuple[EstimatorState, Array]:
         now = Estimator(replace(estimator.robot, current_std=std[row.kind]), estimator.settings)
         z = replace(nothing, wheel_speed=row.speed, current=row.current, gyro=row.gyro)
-        state, seen = now.advance(state, z, row.dt)
-        return state, seen.surface_probability.mean(axis=0)
+        state, estimate = now.advance(state, z, row.dt)
+        return state, estimate.surface_probability.mean(axis=0)
 
     def one(run: _FilterRows) -> Array:
         state = estimator.init()
         state = replace(
-            state,
-            wheels=replace(state.wheels, speed=run.speed[0]),
-            current=run.current[0],
+            state, wheels=replace(state.wheels, speed=run.speed[0]), current=run.current[0]
         )
         return jax.lax.scan(step, state, run)[1]
 

@@ -1,7 +1,17 @@
-"""The one interface of every classifier of floors: what it hears of a run, and what it believes.
+"""The interface of floor classifiers: what they measure, and the belief that they return.
 
-A classifier is fitted to runs of which the floor is known. Then it hears others row by row, and
-says after each row how probable every floor is. It may use what came before, and nothing later.
+A classifier is fitted to runs whose floor is known. It then goes through other runs row by row and
+gives the probability of every floor after each row, from that row and those before it alone.
+
+Features of a row are causal: they are taken over the rows of the last so many seconds, the row
+itself included:
+
+    mean and std of the current and of the speed of each drive
+    mean of the summed currents over that of the summed wheel speeds
+    mean magnitude of the gyro's yaw rate; mean and std of its shortfall from the encoders' yaw rate
+
+together with the time since the start, because windows are shorter there. slipid's own filter uses
+the same channels: wheels, currents, gyro. Vibration is used only where it is requested.
 """
 
 import abc
@@ -17,23 +27,26 @@ from slipid.predict.slip_model import RobotSpec
 
 Beliefs = Float[np.ndarray, "row floor"]
 """Probability of each floor after every row."""
+Features = Float[np.ndarray, "row feature"]
 STILL = 0.3
-"""Wheel speed below which a wheel stands [rad/s]."""
+"""Wheel speed below which a wheel counts as standing [rad/s]."""
+WINDOWS_S = (0.5, 1.0, 2.0)
+"""Lengths of the feature windows [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class FloorSignals:
-    """What a robot feels of a floor, row by row, without a pose.
+    """Signals of a run from which its floor can be recognised, row by row, without a pose.
 
     Attributes:
-        name: of the run.
-        floor: that it was driven on. Classifiers see it where they are fitted, and only there.
-        time: of each row [s], growing.
-        speed: of the wheels of each drive [rad/s].
-        current: of each motor [A]; its size where an ammeter knows no sign.
-        gyro: yaw rate [rad/s], NaN where it was not heard; None without a gyro.
-        vibration: std of the vertical acceleration since the row before [m/s^2], NaN where it was
-            not heard; None where it was not logged.
+        name: name of the run.
+        floor: floor of the run; classifiers may read it in training runs only.
+        time: time of each row [s], increasing.
+        speed: wheel speed of each drive [rad/s].
+        current: current of each motor [A]; its magnitude where an ammeter has no sign.
+        gyro: yaw rate [rad/s], NaN where it is missing; None without a gyro.
+        vibration: std of the vertical acceleration since the row before [m/s^2], NaN where it is
+            missing; None where it was not logged.
     """
 
     name: str
@@ -49,41 +62,41 @@ class FloorSignals:
 
     @property
     def dt(self) -> Float[np.ndarray, " row"]:
-        """How long each row stands for [s]: since the one before, and the first as long as most."""
+        """Duration of each row [s]: time since the row before, and the median for the first."""
         steps = np.diff(self.time)
         first = float(np.median(steps)) if len(steps) else 0.0
         return np.append(first, steps)
 
     @property
-    def moves(self) -> Bool[np.ndarray, " row"]:
-        """Rows in which a wheel turns; a robot that stands feels no floor."""
+    def moving(self) -> Bool[np.ndarray, " row"]:
+        """Rows in which a wheel turns; a robot at rest has no evidence on its floor."""
         return np.asarray(np.abs(self.speed).max(axis=1) > STILL)
 
-    def part(self, first: int, last: int) -> "FloorSignals":
-        """The rows from `first` up to, and without, `last`."""
-        rows = slice(first, last)
+    def rows(self, first: int, last: int) -> "FloorSignals":
+        """Return the rows from `first` up to and without `last`."""
+        part = slice(first, last)
         return replace(
             self,
-            time=self.time[rows],
-            speed=self.speed[rows],
-            current=self.current[rows],
-            gyro=None if self.gyro is None else self.gyro[rows],
-            vibration=None if self.vibration is None else self.vibration[rows],
+            time=self.time[part],
+            speed=self.speed[part],
+            current=self.current[part],
+            gyro=None if self.gyro is None else self.gyro[part],
+            vibration=None if self.vibration is None else self.vibration[part],
         )
 
-    def began(self, seconds: float) -> Int[np.ndarray, " row"]:
-        """First row of the piece that each row is in, of pieces of this length [s]."""
+    def segment_start(self, seconds: float) -> Int[np.ndarray, " row"]:
+        """Return the first row of each row's segment, for segments of this length [s]."""
         start = np.cumsum(self.dt) - self.dt
         number = np.floor(start / seconds + 1e-6)
         return np.searchsorted(number, number)
 
-    def pieces(self, seconds: float) -> list["FloorSignals"]:
-        """The run cut into parts of this length one after another, the last of them shorter."""
-        edges = [*np.unique(self.began(seconds)), len(self)]
-        return [self.part(int(a), int(b)) for a, b in pairwise(edges)]
+    def segments(self, seconds: float) -> list["FloorSignals"]:
+        """Return the run cut into consecutive segments of this length [s]; the last is shorter."""
+        edges = [*np.unique(self.segment_start(seconds)), len(self)]
+        return [self.rows(int(a), int(b)) for a, b in pairwise(edges)]
 
     def rolling(self, spec: RobotSpec) -> Float[np.ndarray, "row 3"]:
-        """Body twist if nothing slips [m/s, m/s, rad/s]."""
+        """Return the body twist without slip [m/s, m/s, rad/s]."""
         return np.asarray(self.speed * spec.wheel_radius @ spec.back.T)
 
 
@@ -92,78 +105,165 @@ class FloorClassifier(abc.ABC):
     """A classifier of floors, before or after it is fitted.
 
     Attributes:
-        name: of its row.
-        labels: floors that it was fitted to, in the order of its beliefs; none before.
+        name: name of its row in the tables.
+        labels: floors that it was fitted to, in the order of its beliefs; empty before a fit.
     """
 
     name: str
     labels: tuple[str, ...] = ()
 
     def candidates(self) -> Sequence["FloorClassifier"]:
-        """Itself with other settings, at most `TRIES`, from which cross-validation picks one."""
+        """Return at most `TRIES` variants with other settings; cross-validation picks one."""
         return (self,)
 
     @abc.abstractmethod
-    def fit(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> Self:
-        """The classifier fitted to runs whose floors it is told."""
+    def fit(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> Self:
+        """Return the classifier fitted to runs with known floors."""
 
     @abc.abstractmethod
-    def probability(self, felts: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
-        """Probability of each floor after every row of runs, each heard from its first row on.
+    def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
+        """Return the probability of each floor after every row of every run.
 
-        What it says after a row depends on that row and those before it, on nothing later.
+        Each run starts anew. The belief after a row depends on that row and earlier ones only.
         """
 
     @property
     @abc.abstractmethod
     def numbers(self) -> int:
-        """How many numbers were fitted."""
+        """Number of fitted parameters."""
 
 
-def floors_of(felts: Sequence[FloorSignals]) -> tuple[str, ...]:
-    """Names of the floors that runs were driven on, sorted."""
-    return tuple(sorted({felt.floor for felt in felts}))
+def floors_of(runs: Sequence[FloorSignals]) -> tuple[str, ...]:
+    """Return the sorted names of the floors of some runs."""
+    return tuple(sorted({run.floor for run in runs}))
 
 
 def training_rows(
-    felts: Sequence[FloorSignals],
-    features: Callable[[FloorSignals], Float[np.ndarray, "row feature"]],
-    every_s: float = 0.0,
-) -> tuple[Float[np.ndarray, "row feature"], np.ndarray]:
-    """Features to train on and the floor of each row, of rows in which the robot moves.
-
-    Rows that are taken are about `every_s` apart [s].
-    """
+    runs: Sequence[FloorSignals], features: Callable[[FloorSignals], Features], every_s: float = 0.0
+) -> tuple[Features, np.ndarray]:
+    """Return features and floor names of the moving rows of runs, about `every_s` [s] apart."""
     found, floors = [], []
-    for felt in felts:
-        every = max(1, round(every_s / max(float(np.median(felt.dt)), 1e-3)))
-        take = np.flatnonzero(felt.moves)[::every]
-        found.append(features(felt)[take])
-        floors += [felt.floor] * len(take)
+    for run in runs:
+        every = max(1, round(every_s / max(float(np.median(run.dt)), 1e-3)))
+        take = np.flatnonzero(run.moving)[::every]
+        found.append(features(run)[take])
+        floors += [run.floor] * len(take)
     return np.concatenate(found), np.array(floors)
 
 
 def accumulated(
     log_likelihood: Float[np.ndarray, "row floor"],
-    felt: FloorSignals,
+    run: FloorSignals,
     apart_s: float,
     memory_s: float = np.inf,
 ) -> Beliefs:
-    """Beliefs by the likelihood of every row, all floors as probable at the start.
+    """Return the beliefs by the likelihood of every row, from equal probabilities at the start.
 
     log p_t = exp(-dt / memory) log p_{t-1} + (dt / apart) log l_t + const,   p_0 uniform
 
-    Rows are no independent witnesses: what lies nearer than `apart_s` [s] counts as one. What was
-    heard longer than `memory_s` [s] ago fades. A row in which the robot stands, or that has no
-    likelihood, changes nothing.
+    Rows are not independent: those within `apart_s` [s] count as one observation. Evidence fades
+    with the time constant `memory_s` [s]. A row in which the robot stands, or whose likelihood is
+    not finite, changes nothing.
     """
-    heard = felt.moves & np.isfinite(log_likelihood).all(axis=1)
-    log = np.zeros(log_likelihood.shape[1])
-    beliefs = np.empty_like(log_likelihood)
-    step = np.exp(-felt.dt / memory_s)
-    news = np.where(heard[:, None], log_likelihood, 0.0) * (felt.dt / apart_s)[:, None]
-    for t, (keep, more) in enumerate(zip(step, news, strict=True)):
-        log = (keep * log if heard[t] else log) + more
+    used = run.moving & np.isfinite(log_likelihood).all(axis=1)
+    evidence = np.where(used[:, None], log_likelihood, 0.0) * (run.dt / apart_s)[:, None]
+    keep = np.where(used, np.exp(-run.dt / memory_s), 1.0)
+    log, beliefs = np.zeros(log_likelihood.shape[1]), np.empty_like(log_likelihood)
+    for t in range(len(run)):
+        log = keep[t] * log + evidence[t]
         log = log - log.max()
         beliefs[t] = np.exp(log)
     return np.asarray(beliefs / beliefs.sum(axis=1, keepdims=True))
+
+
+@dataclass(frozen=True)
+class FeatureChannels:
+    """Optional channels of the features; wheel speeds are always used.
+
+    Attributes:
+        current: currents of the motors are used.
+        gyro: the gyro is used.
+        vibration: the vertical vibration is used.
+    """
+
+    current: bool = True
+    gyro: bool = True
+    vibration: bool = False
+
+
+def features(
+    run: FloorSignals,
+    spec: RobotSpec,
+    channels: FeatureChannels = FeatureChannels(),
+    windows_s: Sequence[float] = WINDOWS_S,
+    restart_s: float = np.inf,
+) -> Features:
+    """Return the features of every row by the rows up to it; NaN where a channel has no value.
+
+    After every `restart_s` [s] earlier rows are forgotten, as if the run started there.
+    """
+    start = run.segment_start(restart_s)
+    columns = [np.minimum(run.time - run.time[start], max(windows_s))]
+    amps = np.abs(run.current) if channels.current else run.current[:, :0]
+    for seconds in windows_s:
+        window = TrailingWindow.of(run.time, seconds, start)
+        columns += [m for x in (*amps.T, *run.speed.T) for m in window.mean_and_std(x)]
+        if channels.current:
+            turning = np.abs(run.speed).sum(axis=1)
+            columns.append(window.mean(amps.sum(axis=1)) / (window.mean(turning) + 0.1))
+        if channels.gyro and run.gyro is not None:
+            shortfall = yaw_rate_shortfall(run.gyro, run.rolling(spec)[:, 2])
+            columns.append(window.mean(np.abs(run.gyro)))
+            columns += window.mean_and_std(shortfall)
+        if channels.vibration and run.vibration is not None:
+            columns += window.mean_and_std(run.vibration)
+    return np.stack(columns, axis=1)
+
+
+def yaw_rate_shortfall(
+    gyro: Float[np.ndarray, " row"], rolling: Float[np.ndarray, " row"]
+) -> Float[np.ndarray, " row"]:
+    """Return the encoders' yaw rate less the gyro's, positive where the body turns less [rad/s]."""
+    return np.asarray(np.where(rolling < 0, gyro - rolling, rolling - gyro))
+
+
+@dataclass(frozen=True, eq=False)
+class TrailingWindow:
+    """Rows of the last seconds up to and including every row.
+
+    Attributes:
+        first: first row in the window of each row.
+    """
+
+    first: Int[np.ndarray, " row"]
+
+    @classmethod
+    def of(
+        cls,
+        time: Float[np.ndarray, " row"],
+        seconds: float,
+        start: Int[np.ndarray, " row"] | None = None,
+    ) -> "TrailingWindow":
+        """Return windows of a length at rows of these times [s], with no row before `start`."""
+        first = np.searchsorted(time, time - seconds + 1e-6)
+        return cls(first if start is None else np.maximum(first, start))
+
+    def mean(self, x: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
+        """Return the mean of the finite values in each window; NaN where there is none."""
+        return self.mean_and_std(x)[0]
+
+    def mean_and_std(self, x: Float[np.ndarray, " row"]) -> list[Float[np.ndarray, " row"]]:
+        """Return mean and std of the finite values in each window; NaN where there is none."""
+        known = np.isfinite(x)
+        # relative to the first value, so that squares lose fewer digits
+        offset = float(x[known][0]) if known.any() else 0.0
+        value = np.where(known, x - offset, 0.0)
+        count = self._sum(known.astype(float))
+        count = np.where(count > 0, count, np.nan)
+        mean = self._sum(value) / count
+        variance = self._sum(value**2) / count - mean**2
+        return [mean + offset, np.sqrt(np.maximum(variance, 0.0))]
+
+    def _sum(self, x: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
+        total = np.append(0.0, np.cumsum(x))
+        return np.asarray(total[1:] - total[self.first])

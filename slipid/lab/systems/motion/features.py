@@ -1,6 +1,6 @@
-"""What learned methods see of a window of half a second, and what they are taught to say of it.
+"""Inputs and targets that learned methods use, in windows of half a second.
 
-Inputs of a window, all from what the robot itself measures, means over the window:
+Inputs of a window, all measured by the robot itself, means over the window:
 
     rolling twist (vx, vy, W), as if nothing slipped; speed of each drive
     direction (vx, vy, L W) / size, with size = |(vx, vy, L W)| and L the base radius,
@@ -11,15 +11,15 @@ The target is the slip ratio of the body,
 
     ratio = (true twist - rolling twist) (1, 1, L) / size
 
-It has no unit and hardly depends on the speed where friction does not, so that what was learned at
-one speed carries over to others; a target in m/s would not. Noise of the pose is divided by the
-size too, so windows count with
+It has no unit and hardly depends on the speed where friction does not, so that a fit at one speed
+carries over to others; a target in m/s would not. Noise of the pose is divided by the size too, so
+windows are weighted by
 
     weight ~ size^2 / (size^2 + (typical size / 2)^2)
 
-which rises with the square where that noise dominates, and is level where what the inputs leave
-unsaid does; windows in which the wheels rest teach nothing. A ratio is multiplied by the size again
-where it is used, so that a robot at rest does not slip.
+which rises with the square where that noise dominates, and is level where the unexplained part of
+the slip dominates; windows in which the wheels rest are left out. A ratio is multiplied by the size
+again where it is used, so that a robot at rest does not slip.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ from slipid.predict.slip_model import (
 )
 
 REST = 0.02
-"""Size of a rolling twist below which a robot is as good as at rest [m/s]."""
+"""Size of a rolling twist below which a robot counts as at rest [m/s]."""
 
 Inputs = Float[np.ndarray, "window input"]
 Ratios = Float[np.ndarray, "window 3"]
@@ -52,7 +52,7 @@ Ratios = Float[np.ndarray, "window 3"]
 
 @runtime_checkable
 class Regressor(Protocol):
-    """What is used of scikit-learn's fitted regressors."""
+    """The method that is used of scikit-learn's fitted regressors."""
 
     def predict(self, X: np.ndarray) -> np.ndarray: ...
 
@@ -62,10 +62,10 @@ class SignalWindows:
     """Windows of several runs, one run after the other.
 
     Attributes:
-        heard: each run in windows.
-        rolling: body twist if nothing slips.
-        size: of the rolling twist [m/s], a yaw rate counted as the speed at the base radius.
-        run: number of the run that each window is of.
+        signals: each run in windows.
+        rolling: body twist without slip.
+        size: size of the rolling twist [m/s]; a yaw rate counts as speed at the base radius.
+        run: index of the run of each window.
     """
 
     signals: Sequence[RunSignals]
@@ -75,35 +75,31 @@ class SignalWindows:
 
     @classmethod
     def of(cls, runs: Sequence[RunSignals], spec: RobotSpec) -> "SignalWindows":
-        """Of runs in their own steps."""
-        return cls.joined([run.windowed() for run in runs], spec)
-
-    @classmethod
-    def joined(cls, joined: Sequence[RunSignals], spec: RobotSpec) -> "SignalWindows":
-        """Of runs whose steps are windows already."""
-        rolling = _stacked([run.rolling(spec) for run in joined])
+        """Return the windows of runs given in their own steps."""
+        joined = [run.windowed() for run in runs]
+        rolling = np.concatenate([run.rolling(spec) for run in joined])
         size = np.sqrt(((rolling * spec.size) ** 2).sum(axis=1))
         return cls(joined, rolling, size, np.repeat(np.arange(len(joined)), [*map(len, joined)]))
 
     @property
-    def moves(self) -> Bool[np.ndarray, " window"]:
-        """Whether the wheels turn fast enough to tell anything."""
+    def moving(self) -> Bool[np.ndarray, " window"]:
+        """Windows in which the wheels turn fast enough for a slip ratio."""
         return self.size >= REST
 
     def direction(self, spec: RobotSpec) -> Float[np.ndarray, "window 3"]:
-        """Rolling twist over its size: ahead, to the left, turning."""
+        """Return the rolling twist over its size: ahead, to the left, turning."""
         return np.asarray(self.rolling * spec.size / self.size.clip(min=REST)[:, None])
 
     def speed(self) -> Float[np.ndarray, "window drive"]:
-        """Wheel speed of each drive [rad/s]."""
-        return _stacked([run.speed for run in self.signals])
+        """Return the wheel speed of each drive [rad/s]."""
+        return np.concatenate([run.speed for run in self.signals])
 
     def amperes(self) -> Float[np.ndarray, "window drive"]:
-        """Magnitude of each drive's current [A]."""
-        return np.abs(_stacked([_logged(run.current, run, "current") for run in self.signals]))
+        """Return the magnitude of each drive's current [A]."""
+        return np.abs(self._channel("current"))
 
     def inputs(self, spec: RobotSpec, channels: frozenset[Channel]) -> Inputs:
-        """All inputs, with those of the channels named.
+        """Return all inputs, including those of the given channels.
 
         Raises:
             ValueError: a run lacks one of the channels.
@@ -114,23 +110,32 @@ class SignalWindows:
         if "current" in channels:
             columns.append(self.amperes())
         if "command" in channels:
-            columns.append(_stacked([_logged(run.command, run, "command") for run in self.signals]))
+            columns.append(self._channel("command"))
         if "gyro" in channels:
-            gyro = _stacked([_logged(run.gyro, run, "gyro")[:, None] for run in self.signals])[:, 0]
+            gyro = self._channel("gyro")
             slip = (gyro - self.rolling[:, 2]) * spec.base_radius / self.size.clip(min=REST)
             columns.append(np.stack([gyro, slip], axis=1))
         return np.concatenate(columns, axis=1)
 
+    def _channel(self, name: Channel) -> Float[np.ndarray, "window *of"]:
+        """Return a channel of all windows."""
+        for run in self.signals:
+            if getattr(run, name) is None:
+                raise ValueError(f"{run.name}: no {name}, but the training runs have one")
+        return np.concatenate([getattr(run, name) for run in self.signals])
+
 
 @dataclass(frozen=True, eq=False)
 class SlipExamples:
-    """Windows in which wheels turned, with the slip that the pose shows in them.
+    """Training windows in which wheels turn, with their true slip ratio by the pose.
 
     Attributes:
-        windows: all of them; the rows of the rest are those that move.
-        channels: that every run has, and whose inputs are used.
-        weight: of each window; the mean is one.
-        run: number of the run that each window is of.
+        windows: all windows; the rows of the other attributes are those that move.
+        channels: channels that every run has and whose inputs are used.
+        inputs: inputs of the learned methods.
+        ratio: true slip ratio.
+        weight: weight of each window; the mean is one.
+        run: index of the run of each window.
     """
 
     windows: SignalWindows
@@ -142,34 +147,39 @@ class SlipExamples:
 
     @classmethod
     def of(cls, runs: Sequence[Run], spec: RobotSpec) -> "SlipExamples":
-        """Of runs with poses.
+        """Return the training windows of runs with poses.
 
         Raises:
-            ValueError: the wheels turn in no window of them.
+            ValueError: the wheels turn in no window.
         """
-        joined, channels = [run.windowed() for run in runs], common(runs)
-        windows = SignalWindows.joined([run.signals for run in joined], spec)
-        moves = windows.moves
-        if not moves.any():
+        channels, windows = common(runs), SignalWindows.of([run.signals for run in runs], spec)
+        moving = windows.moving
+        if not moving.any():
             raise ValueError("no window of the runs has turning wheels; nothing to learn from")
-        size = windows.size[moves]
-        slip = (_stacked([run.twist for run in joined]) - windows.rolling)[moves]
+        size = windows.size[moving]
+        true = np.concatenate([run.windowed().twist for run in runs])
         return cls(
             windows=windows,
             channels=channels,
-            inputs=windows.inputs(spec, channels)[moves],
-            ratio=slip * spec.size / size[:, None],
+            inputs=windows.inputs(spec, channels)[moving],
+            ratio=(true - windows.rolling)[moving] * spec.size / size[:, None],
             weight=weight_of(size),
-            run=windows.run[moves],
+            run=windows.run[moving],
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """Makes columns comparable: mean zero and standard deviation one where it was taken.
+    """Standardisation of columns to mean zero and standard deviation one on the training rows.
 
-    Values beyond those that were seen are taken for the nearest seen: polynomials and networks say
-    nothing sensible far away from where they were taught.
+    Values outside the training range are clipped to it: polynomials and networks do not
+    extrapolate sensibly.
+
+    Attributes:
+        mean: mean of each column.
+        std: standard deviation of each column; one where a column is constant.
+        low: smallest training value.
+        high: largest training value.
     """
 
     mean: Float[np.ndarray, " column"]
@@ -179,20 +189,23 @@ class Scale:
 
     @classmethod
     def of(cls, x: Float[np.ndarray, "row column"]) -> "Scale":
+        """Return the scale of training rows."""
         std = x.std(axis=0)
-        # rounding is no spread: of a column that is constant nothing is left
+        # a constant column has a std of rounding errors only
         flat = std <= 1e-9 * np.abs(x).max(axis=0)
         return cls(x.mean(axis=0), np.where(flat, 1.0, std), x.min(axis=0), x.max(axis=0))
 
     def scaled(self, x: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
+        """Return clipped and standardised values."""
         return np.asarray((x.clip(self.low, self.high) - self.mean) / self.std)
 
     def back(self, x: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
-        return np.asarray(x * self.std + self.mean)
+        """Return standardised values in their own units, clipped to the training range."""
+        return np.asarray((x * self.std + self.mean).clip(self.low, self.high))
 
 
 def common(runs: Sequence[Run]) -> frozenset[Channel]:
-    """Channels beside the encoders that all runs have."""
+    """Return the channels besides the encoders that all runs have."""
     every: tuple[Channel, ...] = ("current", "gyro", "command")
     return frozenset(
         name for name in every if all(getattr(run.signals, name) is not None for run in runs)
@@ -200,7 +213,7 @@ def common(runs: Sequence[Run]) -> frozenset[Channel]:
 
 
 def weight_of(size: Float[np.ndarray, " window"]) -> Float[np.ndarray, " window"]:
-    """How much windows of these sizes count, with a mean of one."""
+    """Return weights of windows of these sizes, with a mean of one."""
     weight = size**2 / (size**2 + (0.5 * np.median(size)) ** 2)
     return np.asarray(weight / weight.mean())
 
@@ -208,7 +221,7 @@ def weight_of(size: Float[np.ndarray, " window"]) -> Float[np.ndarray, " window"
 def with_slip(
     runs: Sequence[RunSignals], windows: SignalWindows, ratio: Ratios, spec: RobotSpec
 ) -> list[PredictedRun]:
-    """Paths of runs at their own steps: the encoders', with the slip that is said of each window.
+    """Return paths of runs at their own steps by encoders and the predicted slip of each window.
 
     A window's slip velocity holds for all of its steps.
     """
@@ -222,21 +235,9 @@ def with_slip(
 def at_steps(
     values: Float[np.ndarray, "window value"], windows: SignalWindows, runs: Sequence[RunSignals]
 ) -> list[Float[np.ndarray, "_ value"]]:
-    """The values of each window, at every step that lies in it; an array for each run."""
+    """Return the value of the window around every step, one array for each run."""
     ends = np.searchsorted(windows.run, np.arange(len(runs) + 1))
     return [
         np.repeat(values[start:stop], np.diff(groups(run.dt, WINDOW_S), append=len(run)), axis=0)
         for run, (start, stop) in zip(runs, pairwise(ends), strict=True)
     ]
-
-
-def _stacked(parts: Sequence[Float[np.ndarray, "_ column"]]) -> Float[np.ndarray, "row column"]:
-    return np.concatenate(list(parts))
-
-
-def _logged(
-    values: Float[np.ndarray, "window *of"] | None, run: RunSignals, channel: Channel
-) -> Float[np.ndarray, "window *of"]:
-    if values is None:
-        raise ValueError(f"{run.name}: no {channel}, but there was one in the runs learned from")
-    return values

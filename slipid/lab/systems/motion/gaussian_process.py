@@ -1,4 +1,4 @@
-"""A Gaussian process with a Matern-3/2 kernel learns from a thousand windows (scikit-learn).
+"""Gaussian process with a Matern-3/2 kernel on at most a thousand windows (scikit-learn).
 
     k(x, x') = variance (1 + sqrt(3) d) exp(-sqrt(3) d),    d^2 = sum_i ((x_i - x'_i) / length_i)^2
     mean(x) = k(x, X) (K + noise I)^-1 y
@@ -6,19 +6,24 @@
 
 All outputs share one kernel, each in units of its own standard deviation. Hyperparameters maximise
 the marginal likelihood of `TUNED` windows, in at most `ROUNDS` steps from one start; `KEPT` windows
-make the posterior. Windows are drawn in proportion to how much they count, with a fixed seed.
+make the posterior. Windows are drawn in proportion to their weight, with a fixed seed.
 
-Source: Rasmussen, Williams 2006, Gaussian Processes for Machine Learning, MIT Press, equations
+Source: Rasmussen, Williams 2006, Gaussian Processes for RobotSpec Learning, MIT Press, equations
 2.25, 2.26, 4.17 and 5.8.
 """
 
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
+
+from slipid.lab.systems.one_thread import one_thread
+
+if TYPE_CHECKING:
+    from sklearn.gaussian_process import GaussianProcessRegressor
 
 KEPT = 1000
 TUNED = 150
@@ -31,22 +36,15 @@ NOISES = (1e-4, 2.0)
 """Bounds of the hyperparameters, variances in units of the outputs' variance."""
 
 
-@runtime_checkable
-class ProcessRegressor(Protocol):
-    """What is used of scikit-learn's Gaussian process."""
-
-    def predict(
-        self, X: np.ndarray, return_std: bool = False, return_cov: bool = False
-    ) -> tuple[np.ndarray, np.ndarray]: ...
-
-
 @dataclass(frozen=True)
 class Kernel:
     """Hyperparameters, variances in units of the outputs' variance.
 
     Attributes:
-        lengths: one for each input, or a single one for all.
-        free: whether the lengths are fitted.
+        lengths: length scale of each input, or a single one for all.
+        free: the lengths are fitted.
+        variance: variance of the process.
+        noise: variance of the measurement noise.
     """
 
     lengths: tuple[float, ...]
@@ -56,19 +54,20 @@ class Kernel:
 
     @property
     def numbers(self) -> int:
-        """How many of them are fitted."""
+        """Number of fitted hyperparameters."""
         return 2 + (len(self.lengths) if self.free else 0)
 
     def tuned(self, rows: "ProcessRows") -> "Kernel":
-        """The kernel that makes a sample of the rows most likely, found from this one."""
+        """Return the most likely kernel for a sample of the rows, found from this one."""
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.gaussian_process import GaussianProcessRegressor
-        from threadpoolctl import threadpool_limits
 
         some = rows.drawn(TUNED)
-        start = GaussianProcessRegressor(_written(self), optimizer=_climbed, normalize_y=True)
-        with threadpool_limits(1), warnings.catch_warnings():
-            # a length at its bound is an input that does not matter, which is no news
+        start = GaussianProcessRegressor(
+            _sklearn_kernel(self), optimizer=_few_steps, normalize_y=True
+        )
+        with one_thread(), warnings.catch_warnings():
+            # a length at its bound means an irrelevant input, which needs no warning
             warnings.simplefilter("ignore", ConvergenceWarning)
             best = start.fit(some.x, some.y).kernel_
         return replace(
@@ -81,17 +80,24 @@ class Kernel:
 
 @dataclass(frozen=True, eq=False)
 class ProcessRows:
-    """Inputs and outputs of which a process is made, and how much each row counts."""
+    """Training rows of a process.
+
+    Attributes:
+        x: inputs.
+        y: outputs.
+        weight: weight of each row.
+    """
 
     x: Float[np.ndarray, "row input"]
     y: Float[np.ndarray, "row output"]
     weight: Float[np.ndarray, " row"]
 
-    def only(self, mine: Bool[np.ndarray, " row"]) -> "ProcessRows":
-        return ProcessRows(self.x[mine], self.y[mine], self.weight[mine])
+    def only(self, take: Bool[np.ndarray, " row"]) -> "ProcessRows":
+        """Return some of the rows."""
+        return ProcessRows(self.x[take], self.y[take], self.weight[take])
 
     def drawn(self, most: int) -> "ProcessRows":
-        """So many rows at most, drawn in proportion to how much they count."""
+        """Return at most so many rows, drawn in proportion to their weight."""
         share, rng = self.weight / self.weight.sum(), np.random.default_rng(SEED)
         count = min(most, int(np.count_nonzero(share)))
         some = rng.choice(len(share), count, replace=False, p=share)
@@ -108,42 +114,44 @@ class ProcessPrediction:
 
 @dataclass(frozen=True, eq=False)
 class GaussianProcess:
-    """A process that knows a sample of rows.
+    """Posterior of a process given a sample of rows.
 
     Attributes:
-        kernel: its hyperparameters.
-        known: the rows.
-        regressor: scikit-learn's.
+        kernel: hyperparameters.
+        known: the sample of rows.
+        regressor: scikit-learn's process.
     """
 
     kernel: Kernel
     known: ProcessRows
-    regressor: ProcessRegressor
+    regressor: "GaussianProcessRegressor"
 
     @classmethod
     def of(cls, rows: ProcessRows, kernel: Kernel) -> "GaussianProcess":
+        """Return the posterior given at most `KEPT` of some rows."""
         from sklearn.gaussian_process import GaussianProcessRegressor
-        from threadpoolctl import threadpool_limits
 
-        known = rows.drawn(KEPT)
-        regressor = GaussianProcessRegressor(_written(kernel), optimizer=None, normalize_y=True)
-        with threadpool_limits(1):
-            regressor.fit(known.x, known.y)
-        return cls(kernel, known, regressor)
+        known, start = rows.drawn(KEPT), _sklearn_kernel(kernel)
+        with one_thread():
+            fitted = GaussianProcessRegressor(start, optimizer=None, normalize_y=True).fit(
+                known.x, known.y
+            )
+        return cls(kernel, known, fitted)
 
     def predict(self, x: Float[np.ndarray, "row input"]) -> ProcessPrediction:
+        """Return the prediction at some inputs."""
         mean, std = self.regressor.predict(x, return_std=True)
         outputs = self.known.y.shape[1]
         return ProcessPrediction(mean.reshape(-1, outputs), std.reshape(-1, outputs))
 
     @property
     def numbers(self) -> int:
-        """Hyperparameters, and (K + noise I)^-1 y."""
+        """Number of hyperparameters and of entries of (K + noise I)^-1 y."""
         return self.kernel.numbers + self.known.y.size
 
 
-def _written(kernel: Kernel) -> object:
-    """The kernel as scikit-learn writes it."""
+def _sklearn_kernel(kernel: Kernel) -> object:
+    """Return the kernel in scikit-learn's form."""
     from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
     bounds = LENGTHS if kernel.free else "fixed"
@@ -152,10 +160,10 @@ def _written(kernel: Kernel) -> object:
     return ConstantKernel(kernel.variance, VARIANCES) * matern + WhiteKernel(kernel.noise, NOISES)
 
 
-def _climbed(
+def _few_steps(
     loss: Callable, start: Float[np.ndarray, " log"], bounds: Float[np.ndarray, "log 2"]
 ) -> tuple[Float[np.ndarray, " log"], float]:
-    """Logarithms of the hyperparameters after a few steps, in the form scikit-learn asks for."""
+    """Return logarithms of the hyperparameters and the loss after at most `ROUNDS` steps."""
     from scipy.optimize import minimize
 
     found = minimize(

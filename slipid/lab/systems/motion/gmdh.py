@@ -2,26 +2,27 @@
 
 There is a network of quadratic neurons (see `polynomial_network`) for each component of the body's
 slip in half a second, over the inputs of `features`. `gmdh_one` has one set of networks whatever
-the floor. `gmdh_class` first tells the floor and then uses the networks of that floor. It tells it
-by one network g_k per floor, which is taught one on its own floor and zero on others:
+the floor. `gmdh_class` first classifies the floor and then uses the networks of that floor. The
+classifier is one network g_k per floor, trained to be one on its own floor and zero on others:
 
     p_k = max(g_k, 0.05) / sum_j max(g_j, 0.05)              of one window
     e_k <- 0.9 e_k + log p_k,   P_k = exp(e_k) / sum_j exp(e_j)    of the run so far
 
-and takes the floor of the largest P_k. A floor that is told and was seen is used instead.
+and takes the floor of the largest P_k. A floor that is given and was trained on is used instead.
 
 Two settings are tuned: the ridge and the number of layers.
 
 Liberties:
     - The papers predict displacement by a robot with other sensors; here it is slip as a ratio, of
       the same half second, from the inputs that all learned methods get.
-    - Halves A and B are runs drawn at random, of every floor alike, since windows of one run are as
-      good as copies of each other.
-    - Ridge replaces plain least squares; inputs and outputs are clipped to what was seen.
-    - Slow windows count less in the networks of slip; floors count alike in those of floors.
-    - Evidence on the floor is added up along the run and fades, since a run may cross floors. What
-      is said of floors is from what is heard, also where the floor is told.
-    - Floors that were never seen with the load at hand, which a robot knows, are left out.
+    - Halves A and B are runs drawn at random, of every floor alike, since windows of one run are
+      nearly copies of each other.
+    - Ridge replaces plain least squares; inputs and outputs are clipped to the training range.
+    - Slow windows have less weight in the networks of slip; floors have equal weight in those of
+      floors.
+    - Evidence on the floor is added up along the run and fades, since a run may cross floors.
+      Probabilities of floors come from the signals, also where the floor is given.
+    - Floors without training runs in the present load set-up, which a robot knows, are left out.
     - Twenty neurons of a layer are kept and inputs of earlier layers are not offered again.
 
 Source: Andrakhanov, Belyaev 2017, Navigation learning system for mobile robot in heterogeneous
@@ -36,6 +37,7 @@ from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import softmax
 
 from slipid.lab.systems.motion.features import (
     Inputs,
@@ -50,9 +52,9 @@ from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, Run
 
 KEPT = 20
 LEAST = 0.05
-"""Probability that one window leaves to a floor at least: outputs of networks may be negative."""
+"""Lower limit of a floor's probability in one window: outputs of networks may be negative."""
 MEMORY = 0.9
-"""Share of the evidence that is left after a window."""
+"""Factor by which the evidence fades from window to window."""
 CANDIDATES = (
     Growth(1e-3, KEPT, 5),
     Growth(1e-1, KEPT, 5),
@@ -64,7 +66,13 @@ SEED = 0
 
 @dataclass(frozen=True, eq=False)
 class NetworkSet:
-    """A network for each of several outputs, with the scales of inputs and outputs."""
+    """A network for each of several outputs.
+
+    Attributes:
+        inputs: scale of the inputs.
+        outputs: scale of the outputs.
+        each: network of each output.
+    """
 
     inputs: Scale
     outputs: Scale
@@ -79,18 +87,20 @@ class NetworkSet:
         in_a: Bool[np.ndarray, " window"],
         growth: Growth,
     ) -> "NetworkSet":
+        """Return networks grown on the windows of half A and ranked on the others."""
         inputs, outputs = Scale.of(x), Scale.of(y)
-        seen, said = inputs.scaled(x), outputs.scaled(y)
-        each = [grown(seen, column, weight, in_a, growth) for column in said.T]
+        scaled = inputs.scaled(x)
+        each = [grown(scaled, column, weight, in_a, growth) for column in outputs.scaled(y).T]
         return cls(inputs, outputs, each)
 
-    def say(self, x: Inputs) -> Float[np.ndarray, "window output"]:
-        seen = self.inputs.scaled(x)
-        said = self.outputs.back(np.stack([network.output(seen) for network in self.each], axis=1))
-        return np.asarray(said.clip(self.outputs.low, self.outputs.high))
+    def output(self, x: Inputs) -> Float[np.ndarray, "window output"]:
+        """Return the outputs, clipped to their training range."""
+        scaled = self.inputs.scaled(x)
+        return self.outputs.back(np.stack([one.output(scaled) for one in self.each], axis=1))
 
     @property
     def numbers(self) -> int:
+        """Number of weights."""
         return sum(network.numbers for network in self.each)
 
 
@@ -100,9 +110,9 @@ class GmdhOne(SlipModel):
     """One set of networks for all floors.
 
     Attributes:
-        growth: how networks are grown.
-        channels: beside the encoders, that inputs are of.
-        networks: of the slip ratio's three components.
+        growth: settings of the networks' growth.
+        channels: channels of the inputs besides the encoders.
+        networks: networks of the slip ratio's three components.
     """
 
     name: str = "gmdh_one"
@@ -114,16 +124,16 @@ class GmdhOne(SlipModel):
         return [replace(self, growth=growth) for growth in CANDIDATES]
 
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhOne":
-        seen = SlipExamples.of(runs, spec)
-        in_a = first_half(seen.run, [run.floor for run in runs])
-        networks = NetworkSet.grown(seen.inputs, seen.ratio, seen.weight, in_a, self.growth)
-        return replace(self, channels=seen.channels, networks=networks)
+        data = SlipExamples.of(runs, spec)
+        in_a = first_half(data.run, [run.floor for run in runs])
+        networks = NetworkSet.grown(data.inputs, data.ratio, data.weight, in_a, self.growth)
+        return replace(self, channels=data.channels, networks=networks)
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.networks is None:
             raise ValueError(f"{self.name}: predict before fit")
         windows = SignalWindows.of(runs, spec)
-        ratio = self.networks.say(windows.inputs(spec, self.channels))
+        ratio = self.networks.output(windows.inputs(spec, self.channels))
         return with_slip(runs, windows, ratio, spec)
 
     @property
@@ -134,14 +144,14 @@ class GmdhOne(SlipModel):
 @final
 @dataclass(frozen=True, eq=False)
 class GmdhClass(SlipModel):
-    """Networks that tell the floor, and then those of the slip on that floor.
+    """Networks that classify the floor, and then networks of the slip on that floor.
 
     Attributes:
-        growth: how networks are grown.
-        channels: beside the encoders, that inputs are of.
+        growth: settings of the networks' growth.
+        channels: channels of the inputs besides the encoders.
         floors: networks of the slip ratio's three components on each floor.
-        loads: load set-ups with which each floor was seen, in the same order.
-        telling: networks of the floors, in the same order; None where only one floor was seen.
+        loads: load set-ups of the training runs on each floor, in the same order.
+        classifier: networks of the floors, in the same order; None if there is only one floor.
     """
 
     name: str = "gmdh_class"
@@ -149,31 +159,33 @@ class GmdhClass(SlipModel):
     channels: frozenset[Channel] = frozenset()
     floors: Mapping[str, NetworkSet] = field(default_factory=dict)
     loads: Sequence[frozenset[str | None]] = ()
-    telling: NetworkSet | None = None
+    classifier: NetworkSet | None = None
 
     def candidates(self) -> Sequence["GmdhClass"]:
         return [replace(self, growth=growth) for growth in CANDIDATES]
 
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhClass":
-        seen = SlipExamples.of(runs, spec)
+        data = SlipExamples.of(runs, spec)
         floor_of_run = [run.floor for run in runs]
-        in_a = first_half(seen.run, floor_of_run)
-        # a floor on which no wheel turned is none that was seen
-        named = np.array(floor_of_run)[seen.run]
+        in_a = first_half(data.run, floor_of_run)
+        # a floor on which no wheel turned has no training windows
+        named = np.array(floor_of_run)[data.run]
         names = [name for name in dict.fromkeys(floor_of_run) if name in named]
         on = np.stack([named == name for name in names], axis=1)
         floors = {
             name: NetworkSet.grown(
-                seen.inputs[mine], seen.ratio[mine], seen.weight[mine], in_a[mine], self.growth
+                data.inputs[mine], data.ratio[mine], data.weight[mine], in_a[mine], self.growth
             )
             for name, mine in zip(names, on.T, strict=True)
         }
-        telling = None
+        classifier = None
         if len(names) > 1:
-            alike = (on / on.sum(axis=0)).sum(axis=1)
-            telling = NetworkSet.grown(seen.inputs, on.astype(float), alike, in_a, self.growth)
+            equal = (on / on.sum(axis=0)).sum(axis=1)
+            classifier = NetworkSet.grown(data.inputs, on.astype(float), equal, in_a, self.growth)
         loads = [frozenset(run.signals.load for run in runs if run.floor == name) for name in names]
-        return replace(self, channels=seen.channels, floors=floors, loads=loads, telling=telling)
+        return replace(
+            self, channels=data.channels, floors=floors, loads=loads, classifier=classifier
+        )
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if not self.floors:
@@ -181,45 +193,47 @@ class GmdhClass(SlipModel):
         windows, names = SignalWindows.of(runs, spec), list(self.floors)
         inputs = windows.inputs(spec, self.channels)
         belief = self._belief(windows, inputs, runs)
-        told = np.array([names.index(run.floor) if run.floor in names else -1 for run in runs])
-        floor = np.where(told[windows.run] < 0, belief.argmax(axis=1), told[windows.run])
+        given = np.array([names.index(run.floor) if run.floor in names else -1 for run in runs])
+        floor = np.where(given[windows.run] < 0, belief.argmax(axis=1), given[windows.run])
         ratio = np.zeros((len(inputs), 3))
         for number, networks in enumerate(self.floors.values()):
-            ratio[floor == number] = networks.say(inputs[floor == number])
-        said = with_slip(runs, windows, ratio, spec)
+            ratio[floor == number] = networks.output(inputs[floor == number])
+        predicted = with_slip(runs, windows, ratio, spec)
         return [
             replace(of_run, floors=dict(zip(names, belief_of_run.T, strict=True)))
-            for of_run, belief_of_run in zip(said, at_steps(belief, windows, runs), strict=True)
+            for of_run, belief_of_run in zip(
+                predicted, at_steps(belief, windows, runs), strict=True
+            )
         ]
 
     def _belief(
         self, windows: SignalWindows, inputs: Inputs, runs: Sequence[RunSignals]
     ) -> Float[np.ndarray, "window floor"]:
-        """Probability of each floor by all of a run that was heard up to each window.
+        """Return the probability of each floor from a run's signals up to each window.
 
-        A floor that was never seen with the run's load is none that it may be on.
+        A floor without training runs in the run's load set-up has probability zero.
         """
-        if self.telling is None:
+        if self.classifier is None:
             return np.ones((len(inputs), 1))
-        share = self.telling.say(inputs).clip(min=LEAST)
+        share = self.classifier.output(inputs).clip(min=LEAST)
         evidence = np.log(share / share.sum(axis=1, keepdims=True))
-        # a robot at rest tells nothing
-        evidence[~windows.moves] = 0.0
-        seen = np.array([[run.load in loads for loads in self.loads] for run in runs])
-        seen |= ~seen.any(axis=1, keepdims=True)
+        # a robot at rest has no evidence on its floor
+        evidence[~windows.moving] = 0.0
+        possible = np.array([[run.load in loads for loads in self.loads] for run in runs])
+        possible |= ~possible.any(axis=1, keepdims=True)
         total = remembered(evidence, windows.run)
-        return _softmax(np.where(seen[windows.run], total, -np.inf))
+        return np.asarray(softmax(np.where(possible[windows.run], total, -np.inf), axis=1))
 
     @property
     def numbers(self) -> int:
-        telling = 0 if self.telling is None else self.telling.numbers
-        return telling + sum(networks.numbers for networks in self.floors.values())
+        networks = [*self.floors.values(), *([self.classifier] if self.classifier else [])]
+        return sum(each.numbers for each in networks)
 
 
 def first_half(
     run: Int[np.ndarray, " window"], floor_of_run: Sequence[str]
 ) -> Bool[np.ndarray, " window"]:
-    """Half A of the windows: those of half of each floor's runs; of a single run, every other."""
+    """Return half A of the windows: half of each floor's runs, or every other window of one run."""
     rng = np.random.default_rng(SEED)
     floors = np.array(floor_of_run)[run]
     in_a = np.zeros(len(run), dtype=bool)
@@ -236,16 +250,11 @@ def first_half(
 def remembered(
     evidence: Float[np.ndarray, "window floor"], run: Int[np.ndarray, " window"]
 ) -> Float[np.ndarray, "window floor"]:
-    """Evidence of each run so far, what is older fading away."""
+    """Return the accumulated evidence of each run, in which older evidence fades."""
     place = np.arange(len(run)) - np.searchsorted(run, run)
     total = evidence.copy()
-    # all runs at once, each place after the one before it
+    # all runs at once, window by window
     for k in range(1, place.max(initial=0) + 1):
         here = np.flatnonzero(place == k)
         total[here] += MEMORY * total[here - 1]
     return total
-
-
-def _softmax(x: Float[np.ndarray, "window floor"]) -> Float[np.ndarray, "window floor"]:
-    odds = np.exp(x - x.max(axis=1, keepdims=True))
-    return np.asarray(odds / odds.sum(axis=1, keepdims=True))

@@ -1,39 +1,38 @@
-"""Boosted trees over all that the robot measures: slip as a sum of many small decision trees.
+"""Two learned slip models on all signals of the robot: boosted trees and a small neural network.
 
-Each component of the body's slip ratio in windows of half a second (see `features`) is
+Boosted trees. Each component of the body's slip ratio in windows of half a second (see `features`)
+is
 
-    f_0 + rate (tree_1 + tree_2 + ... ),    every tree least squares of what those before left over
+    f_0 + rate (tree_1 + tree_2 + ... ),    each tree least squares of the residuals of those before
 
-with inputs in at most 255 bins and trees grown leaf by leaf. Beyond the inputs that were seen they
-say what they say of the nearest.
+with inputs in at most 255 bins and trees grown leaf by leaf. Outside the training inputs the output
+is that of the nearest ones.
 
 Tuned: learning rate and leaves of a tree, of which there are sixty.
 
-Liberties:
-    - Not a published slip system: what anyone would try first on a table of numbers.
-    - Three sets of trees that know nothing of each other; no shrinkage but the rate; no stopping
-      before all trees are there.
-    - Windows are drawn with a chance in proportion to how much they count, and then count alike.
+Liberties of the trees:
+    - Not a published slip system: the obvious first method for a table of numbers.
+    - Three independent sets of trees, one for each component; no shrinkage but the rate; no early
+      stopping.
+    - Windows are drawn with a probability in proportion to their weight, and then count alike.
 
 Source: Friedman 2001, Greedy function approximation: a gradient boosting spec, Annals of
 Statistics 29(5); the binning of Ke and others 2017, LightGBM, NeurIPS, as scikit-learn has it.
 
-A small neural network over all that the robot measures.
-
-The body's slip ratio in windows of half a second (see `features`), all three components at once, is
+Neural network. All three components of the slip ratio at once are
 
     W_n relu(... relu(W_1 x + b_1) ...) + b_n
 
-of standardised inputs and outputs, fitted by Adam to mean square error + alpha |W|^2 until a tenth
-of the windows, drawn at random and left out, gain nothing more.
+of standardised inputs and outputs, fitted by Adam to mean square error + alpha |W|^2 until the loss
+on a tenth of the windows, drawn at random and left out, stops falling.
 
 Tuned: size of the one hidden layer, and alpha.
 
-Liberties:
+Liberties of the network:
     - Not one published network: those of the literature differ in inputs and sizes from robot to
       robot, and this is their common core.
-    - Inputs are clipped to what was seen, outputs likewise.
-    - Windows left out to stop in time are neighbours of those learned from.
+    - Inputs and outputs are clipped to the training range.
+    - Windows left out for early stopping are neighbours of training windows.
 
 Source: scikit-learn's multilayer perceptron; Kingma, Ba 2015, Adam, ICLR; early stopping as in
 Goodfellow, Bengio, Courville 2016, Deep Learning, MIT Press, section 7.8.
@@ -54,28 +53,16 @@ from slipid.lab.systems.motion.features import (
     SlipExamples,
     with_slip,
 )
+from slipid.lab.systems.one_thread import one_thread
 from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, RunSignals, SlipModel
 
 FEWEST = 20
-"""Windows in a leaf at least."""
+"""Smallest number of windows in a leaf, and smallest number of windows for early stopping."""
 SEED = 0
-
-
-@dataclass(frozen=True)
-class Boosting:
-    """How trees are added up."""
-
-    rate: float
-    leaves: int
-    trees: int
-
-
-CANDIDATES = (
-    Boosting(0.1, 8, 60),
-    Boosting(0.05, 8, 60),
-    Boosting(0.2, 4, 60),
-    Boosting(0.1, 4, 60),
-)
+PASSES = 60
+"""Largest number of passes of the network's training through all windows."""
+PATIENCE = 6
+"""Passes without improvement after which the network's training stops."""
 
 
 @final
@@ -84,85 +71,61 @@ class BoostedTrees(SlipModel):
     """Boosted trees for each component of the slip.
 
     Attributes:
-        boosting: how trees are added up.
-        channels: beside the encoders, that inputs are of.
+        rate: learning rate.
+        leaves: largest number of leaves of a tree.
+        trees: number of trees of each component.
+        channels: channels of the inputs besides the encoders.
         each: scikit-learn's trees of each component.
-        windows: how many they were fitted to.
+        windows: number of training windows.
     """
 
     name: str = "boosted_trees"
-    boosting: Boosting = CANDIDATES[0]
+    rate: float = 0.1
+    leaves: int = 8
+    trees: int = 60
     channels: frozenset[Channel] = frozenset()
     each: tuple[Regressor, ...] = ()
     windows: int = 0
 
     def candidates(self) -> Sequence["BoostedTrees"]:
-        return [replace(self, boosting=boosting) for boosting in CANDIDATES]
+        pairs = (0.1, 8), (0.05, 8), (0.2, 4), (0.1, 4)
+        return [replace(self, rate=rate, leaves=leaves) for rate, leaves in pairs]
 
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "BoostedTrees":
         from sklearn.ensemble import HistGradientBoostingRegressor
-        from threadpoolctl import threadpool_limits
 
-        seen, how = SlipExamples.of(runs, spec), self.boosting
+        examples = SlipExamples.of(runs, spec)
         # scikit-learn takes ten times as long for bins of weighted inputs
-        chance = np.random.default_rng(SEED).uniform(size=len(seen.weight))
-        kept = chance <= seen.weight / seen.weight.max()
-        # threads that wait for each other are slower than one where another job runs
-        with threadpool_limits(1):
+        chance = np.random.default_rng(SEED).uniform(size=len(examples.weight))
+        kept = chance <= examples.weight / examples.weight.max()
+        with one_thread():
             each = tuple(
                 HistGradientBoostingRegressor(
-                    learning_rate=how.rate,
-                    max_iter=how.trees,
-                    max_leaf_nodes=how.leaves,
+                    learning_rate=self.rate,
+                    max_iter=self.trees,
+                    max_leaf_nodes=self.leaves,
                     min_samples_leaf=FEWEST,
                     early_stopping=False,
                     random_state=SEED,
-                ).fit(seen.inputs[kept], ratio)
-                for ratio in seen.ratio[kept].T
+                ).fit(examples.inputs[kept], ratio)
+                for ratio in examples.ratio[kept].T
             )
-        return replace(self, channels=seen.channels, each=each, windows=int(kept.sum()))
+        return replace(self, channels=examples.channels, each=each, windows=int(kept.sum()))
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
-        from threadpoolctl import threadpool_limits
-
         if not self.each:
             raise ValueError(f"{self.name}: predict before fit")
         windows = SignalWindows.of(runs, spec)
         inputs = windows.inputs(spec, self.channels)
-        with threadpool_limits(1):
+        with one_thread():
             ratio = np.stack([trees.predict(inputs) for trees in self.each], axis=1)
         return with_slip(runs, windows, ratio, spec)
 
     @property
     def numbers(self) -> int:
-        """Leaves and thresholds at most; trees of few windows have fewer."""
-        leaves = min(self.boosting.leaves, max(1, self.windows // FEWEST))
-        return len(self.each) * self.boosting.trees * (2 * leaves - 1)
-
-
-PASSES = 60
-"""Through all windows, at most."""
-PATIENCE = 6
-"""Passes without gain after which it stops."""
-NETWORK_FEWEST = 20
-"""Windows below which none are left out to stop in time."""
-NETWORK_SEED = 0
-
-
-@dataclass(frozen=True)
-class NetworkShape:
-    """Sizes of the hidden layers, and how much large weights cost."""
-
-    hidden: tuple[int, ...]
-    alpha: float
-
-
-NETWORK_CANDIDATES = (
-    NetworkShape((32,), 1e-3),
-    NetworkShape((16,), 1e-1),
-    NetworkShape((16,), 1.0),
-    NetworkShape((32,), 1.0),
-)
+        """Largest number of leaves and thresholds; trees of few windows have fewer."""
+        leaves = min(self.leaves, max(1, self.windows // FEWEST))
+        return len(self.each) * self.trees * (2 * leaves - 1)
 
 
 @final
@@ -171,45 +134,48 @@ class NeuralNetwork(SlipModel):
     """A multilayer perceptron for the slip.
 
     Attributes:
-        shape: of the network.
-        channels: beside the encoders, that inputs are of.
-        inputs, outputs: their scales.
-        network: scikit-learn's.
+        hidden: sizes of the hidden layers.
+        alpha: penalty on squared weights.
+        channels: channels of the inputs besides the encoders.
+        inputs: scale of the inputs.
+        outputs: scale of the outputs.
+        network: scikit-learn's network.
     """
 
     name: str = "neural_network"
-    shape: NetworkShape = NETWORK_CANDIDATES[0]
+    hidden: tuple[int, ...] = (32,)
+    alpha: float = 1e-3
     channels: frozenset[Channel] = frozenset()
     inputs: Scale | None = None
     outputs: Scale | None = None
     network: Regressor | None = None
 
     def candidates(self) -> Sequence["NeuralNetwork"]:
-        return [replace(self, shape=shape) for shape in NETWORK_CANDIDATES]
+        pairs = (32, 1e-3), (16, 1e-1), (16, 1.0), (32, 1.0)
+        return [replace(self, hidden=(size,), alpha=alpha) for size, alpha in pairs]
 
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "NeuralNetwork":
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.neural_network import MLPRegressor
-        from threadpoolctl import threadpool_limits
 
-        seen = SlipExamples.of(runs, spec)
-        inputs, outputs = Scale.of(seen.inputs), Scale.of(seen.ratio)
+        examples = SlipExamples.of(runs, spec)
+        inputs, outputs = Scale.of(examples.inputs), Scale.of(examples.ratio)
         network = MLPRegressor(
-            hidden_layer_sizes=self.shape.hidden,
-            alpha=self.shape.alpha,
+            hidden_layer_sizes=self.hidden,
+            alpha=self.alpha,
             learning_rate_init=5e-3,
             max_iter=PASSES,
-            early_stopping=len(seen.inputs) >= NETWORK_FEWEST,
+            early_stopping=len(examples.inputs) >= FEWEST,
             n_iter_no_change=PATIENCE,
-            random_state=NETWORK_SEED,
+            random_state=SEED,
         )
-        with threadpool_limits(1), warnings.catch_warnings():
-            # so many passes are what it is given: the end of them is as good as stopping early
+        with one_thread(), warnings.catch_warnings():
+            # the number of passes is limited on purpose, as an alternative to early stopping
             warnings.simplefilter("ignore", ConvergenceWarning)
-            x, y = inputs.scaled(seen.inputs), outputs.scaled(seen.ratio)
-            network.fit(x, y, sample_weight=seen.weight)
+            x, y = inputs.scaled(examples.inputs), outputs.scaled(examples.ratio)
+            network.fit(x, y, sample_weight=examples.weight)
         return replace(
-            self, channels=seen.channels, inputs=inputs, outputs=outputs, network=network
+            self, channels=examples.channels, inputs=inputs, outputs=outputs, network=network
         )
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
@@ -218,13 +184,12 @@ class NeuralNetwork(SlipModel):
         windows = SignalWindows.of(runs, spec)
         inputs = self.inputs.scaled(windows.inputs(spec, self.channels))
         ratio = self.outputs.back(self.network.predict(inputs))
-        ratio = ratio.clip(self.outputs.low, self.outputs.high)
         return with_slip(runs, windows, ratio, spec)
 
     @property
     def numbers(self) -> int:
-        """Weights and biases."""
+        """Number of weights and biases."""
         if self.network is None or self.inputs is None:
             return 0
-        sizes = [len(self.inputs.mean), *self.shape.hidden, 3]
+        sizes = [len(self.inputs.mean), *self.hidden, 3]
         return sum((a + 1) * b for a, b in pairwise(sizes))

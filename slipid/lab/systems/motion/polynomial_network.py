@@ -1,16 +1,16 @@
-"""A GMDH network grows layers of quadratic neurons of two inputs each while unseen data gain.
+"""GMDH network: layers of quadratic neurons of two inputs, added while held-out data improve.
 
-A neuron says  z = w . (1, x1, x2, x1 x2, x1^2, x2^2),  with
+The output of a neuron is  z = w . (1, x1, x2, x1 x2, x1^2, x2^2),  with
 
     w = argmin  mean_A (z - y)^2 + ridge |w without its constant|^2        on half A of the data
 
 Every pair of inputs gets one. They are ranked by mean_B (z - y)^2 on half B, the best few are kept,
-and what they say are the inputs of the next layer. Growing ends where the best neuron of a new
-layer is no better on B than that of the layer before. The network is that best neuron with all
-neurons that it is made of.
+and their outputs are the inputs of the next layer. Growth ends where the best neuron of a new layer
+is no better on B than that of the layer before. The network is that best neuron with all neurons
+that it depends on.
 
 Both means are quadratic in w, with sums of x_i^a x_j^b (a + b <= 4) as coefficients. These are
-products of few matrices, and all pairs are solved at once without writing down their regressors.
+products of few matrices, and all pairs are solved at once without forming their regressors.
 
 Source: Ivakhnenko 1971, Polynomial theory of complex systems, IEEE Transactions on Systems, Man,
 and Cybernetics 1(4).
@@ -25,19 +25,19 @@ from jaxtyping import Bool, Float, Int
 POWERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [2, 0], [0, 2]])
 """Exponents of the first and the second input in a neuron's terms."""
 GAIN = 1e-3
-"""Share of the error on B that a new layer has to remove; less is chance."""
+"""Share of the error on B that a new layer must remove; smaller gains are chance."""
 NOTHING = 1e-12
-"""Error on B that is nothing but rounding, of outputs of variance about one."""
+"""Error on B that consists of rounding errors only, for outputs of variance about one."""
 
 
 @dataclass(frozen=True)
 class Growth:
-    """How a network is grown.
+    """Settings of a network's growth.
 
     Attributes:
-        ridge: on inputs of variance about one.
-        kept: neurons of a layer that the next one is made of.
-        layers: at most.
+        ridge: penalty on squared weights, for inputs of variance about one.
+        kept: number of neurons of a layer that feed the next one.
+        layers: largest number of layers.
     """
 
     ridge: float
@@ -47,22 +47,24 @@ class Growth:
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """Neurons next to each other.
+    """Neurons of one layer.
 
     Attributes:
-        inputs: numbers of the two inputs of each neuron.
-        weight: of each neuron's terms.
+        inputs: indices of the two inputs of each neuron.
+        weight: weights of each neuron's terms.
     """
 
     inputs: Int[np.ndarray, "neuron 2"]
     weight: Float[np.ndarray, "neuron 6"]
 
     def output(self, x: Float[np.ndarray, "row input"]) -> Float[np.ndarray, "row neuron"]:
+        """Return the output of every neuron."""
         a, b = x[:, self.inputs[:, 0]], x[:, self.inputs[:, 1]]
         terms = (np.ones_like(a), a, b, a * b, a * a, b * b)
         return np.asarray(sum(w * term for w, term in zip(self.weight.T, terms, strict=True)))
 
     def only(self, neurons: Int[np.ndarray, " some"]) -> "Layer":
+        """Return some of the neurons."""
         return Layer(self.inputs[neurons], self.weight[neurons])
 
 
@@ -71,21 +73,22 @@ class PolynomialNetwork:
     """A grown network with one output.
 
     Attributes:
-        layers: the last one has a single neuron.
-        errors: mean square error of the best neuron on B, layer by layer.
+        layers: layers of neurons; the last one has a single neuron.
+        errors: mean square error of the best neuron on half B, layer by layer.
     """
 
     layers: Sequence[Layer]
     errors: Sequence[float]
 
     def output(self, x: Float[np.ndarray, "row input"]) -> Float[np.ndarray, " row"]:
+        """Return the output of the network."""
         for layer in self.layers:
             x = layer.output(x)
         return x[:, 0]
 
     @property
     def numbers(self) -> int:
-        """How many weights it has."""
+        """Number of weights."""
         return sum(layer.weight.size for layer in self.layers)
 
 
@@ -96,14 +99,14 @@ def grown(
     in_a: Bool[np.ndarray, " row"],
     growth: Growth,
 ) -> PolynomialNetwork:
-    """The network of one output.
+    """Return the grown network of one output.
 
     Args:
-        x: inputs, two at least, each of about mean zero and variance one.
-        y: what it is to say, likewise.
-        weight: of each row in all means.
-        in_a: rows of half A; the others are half B. Where either is empty, all rows are in both.
-        growth: how far it is grown.
+        x: at least two inputs, each of about mean zero and variance one.
+        y: target of about mean zero and variance one.
+        weight: weight of each row in all means.
+        in_a: rows of half A; the others are half B. If either is empty, all rows are in both.
+        growth: settings of the growth.
     """
     layers: list[Layer] = []
     errors: list[float] = []
@@ -122,7 +125,7 @@ def grown(
 
 
 def pruned(layers: Sequence[Layer]) -> list[Layer]:
-    """Layers with those neurons alone that the first neuron of the last layer is made of."""
+    """Return layers with only the neurons that the last layer's first neuron depends on."""
     needed, kept = np.zeros(1, dtype=int), []
     for layer in reversed(layers):
         part = layer.only(needed)
@@ -135,13 +138,13 @@ def pruned(layers: Sequence[Layer]) -> list[Layer]:
 
 @dataclass(frozen=True, eq=False)
 class PairMoments:
-    """Means over some rows, from which neurons of all pairs of inputs are solved and judged.
+    """Means over some rows from which the neurons of all pairs of inputs are solved and scored.
 
     Attributes:
-        inputs: both numbers of each pair.
-        gram: of a pair's terms.
-        moment: of a pair's terms with what is to be said.
-        square: mean square of what is to be said.
+        inputs: indices of both inputs of each pair.
+        gram: mean products of a pair's terms with each other.
+        moment: mean products of a pair's terms with the target.
+        square: mean square of the target.
     """
 
     inputs: Int[np.ndarray, "pair 2"]
@@ -156,6 +159,7 @@ class PairMoments:
         y: Float[np.ndarray, " row"],
         weight: Float[np.ndarray, " row"],
     ) -> "PairMoments":
+        """Return the weighted means over some rows."""
         weight = weight / weight.sum()
         pair = np.triu_indices(x.shape[1], 1)
         a, b = (POWERS[:, k, None] + POWERS[None, :, k] for k in (0, 1))
@@ -165,23 +169,23 @@ class PairMoments:
         return cls(np.stack(pair, axis=1), np.moveaxis(gram, -1, 0), moment.T, square)
 
     def solved(self, ridge: float) -> Layer:
-        """The neuron of every pair."""
-        # the constant is free
+        """Return the neuron of every pair by least squares with a ridge."""
+        # the constant has no penalty
         penalty = np.diag([0.0, *[ridge] * 5])
         weight = np.linalg.solve(self.gram + penalty, self.moment[..., None])[..., 0]
         return Layer(self.inputs, weight)
 
     def errors(self, weight: Float[np.ndarray, "pair 6"]) -> Float[np.ndarray, " pair"]:
-        """Mean square error of every pair's neuron."""
-        said = np.einsum("pi,pij,pj->p", weight, self.gram, weight)
-        error = self.square - 2 * (weight * self.moment).sum(axis=1) + said
+        """Return the mean square error of every pair's neuron."""
+        output = np.einsum("pi,pij,pj->p", weight, self.gram, weight)
+        error = self.square - 2 * (weight * self.moment).sum(axis=1) + output
         return np.asarray(error.clip(min=0.0))
 
 
 def _products(
     x: Float[np.ndarray, "row input"], weight: Float[np.ndarray, " row"], most: int
 ) -> Float[np.ndarray, "a b input input"]:
-    """Sums of weight x_i^a x_j^b, at [a, b, i, j], where a + b is at most so much; else nan."""
+    """Return sums of weight x_i^a x_j^b at [a, b, i, j] for a + b <= `most`, and NaN elsewhere."""
     inputs = x.shape[1]
     sums = np.full((most + 1, most + 1, inputs, inputs), np.nan)
     powers = [np.ones_like(x)]

@@ -1,28 +1,22 @@
-"""Quann and others predict energy by a law of the motion and a Gaussian process of the place.
+"""Quann and others: energy by a law of the motion and a map, slip by a Gaussian process.
 
 In `quann_energy` the energy per metre  y = P / max(|v|, 0.02)  is linear in (1, |v|, |v|^2, |W|),
-plus a Gaussian process of the place. Power is predicted from encoders alone as  y max(|v|, 0.02).
+plus a Gaussian process over the place. Power is predicted from encoders alone as
+y max(|v|, 0.02).
 
-One setting is tuned, by the energy of whole runs: the length of the map.
+One setting is tuned, by the energy of whole runs: the length scale of the map.
 
-Liberties:
-    - The papers map energy over places that a robot team shares; here the map is relative to where
-      and how a run starts, since no absolute place is given.
+Liberties of the energy:
+    - The papers map energy over places that a robot team shares; here the map is relative to the
+      pose at a run's start, since no absolute place is given.
     - A thousand windows are drawn at random instead of taking all, slow ones less often.
     - The linear law is found by least squares weighted by max(|v|, 0.02)^2, which is least squares
-      of power. The process of what is left follows, with the length given and its variances by
-      marginal likelihood.
-    - Beyond speeds and yaw rates that were seen the law says what it says of the fastest seen: one
+      of power. The process is then fitted to the residuals, with the length scale given and its
+      variances by marginal likelihood.
+    - Speeds and yaw rates above those of the training runs are clipped to them in the law: a law
       fitted at a single speed is off a hundredfold at twice that speed.
     - Power is that of the motors by currents and datasheet, not of the whole robot.
-    - The path is the encoders'.
-
-Source: Quann, Ojeda, Smith, Rizzo, Castanier, Barton 2017, An energy-efficient method for
-multi-robot reconnaissance in an unknown environment, American Control Conference; the same 2020,
-Power prediction for heterogeneous ground robots through spatial mapping and sharing of terrain
-data, IEEE Robotics and Automation Letters 5(2).
-
-Quann and others predict slip by a Gaussian process, here of currents and wheel speeds.
+    - The path is that of the encoders.
 
 In `quann_slip` the body's slip ratio in windows of half a second (see `features`) is a Gaussian
 process of |I| and |w| of each drive and of the direction of travel, its components ahead, to the
@@ -33,17 +27,18 @@ standard deviation in all windows, so that the end of the path has the covarianc
 
 where R_k is the heading, s are the standard deviations as velocities, and J is a quarter turn.
 Inflation is the mean of e^T (S S^T)^-1 e / 2 over runs, where e is the error at the end of a run
-that the process does not know: each quarter of the runs is predicted by what the others say.
+that the process was not fitted to: each quarter of the runs is predicted by a fit to the others.
 
-One setting is tuned: whether each input has a length of its own.
+One setting is tuned: whether each input has its own length scale.
 
-Liberties:
+Liberties of the slip:
     - The papers map slip over places that a robot team shares; here slip depends on what the robot
       measures.
     - A direction is a unit vector with a turning part instead of a heading, and slip is a ratio.
     - A thousand windows are drawn at random instead of taking all, slow ones less often, and
-      inputs are clipped to what was seen.
-    - The covariance of the end, and its inflation, are ours; a millimetre is added each way.
+      inputs are clipped to the training range.
+    - The covariance of the end, and its inflation, are ours; a std of a millimetre is added in each
+      direction.
 
 Source: Quann, Ojeda, Smith, Rizzo, Castanier, Barton 2017, An energy-efficient method for
 multi-robot reconnaissance in an unknown environment, American Control Conference; the same 2020,
@@ -80,7 +75,7 @@ from slipid.predict.slip_model import (
 )
 
 SLOW = 0.02
-"""Speed below which energy is counted per time instead of per way [m/s]."""
+"""Speed below which energy is counted per time instead of per metre [m/s]."""
 
 
 @final
@@ -89,10 +84,10 @@ class QuannEnergy(SlipModel):
     """Energy per metre as a linear law of the motion and a Gaussian process of the place.
 
     Attributes:
-        length: of the map [m].
+        length: length scale of the map [m].
         law: coefficients of (1, |v|, |v|^2, |W|).
-        fastest: |v| and |W| that were seen [m/s], [rad/s].
-        process: of what the law leaves, at places seen from the start of a run.
+        fastest: largest |v| and |W| of the training runs [m/s], [rad/s].
+        process: process of the law's residuals over places relative to a run's start.
     """
 
     name: str = "quann_energy"
@@ -108,12 +103,12 @@ class QuannEnergy(SlipModel):
 
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "QuannEnergy":
         windows = SignalWindows.of([run.signals for run in runs], spec)
-        way, motion = rate(windows.rolling), motions(windows.rolling)
-        energy = np.concatenate([run.power(spec) for run in windows.signals]) / way
+        speed, motion = rate(windows.rolling), motions(windows.rolling)
+        energy = np.concatenate([run.power(spec) for run in windows.signals]) / speed
         terms = law_terms(motion)
-        law = np.linalg.lstsq(terms * way[:, None], energy * way, rcond=1e-6)[0]
-        left = (energy - terms @ law)[:, None]
-        rows = ProcessRows(places(windows, spec), left, way**2)
+        law = np.linalg.lstsq(terms * speed[:, None], energy * speed, rcond=1e-6)[0]
+        residual = (energy - terms @ law)[:, None]
+        rows = ProcessRows(places(windows, spec), residual, speed**2)
         kernel = Kernel((self.length,), free=False).tuned(rows)
         process = GaussianProcess.of(rows, kernel)
         return replace(self, law=law, fastest=motion.max(axis=0), process=process)
@@ -122,9 +117,9 @@ class QuannEnergy(SlipModel):
         if self.process is None or self.law is None or self.fastest is None:
             raise ValueError(f"{self.name}: predict before fit")
         windows = SignalWindows.of(runs, spec)
-        left = self.process.predict(places(windows, spec)).mean
+        residual = self.process.predict(places(windows, spec)).mean
         motion = np.minimum(motions(windows.rolling), self.fastest)
-        energy = law_terms(motion) @ self.law + left[:, 0]
+        energy = law_terms(motion) @ self.law + residual[:, 0]
         rolling = [run.rolling(spec) for run in runs]
         of_steps = at_steps(energy[:, None], windows, runs)
         return [
@@ -138,33 +133,33 @@ class QuannEnergy(SlipModel):
 
 
 def rate(twist: Twists) -> Float[np.ndarray, " row"]:
-    """Speed [m/s], not less than `SLOW`."""
+    """Return the speed [m/s], not less than `SLOW`."""
     return motions(twist)[:, 0].clip(min=SLOW)
 
 
 def motions(twist: Twists) -> Float[np.ndarray, "row 2"]:
-    """|v| [m/s] and |W| [rad/s]."""
+    """Return |v| [m/s] and |W| [rad/s]."""
     return np.stack([np.hypot(twist[:, 0], twist[:, 1]), np.abs(twist[:, 2])], axis=1)
 
 
 def law_terms(motion: Float[np.ndarray, "row 2"]) -> Float[np.ndarray, "row 4"]:
-    """(1, |v|, |v|^2, |W|)."""
+    """Return (1, |v|, |v|^2, |W|)."""
     speed, turning = motion.T
     return np.stack([np.ones_like(speed), speed, speed**2, turning], axis=1)
 
 
 def places(windows: SignalWindows, spec: RobotSpec) -> Float[np.ndarray, "window 2"]:
-    """Place in the middle of each window by the encoders, seen from the run's start [m]."""
+    """Return the place in the middle of each window by encoders, from the run's start [m]."""
     paths = [path_of(run.rolling(spec), run.dt)[:, :2] for run in windows.signals]
     return np.concatenate([0.5 * (path[1:] + path[:-1]) for path in paths])
 
 
 PARTS = 4
-"""Of the runs, each predicted by what the others say, to inflate the covariance."""
+"""Number of parts of the runs, each predicted by a fit to the others for the inflation."""
 START = 2.0
-"""Length of every input that fits begin with, in standard deviations of the input."""
+"""Initial length scale of every input, in standard deviations of the input."""
 CAMERA = 1e-3
-"""Standard deviation of a pose by any camera [m]."""
+"""Standard deviation of a pose by the camera, for any camera [m]."""
 SEED = 0
 
 
@@ -174,10 +169,10 @@ class QuannSlip(SlipModel):
     """Slip as a Gaussian process of currents, speeds and direction.
 
     Attributes:
-        anisotropic: whether each input has a length of its own.
-        scale: of the inputs.
-        process: of the slip ratio's three components.
-        inflation: of the covariance of a path's end.
+        anisotropic: each input has its own length scale.
+        scale: scale of the inputs.
+        process: process of the slip ratio's three components.
+        inflation: factor of the covariance of a path's end.
     """
 
     name: str = "quann_slip"
@@ -191,16 +186,16 @@ class QuannSlip(SlipModel):
         return [replace(self, anisotropic=each) for each in (True, False)]
 
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "QuannSlip":
-        lessons = SlipExamples.of(runs, spec)
-        inputs = slip_inputs(lessons.windows, spec)[lessons.windows.moves]
+        examples = SlipExamples.of(runs, spec)
+        inputs = slip_inputs(examples.windows, spec)[examples.windows.moving]
         scale = Scale.of(inputs)
-        rows = ProcessRows(scale.scaled(inputs), lessons.ratio, lessons.weight)
+        rows = ProcessRows(scale.scaled(inputs), examples.ratio, examples.weight)
         lengths = (START,) * (inputs.shape[1] if self.anisotropic else 1)
         kernel = Kernel(lengths, free=True).tuned(rows)
         squares = []
-        for part in parts(np.unique(lessons.run)):
-            mine = np.isin(lessons.run, part)
-            # of a single run there are no others
+        for part in parts(np.unique(examples.run)):
+            mine = np.isin(examples.run, part)
+            # a single run is predicted by a fit to itself
             others = GaussianProcess.of(rows if mine.all() else rows.only(~mine), kernel)
             known = replace(self, scale=scale, process=others, inflation=1.0)
             squares.append(end_squares(known, [runs[k] for k in part], spec))
@@ -213,11 +208,11 @@ class QuannSlip(SlipModel):
             raise ValueError(f"{self.name}: predict before fit")
         windows = SignalWindows.of(runs, spec)
         slip = self.process.predict(self.scale.scaled(slip_inputs(windows, spec)))
-        said = with_slip(runs, windows, slip.mean, spec)
+        predicted = with_slip(runs, windows, slip.mean, spec)
         std = at_steps(slip.std * windows.size[:, None] / spec.size, windows, runs)
         return [
             replace(of_run, end_covariance=self.inflation * spread + CAMERA**2 * np.eye(2))
-            for of_run, run, of_step in zip(said, runs, std, strict=True)
+            for of_run, run, of_step in zip(predicted, runs, std, strict=True)
             for spread in [end_spread(of_run.path, of_step, run.dt)]
         ]
 
@@ -227,13 +222,13 @@ class QuannSlip(SlipModel):
 
 
 def slip_inputs(windows: SignalWindows, spec: RobotSpec) -> Inputs:
-    """|I| and |w| of each drive, and the direction of travel."""
+    """Return |I| and |w| of each drive, and the direction of travel."""
     columns = [windows.amperes(), np.abs(windows.speed()), windows.direction(spec)]
     return np.concatenate(columns, axis=1)
 
 
 def parts(numbers: Int[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]]:
-    """Numbers of runs dealt out to a few parts at random."""
+    """Return the runs split into a few parts at random."""
     drawn = np.random.default_rng(SEED).permutation(numbers)
     return list(np.array_split(drawn, min(PARTS, len(numbers))))
 
@@ -241,7 +236,7 @@ def parts(numbers: Int[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]]:
 def end_spread(
     path: Float[np.ndarray, "edge 3"], std: Twists, dt: Float[np.ndarray, " step"]
 ) -> Float[np.ndarray, "2 2"]:
-    """Covariance of the place at the end if each component's errors are one and the same."""
+    """Return the covariance of the end place if a component has the same error in all steps."""
     middle = 0.5 * (path[1:] + path[:-1])
     c, s = np.cos(middle[:, 2]), np.sin(middle[:, 2])
     ahead, left = np.stack([c, s]), np.stack([-s, c])
@@ -255,13 +250,13 @@ def end_spread(
 def end_squares(
     fitted: QuannSlip, runs: Sequence[Run], spec: RobotSpec
 ) -> Float[np.ndarray, " run"]:
-    """Square of the error at the end of each run, in units of its covariance, per dimension."""
-    said = fitted.predict([run.signals for run in runs], spec)
+    """Return the squared error at each run's end over its covariance, per dimension."""
+    predicted = fitted.predict([run.signals for run in runs], spec)
     error = np.stack(
         [
             (of_run.path - path_of(run.twist, run.signals.dt))[-1, :2]
-            for of_run, run in zip(said, runs, strict=True)
+            for of_run, run in zip(predicted, runs, strict=True)
         ]
     )
-    known = [of_run.end_covariance for of_run in said if of_run.end_covariance is not None]
+    known = [one.end_covariance for one in predicted if one.end_covariance is not None]
     return (error * np.linalg.solve(np.stack(known), error[..., None])[..., 0]).sum(axis=1) / 2

@@ -1,8 +1,8 @@
-"""Reina and others detect slip by indicators from encoders, gyro and currents.
+"""Reina and others: slip detection by indicators from encoders, gyro and currents.
 
-Thresholds or fuzzy rules decide on them. Signals are smoothed by a causal exponential mean (I~, w,
-gyro). Let J_i be the rim speed of wheel i per body twist, xi_c the commanded twist and xi_enc the
-twist by the encoders. The indicators are
+The decision is by thresholds or by fuzzy rules. Signals are smoothed by a causal exponential mean
+(I~, w, gyro). Let J_i be the rim speed of wheel i per body twist, xi_c the commanded twist and
+xi_enc the twist by the encoders. The indicators are
 
     w_ref,i = J_i xi_c / r  median_j(r w_j / J_j xi_c)   (without a command: xi_enc for xi_c)
     EI = sat(max_i max(|w_i - w_ref,i| / |w_ref,i|, |dw_i/dt| / a_max))
@@ -11,29 +11,30 @@ twist by the encoders. The indicators are
 
 `reina_deterministic` flags slip where GI >= 1 or CI >= 1. `reina_fuzzy` feeds EI, CI and GI into
 Sugeno's inference with fuzzy sets on 0..1, whose consequents are trained by least squares on
-whether the training windows slip, and flags slip where the answer is at least one half. A window of
+whether the training windows slip, and flags slip where the output is at least one half. A window of
 half a second slips where |xi - xi_enc| > 0.2 |xi_enc|, with yaw rates weighted by the base radius.
 
-Two settings are tuned: the quantile of windows without slip that sets a_max, g_th and I_hi, and how
-long signals are smoothed. The fuzzy row has the number of fuzzy sets tuned instead of the quantile.
+Two settings are tuned: the quantile of windows without slip that sets a_max, g_th and I_hi, and the
+time constant of the smoothing. The fuzzy row has the number of fuzzy sets tuned instead of the
+quantile.
 
 Liberties:
 - The original only detects. Here the path is that of the encoders, whose twist is scaled by 1 - s
-  where slip is flagged; s is the mean slip of what was flagged in training windows (least squares).
+  where slip is flagged; s is the mean slip of the flagged training windows (least squares).
 - Thresholds are quantiles over the training windows without slip (for I_lo the median); where all
-  windows slip, they are the smallest value seen.
+  windows slip, they are the smallest value.
 - Where there is no gyro, EI >= 1 takes the place of GI >= 1.
 - The original compares the wheels of a rover with each other. An omni robot's wheels turn at
-  different speeds, so they are compared with the shape of the commanded twist. What a slow wheel is
-  off is divided by 0.3 of the fastest reference instead of its own. Three omni wheels fit any twist
-  exactly: then EI tells how wheels follow their command, not whether they slip, and without a
-  command only accelerations are left of it.
+  different speeds, so they are compared with the shape of the commanded twist. The deviation of a
+  slow wheel is divided by 0.3 of the fastest reference instead of its own. Three omni wheels fit
+  any twist exactly: EI then measures how well wheels follow their command, not whether they slip,
+  and without a command only the acceleration term remains.
 - The smallest current is taken over wheels that turn with at least 0.3 of the fastest rim speed;
-  the others carry no load that could tell of slip.
+  the load of the others carries no information on slip.
 - Fuzzy sets are triangles, every combination of sets has a rule, and consequents are constants
   that are trained on poses; the original's own sets and rules are not taken over.
-- The score is the larger of the uncut indicators that flag, or the fuzzy answer; it is 0 at rest.
-- The original also sees by a camera how deep its wheels have sunk; that is left out.
+- The score is the larger of the uncut indicators that flag, or the fuzzy output; it is 0 at rest.
+- The original also measures the sinkage of its wheels by a camera; that is left out.
 
 Source: Reina, Ojeda, Milella, Borenstein 2006, "Wheel slippage and sinkage detection for planetary
 rovers", IEEE/ASME Transactions on Mechatronics 11(2).
@@ -70,13 +71,13 @@ _CURRENT: frozenset[Channel] = frozenset({"current"})
 
 @dataclass(frozen=True)
 class _Detector(SlipModel):
-    """What both rows share.
+    """Common part of both rows.
 
     Attributes:
-        smoothing: how long signals are smoothed [s].
-        quantile: of the steps without slip that sets the thresholds.
+        smoothing: time constant of the smoothing [s].
+        quantile: quantile of the steps without slip that sets the thresholds.
         limits: fitted thresholds.
-        slip: share of the encoders' twist that is lost where slip is flagged, fitted.
+        slip: fitted share of the encoders' twist that is lost where slip is flagged.
     """
 
     needs: frozenset[Channel] = field(default=_CURRENT, kw_only=True)
@@ -92,23 +93,25 @@ class _Detector(SlipModel):
         return replace(trained, slip=trained._mean_slip(examples))
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
-        said = []
-        for heard in runs:
-            score = self.score(SmoothedSignals.of(heard, spec, self.smoothing))
-            kept = 1.0 - self.slip * (score >= self._flagged)
-            path = path_of(heard.rolling(spec) * kept[:, None], heard.dt)
-            said.append(PredictedRun(path, slipping=score))
-        return said
+        predicted = []
+        for run in runs:
+            score = self.score(SmoothedSignals.of(run, spec, self.smoothing))
+            kept = 1.0 - self.slip * (score >= self._threshold)
+            path = path_of(run.rolling(spec) * kept[:, None], run.dt)
+            predicted.append(PredictedRun(path, slipping=score))
+        return predicted
 
     def score(self, signals: SmoothedSignals) -> Numbers:
-        """How sure it is that the robot slips in each step; 0 where it stands."""
-        return np.where(signals.moving, self._answer(Indicators.of(signals, self.limits)), 0.0)
+        """Return the slip score of each step; 0 at rest."""
+        return np.where(
+            signals.moving, self._moving_score(Indicators.of(signals, self.limits)), 0.0
+        )
 
     def _mean_slip(self, examples: Sequence[LabelledRun]) -> float:
-        """Slip of the flagged parts of windows that explains their twists best."""
+        """Return the slip of the flagged parts of windows by least squares in their twists."""
         against = square = 0.0
         for example in examples:
-            flags = (self.score(example.signals) >= self._flagged).astype(float)
+            flags = (self.score(example.signals) >= self._threshold).astype(float)
             count = np.diff(example.first, append=len(flags))
             share = np.add.reduceat(flags, example.first) / count
             against += float(share @ example.against)
@@ -116,23 +119,23 @@ class _Detector(SlipModel):
         return against / square if square > 0.0 else 0.0
 
     def _trained(self, examples: Sequence[LabelledRun]) -> "_Detector":
-        """Itself, with what it learns beside the thresholds."""
+        """Return the detector with the parameters that are trained besides the thresholds."""
         return self
 
     @property
     @abc.abstractmethod
-    def _flagged(self) -> float:
-        """Score from which on slip is flagged."""
+    def _threshold(self) -> float:
+        """Smallest score that flags slip."""
 
     @abc.abstractmethod
-    def _answer(self, indicators: Indicators) -> Numbers:
-        """Score of moving steps."""
+    def _moving_score(self, indicators: Indicators) -> Numbers:
+        """Return the score of moving steps."""
 
 
 @final
 @dataclass(frozen=True)
 class ReinaDeterministic(_Detector):
-    """Slip is flagged where GI >= 1 or CI >= 1; where there is no gyro, EI >= 1 or CI >= 1."""
+    """Detector that flags slip where GI >= 1 or CI >= 1; EI replaces GI without a gyro."""
 
     name: str = "reina_deterministic"
 
@@ -144,10 +147,10 @@ class ReinaDeterministic(_Detector):
         return 4 + int(np.isfinite(self.limits.turning))
 
     @property
-    def _flagged(self) -> float:
+    def _threshold(self) -> float:
         return 1.0
 
-    def _answer(self, indicators: Indicators) -> Numbers:
+    def _moving_score(self, indicators: Indicators) -> Numbers:
         turning = indicators.encoder if indicators.gyro is None else indicators.gyro
         return np.maximum(turning, indicators.current)
 
@@ -155,11 +158,11 @@ class ReinaDeterministic(_Detector):
 @final
 @dataclass(frozen=True)
 class ReinaFuzzy(_Detector):
-    """Slip is flagged where Sugeno's inference from EI, CI and, if there is one, GI says half.
+    """Detector that flags slip where Sugeno's inference from EI, CI and GI is at least one half.
 
     Attributes:
-        sets: fuzzy sets of every indicator.
-        rules: fitted.
+        sets: number of fuzzy sets of every indicator.
+        rules: fitted rules.
     """
 
     name: str = "reina_fuzzy"
@@ -175,7 +178,7 @@ class ReinaFuzzy(_Detector):
         return 4 + int(np.isfinite(self.limits.turning)) + rules
 
     @property
-    def _flagged(self) -> float:
+    def _threshold(self) -> float:
         return 0.5
 
     def _trained(self, examples: Sequence[LabelledRun]) -> "ReinaFuzzy":
@@ -186,15 +189,15 @@ class ReinaFuzzy(_Detector):
         untrained = Sugeno.logical_or(inputs.shape[1], self.sets)
         return replace(self, rules=untrained.trained(inputs[known], slips[known]))
 
-    def _answer(self, indicators: Indicators) -> Numbers:
+    def _moving_score(self, indicators: Indicators) -> Numbers:
         inputs = self._inputs(indicators)
         rules = self.rules or Sugeno.logical_or(inputs.shape[1], self.sets)
         return rules.infer(inputs)
 
     def _inputs(self, indicators: Indicators) -> Float[np.ndarray, "step input"]:
-        """The indicators as columns. A gyro that is missing in a run says nothing of slip."""
+        """Return the indicators as columns; GI is 0 in a run without a gyro."""
         columns = [indicators.encoder, indicators.current]
         if np.isfinite(self.limits.turning):
-            silent = np.zeros_like(indicators.encoder)
-            columns.append(silent if indicators.gyro is None else indicators.gyro)
+            zero = np.zeros_like(indicators.encoder)
+            columns.append(zero if indicators.gyro is None else indicators.gyro)
         return np.stack(columns, axis=1)

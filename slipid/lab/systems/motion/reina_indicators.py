@@ -1,23 +1,21 @@
-"""Sugeno's fuzzy inference answers by rules with constants that least squares trains.
+"""Reina's slip indicators, and Sugeno's fuzzy inference with trained constants.
 
-Every input lies in 0..1 and belongs to `sets` triangular sets, whose peaks are evenly spaced and
-whose memberships sum to one: for two sets, low is 1 - x and high is x. There is one rule for every
-combination of sets of the inputs. A rule fires with the product of its memberships, and the answer
-is the mean of the rules' consequents, weighted by how much they fire:
+Fuzzy inference. Every input lies in 0..1 and belongs to `sets` triangular sets, whose peaks are
+evenly spaced and whose memberships sum to one: for two sets, low is 1 - x and high is x. There is
+one rule for every combination of sets of the inputs. The strength of a rule is the product of its
+memberships, and the output is the mean of the rules' consequents, weighted by their strengths:
 
     y = sum_k f_k c_k,    f_k = prod_i mu_ik(x_i),    sum_k f_k = 1
 
-Consequents are those of least squares, pulled a little towards the answer of a logical OR, so that
-a rule that no sample fires still says what its words say.
+Consequents are fitted by least squares with a weak prior at the output of a logical OR, so that a
+rule without samples keeps the meaning of its words.
 
 Source: Takagi & Sugeno 1985, IEEE Transactions on Systems, Man, and Cybernetics 15(1); of order
 zero.
 
-The indicators of slip come from smoothed signals and from what these are where nothing slips.
-
-Signals of a run are smoothed in every step. Limits are quantiles of the signals of training steps
-without slip, and indicators are signals over their limits. The formulas stand at the top of
-`method.py`.
+Indicators. Signals of a run are smoothed in every step. Thresholds are quantiles of the signals of
+training steps without slip, and indicators are signals over their thresholds. The formulas are at
+the top of `reina.py`.
 """
 
 from collections.abc import Sequence
@@ -28,8 +26,8 @@ from jaxtyping import Bool, Float
 
 from slipid.predict.slip_model import WINDOW_S, Numbers, RobotSpec, Run, RunSignals, groups
 
-_PULL = 1.0
-"""How many samples the answer of a logical OR counts as, in every rule."""
+_PRIOR = 1.0
+"""Weight of the prior at the logical OR in every rule, in samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +35,8 @@ class Sugeno:
     """Fuzzy rules on a grid of sets.
 
     Attributes:
-        sets: fuzzy sets of each input.
-        consequents: answer of each rule; the sets of the last input change fastest.
+        sets: number of fuzzy sets of each input.
+        consequents: output of each rule; the sets of the last input change fastest.
     """
 
     sets: int
@@ -46,52 +44,52 @@ class Sugeno:
 
     @classmethod
     def logical_or(cls, inputs: int, sets: int) -> "Sugeno":
-        """Rules that answer with the peak of the highest set among their inputs."""
+        """Return rules whose output is the peak of the highest set among their inputs."""
         peak = np.linspace(0.0, 1.0, sets)
         grid = np.stack(np.meshgrid(*[peak] * inputs, indexing="ij"), axis=-1)
         return cls(sets, grid.max(axis=-1).ravel())
 
     def strengths(self, x: Float[np.ndarray, "sample input"]) -> Float[np.ndarray, "sample rule"]:
-        """How much each rule fires; the rules of a sample sum to one."""
+        """Return the strength of each rule; the rules of a sample sum to one."""
         peak = np.linspace(0.0, 1.0, self.sets)
         member = np.maximum(1.0 - np.abs(x[..., None] - peak) * (self.sets - 1), 0.0)
-        fires = member[:, 0]
+        strength = member[:, 0]
         for more in member.transpose(1, 0, 2)[1:]:
-            fires = (fires[:, :, None] * more[:, None, :]).reshape(len(x), -1)
-        return fires
+            strength = (strength[:, :, None] * more[:, None, :]).reshape(len(x), -1)
+        return strength
 
     def infer(self, x: Float[np.ndarray, "sample input"]) -> Float[np.ndarray, " sample"]:
-        """Answer to each sample; inputs beyond 0..1 count as its ends."""
+        """Return the output of each sample; inputs are clipped to 0..1."""
         return np.asarray(self.strengths(np.clip(x, 0.0, 1.0)) @ self.consequents)
 
     def trained(
-        self, x: Float[np.ndarray, "sample input"], wanted: Float[np.ndarray, " sample"]
+        self, x: Float[np.ndarray, "sample input"], target: Float[np.ndarray, " sample"]
     ) -> "Sugeno":
-        """The same sets with the consequents that come nearest to the wanted answers."""
-        fires = self.strengths(np.clip(x, 0.0, 1.0))
-        pulled = _PULL * np.eye(len(self.consequents))
-        right = fires.T @ wanted + _PULL * self.consequents
-        return replace(self, consequents=np.linalg.solve(fires.T @ fires + pulled, right))
+        """Return the same sets with consequents fitted to the target outputs."""
+        strength = self.strengths(np.clip(x, 0.0, 1.0))
+        prior = _PRIOR * np.eye(len(self.consequents))
+        right = strength.T @ target + _PRIOR * self.consequents
+        return replace(self, consequents=np.linalg.solve(strength.T @ strength + prior, right))
 
 
 SLIPS = 0.2
-"""Slip from which on a window counts as slipping, as a share of what the encoders say."""
+"""Smallest slip of a slipping window, relative to the encoders' twist."""
 _REST = 0.01
-"""Rim speed below which a robot stands [m/s]."""
+"""Rim speed below which a robot counts as at rest [m/s]."""
 _DRIVING = 0.3
-"""Share of the fastest rim speed from which on a wheel counts as driving."""
+"""Smallest rim speed of a driving wheel, relative to the fastest wheel."""
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothedSignals:
-    """What the indicators are made of, smoothed, in every step of a run.
+    """Smoothed signals behind the indicators in every step of a run.
 
     Attributes:
-        deviation: largest deviation of a wheel from its reference, relative.
+        deviation: largest relative deviation of a wheel from its reference.
         change: largest acceleration of a wheel [rad/s^2].
-        turning: of the yaw rate by the encoders from the gyro's [rad/s], or None.
-        amps: smallest current of the wheels that drive [A].
-        moving: whether the wheels turn.
+        turning: difference of the yaw rates by encoders and gyro [rad/s], or None.
+        amps: smallest current of the driving wheels [A].
+        moving: steps in which the wheels turn.
     """
 
     deviation: Numbers
@@ -101,19 +99,19 @@ class SmoothedSignals:
     moving: Bool[np.ndarray, " step"]
 
     @classmethod
-    def of(cls, heard: RunSignals, spec: RobotSpec, seconds: float) -> "SmoothedSignals":
-        """Of a run, smoothed over so long."""
-        mean = smoothing(heard.dt, seconds)
-        speed, amps = mean @ heard.speed, mean @ heard.along(spec)
+    def of(cls, run: RunSignals, spec: RobotSpec, seconds: float) -> "SmoothedSignals":
+        """Return the signals of a run, smoothed with this time constant [s]."""
+        mean = smoothing(run.dt, seconds)
+        speed, amps = mean @ run.speed, mean @ run.along(spec)
         rim = spec.wheel_radius * speed
         fastest = np.abs(rim).max(axis=1, keepdims=True)
         drives = np.abs(rim) >= _DRIVING * fastest
         turning = None
-        if heard.gyro is not None:
-            turning = np.abs(mean @ (heard.rolling(spec)[:, 2] - heard.gyro))
-        change = np.diff(speed, axis=0, prepend=speed[:1]) / heard.dt[:, None]
+        if run.gyro is not None:
+            turning = np.abs(mean @ (run.rolling(spec)[:, 2] - run.gyro))
+        change = np.diff(speed, axis=0, prepend=speed[:1]) / run.dt[:, None]
         return cls(
-            deviation=_deviation(rim, mean, heard, spec),
+            deviation=_deviation(rim, mean, run, spec),
             change=np.abs(change).max(axis=1),
             turning=turning,
             amps=np.where(drives, amps, np.inf).min(axis=1),
@@ -123,12 +121,13 @@ class SmoothedSignals:
 
 @dataclass(frozen=True)
 class SlipThresholds:
-    """What signals are without slip.
+    """Thresholds of the signals, from training steps without slip.
 
     Attributes:
         change: a_max, acceleration of a wheel [rad/s^2].
-        turning: g_th, of the yaw rate by the encoders from the gyro's [rad/s].
-        usual, highest: I_lo and I_hi, smallest current of the driving wheels [A].
+        turning: g_th, difference of the yaw rates by encoders and gyro [rad/s].
+        usual: I_lo, median of the smallest current of the driving wheels [A].
+        highest: I_hi, upper quantile of the smallest current of the driving wheels [A].
     """
 
     change: float = 1.0
@@ -138,7 +137,7 @@ class SlipThresholds:
 
     @classmethod
     def of(cls, examples: "Sequence[LabelledRun]", quantile: float) -> "SlipThresholds":
-        """By quantiles of the steps that do not slip."""
+        """Return the quantiles of the steps that do not slip."""
         signals = [example.signals for example in examples]
         slips = np.concatenate([example.slips for example in examples])
 
@@ -162,7 +161,13 @@ class SlipThresholds:
 
 @dataclass(frozen=True, eq=False)
 class Indicators:
-    """EI, CI and GI of every step, before they are cut to 0..1; GI is None without a gyro."""
+    """Indicators of slip in every step, before they are cut to 0..1.
+
+    Attributes:
+        encoder: EI.
+        current: CI.
+        gyro: GI, or None without a gyro.
+    """
 
     encoder: Numbers
     current: Numbers
@@ -170,7 +175,7 @@ class Indicators:
 
     @classmethod
     def of(cls, signals: SmoothedSignals, limits: SlipThresholds) -> "Indicators":
-        """Of a run's signals."""
+        """Return the indicators of a run's signals."""
         turning = signals.turning if np.isfinite(limits.turning) else None
         return cls(
             encoder=np.maximum(signals.deviation, signals.change / limits.change),
@@ -181,14 +186,14 @@ class Indicators:
 
 @dataclass(frozen=True, eq=False)
 class LabelledRun:
-    """A training run: its signals, and how much it slipped in each window.
+    """A training run: its signals, and the slip of each window by the pose.
 
     Attributes:
-        signals: of its steps.
+        signals: smoothed signals of its steps.
         first: first step of every window.
-        slips: of its steps, 1 where their window slips, 0 where not, nan where it stands.
-        against: what the encoders say too much in each window, times what they say [m^2/s^2].
-        square: what they say, times itself [m^2/s^2].
+        slips: 1 in steps whose window slips, 0 where it does not, NaN at rest.
+        against: excess of the encoders' twist times that twist, in each window [m^2/s^2].
+        square: square of the encoders' twist, in each window [m^2/s^2].
     """
 
     signals: SmoothedSignals
@@ -199,7 +204,7 @@ class LabelledRun:
 
     @classmethod
     def of(cls, run: Run, spec: RobotSpec, seconds: float) -> "LabelledRun":
-        """Of a run whose signals are smoothed over so long."""
+        """Return a run whose signals are smoothed with this time constant [s]."""
         joined = run.windowed()
         rolling = joined.signals.rolling(spec) * spec.size
         slip = rolling - joined.twist * spec.size
@@ -216,7 +221,7 @@ class LabelledRun:
 
 
 def smoothing(dt: Numbers, seconds: float) -> Float[np.ndarray, "step step"]:
-    """Matrix of a causal exponential mean with this time constant, by the middles of the steps."""
+    """Return the matrix of a causal exponential mean over the middles of the steps."""
     middle = np.cumsum(dt) - 0.5 * dt
     age = middle[:, None] - middle[None, :]
     weight = np.where(age >= 0.0, np.exp(-np.maximum(age, 0.0) / seconds), 0.0) * dt
@@ -226,19 +231,19 @@ def smoothing(dt: Numbers, seconds: float) -> Float[np.ndarray, "step step"]:
 def _deviation(
     rim: Float[np.ndarray, "step drive"],
     mean: Float[np.ndarray, "step step"],
-    heard: RunSignals,
+    run: RunSignals,
     spec: RobotSpec,
 ) -> Numbers:
-    """Largest relative deviation of a wheel from the shape of the commanded twist."""
+    """Return the largest relative deviation of a wheel from the shape of the commanded twist."""
     forward = spec.forward.T
-    shape = mean @ (heard.rolling(spec) @ forward)
-    if heard.command is not None:
-        commanded = mean @ (heard.command @ forward)
-        asked = np.abs(commanded).max(axis=1, keepdims=True) > _REST
-        shape = np.where(asked, commanded, shape)
+    shape = mean @ (run.rolling(spec) @ forward)
+    if run.command is not None:
+        commanded = mean @ (run.command @ forward)
+        is_commanded = np.abs(commanded).max(axis=1, keepdims=True) > _REST
+        shape = np.where(is_commanded, commanded, shape)
     turns = np.abs(shape) >= np.maximum(_DRIVING * np.abs(shape).max(axis=1, keepdims=True), 1e-9)
     ratio = np.sort(np.where(turns, rim / np.where(turns, shape, 1.0), np.inf), axis=1)
-    # those that do not turn are sorted to the end: the median is in the middle of the others
+    # wheels that do not turn are sorted to the end: the median is in the middle of the others
     count = np.maximum(turns.sum(axis=1, keepdims=True), 1)
     middle = np.concatenate([(count - 1) // 2, count // 2], axis=1)
     median = np.take_along_axis(ratio, middle, axis=1).mean(axis=1, keepdims=True)

@@ -1,13 +1,11 @@
-"""The dynamics say how a robot moves on a floor with a law of traction and resistance.
+"""Dynamics of a robot on a floor with a law of traction and resistance, and padded runs.
 
 Speeds are those of q, and forces are divided by the robot's mass. A step solves the equation of
-motion, whose symbols and formulas stand at the top of `method.py`, for many runs at once, and gives
-the derivatives of the speeds after it.
+motion, whose symbols and formulas are at the top of `ward_iagnemma.py`, for many runs at once, and
+returns the derivatives of the speeds after it.
 
-Runs of any lengths are laid side by side, so that the filter tracks all of them at once.
-
-Of each run it holds what the filter hears: speeds of the wheels, the gyro, and the forces that the
-motors' currents tell.
+Runs of any lengths are padded to one array with the inputs of the filter, which tracks all of them
+at once: speeds of the wheels, the gyro, and the forces by the motors' currents.
 """
 
 from collections.abc import Sequence
@@ -24,13 +22,13 @@ Speeds = Float[np.ndarray, "run 3"]
 Each = Float[np.ndarray, " run"]
 GRAVITY = 9.81
 REST = 0.02
-"""v_s: speed within which resistance fades out [m/s]."""
+"""v_s: speed below which resistance fades out [m/s]."""
 _OVER_MASS = np.array([1.0, 1.0, 2.0])
-"""m / M: what a force over the mass accelerates; the inertia is m L^2 / 2."""
+"""m / M: acceleration of q by a force over the mass; the inertia is m L^2 / 2."""
 _MOST_STEPS = 25
-"""Newton steps after which an equation that is still not solved is left as it is."""
+"""Largest number of Newton steps."""
 _SOLVED = 1e-7
-"""Residual at which an equation counts as solved [m/s]."""
+"""Largest residual of a solved equation [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,13 @@ class ForceLaw:
 
 @dataclass(frozen=True, eq=False)
 class Acceleration:
-    """Accelerations [m/s^2], and their derivatives by the speeds [1/s] and by rho [m/s^2]."""
+    """Accelerations of q and their derivatives.
+
+    Attributes:
+        rate: accelerations [m/s^2].
+        slope: derivatives by the speeds [1/s].
+        by_rolling: derivatives by rho [m/s^2].
+    """
 
     rate: Speeds
     slope: Float[np.ndarray, "run 3 3"]
@@ -65,7 +69,13 @@ class Acceleration:
 
 @dataclass(frozen=True, eq=False)
 class DynamicsStep:
-    """Speeds after a step of the dynamics, and their derivatives by those before and by rho."""
+    """Speeds after a step of the dynamics and their derivatives.
+
+    Attributes:
+        speeds: q after the step [m/s].
+        by_speeds: derivatives by the speeds before the step.
+        by_rolling: derivatives by rho [m/s].
+    """
 
     speeds: Speeds
     by_speeds: Float[np.ndarray, "run 3 3"]
@@ -73,19 +83,11 @@ class DynamicsStep:
 
 
 @dataclass(frozen=True, eq=False)
-class NewtonIterate:
-    """Speeds nearer to the solution of a step, and whether they solve it."""
-
-    speeds: Speeds
-    done: Bool[np.ndarray, " run"]
-
-
-@dataclass(frozen=True, eq=False)
 class Dynamics:
     """A robot on a floor.
 
     Attributes:
-        law: of the floor.
+        law: force law of the floor.
         rims: rim speed of each drive per q.
         turning: 1 for the speeds that count as turning, 0 for those along which the robot rolls.
         base_radius: L [m].
@@ -98,33 +100,35 @@ class Dynamics:
 
     @classmethod
     def of(cls, spec: RobotSpec, law: ForceLaw) -> "Dynamics":
-        """Of a robot."""
+        """Return the dynamics of a robot with a force law."""
         turning = np.array([0.0, 0.0 if spec.determines_twist else 1.0, 1.0])
         rims = np.asarray(spec.forward / spec.size, dtype=float)
         return cls(law, rims, turning, float(spec.base_radius))
 
     def traction(self, slide: Drives) -> Drives:
-        """Traction of each drive over the robot's mass [m/s^2], by sliding speeds [m/s]."""
+        """Return traction of each drive over the robot's mass [m/s^2] at sliding speeds [m/s]."""
         law, load = self.law, GRAVITY / len(self.rims)
         rising = -np.expm1(-law.rise * np.abs(slide))
         return np.asarray(load * (law.grip * np.sign(slide) * rising + law.viscous * slide))
 
     def stiffness(self, slide: Drives) -> Drives:
-        """Derivative of `traction` [1/s]."""
+        """Return the derivative of `traction` [1/s]."""
         law, load = self.law, GRAVITY / len(self.rims)
         rising = law.rise * np.exp(-law.rise * np.abs(slide))
         return np.asarray(load * (law.grip * rising + law.viscous))
 
-    def push(self, q: Speeds, rolling: Each, rim: Drives, secant: bool = False) -> Acceleration:
-        """Accelerations at speeds q; with `secant`, slopes of the chords to where no force acts."""
+    def acceleration(
+        self, q: Speeds, rolling: Each, rim: Drives, secant: bool = False
+    ) -> Acceleration:
+        """Return accelerations at speeds q; `secant` slopes are chords to points without force."""
         law, slide = self.law, rim - q @ self.rims.T
         traction, stiff = self.traction(slide), self.stiffness(slide)
         if secant:
-            still = np.abs(slide) < 1e-9
-            stiff = np.where(still, stiff, traction / np.where(still, 1.0, slide))
+            zero = np.abs(slide) < 1e-9
+            stiff = np.where(zero, stiff, traction / np.where(zero, 1.0, slide))
         straight = 1.0 - self.turning
-        alike = np.outer(self.turning, self.turning) + np.outer(straight, straight)
-        size = np.sqrt(q**2 @ alike + REST**2)
+        coupled = np.outer(self.turning, self.turning) + np.outer(straight, straight)
+        size = np.sqrt(q**2 @ coupled + REST**2)
         along, share = (
             q / size,
             GRAVITY * (rolling[:, None] * straight + law.turning * self.turning),
@@ -133,7 +137,7 @@ class Dynamics:
         squares = (self.rims[:, :, None] * self.rims[:, None, :]).reshape(-1, 9)
         slope = -(stiff @ squares).reshape(-1, 3, 3)
         if not secant:
-            slope += (share / size * along)[:, :, None] * along[:, None, :] * alike
+            slope += (share / size * along)[:, :, None] * along[:, None, :] * coupled
         slope[:, range(3), range(3)] -= linear
         rate = (traction @ self.rims - linear * q) * _OVER_MASS
         slope *= _OVER_MASS[:, None]
@@ -149,80 +153,81 @@ class Dynamics:
         return Acceleration(rate, slope, -GRAVITY * straight * (along + law.drag * q))
 
     def step(self, speeds: Speeds, rolling: Each, rim: Drives, dt: Each) -> DynamicsStep:
-        """Backward Euler: q' = q + dt a(q'), by Newton's method, run by run until it is solved."""
+        """Return q' of backward Euler, q' = q + dt a(q'), by Newton's method for each run."""
         solution, todo = speeds.copy(), np.arange(len(speeds))
         for _ in range(_MOST_STEPS):
-            nearer = self._nearer(solution[todo], speeds[todo], rolling[todo], rim[todo], dt[todo])
-            solution[todo], todo = nearer.speeds, todo[~nearer.done]
+            args = speeds[todo], rolling[todo], rim[todo], dt[todo]
+            solution[todo], done = self._newton(solution[todo], *args)
+            todo = todo[~done]
             if len(todo) == 0:
                 break
-        at, wait = self.push(solution, rolling, rim), dt[:, None]
+        at, wait = self.acceleration(solution, rolling, rim), dt[:, None]
         inverse = np.linalg.inv(np.eye(3) - wait[..., None] * at.slope)
         return DynamicsStep(
             solution, inverse, (inverse @ (wait * at.by_rolling)[..., None])[..., 0]
         )
 
-    def _nearer(
+    def _newton(
         self, q: Speeds, start: Speeds, rolling: Each, rim: Drives, dt: Each
-    ) -> "NewtonIterate":
-        """One step of Newton's method from q.
+    ) -> tuple[Speeds, Bool[np.ndarray, " run"]]:
+        """Return speeds after one step of Newton's method from q, and the runs that are solved.
 
-        Traction and resistance flatten out, so that the step may overshoot. Where it does not come
-        nearer, that of the secants is taken instead: but for the turning axes, the forces have a
+        Traction and resistance flatten out, so that the step may overshoot. Where the residual does
+        not fall, the secants' step is used instead: apart from the turning axes, the forces have a
         potential that is concave in squares of speeds, on which the secants' step descends.
         """
-        here, wait = self.push(q, rolling, rim), dt[:, None]
-        left = q - start - wait * here.rate
-        trial = q - solved(wait, here.slope, left)
-        left_there = trial - start - wait * self.push(trial, rolling, rim).rate
-        before, after = ((x**2 / _OVER_MASS).sum(axis=1) for x in (left, left_there))
+        here, wait = self.acceleration(q, rolling, rim), dt[:, None]
+        residual = q - start - wait * here.rate
+        trial = q - solved(wait, here.slope, residual)
+        residual_after = trial - start - wait * self.acceleration(trial, rolling, rim).rate
+        before, after = ((x**2 / _OVER_MASS).sum(axis=1) for x in (residual, residual_after))
         done = after < _SOLVED**2
         worse = ~done & ~(after < before)
         if worse.any():
-            secants = self.push(q, rolling, rim, secant=True).slope
-            trial = np.where(worse[:, None], q - solved(wait, secants, left), trial)
-        return NewtonIterate(trial, done)
+            secants = self.acceleration(q, rolling, rim, secant=True).slope
+            trial = np.where(worse[:, None], q - solved(wait, secants, residual), trial)
+        return trial, done
 
 
 def solved(
     wait: Float[np.ndarray, "run 1"], slope: Float[np.ndarray, "run 3 3"], right: Speeds
 ) -> Speeds:
-    """What I - dt slope makes the right-hand side."""
+    """Return the solution x of (I - dt slope) x = right."""
     return np.linalg.solve(np.eye(3) - wait[..., None] * slope, right[..., None])[..., 0]
 
 
 _DRIVING = 0.3
-"""Share of the fastest rim speed from which on a wheel counts as driving."""
+"""Smallest rim speed of a driving wheel, relative to the fastest wheel."""
 
 
 @dataclass(frozen=True, eq=False)
 class PaddedRuns:
-    """Runs side by side, padded to the same number of steps with steps of no time.
+    """Runs side by side, padded to the same number of steps with steps of zero duration.
 
     Attributes:
-        dt: [s], 0 in padding.
+        dt: duration of each step [s], 0 in padding.
         rim: rim speed of each drive [m/s].
-        rolling: q if nothing slipped [m/s].
-        gyro: [rad/s], nan where there is none.
-        pull: force of each motor at the rim by its current [N], nan where it tells nothing.
+        rolling: q without slip [m/s].
+        gyro: yaw rate [rad/s], NaN without a gyro.
+        force: force of each motor at the rim by its current [N], NaN where it is unknown.
     """
 
     dt: Float[np.ndarray, "run step"]
     rim: Float[np.ndarray, "run step drive"]
     rolling: Float[np.ndarray, "run step 3"]
     gyro: Float[np.ndarray, "run step"]
-    pull: Float[np.ndarray, "run step drive"]
+    force: Float[np.ndarray, "run step drive"]
 
     @classmethod
     def of(cls, runs: Sequence[RunSignals], spec: RobotSpec) -> "PaddedRuns":
-        """Of runs of any lengths."""
+        """Return padded runs of any lengths."""
         shape, drives = (len(runs), max(len(run) for run in runs)), len(spec.forward)
         padded = cls(
             dt=np.zeros(shape),
             rim=np.zeros((*shape, drives)),
             rolling=np.zeros((*shape, 3)),
             gyro=np.full(shape, np.nan),
-            pull=np.full((*shape, drives), np.nan),
+            force=np.full((*shape, drives), np.nan),
         )
         for k, run in enumerate(runs):
             steps = slice(len(run))
@@ -230,12 +235,12 @@ class PaddedRuns:
             padded.rim[k, steps] = run.speed * spec.wheel_radius
             padded.rolling[k, steps] = run.rolling(spec) * spec.size
             padded.gyro[k, steps] = np.nan if run.gyro is None else run.gyro
-            padded.pull[k, steps] = motor_forces(run, spec)
+            padded.force[k, steps] = motor_forces(run, spec)
         return padded
 
 
 def motor_forces(run: RunSignals, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
-    """Force n C_e I / r along each drive's motion [N]; nan where it tells nothing."""
+    """Return the force n C_e I / r along each drive's motion [N]; NaN if it does not drive."""
     rim = np.abs(run.speed * spec.wheel_radius)
     if run.current is None:
         return np.full(rim.shape, np.nan)

@@ -1,8 +1,9 @@
-"""The extended Kalman filter tracks the state of many runs at once.
+"""Extended Kalman filter over the state of many runs at once.
 
-In every step it moves the state by the dynamics, corrects it by the gyro and the currents, and
-pulls the coefficient of resistance back within its bounds. What it measures stands at the top of
-`method.py`. The error of the pose rides along, so that the end of every path has a covariance.
+Every step moves the state by the dynamics, corrects it by the gyro and the currents, and keeps the
+coefficient of resistance within its bounds. The measurements are described at the top of
+`ward_iagnemma.py`. The error of the pose is part of the state, so that the end of every path has a
+covariance.
 """
 
 from dataclasses import dataclass
@@ -13,21 +14,24 @@ from jaxtyping import Float
 from slipid.lab.systems.motion.ward_iagnemma_dynamics import Drives, Dynamics, Each, PaddedRuns
 from slipid.predict.slip_model import WINDOW_S
 
-Spread = Float[np.ndarray, "run 8 8"]
+Covariance = Float[np.ndarray, "run 8 8"]
 Row = Float[np.ndarray, "run 8"]
 
 
 @dataclass(frozen=True)
 class FilterNoise:
-    """What the law leaves.
+    """Noise of the process and of the measurements, from the residuals of the law.
 
     Attributes:
         rolling: standard deviation of rho between runs.
         drift: standard deviation of place and turn after a second [m], (ahead, left, turn times L).
-        gyro, bias: standard deviation of the gyro over a window, and between runs [rad/s]; the
-            former is nan where training had no gyro, and then none is heard.
-        gain, offset: k, and f [N].
-        force: standard deviation of the force by a current over a window [N]; nan like that.
+        gyro: standard deviation of the gyro over a window [rad/s]; NaN, and then the gyro is not
+            used, where training runs had none.
+        bias: standard deviation of the gyro's bias between runs [rad/s].
+        gain: k.
+        offset: f [N].
+        force: standard deviation of the force by a current over a window [N]; NaN where training
+            runs had no currents.
     """
 
     rolling: float = 0.01
@@ -43,40 +47,45 @@ class FilterNoise:
 class FilterState:
     """Mean and covariance of q (3), rho, the gyro's bias, and the error of the pose (3).
 
-    The pose rides along without being corrected: its error is that of a path of filtered twists.
-    The mean of its error is 0 and left out.
+    The pose is not corrected: its error is that of a path of filtered twists. The mean of that
+    error is 0 and left out.
     """
 
     mean: Float[np.ndarray, "run 5"]
-    spread: Spread
+    covariance: Covariance
 
-    def moved(self, mean: Float[np.ndarray, "run 5"], by: Spread) -> "FilterState":
-        """At another mean, the covariance carried along by the derivatives."""
-        return FilterState(mean, by @ self.spread @ by.transpose(0, 2, 1))
+    def moved(self, mean: Float[np.ndarray, "run 5"], by: Covariance) -> "FilterState":
+        """Return the state at another mean, its covariance propagated by the derivatives `by`."""
+        return FilterState(mean, by @ self.covariance @ by.transpose(0, 2, 1))
 
     def corrected(
-        self, row: Row, news: Each, variance: Each, of: slice = slice(5)
+        self, row: Row, innovation: Each, variance: Each, of: slice = slice(5)
     ) -> "FilterState":
-        """By a measurement with these derivatives; nan news is none.
+        """Return the state corrected by a measurement with these derivatives, NaN for none.
 
         Joseph's form, right for any gain: P - K h P - P h' K' + K s K' with s = h P h' + variance.
         """
-        heard = np.isfinite(news + variance)
-        if not heard.any():
+        measured = np.isfinite(innovation + variance)
+        if not measured.any():
             return self
-        shared = (self.spread @ row[..., None])[..., 0]
-        size = ((shared * row).sum(axis=1) + np.where(heard, variance, 1.0))[:, None]
-        gain = shared / size * heard[:, None]
+        shared = (self.covariance @ row[..., None])[..., 0]
+        size = ((shared * row).sum(axis=1) + np.where(measured, variance, 1.0))[:, None]
+        gain = shared / size * measured[:, None]
         gain[:, : of.start or 0] = 0.0
         gain[:, of.stop :] = 0.0
         less = gain[:, :, None] * (shared - 0.5 * size * gain)[:, None, :]
-        mean = self.mean + gain[:, :5] * np.where(heard, news, 0.0)[:, None]
-        return FilterState(mean, self.spread - less - less.transpose(0, 2, 1))
+        mean = self.mean + gain[:, :5] * np.where(measured, innovation, 0.0)[:, None]
+        return FilterState(mean, self.covariance - less - less.transpose(0, 2, 1))
 
 
 @dataclass(frozen=True, eq=False)
 class FilteredRuns:
-    """What the filter says of padded runs: q in every step, and the covariance of the last pose."""
+    """Filtered states of padded runs.
+
+    Attributes:
+        speeds: q in every step [m/s].
+        covariance: covariance of the last pose.
+    """
 
     speeds: Float[np.ndarray, "run step 3"]
     covariance: Float[np.ndarray, "run 3 3"]
@@ -87,20 +96,21 @@ class SlipFilter:
     """The extended Kalman filter.
 
     Attributes:
-        dynamics, noise: fitted.
-        mass: of the robot [kg].
-        hears_current: whether forces by currents are measurements.
-        wander: standard deviation by which rho moves in a second.
+        dynamics: fitted dynamics.
+        noise: fitted noise.
+        mass: mass of the robot [kg].
+        uses_current: forces by currents are measurements.
+        wander: standard deviation of the random walk of rho after a second.
     """
 
     dynamics: Dynamics
     noise: FilterNoise
     mass: float
-    hears_current: bool
+    uses_current: bool
     wander: float
 
     def track(self, runs: PaddedRuns) -> FilteredRuns:
-        """All runs at once."""
+        """Return the filtered states of all runs, computed together."""
         count, steps = runs.dt.shape
         rolling = np.full((count, 1), self.dynamics.law.rolling)
         mean = np.concatenate([runs.rolling[:, 0], rolling, np.zeros((count, 1))], axis=1)
@@ -109,47 +119,50 @@ class SlipFilter:
         heading, speeds = np.zeros(count), np.zeros((count, steps, 3))
         for k in range(steps):
             dt = runs.dt[:, k]
-            state = self._bounded(self._heard(self._driven(state, runs.rim[:, k], dt), runs, k))
+            predicted = self._predicted(state, runs.rim[:, k], dt)
+            state = self._bounded(self._measured(predicted, runs, k))
             speeds[:, k] = state.mean[:, :3]
             turn = state.mean[:, 2] / self.dynamics.base_radius * dt
-            state = self._travelled(state, heading + 0.5 * turn, dt)
+            state = self._with_pose_error(state, heading + 0.5 * turn, dt)
             heading = heading + turn
-        return FilteredRuns(speeds, state.spread[:, 5:, 5:])
+        return FilteredRuns(speeds, state.covariance[:, 5:, 5:])
 
-    def _driven(self, state: FilterState, rim: Drives, dt: Each) -> FilterState:
-        """A step of the dynamics, and what drifts meanwhile."""
+    def _predicted(self, state: FilterState, rim: Drives, dt: Each) -> FilterState:
+        """Return the state after a step of the dynamics with process noise."""
         step = self.dynamics.step(state.mean[:, :3], state.mean[:, 3], rim, dt)
         by = np.tile(np.eye(8), (len(dt), 1, 1))
         by[:, :3, :3], by[:, :3, 3] = step.by_speeds, step.by_rolling
         after = state.moved(np.concatenate([step.speeds, state.mean[:, 3:]], axis=1), by)
-        # white noise of the twist whose integral grows as the squares of the drift
+        # white noise of the twist whose integral has the variance of the drift
         rate = np.where(dt > 0.0, 1.0 / np.where(dt > 0.0, dt, 1.0), 0.0)[:, None]
-        after.spread[:, range(3), range(3)] += np.square(self.noise.drift) * rate
-        after.spread[:, 3, 3] += self.wander**2 * dt
+        after.covariance[:, range(3), range(3)] += np.square(self.noise.drift) * rate
+        after.covariance[:, 3, 3] += self.wander**2 * dt
         return after
 
-    def _heard(self, state: FilterState, runs: PaddedRuns, k: int) -> FilterState:
-        """The gyro and the currents of a step taken in."""
+    def _measured(self, state: FilterState, runs: PaddedRuns, k: int) -> FilterState:
+        """Return the state corrected by the gyro and the currents of a step."""
         longer = WINDOW_S / np.where(runs.dt[:, k] > 0.0, runs.dt[:, k], WINDOW_S)
         radius = self.dynamics.base_radius
         row = np.zeros((len(longer), 8))
         row[:, 2], row[:, 4] = 1.0 / radius, 1.0
-        told = state.mean[:, 2] / radius + state.mean[:, 4]
-        state = state.corrected(row, runs.gyro[:, k] - told, self.noise.gyro**2 * longer)
-        if not self.hears_current:
+        expected = state.mean[:, 2] / radius + state.mean[:, 4]
+        state = state.corrected(row, runs.gyro[:, k] - expected, self.noise.gyro**2 * longer)
+        if not self.uses_current:
             return state
         for drive, rims in enumerate(self.dynamics.rims):
-            rim, pull = runs.rim[:, k, drive], runs.pull[:, k, drive]
+            rim, force = runs.rim[:, k, drive], runs.force[:, k, drive]
             slide = rim[:, None] - state.mean[:, :3] @ rims[:, None]
             scale = self.noise.gain * self.mass * np.sign(rim)
-            told = self.noise.offset + scale * self.dynamics.traction(slide)[:, 0]
+            expected = self.noise.offset + scale * self.dynamics.traction(slide)[:, 0]
             row = np.zeros((len(longer), 8))
             row[:, :3] = -scale[:, None] * self.dynamics.stiffness(slide) * rims
-            state = state.corrected(row, pull - told, self.noise.force**2 * longer, slice(3, 4))
+            state = state.corrected(
+                row, force - expected, self.noise.force**2 * longer, slice(3, 4)
+            )
         return state
 
     def _bounded(self, state: FilterState) -> FilterState:
-        """The weak constraint on rho."""
+        """Return the state after the weak constraint on rho."""
         law, straight = self.dynamics.law, 1.0 - self.dynamics.turning
         speed = np.linalg.norm(state.mean[:, :3] * straight, axis=1)
         rolling = state.mean[:, 3]
@@ -159,8 +172,8 @@ class SlipFilter:
         variance = np.full(len(rolling), (0.1 * self.noise.rolling) ** 2)
         return state.corrected(row, np.where(beyond == 0.0, np.nan, beyond), variance)
 
-    def _travelled(self, state: FilterState, heading: Each, dt: Each) -> FilterState:
-        """A step added to the error of the pose; the heading is that in its middle."""
+    def _with_pose_error(self, state: FilterState, heading: Each, dt: Each) -> FilterState:
+        """Return the state with the pose error after a step; the heading is that at mid-step."""
         radius = self.dynamics.base_radius
         turning = np.stack([np.cos(heading), np.sin(heading)], axis=1)
         aside = turning[:, ::-1] * [-1.0, 1.0]

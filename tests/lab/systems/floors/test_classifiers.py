@@ -11,47 +11,51 @@ from sklearn.discriminant_analysis import (
 from sklearn.ensemble import HistGradientBoostingClassifier
 
 from slipid.lab.systems.floors.cosine_energy import (
-    DRIVING,
     GRAVITY,
-    BoostedTreesClassifier,
     CosineEnergyClassifier,
     terms,
-    tree_rows,
 )
-from slipid.lab.systems.floors.gaussian import FeatureChannels, GaussianClassifier, features
 from slipid.lab.systems.floors.interface import training_rows
-from tests.helpers.made_felt import HZ, ahead, made_felt, made_felts
+from slipid.lab.systems.floors.learned import (
+    DRIVING,
+    BoostedTreesClassifier,
+    FeatureChannels,
+    GaussianClassifier,
+    features,
+    tree_classifiers,
+)
+from tests.helpers.made_floor_runs import HZ, ahead, made_floor_run, made_floor_runs
 from tests.helpers.made_runs import HUSKY, ROBOTINO
 
 
-def mixed_felts(seed: int = 0):
+def mixed_runs(seed: int = 0):
     """Runs at speeds that change, on floors whose currents overlap."""
     rng = np.random.default_rng(seed)
-    felts = []
+    runs = []
     for k in range(12):
         floor, level = [("grass", 2.0), ("ice", 2.6), ("snow", 3.0)][k % 3]
         speed = ahead(52) + rng.normal(size=(52, 2))
-        felts.append(made_felt(floor, speed, level, seed=seed + k, noise=1.0))
-    return felts
+        runs.append(made_floor_run(floor, speed, level, seed=seed + k, noise=1.0))
+    return runs
 
 
-def training(method, felts):
+def training(method, runs):
     """Features and floors as a method trains on them."""
     if isinstance(method, GaussianClassifier):
-        return training_rows(felts, lambda f: method._features(f, HUSKY, method.piece_s))
+        return training_rows(runs, lambda f: method._features(f, HUSKY, method.restart_s))
 
     def take(f):
-        return features(f, HUSKY, method.hearing, piece_s=method.piece_s)
+        return features(f, HUSKY, method.channels, restart_s=method.restart_s)
 
-    return training_rows(felts, take, method.rows_s)
+    return training_rows(runs, take, method.rows_s)
 
 
 @pytest.mark.parametrize("shared", [0.0, 1.0])
 def test_a_gaussian_is_discriminant_analysis(shared):
-    felts = mixed_felts()
+    runs = mixed_runs()
     method = GaussianClassifier(shared=shared, ridge=1e-9, apart_s=1 / HZ)
-    done = method.fit(felts, HUSKY)
-    rows, floor = training(method, felts)
+    done = method.fit(runs, HUSKY)
+    rows, floor = training(method, runs)
     log = done.fitted.log_likelihood(rows)
     rows, even = done.fitted.comparable(rows), np.full(3, 1 / 3)
     if shared:
@@ -67,19 +71,19 @@ def test_a_gaussian_is_discriminant_analysis(shared):
 
 
 def test_a_shared_part_lies_between():
-    felts, found = mixed_felts(), []
+    runs, found = mixed_runs(), []
     for shared in (0.0, 0.5, 1.0):
         method = GaussianClassifier(shared=shared)
-        root = method.fit(felts, HUSKY).fitted.root
+        root = method.fit(runs, HUSKY).fitted.root
         found.append(np.linalg.inv(root) @ np.linalg.inv(root).transpose(0, 2, 1))
     assert np.allclose(found[1], 0.5 * (found[0] + found[2]))
 
 
 def test_trees_are_those_of_the_library():
-    felts = mixed_felts()
+    runs = mixed_runs()
     method = BoostedTreesClassifier(trees=15, apart_s=1 / HZ, memory_s=np.inf)
-    done = method.fit(felts, HUSKY)
-    rows, floor = training(method, felts)
+    done = method.fit(runs, HUSKY)
+    rows, floor = training(method, runs)
     oracle = HistGradientBoostingClassifier(
         max_iter=15,
         learning_rate=method.rate,
@@ -89,19 +93,19 @@ def test_trees_are_those_of_the_library():
         early_stopping=False,
         random_state=0,
     ).fit(rows, floor)
-    felt = made_felt("ice", ahead(7), 2.6, seed=99)
+    run = made_floor_run("ice", ahead(7), 2.6, seed=99)
     frequency = np.array([np.mean(floor == name) for name in done.labels])
-    log = np.log(oracle.predict_proba(features(felt, HUSKY)) / frequency).sum(axis=0)
+    log = np.log(oracle.predict_proba(features(run, HUSKY)) / frequency).sum(axis=0)
     expected = np.exp(log - log.max())
-    assert np.allclose(done.probability([felt], HUSKY)[0][-1], expected / expected.sum())
+    assert np.allclose(done.probability([run], HUSKY)[0][-1], expected / expected.sum())
 
 
 def test_how_often_a_floor_was_driven_is_no_evidence():
     """Ten times as many runs on one of two floors that feel alike do not make it more probable."""
-    many = [made_felt("grass", ahead(), 2.0, seed=k) for k in range(20)]
-    few = [made_felt("snow", ahead(), 2.0, seed=100 + k) for k in range(2)]
+    many = [made_floor_run("grass", ahead(), 2.0, seed=k) for k in range(20)]
+    few = [made_floor_run("snow", ahead(), 2.0, seed=100 + k) for k in range(2)]
     done = BoostedTreesClassifier(trees=10).fit([*many, *few], HUSKY)
-    unseen = [made_felt("grass", ahead(13), 2.0, seed=200 + k) for k in range(30)]
+    unseen = [made_floor_run("grass", ahead(13), 2.0, seed=200 + k) for k in range(30)]
     mean = np.mean([b[3] for b in done.probability(unseen, HUSKY)], axis=0)
     assert mean[0] < 0.65
 
@@ -111,12 +115,12 @@ def test_trees_with_the_driving_off_do_not_go_by_the_speed():
 
     def runs(start: int):
         return [
-            made_felt(floor, ahead(rate=rate), 2.0, seed=start + k)
+            made_floor_run(floor, ahead(rate=rate), 2.0, seed=start + k)
             for k, (floor, rate) in enumerate([("road", 3.0), ("snow", 1.0)] * 6)
         ]
 
-    plain, off, driving, _ = tree_rows()
-    fast = made_felt("snow", ahead(26, rate=3.0), 2.0, seed=77)
+    plain, off, driving, _ = tree_classifiers()
+    fast = made_floor_run("snow", ahead(26, rate=3.0), 2.0, seed=77)
 
     def believed(method):
         return float(method.fit(runs(0), HUSKY).probability([fast], HUSKY)[0][-1, 0])
@@ -126,22 +130,22 @@ def test_trees_with_the_driving_off_do_not_go_by_the_speed():
     assert believed(off) < 0.8
 
 
-def test_rows_of_trees_hear_what_their_names_say():
-    plain, off, driving, vibration = tree_rows()
+def test_rows_of_trees_use_the_channels_of_their_names():
+    plain, off, driving, vibration = tree_classifiers()
     assert [r.name for r in (plain, off, driving, vibration)] == [
         "boosted_trees",
         "boosted_trees_felt",
         "boosted_trees_driving",
         "boosted_trees_vibration",
     ]
-    assert plain.hearing == off.hearing == FeatureChannels(True, True, False)
-    assert driving.hearing == DRIVING == FeatureChannels(False, False, False)
-    assert vibration.hearing == FeatureChannels(True, True, True)
-    assert off.driving_off
-    assert not plain.driving_off
+    assert plain.channels == off.channels == FeatureChannels(True, True, False)
+    assert driving.channels == DRIVING == FeatureChannels(False, False, False)
+    assert vibration.channels == FeatureChannels(True, True, True)
+    assert off.without_driving
+    assert not plain.without_driving
 
 
-def circle_felt(weight: np.ndarray, floor: str, seed: int = 0, noise: float = 0.0):
+def circle_run(weight: np.ndarray, floor: str, seed: int = 0, noise: float = 0.0):
     """A Robotino that goes in all directions; its energy coefficient is a series, and noise."""
     rng = np.random.default_rng(seed)
     rows = 72
@@ -153,16 +157,16 @@ def circle_felt(weight: np.ndarray, floor: str, seed: int = 0, noise: float = 0.
     # the same power in every motor: R I^2 + C |w| I = P / 3
     c, r = ROBOTINO.back_emf * ROBOTINO.gear_ratio * np.abs(speed), ROBOTINO.resistance
     amps = (np.sqrt(c**2 + 4 * r * power[:, None] / 3) - c) / (2 * r)
-    felt = made_felt(floor, speed, 1.0)
-    return replace(felt, current=amps, time=10.0 * np.arange(rows))
+    run = made_floor_run(floor, speed, 1.0)
+    return replace(run, current=amps, time=10.0 * np.arange(rows))
 
 
 def test_a_series_is_the_one_that_data_were_made_from():
     weight = np.array([0.5, 0.1, -0.05, 0.0, 0.08])
     method = CosineEnergyClassifier(harmonics=2, ridge=0.0)
-    done = method.fit([circle_felt(weight, "gray")], ROBOTINO)
+    done = method.fit([circle_run(weight, "gray")], ROBOTINO)
     assert np.allclose(done.fitted.weight[0], weight, atol=1e-9)
-    noisy = method.fit([circle_felt(weight, "gray", noise=0.05)], ROBOTINO)
+    noisy = method.fit([circle_run(weight, "gray", noise=0.05)], ROBOTINO)
     assert noisy.fitted.std[0] == pytest.approx(0.05, rel=0.2)
     assert np.allclose(noisy.fitted.weight[0], weight, atol=0.02)
 
@@ -171,23 +175,23 @@ def test_a_ridge_pulls_waves_towards_nothing_and_not_the_mean():
     weight = np.array([0.5, 0.1, 0.0, 0.0, 0.0])
     rows = 72
     done = CosineEnergyClassifier(harmonics=2, ridge=rows / 2).fit(
-        [circle_felt(weight, "gray")], ROBOTINO
+        [circle_run(weight, "gray")], ROBOTINO
     )
     assert np.allclose(done.fitted.weight[0], [0.5, 0.05, 0, 0, 0], atol=2e-3)
 
 
 def test_the_likelihood_is_that_of_normal_coefficients():
     weights = {"gray": np.array([0.5, 0.2, 0, 0, 0.0]), "green": np.array([0.6, -0.2, 0, 0, 0.0])}
-    felts = [
-        circle_felt(w, name, seed=k, noise=0.05 * (k + 1))
+    runs = [
+        circle_run(w, name, seed=k, noise=0.05 * (k + 1))
         for k, (name, w) in enumerate(weights.items())
     ]
     method = CosineEnergyClassifier(harmonics=2, ridge=0.0, apart_s=10.0, memory_s=np.inf)
-    done = method.fit(felts, ROBOTINO)
+    done = method.fit(runs, ROBOTINO)
     assert done.fitted.std[1] > 1.5 * done.fitted.std[0]
-    one = felts[0].part(0, 2)
+    one = runs[0].rows(0, 2)
     beliefs = done.probability([replace(one, time=np.array([0.0, 10.0]))], ROBOTINO)[0]
-    angle, energy = method._seen(one, ROBOTINO).T
+    angle, energy = method._direction_and_energy(one, ROBOTINO).T
     series = terms(angle, 2) @ done.fitted.weight.T
     density = np.exp(-0.5 * ((energy[:, None] - series) / done.fitted.std) ** 2) / done.fitted.std
     expected = np.cumprod(density, axis=0)
@@ -195,22 +199,25 @@ def test_the_likelihood_is_that_of_normal_coefficients():
 
 
 def test_a_logarithm_of_the_coefficient_may_be_modelled():
-    felt = circle_felt(np.array([0.5, 0.1, 0, 0, 0]), "gray")
-    plain, log = (CosineEnergyClassifier(logarithm=x)._seen(felt, ROBOTINO) for x in (False, True))
+    run = circle_run(np.array([0.5, 0.1, 0, 0, 0]), "gray")
+    plain, log = (
+        CosineEnergyClassifier(logarithm=x)._direction_and_energy(run, ROBOTINO)
+        for x in (False, True)
+    )
     assert np.allclose(np.log(plain[:, 1]), log[:, 1])
 
 
 def test_the_direction_of_a_skid_steer_is_that_of_going_and_turning():
     method = CosineEnergyClassifier()
     for wheels, expected in [([1, 1], 0), ([-1, -1], np.pi), ([-1, 1], np.pi / 2)]:
-        felt = made_felt("grass", np.tile(np.array(wheels, float), (5, 1)), 1.0)
-        angle = method._seen(felt, HUSKY)[-1, 0]
+        run = made_floor_run("grass", np.tile(np.array(wheels, float), (5, 1)), 1.0)
+        angle = method._direction_and_energy(run, HUSKY)[-1, 0]
         assert np.cos(angle - expected) == pytest.approx(1.0)
 
 
 def test_a_robot_that_stands_has_no_coefficient():
-    felt = made_felt("grass", np.zeros((4, 2)), 1.0)
-    assert np.isnan(CosineEnergyClassifier()._seen(felt, HUSKY)[:, 1]).all()
+    run = made_floor_run("grass", np.zeros((4, 2)), 1.0)
+    assert np.isnan(CosineEnergyClassifier()._direction_and_energy(run, HUSKY)[:, 1]).all()
 
 
 def test_candidates_of_the_series_are_with_and_without_heat_and_logarithm():
@@ -219,18 +226,19 @@ def test_candidates_of_the_series_are_with_and_without_heat_and_logarithm():
 
 
 def test_without_heat_a_coefficient_does_not_depend_on_how_fast_all_wheels_turn():
-    slow = made_felt("grass", ahead(5, rate=1.0), 2.0)
+    slow = made_floor_run("grass", ahead(5, rate=1.0), 2.0)
     fast = replace(slow, speed=3 * slow.speed)
     for losses, same in ((True, False), (False, True)):
         one, other = (
-            CosineEnergyClassifier(losses=losses)._seen(f, HUSKY)[:, 1] for f in (slow, fast)
+            CosineEnergyClassifier(losses=losses)._direction_and_energy(f, HUSKY)[:, 1]
+            for f in (slow, fast)
         )
         assert np.allclose(one, other) == same
 
 
-def test_a_gaussian_treats_what_was_not_heard_as_the_mean():
-    felts = made_felts({"grass": 2.0, "snow": 4.0})
-    done = GaussianClassifier().fit(felts, HUSKY)
-    deaf = replace(felts[0], gyro=np.full(60, np.nan))
+def test_a_gaussian_treats_missing_features_as_the_mean():
+    runs = made_floor_runs({"grass": 2.0, "snow": 4.0})
+    done = GaussianClassifier().fit(runs, HUSKY)
+    deaf = replace(runs[0], gyro=np.full(60, np.nan))
     assert np.isfinite(done.probability([deaf], HUSKY)[0]).all()
     assert done.probability([deaf], HUSKY)[0][-1, 0] > 0.9

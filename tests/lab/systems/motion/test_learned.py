@@ -17,11 +17,10 @@ from slipid.lab.systems.motion.features import (
 from slipid.lab.systems.motion.learners import (
     PASSES,
     BoostedTrees,
-    Boosting,
-    NetworkShape,
     NeuralNetwork,
 )
-from slipid.predict.slip_model import ByFloor, Run, path_of
+from slipid.predict.slip_model import Run, path_of
+from slipid.predict.slip_models import ByFloor
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
 SIZES = np.array([1.0, 1.0, 0.125])
@@ -108,7 +107,7 @@ def test_values_of_windows_are_those_of_their_steps():
     assert second[:, 0].tolist() == [3.0] * 7
 
 
-def test_scaled_columns_have_no_mean_and_unit_spread_and_end_where_nothing_was_seen():
+def test_scaled_columns_have_zero_mean_and_unit_std_and_are_clipped():
     x = np.random.default_rng(0).normal([1.0, -2.0], [3.0, 0.1], (500, 2))
     scale = Scale.of(np.column_stack([x, np.full(500, 0.7)]))
     scaled = scale.scaled(np.column_stack([x, np.full(500, 0.7)]))
@@ -123,7 +122,7 @@ def test_boosted_trees_come_as_near_to_two_levels_as_their_rate_lets_them():
     there, back = (
         slipping(angle, [ratio, 0.0, 0.0]) for angle, ratio in ((0.0, -0.2), (np.pi, 0.4))
     )
-    method = BoostedTrees(boosting=Boosting(0.1, 4, 20)).fit([there] * 8 + [back] * 8, ROBOTINO)
+    method = BoostedTrees(rate=0.1, leaves=4, trees=20).fit([there] * 8 + [back] * 8, ROBOTINO)
     said = method.predict([there.signals, back.signals], ROBOTINO)
     # every tree takes a tenth of what is left away from the mean of the two
     left = 0.9**20
@@ -140,7 +139,7 @@ def test_boosted_trees_come_as_near_to_two_levels_as_their_rate_lets_them():
 def test_trees_heed_windows_in_proportion_to_their_weight():
     # at a tenth of the usual speed slip is another; it counts 0.05 as much
     fast, slow = slipping(0.0, [-0.1, 0.0, 0.0]), slipping(0.0, [0.5, 0.0, 0.0], 0.025)
-    stump = BoostedTrees(boosting=Boosting(0.1, 2, 1))
+    stump = BoostedTrees(rate=0.1, leaves=2, trees=1)
     method = stump.fit([fast] * 30 + [slow] * 20, ROBOTINO)
     assert 0.6 * 50 * 8 < method.windows < 0.65 * 50 * 8
 
@@ -159,9 +158,7 @@ def test_a_neural_network_learns_how_slip_turns_with_the_direction():
 
 
 def test_the_numbers_of_a_network_are_its_weights():
-    method = NeuralNetwork(shape=NetworkShape((5, 4), 0.1)).fit(
-        [slipping(0.0, [0.1, 0.0, 0.0])], ROBOTINO
-    )
+    method = NeuralNetwork(hidden=(5, 4), alpha=0.1).fit([slipping(0.0, [0.1, 0.0, 0.0])], ROBOTINO)
     parts = (*method.network.coefs_, *method.network.intercepts_)
     assert method.numbers == sum(part.size for part in parts)
     assert NeuralNetwork().numbers == 0
@@ -173,7 +170,7 @@ def test_a_network_that_has_not_converged_does_not_warn():
     assert NeuralNetwork().fit(runs, ROBOTINO).network.n_iter_ == PASSES
 
 
-def test_a_network_says_nothing_beyond_what_it_was_taught():
+def test_the_output_of_a_network_is_clipped_to_the_training_range():
     runs = [slipping(angle, [0.2 * np.cos(angle), 0.0, 0.0]) for angle in np.linspace(0, 6, 40)]
     method = NeuralNetwork().fit(runs, ROBOTINO)
     fast = made_run(straight(0.0, speed=5.0))
@@ -197,7 +194,7 @@ def test_learned_slip_of_a_skid_steer_without_currents_is_that_of_each_floor(met
 
 
 @pytest.mark.parametrize("method", LEARNERS, ids=lambda method: method.name)
-def test_learned_methods_say_the_same_again_and_rest_where_wheels_rest(method):
+def test_learned_methods_are_reproducible_and_rest_where_wheels_rest(method):
     runs = [slipping(angle, [0.2, -0.1, 0.3]) for angle in np.linspace(0, 6, 12)]
     at_rest = made_run(np.zeros((40, 3))).signals
     one, other = (

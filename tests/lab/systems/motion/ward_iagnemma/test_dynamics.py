@@ -84,7 +84,7 @@ def test_a_step_solves_its_equation_however_stiff(spec):
         q, rolling = rng.normal(size=(2, 20, 3)) * 0.3
         rim, rho, dt = rolling @ dynamics.rims.T, np.full(20, law.rolling), np.full(20, 0.2)
         after = dynamics.step(q, rho, rim, dt).speeds
-        left = after - q - 0.2 * dynamics.push(after, rho, rim).rate
+        left = after - q - 0.2 * dynamics.acceleration(after, rho, rim).rate
         assert np.abs(left).max() < 1e-5
 
 

@@ -26,7 +26,7 @@ def test_linear_traction_makes_it_the_linear_kalman_filter():
     wheels, gyro, dt, radius = rng.normal(size=40), rng.normal(size=40), 0.1, 0.125
     rolling = np.outer(wheels, [0.0, 0.0, 1.0])
     heard = made_run(rolling, gyro=gyro, dt=dt).signals
-    own = SlipFilter(Dynamics.of(ROBOTINO, law), noise, 10.0, hears_current=False, wander=0.0)
+    own = SlipFilter(Dynamics.of(ROBOTINO, law), noise, 10.0, uses_current=False, wander=0.0)
     tracked = own.track(PaddedRuns.of([heard], ROBOTINO))
 
     # 2 (N / m) C2 u of three wheels, the 2 by the inertia m L^2 / 2
@@ -59,12 +59,14 @@ def test_a_measurement_is_that_of_the_textbook_but_for_the_pose():
     after = state.corrected(row[None], np.array([0.7]), np.array([0.3]))
     gain = spread @ row / (row @ spread @ row + 0.3)
     assert after.mean[0] == pytest.approx(mean + 0.7 * gain[:5])
-    assert after.spread[0, :5, :5] == pytest.approx((spread - np.outer(gain, row @ spread))[:5, :5])
-    assert after.spread[0, 5:, 5:] == pytest.approx(spread[5:, 5:])
+    assert after.covariance[0, :5, :5] == pytest.approx(
+        (spread - np.outer(gain, row @ spread))[:5, :5]
+    )
+    assert after.covariance[0, 5:, 5:] == pytest.approx(spread[5:, 5:])
     own = np.append(gain[:5], np.zeros(3))
     left = np.eye(8) - np.outer(own, row)
     joseph = left @ spread @ left.T + 0.3 * np.outer(own, own)
-    assert after.spread[0] == pytest.approx(joseph)
+    assert after.covariance[0] == pytest.approx(joseph)
     one = state.corrected(row[None], np.array([0.7]), np.array([0.3]), slice(3, 4))
     assert one.mean[0] == pytest.approx(mean + 0.7 * gain[:5] * [0, 0, 0, 1, 0])
     two = FilterState(np.tile(mean, (2, 1)), np.tile(spread, (2, 1, 1)))
@@ -73,12 +75,12 @@ def test_a_measurement_is_that_of_the_textbook_but_for_the_pose():
             np.tile(row, (2, 1)), np.array([0.7, news]), np.array([0.3, variance])
         )
         assert heard.mean == pytest.approx(np.stack([after.mean[0], mean]))
-        assert heard.spread == pytest.approx(np.stack([after.spread[0], spread]))
+        assert heard.covariance == pytest.approx(np.stack([after.covariance[0], spread]))
 
 
 def test_resistance_that_pushes_or_exceeds_traction_is_pulled_back():
     law, noise = ForceLaw(drag=2.0), FilterNoise(rolling=0.1)
-    own = SlipFilter(Dynamics.of(ROBOTINO, law), noise, 10.0, hears_current=False, wander=0.0)
+    own = SlipFilter(Dynamics.of(ROBOTINO, law), noise, 10.0, uses_current=False, wander=0.0)
     mean = np.array([[0.3, 0.4, 9.0, rho, 0.0] for rho in (-0.2, 0.1, 0.8)])
     spread = np.tile(np.diag([0.0, 0, 0, 0.01, 0, 0, 0, 0]), (3, 1, 1))
     after = own._bounded(FilterState(mean, spread)).mean[:, 3]
@@ -99,7 +101,7 @@ def test_the_spread_of_the_end_is_that_of_paths_with_other_twists():
     noise = FilterNoise(rolling=0.0, drift=(0.01, 0.02, 0.03))
     heard = made_run(np.tile([0.3, -0.2, 2.0], (2, 1)), dt=0.2).signals
     dynamics = Dynamics.of(ROBOTINO, FLOOR)
-    own = SlipFilter(dynamics, noise, 10.0, hears_current=False, wander=0.0)
+    own = SlipFilter(dynamics, noise, 10.0, uses_current=False, wander=0.0)
     runs = PaddedRuns.of([heard], ROBOTINO)
 
     def end(shaken):

@@ -7,7 +7,7 @@ from slipid.lab.systems.floors.interface import FloorSignals
 HZ = 6.5
 
 
-def made_felt(
+def made_floor_run(
     floor: str,
     speed: np.ndarray,
     level: float,
@@ -36,12 +36,12 @@ def ahead(rows: int = 60, rate: float = 1.5, drives: int = 2) -> np.ndarray:
     return np.full((rows, drives), rate)
 
 
-def made_felts(
+def made_floor_runs(
     levels: dict[str, float], runs: int = 4, rows: int = 60, **kw: float
 ) -> list[FloorSignals]:
     """Runs straight ahead on floors that differ in what motors draw there [A]."""
     return [
-        made_felt(floor, ahead(rows), level, seed=100 * n + k, name=f"{floor}/{k}", **kw)
+        made_floor_run(floor, ahead(rows), level, seed=100 * n + k, name=f"{floor}/{k}", **kw)
         for n, (floor, level) in enumerate(levels.items())
         for k in range(runs)
     ]

@@ -1,17 +1,17 @@
 """Video frames: their pixels, their times, and the interface of everything that supplies them."""
 
 import csv
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import Grey, opencv
 from slipid.support.errors import DataError, bad_data
 
 LOST = 0.02
@@ -34,33 +34,28 @@ class Frame:
 
     index: int
     time: float
-    grey: UInt8[np.ndarray, "row column"]
+    grey: Grey
 
 
-@runtime_checkable
-class FrameSource(Protocol):
-    """A video, a folder of pictures or a device that supplies frames."""
+@dataclass(frozen=True, eq=False)
+class FrameSource(ABC):
+    """A video, a folder of pictures or a device that supplies frames.
 
-    @property
-    def name(self) -> str:
-        """Its name in messages."""
+    Attributes:
+        name: its name in messages.
+        image_px: width and height of every frame.
+        count: expected number of frames; None where it is not known.
+        exact: whether `count` is exact, as where each frame has a given time.
+        identity: text that changes with its content, such as name, size and date.
+    """
 
-    @property
-    def image_px(self) -> tuple[int, int]:
-        """Width and height of every frame."""
+    name: str
+    image_px: tuple[int, int]
+    count: int | None
+    exact: bool
+    identity: str
 
-    @property
-    def count(self) -> int | None:
-        """Expected number of frames; None where it is not known."""
-
-    @property
-    def exact(self) -> bool:
-        """Whether `count` is exact, as where each frame has a given time."""
-
-    @property
-    def identity(self) -> str:
-        """Name, size and date, which distinguish it from other sources."""
-
+    @abstractmethod
     def frames(self, first: int = 0) -> Iterator[Frame]:
         """Yield the frames from a number on, in order."""
 
@@ -85,7 +80,7 @@ def stamp(path: Path) -> tuple[str, int, int]:
     return path.name, status.st_size, status.st_mtime_ns
 
 
-def grey_of(picture: np.ndarray) -> UInt8[np.ndarray, "row column"]:
+def grey_of(picture: np.ndarray) -> Grey:
     """Return the grey levels of a picture in blue, green, red, or of one that is grey already."""
     if picture.ndim == 2 or picture.shape[2] == 1:
         return np.asarray(picture).reshape(picture.shape[:2])

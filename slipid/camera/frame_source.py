@@ -1,0 +1,288 @@
+"""Frames from the file, folder or device that a user names, and one still picture of a floor."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import count as numbers
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from slipid.camera.frame import Frame, FrameSource, even_times, grey_of, read_times, stamp
+from slipid.camera.opencv import opencv, read_picture, size_of
+from slipid.support.errors import DataError
+
+BROKEN = 25
+"""Frames in a row that cannot be decoded, after which a video counts as ended."""
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+MEDIAN_FRAMES = 25
+"""Number of frames of a video from which a still picture is made."""
+Times = Float[np.ndarray, " frame"]
+"""Times of frames [s]."""
+
+
+class Capture:
+    """OpenCV's reader of a file or a device.
+
+    Raises:
+        DataError: it cannot be opened.
+    """
+
+    def __init__(self, place: str):
+        cv2 = opencv()
+        self._capture = cv2.VideoCapture(int(place) if place.isdigit() else place)
+        if not self._capture.isOpened():
+            raise DataError(
+                f"{place}: OpenCV cannot open it; expected a video in a format it knows, or a "
+                "camera that is plugged in (a recording that was cut off may have lost its index)"
+            )
+
+    def next_picture(self, decode: bool = True) -> np.ndarray | None:
+        """Return the next frame, or an empty one where it is not decoded; None at the end."""
+        for _ in range(BROKEN):
+            if not self._capture.grab():
+                continue
+            if not decode:
+                return np.zeros((0, 0, 3), np.uint8)
+            decoded, picture = self._capture.retrieve()
+            if decoded and picture is not None and picture.size:
+                return np.asarray(picture)
+        return None
+
+    def value(self, property_id: int) -> float:
+        """Return one of OpenCV's properties of the file or device."""
+        return float(self._capture.get(property_id))
+
+    def close(self) -> None:
+        """Release the file or device."""
+        self._capture.release()
+
+
+@dataclass(frozen=True, eq=False)
+class Video(FrameSource):
+    """A video file, with its own times or with given ones.
+
+    Attributes:
+        times: given time of each frame [s]; None takes the file's own.
+        fps: given frame rate [1/s], instead of times.
+    """
+
+    times: Times | None
+    fps: float | None
+
+    @classmethod
+    def at(cls, path: Path, fps: float | None, times: Times | None) -> "Video":
+        """Return a video; DataError where OpenCV cannot open it or decode its first frame."""
+        if fps is not None:
+            even_times(1, fps)
+        with closing(Capture(str(path))) as capture:
+            first = capture.next_picture()
+            if first is None:
+                raise DataError(
+                    f"{path}: no frame that OpenCV can decode; expected a video (a file that was "
+                    "cut off, as by a full disk, may have lost its index)"
+                )
+            announced = capture.value(opencv().CAP_PROP_FRAME_COUNT)
+        count = int(announced) if 0 < announced < 1e9 else None
+        if times is not None:
+            count = len(times)
+        identity = repr((stamp(path), fps, None if times is None else times.tolist()))
+        return cls(str(path), size_of(first), count, times is not None, identity, times, fps)
+
+    def frames(self, first: int = 0) -> Iterator[Frame]:
+        """Yield the frames from a number on; those before are skipped without decoding.
+
+        Raises:
+            DataError: the file has no times, they do not increase, or too few were given.
+        """
+        before = -np.inf
+        with closing(Capture(self.name)) as capture:
+            for k in numbers():
+                picture = capture.next_picture(decode=k >= first)
+                if picture is None:
+                    return
+                at = self._time(k, capture)
+                if at <= before and k >= first:
+                    raise DataError(
+                        f"{self.name}: frame {k} has time {at:.4f} s after {before:.4f} s; it "
+                        "has no times that increase: expected --fps, or --times FILE"
+                    )
+                before = at
+                if k >= first:
+                    yield Frame(k, at, grey_of(picture))
+
+    def _time(self, k: int, capture: Capture) -> float:
+        """Return the time of the frame that was read last [s]."""
+        if self.fps is not None:
+            return k / self.fps
+        if self.times is None:
+            return capture.value(opencv().CAP_PROP_POS_MSEC) / 1000.0
+        if k >= len(self.times):
+            raise DataError(
+                f"{self.name}: more than the {len(self.times)} frames that have a time; expected "
+                "a time for each"
+            )
+        return float(self.times[k])
+
+
+@dataclass(frozen=True, eq=False)
+class Device(FrameSource):
+    """A camera plugged into this computer; times are of its clock, from the first frame on.
+
+    Its identity never comes twice, since its frames do not either.
+
+    Attributes:
+        place: number or path of the device.
+        seconds: duration of the recording [s].
+    """
+
+    place: str
+    seconds: float
+
+    @classmethod
+    def at(cls, place: str, seconds: float) -> "Device":
+        """Return a camera; DataError where it supplies no frame."""
+        name = f"device {place}"
+        with closing(Capture(place)) as capture:
+            first = capture.next_picture()
+        if first is None:
+            raise DataError(f"{name}: it shows nothing; expected a camera that is not in use")
+        return cls(name, size_of(first), None, False, f"{place} {time.time_ns()}", place, seconds)
+
+    def frames(self, first: int = 0) -> Iterator[Frame]:
+        """Yield the frames from now on, until the recording is over."""
+        began: float | None = None
+        with closing(Capture(self.place)) as capture:
+            for k in numbers():
+                picture = capture.next_picture()
+                now = time.monotonic()
+                began = now if began is None else began
+                if picture is None or now - began > self.seconds:
+                    return
+                yield Frame(k, now - began, grey_of(picture))
+
+
+@dataclass(frozen=True, eq=False)
+class PictureFolder(FrameSource):
+    """Pictures in the order of their names, all of one size.
+
+    Attributes:
+        paths: files of the pictures.
+        times: time of each [s].
+    """
+
+    paths: tuple[Path, ...]
+    times: Times
+
+    @classmethod
+    def at(cls, folder: Path, fps: float | None, times: Times | None) -> "PictureFolder":
+        """Return every picture in a folder, at a rate or at given times.
+
+        Raises:
+            DataError: there is no picture, or not one time for each.
+        """
+        paths = sorted(p for p in folder.iterdir() if is_picture(p))
+        if not paths:
+            raise DataError(f"{folder}: no picture; expected {', '.join(PICTURES)}")
+        if times is None:
+            if fps is None:
+                raise DataError(f"{folder}: pictures have no times; expected --fps or --times FILE")
+            times = even_times(len(paths), fps)
+        if len(times) != len(paths):
+            raise DataError(
+                f"{folder}: {len(paths)} pictures and {len(times)} times; expected one each"
+            )
+        return cls.of(folder, paths, times)
+
+    @classmethod
+    def of(cls, place: Path, paths: Sequence[Path], times: Times) -> "PictureFolder":
+        """Return pictures of the first one's size; DataError where the first is no picture."""
+        size, identity = size_of(read_picture(paths[0])), repr([stamp(path) for path in paths])
+        return cls(str(place), size, len(paths), True, identity, tuple(paths), times)
+
+    def frames(self, first: int = 0) -> Iterator[Frame]:
+        """Yield the pictures from a number on; DataError where one has another size."""
+        for k in range(first, len(self.paths)):
+            picture = read_picture(self.paths[k])
+            if size_of(picture) != self.image_px:
+                (w, h), (width, height) = size_of(picture), self.image_px
+                raise DataError(
+                    f"{self.paths[k]}: {w} x {h} pixels; expected {width} x {height} as "
+                    f"{self.paths[0].name}"
+                )
+            yield Frame(k, float(self.times[k]), grey_of(picture))
+
+
+def open_source(
+    place: str, fps: float | None = None, times: Path | None = None, seconds: float | None = None
+) -> FrameSource:
+    """Return the frames of a video file, a folder of pictures or a device.
+
+    Args:
+        place: a file, a folder, or a device: its number, or its path such as /dev/video0.
+        fps: frames per second where times are not to be taken from the source.
+        times: CSV file with the columns frame and time [s], instead.
+        seconds: how long to record from a device, which has no end.
+
+    Raises:
+        DataError: nothing there that can be read, or no times.
+    """
+    if fps is not None and times is not None:
+        raise DataError("--fps and --times at once; expected one of them")
+    path = Path(place)
+    if place.isdigit() or place.startswith("/dev/video"):
+        if seconds is None or not 0 < seconds < float("inf"):
+            raise DataError(f"device {place}: it has no end; expected --seconds")
+        if fps is not None or times is not None:
+            raise DataError(f"device {place}: its times are this computer's; no --fps, no --times")
+        return Device.at(place, seconds)
+    if seconds is not None:
+        raise DataError(f"--seconds is for devices, not for {place}; a video is read to its end")
+    try:
+        size = path.stat().st_size
+    except (OSError, ValueError):
+        expected = "a video or a folder of pictures"
+        raise DataError(f"{path}: no such file or folder; expected {expected}") from None
+    given = None if times is None else read_times(times)
+    if path.is_dir():
+        return PictureFolder.at(path, fps, given)
+    if not size:
+        raise DataError(f"{path}: the file is empty; expected a video")
+    if is_picture(path):
+        given = even_times(1, fps or 1.0) if given is None else given
+        return PictureFolder.of(path, (path,), given)
+    return Video.at(path, fps, given)
+
+
+def is_picture(path: Path) -> bool:
+    """Return whether a file is a picture, by the end of its name."""
+    return path.suffix.lower() in PICTURES
+
+
+def still(path: Path) -> np.ndarray:
+    """Return a picture, or the median of a video's frames, as rows, columns and blue, green, red.
+
+    An object that moves through a video is not in the median, unless it stands in one place half of
+    the time.
+
+    Raises:
+        DataError: the file is neither a picture nor a video.
+    """
+    if is_picture(path) or not path.is_file() or not path.stat().st_size:
+        return read_picture(path)
+    with closing(Capture(str(path))) as capture:
+        count = int(capture.value(opencv().CAP_PROP_FRAME_COUNT))
+        every, kept = max(1, count // MEDIAN_FRAMES), []
+        for k in numbers():
+            chosen = k % every == 0
+            picture = capture.next_picture(decode=chosen)
+            if picture is None:
+                break
+            kept += [picture] if chosen else []
+            if len(kept) == 2 * MEDIAN_FRAMES:  # of a video that does not know its length
+                kept, every = kept[::2], 2 * every
+    if not kept:
+        raise DataError(f"{path}: no frame that OpenCV can decode; expected a picture or a video")
+    return np.median(np.stack(kept), axis=0).astype(np.uint8)

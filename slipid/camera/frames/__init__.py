@@ -1,1 +1,0 @@
-"""Frames and their times, from a video, a folder of pictures or a plugged-in camera."""

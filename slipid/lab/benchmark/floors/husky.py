@@ -1,0 +1,155 @@
+"""The floors of `borealtc`: a Husky on five floors without a pose.
+
+The robot is the Husky of the public logs with its maker's data and the measured behaviour of its
+motors and ammeters. Without a pose the torque constant is not identified; frictions of floors are
+then in units of the assumed constant, and only their ratios are meaningful.
+
+Logs have a folder per floor with a CSV file per run.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from slipid.data.reading.layout import Channel, Layout
+from slipid.data.reading.table import read_table
+from slipid.lab.benchmark.floors.protocol import EvaluationSettings, FloorTask, classifier_table
+from slipid.lab.benchmark.floors.result import ClassifierTable
+from slipid.lab.benchmark.floors.slipid_row import SlipidFloorClassifier
+from slipid.lab.systems.floors.cosine_energy import CosineEnergyClassifier
+from slipid.lab.systems.floors.interface import FloorClassifier, FloorSignals
+from slipid.lab.systems.floors.learned import GaussianClassifier, tree_classifiers
+from slipid.model.geometry import skid_steer
+from slipid.model.robot import Robot, build
+from slipid.predict.slip_model import RobotSpec
+from slipid.support.errors import bad_data
+from slipid.support.files import hash_of
+
+RADIUS = 0.165
+"""Wheel radius [m]."""
+MASS = 60.0
+"""Mass of the robot [kg]."""
+ZERO_A = 0.59
+"""Reading of the ammeters for wheels at rest [A]; for braking motors they read nothing."""
+FREE_A, FREE_AS = 0.54, 0.032
+"""Friction of a wheel in the air, and its growth with the wheel's speed [A], [A s/rad]."""
+
+FOLDER = "borealtc"
+ABOUT = (
+    "Husky on five floors, no pose: wheel speeds, sizes of currents and a gyro, 6.5 rows a second"
+)
+COLUMNS = ("time", "curL", "curR", "velL", "velR", "gyro_z", "accel_std")
+"""Time [s], currents without a sign [A], rim speeds [m/s], yaw rate [rad/s], and the std of the
+vertical acceleration since the row before [m/s^2]."""
+LAYOUT = Layout(FOLDER, {name: Channel(columns=(name,), unit="1") for name in COLUMNS})
+NEEDED = COLUMNS[:5]
+"""Columns without missing values."""
+LONGEST_S = 0.5
+"""Time between two rows above which a file holds two runs [s]."""
+FEWEST = 3
+"""Smallest number of rows of a run."""
+
+
+def husky() -> Robot:
+    """Return the robot, without floors."""
+    robot = build(skid_steer(0.256, 0.275, RADIUS, 78.71, drive_of=(0, 1, 0, 1)), ())
+    gain = float(robot.motor.gain)
+    motor = replace(
+        robot.motor,
+        coulomb_friction=jnp.asarray(gain * FREE_A),
+        viscous_friction=jnp.asarray(gain * FREE_AS),
+    )
+    return replace(robot, motor=motor, body=replace(robot.body, mass=jnp.asarray(MASS)))
+
+
+def read_floor_runs(root: Path, wheel_radius: float) -> list[FloorSignals]:
+    """Read the runs of a skid-steer robot below a folder, one folder per floor, as in `borealtc`.
+
+    A file is one run, or several where rows are more than `LONGEST_S` apart.
+
+    Args:
+        root: the folder.
+        wheel_radius: wheel radius [m].
+
+    Raises:
+        DataError: there is no file, or one cannot be read; names file, row and column.
+    """
+    files = sorted(root.glob("*/*.csv"))
+    if not files:
+        raise bad_data(root, "no file FLOOR/RUN.csv", "a folder per floor and a file per run")
+    return [run for path in files for run in _runs(path, wheel_radius)]
+
+
+def _runs(path: Path, wheel_radius: float) -> list[FloorSignals]:
+    """Return the runs of one file."""
+    table = read_table(path, LAYOUT)
+    if len(table.values) < FEWEST:
+        raise bad_data(path, f"{len(table.values)} rows", f"at least {FEWEST}")
+    for name in NEEDED:
+        missing = np.flatnonzero(~np.isfinite(table[name]))
+        if len(missing):
+            row = int(table.lines[missing[0]])
+            raise bad_data(path, "no number", "a finite number", row=row, column=name)
+    back = np.flatnonzero(np.diff(table["time"]) <= 0)
+    if len(back):
+        row = int(table.lines[back[0] + 1])
+        raise bad_data(path, "does not increase", "increasing times", row=row, column="time")
+    whole = FloorSignals(
+        name=f"{path.parent.name}/{path.stem}",
+        floor=path.parent.name.lower(),
+        time=table["time"],
+        speed=np.stack([table["velL"], table["velR"]], axis=1) / wheel_radius,
+        current=np.stack([table["curL"], table["curR"]], axis=1),
+        gyro=table["gyro_z"],
+        vibration=table["accel_std"],
+    )
+    edges = [0, *(np.flatnonzero(np.diff(whole.time) > LONGEST_S) + 1), len(whole)]
+    runs = [whole.rows(int(a), int(b)) for a, b in pairwise(edges)]
+    return [run for run in runs if len(run) >= FEWEST]
+
+
+def husky_classifiers() -> list[FloorClassifier]:
+    """Return all classifiers, slipid first, unfitted."""
+    slipid = SlipidFloorClassifier(robot=husky(), zero_a=ZERO_A)
+    return [slipid, CosineEnergyClassifier(), GaussianClassifier(), *tree_classifiers()]
+
+
+def husky_table(data: Path, quick: bool = False, only: tuple[str, ...] = ()) -> ClassifierTable:
+    """Return the table of all classifiers, or of the named ones.
+
+    Args:
+        data: folder with the data sets.
+        quick: one fold, short times, default settings.
+        only: names of rows; all if empty.
+
+    Raises:
+        DataError: the folder's files cannot be read.
+    """
+    runs = read_floor_runs(data / FOLDER, RADIUS)
+    spec = RobotSpec.of(husky().on(["any"]))
+    methods = [method for method in husky_classifiers() if not only or method.name in only]
+    settings = EvaluationSettings.quick() if quick else EvaluationSettings()
+    return classifier_table(methods, runs, spec, ABOUT, settings)
+
+
+class HuskyFloorTask(FloorTask):
+    """Table of the Husky on five floors without a pose."""
+
+    name = "husky_floors"
+    folder = FOLDER
+
+    @property
+    def rows(self) -> Sequence[str]:
+        return [method.name for method in husky_classifiers()]
+
+    def log_hash(self) -> str:
+        root = self.options.data / FOLDER
+        files = sorted(root.glob("*/*.csv"))
+        return hash_of((str(f.relative_to(root)), f.read_text(errors="replace")) for f in files)
+
+    def make(self) -> ClassifierTable:
+        return husky_table(self.options.data, self.options.quick, self.options.only)

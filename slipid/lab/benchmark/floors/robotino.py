@@ -1,0 +1,145 @@
+"""The floors of the Robotino runs of 2022, by wheel speeds and magnitudes of currents alone.
+
+Runs are split by headings, as elsewhere in the benchmark, and start where the wheels have moved a
+centimetre; none of them contains a stop or a second start. slipid is its fit to the training runs
+with their poses, and the estimator as it is deployed, with its own settings. It knows the load
+set-up, as a robot in service does; the other rows use neither poses nor loads, and are fitted to
+runs with all loads together.
+"""
+
+import time
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+
+from slipid.data.runs import Runs
+from slipid.lab.benchmark.floors.protocol import (
+    EvaluationSettings,
+    FloorTask,
+    ScoredClassifier,
+    answers_after,
+    attempted,
+    evaluated,
+    joined,
+    table_of,
+)
+from slipid.lab.benchmark.floors.result import Answer, ClassifierRow, ClassifierTable
+from slipid.lab.benchmark.protocols import base_of, splits
+from slipid.lab.benchmark.slipid_rows import (
+    NAME,
+    FloorKnowledge,
+    SlipidFit,
+    estimator_runs,
+    fit_slipid,
+)
+from slipid.lab.benchmark.steps import RunBatch, in_order, run_batches
+from slipid.lab.benchmark.work import BenchmarkOptions, FoldTask, checkpoint_of, data_of, problem_of
+from slipid.lab.systems.floors.cosine_energy import CosineEnergyClassifier
+from slipid.lab.systems.floors.interface import FloorClassifier, FloorSignals
+from slipid.lab.systems.floors.learned import GaussianClassifier, tree_classifiers
+from slipid.predict.slip_model import PredictedRun, Run
+
+SOURCE, KIND = "robotino2022", "headings"
+SECONDS = (0.5, 1.0, 2.0, 4.0)
+"""Times after which answers are read; steps last a third of a second, runs six and more [s]."""
+ABOUT = "Robotino on four floors, straight runs: wheel speeds and sizes of currents"
+
+
+def robotino_classifiers() -> list[FloorClassifier]:
+    """Return the classifiers besides slipid; without an accelerometer there is no vibration row."""
+    trees = [row for row in tree_classifiers() if not row.channels.vibration]
+    return [CosineEnergyClassifier(), GaussianClassifier(), *trees]
+
+
+def robotino_table(options: BenchmarkOptions) -> ClassifierTable:
+    """Return the table of all classifiers on the Robotino's runs, or of the requested ones.
+
+    A kept fit of slipid to the same runs is reused.
+    """
+    data, only = data_of(options, SOURCE), options.only
+    inner = 1 if options.quick else 2
+    settings = EvaluationSettings(seconds=SECONDS, inner=inner, first_s=max(SECONDS))
+    folds: dict[str, list[ScoredClassifier]] = {}
+    runs: list[FloorSignals] = []
+    for split in splits(data.facts, KIND)[: 1 if options.quick else None]:
+        kept = checkpoint_of(FoldTask(options, SOURCE, KIND, split.fold), fit=True)
+        fit = fit_slipid(data.job, problem_of(options, SOURCE), split.training, kept)
+
+        def batches(numbers: np.ndarray, fit: SlipidFit = fit) -> list[RunBatch]:
+            some = data.logged.subset(numbers)
+            return run_batches(some, fit.contact.robot, data.source.poses_per_step)
+
+        training = [floor_signals(run) for run in in_order(batches(split.training))]
+        batch = batches(split.held_out)
+        held_out = [floor_signals(run) for one in batch for run in one.runs]
+        runs += held_out
+        logs = data.logged.subset(split.held_out)
+        work = {NAME: partial(_slipid, fit, batch, logs, held_out)}
+        for method in robotino_classifiers():
+            work[method.name] = partial(evaluated, method, training, held_out, data.spec, settings)
+        for name, one in work.items():
+            if not only or name in only:
+                folds.setdefault(name, []).append(attempted(name, one))
+    done = {name: joined(each) for name, each in folds.items()}
+    return table_of(done, runs, ABOUT, settings, NAME)
+
+
+def floor_signals(run: Run) -> FloorSignals:
+    """Return the signals of a run for classifiers, without its pose.
+
+    Raises:
+        ValueError: it has no currents.
+    """
+    signals = run.signals
+    if signals.current is None:
+        raise ValueError(f"{signals.name}: no current; classifiers of floors need it")
+    return FloorSignals(
+        name=signals.name,
+        floor=base_of(run.floor),
+        time=np.cumsum(signals.dt),
+        speed=signals.speed,
+        current=np.abs(signals.current),
+        gyro=signals.gyro,
+    )
+
+
+def _slipid(
+    fit: SlipidFit, batches: list[RunBatch], data: Runs, runs: list[FloorSignals]
+) -> ScoredClassifier:
+    """Return the estimator's result on held-out runs."""
+    began = time.perf_counter()
+    predicted = estimator_runs(fit, batches, data, FloorKnowledge())
+    took = time.perf_counter() - began
+    answers: list[Answer] = []
+    for run, one in zip(runs, predicted, strict=True):
+        labels, beliefs = beliefs_of(one)
+        answers += answers_after(run, beliefs, labels, SECONDS)
+    row_us = 1e6 * took / sum(map(len, runs))
+    row = ClassifierRow(NAME, numbers=fit.numbers, fit_s=fit.seconds, row_us=row_us)
+    return ScoredClassifier(row, tuple(answers))
+
+
+def beliefs_of(predicted: PredictedRun) -> tuple[tuple[str, ...], np.ndarray]:
+    """Return the known floors, and their probabilities given that it is one of them."""
+    assert predicted.floors is not None
+    labels = tuple(name for name in predicted.floors if name != "unknown")
+    each = np.stack([predicted.floors[name] for name in labels], axis=1)
+    return labels, each / each.sum(axis=1, keepdims=True)
+
+
+class RobotinoFloorTask(FloorTask):
+    """Table of the Robotino on four floors; slipid is its fit to the runs with poses."""
+
+    name = "robotino_floors"
+    folder = SOURCE
+
+    @property
+    def rows(self) -> Sequence[str]:
+        return [NAME, *(method.name for method in robotino_classifiers())]
+
+    def log_hash(self) -> str:
+        return data_of(self.options, SOURCE).job.data_hash
+
+    def make(self) -> ClassifierTable:
+        return robotino_table(self.options)
