@@ -121,7 +121,7 @@ def test_every_field_has_a_unit():
 def test_a_docstring_says_what_each_attribute_is():
     said = attribute_docs(Measurement)
     assert said["gyro"] == "yaw rate [rad/s]"
-    assert said["fix_std"].startswith("of its place [m] and of its heading [rad]")
+    assert said["fix_std"].startswith("std of the fix's position [m] and heading [rad]")
     assert set(said) == set(vars(Measurement()))
 
 
