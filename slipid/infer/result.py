@@ -17,9 +17,7 @@ from slipid.data.runs import Runs
 from slipid.fit.noise import POOLED
 from slipid.fit.optimise import Optimum
 from slipid.fit.problem import Problem
-from slipid.fit.shared_effects import (
-    EffectTable,
-)
+from slipid.fit.shared_effects import FittedEffects
 from slipid.fit.variances import Search, Square
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.disputed import Dispute, disputes, marked
@@ -117,7 +115,7 @@ class Fit:
     current_trend: tuple[float, float] = (0.0, 0.0)
     mixed: Mapping[str, Any] | None = None
     refused: Mapping[str, Any] | None = None
-    shared: Mapping[str, EffectTable] = field(default_factory=dict)
+    shared: Mapping[str, FittedEffects] = field(default_factory=dict)
     extrapolation: Mapping[str, float] = field(default_factory=dict)
     data: Runs | None = None
     problem: Problem | None = None

@@ -8,7 +8,8 @@ import numpy as np
 
 from slipid.lab.benchmark.protocols import INNER, inner
 from slipid.lab.benchmark.scores import scored
-from slipid.predict.slip_model import TRIES, ByFloor, RobotSpec, Run, SlipModel
+from slipid.predict.slip_model import TRIES, RobotSpec, Run, SlipModel
+from slipid.predict.slip_models import ByFloor
 
 WORST = 2.0
 """Relative error above which all errors of a setting count the same."""
