@@ -1,10 +1,11 @@
 """The config of a map: surfaces by colour or by marked points, the region, and masks on it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
+from jaxtyping import Float
 from pydantic import Field, model_validator
 
 from slipid.data.floor_map import Colour, Point
@@ -78,28 +79,11 @@ def read_palette(path: Path) -> Palette:
     return palette
 
 
-@dataclass(frozen=True)
-class ProposedSurface:
-    """A surface proposed without a config, and points on it.
-
-    Attributes:
-        name: name for the config.
-        colour: `#rrggbb`.
-        share: part of the mapped floor that it covers [1].
-        points: places on it [pixel].
-    """
-
-    name: str
-    colour: str
-    share: float
-    points: tuple[tuple[float, float], ...]
-
-
-def palette_text(surfaces: Sequence[ProposedSurface], image: str, before: Palette) -> str:
+def palette_text(surfaces: Sequence[str], image: str, before: Palette) -> str:
     """Return a config that finds the same surfaces again, to be edited.
 
     Args:
-        surfaces: the proposed surfaces.
+        surfaces: tables of the proposed surfaces, see `points_text`.
         image: name of the picture.
         before: config without surfaces, whose region and masks are kept.
     """
@@ -114,15 +98,23 @@ def palette_text(surfaces: Sequence[ProposedSurface], image: str, before: Palett
     lines += _polygon("[region]", before.region) if before.region else _EXAMPLE
     for one in before.mask:
         lines += _polygon("[[mask]]", one)
-    for surface in surfaces:
-        points = ", ".join(f"[{x:.0f}, {y:.0f}]" for x, y in surface.points)
-        lines += [
-            f"[[points]]  # {surface.colour}, {100 * surface.share:.1f} % of the mapped floor",
-            f'surface = "{surface.name}"',
-            f"at_px = [{points}]",
-            "",
-        ]
-    return "\n".join(lines)
+    return "\n".join([*lines, *surfaces])
+
+
+def points_text(name: str, colour: str, share: float, pixels: Float[np.ndarray, "point 2"]) -> str:
+    """Return the table of a surface that is marked by points.
+
+    Args:
+        name: name for the surface.
+        colour: its colour `#rrggbb`, for a comment.
+        share: part of the mapped floor that it covers [1], for a comment.
+        pixels: points on it.
+    """
+    points = ", ".join(f"[{x:.0f}, {y:.0f}]" for x, y in pixels.tolist())
+    return (
+        f"[[points]]  # {colour}, {100 * share:.1f} % of the mapped floor\n"
+        f'surface = "{name}"\nat_px = [{points}]\n'
+    )
 
 
 _EXAMPLE = [
