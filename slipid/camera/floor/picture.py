@@ -7,9 +7,18 @@ import numpy as np
 
 from slipid.camera.floor.grid import RobotShape
 from slipid.camera.floor.light import Features, features_of
-from slipid.camera.floor.palette import SCHEMA, Palette, palette_text, points_text, read_palette
 from slipid.camera.floor.proposal import matched, proposed
-from slipid.camera.floor.region import FloorPicture, FloorRegion, requested_region, seeds_of
+from slipid.camera.floor.region import (
+    SCHEMA,
+    FloorPicture,
+    FloorRegion,
+    Palette,
+    palette_text,
+    points_text,
+    read_palette,
+    requested_region,
+    seeds_of,
+)
 from slipid.camera.floor.result import PictureMap, Segmentation, map_from
 from slipid.camera.floor.surfaces import (
     AROUND,
