@@ -50,7 +50,7 @@ def test_all_but_extras_runs_without_their_libraries():
     assert done.returncode == 0, done.stderr
 
 
-def test_xla_is_told_only_what_it_knows_and_nobody_said_otherwise(monkeypatch):
+def test_xla_gets_only_flags_that_it_knows_and_that_are_not_set(monkeypatch):
     from slipid.support import jax_setup
 
     for version, before, after in (

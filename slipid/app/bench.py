@@ -118,7 +118,7 @@ def read_motor_log(
 def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
     """Return the record of each motor of a log, at the motor shaft."""
     if log.current is None:
-        raise DataError(f"{log.name}: no current; expected a column of it for each motor")
+        raise DataError(f"{log.name}: no current; expected a column for each motor")
     if not log.wheels:
         raise DataError(f"{log.name}: no speed; expected the speed or angle of each motor's shaft")
     speed = log.wheel_speed

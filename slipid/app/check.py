@@ -60,8 +60,8 @@ def _braking(task: FitTask) -> Iterator[Finding]:
     if has and not runs.current_is_signed and not task.robot.geometry.determines_twist:
         yield Finding(
             "braking_unseen",
-            "currents are magnitudes, and in turns a wheel that is dragged along brakes: read with "
-            "the voltages as if it drove, they give a wrong resistance and back-EMF",
+            "currents are magnitudes, and in turns a wheel that is dragged along brakes: taken as "
+            "driving currents beside the voltages, they give a wrong resistance and back-EMF",
             "log currents with their sign, or take the voltage out of the layout",
             "wrong",
         )

@@ -128,7 +128,7 @@ def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
     if config["sha256"] == task.config.hash and data["hash"] == task.data_hash:
         return None
     other = "other logs" if config["sha256"] == task.config.hash else f"another {config['name']}"
-    return f"{out} holds a fit of {other}; it is replaced when this one is done"
+    return f"{out} has a fit of {other}; it is replaced when this one is done"
 
 
 def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:

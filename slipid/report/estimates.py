@@ -91,15 +91,15 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
 
 
-def show_trust(page: Page, judged: "TrustReport") -> None:
+def show_trust(page: Page, found: "TrustReport") -> None:
     """Write the open-loop errors of the fit on its own runs, and the trust in it."""
-    if judged.floors:
+    if found.floors:
         made = table(("surface", "end / path", "encoders alone"))
-        for name, e in judged.floors.items():
+        for name, e in found.floors.items():
             made.add_row(name, percent(e.model), percent(e.encoders))
-        page.line(f"open loop from the first pose on, {judged.runs} of the fitted runs:")
+        page.line(f"open loop from the first pose on, {found.runs} of the fitted runs:")
         page.table(made)
-    page.line(f"verdict: {judged.trust}")
+    page.line(f"verdict: {found.trust}")
 
 
 _COMMANDED = ("commanded headings", r"and speeds \[m/s]")

@@ -32,7 +32,7 @@ def test_the_other_length_is_free(tmp_path, trusted, freed):
     assert found & {"robot.wheel_radius", "camera.scale"} == {freed}
 
 
-def test_neither_is_free_unless_it_is_said(tmp_path):
+def test_neither_is_free_by_default(tmp_path):
     assert not free(job(tmp_path, "")) & {"robot.wheel_radius", "camera.scale"}
 
 

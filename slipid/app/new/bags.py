@@ -83,7 +83,7 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
     if not any(one.channel == "pose" for one in channels):
         questions.append("no topic with a pose was found: a fit needs one")
     if not wheels:
-        questions.append("no topic tells how wheels turn: which one does, and in which field?")
+        questions.append("no topic has the wheels' motion: which one does, and in which field?")
     is_bag = path.is_file() or bag == path / _METADATA
     root = path.parent if is_bag else path
     inside = [PurePosixPath(one.relative_to(root)) for one in bags]
@@ -95,7 +95,7 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
         _unused(topics, channels),
         tuple(questions),
     )
-    floor = "on which floor was it driven? Or a topic or table tells: runs, in the layout"
+    floor = "on which floor was it driven? A topic or table can give it: runs, in the layout"
     glob = common_glob(inside)
     draft = ConfigDraft(
         guessed.robot,
@@ -125,7 +125,7 @@ def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
         return names, f"which of the joints are wheels, in which order? {', '.join(names)}"
     ordered = tuple(sorted(wheels, key=lambda name: rank(labels[name].label)))
     others = [name for name in names if name not in wheels]
-    doubt = f"joints that are taken for no wheels: {', '.join(others)}" if others else ""
+    doubt = f"joints that are not taken for wheels: {', '.join(others)}" if others else ""
     return ordered, doubt
 
 

@@ -140,7 +140,7 @@ def drawing(robot: Geometry) -> str:
     which it rolls at a positive speed, and the letter of the motor that it shares with other
     wheels.
     """
-    lines = ["seen from above, arrows: the way of a positive wheel speed", ""]
+    lines = ["seen from above, arrows: direction of a positive wheel speed", ""]
     lines += _picture(_grid_wheels(robot))
     lines += [
         "",

@@ -111,9 +111,9 @@ def channels_in(numbers: TableNumbers) -> FileChannels:
     first: dict[str, FileChannel] = {}
     for resolved in _resolved(found):
         first.setdefault(resolved.channel, resolved)
-    notes = _odometry_note(numbers, meanings) + [f"not used, said twice: {', '.join(also)}"] * bool(
-        also
-    )
+    notes = _odometry_note(numbers, meanings) + [
+        f"not used, a second column: {', '.join(also)}"
+    ] * bool(also)
     kept, dropped = _consistent(list(first.values()))
     used = {at for one in kept for at in one.columns}
     unused = [
@@ -209,7 +209,7 @@ def _odometry_note(numbers: TableNumbers, meanings: dict[int, ColumnMeaning]) ->
     names = [numbers.format.names[at] for at, one in meanings.items() if one.channel == "odometry"]
     if not names:
         return []
-    return [f"{', '.join(names)}: odometry is no pose of its own, wheels tell it already"]
+    return [f"{', '.join(names)}: odometry is no measured pose, it comes from the wheels"]
 
 
 def unnamed_channels(numbers: TableNumbers) -> FileChannels:

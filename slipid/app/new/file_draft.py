@@ -36,11 +36,11 @@ ASK_EFFORT = (
 )
 _ASK_COLUMNS = "which column holds what? There are: {}"
 _SUPPLY_CURRENT = (
-    "positive whichever way the wheels drive, and negative at times, so it is what the battery "
-    "gives: slipid wants the current of each motor"
+    "positive in both directions of the wheels, and negative at times, so it is the battery's: "
+    "slipid needs the current of each motor"
 )
 _BATTERY_VOLTAGE = (
-    "it stays up whatever the wheels do, so it is the battery's: slipid wants the voltage at the "
+    "it stays up whatever the wheels do, so it is the battery's: slipid needs the voltage at the "
     "motors, or duty beside bus_voltage"
 )
 
@@ -110,7 +110,7 @@ def _layout_settings(run: RunStudy) -> list[ConfigLine]:
     lines.append(layout_line("gear_ratio", robot.gear_ratio, comment="as above"))
     if run.find(*CURRENTS) is not None and not run.of_supply:
         sign = run.has_sign
-        ask = "the logs do not tell: do currents have a sign, or are they magnitudes?"
+        ask = "the logs do not show it: do currents have a sign, or are they magnitudes?"
         lines.append(
             layout_line(
                 "current_is_signed",
@@ -199,7 +199,7 @@ def unit_of(one: FileStudy, found: FileChannel, run: RunStudy) -> UnitGuess:
     if channel == "time":
         return one.clock or UnitGuess("s")
     if channel in ("pose_x", "pose_y"):
-        # asked once is enough
+        # one question is enough for x and y
         place = run.by_pose.unit
         return place if channel == "pose_x" else UnitGuess(place.unit)
     if channel == "pose_heading":

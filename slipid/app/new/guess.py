@@ -70,7 +70,7 @@ def _likely_drive(wheels: int, aside: bool | None) -> tuple[str, str]:
         return "general", f"{wheels} wheels: where do they stand, in the order of the columns?"
     if wheels == 1:
         return "omni", "one column of wheels only: a motor on a bench (slipid motor FILE), or more?"
-    return "omni", "no column tells how wheels turn: which drive is it, and how many wheels?"
+    return "omni", "no column has the wheels' motion: which drive is it, and how many wheels?"
 
 
 def drives_sideways(files: tuple[FileStudy, ...]) -> bool | None:
@@ -248,9 +248,7 @@ def _run_files(kinds: list[tuple[FileKind, FileStudy]]) -> tuple[list[RunFiles],
         group = RunFiles(kind, main, tuple(beside))
         groups.append(replace(group, others=_more_runs(group)))
     lost = [kind for kind, _ in rest if kind not in used]
-    lines = [
-        f"{k.paths[0]}: no wheels in it, and nothing of a run that it lies beside" for k in lost
-    ]
+    lines = [f"{k.paths[0]}: no wheels in it, and no channels for a run beside it" for k in lost]
     return groups, lines
 
 
@@ -268,7 +266,7 @@ def _more_runs(group: RunFiles) -> tuple[RunFiles, ...]:
             beside = tuple((name, study_file(format_of(path))) for name, path in names)
             out.append(RunFiles(group.kind, study_file(format), beside))
         except DataError:
-            continue  # the reader will say it of this run; the first one tells enough
+            continue  # the reader will report this run; the first one is enough here
     return tuple(out)
 
 
@@ -280,4 +278,4 @@ def _sentence(group: RunFiles) -> str:
         for (name, _), channels in zip(group.beside, listed[1:], strict=True)
     ]
     like = f"{len(group.kind.paths)} like {group.kind.paths[0]}"
-    return f"{like}: {listed[0] or 'nothing known'}{''.join(more)}"
+    return f"{like}: {listed[0] or 'no known channel'}{''.join(more)}"

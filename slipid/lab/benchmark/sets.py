@@ -117,7 +117,7 @@ class DataSet:
 
     Attributes:
         source: source of the logs.
-        job: job of slipid's fit to the runs.
+        job: task of slipid's fit to the runs.
         logged: the same runs with all logged channels.
         facts: facts of each run for splits.
         crossing: runs over several floors, or None.
@@ -212,7 +212,7 @@ def _with_currents(config: Config, currents: CurrentColumns | None) -> Config:
 
 
 def _job(config: Config, logged: Runs, source: LogSource) -> ConfigFitTask:
-    """Return the job of slipid's fit to runs, with currents only if its config reads them."""
+    """Return the task of slipid's fit to runs, with currents only if its config reads them."""
     fitted = logged
     if source.currents is not None:
         logs = [replace(log, current=None, current_fresh=None) for log in logged.logs]

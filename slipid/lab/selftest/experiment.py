@@ -116,7 +116,7 @@ def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
     paths = [e.path for e in problem.space.free] + [e.path for e in ratios]
     given = config.content.selftest.wanted
     patterns = ["surface.*.creep"]
-    if problem.robot.geometry.determines_twist:  # else runs hardly tell where the weight is
+    if problem.robot.geometry.determines_twist:  # other drives hardly show where the weight is
         patterns += ["surface.*.roller_drag", "robot.load_share@*"]
     patterns += ["surface.*.friction/motor.back_emf"] if w.has_current else []
     patterns += ["motor.resistance", "motor.back_emf"] if w.has_current and w.has_voltage else []

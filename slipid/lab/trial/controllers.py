@@ -104,7 +104,7 @@ def unused_gains(robot: DeployedRobot, forced: bool) -> str:
     if tuned is None:
         return ""
     if tuned.load != robot.load_setup:
-        return f"gains were tuned for load set-up {tuned.load}: driving with those set by hand"
+        return f"gains were tuned for load set-up {tuned.load}: driving with hand-set gains"
     if not (tuned.is_better or forced):
         return (
             f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "
