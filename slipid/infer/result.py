@@ -20,7 +20,7 @@ from slipid.fit.optimise import Optimum
 from slipid.fit.problem import Problem, log_jacobian
 from slipid.fit.shared_effects import (
     EffectPosterior,
-    EffectTable,
+    FittedEffects,
     marginal_residuals,
     marginal_slopes,
 )
@@ -124,7 +124,7 @@ class Fit:
     current_trend: tuple[float, float] = (0.0, 0.0)
     mixed: Mapping[str, Any] | None = None
     refused: Mapping[str, Any] | None = None
-    shared: Mapping[str, EffectTable] = field(default_factory=dict)
+    shared: Mapping[str, FittedEffects] = field(default_factory=dict)
     extrapolation: Mapping[str, float] = field(default_factory=dict)
     data: Runs | None = None
     problem: Problem | None = None
