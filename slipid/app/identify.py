@@ -166,7 +166,7 @@ def optimised(
 ) -> tuple[Problem, Optimum]:
     """Return the optimum of a task and the problem it belongs to, starting from `task.problem()`.
 
-    Windows are cut again, which makes another problem, where the fitted lag is far from the
+    Windows are cut again, which makes another problem, where the fitted lag differs from the
     expected one (see `FitTask.cutting_robot`). The fit continues from the checkpoint of this very
     task, and every round is kept there.
     """

@@ -1,4 +1,4 @@
-"""What a check promises before a fit, and what the fit then keeps."""
+"""Expected verdicts before a fit, and whether the fit keeps them."""
 
 from functools import partial
 

@@ -94,7 +94,7 @@ def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, spec: RobotS
 
 
 def settings_of(best: object, candidates: Sequence[object]) -> str:
-    """Return the best candidate's values of fields in which candidates differ: `ridge = 0.01`."""
+    """Return the settings in which candidates differ, of the best one, such as `ridge = 0.01`."""
     inside = [vars(c.method if isinstance(c, ByFloor) else c) for c in (best, *candidates)]
     names = [name for name in inside[0] if len({repr(one[name]) for one in inside}) > 1]
     return ", ".join(f"{name} = {inside[0][name]!r}" for name in names)
