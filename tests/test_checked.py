@@ -93,7 +93,7 @@ def test_axes_of_one_name_are_of_one_length(made):
         made.pair(3.0, ONES)
 
 
-def test_functions_of_one_code_are_checked_alike_and_stay_themselves(made):
+def test_functions_with_equal_code_are_checked_equally_and_stay_themselves(made):
     one, other, wrong = made.adder(1.0), made.adder(2.0), made.adder(np.ones((2, 1)))
     np.testing.assert_array_equal(one(ONES), 2.0)
     np.testing.assert_array_equal(other(ONES), 3.0)
@@ -115,7 +115,7 @@ def test_defaults_are_kept(made):
         made.scaled(ONES, "a")
 
 
-def test_dataclasses_whose_code_is_equal_are_told_apart(made):
+def test_dataclasses_with_equal_code_are_distinguished(made):
     assert (made.One(1).x, made.Other("a").x) == (1, "a")
     with REFUSED:
         made.One("a")

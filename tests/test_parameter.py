@@ -1,4 +1,4 @@
-"""Declared numbers: the ways between SI and search space, and names."""
+"""Declared numbers: conversion between SI and search space, and names."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_paths_of_the_contract():
         assert path in paths
 
 
-def test_every_declaration_says_its_unit_and_starts_inside_its_bounds():
+def test_every_declaration_has_a_unit_and_starts_inside_its_bounds():
     robot = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["gray"], sessions=("one",))
     for e in entries(robot):
         d = e.declaration

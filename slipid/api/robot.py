@@ -114,7 +114,7 @@ def export(
     Args:
         robot: a fit's or a posterior's `deploy()`, or `DeployedRobot.load`; `on(...)` leaves floors
             out.
-        folder: that is new, empty, or an older export, which is then replaced.
+        folder: a new or empty folder, or an older export, which is then replaced.
         to: `c` (C99 of the very steps of estimator and controller), `ros2` (parameters by the names
             of ros2_controllers and robot_localization), `stablehlo`, `table` (Markdown and CSV).
         controller: a controller of `slipid trial`.

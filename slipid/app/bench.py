@@ -81,10 +81,17 @@ def read_bench_task(config: Config, root: Path, report: Reporter) -> BenchTask:
     robot = config.content.robot
     names = robot.names if isinstance(robot, BenchMotors) else []
     labels = _labels(names, counts.pop(), str(config.path))
-    parts, left = _with_voltage(parts)
+    with_voltage = [p for p in parts if p[0].voltage is not None]
+    dropped: list[str] = []
+    if 0 < len(with_voltage) < len(parts):
+        without = len(parts) - len(with_voltage)
+        dropped, parts = (
+            [f"skipped: {without} logs without a voltage, others have one"],
+            with_voltage,
+        )
     records = {label: tuple(p[k] for p in parts) for k, label in enumerate(labels)}
     choices = {label: _choices(config, label) for label in labels}
-    lines = (*skipped, *left)
+    lines = (*skipped, *dropped)
     for line in lines:
         report.line(line)
     unit_is_known = any(
@@ -114,7 +121,7 @@ def read_motor_log(
 def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
     """Return the record of each motor of a log, at the motor shaft."""
     if log.current is None:
-        raise DataError(f"{log.name}: no current; expected a column of it for each motor")
+        raise DataError(f"{log.name}: no current; expected a column for each motor")
     if not log.wheels:
         raise DataError(f"{log.name}: no speed; expected the speed or angle of each motor's shaft")
     speed = log.wheel_speed
@@ -160,14 +167,6 @@ def _labels(names: Sequence[str], motors: int, where: str) -> tuple[str, ...]:
             f"{where}: robot.names: {len(names)} names; expected {motors}, one per motor"
         )
     return tuple(names) or (("",) if motors == 1 else tuple(str(k + 1) for k in range(motors)))
-
-
-def _with_voltage(parts: list[list[BenchRecord]]) -> tuple[list[list[BenchRecord]], list[str]]:
-    """Return the logs that have a voltage, if any has one, and a line about the others."""
-    have = [p for p in parts if p[0].voltage is not None]
-    if not have or len(have) == len(parts):
-        return parts, []
-    return have, [f"skipped: {len(parts) - len(have)} logs without a voltage, others have one"]
 
 
 def _choices(config: Config, label: str) -> tuple[Choice, ...]:

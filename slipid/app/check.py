@@ -14,7 +14,6 @@ from slipid.data.align.clock import Clock
 from slipid.data.check.findings import Finding, worst_first, wrong
 from slipid.data.check.sanity import findings
 from slipid.data.log import Log
-from slipid.data.reading.reader import AnyLayout
 from slipid.data.runs import Runs
 from slipid.fit.problem import CREEPS, Problem
 from slipid.infer import slip_curves as curves_of
@@ -61,8 +60,8 @@ def _braking(task: FitTask) -> Iterator[Finding]:
     if has and not runs.current_is_signed and not task.robot.geometry.determines_twist:
         yield Finding(
             "braking_unseen",
-            "currents are magnitudes, and in turns a wheel that is dragged along brakes: read with "
-            "the voltages as if it drove, they give a wrong resistance and back-EMF",
+            "currents are magnitudes, and in turns a wheel that is dragged along brakes: taken as "
+            "driving currents beside the voltages, they give a wrong resistance and back-EMF",
             "log currents with their sign, or take the voltage out of the layout",
             "wrong",
         )
@@ -94,7 +93,7 @@ def _different_gears(task: ConfigFitTask) -> Iterator[Finding]:
     checked: set[str] = set()
     for section in task.config.content.logs:
         layout = layout_of(task.config, section)
-        if section.format in checked or not _uses_gear(layout):
+        if section.format in checked or not any(c in layout.holds for c in _AT_MOTOR):
             continue
         checked.add(section.format)
         if abs(layout.gear_ratio / robot.gear_ratio - 1) > 1e-3:
@@ -106,10 +105,6 @@ def _different_gears(task: ConfigFitTask) -> Iterator[Finding]:
                 "(wheel_angle, wheel_speed), if they are of the wheel",
                 "wrong",
             )
-
-
-def _uses_gear(layout: AnyLayout) -> bool:
-    return any(channel in layout.holds for channel in _AT_MOTOR)
 
 
 _CHANNELS = (
@@ -150,18 +145,15 @@ def check(
     report.stage("do logs and config go together?")
     content = overview(task, task.skipped)
     report.stage("expected information")
-    content |= _expected_if_any(task).to_json()
+    try:
+        estimates_before = expected(task, task.problem())
+    except DataError as error:  # the logs leave no windows to fit
+        message = f"nothing can be expected of a fit: {error}"
+        estimates_before = ExpectedEstimates({}, {}, (message,))
+    content |= estimates_before.to_json()
     if out is not None:
         write_json(out / "check.json", content)
     return task.dataset, content
-
-
-def _expected_if_any(task: FitTask) -> ExpectedEstimates:
-    """Return `expected`, or a message alone where the logs leave no windows to fit."""
-    try:
-        return expected(task, task.problem())
-    except DataError as error:
-        return ExpectedEstimates({}, {}, (f"nothing can be expected of a fit: {error}",))
 
 
 def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
@@ -243,9 +235,9 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
         found = estimates(space, task.choices, space.start, covariance, volt, members(flat))
         _least(parameters, found)
         _least(ratios, derived(space, space.start, covariance, volt))
-        left = float(np.linalg.slogdet(covariance)[1])
-        if left > most:
-            most, open_ = left, flat
+        uncertainty = float(np.linalg.slogdet(covariance)[1])
+        if uncertainty > most:
+            most, open_ = uncertainty, flat
     return ExpectedEstimates(parameters, ratios, sentences(open_))
 
 

@@ -28,7 +28,7 @@ class WheeledDrive(Section):
         wheel_radius_m: rolling radius of the wheels under the robot's weight.
         gear_ratio: motor turns per wheel turn.
         mass_kg: mass of the robot as it drives; friction scales with it.
-        drives: which wheels, counted from 1, share a motor with its encoder and ammeter, in the
+        drives: wheels, counted from 1, that share a motor with its encoder and ammeter, in the
             order of the columns of the logs: [[1, 3], [2, 4]] turns the wheels of a side together.
             Without
                 it
@@ -148,7 +148,7 @@ class LogsSection(Section):
         map: file of a floor map, relative to the config, instead of a surface: runs cross the
             floors it shows, and their poses are in its frame.
         load: name of the load set-up; each has its own wheel loads.
-        session: what the runs of a session have in common; the marker stays in place within one.
+        session: runs with this in common share a session, in which the marker stays in place.
         session_name: instead of session: runs that belong together, of this section and of others
             with the same name, such as those of a day, or between two set-ups of the robot.
         min_rows: shorter runs are left out.
@@ -202,7 +202,7 @@ class ParameterSection(Section):
         start: start value [SI]; a number that is not fitted keeps it.
         fixed: value that the number keeps [SI].
         free: whether it is fitted.
-        prior: what is known about it beforehand.
+        prior: knowledge about it from elsewhere.
     """
 
     start: Numbers | None = None
@@ -220,12 +220,12 @@ class ParameterSection(Section):
 class WeightsSection(Section):
     """Known weight on the wheels in a load set-up.
 
-    Either what scales show under each wheel, `kg`; or that it is `like` another set-up, with
-    `mass_kg` more (or less) at `place_m`.
+    Either scales under each wheel give `kg`; or the set-up is `like` another one, with `mass_kg`
+    more (or less) at `place_m`.
 
     Attributes:
         std_kg: standard deviation of each scale, or of the weight that the mass adds to each wheel.
-        kg: what scales show under each wheel, in the order of the wheels.
+        kg: reading of the scales under each wheel, in the order of the wheels.
         like: name of another load set-up.
         mass_kg: mass added to that one; negative where it was taken away.
         place_m: x (ahead) and y (left) of that mass, from the middle.
@@ -253,9 +253,9 @@ class FitSection(Section):
     Motion determines the ratio of wheel radius to pose scale, and neither of them alone.
 
     Attributes:
-        lengths_from: which of the two is known: "poses" in true metres, as those of motion capture,
-            lidar and RTK are, make the wheel radius free; "wheels" that were measured make the
-            scale of the camera free. Without it both are as `[parameters]` says.
+        lengths_from: the known lengths: "poses" in true metres, as those of motion capture, lidar
+            and RTK are, make the wheel radius free; "wheels" that were measured make the scale of
+            the camera free. Without it both are as `[parameters]` says.
         windows_per_piece: number of windows in a segment of a run.
         longest_window_s: longer windows become more segments.
         rounds: largest number of rounds.
@@ -309,12 +309,12 @@ class ConfigContent(Section):
 
     Attributes:
         robot: its wheels.
-        layouts: which column of your files holds what, by names of your own.
+        layouts: columns of your files and their channels, by names of your own.
         logs: one section for each set of log files.
         camera: the camera that measured the poses.
         parameters: choices for parameters, by patterns of their names.
         weights: known wheel loads, by load set-up.
-        fit: how finely runs are cut and how long to fit.
+        fit: size of the windows and length of the fit.
         selftest: plan that `slipid selftest` simulates where there are no logs.
         validate: runs to predict instead of those that were fitted.
     """

@@ -20,7 +20,8 @@ from slipid.fit.multi_floor_fit import fit_multi_floor
 from slipid.fit.optimise import Optimum, optimise
 from slipid.fit.problem import FitState, Problem
 from slipid.infer.fit_file import save
-from slipid.infer.result import Fit, summarise
+from slipid.infer.result import Fit
+from slipid.infer.summary import summarise
 from slipid.infer.verdicts.profile import Profile, profile, profiled
 from slipid.predict.agreement import contradiction, floor_errors, largest_shift
 from slipid.predict.slip_models import slip_models
@@ -128,7 +129,7 @@ def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
     if config["sha256"] == task.config.hash and data["hash"] == task.data_hash:
         return None
     other = "other logs" if config["sha256"] == task.config.hash else f"another {config['name']}"
-    return f"{out} holds a fit of {other}; it is replaced when this one is done"
+    return f"{out} has a fit of {other}; it is replaced when this one is done"
 
 
 def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:
@@ -165,7 +166,7 @@ def optimised(
 ) -> tuple[Problem, Optimum]:
     """Return the optimum of a task and the problem it belongs to, starting from `task.problem()`.
 
-    Windows are cut again, which makes another problem, where the fitted lag is far from the
+    Windows are cut again, which makes another problem, where the fitted lag differs from the
     expected one (see `FitTask.cutting_robot`). The fit continues from the checkpoint of this very
     task, and every round is kept there.
     """

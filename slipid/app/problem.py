@@ -300,7 +300,7 @@ _STATED = ("robot.wheel_radius", "robot.base_radius", "robot.mass")
 
 
 def stated_sizes(robot: Robot, mass: float) -> list[Choice]:
-    """Hold size and mass at their stated values, the prior means of those that are freed."""
+    """Hold size and mass at their stated values, the prior means of those the config frees."""
     choices = []
     for e in entries(robot):
         if e.path in _STATED:

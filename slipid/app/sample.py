@@ -108,7 +108,7 @@ def _log_folder(out: Path, data: Path | None) -> Path:
     run = read_json(out / "run.json", "what `slipid identify` keeps of a run")
     folder = Path(run["data"]["folder"])
     if not folder.is_dir():
-        raise DataError(f"{folder}: the logs were fitted from there; expected --data DIR")
+        raise DataError(f"{folder}: the folder of the fitted logs is gone; expected --data DIR")
     return folder
 
 
@@ -127,4 +127,4 @@ def _refuse_other_logs(fit: Fit, task: ConfigFitTask) -> None:
     for name in [*then, *now]:
         if then.get(name) != now.get(name):
             what = "is missing" if name not in now else "is new" if name not in then else "changed"
-            raise DataError(f"{name}: {what} since the fit; expected the very logs it was made of")
+            raise DataError(f"{name}: {what} since the fit; expected the logs that were fitted")

@@ -1,1 +1,1 @@
-"""From pictures to poses and maps of floors: the room that knows OpenCV."""
+"""Camera calibration, poses and floor maps from pictures: the only package that needs OpenCV."""

@@ -1,6 +1,8 @@
 """OpenCV, imported when first needed, with what differs between its versions 4 and 5."""
 
 import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -11,6 +13,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from slipid.support.errors import DataError, did_you_mean
 
+NEARLY = 0.8
+"""Part of the largest number of markers with which a smaller dictionary is preferred."""
 Mask = Bool[np.ndarray, "row column"]
 """Some of the pixels of a picture or of the cells of a grid."""
 Labels = Int[np.ndarray, "row column"]
@@ -64,6 +68,32 @@ def marker_dictionary(name: str) -> Any:
         raise DataError(f"no marker dictionary '{name}'{hint}; expected one of {', '.join(names)}")
     aruco = opencv().aruco
     return aruco.getPredefinedDictionary(getattr(aruco, f"DICT_{short}"))
+
+
+def marker_count(dictionary: str) -> int:
+    """Return the number of markers in a dictionary."""
+    return len(marker_dictionary(dictionary).bytesList)
+
+
+@dataclass(frozen=True)
+class VisibleMarkers:
+    """Numbers of the markers in pictures, and the name of their dictionary."""
+
+    dictionary: str
+    numbers: list[int]
+
+
+def visible_markers(pictures: Sequence[np.ndarray]) -> VisibleMarkers:
+    """Return the markers in pictures, by the smallest dictionary with nearly most of them."""
+    aruco, numbers = opencv().aruco, dict[str, set[int]]()
+    for name in dictionary_names():
+        detector = aruco.ArucoDetector(marker_dictionary(name))
+        ids = [detector.detectMarkers(np.ascontiguousarray(one))[1] for one in pictures if one.size]
+        numbers[name] = {int(n) for one in ids if one is not None for n in np.ravel(one)}
+    # a large dictionary contains smaller ones, and detects a few more markers by chance
+    most = max(map(len, numbers.values()))
+    best = min((n for n in numbers if len(numbers[n]) >= NEARLY * most), key=marker_count)
+    return VisibleMarkers(best, sorted(numbers[best]))
 
 
 def read_picture(path: Path) -> np.ndarray:

@@ -143,14 +143,14 @@ def _few(cells: int) -> None:
         raise ValueError(f"{cells} cells; expected at most {MOST_CELLS}: a larger cell, less floor")
 
 
-class Patch(Section):
+class PatchTable(Section):
     """Table of a map file: one surface on top of the base."""
 
     surface: str
     polygon: list[Point] = Field(min_length=3)
 
 
-class Patched(Section):
+class PatchedFile(Section):
     """Map file of patches on a base, later ones on top.
 
     `extent_m` is lowest x, lowest y, highest x, highest y.
@@ -160,10 +160,10 @@ class Patched(Section):
     base: str
     extent_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
     cell_m: float = Field(0.005, gt=0, le=1)
-    patch: list[Patch] = Field(default_factory=list)
+    patch: list[PatchTable] = Field(default_factory=list)
 
 
-class Pictured(Section):
+class PicturedFile(Section):
     """Map file with a picture seen from above, whose lower left corner is at `corner_m`."""
 
     schema_: Literal["slipid.map/1"] = Field(alias="schema")
@@ -188,8 +188,8 @@ def read_map(path: Path) -> FloorMap:
     mapping = mapping_of(path, text_of(path, "a floor map"))
     try:
         if "picture" in mapping:
-            return _pictured(path, checked(path, mapping, Pictured))
-        given = checked(path, mapping, Patched)
+            return _pictured(path, checked(path, mapping, PicturedFile))
+        given = checked(path, mapping, PatchedFile)
         x0, y0, x1, y1 = given.extent_m
         if not (x0 < x1 and y0 < y1):
             raise DataError(
@@ -229,7 +229,7 @@ def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
     write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
-def _pictured(path: Path, given: Pictured) -> FloorMap:
+def _pictured(path: Path, given: PicturedFile) -> FloorMap:
     """Return the map of a picture: each pixel has the surface of the nearest colour."""
     from matplotlib.colors import to_rgb
     from matplotlib.image import imread

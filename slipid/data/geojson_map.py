@@ -79,7 +79,9 @@ class VectorMap:
         """Return a FeatureCollection, with all other data under the key `slipid`."""
         about = {
             "schema": SCHEMA,
-            "extent_m": [round(v, DIGITS) for v in self._corners()],
+            "extent_m": [
+                round(v, DIGITS) for v in (self.low_x, self.low_y, self.high_x, self.high_y)
+            ],
             "cell_m": self.cell,
             "base": self.base,
             "colours": self.colours,
@@ -89,9 +91,6 @@ class VectorMap:
         }
         features = [self._feature(patch) for patch in self.patches]
         return {"type": "FeatureCollection", "slipid": about, "features": features}
-
-    def _corners(self) -> tuple[float, float, float, float]:
-        return self.low_x, self.low_y, self.high_x, self.high_y
 
     def _feature(self, patch: Patch) -> Content:
         closed = [np.concatenate([ring, ring[:1]]).round(DIGITS) for ring in patch.rings]
@@ -136,7 +135,7 @@ class _About(Section):
     notes: list[str]
 
 
-class _File(Section):
+class _GeojsonFile(Section):
     """A GeoJSON map file."""
 
     type: Literal["FeatureCollection"]
@@ -150,7 +149,7 @@ def read_vector_map(path: Path) -> VectorMap:
     Raises:
         DataError: the file is absent, is no such map, or has wrong values.
     """
-    given = checked(path, read_json(path, WHAT), _File)
+    given = checked(path, read_json(path, WHAT), _GeojsonFile)
     about = given.slipid
     low_x, low_y, high_x, high_y = about.extent_m
     if not (low_x < high_x and low_y < high_y):

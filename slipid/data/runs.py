@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -103,7 +103,7 @@ def collect(
             )
         if log.pose is None:
             raise DataError(
-                f"{log.name}: no pose; expected camera columns, there is nothing to fit without"
+                f"{log.name}: no pose; expected the columns of a camera, which a fit needs"
             )
     offset = np.concatenate([[0], np.cumsum([log.samples for log in logs])])
     heading, speed, turn = np.array([_command(log) for log in logs]).T
@@ -119,12 +119,10 @@ def collect(
     )
 
     def view(k: int, log: Log) -> Log:
-        """The run with its arrays in the flat ones; a bridged one keeps its raw wheel angle."""
-        raw = bridged[k][0] is not log.wheel_angle
-        rows = slice(int(offset[k]), int(offset[k + 1]))
-        views: dict[str, Any] = {
-            n: a[rows] for n, a in flat.items() if not (raw and n == "wheel_angle")
-        }
+        """Return a run with views of the flat arrays; a bridged one keeps its raw wheel angle."""
+        views: dict[str, Any] = {n: a[offset[k] : offset[k + 1]] for n, a in flat.items()}
+        if bridged[k][0] is not log.wheel_angle:
+            del views["wheel_angle"]
         return replace(log, **views)
 
     return Runs(
@@ -170,8 +168,8 @@ def counted_once(logs: Sequence[Log]) -> list[Log]:
     wheels = max((logs[k].wheels for k in have), default=0)
     periods: dict[int, float] = {}
     for wheel in range(wheels):
-        series = [_read(logs[k], wheel) for k in have if logs[k].wheels > wheel]
-        period = refresh_period((one.time, one.amps) for one in series)
+        some = [logs[k] for k in have if logs[k].wheels > wheel]
+        period = refresh_period(_readings(log, _rows_read(log, wheel), wheel) for log in some)
         if period is not None:
             periods[wheel] = period
     out = list(logs)
@@ -180,28 +178,24 @@ def counted_once(logs: Sequence[Log]) -> list[Log]:
         shape = (out[k].samples, out[k].wheels)
         fresh = np.ones(shape, dtype=bool) if before is None else before.copy()
         for wheel, period in periods.items():
-            one = _read(out[k], wheel)
-            fresh[one.rows, wheel] &= read_anew(one.time, one.amps, period)
+            rows = _rows_read(out[k], wheel)
+            fresh[rows, wheel] &= read_anew(*_readings(out[k], rows, wheel), period)
         listed = ", ".join(sorted({f"{p:.2g}" for p in periods.values()}))
         note = f"current is read anew every {listed} s: between, it repeats and is not counted"
         out[k] = replace(out[k], current_fresh=fresh, notes=(*out[k].notes, note))
     return out
 
 
-class _Readings(NamedTuple):
-    """Readings of one ammeter in a run: time [s], current [A] and row of each."""
-
-    time: Float[np.ndarray, " read"]
-    amps: Float[np.ndarray, " read"]
-    rows: Int[np.ndarray, " read"]
-
-
-def _read(log: Log, wheel: int) -> _Readings:
-    """Return the readings of one ammeter."""
-    assert log.current is not None
+def _rows_read(log: Log, wheel: int) -> Int[np.ndarray, " read"]:
+    """Return the rows in which one ammeter was read."""
     fresh = log.current_fresh
-    rows = np.arange(log.samples) if fresh is None else np.flatnonzero(fresh[:, wheel])
-    return _Readings(log.time[rows], log.current[rows, wheel], rows)
+    return np.arange(log.samples) if fresh is None else np.flatnonzero(fresh[:, wheel])
+
+
+def _readings(log: Log, rows: np.ndarray, wheel: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return times [s] and currents [A] of one ammeter in some rows."""
+    assert log.current is not None
+    return log.time[rows], log.current[rows, wheel]
 
 
 def default_session(log: Log) -> str:

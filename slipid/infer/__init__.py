@@ -1,1 +1,1 @@
-"""What the data know: fit results, verdicts, profiles, posteriors, designs, motors on a bench."""
+"""Inference: fit results, verdicts, profiles, posteriors, proposals of runs, bench motors."""

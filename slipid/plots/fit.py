@@ -14,19 +14,16 @@ from slipid.infer.verdicts.estimates import Estimate
 from slipid.plots import drawing
 from slipid.plots.drawing import add_warning, figure, save, save_all
 from slipid.plots.measured_windows import MeasuredWindows, measured_windows
-from slipid.plots.motion import heading_figure, path_figure
+from slipid.plots.motion import heading_figure, path_figure, runs_by_setup
 from slipid.plots.wheels import current_figure, curve_figure
 from slipid.predict.validation import Validation
 
 
 def raw_plots(data: Runs, out: Path) -> list[Path]:
     """Write the picture `plot_runs` of each floor and load set-up; return the files."""
-    groups: dict[tuple[str, str], list[int]] = {}
-    for k, log in enumerate(data.logs):
-        groups.setdefault((log.surface or "unknown", log.load), []).append(k)
     return [
         save(plot_runs(data, runs, f"{floor}, {load}"), out / f"raw_{floor}_{load}.png")
-        for (floor, load), runs in sorted(groups.items())
+        for (floor, load), runs in sorted(runs_by_setup(data).items())
     ]
 
 

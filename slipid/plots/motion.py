@@ -1,6 +1,7 @@
 """Pictures of motion: slip and drift over heading, and predicted beside measured paths."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -101,6 +102,14 @@ def named(surface: str, load: str, groups: Sequence[tuple[str, str]]) -> str:
     return f"{surface}, load {load}" if several else surface
 
 
+def runs_by_setup(data: Runs) -> dict[tuple[str, str], list[int]]:
+    """Return the numbers of the runs of each floor and load set-up."""
+    groups: dict[tuple[str, str], list[int]] = {}
+    for k, log in enumerate(data.logs):
+        groups.setdefault((log.surface or "unknown", log.load), []).append(k)
+    return groups
+
+
 def path_figure(
     model: ForceBalance, data: Runs, order: Sequence[tuple[str, str]], title: str
 ) -> Figure:
@@ -112,20 +121,18 @@ def path_figure(
         order: order of the panels, (floor, load set-up).
         title: title that names the set of runs.
     """
-    groups: dict[tuple[str, str], list[int]] = {}
-    for k, log in enumerate(data.logs):
-        groups.setdefault((log.surface or "unknown", log.load), []).append(k)
+    groups = runs_by_setup(data)
     names = [name for name in order if name in groups]
     paths = _paths(model, data)
     made, axes = drawing.panels(len(names), 3.7, 4.3, title)
     for ax, (surface, load) in zip(axes, names, strict=True):
         runs = groups[surface, load]
         shown = [paths[k] for k in _spread(data, runs)]
-        for three in shown:
-            _ray(ax, three)
+        for run in shown:
+            _ray(ax, run)
         errors = _errors([paths[k] for k in runs])
         ax.set_title(f"{named(surface, load, names)}\n{errors}", fontsize=10)
-        reach = 1.08 * max(float(np.abs(p).max()) for three in shown for p in three)
+        reach = 1.08 * max(float(np.abs(p).max()) for run in shown for p in run)
         ax.set_aspect("equal")
         ax.set(xlim=(-reach, reach), xlabel="ahead of the start [m]")
         ax.set(ylim=(-reach, reach), ylabel="left of the start [m]")
@@ -152,9 +159,17 @@ def _spread(data: Runs, runs: list[int]) -> list[int]:
     return [runs[k] for k in at]
 
 
-def _paths(model: ForceBalance, data: Runs) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return measured, predicted and encoder path (edge, 2) of every run, starting along x."""
-    out: list[tuple[np.ndarray, np.ndarray, np.ndarray] | None] = [None] * len(data)
+class _Paths(NamedTuple):
+    """Paths (edge, 2) of a run from the origin, starting along x."""
+
+    measured: np.ndarray
+    predicted: np.ndarray
+    encoder: np.ndarray
+
+
+def _paths(model: ForceBalance, data: Runs) -> dict[int, _Paths]:
+    """Return the paths of every run by its number."""
+    out: dict[int, _Paths] = {}
     robot = model.robot
     for w in replay.replay_windows(data, robot):
         tracks = model.tracks(w)
@@ -166,16 +181,14 @@ def _paths(model: ForceBalance, data: Runs) -> list[tuple[np.ndarray, np.ndarray
             first = tracks.measured[n, 0]
             c, s = np.cos(first[2] - yaw), np.sin(first[2] - yaw)
             back = np.array([[c, s], [-s, c]])
-            out[int(k)] = tuple(
-                (p[n, :, :2] - first[:2]) @ back.T
-                for p in (tracks.measured, tracks.predicted, encoder.predicted)
-            )
-    return [p for p in out if p is not None]
+            every = (tracks.measured, tracks.predicted, encoder.predicted)
+            out[int(k)] = _Paths(*((p[n, :, :2] - first[:2]) @ back.T for p in every))
+    return out
 
 
-def _errors(paths: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> str:
+def _errors(paths: Sequence[_Paths]) -> str:
     """Return a text with the mean end-point errors over displacement, of model and encoders."""
-    ends = np.array([[p[-1] for p in three] for three in paths])
+    ends = np.array([[p[-1] for p in run] for run in paths])
     chord = np.maximum(np.linalg.norm(ends[:, 0], axis=1), 1e-9)
     error = np.linalg.norm(ends[:, 1:] - ends[:, :1], axis=2) / chord[:, None]
     model, encoder = 100 * error.mean(axis=0)
@@ -183,9 +196,8 @@ def _errors(paths: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> str:
     return f"{count}: end off by {model:.1f} % (encoders {encoder:.1f} %)"
 
 
-def _ray(ax: Axes, paths: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-    measured, predicted, encoder = paths
-    ax.plot(*encoder.T, ":", color=drawing.ORANGE, lw=1.0)
-    ax.plot(*measured.T, color=drawing.INK, lw=3.2, alpha=0.35, solid_capstyle="round")
-    ax.plot(*predicted.T, color=drawing.BLUE, lw=1.2)
-    ax.plot(*predicted[-1], "o", color=drawing.BLUE, ms=3.5)
+def _ray(ax: Axes, paths: _Paths) -> None:
+    ax.plot(*paths.encoder.T, ":", color=drawing.ORANGE, lw=1.0)
+    ax.plot(*paths.measured.T, color=drawing.INK, lw=3.2, alpha=0.35, solid_capstyle="round")
+    ax.plot(*paths.predicted.T, color=drawing.BLUE, lw=1.2)
+    ax.plot(*paths.predicted[-1], "o", color=drawing.BLUE, ms=3.5)

@@ -67,15 +67,15 @@ def floor_errors(
 
     Both models were fitted to these runs, the second one also to others.
     """
-    (old, far), (new, _) = end_errors(before, data), end_errors(after, data)
-    return compared([log.surface or "unknown" for log in data.logs], old, new, far)
+    (old, distance), (new, _) = end_errors(before, data), end_errors(after, data)
+    return compared([log.surface or "unknown" for log in data.logs], old, new, distance)
 
 
 def compared(
     floors: Sequence[str],
     old: Float[np.ndarray, " run"],
     new: Float[np.ndarray, " run"],
-    far: Float[np.ndarray, " run"],
+    distance: Float[np.ndarray, " run"],
 ) -> dict[str, FloorErrors]:
     """Return old and new errors of runs by floor, for the distances [m] that the runs drove."""
     out = {}
@@ -84,10 +84,10 @@ def compared(
         grown = new[mine] - old[mine]
         _, error, _ = mean_error(grown, np.arange(len(grown)))
         much = new[mine].mean() > WORSE * old[mine].mean()
-        way = max(float(far[mine].sum()), 1e-9)  # runs may only have turned
+        total = max(float(distance[mine].sum()), 1e-9)  # runs may only have turned
         out[name] = FloorErrors(
-            float(old[mine].sum() / way),
-            float(new[mine].sum() / way),
+            float(old[mine].sum() / total),
+            float(new[mine].sum() / total),
             bool(much and grown.mean() > SURE * error),
         )
     return out
@@ -97,12 +97,12 @@ def end_errors(
     model: PredictiveModel, data: Runs
 ) -> tuple[Float[np.ndarray, " run"], Float[np.ndarray, " run"]]:
     """Return the distance of predicted from measured end, and the chord, of each run [m]."""
-    error, far = np.zeros(len(data)), np.zeros(len(data))
+    error, distance = np.zeros(len(data)), np.zeros(len(data))
     for w in replay.replay_windows(data, model.robot):
         tracks, _ = model.ends(w)
         error[tracks.run] = np.linalg.norm(tracks.gap[:, :2], axis=1)
-        far[tracks.run] = chords(tracks.measured)
-    return error, far
+        distance[tracks.run] = chords(tracks.measured)
+    return error, distance
 
 
 class LargestShift(NamedTuple):
@@ -120,8 +120,8 @@ def largest_shift(
     Runs that agree move a number by less than the standard error it had without them (Hausman 1978,
     Econometrica 46(6)).
     """
-    told = ~space.electric & ~space.where(lambda e: e.part == "camera")
-    sigma = np.where(told, np.abs(after - before) / np.sqrt(np.diag(covariance)), 0.0)
+    known = ~space.electric & ~space.where(lambda e: e.part == "camera")
+    sigma = np.where(known, np.abs(after - before) / np.sqrt(np.diag(covariance)), 0.0)
     worst = int(np.argmax(sigma))
     return LargestShift(space.names[worst], float(sigma[worst]) if settled else np.inf)
 
@@ -137,30 +137,27 @@ def contradiction(
         by_map: error of the runs over several floors [m/s], with the map for the wheels' floors.
         as_if: error as if all wheels had always stood on one floor, by floor [m/s].
     """
-    worse = [
-        f"{floor} from {100 * e.before:.1f} to {100 * e.after:.1f} % of the way"
+    worse = ", ".join(
+        f"{floor} from {100 * e.before:.1f} to {100 * e.after:.1f} % of the distance driven"
         for floor, e in found.items()
         if e.is_worse
-    ]
-    if worse:
-        return f"{_NOT_LEARNT} (end-point errors on {', '.join(worse)}); {_WHY}"
-    if not np.isfinite(moved.sigma):
-        return f"{_NOT_LEARNT} (the fit to all found no rest); {_WHY}"
-    if moved.sigma > FAR:
-        return f"{_NOT_LEARNT} ({moved.name} moves by {moved.sigma:.0f} standard errors); {_WHY}"
+    )
     best = min(as_if, key=lambda floor: as_if[floor])
-    if as_if[best] < BETTER * by_map:
-        told = (
-            f"{1000 * by_map:.1f} mm/s by their map, {1000 * as_if[best]:.1f} as if all on {best}"
-        )
-        return f"{_NOT_LEARNT} (errors of {told}); {_WHY}"
-    return None
-
-
-_NOT_LEARNT = (
-    "the runs over several floors were not learnt from: they contradict those on one floor"
-)
-_WHY = "their map may be wrong or out of place, or the contact law where floors meet"
+    if worse:
+        reason = f"end-point errors on {worse}"
+    elif not np.isfinite(moved.sigma):
+        reason = "the fit to all of them did not settle"
+    elif moved.sigma > FAR:
+        reason = f"{moved.name} moves by {moved.sigma:.0f} standard errors"
+    elif as_if[best] < BETTER * by_map:
+        errors = f"{1000 * by_map:.1f} mm/s by their map, {1000 * as_if[best]:.1f} mm/s"
+        reason = f"errors of {errors} as if all on {best}"
+    else:
+        return None
+    return (
+        "the runs over several floors were not used: they contradict those on one floor "
+        f"({reason}); their map may be wrong or misplaced, or the contact law where floors meet"
+    )
 
 
 _TINY = 1e-6
@@ -174,12 +171,12 @@ def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
     The scatter is large on a floor with too few runs to predict one from the others.
     """
     w, robot = problem.windows, problem.robot
-    far, _ = travel(w, robot)
+    distance, _ = travel(w, robot)
     left = _unpredicted_motion(w, robot, "camera.marker_place" in problem.space.slices)
     variance = dict(zip(problem.noise.names, problem.noise.typical**2, strict=True))
     for floor in dict.fromkeys(w.surface):
         mine = np.asarray(w.surface) == floor
-        e, d, whole = left[mine], far[mine], far[mine].sum(axis=1)
+        e, d, whole = left[mine], distance[mine], distance[mine].sum(axis=1)
         total, most = e.sum(axis=1), np.maximum(whole, 1e-9)
         level = total / most[:, None]
         within = ((e - level[:, None] * d[..., None]) ** 2).sum(axis=(0, 1))

@@ -64,7 +64,7 @@ class FittedSlipModel(PredictiveModel):
         by_camera = by_z[..., self.contact.camera]
         return gap(model), np.concatenate([slopes(model, w, gap), by_camera], axis=-1)
 
-    def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "segment 2 2"]]:
+    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
         robot, contact = self.robot, self.contact
 
         def tracks_of(model: FloorModels) -> replay.Tracks:
@@ -74,10 +74,7 @@ class FittedSlipModel(PredictiveModel):
         twist, start = self.model.twist(w, robot), tracks.predicted[:, 0]
         camera = replay.end_jacobian(contact.space, contact.z, lk.batch(w, robot), start, twist)
         own = slopes(self.model, w, lambda model: tracks_of(model).predicted[:, -1, :2])
-        jac = np.concatenate([own, np.asarray(camera)[..., contact.camera]], axis=-1)
-        spread = parameter_covariance(jac, self.covariance)
-        effect = self.effect_covariance(w)
-        return tracks, replay.end_covariance(robot, w, tracks, self.variance, effect, spread)
+        return tracks, np.concatenate([own, np.asarray(camera)[..., contact.camera]], axis=-1)
 
 
 def fit_with_noise(
@@ -89,15 +86,15 @@ def fit_with_noise(
     balance; the degrees of freedom of the model's own numbers are subtracted.
     """
     robot = contact.robot
-    seen = problem.windows.at_lag(float(robot.camera.lag)).segments(np.flatnonzero(keep > 0))
-    model = model.fit(seen, robot)
-    before = _prior_precision(model, seen, robot)
+    w = problem.windows.at_lag(float(robot.camera.lag)).segments(np.flatnonzero(keep > 0))
+    model = model.fit(w, robot)
+    before = _prior_precision(model, w, robot)
     common = contact.covariance[np.ix_(contact.camera, contact.camera)]
     plain = FittedSlipModel(robot, contact.variance, common, model, contact)
     gap, slope = plain.linear(problem)
     log_v, count = jnp.asarray(contact.log_variance(problem)), jnp.asarray(keep, float)
     own_effects = np.array([c.kind == "run" for c in problem.noise.components])
-    target = replace(problem.objective, scored=problem.objective.scored | own_effects)
+    objective = replace(problem.objective, scored=problem.objective.scored | own_effects)
     for _ in range(MOST_TURNS):
         last = log_v
         scale = np.asarray(problem.covariance("motion", log_v))
@@ -105,7 +102,7 @@ def fit_with_noise(
         spread = jnp.asarray(parameter_covariance(slope, covariance))
         blocks = {"motion": jnp.asarray(gap)}, {"motion": spread}
         for _ in range(SCORING):
-            log_v = scoring_step(target, *blocks, log_v, count, None)
+            log_v = scoring_step(objective, *blocks, log_v, count, None)
         if float(jnp.abs(log_v - last).max()) < SETTLED:
             break
     plain = replace(plain, variance=by_name(problem, log_v), covariance=covariance)

@@ -45,32 +45,32 @@ class FoldKey:
 def fold_keys(data: Runs) -> list[FoldKey]:
     """Return the fold keys of all runs; unknown directions and speeds are nan."""
     where = setups([log.surface or "unknown" for log in data.logs], [log.load for log in data.logs])
-    way = np.degrees(data.heading).tolist()
-    return [FoldKey(*one) for one in zip(where, way, data.speed.tolist(), strict=True)]
+    heading, speed = np.degrees(data.heading).tolist(), data.speed.tolist()
+    return [FoldKey(*key) for key in zip(where, heading, speed, strict=True)]
 
 
-def sectors(facts: Sequence[FoldKey]) -> Fold:
+def sectors(keys: Sequence[FoldKey]) -> Fold:
     """Return the fold of every run by its commanded heading's 60 deg sector, -1 without one."""
-    way, known = _headings(facts)
-    return np.where(known, (np.floor((way % 360.0 + 1e-6) / 60.0) % 6).astype(int), -1)
+    heading, known = _headings(keys)
+    return np.where(known, (np.floor((heading % 360.0 + 1e-6) / 60.0) % 6).astype(int), -1)
 
 
-def random_headings(facts: Sequence[FoldKey]) -> Fold:
+def random_headings(keys: Sequence[FoldKey]) -> Fold:
     """Return a random one of six folds for every 5 deg of heading, -1 for runs without one."""
     dealt = np.random.default_rng(0).permutation(72) % 6
-    way, known = _headings(facts)
-    return np.where(known, dealt[np.round(way / 5.0).astype(int) % 72], -1)
+    heading, known = _headings(keys)
+    return np.where(known, dealt[np.round(heading / 5.0).astype(int) % 72], -1)
 
 
-def speeds(facts: Sequence[FoldKey], most: int | None = None) -> Fold:
+def speeds(keys: Sequence[FoldKey], most: int | None = None) -> Fold:
     """Return the fold of every run by its commanded speed, -1 where there is nothing to hold out.
 
     This is so where the runs of its floor and load set-up are all in one fold. If there are more
     than twice `most` speeds, the folds are `most` groups of equally many speeds. Turns on the spot
     have no speed to hold out.
     """
-    speed = np.round([f.speed for f in facts], 3)
-    where, known = np.array([f.floor for f in facts]), np.isfinite(speed) & (speed > 0)
+    speed = np.round([f.speed for f in keys], 3)
+    where, known = np.array([f.floor for f in keys]), np.isfinite(speed) & (speed > 0)
     every = np.unique(speed[known])
     edges = every[1:]
     if most is not None and len(every) > 2 * most:
@@ -83,12 +83,12 @@ def speeds(facts: Sequence[FoldKey], most: int | None = None) -> Fold:
 
 
 def _headings(
-    facts: Sequence[FoldKey],
+    keys: Sequence[FoldKey],
 ) -> tuple[Float[np.ndarray, " run"], Bool[np.ndarray, " run"]]:
     """Return commanded headings, zero where there is none [deg], and whether there is one."""
-    way = np.array([f.heading_deg for f in facts], float)
-    known = np.isfinite(way)
-    return np.where(known, way, 0.0), known
+    heading = np.array([f.heading_deg for f in keys], float)
+    known = np.isfinite(heading)
+    return np.where(known, heading, 0.0), known
 
 
 QUESTIONS: dict[str, Callable[[Sequence[FoldKey]], Fold]] = {
@@ -131,11 +131,11 @@ def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
         )
     if parts is not None and parts < 2:
         raise ValueError(f"{parts} parts; expected 2 or more")
-    facts = fold_keys(data)
-    fold = QUESTIONS[question](facts)
+    keys = fold_keys(data)
+    fold = QUESTIONS[question](keys)
     if parts is not None:
         fold = np.where(fold < 0, fold, fold % parts)
-    group = np.array([f.floor for f in facts])
+    group = np.array([f.floor for f in keys])
     for name in np.unique(group):
         if len(np.unique(fold[group == name])) < 2:
             fold[group == name] = -1
@@ -238,13 +238,13 @@ def judge(
         judged: numbers of the held-out runs.
         fit: function that fits the problem.
     """
-    learnt = fit_fold(problem, choices, data, question, judged, fit)
-    problem, optimum = learnt.problem, learnt.optimum
-    seconds = {name: {"fit": spent} for name, spent in learnt.seconds.items()}
+    fold = fit_fold(problem, choices, data, question, judged, fit)
+    problem, optimum = fold.problem, fold.optimum
+    seconds = {name: {"fit": spent} for name, spent in fold.seconds.items()}
     part = data.subset(judged)
     runs: dict[int, ScoredRun] = {}
-    cuts = replay.replay_windows(part, learnt.models[0].robot)
-    for model in learnt.models:
+    cuts = replay.replay_windows(part, fold.models[0].robot)
+    for model in fold.models:
         began = time.perf_counter()
         for w in cuts:
             add_scores(runs, part, model.name, *model.ends(w))
@@ -256,7 +256,7 @@ def judge(
     return FoldResult(
         rows=tuple(replace(runs[k], session=name) for k, name in enumerate(part.session)),
         seconds=seconds,
-        numbers={model.name: model.numbers for model in learnt.models},
+        numbers={model.name: model.numbers for model in fold.models},
         converged=bool(optimum.converged),
         reason=optimum.reason,
     )

@@ -34,7 +34,7 @@ from slipid.fit.session_effects import LinearModel, by_axis, with_session_effect
 from slipid.fit.shared_effects import (
     AXES,
     EffectForecast,
-    EffectTable,
+    FittedEffects,
     TravelConditions,
     forecast_effects,
 )
@@ -82,8 +82,14 @@ class PredictiveModel(abc.ABC):
         """Return predicted less measured increments of every segment, and their derivative."""
 
     @abc.abstractmethod
+    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
+        """Return tracks of whole runs and the derivative of their ends (segment, 2, number)."""
+
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "segment 2 2"]]:
         """Return tracks of whole runs and the scale matrix of their ends' Student t."""
+        tracks, slope = self.tracks_and_slopes(w)
+        numbers, effect = self._number_covariance(w, slope), self.effect_covariance(w)
+        return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, numbers)
 
     def scale(self, problem: Problem) -> tuple[Gaps, Float[np.ndarray, "segment m m"]]:
         """Return the residuals of every segment, and the scale matrix of their distribution."""
@@ -91,10 +97,12 @@ class PredictiveModel(abc.ABC):
         noise = np.asarray(problem.covariance("motion", self.log_variance(problem)))
         e = effects(problem.windows, problem.robot)
         v = self.effect_covariance(problem.windows)
-        numbers = self.growth(problem.windows)[:, None, None] * parameter_covariance(
-            slope, self.covariance
-        )
+        numbers = self._number_covariance(problem.windows, slope)
         return gap, noise + np.einsum("nma,nab,nlb->nml", e, v, e) + numbers
+
+    def _number_covariance(self, w: Windows, slope: Slopes) -> Float[np.ndarray, "segment m m"]:
+        """Return the covariance due to the uncertain numbers, grown for new runs."""
+        return self.growth(w)[:, None, None] * parameter_covariance(slope, self.covariance)
 
     def growth(self, w: Windows) -> Float[np.ndarray, " segment"]:
         """Return the factor of the variances of numbers and shared effects for new runs."""
@@ -163,7 +171,7 @@ class ForceBalance(PredictiveModel):
 
     space: Space
     z: Search
-    shared: Mapping[str, EffectTable]
+    shared: Mapping[str, FittedEffects]
     extrapolation: Mapping[str, float]
 
     @property
@@ -209,37 +217,30 @@ class ForceBalance(PredictiveModel):
     def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
         electric = problem.electric(self.z, self.log_variance(problem))
         blocks, jac = problem.linear(self.z, electric)
-        told, e = self.expected_effects(problem.windows), effects(problem.windows, problem.robot)
-        gap = np.asarray(blocks["motion"]) - np.einsum("nma,na->nm", e, told.mean)
-        slope = np.asarray(jac["motion"]) - np.einsum("nma,nap->nmp", e, told.slope)
-        return gap, slope
+        gap, slope = self._correction(problem.windows)
+        return np.asarray(blocks["motion"]) - gap, np.asarray(jac["motion"]) - slope
+
+    def _correction(self, w: Windows) -> tuple[Gaps, Slopes]:
+        """Return the expected effects on increments, and their derivative; both are subtracted."""
+        expected, e = self.expected_effects(w), effects(w, self.robot)
+        mean = np.einsum("nma,na->nm", e, expected.mean)
+        return mean, np.einsum("nma,nap->nmp", e, expected.slope)
 
     def tracks(self, w: Windows) -> replay.Tracks:
         """Return the tracks of whole runs by the force balance and the expected effects."""
-        return self._tracks(w, self._moved(w, self.expected_effects(w)))
+        increments = np.asarray(replay.contact_increments(self.robot, lk.batch(w, self.robot)))
+        mean = self._correction(w)[0].reshape(increments.shape)
+        return replay.tracks_from_increments(self.robot, w, increments - mean)
 
-    def _moved(self, w: Windows, told: EffectForecast) -> Float[np.ndarray, "segment window 3"]:
-        """Return the expected effects as increments to subtract from those of the force balance."""
-        moved = np.einsum("nma,na->nm", effects(w, self.robot), told.mean)
-        return moved.reshape(*w.dt.shape, 3)
-
-    def _tracks(self, w: Windows, moved: Float[np.ndarray, "segment window 3"]) -> replay.Tracks:
-        b = lk.batch(w, self.robot)
-        increments = np.asarray(replay.contact_increments(self.robot, b)) - moved
-        return replay.tracks_from_increments(self.robot, w, increments)
-
-    def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "segment 2 2"]]:
-        b, told, e = lk.batch(w, self.robot), self.expected_effects(w), effects(w, self.robot)
-        moved = self._moved(w, told)
-        tracks = self._tracks(w, moved)
-        by_number = np.einsum("nma,nap->nmp", e, told.slope).reshape(*moved.shape, -1)
-        more = replay.IncrementCorrection(jnp.asarray(moved), jnp.asarray(by_number))
-        start = tracks.predicted[:, 0]
-        jac = np.asarray(replay.end_jacobian(self.space, self.z, b, start, corrected=more))
-        own = np.einsum("nip,pq,njq->nij", jac, self.covariance, jac)
-        own *= self.growth(w)[:, None, None]
-        effect = self.effect_covariance(w)
-        return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, own)
+    def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
+        tracks, (mean, slope) = self.tracks(w), self._correction(w)
+        shape = *w.dt.shape, 3
+        correction = replay.IncrementCorrection(
+            jnp.asarray(mean.reshape(shape)), jnp.asarray(slope.reshape(*shape, -1))
+        )
+        b, start = lk.batch(w, self.robot), tracks.predicted[:, 0]
+        by_z = replay.end_jacobian(self.space, self.z, b, start, corrected=correction)
+        return tracks, np.asarray(by_z)
 
 
 def force_balance_of(
@@ -252,43 +253,42 @@ def force_balance_of(
     motion = blocks["motion"], jacobian["motion"]
     w = problem.windows
     direction = TravelConditions.of(w, problem.robot).direction
-    courses = TravelDirections(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
-    grown = extrapolation(problem.objective, motion, keep[: len(w)], covariance, log_v, courses)
+    travelled = TravelDirections(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
+    grown = extrapolation(problem.objective, motion, keep[: len(w)], covariance, log_v, travelled)
     return ForceBalance(
         robot,
         variance,
         np.asarray(covariance),
         problem.space,
         z,
-        shared=effect_tables(problem, state, keep),
+        shared=fitted_effects(problem, state, keep),
         extrapolation=grown,
     )
 
 
-def effect_tables(
+def fitted_effects(
     problem: Problem, state: FitState, keep: Float[np.ndarray, " segment"]
-) -> dict[str, EffectTable]:
+) -> dict[str, FittedEffects]:
     """Return the effects that neighbouring runs share on every floor, by a fit of some segments."""
     log_v, free = jnp.asarray(state.log_variance), problem.space.size
     residual, jacobian = problem.linear(state.z, problem.electric(state.z, log_v))
-    seen = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
-    white = jnp.einsum("nij,nj->ni", seen.whitening.root["motion"], residual["motion"])
+    weighed = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
+    white = jnp.einsum("nij,nj->ni", weighed.whitening.root["motion"], residual["motion"])
     half = whitened(problem.objective.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]
     expected = expected_posteriors(problem.objective, log_v, jnp.asarray(keep))
     std = np.exp(0.5 * np.asarray(log_v))
     out = {}
-    for floor, of, tie, to in zip(
-        problem.robot.surfaces.labels, problem.objective.shared, seen.effects, expected, strict=True
-    ):
+    floors, shared = problem.robot.surfaces.labels, problem.objective.shared
+    for floor, of, fitted, to in zip(floors, shared, weighed.effects, expected, strict=True):
         near = of.near.shape[-1]
         count = near + of.session.shape[1]
         inverse = np.linalg.inv(np.asarray(to.factor))
         covariance = (inverse.T @ inverse).reshape(3, count, 3, count)
         slope = jax.vmap(to.coefs, in_axes=-1, out_axes=-1)(half)
-        out[floor] = EffectTable(
+        out[floor] = FittedEffects(
             speeds_and_loads=problem.speeds_and_loads[floor],
             std=std[np.asarray(of.numbers)[1]],
-            coefs=np.asarray(tie.coefs(white)).reshape(3, count)[:, :near],
+            coefs=np.asarray(fitted.coefs(white)).reshape(3, count)[:, :near],
             by_number=np.asarray(slope).reshape(3, count, free)[:, :near],
             covariance=covariance[:, :near, :, :near],
         )

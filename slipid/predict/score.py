@@ -68,27 +68,25 @@ def scores(
         Score(
             predicted_end=predicted[n, -1].tolist(),
             endpoint_error=float(off[n]) / max(whole[n], 1e-9),
-            endpoint_error_over_path=float(off[n]) / max(way, 1e-9),
+            endpoint_error_over_path=float(off[n]) / max(length, 1e-9),
             length_error=abs(ahead[n] / max(whole[n], 1e-9) - 1.0),
             heading_error_deg=float(turn[n]),
             level=None if level is None else float(level[n]),
             covered90=None if level is None else bool(level[n] <= 0.9),
             energy_score=float(energy[n]),
         )
-        for n, way in enumerate(lengths(measured))
+        for n, length in enumerate(lengths(measured))
     ]
 
 
 def chords(path: Float[np.ndarray, "run edge 3"]) -> list[float]:
     """Return the straight-line displacement of every path [m]."""
-    moved: list[float] = np.linalg.norm((path[:, -1] - path[:, 0])[:, :2], axis=1).tolist()
-    return moved
+    return list(np.linalg.norm((path[:, -1] - path[:, 0])[:, :2], axis=1).tolist())
 
 
 def lengths(path: Float[np.ndarray, "run edge 3"]) -> list[float]:
     """Return the length of every path, step by step [m]."""
-    moved: list[float] = np.linalg.norm(np.diff(path[..., :2], axis=1), axis=2).sum(axis=1).tolist()
-    return moved
+    return list(np.linalg.norm(np.diff(path[..., :2], axis=1), axis=2).sum(axis=1).tolist())
 
 
 def forecast(

@@ -1,1 +1,1 @@
-"""Results as text for people: tables, and the sentences around them."""
+"""Text for people: tables of results, and the sentences around them."""

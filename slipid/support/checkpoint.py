@@ -61,7 +61,7 @@ def key_of(*parts: object) -> str:
             data = f"{part.dtype.str} {part.shape} ".encode() + part.tobytes()
         else:
             data = part if isinstance(part, bytes) else repr(part).encode()
-        # the length goes first, so that no two lists of parts read the same
+        # the length goes first, so that no two lists of parts give the same bytes
         mark.update(len(data).to_bytes(8, "little") + data)
     return mark.hexdigest()
 
@@ -90,7 +90,7 @@ class Checkpoint:
     def load(self, name: str) -> dict[str, np.ndarray] | None:
         """Return the arrays under a name; None where this very job has left none."""
         try:
-            # opened here: numpy leaves a damaged file open
+            # opened here because numpy leaves damaged files open
             path = self.folder / f"{name}.npz"
             with path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
                 if str(kept["key"]) != self.key:

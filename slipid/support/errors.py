@@ -37,3 +37,9 @@ def did_you_mean(name: object, choices: Iterable[str]) -> str:
     """Return `, did you mean this or that?` where choices are spelled alike, else an empty text."""
     found = get_close_matches(str(name), list(choices), n=2)
     return f", did you mean {' or '.join(found)}?" if found else ""
+
+
+def first_names(names: Iterable[str], none: str = "none") -> str:
+    """Return the first dozen names for a message, or `none` where there are none."""
+    every = list(names)
+    return ", ".join(every[:12] + ["..."] * (len(every) > 12)) or none

@@ -94,7 +94,7 @@ def results(
         collect(as_completed(list(waiting)))
     except BrokenExecutor as error:
         raise DataError(
-            "a process ended before its work did (memory?); called again, it goes on from there"
+            "a process ended before its job (too little memory?); run the command again to continue"
         ) from error
     return found
 

@@ -16,7 +16,7 @@ class Reporter:
     """Reporter of progress, silent if quiet; use it as a context."""
 
     def __init__(self, quiet: bool = False):
-        # late: every command names a reporter, and `--help` needs none
+        # imported late: every command imports this module, and `--help` needs no bar
         from rich import progress as bars
         from rich.console import Console
 
@@ -30,7 +30,7 @@ class Reporter:
             console=self._console,
             transient=True,
             speed_estimate_period=MEMORY_S,
-            # away from a terminal it only does the arithmetic
+            # away from a terminal it only computes the remaining time
             disable=quiet or not self._console.is_terminal,
         )
         self._task: "TaskID | None" = None

@@ -1,4 +1,4 @@
-"""What a notebook has beside fits: made runs, steady motion, a check, a comparison, a drive."""
+"""The public interface beside fits: simulated runs, steady motion, check, comparison, drive."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import slipid as sl
 
 
 @pytest.mark.slow
-def test_made_runs_have_the_channels_and_the_truth_that_were_asked_for():
+def test_simulated_runs_have_the_requested_channels_and_truth():
     slippery = {"surface.gray.creep": 0.4}
     made = sl.made_runs(["gray"], headings=3, speeds=[0.2], turns=0, truth=slippery, current=False)
     log = made.runs.logs[0]
@@ -67,7 +67,7 @@ def test_a_comparison_ranks_every_model_on_left_out_runs(fit):
 
 
 @pytest.mark.slow
-def test_a_proposal_has_the_runs_that_were_asked_for(fit):
+def test_a_proposal_has_the_requested_runs(fit):
     proposal = fit.design("surface.soft.creep", runs=2)
     assert len(proposal.runs) == 2
     assert str(proposal).startswith("run,floor,load,vx_m_s")
@@ -77,7 +77,7 @@ def test_a_proposal_has_the_runs_that_were_asked_for(fit):
 
 
 @pytest.mark.slow
-def test_a_drive_says_what_became_of_its_path(fit):
+def test_a_closed_loop_run_prints_its_path_errors(fit):
     robot = fit.deploy()
     found = sl.drive(robot, "encoder", start=1, seed=2)
     assert found.run.pose.shape == found.run.estimated_pose.shape

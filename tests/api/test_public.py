@@ -1,4 +1,4 @@
-"""The README's example, word by word, and what is beside it on the public interface."""
+"""The README's example, word by word, and the rest of the public interface."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_every_public_name_is_there():
 
 
 @pytest.mark.slow
-def test_setting_up_jax_says_what_it_did():
+def test_setting_up_jax_reports_its_settings():
     code = "import slipid, jax; slipid.setup_jax(); print(jax.config.jax_enable_x64)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "float64" in done.stderr

@@ -1,4 +1,4 @@
-"""What `slipid check` says of the clocks of poses that had their own."""
+"""Lines of `slipid check` about poses that have a clock of their own."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CLOCK = Clock(
     drift=2e-5,
     drift_std=1e-4,
     middle=4.0,
-    left=0.1,
+    unexplained=0.1,
     source="gyro",
 )
 
@@ -39,10 +39,10 @@ def test_offsets_and_their_intervals_are_one_line():
 
 
 @pytest.mark.parametrize("drift", [1e-3, -1e-3])
-def test_rates_that_no_quartz_has_are_asked_about(drift):
+def test_implausible_clock_rates_raise_a_question(drift):
     text = shown(CLOCK, replace(CLOCK, drift=drift))
     assert f"differ by up to {1e6 * drift:+.0f} ppm: is the video's frame rate right?" in text
 
 
-def test_nothing_is_said_where_all_clocks_are_the_robots():
+def test_the_robots_own_clock_needs_no_line():
     assert "clock" not in shown()

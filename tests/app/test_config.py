@@ -1,4 +1,4 @@
-"""Configs: what may be said, what is refused and in which words; from a config to a job."""
+"""Configs: accepted keys, refusals and their messages, and the fit task of a config."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def job_of(folder: Path, text: str, said: KeptMessages | None = None):
     return read_fit_task(read_config(written(folder, text)), folder, said or KeptMessages())
 
 
-def test_a_job_reads_floors_from_folders_and_takes_the_mass(tmp_path):
+def test_a_fit_task_reads_floors_from_folders_and_takes_the_mass(tmp_path):
     write_good(tmp_path)
     other = tmp_path / "one_surface/green_surface/exp01.csv"
     other.parent.mkdir()
@@ -171,7 +171,7 @@ def test_a_job_reads_floors_from_folders_and_takes_the_mass(tmp_path):
     assert "surface.gray.lead" not in problem.space.slices
 
 
-def test_what_the_robot_section_says_is_the_centre_of_its_prior(tmp_path):
+def test_values_of_the_robot_section_are_centres_of_priors(tmp_path):
     write_good(tmp_path)
     freed = '[parameters]\n"robot.*" = { free = true }\n"robot.base_radius" = { prior = '
     text = GOOD.replace("[parameters]", f"{freed}{{ mean = 0.13, std = 0.005 }} }}")

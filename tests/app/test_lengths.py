@@ -1,4 +1,4 @@
-"""Which lengths are trusted, and what is found of a lag, before the user says otherwise."""
+"""Trusted lengths, and the lag that the motion shows, unless the config decides otherwise."""
 
 import re
 from pathlib import Path
@@ -32,7 +32,7 @@ def test_the_other_length_is_free(tmp_path, trusted, freed):
     assert found & {"robot.wheel_radius", "camera.scale"} == {freed}
 
 
-def test_neither_is_free_unless_it_is_said(tmp_path):
+def test_neither_is_free_by_default(tmp_path):
     assert not free(job(tmp_path, "")) & {"robot.wheel_radius", "camera.scale"}
 
 

@@ -1,4 +1,4 @@
-"""A new config: what each drive is asked, what is written, and the robot as it is drawn."""
+"""A new config: questions of each drive, the written text, and the drawing of the robot."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def refuse(*_: object) -> str:
 
 
 @pytest.mark.parametrize("drive", CASES)
-def test_wheels_stand_where_they_were_said_to_be(drive):
+def test_wheels_stand_where_the_answers_place_them(drive):
     _, places, directions, drives = CASES[drive]
     told = RobotOptions(**{**CASES[drive][0], **SIZES, "drive": drive})
     config = new_config(template_draft(ask(told, refuse)), "mine.toml")
@@ -106,7 +106,7 @@ def test_logs_without_ticks_have_speeds():
     assert columns["columns"]["wheel_speed"]["columns"] == ["speed_left", "speed_right"]
 
 
-def test_what_nobody_said_is_a_question_in_the_file_and_in_the_list():
+def test_missing_answers_are_questions_in_the_file_and_in_the_list():
     config = new_config(
         template_draft(ask(RobotOptions(drive="skid", track_m="0.5"), None)), "mine.toml"
     )
@@ -120,7 +120,7 @@ def test_what_nobody_said_is_a_question_in_the_file_and_in_the_list():
     ].startswith(QUESTION_MARK)
 
 
-def test_people_are_asked_only_what_the_drive_needs_and_again_where_they_are_wrong():
+def test_only_questions_of_the_drive_are_put_and_repeated_after_wrong_answers():
     said: list[tuple[str, str]] = []
     answers = iter(["skidd", "skid", "0.5", "-1", "wide", "0.6", "yes", "0.08", "1", "20", "0"])
 
@@ -155,7 +155,7 @@ def test_people_are_asked_only_what_the_drive_needs_and_again_where_they_are_wro
         ({"drive": "general", **FOUR, "rollers_deg": "0, 1, 2"}, "run freely along it"),
     ],
 )
-def test_what_was_told_wrong_is_one_clear_error(told, message):
+def test_a_wrong_option_is_one_clear_error(told, message):
     with pytest.raises(DataError) as caught:
         new_config(template_draft(ask(RobotOptions(**told), None)), "mine.toml")
     assert message in str(caught.value)
@@ -169,7 +169,7 @@ def test_long_comments_stand_above_their_key():
 
 # drawings ---------------------------------------------------------------------------------------
 
-SKID = r"""seen from above, arrows: the way of a positive wheel speed
+SKID = r"""seen from above, arrows: direction of a positive wheel speed
 
                 ^ x
     1↑A         |         2↑B
@@ -190,7 +190,7 @@ wheel 3: rear left    x = -0.256 m, y = +0.275 m, drives ahead, no rollers
 wheel 4: rear right   x = -0.256 m, y = -0.275 m, drives ahead, no rollers
 motor A, column 1 of the logs: wheels 1 and 3
 motor B, column 2 of the logs: wheels 2 and 4"""
-OMNI = r"""seen from above, arrows: the way of a positive wheel speed
+OMNI = r"""seen from above, arrows: direction of a positive wheel speed
 
                ^ x
      1↙        |       3↖

@@ -1,4 +1,4 @@
-"""Logs and config that do not go together are named, and not fitted unless that is wanted."""
+"""Logs and config that contradict each other are named, and fitted only on request."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_sound_config_is_not_held_back(tmp_path):
         (f"base_radius_m = {BASE}", f"base_radius_m = {10 * BASE}", "base_radius"),
     ],
 )
-def test_what_is_wrong_in_the_config_is_named(tmp_path, said, instead, kind):
+def test_mistakes_in_the_config_are_named(tmp_path, said, instead, kind):
     assert kinds(config(tmp_path, ROBOT.replace(said, instead))) == [kind]
 
 
@@ -48,7 +48,7 @@ def test_a_gear_that_is_wrong_in_both_places_is_named(tmp_path):
 
 
 @pytest.mark.slow
-def test_identify_refuses_and_says_how_to_go_on(tmp_path):
+def test_identify_refuses_and_names_the_option_to_go_on(tmp_path):
     file = config(tmp_path, ROBOT.replace("mass_kg = 12.0\n", ""))
     with pytest.raises(DataError, match=r"(?s)1\. mass_kg \(.*into \[robot\].*--anyway"):
         identify(file, tmp_path / "logs", tmp_path / "out", Reporter(quiet=True))
@@ -58,7 +58,7 @@ def test_identify_refuses_and_says_how_to_go_on(tmp_path):
 
 
 @pytest.mark.slow
-def test_check_says_it_first_and_ends_with_one(tmp_path):
+def test_check_reports_it_first_and_exits_with_one(tmp_path):
     file = config(tmp_path, ROBOT.replace("[60, 180, 300]", "[180, 60, 300]"))
     words = ("--data", tmp_path / "logs", "--out", tmp_path / "out", "--quiet")
     result = invoke("check", file, *words)

@@ -1,4 +1,4 @@
-"""How far a fit may be trusted stands in run.json, in pictures and in the exit code."""
+"""The trust in a fit is in run.json, in pictures and in the exit code."""
 
 import json
 
@@ -13,7 +13,7 @@ def judged(word):
     return TrustReport(Trust(word, ("it predicts worse",)), {"gray": EndPoints(0.4, 0.1)}, 12)
 
 
-def test_a_fit_that_is_not_to_be_trusted_says_so_in_its_pictures():
+def test_pictures_of_a_fit_that_is_not_to_be_trusted_have_a_warning():
     bad = judged("not to be trusted")
     assert bad.is_bad
     made = drawing.figure(4.0, 3.0, "a title")

@@ -19,7 +19,7 @@ def test_pixels_are_those_of_the_lens_written_out():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.7, 0.7, (50, 2)), rng.uniform(0, 0.5, 50)])
     away = (points - STAGE.place) @ STAGE.rotation.T
-    np.testing.assert_allclose(STAGE.camera.pixels(points), STAGE.lens.seen(away), atol=1e-6)
+    np.testing.assert_allclose(STAGE.camera.pixels(points), STAGE.lens.project(away), atol=1e-6)
 
 
 @pytest.mark.parametrize("height", [0.0, 0.25, -0.1])

@@ -206,7 +206,7 @@ def test_identify_asks_for_a_place_to_write_before_it_fits(tmp_path):
 
 
 @pytest.mark.slow
-def test_identify_writes_what_the_contract_says(small):
+def test_identify_writes_the_files_of_the_contract(small):
     folder, result = small
     assert result.exit_code == 0, result.stderr
     out = folder / "out"
@@ -284,7 +284,7 @@ def test_validate_predicts_unseen_runs(small, tmp_path):
 
 
 @pytest.mark.slow
-def test_validate_says_when_runs_were_fitted_and_when_a_floor_is_unknown(small, tmp_path):
+def test_validate_reports_fitted_runs_and_unknown_floors(small, tmp_path):
     folder, _ = small
     result = invoke("validate", folder / "out", "--data", folder / "logs")
     assert result.exit_code == 0
@@ -299,7 +299,7 @@ def test_validate_says_when_runs_were_fitted_and_when_a_floor_is_unknown(small, 
 
 
 @pytest.mark.slow
-def test_check_tells_before_the_fit(small, tmp_path):
+def test_check_reports_before_the_fit(small, tmp_path):
     folder, _ = small
     out = tmp_path / "check"
     result = invoke("check", folder / "my.toml", "--data", folder / "logs", "--out", out)
@@ -319,7 +319,7 @@ def test_check_tells_before_the_fit(small, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_fit_that_does_not_settle_is_1_and_says_so(small, tmp_path):
+def test_a_fit_that_does_not_converge_exits_with_1_and_reports_it(small, tmp_path):
     folder, _ = small
     config = tmp_path / "short.toml"
     text = packaged_config("robotino.toml").replace("rounds = 30 ", "rounds = 1  ")
@@ -419,7 +419,7 @@ def test_an_interrupt_is_130_and_keeps_the_checkpoint(small, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_posterior_that_has_not_converged_says_so_everywhere(sampled):
+def test_a_posterior_that_has_not_converged_is_marked_everywhere(sampled):
     out, result = sampled
     assert result.exit_code == 1, result.stderr
     assert "NOT converged" in result.stdout
@@ -569,7 +569,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monke
 
 
 @pytest.mark.slow
-def test_export_writes_a_folder_and_tells_a_changed_byte(small, tmp_path):
+def test_export_writes_a_folder_and_detects_a_changed_byte(small, tmp_path):
     out = tmp_path / "to_go"
     done = invoke(
         "export", small[0] / "out", "--to", "table, ros2", "--out", out, "--json", "-", "--quiet"
@@ -595,7 +595,7 @@ def test_export_writes_a_folder_and_tells_a_changed_byte(small, tmp_path):
     assert not (out / "ros2").exists()
 
 
-def test_export_says_what_is_missing(tmp_path):
+def test_export_names_missing_options(tmp_path):
     assert "robot.json: not there" in invoke("export", tmp_path, "--out", tmp_path / "o").output
     told = invoke("export", tmp_path)
     assert told.exit_code == 2
@@ -604,7 +604,7 @@ def test_export_says_what_is_missing(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_place_that_cannot_be_written_to_is_said_before_the_work(tmp_path):
+def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(tmp_path):
     (tmp_path / "file").write_text("")
     path = tmp_path / "file" / "x.toml"
     with pytest.raises(DataError, match=r"x\.toml: cannot be written"):

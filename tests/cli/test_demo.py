@@ -1,4 +1,4 @@
-"""The demo: recorded logs of the test site, and what slipid makes of a physics it does not know."""
+"""The demo: recorded logs of the test site, and a fit to a physics that slipid does not know."""
 
 import json
 import subprocess
@@ -99,7 +99,7 @@ def test_the_recording_needs_neither_mujoco_nor_opencv(tmp_path):
     assert (tmp_path / "fit" / "truth" / "truth.json").is_file()
 
 
-def test_a_missing_recording_is_said(tmp_path, monkeypatch):
+def test_a_missing_recording_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(packaged, "RECORDED", tmp_path / "gone.zip")
     with pytest.raises(DataError, match=r"gone\.zip: .*expected the recorded logs"):
         unpack(tmp_path)

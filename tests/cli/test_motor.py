@@ -225,7 +225,7 @@ def test_two_motors_of_a_config(identified):
 
 
 @pytest.mark.slow
-def test_check_says_what_there_is(bench):
+def test_check_lists_the_logs_and_their_ranges(bench):
     result = invoke("check", bench / "bench.toml", "--data", bench / "two", "--quiet")
     assert result.exit_code == 0
     assert "both.csv" in result.output
@@ -243,7 +243,7 @@ def test_check_says_what_there_is(bench):
         ("selftest", "CONFIG"),
     ],
 )
-def test_what_needs_wheels_says_so(identified, bench, words):
+def test_commands_that_need_wheels_refuse_a_bench(identified, bench, words):
     where = {"OUT": identified, "CONFIG": bench / "bench.toml"}
     result = invoke(*(where.get(word, word) for word in words))
     assert result.exit_code == 2
@@ -272,7 +272,7 @@ def test_a_bench_that_is_none_is_refused(tmp_path):
         bench_priors(config, 16.0)
 
 
-def test_a_missing_bench_is_told_before_logs_are_read(tmp_path):
+def test_a_missing_bench_file_is_reported_before_logs_are_read(tmp_path):
     (tmp_path / "robot.toml").write_text(ROBOT.format(motor='motor = "b.json"'))
     result = invoke("check", str(tmp_path / "robot.toml"), "--data", str(tmp_path))
     assert result.exit_code == 2

@@ -39,7 +39,7 @@ def test_options_alone_ask_nothing(tmp_path):
     assert out.read_bytes() == before
 
 
-def test_answers_that_are_wrong_are_asked_again(tmp_path):
+def test_questions_are_repeated_after_wrong_answers(tmp_path):
     out = tmp_path / "mine.toml"
     result = answered("skid\n0.5\nwide\n0.6\nyes\n0.1\n1\n30\n0\n", "new", "--out", out)
     assert result.exit_code == 0, result.stderr

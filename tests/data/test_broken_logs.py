@@ -61,8 +61,8 @@ def test_exchanged_and_reversed_wheels_are_read_and_then_named(root, case: Case)
     log = read_log(path, declared_layout(case.mapping(), "layout"), root=root)
     with pytest.raises(DataError) as caught:
         refuse_misordered([good, log])
-    for said in case.expected:
-        assert said in str(caught.value)
+    for part in case.expected:
+        assert part in str(caught.value)
     robot = omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0)
     wrong = [f for f in findings(collect([log]), robot) if f.severity == "wrong"]
     kinds = {"wheel_columns", "wheel_order", "wheel_sign", "command_order", "command_sign"}

@@ -1,4 +1,4 @@
-"""The clock of a camera is found from the motion that the robot's own sensors saw as well."""
+"""The clock of a camera is found from the motion that the robot measured as well."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from slipid.data.reading.reader import read_logs, read_runs
 from slipid.support.errors import DataError
 
 OFFSET = 1.2345
-"""Of the robot's clock ahead of the camera's [s]."""
+"""Offset of the robot's clock ahead of the camera's [s]."""
 
 
 class Drive:
@@ -41,10 +41,10 @@ class Drive:
         self.angle = np.stack([np.interp(self.time, fine, a) for a in angle.T], 1)
         gyro = np.interp(self.time, fine, twist[:, 2])
         self.gyro = gyro + 0.01 + rng.normal(0.0, 0.004, len(gyro))
-        seen = np.arange(-1.0, seconds + 1.0, 1 / 29)
-        pose = np.stack([np.interp(seen, fine, p) for p in (*place.T, heading)], 1)
+        times = np.arange(-1.0, seconds + 1.0, 1 / 29)
+        pose = np.stack([np.interp(times, fine, p) for p in (*place.T, heading)], 1)
         self.pose = pose + rng.normal(0.0, 1.0, pose.shape) * [2e-4, 2e-4, 0.0015]
-        self.pose_time = (seen - OFFSET) / (1.0 + drift)
+        self.pose_time = (times - OFFSET) / (1.0 + drift)
 
     def by_wheels(self):
         return MotionPair.of_wheels(self.time, self.angle, self.pose_time, self.pose)
@@ -54,7 +54,7 @@ class Drive:
 
 
 @pytest.mark.slow
-def test_a_gyro_tells_the_offset_to_milliseconds_and_how_sure_it_is():
+def test_a_gyro_gives_the_offset_to_milliseconds_with_its_uncertainty():
     clocks = [clock_of_poses(Drive(seed).by_gyro()) for seed in range(8)]
     assert all(clock is not None for clock in clocks)
     error = np.array([clock.offset - OFFSET for clock in clocks])
@@ -64,7 +64,7 @@ def test_a_gyro_tells_the_offset_to_milliseconds_and_how_sure_it_is():
     assert 0.3 < np.sqrt(np.mean((error / std) ** 2)) < 2.0
 
 
-def test_wheels_tell_it_too_and_claim_less():
+def test_wheels_give_it_with_a_wider_interval():
     clock = clock_of_poses(Drive(3).by_wheels())
     assert clock is not None
     assert clock.source == "wheels"
@@ -73,7 +73,7 @@ def test_wheels_tell_it_too_and_claim_less():
 
 
 @pytest.mark.slow
-def test_the_gyro_is_asked_first_and_wheels_only_where_it_does_not_tell():
+def test_the_gyro_comes_first_and_wheels_only_where_it_determines_no_clock():
     drive = Drive(1)
 
     def views():
@@ -94,8 +94,8 @@ def test_times_of_poses_come_out_on_the_clock_of_the_robot():
     drive = Drive(2)
     clock = clock_of_poses(drive.by_gyro())
     assert clock is not None
-    seen = clock.robot_time(drive.pose_time)
-    np.testing.assert_allclose(seen, np.arange(-1.0, 13.0, 1 / 29)[: len(seen)], atol=0.005)
+    times = clock.robot_time(drive.pose_time)
+    np.testing.assert_allclose(times, np.arange(-1.0, 13.0, 1 / 29)[: len(times)], atol=0.005)
     moved = clock.robot_time(np.array([clock.middle, clock.middle + 10.0]))
     assert moved[0] == pytest.approx(clock.middle + clock.offset)
     assert moved[1] - moved[0] == pytest.approx(10.0 * (1.0 + clock.drift))
@@ -190,9 +190,9 @@ def test_a_short_record_tells_nothing():
 
 def test_noise_of_poses_is_told_from_that_of_steps():
     rng = np.random.default_rng(0)
-    seen, own = rng.normal(0.0, 2.0, 20001), rng.normal(0.0, 1.0, 20000)
+    times, own = rng.normal(0.0, 2.0, 20001), rng.normal(0.0, 1.0, 20000)
     joined = np.arange(20000) > 0
-    noise = StepNoise.of(np.diff(seen) + own, joined)
+    noise = StepNoise.of(np.diff(times) + own, joined)
     assert noise.shared == pytest.approx(4.0, rel=0.05)
     assert noise.separate == pytest.approx(1.0, rel=0.15)
 
@@ -261,9 +261,9 @@ def test_poses_of_another_run_are_refused_with_what_to_do(tmp_path):
         tmp_path / "run.csv", declared_layout(layout(), "test"), tmp_path, "f", "as_built"
     )
     assert found.logs == ()
-    (said,) = found.aside
+    (line,) = found.aside
     assert re.search(
-        r"set aside: .*run.poses.csv: .*does not determine its clock.*starts, stops", said
+        r"set aside: .*run.poses.csv: .*does not determine its clock.*starts, stops", line
     )
 
 

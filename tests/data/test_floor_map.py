@@ -142,7 +142,7 @@ def test_the_four_zones_meet_in_the_middle_of_the_rectangle():
         (("cell_m = 0.01", "cell_m = 0.0001"), "100000000 cells; expected at most"),
     ],
 )
-def test_what_is_wrong_with_a_map_is_said(tmp_path, change, match):
+def test_errors_of_a_map_are_named(tmp_path, change, match):
     path = tmp_path / "map.toml"
     path.write_text(GOOD)
     assert read_map(path).surfaces == ("table", "gray")
@@ -152,7 +152,7 @@ def test_what_is_wrong_with_a_map_is_said(tmp_path, change, match):
     assert str(path) in str(error.value)
 
 
-def test_absent_and_broken_pictures_are_said(tmp_path):
+def test_absent_and_broken_pictures_are_named(tmp_path):
     path = tmp_path / "map.toml"
     with pytest.raises(DataError, match="expected a floor map"):
         read_map(path)
@@ -252,7 +252,7 @@ def test_cells_are_covered_by_their_middles():
         (('"type": "Feature"', '"type" "Feature"'), "no valid JSON"),
     ],
 )
-def test_what_is_wrong_with_a_geojson_map_is_said(tmp_path, change, match):
+def test_errors_of_a_geojson_map_are_named(tmp_path, change, match):
     path = tmp_path / "map.geojson"
     vector_map(ringed("table", WHOLE, HOLE), ringed("gray", SQUARE)).save(path)
     text = path.read_text()

@@ -13,7 +13,7 @@ RATE = 50.0
 
 
 def run(lag, seed, wheels=2, steady=False, rolling=0.05, noise=0.0005):
-    """A robot that starts, changes its speed and turns, seen `lag` seconds late."""
+    """Return a run of a robot that changes its speed and turns, with poses `lag` seconds late."""
     rng = np.random.default_rng(seed)
     time = np.arange(0.0, 6.0, 1 / RATE)
     knots = np.linspace(-4.0, 10.0, 15)
@@ -64,14 +64,14 @@ def test_signs_and_units_do_not_matter(rolling):
     assert found.seconds == pytest.approx(0.4, abs=0.02)
 
 
-def test_slow_poses_of_a_robot_with_three_wheels_tell_it_too():
+def test_slow_poses_of_a_robot_with_three_wheels_give_it_too():
     logs = [run(0.3, seed, wheels=3) for seed in range(4)]
     found = pose_lag(collect(logs))
     assert found is not None
     assert found.seconds == pytest.approx(0.3, abs=0.03)
 
 
-def test_steady_motion_tells_no_lag():
+def test_steady_motion_gives_no_lag():
     assert pose_lag(collect([run(0.4, seed, steady=True) for seed in range(3)])) is None
 
 
@@ -81,7 +81,7 @@ def test_it_is_searched_once_for_a_set_of_runs():
 
 
 @pytest.mark.slow
-def test_real_robots_have_the_lag_that_each_day_tells(real_data):
+def test_real_robots_have_the_lag_of_each_day(real_data):
     from slipid.app.config import read_config
     from slipid.app.logs import read_dataset
     from slipid.support.progress import Reporter

@@ -1,4 +1,4 @@
-"""Runs laid end to end and cut into windows: nothing is lost, doubled or invented."""
+"""Runs are laid end to end and cut into windows without loss, doubling or invention."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def run(
     seed=0,
     **changes,
 ):
-    """A run whose wheels swing after `start` and whose camera repeats a tenth of its frames."""
+    """Return a run whose wheels swing after `start`; its camera repeats a tenth of its frames."""
     rng = np.random.default_rng(seed)
     time = 5.0 + np.cumsum(rng.normal(0.031, 0.002, int(seconds / 0.031)).clip(0.02))
     since = np.maximum(time - time[0] - start, 0.0)
@@ -166,7 +166,7 @@ def test_edges_lie_on_new_camera_frames(logs):
             assert log.pose_fresh[row].all()
 
 
-def test_only_long_runs_are_cut_in_pieces():
+def test_only_long_runs_are_cut_into_segments():
     w = windows(collect([run("short", seconds=10.0), run("long", seconds=60.0)]), RADIUS)
     assert (w.run == 0).sum() == 1
     assert (w.run == 1).sum() == 3  # 59 s in pieces of at most 4 times 6 s
@@ -180,7 +180,7 @@ def turn_per_lag(data, lag, small):
 
 
 @pytest.mark.parametrize("lag", [0.1, 0.156])
-def test_faster_is_the_derivative_by_the_lag(logs, lag):
+def test_speed_change_is_the_derivative_by_the_lag(logs, lag):
     data = collect(logs)
     w = windows(data, RADIUS, lag=lag)
     # a secant over the 0.16 s in which speeds are taken, but for the end of the run
@@ -230,7 +230,7 @@ def test_means_are_over_time_and_their_variance_the_ammeters_over_their_count():
 
 @pytest.mark.parametrize("lag", [0.0, 0.011, 0.05])
 def test_means_of_what_grows_are_those_of_the_middle_of_the_window(lag):
-    """A voltage that rises with time: whichever rows lie in a window, its mean is not late."""
+    """The mean of a rising voltage is not late, whichever rows lie in a window."""
     blank = run()
     log = replace(blank, voltage=2.0 + 3.0 * blank.time[:, None] * np.ones(3))
     data = collect([log])
@@ -243,7 +243,7 @@ def test_means_of_what_grows_are_those_of_the_middle_of_the_window(lag):
 
 @pytest.mark.parametrize("n", [3, 5])
 def test_a_slow_meter_is_even_between_its_readings(n):
-    """What grows evenly has the same mean, however seldom it is read; readings count once."""
+    """A linear signal has the same mean, however rarely it is read; readings count once."""
     blank = run()
     grows = 2.0 + 3.0 * blank.time[:, None] * np.ones(3)
     log = replace(blank, current=grows, voltage=grows, current_is_signed=True)
@@ -259,25 +259,25 @@ def test_a_slow_meter_is_even_between_its_readings(n):
 
 @pytest.mark.slow
 def test_a_meter_that_is_read_in_every_row_misses_nothing():
-    """Whether a log says so, or says nothing of it."""
+    """A log may state it or leave it out."""
     log = run(pose_fresh=None)
-    often, said = (windows(collect([one]), RADIUS, per_segment=2) for one in (log, held(log, 1)))
+    often, stated = (windows(collect([one]), RADIUS, per_segment=2) for one in (log, held(log, 1)))
     for name in ("current", "voltage", "current_var", "voltage_var"):
-        np.testing.assert_array_equal(getattr(said, name), getattr(often, name))
+        np.testing.assert_array_equal(getattr(stated, name), getattr(often, name))
 
 
 def test_what_a_slow_meter_missed_is_covered_by_its_variance():
-    """A voltage that jumps once, at any time between two readings: errors are as large as told."""
+    """A voltage jumps once, anywhere between two readings: errors match the variance."""
     off = []
     for k in range(60):
         blank = run(seconds=6.0)
         jumps = blank.time[:, None] > 7.0 + 0.05 * k
         log = replace(blank, voltage=np.where(jumps, 5.0, 1.0) * np.ones(3))
         often, seldom = (windows(collect([x]), RADIUS, per_segment=2) for x in (log, held(log, 15)))
-        told = seldom.voltage_var > 1e-9
+        known = seldom.voltage_var > 1e-9
         gap = seldom.voltage - often.voltage
-        np.testing.assert_allclose(gap[~told], 0.0, atol=1e-9)
-        off += (gap[told] / np.sqrt(seldom.voltage_var[told])).tolist()
+        np.testing.assert_allclose(gap[~known], 0.0, atol=1e-9)
+        off += (gap[known] / np.sqrt(seldom.voltage_var[known])).tolist()
     assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.2)
 
 
@@ -349,7 +349,7 @@ def test_different_robots_are_refused():
 
 
 def test_runs_without_poses_are_refused():
-    with pytest.raises(DataError, match=r"b\.csv: no pose; expected camera columns"):
+    with pytest.raises(DataError, match=r"b\.csv: no pose; expected the columns of a camera"):
         collect([run("a.csv"), run("b.csv", pose=None, pose_fresh=None)])
 
 

@@ -1,4 +1,4 @@
-"""What several tests of the fit set up."""
+"""Fixtures that several tests of the fit share."""
 
 from __future__ import annotations
 

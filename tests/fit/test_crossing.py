@@ -1,4 +1,4 @@
-"""Runs over several floors: what they add to a fit, where wheels stand, what configs may say."""
+"""Runs over several floors: their part of a fit, wheel positions, and their config."""
 
 from __future__ import annotations
 
@@ -526,7 +526,7 @@ def test_runs_with_a_wrong_map_are_refused(tmp_path):
     config, out = written(tmp_path, text), tmp_path / "out"
     said = invoke("identify", config, "--data", tmp_path / "logs", "--out", out)
     assert said.exit_code == 0, said.stderr
-    assert "were not learnt from: they contradict those on one floor" in said.stderr
+    assert "were not used: they contradict those on one floor" in said.stderr
     fit = load(out)
     assert fit.mixed is None
     assert fit.refused["reason"] in fit.messages

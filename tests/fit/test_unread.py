@@ -1,4 +1,4 @@
-"""Windows in which a sensor was not read say nothing, whatever stands in them."""
+"""Windows in which a sensor was not read carry no information, whatever values they hold."""
 
 from dataclasses import replace
 

@@ -402,12 +402,12 @@ EXCHANGED = (
     Case(
         "swapped wheels",
         _swap_names("m1pos", "m3pos"),
-        ("exp07.csv", "as their wheel_speed", "order 3, 2, 1"),
+        ("exp07.csv", "match their wheel_speed", "order 3, 2, 1"),
     ),
     Case(
         "reversed wheel",
         _cell(range(FIRST, _END), "m1pos", lambda cell: f"{-float(cell):.6g}"),
-        ("exp07.csv", "as their wheel_speed", "order -1, 2, 3"),
+        ("exp07.csv", "match their wheel_speed", "order -1, 2, 3"),
     ),
 )
 """Logs whose encoders have exchanged or reversed columns: they are read, and sanity names them."""

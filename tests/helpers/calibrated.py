@@ -5,11 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from slipid.camera.calibration.board import Board, Picture, View
+from slipid.camera.calibration.board import Board, Picture, View, check_enough
 from slipid.camera.calibration.lens import fit_robustly
 from slipid.camera.calibration.points import FloorPoints
 from slipid.camera.calibration.quality import quality_of
-from slipid.camera.calibration.views import check_enough
 from slipid.camera.overhead import Lens
 from tests.helpers import made_boards as made
 
@@ -31,13 +30,13 @@ ABOVE = made.overhead(3.0, -4.0, 10.0, CAMERA)
 GRID = [(x, y, 0.0) for x in (-0.9, -0.3, 0.4, 1.0) for y in (-0.7, 0.0, 0.6)]
 
 
-def seen_views(places, noise=NOISE, seed=0) -> list[View]:
+def projected_views(places, noise=NOISE, seed=0) -> list[View]:
     """Return the corners that a lens sees inside of the picture."""
     rng, views = np.random.default_rng(seed), []
     corners = BOARD.corners_m
     for k, place in enumerate(places):
         solid = np.c_[corners, np.zeros(len(corners))]
-        pixels = TRUE.seen(solid @ place.rotation.T + place.shift)
+        pixels = TRUE.project(solid @ place.rotation.T + place.shift)
         pixels = pixels + noise * rng.standard_normal(pixels.shape)
         inside = ((pixels > 0) & (pixels < SIZE)).all(1)
         views.append(View(f"view{k}", pixels[inside], corners[inside]))
@@ -48,7 +47,7 @@ def floor_points(places, camera=(0.1, -0.2, 2.4), tilt=(3.0, -4.0), noise=0.3, s
     """Return points of the world as the lens sees them, and the rotation of its camera."""
     rotation = made.from_world(made.overhead(*tilt, 10.0, camera))
     places = np.asarray(places, float)
-    pixels = TRUE.seen((places - np.array(camera)) @ rotation.T)
+    pixels = TRUE.project((places - np.array(camera)) @ rotation.T)
     pixels = pixels + noise * np.random.default_rng(seed).standard_normal(pixels.shape)
     names = tuple(f"row {k}" for k in range(2, len(places) + 2))
     return FloorPoints(names, pixels, places), rotation

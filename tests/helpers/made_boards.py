@@ -11,9 +11,9 @@ import numpy as np
 
 COLUMNS, ROWS, SQUARE, MARKER = 7, 5, 0.04, 0.03
 DOTS = 40
-"""Of the drawing, along a square."""
+"""Number of dots of the drawing along a square."""
 FINE = 2
-"""Rays along a pixel."""
+"""Number of rays along a pixel."""
 
 
 @dataclass(frozen=True)
@@ -43,14 +43,14 @@ class TrueLens:
             y * wide + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
         )
 
-    def seen(self, points: np.ndarray) -> np.ndarray:
-        """Pixels of points in the camera's axes."""
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return the pixels of points in the camera's axes."""
         x, y = self.bent(points[..., 0] / points[..., 2], points[..., 1] / points[..., 2])
         return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], -1)
 
     @cached_property
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
-        """x and y at distance 1 of every fine ray, row by row: the model inverted by repetition."""
+        """x and y at distance 1 of every fine ray, by iterated inversion of the model."""
         u, v = (
             (np.arange(FINE * n, dtype=float) + 0.5) / FINE - 0.5 for n in (self.width, self.height)
         )
@@ -64,11 +64,11 @@ class TrueLens:
 
 @dataclass(frozen=True)
 class Light:
-    """What a picture suffers.
+    """Light and flaws of a picture.
 
     Attributes:
-        blur_px: of the lens.
-        noise: standard deviation, of 255.
+        blur_px: blur of the lens [pixel].
+        noise: standard deviation [of 255].
         falloff: share of the light that is missing at the right edge.
     """
 
@@ -79,7 +79,7 @@ class Light:
 
 @cache
 def drawing(columns: int = COLUMNS, rows: int = ROWS, legacy: bool = False) -> np.ndarray:
-    """The printed board with a white margin of one square."""
+    """Return the printed board with a white margin of one square."""
     book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     board = cv2.aruco.CharucoBoard((columns, rows), SQUARE, MARKER, book)
     board.setLegacyPattern(legacy)
@@ -89,14 +89,14 @@ def drawing(columns: int = COLUMNS, rows: int = ROWS, legacy: bool = False) -> n
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """From the board's axes (x right, y down, origin at its upper left) to the camera's."""
+    """Pose of the board (x right, y down, origin at its upper left) in the camera's axes."""
 
     rotation: np.ndarray
     shift: np.ndarray
 
 
 def held(tilt_x: float, tilt_y: float, turn: float, middle: tuple[float, float, float]) -> Place:
-    """A board before the camera, its middle at a point of the camera's axes [m]; angles [deg]."""
+    """Return a board with its middle at a point of the camera's axes [m], by angles [deg]."""
     rotation = np.eye(3)
     for axis, angle in (([0, 0, 1.0], turn), ([0, 1.0, 0], tilt_y), ([1.0, 0, 0], tilt_x)):
         rotation = cv2.Rodrigues(np.radians(angle) * np.array(axis))[0] @ rotation
@@ -111,15 +111,15 @@ def photo(
     light: Light = Light(),
     print_: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Picture of the board: grey levels from 0 to 255, thrice."""
+    """Return a picture of the board, with equal blue, green and red."""
     print_ = drawing() if print_ is None else print_
     x, y = lens.rays
     # the plane is z' = 0 of the board: solve R^T (s ray - t) for s, then x' and y'
     back, start = place.rotation.T, place.rotation.T @ place.shift
     rays = [back[k, 0] * x + back[k, 1] * y + back[k, 2] for k in range(3)]
-    far = start[2] / rays[2]
-    at = [((far * rays[k] - start[k]) / SQUARE + 1) * DOTS - 0.5 for k in range(2)]
-    at = [np.where(far > 0, a, -1e4).astype(np.float32) for a in at]
+    depth = start[2] / rays[2]
+    at = [((depth * rays[k] - start[k]) / SQUARE + 1) * DOTS - 0.5 for k in range(2)]
+    at = [np.where(depth > 0, a, -1e4).astype(np.float32) for a in at]
     fine = cv2.remap(print_, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=120)
     image = cv2.resize(fine, (lens.width, lens.height), interpolation=cv2.INTER_AREA).astype(float)
     image = cv2.GaussianBlur(image, (0, 0), light.blur_px)
@@ -129,21 +129,21 @@ def photo(
 
 
 def places(count: int = 14, tilt: float = 32.0) -> list[Place]:
-    """Views as a careful person takes them: all over the picture, tilted about both axes."""
+    """Return good views of the board: all over the picture, tilted about both axes."""
     spots = [(-0.16, -0.11), (0.16, -0.11), (-0.16, 0.11), (0.16, 0.11), (0.0, 0.0)]
     spots += [(0.0, -0.12), (0.0, 0.12), (-0.18, 0.0), (0.18, 0.0)]
-    found = []
+    poses = []
     for k in range(count):
         angle = 2.4 * k
         x, y = spots[k % len(spots)]
         at = (x, y, 0.46 + 0.06 * (k % 3))
         lean = tilt * (0.6 + 0.4 * (k % 2))
-        found.append(held(lean * np.cos(angle), lean * np.sin(angle), 20.0 * (k % 5 - 2), at))
-    return found
+        poses.append(held(lean * np.cos(angle), lean * np.sin(angle), 20.0 * (k % 5 - 2), at))
+    return poses
 
 
 def overhead(tilt_x: float, tilt_y: float, turn: float, place: tuple[float, float, float]) -> Place:
-    """The board on the floor, seen by a camera at a place of the world.
+    """Return the pose of the board on the floor for a camera at a place in the world.
 
     The world's origin is the middle of the board, x along its columns, y up its rows, z up. Angles
     [deg] are those by which the camera is off from straight down with x to the right.
@@ -157,13 +157,13 @@ def overhead(tilt_x: float, tilt_y: float, turn: float, place: tuple[float, floa
     return Place(rotation @ down, -rotation @ (down @ inside + np.array(place)))
 
 
-def from_world(seen: Place) -> np.ndarray:
-    """Rotation from the world of `overhead` to the camera's axes."""
-    return seen.rotation @ np.diag([1.0, -1.0, -1.0])
+def from_world(board: Place) -> np.ndarray:
+    """Return the rotation from the world of `overhead` to the camera's axes."""
+    return board.rotation @ np.diag([1.0, -1.0, -1.0])
 
 
 def write(image: np.ndarray, path: Path) -> Path:
-    """A picture as a PNG file."""
+    """Write a picture as a PNG file, and return its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
     return path

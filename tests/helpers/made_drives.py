@@ -1,4 +1,4 @@
-"""Ways of robots: x, y [m], heading [rad] at a time [s]."""
+"""Paths of robots: x, y [m], heading [rad] at a time [s]."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def round_trip(speed: float = 0.25, turning: float = 0.8) -> Callable[[float], np.ndarray]:
-    """An ellipse with the heading's own rhythm, at about a speed [m/s] and turning rate [rad/s]."""
+    """Return an ellipse at about a speed [m/s], with a constant turning rate [rad/s]."""
 
     def pose(t: float) -> np.ndarray:
         a = speed * t / 0.35
@@ -18,14 +18,14 @@ def round_trip(speed: float = 0.25, turning: float = 0.8) -> Callable[[float], n
 
 
 def starts_and_stops(t: float) -> np.ndarray:
-    """Every second a start at 1 m/s^2 to 0.4 m/s, a stop, then at once a turn at 90 deg/s."""
+    """Return the pose after starts at 1 m/s^2 to 0.4 m/s, stops, and turns at 90 deg/s."""
     whole, part = divmod(t, 3.0)
     ramp, speed = 0.4, 0.4
     p = min(part, 1.4)
-    way = 0.5 * min(p, ramp) ** 2 + speed * min(max(p - ramp, 0.0), 0.6)
+    path = 0.5 * min(p, ramp) ** 2 + speed * min(max(p - ramp, 0.0), 0.6)
     brake = min(max(p - 1.0, 0.0), ramp)
-    way += speed * brake - 0.5 * brake**2
+    path += speed * brake - 0.5 * brake**2
     side = -1.0 if whole % 2 else 1.0
     turn = np.pi / 2 * min(max(part - 1.6, 0.0), 1.0)
     start = -0.2 if side > 0 else 0.2
-    return np.array([start + side * way, 0.1, 0.3 + turn + np.pi / 2 * whole])
+    return np.array([start + side * path, 0.1, 0.3 + turn + np.pi / 2 * whole])

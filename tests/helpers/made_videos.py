@@ -13,11 +13,11 @@ from slipid.camera.overhead import Lens, OverheadCamera
 from tests.helpers.made_boards import FINE, TrueLens, from_world, overhead
 
 DOTS = 24
-"""Of the drawing, along one of the marker's squares."""
+"""Number of dots of the drawing along one of the marker's squares."""
 FPS = 30.0
 AREA = cv2.INTER_AREA
 SHIFT = 41
-"""Places to which the noise of a frame is shifted, along each edge [pixel]."""
+"""Largest shift of the noise of a frame along each edge [pixel]."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Printed:
     Attributes:
         size, height: edge of the black square and its height above the floor [m].
         ahead, left: its middle on the body [m].
-        yaw: of its top edge, counter-clockwise from ahead [rad].
+        yaw: angle of its top edge, counter-clockwise from ahead [rad].
     """
 
     id: int = 0
@@ -40,11 +40,11 @@ class Printed:
 
     @property
     def squares(self) -> int:
-        """Of the black square's edge."""
+        """Number of squares along the black square's edge."""
         return int(self.dictionary[0]) + 2
 
     def middle(self, pose: np.ndarray) -> np.ndarray:
-        """Where it is in the world [m]."""
+        """Return its middle in the world [m]."""
         c, s = np.cos(pose[2]), np.sin(pose[2])
         flat = pose[:2] + np.array([[c, -s], [s, c]]) @ (self.ahead, self.left)
         return np.array([*flat, self.height])
@@ -52,7 +52,7 @@ class Printed:
 
 @dataclass(frozen=True)
 class Box:
-    """A part of a picture [pixel]."""
+    """A rectangle of a picture [pixel]."""
 
     x0: int
     y0: int
@@ -94,15 +94,15 @@ def _drawn(id: int, dictionary: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Light:
-    """What a frame suffers.
+    """Light and flaws of a frame.
 
     Attributes:
-        exposure_s: over which it is smeared.
-        blur_px: of the lens.
-        noise: standard deviation, of 255.
+        exposure_s: time over which it is smeared [s].
+        blur_px: blur of the lens [pixel].
+        noise: standard deviation [of 255].
         falloff: part of the light that is missing at the right edge.
-        flicker: part by which it goes up and down.
-        bright: of everything.
+        flicker: part by which the light varies.
+        bright: factor of all light.
     """
 
     exposure_s: float = 0.008
@@ -115,7 +115,7 @@ class Light:
 
 @cache
 def lens_of(width: int, focal: float | None = None, bend: float = -0.08) -> TrueLens:
-    """A lens of pictures 16:9; of 1080p it has a focal length of 1200 pixel by default."""
+    """Return a lens for 16:9 pictures, by default of focal length 1200 pixel at 1080p."""
     height = round(width * 9 / 16)
     f = width * 1200 / 1920 if focal is None else focal
     return TrueLens(
@@ -129,8 +129,8 @@ class Stage:
     """A camera, its light and the floor below it.
 
     Attributes:
-        tilt: about the picture's axes and about the vertical [deg].
-        place: of the lens in the world [m].
+        tilt: angles about the picture's axes and about the vertical [deg].
+        place: place of the lens in the world [m].
     """
 
     lens: TrueLens = field(default_factory=lambda: lens_of(640))
@@ -152,7 +152,7 @@ class Stage:
 
     @cached_property
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
-        """x and y of every fine ray in the world where it has gone down by one metre."""
+        """x and y in the world of every fine ray one metre below the lens."""
         x, y = self.lens.rays
         ray = np.stack([x, y, np.ones_like(x)], -1) @ self.rotation
         return -ray[..., 0] / ray[..., 2], -ray[..., 1] / ray[..., 2]
@@ -175,8 +175,8 @@ class Stage:
     @cached_property
     def empty(self) -> np.ndarray:
         """The empty floor as the lens blurs it."""
-        seen = cv2.resize(self.floor, (self.lens.width, self.lens.height), None, 0, 0, AREA)
-        return cv2.GaussianBlur(seen, (0, 0), max(self.light.blur_px, 1e-3))
+        small = cv2.resize(self.floor, (self.lens.width, self.lens.height), None, 0, 0, AREA)
+        return cv2.GaussianBlur(small, (0, 0), max(self.light.blur_px, 1e-3))
 
     @cached_property
     def shade(self) -> np.ndarray:
@@ -184,12 +184,12 @@ class Stage:
         return self.light.bright * (1 - self.light.falloff * across)
 
     def _box(self, marker: Printed, poses: Sequence[np.ndarray]) -> Box:
-        """Pixels among which a marker is seen at some poses, with room for blur."""
+        """Return the pixels that a marker covers at some poses, with room for blur."""
         corners = []
         for pose in poses:
             away = self.rotation @ (marker.middle(pose) - np.array(self.place))
             half = marker.size * self.lens.fx / away[2] + 8 + 4 * self.light.blur_px
-            corners += [self.lens.seen(away) - half, self.lens.seen(away) + half]
+            corners += [self.lens.project(away) - half, self.lens.project(away) + half]
         limit = np.array([self.lens.width, self.lens.height])
         low, high = (np.clip(f(corners, axis=0), 0, limit).astype(int) for f in (np.min, np.max))
         return Box(*low.tolist(), *high.tolist())
@@ -203,10 +203,10 @@ class Stage:
         dots, middle_dot = marker.squares * DOTS / marker.size, 0.5 * (marker.squares + 2) * DOTS
         at = [(middle_dot - dots * a - 0.5).astype(np.float32) for a in (left, ahead)]
         drawn = _drawn(marker.id, marker.dictionary)
-        seen = cv2.remap(drawn, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        picture = cv2.remap(drawn, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         edge = middle_dot / dots
         inside = (np.abs(ahead) < edge) & (np.abs(left) < edge)
-        np.copyto(fine, seen, where=inside, casting="unsafe")
+        np.copyto(fine, picture, where=inside, casting="unsafe")
 
     def _draw(self, total: np.ndarray, marker: Printed, poses: Sequence[np.ndarray]) -> None:
         """Draw a marker, smeared over some poses, into a picture."""
@@ -218,11 +218,13 @@ class Stage:
             part = self.floor[box.fine].copy()
             self._put(part, box, marker, pose)
             fine += part / len(poses)
-        seen = cv2.resize(fine, (box.width, box.height), None, 0, 0, AREA)
-        total[box.rows, box.columns] = cv2.GaussianBlur(seen, (0, 0), max(self.light.blur_px, 1e-3))
+        small = cv2.resize(fine, (box.width, box.height), None, 0, 0, AREA)
+        total[box.rows, box.columns] = cv2.GaussianBlur(
+            small, (0, 0), max(self.light.blur_px, 1e-3)
+        )
 
     def frame(self, time: float, bodies: Sequence[Body]) -> np.ndarray:
-        """Grey levels of a frame whose exposure is centred on a time; markers lie well apart."""
+        """Return a frame whose exposure is centred on a time; markers lie well apart."""
         light, (w, h) = self.light, (self.lens.width, self.lens.height)
         steps = (-0.375, -0.125, 0.125, 0.375) if light.exposure_s > 0 else (0.0,)
         total = self.empty.copy()
@@ -236,7 +238,7 @@ class Stage:
         return cv2.convertScaleAbs(np.maximum(total, 0, out=total))
 
     def film(self, bodies: Sequence[Body], count: int, fps: float = FPS) -> list[np.ndarray]:
-        """Frames from time 0 on."""
+        """Return frames from time 0 on."""
         return [self.frame(k / fps, bodies) for k in range(count)]
 
 

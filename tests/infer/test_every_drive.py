@@ -1,4 +1,4 @@
-"""Robots of every kind of drive give back the numbers that made their logs."""
+"""A fit recovers the numbers of robots with every kind of drive."""
 
 import numpy as np
 import pytest

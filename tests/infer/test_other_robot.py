@@ -14,7 +14,7 @@ from slipid.app.logs import read_dataset
 from slipid.app.problem import read_fit_task
 from slipid.fit import likelihood as lk
 from slipid.fit.optimise import optimise
-from slipid.infer.result import summarise
+from slipid.infer.summary import summarise
 from slipid.predict import open_loop as replay
 from slipid.support.progress import Reporter
 
@@ -27,14 +27,14 @@ LEAST_SQUARES = 0.0505
 
 
 def end_errors(robot, data) -> tuple[np.ndarray, np.ndarray]:
-    """Distance between predicted and tracked end of every run [m], and length of its path [m]."""
-    off, way = np.zeros(len(data)), np.zeros(len(data))
+    """Return the distance of predicted and tracked end of every run, and its path length [m]."""
+    error, length = np.zeros(len(data)), np.zeros(len(data))
     for w in replay.replay_windows(data, robot):
         step = np.asarray(replay.contact_increments(robot, lk.batch(w, robot)))
         track = replay.tracks_from_increments(robot, w, step)
-        way[track.run] = np.linalg.norm(np.diff(track.measured[..., :2], axis=1), axis=-1).sum(1)
-        off[track.run] = np.linalg.norm(track.gap[:, :2], axis=1)
-    return off, way
+        length[track.run] = np.linalg.norm(np.diff(track.measured[..., :2], axis=1), axis=-1).sum(1)
+        error[track.run] = np.linalg.norm(track.gap[:, :2], axis=1)
+    return error, length
 
 
 @pytest.mark.slow
@@ -52,13 +52,15 @@ def test_radii_from_joystick_runs_predict_squares_and_circles(real_data):
         assert found.ratio < 0.35  # two recordings, which do not agree as well as runs of one do
         assert not found.interval90[0] < nominal < found.interval90[1]
     unseen, _ = read_dataset(config, config.content.validate_.logs, root, Reporter(quiet=True))
-    nominal = eqx.tree_at(  # as the metadata says, everything else at its start
+    nominal = eqx.tree_at(  # by the metadata, everything else at its start
         lambda r: (r.geometry.wheel_radius, r.geometry.base_radius),
         fit.space.template,
         tuple(jnp.asarray(v) for v in NOMINAL.values()),
     )
-    (before, _), (after, way) = end_errors(nominal, unseen), end_errors(fit.robot, unseen)
-    print("end error [m], nominal:", before.round(4), "identified:", after.round(4), "path:", way)
+    (before, _), (after, length) = end_errors(nominal, unseen), end_errors(fit.robot, unseen)
+    print(
+        "end error [m], nominal:", before.round(4), "identified:", after.round(4), "path:", length
+    )
     assert (after < before).all()
     assert after.mean() < LEAST_SQUARES
-    assert np.mean(after / way) < 0.5 * np.mean(before / way)
+    assert np.mean(after / length) < 0.5 * np.mean(before / length)

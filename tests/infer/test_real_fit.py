@@ -13,7 +13,7 @@ from tests.helpers import golden_rows as rows
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "robotino2022.toml"
 SAME = 1e-3
-"""Numbers may differ by so much of themselves: how code is compiled moves where a fit rests."""
+"""Relative tolerance of numbers: the end of a fit depends on how code is compiled."""
 pytestmark = pytest.mark.slow  # fits 472 runs
 
 

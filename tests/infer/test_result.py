@@ -23,8 +23,9 @@ from slipid.infer import fit_file
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.fit_file import identified_json, load, save, to_json
 from slipid.infer.posterior import diagnosis
-from slipid.infer.result import Fit, summarise
+from slipid.infer.result import Fit
 from slipid.infer.slip_curves import by_encoders, has_steady_command, validity
+from slipid.infer.summary import summarise
 from slipid.infer.verdicts.estimates import estimates
 from slipid.infer.verdicts.unidentified import flat_directions, members
 from slipid.lab.selftest.logs import (
@@ -53,7 +54,7 @@ CHOICES = (
 
 @functools.cache
 def made(voltage: bool):
-    """A problem, its data, and the Laplace covariance at the truth."""
+    """Return a problem, its data, and the Laplace covariance at the truth."""
     data = collect(simulate_logs(TRUTH, DRIVES, 1, SimulatedSensors(has_voltage=voltage)))
     problem = Problem(windows(data, 0.04, lag=0.05), nominal_robot(DRIVES), list(CHOICES))
     z = problem.space.vector(TRUTH)
@@ -98,7 +99,7 @@ def verdicts(
     prior_std: float | None = None,
     flat: tuple[str, ...] = (),
 ):
-    """Estimates when every posterior is `ratio` times its prior, `shift` prior stds from it.
+    """Return estimates when every posterior is `ratio` times its prior, `shift` prior stds from it.
 
     `prior_std` in the search space is the declared one, or one for all.
     """
@@ -125,7 +126,7 @@ def test_the_verdict_rule(ratio, verdict):
 
 @pytest.mark.parametrize(("std", "verdict"), [(0.33, "identified"), (0.34, "weak")])
 def test_a_positive_number_within_three_stds_of_zero_is_not_identified(std, verdict):
-    # a wide prior, of which a wide interval is a small part; one that takes any sign is not asked
+    # a wide interval is narrow relative to a wide prior; unbounded numbers are not tested
     found = verdicts(std / 4, prior_std=4.0)
     assert found["surface.soft.creep"].verdict == verdict
     assert found["surface.soft.lead"].verdict == "identified"
@@ -203,7 +204,7 @@ def test_with_voltage_both_are_identified_and_no_flat_direction_holds_them():
     assert not [f for f in fit.flat if {"motor.resistance", "motor.back_emf"} & set(f.paths)]
 
 
-def test_a_made_up_flat_direction_comes_out_with_its_powers():
+def test_a_constructed_flat_direction_is_found_with_its_powers():
     problem, _, _ = made(True)
     space = problem.space
     std, names = space.prior_std, space.names
@@ -242,11 +243,11 @@ def test_curves_rise_hold_their_line_and_end_where_the_data_end():
     assert torque[k] == pytest.approx(expected, rel=2e-3)
 
 
-def test_what_was_driven_is_told_by_the_wheels_where_no_steady_command_was_logged():
+def test_encoders_show_the_driven_motion_where_no_steady_command_was_logged():
     twist = np.zeros((400, 3))
-    way = np.radians(60.0 * (np.arange(400) % 6))
+    angle = np.radians(60.0 * (np.arange(400) % 6))
     speed = np.where(np.arange(400) < 200, 0.1, 0.3)
-    twist[:, 0], twist[:, 1] = speed * np.cos(way), speed * np.sin(way)
+    twist[:, 0], twist[:, 1] = speed * np.cos(angle), speed * np.sin(angle)
     twist[:40], twist[40:80, 2] = 0.0, 0.5
     twist[80] = 0.3 * np.array([0.0, 1.0, 0.0])  # one window is no direction that was driven
     driven = by_encoders(twist)
@@ -256,19 +257,19 @@ def test_what_was_driven_is_told_by_the_wheels_where_no_steady_command_was_logge
     assert by_encoders(np.zeros((5, 3))) == ((), (), ())
 
 
-def test_a_floor_whose_runs_have_no_steady_command_was_seen_as_the_wheels_say():
+def test_a_floor_without_steady_commands_has_the_ranges_of_the_encoders():
     problem, data, _ = made(True)
     robot = problem.space.tree(problem.space.start)
     blind = tuple(replace(log, twist_command=None) for log in data.logs)
     lies = replace(data, heading=data.heading + 0.1)
-    asked, seen = (
+    commanded, encoders = (
         validity(runs, robot, problem.batch)["soft"] for runs in (lies, replace(lies, logs=blind))
     )
-    assert set(np.mod(asked.headings_deg, 30.0)) != {0.0}
-    assert set(np.mod(seen.headings_deg, 30.0)) == {0.0}
+    assert set(np.mod(commanded.headings_deg, 30.0)) != {0.0}
+    assert set(np.mod(encoders.headings_deg, 30.0)) == {0.0}
 
 
-def test_a_command_that_changes_or_rests_tells_nothing_of_a_run():
+def test_a_command_that_changes_or_rests_does_not_describe_a_run():
     data = made(True)[1]
     log = replace(data.logs[0], twist_command=np.tile([0.2, 0.0, 0.0], (data.logs[0].samples, 1)))
     assert has_steady_command(log)
@@ -279,11 +280,11 @@ def test_a_command_that_changes_or_rests_tells_nothing_of_a_run():
     assert not has_steady_command(replace(log, twist_command=resting))
 
 
-def test_a_solver_that_stopped_on_its_way_is_not_called_converged():
-    """At the truth, not at the optimum, of this very noise a step of some stds remains."""
+def test_a_solver_that_stopped_early_is_not_called_converged():
+    """At the truth, which is not the optimum for this noise, a step of some stds remains."""
     problem, data, end = made(True)
     fit = fit_of(True)
-    assert end.converged  # or so it says
+    assert end.converged  # the flag alone
     assert fit.remaining > 0.3
     assert not fit.converged
     assert fit.reason.startswith("the solver stopped")
@@ -304,7 +305,7 @@ def test_a_solver_that_stopped_on_its_way_is_not_called_converged():
     assert there.converged
 
 
-def test_identified_json_is_what_the_contract_says():
+def test_identified_json_has_the_documented_content():
     found = json.loads(json.dumps(identified_json(fit_of(True)), allow_nan=False))
     assert found["schema"] == "slipid.identified/1"
     keys = {"value", "unit", "shape", "labels", "std", "interval90", "source", "verdict"}
@@ -318,7 +319,7 @@ def test_identified_json_is_what_the_contract_says():
     assert found["data"]["runs"] == [log.name for log in made(True)[1].logs]
 
 
-def test_the_data_hash_knows_names_and_bytes_but_no_order():
+def test_the_data_hash_depends_on_names_and_bytes_not_on_order():
     runs = [("a", "1"), ("b", "2")]
     assert hash_of(runs) == hash_of(runs[::-1])
     assert len({hash_of(runs), hash_of(runs[:1]), hash_of([("a", "2"), ("b", "1")])}) == 3
@@ -339,11 +340,11 @@ def test_a_saved_fit_comes_back_the_same(tmp_path):
 
 
 class Killed(BaseException):
-    """The process died."""
+    """Stand-in for the death of a process."""
 
 
 def dies_after(monkeypatch, writes: int) -> None:
-    """The next writing process dies after so many of its files."""
+    """Let the next writing process die after so many of its files."""
     done = iter(range(writes))
     write = fit_file.write_bytes
 
@@ -356,7 +357,7 @@ def dies_after(monkeypatch, writes: int) -> None:
 
 
 OLD = 4.0
-"""A number by which two fits are told apart, in what is JSON and in what is an array."""
+"""A number that distinguishes two fits, in JSON and in an array."""
 
 
 def of_two() -> tuple[Fit, Fit]:
@@ -381,9 +382,9 @@ def test_a_refit_that_dies_while_it_is_written_never_leaves_parts_of_two(
         with pytest.raises(DataError, match="belongs to another fit than"):
             load(tmp_path)
         (tmp_path / "identified.json").unlink()
-    back, left = load(tmp_path), new if writes >= 2 else old
-    assert back.remaining == left.remaining
-    np.testing.assert_array_equal(back.laplace, left.laplace)
+    back, expected = load(tmp_path), new if writes >= 2 else old
+    assert back.remaining == expected.remaining
+    np.testing.assert_array_equal(back.laplace, expected.laplace)
     names = save(new, tmp_path)  # and the next one cleans up
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
     assert load(tmp_path).remaining == new.remaining
@@ -430,11 +431,11 @@ def test_damage_of_any_file_is_a_message_and_never_a_traceback(tmp_path):
 # sessions ---------------------------------------------------------------------------------------
 
 SHARED = {"along": 0.02, "across": 0.01}
-"""Stds of what runs of one session share [m/m]: thrice and twice as much as a run has alone."""
+"""Stds of session effects [m/m]: three and two times those of single runs."""
 
 
 def in_sessions(session, seed):
-    """Runs in these sessions, whose ends are off by what the runs of each share."""
+    """Return runs in these sessions, whose ends have the effects of their sessions."""
     rng = np.random.default_rng(seed)
     drives = [
         PlannedRun("soft", "as_built", h, 0.1) for h in rng.uniform(0, 2 * np.pi, len(session))
@@ -446,16 +447,16 @@ def in_sessions(session, seed):
         back = np.linalg.pinv(np.asarray(TRUTH.geometry.forward()))
         step = log.wheel_angle * float(TRUTH.geometry.wheel_radius) @ back.T
         seen_at = log.time - float(TRUTH.camera.lag)
-        far = np.interp(seen_at, log.time, np.hypot(*step.T[:2])) / float(TRUTH.camera.scale)
-        way = log.pose[0, 2] + drive.heading
-        turn = np.array([[np.cos(way), np.sin(way)], [-np.sin(way), np.cos(way)]])
+        length = np.interp(seen_at, log.time, np.hypot(*step.T[:2])) / float(TRUTH.camera.scale)
+        angle = log.pose[0, 2] + drive.heading
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         pose = log.pose.copy()
-        pose[:, :2] += far[:, None] * (np.array([along, across]) @ turn)
+        pose[:, :2] += length[:, None] * (np.array([along, across]) @ turn)
         moved.append(dataclasses.replace(log, pose=pose))
     return collect(moved, [f"s{k}" for k in session])
 
 
-def test_what_sessions_share_is_stored_with_its_unit():
+def test_session_effects_are_stored_with_their_unit():
     data = in_sessions(np.arange(24) % 6, 1)
     problem = Problem(windows(data, 0.04, lag=0.056), nominal_robot(DRIVES), list(CHOICES))
     z, log_v = problem.space.vector(TRUTH), 2 * np.log(problem.noise.typical)
@@ -469,8 +470,8 @@ def test_what_sessions_share_is_stored_with_its_unit():
 
 
 @pytest.mark.nightly
-def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
-    """At the truth, so that all that is off is noise: 200 runs, each in a session of its own."""
+def test_session_effects_are_stored_and_widen_validation(tmp_path):
+    """At the truth all errors are noise: 200 runs, each in a session of its own."""
     data = in_sessions(np.arange(160) % 40, 1)
     problem = Problem(windows(data, 0.04, lag=0.056), nominal_robot(DRIVES), list(CHOICES))
     z, sensors = problem.space.vector(TRUTH), SimulatedSensors()
@@ -493,7 +494,7 @@ def test_what_sessions_share_is_stored_and_makes_validation_honest(tmp_path):
         fitted = dataclasses.replace(fit.contact, variance=variance, covariance=covariance)
         return validation(fitted, (), new).summary["soft"]["identified"].coverage90
 
-    # what it says at least; what is drawn is Gaussian, of which a Student t's region holds more
+    # at least the stated share; draws are Gaussian, and the Student t's region holds more of them
     held = chi2.cdf(2 * fisher.ppf(0.9, 2, DEGREES), 2)
     low, high = binom.ppf(0.005, 200, 0.9), binom.ppf(0.995, 200, held)
     assert low <= 200 * covered(fit.covariance, dict(fit.variance)) <= high
@@ -522,7 +523,7 @@ def test_damaged_results_are_refused_with_a_message(tmp_path):
         load(tmp_path)
 
 
-def test_a_fit_from_its_files_is_the_same_type_and_says_what_it_lacks(tmp_path):
+def test_a_fit_from_its_files_has_the_same_type_and_names_what_it_lacks(tmp_path):
     fit = fit_of(True)
     fit.save(tmp_path)
     again = Fit.load(tmp_path)

@@ -1,4 +1,4 @@
-"""What the camera does to places and headings, against OpenCV's lens and against differences."""
+"""The camera's map of positions and headings, against OpenCV's lens and differences."""
 
 import cv2
 import equinox as eqx

@@ -1,4 +1,4 @@
-"""Wheels that share a motor, and wheels of other radii than they are said to have."""
+"""Wheels that share a motor, and wheels whose radii deviate from the config."""
 
 from dataclasses import replace
 

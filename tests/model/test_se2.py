@@ -1,4 +1,4 @@
-"""Motions in the plane against the exponential of their matrices, and where a turn is none."""
+"""Motions in the plane against the exponential of their matrices, at small turns, too."""
 
 from __future__ import annotations
 

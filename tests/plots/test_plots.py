@@ -1,4 +1,4 @@
-"""Pictures: what they compare is right, and every one of them shows something."""
+"""Pictures: the compared values are correct, and no picture is empty."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from slipid.data.windows import windows
 from slipid.fit.optimise import Optimum
 from slipid.fit.problem import FitState, Problem
 from slipid.infer.design.planned_runs import PlannedRun
-from slipid.infer.result import Fit, summarise
+from slipid.infer.result import Fit
+from slipid.infer.summary import summarise
 from slipid.lab.selftest.logs import (
     SimulatedSensors,
     heading_grid,
@@ -49,13 +50,13 @@ def data():
 
 
 @functools.cache
-def pieces():
+def segments():
     return measured_windows(ROBOT, data(), 4)
 
 
 @functools.cache
 def fit() -> Fit:
-    """A fit that ended at the truth."""
+    """Return a fit that ended at the truth."""
     choices = [Choice("camera.scale", prior_mean=1.117, prior_std=0.002)]
     choices.append(Choice("camera.lag", prior_mean=0.056, prior_std=0.02))
     choices.append(Choice("robot.mass", fixed=12.0))
@@ -77,25 +78,25 @@ def shows_something(path) -> bool:
 
 
 def test_camera_of_undisturbed_logs_lies_on_the_predicted_lines():
-    p = pieces()
+    p = segments()
     assert p.straight.all()
     for g, (floor, load) in enumerate(p.groups):
         for speed in (0.1, 0.2):
             mine = (p.group == g) & (p.speed == speed)
             assert mine.sum() >= 8
             slip, drift, yaw = by_heading(ROBOT, floor, load, speed, p.heading[mine]).T
-            # wheels ramp up and are rounded to ticks, so a little is left
+            # wheels ramp up and are rounded to ticks, so small residuals remain
             np.testing.assert_allclose(p.slip[mine], slip, atol=0.01)
             np.testing.assert_allclose(p.drift[mine], drift, atol=0.5)
             np.testing.assert_allclose(p.yaw[mine], yaw, atol=1.5)
 
 
 def test_floors_are_ordered_by_slip():
-    assert pieces().groups == (("firm", "as_built"), ("soft", "as_built"))
+    assert segments().groups == (("firm", "as_built"), ("soft", "as_built"))
 
 
 def test_torque_from_unsigned_currents_is_that_of_the_contact():
-    p = pieces()
+    p = segments()
     turning = np.abs(p.wheel_speed) > 0.5
     gap = driving_torque(ROBOT, p) - p.torque * np.sign(p.wheel_speed)
     # half a step of 1/39 A is 0.01 N m
@@ -104,7 +105,7 @@ def test_torque_from_unsigned_currents_is_that_of_the_contact():
 
 
 def test_wheel_slip_and_torque_lie_on_the_curve_of_a_wheel():
-    p = pieces()
+    p = segments()
     k = int(np.argmin(np.where(p.group == 1, p.sideways[:, 0], np.inf)))
     args = float(p.sideways[k, 0]), abs(float(p.wheel_speed[k, 0]))
     slip = np.linspace(0, 1, 201)
@@ -151,12 +152,12 @@ def test_an_empty_figure_does_not_pass_for_a_picture(tmp_path):
 
 
 def test_without_currents_or_directions_those_pictures_are_left_out():
-    assert current_figure(replace(pieces(), amps=None)) is None
-    one_way = replace(pieces(), heading=np.full(len(pieces().heading), 90.0))
+    assert current_figure(replace(segments(), amps=None)) is None
+    one_way = replace(segments(), heading=np.full(len(segments().heading), 90.0))
     assert heading_figure(ROBOT, one_way) is None
 
 
-def test_turning_pieces_have_no_direction():
+def test_turning_segments_have_no_direction():
     drives = (PlannedRun("soft", "as_built", 0.3, 0.2, turn=0.8),)
     robot = true_robot(drives)
     assert not measured_windows(
@@ -175,7 +176,7 @@ def test_loads_are_written_at_their_wheels():
     assert texts["wheel 1"].get_position()[0] < 0 < texts["wheel 1"].get_position()[1]
 
 
-def test_every_rung_has_words_in_the_picture():
+def test_every_slip_model_has_a_readable_name():
     shapes = omni([60.0, 180.0, 300.0], 0.1, 0.04), differential(0.2, 0.04)
     names = {model.name for shape in shapes for model in slip_models(shape, has_current=True)}
     assert set(WORDS) == {"identified", *names}

@@ -1,4 +1,4 @@
-"""What other runs taught is refused where it predicts a floor's own runs worse beyond chance."""
+"""Runs over several floors are refused where they worsen a floor's own runs beyond chance."""
 
 from __future__ import annotations
 
@@ -54,36 +54,36 @@ def test_a_single_run_shows_nothing():
 
 
 def test_floors_that_are_worse_are_named_and_no_others():
-    said = contradiction(
+    reason = contradiction(
         {"gray": FloorErrors(0.0126, 0.0702, True), "green": FloorErrors(0.1, 0.1, False)},
         STILL,
         0.02,
         {"gray": 0.03, "green": 0.03},
     )
-    assert "gray from 1.3 to 7.0 % of the way" in said
-    assert "green" not in said
-    assert "map may be wrong" in said
+    assert "gray from 1.3 to 7.0 % of the distance driven" in reason
+    assert "green" not in reason
+    assert "map may be wrong" in reason
 
 
 @pytest.mark.parametrize(("green", "refused"), [(0.017, False), (0.015, True)])
 def test_a_map_that_predicts_worse_than_a_single_floor_is_said_to_be_wrong(green, refused):
-    said = contradiction(FINE, STILL, 0.02, {"gray": 0.05, "green": green})
-    assert (said is not None) == refused
+    reason = contradiction(FINE, STILL, 0.02, {"gray": 0.05, "green": green})
+    assert (reason is not None) == refused
     if refused:
-        assert "20.0 mm/s by their map, 15.0 as if all on green" in said
-        assert "map may be wrong" in said
+        assert "20.0 mm/s by their map, 15.0 mm/s as if all on green" in reason
+        assert "map may be wrong" in reason
 
 
 @pytest.mark.parametrize(
-    ("sigma", "said"),
-    [(3.9, None), (25.0, "moves by 25 standard errors"), (np.inf, "found no rest")],
+    ("sigma", "reason"),
+    [(3.9, None), (25.0, "moves by 25 standard errors"), (np.inf, "did not settle")],
 )
-def test_numbers_that_move_far_are_a_contradiction(sigma, said):
+def test_numbers_that_move_far_are_a_contradiction(sigma, reason):
     found = contradiction(FINE, LargestShift("robot.load_share", sigma), 0.02, {"gray": 0.05})
-    assert found is None if said is None else said in found
+    assert found is None if reason is None else reason in found
 
 
-def test_what_moves_most_is_told_of_motion_and_not_of_the_camera():
+def test_the_largest_shift_is_among_numbers_of_the_motion_without_the_camera():
     blank = robot()
     free = ("surface.*.creep", "surface.*.friction", "camera.scale")
     space = Space(blank, [Choice("*", free=False), *(Choice(path, free=True) for path in free)])

@@ -1,4 +1,4 @@
-"""What methods are given: steps, windows, paths, and floors told or not."""
+"""Inputs of slip models: steps, windows, paths, and known or unknown floors."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Models below the force balance: each finds what made the data, none knows more than it saw."""
+"""Slip models below the force balance: each recovers the model that generated its data."""
 
 from dataclasses import replace
 

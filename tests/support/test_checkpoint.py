@@ -1,4 +1,4 @@
-"""Checkpoints: what is loaded is whole and of the same work, whatever happened to the files."""
+"""Checkpoints load only complete parts of the same job, whatever happened to the files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What spreads work: results come whole, in any engine, and errors end what is still to be done."""
+"""Executors return complete results, and errors end the remaining jobs."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_any_executor_of_the_standard_library_does(engine):
 
 
 @pytest.mark.slow
-def test_processes_are_others_and_a_dead_one_is_said():
+def test_processes_are_others_and_a_dead_one_is_an_error():
     with Processes(2) as executor:
         assert os.getpid() not in results(executor, where, TODO, Reporter(quiet=True))
     with (

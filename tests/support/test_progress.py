@@ -1,4 +1,4 @@
-"""Progress away from a terminal: few lines, whole sentences, nothing where quiet is wanted."""
+"""Progress away from a terminal has few lines and whole sentences, and none if quiet."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def test_stages_and_sentences_are_lines_and_progress_is_one_now_and_then(capsys)
         for k in range(1, 1001):
             report.advance(k, 1000)
         report.line("[1000] runs")
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.splitlines() == ["reading logs ...", "  1000 of 1000", "[1000] runs"]
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.splitlines() == ["reading logs ...", "  1000 of 1000", "[1000] runs"]
 
 
 def test_the_time_left_is_that_of_the_steps_after_the_first(capsys, monkeypatch):

@@ -68,7 +68,7 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
     Args:
         bags: the files, as from `bags_in`.
         path: the log or folder that the user named.
-        options: what the user said about the robot.
+        options: command-line options that describe the robot.
     """
     bag = bags[0]
     topics = topics_of(bag)
@@ -83,7 +83,7 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
     if not any(one.channel == "pose" for one in channels):
         questions.append("no topic with a pose was found: a fit needs one")
     if not wheels:
-        questions.append("no topic tells how wheels turn: which one does, and in which field?")
+        questions.append("no topic has the wheels' motion: which one does, and in which field?")
     is_bag = path.is_file() or bag == path / _METADATA
     root = path.parent if is_bag else path
     inside = [PurePosixPath(one.relative_to(root)) for one in bags]
@@ -95,7 +95,7 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
         _unused(topics, channels),
         tuple(questions),
     )
-    floor = "on which floor was it driven? Or a topic or table tells: runs, in the layout"
+    floor = "on which floor was it driven? A topic or table can give it: runs, in the layout"
     glob = common_glob(inside)
     draft = ConfigDraft(
         guessed.robot,
@@ -125,7 +125,7 @@ def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
         return names, f"which of the joints are wheels, in which order? {', '.join(names)}"
     ordered = tuple(sorted(wheels, key=lambda name: rank(labels[name].label)))
     others = [name for name in names if name not in wheels]
-    doubt = f"joints that are taken for no wheels: {', '.join(others)}" if others else ""
+    doubt = f"joints that are not taken for wheels: {', '.join(others)}" if others else ""
     return ordered, doubt
 
 
@@ -138,7 +138,8 @@ def _best_topics(topics: Sequence[Topic], joints: int) -> Iterator[_TopicChannel
             if channel in taken or not topic.count:
                 continue
             taken.add(channel)
-            wheels = joints if topic.joints else _array_length(topic) if channel in PER_WHEEL else 0
+            count = max((f.count for f in topic.fields if f.type.endswith("[]")), default=1)
+            wheels = joints if topic.joints else count if channel in PER_WHEEL else 0
             yield _TopicChannel(channel, topic, wheels, _pose_question(channel, topic))
         if any(f.path == "effort" and f.count for f in topic.fields) and "current" not in taken:
             taken.add("current")
@@ -161,11 +162,6 @@ def _by_field_names(
             unit = meaning.unit or CHANNELS[meaning.channel]
             ask = f"by the name of the field: is it that, in {unit}, in the order of the joints?"
             yield _TopicChannel(meaning.channel, topic, wheels, ask, field.path, unit)
-
-
-def _array_length(topic: Topic) -> int:
-    """Return the number of wheels that a message has numbers for."""
-    return max((field.count for field in topic.fields if field.type.endswith("[]")), default=1)
 
 
 def _pose_question(channel: str, topic: Topic) -> str:

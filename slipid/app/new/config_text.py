@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from slipid.app.config import FitSection, LogsSection, Wheels, geometry, parsed
-from slipid.app.new.config_lines import ConfigBlock, ConfigLine, all_questions, drawing, toml
+from slipid.app.config import LogsSection, OmniDrive, Wheels, geometry, parsed
+from slipid.app.new.config_lines import ConfigBlock, ConfigLine, drawing, toml
 from slipid.app.new.draft import BagDraft, ConfigDraft, FileDraft, LayoutDraft, LogsDraft
 from slipid.app.new.robot_questions import robot_of
 from slipid.app.reference.keys import in_short
@@ -41,8 +41,8 @@ _QUESTIONS = {
     "wheel_radius_m": _ASK_MEASURED,
 }
 _DATASHEET = (
-    "without the voltages of the motors this and the next stay what is written: what are they, by "
-    "the datasheet?"
+    "without the voltages of the motors this and the next keep their values: what are they, by the "
+    "datasheet?"
 )
 FRAME = "x ahead, y left, angles counter-clockwise from ahead; wheels in the order of the columns"
 _LENGTHS_HELP = (
@@ -50,10 +50,10 @@ _LENGTHS_HELP = (
     "were measured, which make the scale of the camera free:"
 )
 _COLUMNS_HELP = (
-    "Which column of your files holds what, in which unit. Time: s, ms, us or ns, since the start "
+    "The channel and unit of each column of your files. Time: s, ms, us or ns, since the start "
     "or since 1970. Others: rad, deg, rev, rad/s, rpm, tick, m, mm, A, mA, V, percent and so on.",
-    "Take out what you do not log. To be fitted a run needs time, the motion of the wheels and the "
-    "pose; currents tell friction, voltages (or duty and bus_voltage) the motor's constants.",
+    "Remove what you do not log. A fit needs time, the motion of the wheels and the pose; currents "
+    "identify friction, voltages (or duty and bus_voltage) the motor's constants.",
 )
 _OTHER_CHANNELS = (
     'With a quaternion: pose_quaternion = { columns = ["qx", "qy", "qz", "qw"], unit = "1" }',
@@ -97,7 +97,7 @@ def _head(draft: ConfigDraft, name: str) -> tuple[str, ...]:
         f"  slipid identify {name} --data {draft.data} --out OUT",
         "Every number is SI or has its unit in the name of its key. `slipid reference` explains "
         'all keys, channels, units and parameters. A line that begins with "# ?" is to be '
-        "answered, and then taken out.",
+        "answered, and then removed.",
     )
 
 
@@ -107,18 +107,14 @@ def _robot_block(draft: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock
         ConfigLine("drive", toml(robot.drive), _ORDER[robot.drive], _open_question(draft, "drive"))
     ]
     given = robot.model_dump(exclude_none=True, exclude={"drive"}, exclude_defaults=False)
-    own = {key: value for key, value in given.items() if _is_worth_a_line(robot, key, value)}
+    if isinstance(robot, OmniDrive) and robot.roller_angle_deg == 90.0:
+        del given["roller_angle_deg"]  # ordinary omni wheels
     # what the drive is made of comes first, what all robots have after it
     common = ("wheel_radius_m", "gear_ratio", "mass_kg")
-    for key in (*(k for k in own if k not in common), *common):
+    for key in (*(k for k in given if k not in common), *common):
         comment = in_short(type(robot), key)
-        lines.append(ConfigLine(key, toml(own[key]), comment, _open_question(draft, key)))
+        lines.append(ConfigLine(key, toml(given[key]), comment, _open_question(draft, key)))
     return ConfigBlock("[robot]", tuple(lines), above=(*picture.splitlines(), "", FRAME))
-
-
-def _is_worth_a_line(robot: Wheels, key: str, value: object) -> bool:
-    """Return False for the default roller angle, which ordinary omni wheels need not mention."""
-    return key not in ("roller_angle_deg",) or value != type(robot).model_fields[key].default
 
 
 def _open_question(draft: ConfigDraft, key: str) -> str:
@@ -153,8 +149,8 @@ def _file_blocks(
 def _bag_blocks(bag: BagDraft) -> list[ConfigBlock]:
     """Return a layout of bags with its topics."""
     above = (
-        "Which topic holds what. Known types of messages need neither field nor unit; the frame of "
-        "a pose in /tf and what the effort of joints is must be said.",
+        "The topic of each channel. Known types of messages need neither field nor unit; the frame "
+        "of a pose in /tf and the meaning of the effort of joints must be given.",
     )
     return [
         ConfigBlock(f"[layouts.{bag.name}]", bag.settings, above=above, questions=bag.questions),
@@ -199,7 +195,7 @@ def _logs_block(logs: LogsDraft, first: bool) -> ConfigBlock:
 def _fit_block() -> ConfigBlock:
     """Return the question whether poses are in true metres, which logs do not show."""
     above = (
-        f"Of lengths, {in_short(FitSection, 'lengths_from')}? " + _LENGTHS_HELP,
+        "Which lengths are known? " + _LENGTHS_HELP,
         "[fit]",
     )
     return ConfigBlock(
@@ -213,7 +209,7 @@ def _weights_block(wheels: int) -> ConfigBlock:
         ConfigLine("kg", kg, "in the order of the wheels", commented_out=True),
         ConfigLine("std_kg", "0.05", "standard deviation of each scale", commented_out=True),
     )
-    above = ("What scales show under each wheel, if you weighed the robot:", "[weights.as_built]")
+    above = ("Reading of scales under each wheel, if you weighed the robot:", "[weights.as_built]")
     return ConfigBlock("", lines, above=above)
 
 
@@ -233,9 +229,9 @@ def _parameters_block(channels: frozenset[str]) -> ConfigBlock:
         )
         lines.append(ConfigLine('"motor.back_emf"', f"{{ prior = {emf} }}", "[V s/rad]"))
     else:
-        lines.append(ConfigLine('"motor.*"', "{ free = false }", "no current: motors are not seen"))
+        lines.append(ConfigLine('"motor.*"', "{ free = false }", "no current: motors unknown"))
         lines.append(
-            ConfigLine('"surface.*.friction"', "{ free = false }", "nor how much floors can hold")
+            ConfigLine('"surface.*.friction"', "{ free = false }", "nor the friction of floors")
         )
     above = (
         "Patterns of parameter names. fixed = value; start = value; free = true or false; prior is "
@@ -287,4 +283,5 @@ def new_config(draft: ConfigDraft, name: str) -> NewConfig:
     blocks = blocks_of(draft, robot, picture, name)
     text = "\n\n".join(block.text() for block in blocks) + "\n"
     parsed(Path(name), text)
-    return NewConfig(text, robot, picture, all_questions(blocks))
+    questions = tuple(question for block in blocks for question in block.open_questions)
+    return NewConfig(text, robot, picture, questions)

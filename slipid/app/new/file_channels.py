@@ -108,11 +108,13 @@ def channels_in(numbers: TableNumbers) -> FileChannels:
         else:
             there[one.label] = at
     found = [_file_channel(numbers, meanings, name, places) for name, places in channels.items()]
-    found = _without_duplicates(_resolved(found))
-    notes = _odometry_note(numbers, meanings) + [f"not used, said twice: {', '.join(also)}"] * bool(
-        also
-    )
-    kept, dropped = _consistent(found)
+    first: dict[str, FileChannel] = {}
+    for resolved in _resolved(found):
+        first.setdefault(resolved.channel, resolved)
+    notes = _odometry_note(numbers, meanings) + [
+        f"not used, a second column: {', '.join(also)}"
+    ] * bool(also)
+    kept, dropped = _consistent(list(first.values()))
     used = {at for one in kept for at in one.columns}
     unused = [
         name for at, name in enumerate(format.names) if name and at in meanings and at not in used
@@ -177,14 +179,6 @@ def _stays_up(values: Float[np.ndarray, "row column"]) -> bool:
     return bool(known.size) and float(known.min()) > 0.5 * float(known.max()) > 0.0
 
 
-def _without_duplicates(found: list[FileChannel]) -> list[FileChannel]:
-    """Return the first of channels with the same name."""
-    out: dict[str, FileChannel] = {}
-    for one in found:
-        out.setdefault(one.channel, one)
-    return list(out.values())
-
-
 def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
     """Return the channels with the same wheels, and a line for each channel that is left out."""
     turns = [one for name in WHEEL_MOTION for one in found if one.channel == name]
@@ -215,7 +209,7 @@ def _odometry_note(numbers: TableNumbers, meanings: dict[int, ColumnMeaning]) ->
     names = [numbers.format.names[at] for at, one in meanings.items() if one.channel == "odometry"]
     if not names:
         return []
-    return [f"{', '.join(names)}: odometry is no pose of its own, wheels tell it already"]
+    return [f"{', '.join(names)}: odometry is no measured pose, it comes from the wheels"]
 
 
 def unnamed_channels(numbers: TableNumbers) -> FileChannels:
@@ -411,13 +405,10 @@ def matching_presets(kind: FileKind) -> PresetMatches:
     fits = [name for name, layout in PRESETS.items() if _matches(kind.formats[0], layout)]
     fits = [name for name in fits if _reads(kind, PRESETS[name])]
     fits.sort(key=lambda name: len(PRESETS[name].columns), reverse=True)
-    telling = [name for name in fits if PRESETS[name].names_row and _is_telling(PRESETS[name])]
+    named = [name for name in fits if PRESETS[name].names_row]
+    telling = [name for name in named if len(PRESETS[name].columns) >= _TELLING_COLUMNS]
     sure = telling[0] if telling else None
     return PresetMatches(sure, tuple(name for name in fits if name not in telling))
-
-
-def _is_telling(layout: Layout) -> bool:
-    return len(layout.columns) >= _TELLING_COLUMNS
 
 
 def _matches(format: TableFormat, layout: Layout) -> bool:

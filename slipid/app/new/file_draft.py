@@ -34,12 +34,13 @@ ASK_EFFORT = (
     "what is it: a current (unit A), a torque (N*m, and torque_constant in the layout), a voltage "
     "(V) or a duty (1)?"
 )
+_ASK_COLUMNS = "which column holds what? There are: {}"
 _SUPPLY_CURRENT = (
-    "positive whichever way the wheels drive, and negative at times, so it is what the battery "
-    "gives: slipid wants the current of each motor"
+    "positive in both directions of the wheels, and negative at times, so it is the battery's: "
+    "slipid needs the current of each motor"
 )
 _BATTERY_VOLTAGE = (
-    "it stays up whatever the wheels do, so it is the battery's: slipid wants the voltage at the "
+    "it stays up whatever the wheels do, so it is the battery's: slipid needs the voltage at the "
     "motors, or duty beside bus_voltage"
 )
 
@@ -53,7 +54,7 @@ def file_draft(one: FileStudy, run: RunStudy) -> FileDraft:
         above.append(f"Not used: {', '.join(one.channels.unused)}.")
     if not format.names_row and format.delimiter:
         above.append("Columns without names, by their places from 0.")
-    main = one is run.main
+    main, named = one is run.main, list(filter(None, format.names)) or ["none have a name"]
     return FileDraft(
         tuple(sorted(channels, key=lambda channel: channel.channel != "time")),
         delimiter=format.delimiter,
@@ -62,7 +63,7 @@ def file_draft(one: FileStudy, run: RunStudy) -> FileDraft:
         first_data_row=format.first_data_row,
         settings=tuple(_row_lines(one, main) + (_layout_settings(run) if main else [])),
         above=tuple(above),
-        questions=_questions(one),
+        questions=() if one.channels.found else (_ASK_COLUMNS.format(", ".join(named)),),
     )
 
 
@@ -70,13 +71,6 @@ def _units_row(one: FileStudy) -> int:
     """Return the row of units, which the reader checks; 0 where a used column has none."""
     used = [at for found in one.channels.found for at in found.columns]
     return one.format.units_row if all(one.format.units[at] for at in used) else 0
-
-
-def _questions(one: FileStudy) -> tuple[str, ...]:
-    if not one.channels.found:
-        names = ", ".join(name for name in one.format.names if name) or "none have a name"
-        return (f"which column holds what? There are: {names}",)
-    return ()
 
 
 def _row_lines(one: FileStudy, main: bool) -> list[ConfigLine]:
@@ -116,7 +110,7 @@ def _layout_settings(run: RunStudy) -> list[ConfigLine]:
     lines.append(layout_line("gear_ratio", robot.gear_ratio, comment="as above"))
     if run.find(*CURRENTS) is not None and not run.of_supply:
         sign = run.has_sign
-        ask = "the logs do not tell: do currents have a sign, or are they magnitudes?"
+        ask = "the logs do not show it: do currents have a sign, or are they magnitudes?"
         lines.append(
             layout_line(
                 "current_is_signed",
@@ -205,7 +199,7 @@ def unit_of(one: FileStudy, found: FileChannel, run: RunStudy) -> UnitGuess:
     if channel == "time":
         return one.clock or UnitGuess("s")
     if channel in ("pose_x", "pose_y"):
-        # asked once is enough
+        # one question is enough for x and y
         place = run.by_pose.unit
         return place if channel == "pose_x" else UnitGuess(place.unit)
     if channel == "pose_heading":

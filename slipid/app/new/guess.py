@@ -70,7 +70,7 @@ def _likely_drive(wheels: int, aside: bool | None) -> tuple[str, str]:
         return "general", f"{wheels} wheels: where do they stand, in the order of the columns?"
     if wheels == 1:
         return "omni", "one column of wheels only: a motor on a bench (slipid motor FILE), or more?"
-    return "omni", "no column tells how wheels turn: which drive is it, and how many wheels?"
+    return "omni", "no column has the wheels' motion: which drive is it, and how many wheels?"
 
 
 def drives_sideways(files: tuple[FileStudy, ...]) -> bool | None:
@@ -240,17 +240,15 @@ def _run_files(kinds: list[tuple[FileKind, FileStudy]]) -> tuple[list[RunFiles],
             fresh = {found.channel for found in one.channels.found} - {"time"}
             if pattern is None or not fresh or one.clock is None or main.clock is None:
                 continue
-            if not _overlap(main, one):
-                continue
+            if max(main.time[0], one.time[0]) >= min(main.time[-1], one.time[-1]):
+                continue  # files of one run cover the same time
             beside.append((pattern, one))
             have |= fresh
             used.append(other)
         group = RunFiles(kind, main, tuple(beside))
         groups.append(replace(group, others=_more_runs(group)))
     lost = [kind for kind, _ in rest if kind not in used]
-    lines = [
-        f"{k.paths[0]}: no wheels in it, and nothing of a run that it lies beside" for k in lost
-    ]
+    lines = [f"{k.paths[0]}: no wheels in it, and no channels for a run beside it" for k in lost]
     return groups, lines
 
 
@@ -268,13 +266,8 @@ def _more_runs(group: RunFiles) -> tuple[RunFiles, ...]:
             beside = tuple((name, study_file(format_of(path))) for name, path in names)
             out.append(RunFiles(group.kind, study_file(format), beside))
         except DataError:
-            continue  # the reader will say it of this run; the first one tells enough
+            continue  # the reader will report this run; the first one is enough here
     return tuple(out)
-
-
-def _overlap(one: FileStudy, other: FileStudy) -> bool:
-    """Return True where two files cover the same time and so belong to one run."""
-    return bool(max(one.time[0], other.time[0]) < min(one.time[-1], other.time[-1]))
 
 
 def _sentence(group: RunFiles) -> str:
@@ -285,4 +278,4 @@ def _sentence(group: RunFiles) -> str:
         for (name, _), channels in zip(group.beside, listed[1:], strict=True)
     ]
     like = f"{len(group.kind.paths)} like {group.kind.paths[0]}"
-    return f"{like}: {listed[0] or 'nothing known'}{''.join(more)}"
+    return f"{like}: {listed[0] or 'no known channel'}{''.join(more)}"

@@ -12,6 +12,8 @@ from slipid.camera.calibration.board import (
     Board,
     Picture,
     named_pictures,
+    not_detected,
+    usable,
     view_of,
 )
 from slipid.camera.calibration.lens import fit_robustly
@@ -19,7 +21,6 @@ from slipid.camera.calibration.place import FloorFit, fit_place, fit_place_robus
 from slipid.camera.calibration.points import FloorPoints, read_points
 from slipid.camera.calibration.quality import Quality, quality_of
 from slipid.camera.calibration.report import floor_report, lens_report, scale_std, straight_report
-from slipid.camera.calibration.views import not_detected, usable
 from slipid.camera.opencv import read_picture, size_of
 from slipid.camera.overhead import Lens, OverheadCamera, read_camera
 from slipid.support.content import Content

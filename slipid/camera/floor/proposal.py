@@ -203,7 +203,7 @@ def _exposed(
     fitted: Float[np.ndarray, "surface 3"],
     matched: Int[np.ndarray, " match"],
 ) -> Float[np.ndarray, "surface 3"]:
-    """Return fitted colours of matched surfaces, and given colours, as bright, of the others."""
+    """Return the fitted colours of matched surfaces, and given ones of equal brightness else."""
     if not len(matched):
         return given
     brighter = np.median(fitted[matched].sum(axis=1) / given[matched].sum(axis=1))

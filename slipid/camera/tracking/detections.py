@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from slipid.camera.frame import Frame, FrameSource, read_ahead
-from slipid.camera.opencv import Grey, dictionary_names
-from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region
+from slipid.camera.opencv import Grey, visible_markers
+from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region, cut
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -149,34 +149,17 @@ def _others(grey: Grey, tracker: MarkerTracker) -> str | None:
             f"marker {wanted} is in no frame so far, but {_numbers(others)}; expected --id "
             f"{others[0]}, or a file of targets"
         )
-    if (other := _visible_dictionary(grey, tracker.region)) is None:
+    markers = visible_markers([cut(grey, tracker.region)])
+    if not markers.numbers:
         return None
     return (
-        f"marker {wanted} is in no frame so far, but {_numbers(other.ids)} of the dictionary "
-        f"{other.name}; expected --dictionary {other.name}"
+        f"marker {wanted} is in no frame so far, but {_numbers(markers.numbers)} of the dictionary "
+        f"{markers.dictionary}; expected --dictionary {markers.dictionary}"
     )
 
 
 def _numbers(ids: Sequence[int]) -> str:
     return f"marker{'s' if len(ids) > 1 else ''} {', '.join(map(str, ids))}"
-
-
-@dataclass(frozen=True)
-class _VisibleDictionary:
-    """A dictionary, and the numbers of its markers in a picture."""
-
-    name: str
-    ids: list[int]
-
-
-def _visible_dictionary(grey: Grey, region: Region | None = None) -> _VisibleDictionary | None:
-    """Return the smallest of the dictionaries with most markers in a picture; None without any."""
-    ids = {
-        name: {d.id for d in MarkerDetector(name).detect(grey, region)}
-        for name in dictionary_names()
-    }
-    best = min(ids, key=lambda name: (-len(ids[name]), len(name), name))
-    return _VisibleDictionary(best, sorted(ids[best])) if ids[best] else None
 
 
 def only_marker(source: FrameSource, detector: MarkerDetector, region: Region | None = None) -> int:
@@ -201,10 +184,10 @@ def only_marker(source: FrameSource, detector: MarkerDetector, region: Region | 
             f"{source.name}: {_numbers(often)} in view; expected --id for the robot's, or a file "
             "of targets"
         )
-    if last is not None and (other := _visible_dictionary(last, region)) is not None:
+    if last is not None and (markers := visible_markers([cut(last, region)])).numbers:
         raise DataError(
-            f"{source.name}: no marker of this dictionary, but {_numbers(other.ids)} of "
-            f"{other.name}; expected --dictionary {other.name}"
+            f"{source.name}: no marker of this dictionary, but {_numbers(markers.numbers)} of "
+            f"{markers.dictionary}; expected --dictionary {markers.dictionary}"
         )
     raise DataError(
         f"{source.name}: no marker of any dictionary in the first frames; expected one in view, "

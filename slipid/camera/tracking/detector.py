@@ -16,9 +16,9 @@ blurred it is by the lens or by motion.
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
-from slipid.camera.opencv import Grey, marker_dictionary, opencv
+from slipid.camera.opencv import Grey, marker_dictionary, opencv, size_of
 
 WHOLE = 30
 """Interval, in frames, at which the whole frame is searched."""
@@ -83,6 +83,14 @@ class Region:
         return self.right <= self.left or self.bottom <= self.top
 
 
+def cut(grey: Grey, region: Region | None) -> UInt8[np.ndarray, "down across"]:
+    """Return the part of a picture within a region, or all of it where that is None."""
+    if region is None:
+        return grey
+    part = region.within(Region(0, 0, *size_of(grey)))
+    return np.ascontiguousarray(grey[part.top : part.bottom, part.left : part.right])
+
+
 class MarkerDetector:
     """OpenCV's detector of the markers of a dictionary, with corners refined below a pixel.
 
@@ -97,15 +105,13 @@ class MarkerDetector:
 
     def detect(self, grey: Grey, region: Region | None = None) -> list[Detection]:
         """Return every marker in a frame, or in a region of it."""
-        whole = Region(0, 0, grey.shape[1], grey.shape[0])
-        part = whole if region is None else region.within(whole)
-        if part.empty:
-            return []
-        searched = np.ascontiguousarray(grey[part.top : part.bottom, part.left : part.right])
-        corners, ids, _ = self._detector.detectMarkers(searched)
+        part = cut(grey, region)
+        corners, ids, _ = self._detector.detectMarkers(part) if part.size else (None, None, None)
         if ids is None or not len(ids):
             return []
-        rough = np.asarray(corners, float).reshape(-1, 4, 2) + np.array([part.left, part.top])
+        rough = np.asarray(corners, float).reshape(-1, 4, 2)
+        if region is not None:
+            rough = rough + np.maximum([region.left, region.top], 0)
         fine = refined(grey, rough, self._squares)
         numbers = np.asarray(ids).ravel().tolist()
         return [Detection(*one) for one in zip(numbers, fine, strict=True)]

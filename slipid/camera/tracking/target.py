@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, FiniteFloat
 
-from slipid.camera.opencv import marker_dictionary
+from slipid.camera.opencv import marker_count
 from slipid.support.errors import DataError
 from slipid.support.toml_file import Positive, Section, checked, mapping_of, text_of
 
@@ -135,10 +135,7 @@ class _Board(_Placed):
             row, column = divmod(k, self.columns)
             ahead = pitch * (0.5 * (self.rows - 1) - row)
             left = pitch * (0.5 * (self.columns - 1) - column)
-            place = (
-                self.place_m[0] + c * ahead - s * left,
-                self.place_m[1] + s * ahead + c * left,
-            )
+            place = (self.place_m[0] + c * ahead - s * left, self.place_m[1] + s * ahead + c * left)
             out.append(Marker.at(self.first_id + k, self.size_m, self.height_m, place, yaw))
         return out
 
@@ -179,7 +176,7 @@ def _target(given: _Target, where: str) -> Target:
     markers += [marker for board in given.board for marker in board.markers()]
     if not markers:
         raise DataError(f"{where}: no marker; expected [[target.marker]] or [[target.board]]")
-    most = len(marker_dictionary(given.dictionary).bytesList)
+    most = marker_count(given.dictionary)
     for marker in markers:
         if marker.id >= most:
             raise DataError(

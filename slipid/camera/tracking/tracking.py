@@ -8,7 +8,7 @@ import numpy as np
 
 from slipid.camera.frame import FrameSource, cut_off, read_ahead, uneven
 from slipid.camera.frame_source import Device
-from slipid.camera.opencv import marker_dictionary, opencv
+from slipid.camera.opencv import marker_count, opencv
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.detections import detect_all, only_marker
 from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region
@@ -176,7 +176,7 @@ class LoneMarker:
             )
         if not np.isfinite(self.yaw):
             raise DataError(f"--marker-yaw {np.degrees(self.yaw):g}; expected an angle in degrees")
-        most = len(marker_dictionary(self.dictionary).bytesList) - 1
+        most = marker_count(self.dictionary) - 1
         if self.id is not None and self.id > most:
             raise DataError(f"--id {self.id}; expected 0 to {most} in {self.dictionary}")
 

@@ -126,7 +126,7 @@ def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | 
     middle = 0.5 * float(steps.first[0] + steps.last[-1])
     grid = offset + np.arange(-REACH, REACH + FINE, FINE)
     at, noise = np.array([offset, 0.0]), tuple(StepNoise(0.0, 1.0) for _ in pair.components)
-    for _ in range(2):  # the second time with the noise of the first
+    for _ in range(2):  # the second round has the noise of the first
         every = [linearised(pair, steps, np.array([o, 0.0]), middle, noise) for o in grid]
         fits = [(near.squares, k, near.noise) for k, near in enumerate(every) if near is not None]
         if not fits:

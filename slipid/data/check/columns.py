@@ -51,7 +51,7 @@ def misordered(logs: Sequence[Log]) -> Iterator[Finding]:
         listed = ", ".join(map(str, order))
         yield Finding(
             "wheel_columns",
-            f"the wheels move as their {name} says only if their columns are taken in the order "
+            f"the wheels match their {name} only with their columns in the order "
             f"{listed}, where those below zero count backwards",
             f"list the columns of the wheels, or those of {name}, in another order, or set "
             "scale = -1 for those that count backwards",
@@ -179,7 +179,11 @@ def electric(
         watts = float(np.nanmean((current * voltage).sum(axis=1)))
         rim = float(np.nanmean(np.abs(speed[driving]).mean(axis=1))) * radius
         power = watts / max(mass_kg * GRAVITY * rim, 1e-9)
-    sizes = [*_size_of_voltage(voltage), *_size_of_current(current, mass_kg)]
+    most = MOST_UNWEIGHED_A if mass_kg is None else MOST_A + MOST_A_PER_KG * mass_kg
+    sizes = [
+        *_size(voltage, "voltage", "V", LEAST_V, MOST_V, "voltage or bus_voltage"),
+        *_size(current, "current", "A", LEAST_A, most, "current"),
+    ]
     if not sizes and power is not None and not POWER[0] <= power <= POWER[1]:
         yield Finding(
             "current_unit",
@@ -235,8 +239,8 @@ def _sign_findings(
         listed = ", ".join(str(k + 1) for k in order)
         yield Finding(
             f"{name}_order",
-            f"the columns of the {name} are in another order than the wheels: number {listed} "
-            f"go with wheels 1 to {len(order)}",
+            f"the columns of the {name} are in another order than the wheels: columns {listed} "
+            f"belong to wheels 1 to {len(order)}",
             f"name the columns of the channel {name} in the order {listed}",
         )
         return
@@ -287,37 +291,19 @@ def _share(work: np.ndarray) -> float:
     return float(work.sum()) / total if total > 0 else 0.0
 
 
-def _size_of_current(amps: np.ndarray | None, mass_kg: float | None) -> Iterator[Finding]:
-    """Yield a finding where currents are not what such a robot draws."""
-    if amps is None or not np.nanmax(amps, initial=0.0) > 0:
+def _size(
+    values: np.ndarray | None, name: str, unit: str, low: float, high: float, channel: str
+) -> Iterator[Finding]:
+    """Yield a finding where currents or voltages are implausible while the motors drive."""
+    if values is None or not np.nanmax(values, initial=0.0) > 0:
         return
-    high = float(np.nanquantile(amps, 0.95))
-    most = MOST_UNWEIGHED_A if mass_kg is None else MOST_A + MOST_A_PER_KG * mass_kg
-    weighs = "" if mass_kg is None else f" for a robot of {mass_kg:g} kg"
-    if high > most:
-        yield Finding(
-            "current_unit",
-            f"the motors draw {high:.4g} A{weighs}, where at most {most:.3g} A are to be expected",
-            "set unit = 'mA' for the channel current (scale = 0.001)",
-        )
-    elif high < LEAST_A:
-        yield Finding(
-            "current_unit",
-            f"the motors draw no more than {high:.2g} A while they drive",
-            "set unit = 'A' for the channel current, if it is declared in mA (scale = 1000)",
-        )
-
-
-def _size_of_voltage(volts: np.ndarray | None) -> Iterator[Finding]:
-    """Yield a finding where voltages are not what such a robot has."""
-    if volts is None or not np.nanmax(volts, initial=0.0) > 0:
+    usual = float(np.nanquantile(values, 0.95))
+    if low <= usual <= high:
         return
-    high = float(np.nanquantile(volts, 0.95))
-    if LEAST_V <= high <= MOST_V:
-        return
-    unit, scale = ("mV", "0.001") if high > MOST_V else ("V", "1000")
+    right, scale = (f"m{unit}", "0.001") if usual > high else (unit, "1000")
     yield Finding(
-        "voltage_unit",
-        f"the motors see {high:.4g} V while they drive",
-        f"set unit = '{unit}' for the channel voltage or bus_voltage (scale = {scale})",
+        f"{name}_unit",
+        f"the {name} of driving motors reaches {usual:.4g} {unit}; plausible are {low:g} to "
+        f"{high:.3g} {unit} for such a robot",
+        f"set unit = '{right}' for the channel {channel} (scale = {scale})",
     )

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from math import isclose, pi
 from typing import Literal
 
-from slipid.data.check.interpretation import Interpretation
 from slipid.data.check.joined import PoseConvention
 from slipid.data.check.mistakes import Candidate, Mistake
 from slipid.data.check.ratios import ScaleCause, ScaleRatios
@@ -74,27 +73,30 @@ def wrong(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 _CONVENTION_SENTENCES = {
-    "heading_sign": "the heading of the poses turns the other way round than the body does",
+    "heading_sign": "the heading of the poses turns in the opposite direction of the body",
     "pose_axis": "an axis of the poses has the wrong sign",
     "pose_swapped": "x and y of the poses are exchanged",
     "pose_mirrored": "the poses are mirrored, as from below or in an image whose y points down",
     "heading_quaternion": "the heading is the z of a quaternion, sin(yaw / 2), not an angle",
 }
-_CAUSE_KINDS = {
-    "time": "time_unit",
-    "pose_length": "pose_length",
-    "heading": "heading_unit",
-    "wheel_gear": "wheel_scale",
-    "wheel_turns": "wheel_scale",
-    "wheel_radius": "wheel_scale",
-    "base": "base_radius",
-    "gyro": "gyro_unit",
-    "report": "wheel_speed_unit",
-    "command_wheels": "command_unit",
-    "command_twist": "command_unit",
-    "command_yaw": "command_unit",
+_CAUSES = {
+    "time": ("time_unit", "time"),
+    "pose_length": ("pose_length", "the scale of the poses"),
+    "heading": ("heading_unit", "the heading"),
+    "wheel_gear": ("wheel_scale", "the angle of the wheels"),
+    "wheel_turns": ("wheel_scale", "the angle of the wheels"),
+    "wheel_radius": ("wheel_scale", "wheel_radius_m"),
+    "base": ("base_radius", "the distance of the wheels from the centre"),
+    "gyro": ("gyro_unit", "the channel gyro"),
+    "report": ("wheel_speed_unit", "the channel wheel_speed (or motor_speed)"),
+    "command_wheels": (
+        "command_unit",
+        "the channel wheel_speed_command (or motor_speed_command)",
+    ),
+    "command_twist": ("command_unit", "the channel twist_command_x and twist_command_y"),
+    "command_yaw": ("command_unit", "the channel twist_command_yaw"),
 }
-"""Kind of the finding about each wrong factor."""
+"""Kind of the finding about each wrong factor, and the scaled quantity."""
 
 
 def mistake_finding(mistake: Mistake) -> Finding:
@@ -111,70 +113,54 @@ def mistake_finding(mistake: Mistake) -> Finding:
 def _candidate_finding(candidate: Candidate) -> Finding:
     """Return the finding about one interpretation that differs in order, signs or axes."""
     kind, meant = candidate.kind, candidate.meant
-    if kind in ("wheel_sign", "command_sign") and (meant.sign or meant.command_sign):
-        sign = meant.sign if kind == "wheel_sign" else meant.command_sign
-        return _sign_finding(kind, [k + 1 for k, s in enumerate(sign) if s < 0], len(sign))
+    if kind == "wheel_sign":
+        return _sign_finding(kind, meant.sign, "")
+    if kind == "command_sign" and meant.command_sign:
+        return _sign_finding(kind, meant.command_sign, "commanded ")
     if kind == "command_sign":
         axes = [a for a, s in zip(("x", "y", "yaw"), meant.twist_sign, strict=True) if s < 0]
-        return Finding(
-            kind,
-            f"the commanded twist has the wrong sign in {' and '.join(axes)}",
-            "turn the sign of scale for "
-            + " and ".join(f"the channel twist_command_{axis}" for axis in axes),
-        )
-    if kind in ("wheel_order", "command_order"):
-        return _order_finding(kind, meant)
+        found = f"the commanded twist has the wrong sign in {' and '.join(axes)}"
+        channels = " and ".join(f"the channel twist_command_{axis}" for axis in axes)
+        return Finding(kind, found, f"turn the sign of scale for {channels}")
+    if kind == "wheel_order":
+        return _order_finding(kind, meant.order, "the wheels' columns")
+    if kind == "command_order":
+        return _order_finding(kind, meant.command_order, "the columns of the commanded speeds")
     if kind == "wheel_azimuths":
         return Finding(
             kind,
-            f"the wheels stand turned by {meant.azimuth:+d} deg about the middle against what is "
-            "declared",
+            f"the wheels are rotated by {meant.azimuth:+d} deg about the centre from the declared "
+            "directions",
             f"add {meant.azimuth} deg to wheel_azimuths_deg (or to wheel_places_m and "
             "drive_directions_deg) in [robot]",
         )
     if kind == "gyro_sign":
-        return Finding(
-            kind,
-            "the gyro turns the other way round than the poses",
-            "turn the sign of scale for the channel gyro",
-        )
+        remedy = "turn the sign of scale for the channel gyro"
+        return Finding(kind, "the gyro turns in the opposite direction of the poses", remedy)
     return _convention_finding(kind, meant.convention)
 
 
-def _sign_finding(kind: str, turned: Sequence[int], wheels: int) -> Finding:
-    """Return the finding about wheels that count backwards."""
-    names = " and ".join(map(str, turned))
-    channel = "its column" if len(turned) == 1 else "their columns"
-    if kind == "command_sign":
-        return Finding(
-            kind,
-            f"the commanded speed of wheel {names} has the opposite sign of what it does",
-            f"set scale = -1 for {channel} in the commanded speeds",
-        )
-    which, channel = (
-        ("every wheel counts", "the channel of the wheels")
-        if len(turned) == wheels
-        else (f"wheel {names} counts" if len(turned) == 1 else f"wheels {names} count", channel)
-    )
-    every = "all turns" if len(turned) == wheels else "the turns"
+def _sign_finding(kind: str, sign: Sequence[int], commanded: str) -> Finding:
+    """Return the finding about wheels whose turns or commands have the wrong sign."""
+    turned = [str(k + 1) for k, s in enumerate(sign) if s < 0]
+    wheels = f"wheel{'s' if len(turned) > 1 else ''} {' and '.join(turned)}"
+    column = "their columns" if len(turned) > 1 else "its column"
+    if len(turned) == len(sign):
+        wheels, column = "every wheel", "the channel of the wheels"
     return Finding(
         kind,
-        f"{which} backwards: {every} have the opposite sign of what the poses say",
-        f"set scale = -1 for {channel}, if it is 1 (else turn its sign)",
+        f"the {commanded}turns of {wheels} have the opposite sign of the motion",
+        f"set scale = -1 for {column}{' in the commanded speeds' if commanded else ''}, "
+        "if it is 1 (else turn its sign)",
     )
 
 
-def _order_finding(kind: str, meant: Interpretation) -> Finding:
+def _order_finding(kind: str, order: Sequence[int], columns: str) -> Finding:
     """Return the finding about columns in another order."""
-    order, what = (
-        (meant.order, "the wheels' columns")
-        if kind == "wheel_order"
-        else (meant.command_order, "the columns of the commanded speeds")
-    )
     listed = ", ".join(str(k + 1) for k in order)
     return Finding(
         kind,
-        f"{what} are in another order than the wheels of [robot]",
+        f"{columns} are in another order than the wheels of [robot]",
         f"list the columns in the order {listed} (counted as they are listed now)",
     )
 
@@ -232,64 +218,51 @@ def ratio_sentence(scales: ScaleRatios) -> str:
     sentences = {
         "travel": "the body's path length is {:.3g} times that of the wheels",
         "turning": "the body turns {:.3g} times as much as the wheels",
-        "drive": "the commanded motion is {:.3g} times what the wheels did",
-        "steer": "the commanded turn is {:.3g} times what the wheels did",
+        "drive": "the commanded motion is {:.3g} times that of the wheels",
+        "steer": "the commanded turn is {:.3g} times that of the wheels",
         "command": "the commanded wheel speeds are {:.3g} times the measured ones",
-        "report": "the reported wheel speeds are {:.3g} times what the encoders say",
+        "report": "the reported wheel speeds are {:.3g} times those of the encoders",
         "gyro": "the gyro turns {:.3g} times as much as the poses",
     }
     unnatural = {k: r.value for k, r in scales.known.items() if not r.natural}
     return ", ".join(sentences[k].format(value) for k, value in unnatural.items())
 
 
-def _factor_finding(of: ScaleCause, gear_ratio: float) -> Finding:
+def _factor_finding(cause: ScaleCause, gear_ratio: float) -> Finding:
     """Return the finding about a factor by which a channel is too large."""
-    name, kind = of.name, _CAUSE_KINDS[of.name]
-    size = of.factor if of.factor > 1 else 1 / of.factor
-    much = f"{size:.3g} times too " + ("large" if of.factor > 1 else "small")
-    if name == "time":
-        unit = _unit_name(of.factor, {1e3: "ms", 1e6: "us", 1e9: "ns", 60.0: "s", 1e-3: "s"})
-        to = f"set unit = '{unit}' for the channel time" if unit else "correct the unit of time"
-        return Finding(kind, f"time is in another unit, {much}", to)
-    if name == "pose_length":
-        unit = _unit_name(of.factor, {1e3: "mm", 1e2: "cm", 1e-3: "m", 1e-2: "m"})
+    factor, (kind, channel) = cause.factor, _CAUSES[cause.name]
+    ratio = f"{max(factor, 1 / factor):.3g}"
+    size = f"{ratio} times too {'large' if factor > 1 else 'small'}"
+    found = f"{channel} is {size}"
+    if cause.name == "time":
+        unit = _unit_name(factor, {1e3: "ms", 1e6: "us", 1e9: "ns", 60.0: "s", 1e-3: "s"})
+        remedy = f"set unit = '{unit}' for the channel time" if unit else "correct the unit of time"
+        found = f"time is in another unit, {size}"
+    elif cause.name == "pose_length":
+        unit = _unit_name(factor, {1e3: "mm", 1e2: "cm", 1e-3: "m", 1e-2: "m"})
         to = f"set unit = '{unit}' for the channels" if unit else "correct the unit or scale of"
-        remedy = f"{to} pose_x and pose_y (scale = {1 / of.factor:.3g})"
-        return Finding(kind, f"the poses' lengths are {much}", remedy)
-    if name == "heading":
-        unit = "deg" if of.factor > 1 else "rad"
-        remedy = f"set unit = '{unit}' for the channel pose_heading"
-        return Finding(kind, f"the heading is {much}", remedy)
-    if name in ("wheel_gear", "wheel_turns"):
-        return Finding(kind, f"the wheels' turns are {much}", _turns(of.factor, gear_ratio))
-    if name == "wheel_radius":
-        return Finding(
-            kind,
-            f"wheel_radius_m is {much}, or the wheels' turns are",
-            f"divide wheel_radius_m in [robot] by {of.factor:.3g}, or "
-            + _turns(of.factor, gear_ratio),
+        remedy = f"{to} pose_x and pose_y (scale = {1 / factor:.3g})"
+    elif cause.name == "heading":
+        remedy = f"set unit = '{'deg' if factor > 1 else 'rad'}' for the channel pose_heading"
+    elif cause.name == "wheel_radius":
+        found = f"wheel_radius_m is {size}, or the wheels' turns are"
+        remedy = (
+            f"divide wheel_radius_m in [robot] by {factor:.3g}, or {_turns(factor, gear_ratio)}"
         )
-    if name == "base":
-        return Finding(
-            kind,
-            f"the distance of the wheels from the middle is {'less' if of.factor < 1 else 'more'} "
-            f"than declared, by a factor of {size:.3g}",
+    elif kind == "wheel_scale":
+        remedy = _turns(factor, gear_ratio)
+    elif cause.name == "base":
+        found = (
+            f"{channel} is {'more' if factor > 1 else 'less'} than declared, by a factor of {ratio}"
+        )
+        remedy = (
             "correct base_radius_m (or track_m, half_width_m, half_length_m, wheel_places_m) of "
-            "[robot]",
+            "[robot]"
         )
-    channel = {
-        "gyro": "gyro",
-        "report": "wheel_speed (or motor_speed)",
-        "command_wheels": "wheel_speed_command (or motor_speed_command)",
-        "command_twist": "twist_command_x and twist_command_y",
-        "command_yaw": "twist_command_yaw",
-    }[name]
-    return Finding(
-        kind,
-        f"the channel {channel} is {much}",
-        f"correct unit or scale of the channel {channel}{_unit_of_rate(of.factor)} "
-        f"(scale = {1 / of.factor:.3g})",
-    )
+    else:
+        unit = _unit_of_rate(factor)
+        remedy = f"correct unit or scale of {channel}{unit} (scale = {1 / factor:.3g})"
+    return Finding(kind, found, remedy)
 
 
 def _turns(factor: float, gear_ratio: float) -> str:

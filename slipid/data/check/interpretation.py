@@ -196,7 +196,7 @@ def to_body(evidence: Evidence, meant: Interpretation) -> Float[np.ndarray, "3 w
 
 
 def _unexplained(
-    of: Products,
+    sums: Products,
     predict: Float[np.ndarray, "3 wheel"],
     axes: Float[np.ndarray, "3 3"],
     free: bool,
@@ -207,9 +207,8 @@ def _unexplained(
     poses: lengths in a wrong unit must not hide either. Wheels that do not determine the twist
     (not `free`) determine one direction, which has one factor.
     """
-    predicted = np.einsum("aw,wv,av->a", predict, of.turns, predict)
-    both = np.einsum("aw,wa->a", predict, of.across @ axes.T)
-    measured = np.diag(axes @ of.body @ axes.T)
+    predicted, both = sums.predicted(predict), sums.matched(predict, axes)
+    measured = np.diag(axes @ sums.body @ axes.T)
     total = predicted.sum()
     if not total > 0 or not measured.sum() > 0:
         return 1.0
@@ -224,16 +223,18 @@ def _unexplained(
 
 
 def _beyond_rigid(
-    of: Products, rolling: Float[np.ndarray, "wheel 3"], wheels: Float[np.ndarray, "wheel wheel"]
+    sums: Products, rolling: Float[np.ndarray, "wheel 3"], wheels: Float[np.ndarray, "wheel wheel"]
 ) -> float:
     """Return the share of the turns that no motion of a rigid body makes without slip."""
     basis, values, _ = np.linalg.svd(rolling, full_matrices=False)
     basis = basis[:, values > 1e-6 * values[0]]
-    turns = wheels @ of.turns @ wheels.T
+    turns = wheels @ sums.turns @ wheels.T
     total = float(np.trace(turns))
     return 1.0 - float(np.trace(basis.T @ turns @ basis)) / total if total > 0 else 0.0
 
 
-def _uncommanded(of: Commanded, meant: Interpretation) -> float:
+def _uncommanded(commanded: Commanded, meant: Interpretation) -> float:
     """Return the share of the turns that the commanded ones, times one factor, do not explain."""
-    return 1.0 - max(of.product(meant), 0.0) ** 2 / max(of.turns * of.commanded, 1e-300)
+    return 1.0 - max(commanded.product(meant), 0.0) ** 2 / max(
+        commanded.turns * commanded.commanded, 1e-300
+    )

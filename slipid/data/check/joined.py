@@ -11,14 +11,12 @@ mean:
 since a linear map of turns absorbs order, signs, radius, azimuths and heading offset alike.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import body_increments, integral, interpolate
 
@@ -133,21 +131,24 @@ def joined(data: Runs) -> JoinedRuns:
     length = np.array([log.duration for log in data.logs])
     starts = np.concatenate([[0.0], np.cumsum(length + 1.0)])[:-1]
     time = data.time + np.repeat(starts - first, np.diff(data.offset))
-    # a pose holds to both ends of its run: nothing is drawn between runs
+    # a pose holds to both ends of its run, so that none is interpolated between runs
     fresh = data.fresh.copy()
     fresh[data.offset[:-1]] = fresh[data.offset[1:] - 1] = True
 
-    def channel(of: Callable[[Log], np.ndarray | None], summed: bool) -> JoinedChannel | None:
-        """A channel, or its integral, nan where a run lacks it; None where every run does."""
-        parts = [_columns(log, of(log), summed) for log in data.logs]
-        columns = next((part.shape[1] for part in parts if part is not None), None)
-        if columns is None:
+    def channel(name: str, summed: bool = True) -> JoinedChannel | None:
+        """Return a channel, or its integral; nan where a run lacks it, None where all do."""
+        logged = [getattr(log, name) for log in data.logs]
+        columns = [values.size // len(values) for values in logged if values is not None]
+        if not columns:
             return None
-        filled = [
-            np.full((log.samples, columns), np.nan) if part is None else part
-            for log, part in zip(data.logs, parts, strict=True)
-        ]
-        return JoinedChannel(time, np.concatenate(filled))
+        parts = []
+        for log, values in zip(data.logs, logged, strict=True):
+            if values is None:
+                parts.append(np.full((log.samples, columns[0]), np.nan))
+                continue
+            part = values.reshape(log.samples, -1)
+            parts.append(integral(log.time, part) if summed else part)
+        return JoinedChannel(time, np.concatenate(parts))
 
     return JoinedRuns(
         names=tuple(log.name for log in data.logs),
@@ -156,23 +157,15 @@ def joined(data: Runs) -> JoinedRuns:
         row=np.array([float(np.median(np.diff(log.time))) for log in data.logs]),
         angle=JoinedChannel(time, data.wheel_angle),
         pose=JoinedChannel(time[fresh], data.pose[fresh]),
-        reported=channel(lambda log: log.wheel_speed, summed=True),
-        commanded=channel(lambda log: log.wheel_speed_command, summed=True),
-        twist=channel(lambda log: log.twist_command, summed=True),
-        gyro=channel(lambda log: log.gyro, summed=True),
-        current=channel(lambda log: log.current, summed=False),
-        voltage=channel(lambda log: log.voltage, summed=False),
-        bus=channel(lambda log: log.bus_voltage, summed=False),
+        reported=channel("wheel_speed"),
+        commanded=channel("wheel_speed_command"),
+        twist=channel("twist_command"),
+        gyro=channel("gyro"),
+        current=channel("current", summed=False),
+        voltage=channel("voltage", summed=False),
+        bus=channel("bus_voltage", summed=False),
         current_is_signed=data.current_is_signed,
     )
-
-
-def _columns(log: Log, values: np.ndarray | None, summed: bool) -> np.ndarray | None:
-    """Return the columns of a channel of a run, or their integrals."""
-    if values is None:
-        return None
-    columns = values.reshape(log.samples, -1)
-    return integral(log.time, columns) if summed else columns
 
 
 def edges(data: JoinedRuns) -> StepEdges:
@@ -199,11 +192,9 @@ def increments(data: JoinedRuns, at: StepEdges, lag: float) -> ChannelIncrements
         change[outside] = np.nan
         return change
 
-    def maybe(channel: JoinedChannel | None) -> np.ndarray | None:
-        return None if channel is None else moved(channel)
-
+    optional = (data.commanded, data.twist, data.gyro)
     return ChannelIncrements(
-        moved(data.angle), maybe(data.commanded), maybe(data.twist), maybe(data.gyro)
+        moved(data.angle), *(None if channel is None else moved(channel) for channel in optional)
     )
 
 
@@ -253,7 +244,7 @@ def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, 
     before, after = at.pose_before * flip, at.pose_after * flip
     before[:, 2] = _heading(before[:, 2], convention.heading)
     turned = _heading(after[:, 2], convention.heading) - before[:, 2]
-    if convention.heading in ("radians", "half_sine"):  # the reader could not see where it wraps
+    if convention.heading in ("radians", "half_sine"):  # the reader did not know the wrap
         turned = np.mod(turned + np.pi, 2 * np.pi) - np.pi
     after[:, 2] = before[:, 2] + turned
     return body_increments(before, after)
@@ -268,7 +259,7 @@ def _heading(logged: Float[np.ndarray, " step"], meaning: Heading) -> Float[np.n
     if meaning == "radians":
         return np.degrees(logged)
     if meaning == "half_sine":
-        # beyond: no sine
+        # values beyond 1 are no sine
         return 2 * np.arcsin(np.where(np.abs(logged) <= 1.0 + 1e-3, logged.clip(-1, 1), np.nan))
     return logged
 
@@ -297,6 +288,16 @@ class Products:
     body: Float[np.ndarray, "3 3"]
     known: Bool[np.ndarray, " every"]
     weight: Float[np.ndarray, " step"]
+
+    def predicted(self, predict: Float[np.ndarray, "3 wheel"]) -> Float[np.ndarray, "3"]:
+        """Return the sum of squares of the predicted body increments along each axis [m^2]."""
+        return np.einsum("aw,wv,av->a", predict, self.turns, predict)
+
+    def matched(
+        self, predict: Float[np.ndarray, "3 wheel"], axes: Float[np.ndarray, "3 3"]
+    ) -> Float[np.ndarray, "3"]:
+        """Return the sum of products of predicted and measured increments along each axis [m^2]."""
+        return np.einsum("aw,wa->a", predict, self.across @ axes.T)
 
 
 def usable(*parts: Float[np.ndarray, "step _"]) -> Bool[np.ndarray, " step"]:

@@ -70,15 +70,16 @@ def mistakes(evidence: Evidence) -> tuple[Interpretation, tuple[Mistake, ...]]:
     return meant, tuple(found)
 
 
-def _next_mistake(evidence: Evidence, of: Interpretation) -> Mistake | None:
+def _next_mistake(evidence: Evidence, current: Interpretation) -> Mistake | None:
     """Return the simplest mistake that explains the logs decisively better, or None."""
-    before = misfit(evidence, of)
-    tried = [(misfit(evidence, c.meant), c) for c in candidates(evidence, of)]
+    before = misfit(evidence, current)
+    tried = [(misfit(evidence, c.meant), c) for c in candidates(evidence, current)]
     # poses of another convention must then follow the wheels
     tried = [
         (left, c)
         for left, c in tried
-        if c.meant.convention == of.convention or misfits(evidence, c.meant)["pose"] < EXPLAINED
+        if c.meant.convention == current.convention
+        or misfits(evidence, c.meant)["pose"] < EXPLAINED
     ]
     after, best = min(tried, key=lambda pair: pair[0] + pair[1].cost)
     if before - after < GAIN + SHARE * after:
@@ -90,34 +91,34 @@ def _next_mistake(evidence: Evidence, of: Interpretation) -> Mistake | None:
     return Mistake(best, before, after, tuple(alternatives.values()))
 
 
-def candidates(evidence: Evidence, of: Interpretation) -> Iterator[Candidate]:
+def candidates(evidence: Evidence, current: Interpretation) -> Iterator[Candidate]:
     """Yield the interpretations that are one mistake away."""
     wheels = evidence.wheels
     for sign, cost in _signs(wheels, evidence.rolling):
-        yield Candidate("wheel_sign", replace(of, sign=sign), cost)
+        yield Candidate("wheel_sign", replace(current, sign=sign), cost)
     for order, cost in _orders(wheels):
-        yield Candidate("wheel_order", replace(of, order=order), cost)
+        yield Candidate("wheel_order", replace(current, order=order), cost)
     for azimuth in range(-180 + TURN_DEG, 180, TURN_DEG):
         if azimuth:
-            yield Candidate("wheel_azimuths", replace(of, azimuth=azimuth), 0.025)
-    if of.convention == PoseConvention():
-        yield from _conventions(of)
+            yield Candidate("wheel_azimuths", replace(current, azimuth=azimuth), 0.025)
+    if current.convention == PoseConvention():
+        yield from _conventions(current)
     if evidence.command is not None:
         for sign, cost in _signs(wheels, evidence.rolling):
-            yield Candidate("command_sign", replace(of, command_sign=sign), 0.01 + cost)
+            yield Candidate("command_sign", replace(current, command_sign=sign), 0.01 + cost)
         for order, cost in _orders(wheels):
-            yield Candidate("command_order", replace(of, command_order=order), 0.01 + cost)
+            yield Candidate("command_order", replace(current, command_order=order), 0.01 + cost)
     if evidence.twist is not None:
         for signs in product((1, -1), repeat=3):
             if -1 in signs:
                 x, y, yaw = signs
-                read = replace(of, twist_sign=(x, y, yaw))
+                read = replace(current, twist_sign=(x, y, yaw))
                 yield Candidate("command_sign", read, 0.01 * (1 + signs.count(-1)))
     if evidence.gyro is not None:
-        yield Candidate("gyro_sign", replace(of, gyro_sign=-1), 0.0)
+        yield Candidate("gyro_sign", replace(current, gyro_sign=-1), 0.0)
 
 
-def _conventions(of: Interpretation) -> Iterator[Candidate]:
+def _conventions(current: Interpretation) -> Iterator[Candidate]:
     """Yield candidates with other conventions of the pose."""
     found: list[tuple[str, float, PoseConvention]] = []
     for quarter in (0, 90, 180, -90):
@@ -139,7 +140,7 @@ def _conventions(of: Interpretation) -> Iterator[Candidate]:
             cost = 0.01 if offset % 90 == 0 else 0.02
             found.append(("heading_offset", cost, PoseConvention(offset=offset)))
     for kind, cost, convention in found:
-        yield Candidate(kind, replace(of, convention=convention), cost)
+        yield Candidate(kind, replace(current, convention=convention), cost)
 
 
 def _signs(wheels: int, rolling: np.ndarray) -> Iterator[tuple[tuple[int, ...], float]]:

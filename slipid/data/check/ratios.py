@@ -128,18 +128,17 @@ def ratios(
 
 
 def _along(
-    of: Products, predict: Float[np.ndarray, "3 wheel"], offset: int
+    sums: Products, predict: Float[np.ndarray, "3 wheel"], offset: int
 ) -> tuple[float | None, float | None]:
     """Return least-squares ratios of the body's to the predicted motion, along and in heading."""
-    predicted = np.einsum("aw,wv,av->a", predict, of.turns, predict)
-    both = np.einsum("aw,wa->a", predict, of.across @ rotation(-offset).T)
+    predicted, both = sums.predicted(predict), sums.matched(predict, rotation(-offset))
     total = predicted.sum()
     if not total > 0:
         return None, None
     ahead, about = predicted[:2].sum(), predicted[2]
     along = float(both[:2].sum() / ahead) if ahead > FORWARD * total else None
     # small predicted turns are hidden by the turns that slip causes
-    turns = about > TURNS * total and both[2] ** 2 > 0.25 * about * of.body[2, 2]
+    turns = about > TURNS * total and both[2] ** 2 > 0.25 * about * sums.body[2, 2]
     return along, float(both[2] / about) if turns else None
 
 

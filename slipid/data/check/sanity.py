@@ -238,8 +238,7 @@ def _unmoved(evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
     pose = next(iter(evidence.pose.values()), None)
     if pose is None:
         return
-    predict = to_body(evidence, meant)
-    share = np.einsum("aw,wv,av->a", predict, pose.turns, predict)
+    share = pose.predicted(to_body(evidence, meant))
     share = share / max(float(share.sum()), 1e-300)
     if share[2] < TURNS:
         yield _not_checked("no run turns: base radius, unit of the heading and gyro are unchecked")

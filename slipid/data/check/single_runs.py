@@ -81,38 +81,43 @@ def agreement(
     )
 
 
-def standing(data: JoinedRuns, of: RunAgreement) -> Bool[np.ndarray, " run"]:
+def standing(data: JoinedRuns, compared: RunAgreement) -> Bool[np.ndarray, " run"]:
     """Return whether the poses of each run do not change while its wheels turn."""
-    return (of.poses_m < STILL_M) & (of.wheels_m > MOVED_M) & (_rows(data) >= ROWS)
+    return (compared.poses_m < STILL_M) & (compared.wheels_m > MOVED_M) & (_rows(data) >= ROWS)
 
 
-def single_runs(data: JoinedRuns, of: RunAgreement) -> Iterator[Finding]:
+def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
     """Yield findings about runs that do not agree with the others."""
-    still = standing(data, of)
+    still = standing(data, compared)
     if still.any():
         every = bool(still.mean() >= ALL)
         yield Finding(
             "pose_constant",
             f"the poses do not change in {still.sum()} of {len(still)} runs while the wheels "
-            f"travel {np.median(of.wheels_m[still]):.2g} m",
+            f"travel {np.median(compared.wheels_m[still]):.2g} m",
             "check the columns of pose_x, pose_y and pose_heading, and the marker's visibility"
             if every
             else "leave these runs out of the globs of [[logs]]",
             runs=() if every else _names(data, still),
         )
     # a robot that is held in place by the floor is not like another run
-    moves = ~still & (_rows(data) >= ROWS) & (of.wheels_m > MOVED_M)
+    moves = ~still & (_rows(data) >= ROWS) & (compared.wheels_m > MOVED_M)
     if moves.any():
-        moves &= of.poses_m > 0.25 * np.median(of.poses_m[moves] / of.wheels_m[moves]) * of.wheels_m
-    if moves.sum() < 2 or (usual := float(np.median(of.cosine[moves]))) < USUAL:
+        moves &= (
+            compared.poses_m
+            > 0.25
+            * np.median(compared.poses_m[moves] / compared.wheels_m[moves])
+            * compared.wheels_m
+        )
+    if moves.sum() < 2 or (usual := float(np.median(compared.cosine[moves]))) < USUAL:
         return
-    odd = moves & (1 - of.cosine > max(ODD, TIMES * (1 - usual)))
+    odd = moves & (1 - compared.cosine > max(ODD, TIMES * (1 - usual)))
     if odd.any():
         yield Finding(
             "pose_of_another_run",
             f"the poses of {odd.sum()} of {len(odd)} runs do not follow their wheels "
-            f"(agreement {np.median(of.cosine[odd]):.2f}, in the others "
-            f"{np.median(of.cosine[moves & ~odd]):.2f})",
+            f"(agreement {np.median(compared.cosine[odd]):.2f}, in the others "
+            f"{np.median(compared.cosine[moves & ~odd]):.2f})",
             "check whether these files hold poses of another run, or of another time, and leave "
             "them out of the globs of [[logs]]",
             runs=_names(data, odd),

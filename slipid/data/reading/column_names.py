@@ -304,7 +304,7 @@ def _measured(parts: NameParts, unit: str) -> str | None:
     for what in ("ticks", "current", "torque", "voltage", "duty", "speed"):
         if parts.has("what", what):
             return what
-    if parts.has("what", "position", "angle", "yaw"):  # before w, which may be a wheel
+    if parts.has("what", "position", "angle", "yaw"):  # w comes later, since it may be a wheel
         return "position"
     if parts.has("what", "angular", "w"):
         return "speed"

@@ -268,7 +268,7 @@ def _problem(layout: Layout) -> str | None:
         )
     for name, one in [("the robot's own file", layout), *layout.beside.items()]:
         if one.clock == "own" and not set(one.channels) <= {"time", *POSES}:
-            return f"{name}: clock = 'own'; expected it of a file that holds poses alone"
+            return f"{name}: clock = 'own'; expected it for a file that has poses alone"
     if layout.beside and layout.new_run != "never":
         return f"new_run = '{layout.new_run}' with files beside; expected one run for each file"
     return None

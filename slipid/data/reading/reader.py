@@ -21,7 +21,7 @@ from slipid.data.reading.presets import preset
 from slipid.data.reading.signal import Signal, SignalSource
 from slipid.data.reading.table import Table, read_table
 from slipid.data.runs import Runs, collect, counted_once, default_session
-from slipid.support.errors import DataError
+from slipid.support.errors import DataError, first_names
 
 AnyLayout = Layout | BagLayout
 """Layout of a file of rows or of a bag."""
@@ -193,10 +193,9 @@ def _beside(path: Path, pattern: str, layout: Layout) -> Table:
     other = path.parent / pattern.replace("{stem}", path.stem)
     if not other.is_file():
         there = sorted(p.name for p in path.parent.iterdir() if p.is_file() and p != path)
-        listed = ", ".join(there[:8] + ["..."] * (len(there) > 8)) or "nothing else"
         raise DataError(
             f"{other}: not there; expected it beside {path.name}, as the layout says "
-            f"(there is {listed})"
+            f"(there is {first_names(there, 'nothing else')})"
         )
     return read_table(other, layout)
 
@@ -214,10 +213,9 @@ def find_logs(root: Path, pattern: str) -> list[Path]:
             break
         nearest = nearest / part
     inside = sorted(p.name + ("/" if p.is_dir() else "") for p in nearest.iterdir())
-    listed = ", ".join(inside[:8] + ["..."] * (len(inside) > 8))
     raise DataError(
         f"{root}: no file matches '{pattern}'; expected at least one "
-        f"({nearest} has {listed or 'nothing in it'})"
+        f"({nearest} has {first_names(inside, 'nothing in it')})"
     )
 
 

@@ -3,13 +3,14 @@
 import hashlib
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from slipid.data.reading.layout import Channel, Layout
 from slipid.data.reading.units import same_unit
@@ -77,10 +78,13 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     if layout.units_row:
         check_units(path, text[layout.units_row - 1], header, layout)
     where = [header.index(str(name)) if layout.names_row else int(name) for name in names]
-    try:
-        values = np.loadtxt(body, delimiter=layout.delimiter, usecols=where, ndmin=2, comments=None)
-    except ValueError:
-        values = cell_by_cell(path, body, names, where, layout)
+    values, wrong = cell_numbers(body, layout.delimiter, where)
+    for i, j in np.argwhere(wrong)[:1].tolist():
+        cell = cells_of(body[i], layout.delimiter)[where[j]]
+        comma = re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell)
+        expected = "a number" + " with a decimal point, not a decimal comma" * bool(comma)
+        row, column = layout.first_data_row + i, str(names[j])
+        raise bad_data(path, f"'{cell[:40]}'", expected, row=row, column=column)
     lines_read = layout.first_data_row + np.arange(len(values))
     return Table(path, sha256, names, values, lines_read)
 
@@ -259,20 +263,21 @@ def check_units(path: Path, line: str, header: list[str], layout: Layout) -> Non
                 raise bad_data(path, found, expected, row=row, column=str(column))
 
 
-def cell_by_cell(
-    path: Path, body: list[str], names: tuple[str | int, ...], where: list[int], layout: Layout
-) -> Float[np.ndarray, "row column"]:
-    """Return numbers where the fast parser fails: empty cells are NaN, wrong ones an error."""
-    values = np.empty((len(body), len(where)))
+def cell_numbers(
+    body: Sequence[str], delimiter: str, where: Sequence[int]
+) -> tuple[Float[np.ndarray, "row column"], Bool[np.ndarray, "row column"]]:
+    """Return the numbers in some columns of lines, NaN without one, and which cells are texts."""
+    wrong = np.zeros((len(body), len(where)), dtype=bool)
+    try:
+        values = np.loadtxt(body, delimiter=delimiter, usecols=where, ndmin=2, comments=None)
+        return values, wrong[: len(values)]
+    except ValueError:
+        values = np.full(wrong.shape, np.nan)
     for i, line in enumerate(body):
-        cells = cells_of(line, layout.delimiter)
+        cells = cells_of(line, delimiter)
         for j, at in enumerate(where):
-            cell = cells[at]
-            number = np.nan if cell.lower() in MISSING else number_in(cell)
-            if number is None:
-                comma = re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell)
-                more = " with a decimal point, not a decimal comma" if comma else ""
-                row, column = layout.first_data_row + i, str(names[j])
-                raise bad_data(path, f"'{cell[:40]}'", f"a number{more}", row=row, column=column)
-            values[i, j] = number
-    return values
+            cell = cells[at] if at < len(cells) else ""
+            number = number_in(cell)
+            values[i, j] = np.nan if number is None else number
+            wrong[i, j] = number is None and cell.lower() not in MISSING
+    return values, wrong

@@ -8,7 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.reading.column_names import is_unit, unit_in
-from slipid.data.reading.table import MISSING, bytes_of, cells_of, number_in, parquet_of, text_lines
+from slipid.data.reading.table import (
+    MISSING,
+    bytes_of,
+    cell_numbers,
+    cells_of,
+    number_in,
+    parquet_of,
+    text_lines,
+)
 from slipid.support.errors import bad_data
 
 ROWS = 50_000
@@ -109,27 +117,8 @@ def numbers_of(format: TableFormat) -> TableNumbers:
         return _parquet_numbers(format)
     lines = _lines(format.path)
     body = [line for line in lines[format.first_data_row - 1 :][:ROWS] if line.strip()]
-    between, columns = format.delimiter, range(len(format.names))
-    try:
-        values = np.loadtxt(body, delimiter=between, usecols=columns, ndmin=2, comments=None)
-        return TableNumbers(format, values, frozenset())
-    except ValueError:
-        return _cell_by_cell(format, body)
-
-
-def _cell_by_cell(format: TableFormat, body: list[str]) -> TableNumbers:
-    """Return the numbers where the fast parser fails, with empty cells and texts."""
-    width = len(format.names)
-    values = np.full((len(body), width), np.nan)
-    wrong = np.zeros(width, dtype=int)
-    for i, line in enumerate(body):
-        for j, cell in enumerate(cells_of(line, format.delimiter)[:width]):
-            number = number_in(cell)
-            if number is not None:
-                values[i, j] = number
-            elif cell.lower() not in MISSING:
-                wrong[j] += 1
-    texts = np.flatnonzero(wrong > 0.02 * len(body)).tolist()
+    values, wrong = cell_numbers(body, format.delimiter, range(len(format.names)))
+    texts = np.flatnonzero(wrong.sum(axis=0) > 0.02 * len(body)).tolist()
     return TableNumbers(format, values, frozenset(texts))
 
 
@@ -189,7 +178,7 @@ def _header_rows(rows: list[list[str]], width: int) -> tuple[int, int]:
         filled = [cell for cell in row if cell]
         if len(row) < width - 1 or len(filled) < len(row) - 2:
             continue
-        # below names single letters are units as well: above, they may be the names themselves
+        # single letters are units below the names; above, they may be names themselves
         counted = sum(map(bool, map(unit_in, filled))) if names else sum(map(is_unit, filled))
         if counted > 0.5 * len(filled) and (names or any(len(c) > 1 for c in filled)):
             units = k
@@ -197,7 +186,7 @@ def _header_rows(rows: list[list[str]], width: int) -> tuple[int, int]:
             names = k
     if names or not units:
         return names, units
-    # units written out, each once, are the names of their columns
+    # written-out units that occur once each are the names of their columns
     cells = [cell for cell in rows[units - 1] if cell]
     words = any(len(cell) > 4 and cell.isalpha() for cell in cells)
     return (units, 0) if words and len(set(cells)) == len(cells) else (0, 0)

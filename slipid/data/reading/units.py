@@ -46,7 +46,7 @@ KNOWN = (
 
 @lru_cache(maxsize=1)
 def _registry() -> "pint.UnitRegistry[Any]":
-    # Late: importing pint takes as long as importing numpy, and most commands read no log.
+    # Imported late: pint takes as long as numpy, and most commands read no log.
     """Return the registry of units."""
     import pint
 
@@ -67,7 +67,7 @@ def factor(unit: str, target: str) -> float:
     wanted = registry.parse_units(_ALIASES.get(target, target))
     try:
         given = registry.parse_units(_ALIASES.get(unit.strip(), unit.strip()))
-    except Exception as error:  # pint raises a dozen types, one of them tokenize's
+    except Exception as error:  # pint raises a dozen types of errors, among them one of tokenize
         known = f"{did_you_mean(unit, KNOWN)} (known: {', '.join(KNOWN)})"
         raise ValueError(f"unknown unit '{unit}'{known}") from error
     if given.dimensionality != wanted.dimensionality:

@@ -1,1 +1,1 @@
-"""A motor on a bench: its constants from voltage, current and speed, and how sure they are."""
+"""Motors on a bench: constants with intervals from voltage, current and speed."""

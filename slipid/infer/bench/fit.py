@@ -203,11 +203,11 @@ def _first(volts: BenchWindows | None, amps: BenchWindows, signed: bool) -> Benc
     usual = BenchMotor()
     r, c, drop, slow, one = float(usual.resistance), float(usual.back_emf), 0.0, 0.0, 0.0
     if volts is not None:
-        found = start(volts, MOMENTS[0], list(range(MOMENTS[0])))
+        found = start(volts, MOMENTS[0])
         r, c = (float(x) if x > 0 else y for x, y in zip(found, (r, c), strict=False))
         drop, slow, one = map(float, found[2:5])
     # the zero of a magnitude and friction have the same signal, so the zero is left out
-    k = start(amps, MOMENTS[1], list(range(MOMENTS[1] if signed else MOMENTS[1] - 1)))
+    k = start(amps, MOMENTS[1] if signed else MOMENTS[1] - 1)
     torque = (usual.rotor_inertia, usual.coulomb_friction, usual.viscous_friction)
     j, tau, b = (float(x) * c if x > 0 else float(y) for x, y in zip(k, torque, strict=False))
     zero = float(k[3])

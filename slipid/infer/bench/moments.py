@@ -104,17 +104,17 @@ def sums(w: BenchWindows, coefficients: Float[np.ndarray, " column"], signals: i
     return MomentSums(constant, slope, tangent, even, odd, scale)
 
 
-def start(w: BenchWindows, signals: int, columns: list[int], rounds: int = 12) -> np.ndarray:
-    """Return coefficients of some columns that make all moments vanish, 0 for the others."""
+def start(w: BenchWindows, count: int, rounds: int = 12) -> np.ndarray:
+    """Return the first `count` coefficients that make their moments vanish, 0 for the others."""
     found = np.zeros(w.even.signals.shape[1])
     weight = [w.usable.astype(float)] * 2
-    used = [k for k in columns if k < signals]
     for _ in range(rounds):
-        halves = ((w.even, w.odd, weight[0]), (w.odd, w.even, weight[1]))
-        slope = sum(o.signals[:, used].T @ (k[:, None] * m.signals[:, used]) for m, o, k in halves)
-        constant = sum(o.signals[:, used].T @ (k * m.measured) for m, o, k in halves)
-        found[used] = np.linalg.lstsq(slope, constant, rcond=1e-10)[0]
-        weight = [_weights(m, found, w.usable) for m in (w.even, w.odd)]
+        even, odd = w.even.signals[:, :count], w.odd.signals[:, :count]
+        halves = ((w.even, odd, weight[0]), (w.odd, even, weight[1]))
+        slope = sum(z.T @ (k[:, None] * half.signals[:, :count]) for half, z, k in halves)
+        constant = sum(z.T @ (k * half.measured) for half, z, k in halves)
+        found[:count] = np.linalg.lstsq(slope, constant, rcond=1e-10)[0]
+        weight = [_weights(half, found, w.usable) for half in (w.even, w.odd)]
     return found
 
 

@@ -94,7 +94,7 @@ def _signs(
 def _sure(w: BenchWindows, column: int) -> float:
     """Return a coefficient over its std, from the equation alone without priors."""
     signals = w.even.signals.shape[1] - (w.even.signals.shape[1] == 6)
-    found = start(w, signals, list(range(signals)))
+    found = start(w, signals)
     s = sums(w, found, signals)
     inverse = np.linalg.pinv(s.tangent[:, :signals], rcond=1e-10)
     std = np.sqrt(np.diag(inverse @ scatter(s.moments, 8) @ inverse.T))
@@ -102,7 +102,7 @@ def _sure(w: BenchWindows, column: int) -> float:
 
 
 def _milliamperes(where: str, records: Sequence[BenchRecord], volts: BenchWindows) -> None:
-    found = start(volts, 5, list(range(5)))
+    found = start(volts, 5)
     highest = max(float(np.abs(r.voltage).max()) for r in records if r.voltage is not None)
     if 0 < found[0] < highest**2 / POWER and _sure(volts, 0) > SURE:
         heat = highest**2 / found[0] / 1e3

@@ -1,1 +1,1 @@
-"""Which runs to drive next."""
+"""Proposals of the next runs to drive."""

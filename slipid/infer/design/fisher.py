@@ -89,7 +89,7 @@ class Information:
         return out
 
     def criterion(self, goal: Float[np.ndarray, "k free"]) -> float:
-        """tr(G cov G^T)."""
+        """Return tr(G cov G^T) of the matrix G of a goal."""
         return float(np.einsum("ki,ij,kj->", goal, self.covariance, goal))
 
     def after_each(

@@ -104,7 +104,7 @@ class Planner:
         return first.joined(*others)
 
     def _rows(self, runs: Sequence[PlannedRun]) -> RunJacobians:
-        # always as many at once, so that one compiled function serves
+        # padded to a fixed count, so that one compiled function serves
         filled = [*runs, *[runs[-1]] * (_TOGETHER - len(runs))]
         windows = self._windows(filled)
         this = self._problem.of(windows)

@@ -32,19 +32,12 @@ DRAWS_PER_EFFECTIVE = 20.0
 """Approximate number of warm-up draws that are worth one independent draw."""
 
 
-def extended(
-    target: LogDensity,
-    plan: Plan,
-    part: str,
-    store: BlockStore,
-    done: Sequence[ChainBlock] | None = None,
-) -> list[ChainBlock]:
+def extended(target: LogDensity, plan: Plan, part: str, store: BlockStore) -> list[ChainBlock]:
     """Sample blocks of a part until `diagnose` finds convergence or the plan's limit is reached.
 
-    Sampling continues after the blocks that are done, by default those in the store; each new
-    block is stored.
+    Sampling continues after the blocks in the store, which keeps each new block.
     """
-    blocks = list(store.done(part) if done is None else done)
+    blocks = list(store.done(part))
     while not _ended(blocks, plan):
         block = _block(target, plan, blocks, lambda steps: store.progress(part, steps))
         blocks.append(block)

@@ -296,7 +296,7 @@ def _replicates(
     density: Density,
     x: Float[np.ndarray, "ensemble draw size"],
     log_variance: Float[np.ndarray, "ensemble draw variance"],
-) -> dict[str, Float[np.ndarray, "ensemble replicate piece m"]]:
+) -> dict[str, Float[np.ndarray, "ensemble replicate segment m"]]:
     """Return replicated less measured data of every segment, from some draws of each ensemble.
 
     They are predicted less measured data, plus noise with the draw's own variances.

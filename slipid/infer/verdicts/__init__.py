@@ -1,1 +1,1 @@
-"""Verdicts: what a fit knows and what it does not."""
+"""Verdicts: identified numbers, flat directions, disputes and trust in a fit."""

@@ -73,9 +73,7 @@ def _product(axes: list[Axis], power: np.ndarray) -> str:
         last = NEEDS_VOLTAGE[1] if NEEDS_VOLTAGE[1] in short else short[0]
         return f"{', '.join(short)} only as {', '.join(f'{p}/{last}' for p in short if p != last)}"
     if len(names) == 2:
-        k = float(power[1] / power[0])  # b / a^k does not change
-        first, other = names if abs(k) >= 1 else names[::-1]
-        k = k if abs(k) >= 1 else 1 / k
+        first, other, k = _pair(names, power)  # other / first^k does not change
         held = _power(first, abs(k))
         held = f"{held} * {other}" if k < 0 else f"{other} / {held}"
         return f"{names[0]} and {names[1]} only as {held}"
@@ -83,12 +81,18 @@ def _product(axes: list[Axis], power: np.ndarray) -> str:
         up, down = (
             listed([n for n, k in zip(names, power, strict=True) if s * k > 0]) for s in (1, -1)
         )
-        return f"no effect on the data for any factor: {up} times it, {down} divided by it"
+        return f"no effect on the data if one factor multiplies {up} and divides {down}"
     parts = [
         f"{name} {'times' if k > 0 else 'divided by'} {_power('t', abs(k))}"
         for name, k in zip(names, power, strict=True)
     ]
     return f"no effect on the data for any factor t: {', '.join(parts)}"
+
+
+def _pair(names: list[str], power: np.ndarray) -> tuple[str, str, float]:
+    """Return two names, and the power of the second over the first, ordered so that |k| >= 1."""
+    k = float(power[1] / power[0])
+    return (names[0], names[1], k) if abs(k) >= 1 else (names[1], names[0], 1 / k)
 
 
 def _power(name: str, k: float) -> str:
@@ -99,9 +103,7 @@ def _sum(names: list[str], weight: np.ndarray) -> str:
     if (np.abs(weight - 1) < _SAME).all():
         return f"{', '.join(names)} only as their differences"
     if len(names) == 2:
-        k = float(weight[1] / weight[0])  # b - k a does not change
-        first, other = names if abs(k) >= 1 else names[::-1]
-        k = k if abs(k) >= 1 else 1 / k
+        first, other, k = _pair(names, weight)  # other - k first does not change
         times = "" if abs(abs(k) - 1) < _SAME else f"{abs(k):.2g} "
         sign = "+" if k < 0 else "-"
         return f"{names[0]} and {names[1]} only as {other} {sign} {times}{first}"

@@ -44,14 +44,14 @@ class BenchmarkProtocol(NamedTuple):
 
 
 PROTOCOLS: dict[str, BenchmarkProtocol] = {
-    "known_floor": BenchmarkProtocol("headings", True, "new headings on a floor that is told"),
-    "unknown_floor": BenchmarkProtocol("headings", False, "new headings, the floor is not told"),
+    "known_floor": BenchmarkProtocol("headings", True, "new headings on a known floor"),
+    "unknown_floor": BenchmarkProtocol("headings", False, "new headings on an unknown floor"),
     "sectors": BenchmarkProtocol(
-        "sectors", True, "left-out sectors of 60 degrees, the floor is told"
+        "sectors", True, "left-out sectors of 60 degrees on a known floor"
     ),
-    "speeds": BenchmarkProtocol("speeds", True, "a left-out speed, the floor is told"),
-    "new_floor": BenchmarkProtocol("floors", False, "a floor that no method has seen", True),
-    "two_floors": BenchmarkProtocol("all", False, "runs from one floor to another, not told where"),
+    "speeds": BenchmarkProtocol("speeds", True, "a left-out speed on a known floor"),
+    "new_floor": BenchmarkProtocol("floors", False, "a floor without training runs", True),
+    "two_floors": BenchmarkProtocol("all", False, "runs from one floor to another, floors unknown"),
 }
 
 

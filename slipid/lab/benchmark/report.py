@@ -37,7 +37,7 @@ def show_benchmark(page: Page, found: Content) -> None:
             about = found["protocols"][protocol]
             title = f"\n{name}: {about}; end points over the {one['over']}"
             brief = [number for number in shown(rows) if number not in ON_THE_PAGE]
-            head = ("row", *headings(brief), *COSTS[1:])
+            head = ("row", *(COLUMNS[name][0] for name in brief), *COSTS[1:])
             made = table(head, title, right=head[1:])
             for row, content in ranked(rows):
                 made.add_row(Text(row), *cells(content, brief), *costs(content)[1:])
@@ -70,11 +70,6 @@ def ranked(rows: Content) -> list[tuple[str, Content]]:
 def shown(rows: Content) -> list[str]:
     """Return the names of numbers that some row has."""
     return [name for name in COLUMNS if any(row[name] is not None for row in rows.values())]
-
-
-def headings(numbers: Sequence[str]) -> list[str]:
-    """Return the headings of numbers."""
-    return [COLUMNS[name][0] for name in numbers]
 
 
 def cells(row: Content, numbers: Sequence[str]) -> list[str]:
@@ -245,19 +240,23 @@ def page(found: Content, pictures: Mapping[str, bytes]) -> str:
         parts.append(f"<p>{escape(other.failure or other.title)}</p>")
         if not other.failure:
             parts.append(html_table(other.head, other.body))
-    parts.append(f"<p class='note'>{_versions(found)}</p></html>")
+    names = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+    note = escape(f"{names}; this call took {found['seconds']:.0f} s")
+    parts.append(f"<p class='note'>{note}</p></html>")
     return "\n".join(parts)
 
 
 def _set(found: Content, name: str, one: Content, drawn: bytes | None) -> list[str]:
     parts = [f"<h2>{escape(name)}</h2><p>{escape(one['about'])}; {one['runs']} runs</p>"]
     if drawn is not None:
-        parts.append(picture(drawn, f"End-point errors on {name}"))
+        data = b64encode(drawn).decode()
+        title = escape(f"End-point errors on {name}")
+        parts.append(f"<img alt='{title}' src='data:image/png;base64,{data}'>")
     for protocol, rows in one["protocols"].items():
         title = f"{protocol.replace('_', ' ')}: {found['protocols'][protocol]}"
         parts.append(f"<h3>{escape(title)}</h3>")
         numbers = shown(rows)
-        head = ("row", *headings(numbers), *COSTS)
+        head = ("row", *(COLUMNS[name][0] for name in numbers), *COSTS)
         body = [(row, *cells(content, numbers), *costs(content)) for row, content in ranked(rows)]
         parts.append(html_table(head, body))
         parts += [f"<p class='note'>{escape(line)}</p>" for line in absent(rows)]
@@ -278,14 +277,3 @@ def html_table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
         own = " class='own'" if row[0].startswith(("slipid", "contact")) else ""
         lines.append(f"<tr{own}>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
     return "".join([*lines, "</table></div>"])
-
-
-def picture(png: bytes, description: str) -> str:
-    """Return a picture embedded in the page, with its description."""
-    data = b64encode(png).decode()
-    return f"<img alt='{escape(description)}' src='data:image/png;base64,{data}'>"
-
-
-def _versions(found: Content) -> str:
-    names = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
-    return escape(f"{names}; this call took {found['seconds']:.0f} s")

@@ -49,7 +49,7 @@ class SlipidFit:
 
     Attributes:
         contact: force balance with its forecasts.
-        job: job of all runs of the data set.
+        job: fit task of all runs of the data set.
         floors: indices of the fitted floors.
         highest_speed: highest wheel speed in these runs [rad/s].
         trend: trend of their currents, see `slipid.infer.slip_curves.current_trend`.
@@ -82,7 +82,7 @@ class SlipidFit:
 def fit_slipid(
     job: ConfigFitTask, problem: Problem, training: np.ndarray, kept: Checkpoint
 ) -> SlipidFit:
-    """Return the force balance fitted to some runs of a job, or the kept one of the same fit.
+    """Return the force balance fitted to some runs of a fit task, or the kept result.
 
     Fits of one `job.problem()` share its compiled functions.
     """
@@ -116,7 +116,7 @@ def fit_slipid(
 
 
 def forecast(fit: SlipidFit, batch: RunBatch, spec: RobotSpec) -> list[PredictedRun]:
-    """Return the force balance's predictions of runs on known floors, with the electric power."""
+    """Return the force balance's predictions of runs on known floors, with electric power."""
     w = batch.windows
     tracks, cov = fit.contact.ends(w)
     robot = fit.contact.robot

@@ -220,15 +220,15 @@ def _with_facts(batch: RunBatch, data: DataSet, numbers: np.ndarray) -> RunBatch
 
 def _score(data: FoldData, protocol: str, name: str) -> FoldScore:
     """Return the score of a row in a protocol, or the reason why it is absent."""
-    asked = PROTOCOLS[protocol]
-    runs = [run.with_floor(asked.floor_known) for run in data.runs]
+    rules = PROTOCOLS[protocol]
+    runs = [run.with_floor(rules.floor_known) for run in data.runs]
     try:
         if name in (slipid_rows.NAME, OWN_MAP):
-            return _slipid(data, asked, runs, name)
+            return _slipid(data, rules, runs, name)
         method = next(m for m in rows(data.data.spec) if m.name == name)
         if lacks := method.needs - channels_of(runs, data.data.spec):
             return FoldScore.lacking(lacks)
-        return _published(data, asked, runs, method)
+        return _published(data, rules, runs, method)
     except Exception as error:  # other rows are scored all the same
         return FoldScore.of_error(error)
 
@@ -262,7 +262,7 @@ def _published(
 
 
 def _slipid(data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], name: str) -> FoldScore:
-    """Return the score of slipid: the force balance, or its estimator where that adds something."""
+    """Return the score of slipid: its estimator on unknown floors or with a gyro, else its fit."""
     fit, known = data.fit, protocol.floor_known
     if isinstance(fit, FoldScore):
         return fit

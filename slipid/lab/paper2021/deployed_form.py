@@ -2,15 +2,15 @@
 
     xi = back r (w_i (1 - s_i))
 
-    paper_print           s = -0.072 + 4.888 M - 5.456 M^2, held in [0, 1], as printed
+    paper_print           s = -0.072 + 4.888 M - 5.456 M^2, clipped to [0, 1], as printed
     paper_code            1 - s = a_i I~ + b_i, s in [0, 1], where I~ > 0.4 A, else s = 0, as run
     paper_print_refit     s = c0 + c1 M + c2 M^2, one curve for all motors
     paper_code_refit      s = c_i I~ + d_i where I~ > 0.4 A, else s = 0, for each motor
-    paper_linear_svr      s = c0 + c1 M, by epsilon-insensitive regression, held in [0, 1]
+    paper_linear_svr      s = c0 + c1 M, by epsilon-insensitive regression, clipped to [0, 1]
     paper_quadratic_svr   s = c0 + c1 M + c2 M^2, likewise
 
 M is the torque characterising variable at the motor's shaft [N m], I~ the current [A] smoothed with
-0.97 of it kept from each sample of 31 ms to the next. The first two are the authors' own numbers
+a factor of 0.97 from each sample of 31 ms to the next. The first two are the authors' own numbers
 and are never fitted. The refits are least squares in the displacement of half-second windows. The
 last two follow the authors' recipe: s = 1 - w_eff / w of each wheel and window, w_eff by the pose;
 only 0 < s <= 1 and I > 0.25 A are kept, which cuts the response that is fitted.
@@ -22,7 +22,7 @@ Liberties:
       numbers take R and C_e of their scripts, the refits those of the robot's config.
     - `paper_code` starts its smoothing at a run's first current. Robots that do not have three
       drives get the mean of the three motors' slips.
-    - The refits are held in [-1, 1] instead: where a wheel is dragged along its slip is negative.
+    - The refits are clipped to [-1, 1] instead: the slip of a dragged wheel is negative.
     - The recipe's M is not cut at 0.5 N m, and all motors are pooled, as the printed curve is used
       for all; at most 3000 samples are used.
     - C and epsilon are not printed. With ours, epsilon a tenth of a robust std, figure 2's line
@@ -35,9 +35,10 @@ Source: Belyaev, Brylev, Ivanov 2021, IFAC-PapersOnLine 54(13), section 3, figur
 code that its authors published, BrOleg5/Slippage-compensation.
 """
 
+import abc
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, final
+from typing import ClassVar, Self, final
 
 import numpy as np
 from jaxtyping import Float
@@ -50,22 +51,28 @@ from slipid.predict.steps import Steps, TrainingWindows
 
 NEEDS: frozenset[Channel] = frozenset({"current", "twist"})
 TIME_CONSTANT = -0.031 / float(np.log(tables.DEPLOYED_MEMORY))
-"""Of the authors' smoothing [s]: their computer sampled about every 31 ms."""
+"""Time constant of the authors' smoothing [s]: their computer sampled about every 31 ms."""
 MOST = 3000
-"""Samples that a support vector regression is fitted to."""
+"""Largest number of samples of a support vector regression."""
+
+
+@dataclass(frozen=True)
+class _AsPublished(WheelSlip, abc.ABC):
+    """A slip model with the authors' own numbers, which is never fitted."""
+
+    learns: ClassVar[bool] = False
+    needs: frozenset[Channel] = field(default=NEEDS, kw_only=True)
+
+    def learn(self, w: TrainingWindows, spec: RobotSpec) -> Self:
+        return self
 
 
 @final
 @dataclass(frozen=True)
-class PaperPrint(WheelSlip):
+class PaperPrint(_AsPublished):
     """The printed curve over torque, with the motor's constants of the authors' scripts."""
 
-    learns: ClassVar[bool] = False
     name: str = "paper_print"
-    needs: frozenset[Channel] = field(default=NEEDS, kw_only=True)
-
-    def learn(self, w: TrainingWindows, spec: RobotSpec) -> "PaperPrint":
-        return self
 
     def slip(self, steps: Steps, spec: RobotSpec) -> Slips:
         recipe = FIGURES_3_AND_4
@@ -76,15 +83,10 @@ class PaperPrint(WheelSlip):
 
 @final
 @dataclass(frozen=True)
-class PaperCode(WheelSlip):
+class PaperCode(_AsPublished):
     """The lines over smoothed current that ran on the authors' robot."""
 
-    learns: ClassVar[bool] = False
     name: str = "paper_code"
-    needs: frozenset[Channel] = field(default=NEEDS, kw_only=True)
-
-    def learn(self, w: TrainingWindows, spec: RobotSpec) -> "PaperCode":
-        return self
 
     def slip(self, steps: Steps, spec: RobotSpec) -> Slips:
         current = steps.smoothed(steps.signals.along(spec), TIME_CONSTANT)
@@ -95,18 +97,17 @@ class PaperCode(WheelSlip):
 
 
 def recipe_samples(w: TrainingWindows, spec: RobotSpec) -> SlipSamples:
-    """All wheels and windows that the authors' cuts leave, at most `MOST` of them by lot."""
+    """Return the wheels and windows within the authors' cuts, at most `MOST` drawn at random."""
     signals = w.signals
     rim = signals.speed * spec.wheel_radius
     real = w.twist @ spec.forward.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        # a wheel at rest has no slip ratio: not finite, so that no comparison keeps it
+        # a wheel at rest has no finite slip ratio, and no comparison is true for it
         slip = 1.0 - real / rim
     amps = signals.along(spec)
     kept = (slip > 0.0) & (slip <= 1.0) & (amps > FIGURES_3_AND_4.min_current)
-    lot = np.random.default_rng(0).permutation(int(kept.sum()))[:MOST]
-    torque = signals.torque(spec)
-    return SlipSamples(amps[kept][lot], torque[kept][lot], slip[kept][lot])
+    drawn = np.random.default_rng(0).permutation(int(kept.sum()))[:MOST]
+    return SlipSamples(*(x[kept][drawn] for x in (amps, signals.torque(spec), slip)))
 
 
 def insensitive_curve(
@@ -116,10 +117,11 @@ def insensitive_curve(
     c: float,
     tube: float,
 ) -> Float[np.ndarray, " power"]:
-    """Coefficients of 1, x, ..., x^degree by epsilon-insensitive support vector regression.
+    """Return coefficients of 1, x, ..., x^degree by epsilon-insensitive regression.
 
-    Powers are standardised and the slip is centred first: the penalty is on these. C weighs the
-    loss of each sample; epsilon is the tube times a robust std of the slip.
+    The support vector regression is linear in standardised powers with a centred slip, to which
+    its penalty applies. C weighs the loss of each sample; epsilon is the tube times a robust std of
+    the slip.
     """
     from sklearn.svm import LinearSVR
 
@@ -136,12 +138,12 @@ def insensitive_curve(
 class PaperSvr(WheelSlip):
     """Support vector regression of slip over torque, by the authors' recipe.
 
-    The coefficients are of 1, M, M^2, as far as its degree goes.
+    The coefficients are those of 1, M and, for degree 2, M^2.
 
     Attributes:
-        degree: 1 or 2.
-        c: weight of what lies outside the tube, for each sample.
-        tube: half width epsilon of the tube without a price, in robust stds of the slip.
+        degree: degree of the polynomial, 1 or 2.
+        c: weight of each sample's loss outside the tube.
+        tube: half width epsilon of the tube without loss, in robust stds of the slip.
     """
 
     needs: frozenset[Channel] = field(default=NEEDS, kw_only=True)
@@ -153,12 +155,12 @@ class PaperSvr(WheelSlip):
         return [replace(self, c=c, tube=tube) for c in (1e-3, 0.1) for tube in (0.1, 0.5)]
 
     def learn(self, w: TrainingWindows, spec: RobotSpec) -> "PaperSvr":
-        seen = recipe_samples(w, spec)
-        if len(np.unique(seen.torque.round(9))) <= self.degree:
-            # nothing to fit a curve to: the slip that was seen, if any was
-            level = float(seen.slip.mean()) if len(seen) else 0.0
+        samples = recipe_samples(w, spec)
+        if len(np.unique(samples.torque.round(9))) <= self.degree:
+            # too few samples for a curve: their mean slip, or none
+            level = float(samples.slip.mean()) if len(samples) else 0.0
             return replace(self, coefficients=np.array([level] + [0.0] * self.degree))
-        curve = insensitive_curve(seen.torque, seen.slip, self.degree, self.c, self.tube)
+        curve = insensitive_curve(samples.torque, samples.slip, self.degree, self.c, self.tube)
         return replace(self, coefficients=curve)
 
     def slip(self, steps: Steps, spec: RobotSpec) -> Slips:
@@ -167,7 +169,7 @@ class PaperSvr(WheelSlip):
 
 
 def refits() -> list[CurveModel]:
-    """The forms that were printed and deployed, unfitted, in [-1, 1]."""
+    """Return the printed and the deployed form, unfitted, clipped to [-1, 1]."""
     deployed = above(tables.DEPLOYED_THRESHOLD)
     return [
         CurveModel("paper_print_refit", powers(0, 1, 2), RunSignals.torque, most=1.0, needs=NEEDS),
@@ -183,6 +185,6 @@ def refits() -> list[CurveModel]:
 
 
 def paper_rows() -> list[SlipModel]:
-    """The paper's rows, unfitted."""
+    """Return the paper's rows, unfitted."""
     svr = PaperSvr("paper_linear_svr", 1), PaperSvr("paper_quadratic_svr", 2)
     return [PaperPrint(), PaperCode(), *refits(), *svr]

@@ -13,7 +13,6 @@ from slipid.lab.paper2021.table import FittedForm, MotorTable, deployed_slip
 from slipid.plots import drawing
 from slipid.support.files import write_json
 
-# the surfaces keep their names
 _SURFACE = {"gray": ("#666666", "o"), "blue": (drawing.BLUE, "^"), "red": (drawing.ORANGE, "s")}
 _PAPER, _OURS, _THIRD = drawing.PURPLE, drawing.INK, drawing.GREEN
 _TRACK = {"encoders": drawing.ORANGE, "slip_model": "#E69F00", "compensation": drawing.BLUE}
@@ -21,7 +20,7 @@ _AXIS = {"current": "motor current I / A", "torque": "torque variable M at the m
 
 
 def run(data_dir: Path, out: Path) -> list[Path]:
-    """Regenerate the paper: `paper.json` and one PNG per figure, each written whole or not at all.
+    """Regenerate the paper: write `paper.json` and one PNG per figure, each file atomically.
 
     Args:
         data_dir: folder that holds robotino2021 (and robotino2022), or robotino2021 itself.
@@ -44,13 +43,13 @@ def run(data_dir: Path, out: Path) -> list[Path]:
 
 
 def runs_2022(folder: Path) -> tuple[Log, ...] | None:
-    """The 2022 runs on one surface each, None where there are none."""
+    """Return the 2022 runs on one surface each, or None without any."""
     pattern = "one_surface/*/*.csv"
     return read_runs(folder, pattern, "robotino2022").logs if any(folder.glob(pattern)) else None
 
 
 def figure2(field: MotorTable) -> Figure:
-    """Slip against current of motor 1 over the whole site, the paper's line and ours."""
+    """Return slip against current of motor 1 over the whole site, with both fitted lines."""
     points = field.samples
     made = drawing.figure(
         7.2, 4.8, f"Figure 2: whole site, motor 1, {len(points)} half-second means"
@@ -71,7 +70,7 @@ def figure2(field: MotorTable) -> Figure:
 
 
 def figure3(motors: dict[int, MotorTable]) -> Figure:
-    """Slip against current and against torque, per surface, one column per motor."""
+    """Return slip against current and against torque, per surface, one column per motor."""
     made = drawing.figure(
         11.5,
         7.0,
@@ -100,7 +99,7 @@ def figure3(motors: dict[int, MotorTable]) -> Figure:
 
 
 def figure4(table: MotorTable) -> Figure:
-    """Slip of motor 1 against the torque variable, the linear and quadratic models."""
+    """Return slip of motor 1 against the torque variable, with linear and quadratic models."""
     made = drawing.figure(7.2, 4.8, f"Figure 4: motor 1, {len(table.samples)} half-second means")
     axes = made.subplots()
     for surface, part in table.by_surface.items():
@@ -123,7 +122,7 @@ def figure4(table: MotorTable) -> Figure:
 
 
 def figure7(tracks: tuple[SquareTrack, ...]) -> Figure:
-    """Camera tracks around the commanded rectangle, with headings and how well they end."""
+    """Return camera tracks around the commanded rectangle, with headings and closure errors."""
     made = drawing.figure(
         12.0, 5.7, "Figure 7: the same commanded rectangle, three ways to follow it"
     )
@@ -145,7 +144,7 @@ def _draw_track(axes: Axes, track: SquareTrack) -> None:
     axes.plot(*xy.T, color=colour, lw=2)
     side = xy[: track.file.side_frames]
     axes.plot(*side.T, color=colour, lw=6, alpha=0.4, label="first side")
-    # every 160 mm of path: where the robot stands, arrows would pile up
+    # an arrow every 160 mm of path, since they would overlap where the robot stands
     travel = np.cumsum(np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T))
     every = np.searchsorted(travel, np.arange(80.0, travel[-1], 160.0))
     # logged headings are 90 deg ahead of right-handed ones on the floor
@@ -171,7 +170,7 @@ def _draw_track(axes: Axes, track: SquareTrack) -> None:
 
 
 def _floor(track: SquareTrack) -> np.ndarray:
-    """Positions from the start in right-handed axes [mm]: the camera's image has y down."""
+    """Return positions from the start in right-handed axes [mm]; the image has y down."""
     step = track.position - track.position[0]
     return np.stack([-step[:, 0], step[:, 1]], axis=1)
 
@@ -179,7 +178,7 @@ def _floor(track: SquareTrack) -> np.ndarray:
 def _medians(
     axes: Axes, x: np.ndarray, slip: np.ndarray, colour: str, marker: str, label: str, width: float
 ) -> None:
-    """Running medians, where a bin holds enough points for one to mean something."""
+    """Draw running medians of bins with enough points."""
     bins = np.floor(x / width).astype(int)
     filled = [b for b in np.unique(bins) if np.count_nonzero(bins == b) >= 8]
     centre = [np.median(x[bins == b]) for b in filled]
@@ -197,8 +196,7 @@ def _formula(form: FittedForm) -> str:
     symbol = "M" if form.regressor == "torque" else "I"
     powers = ("", f" {symbol}", f" {symbol}²")[form.first_power :]
     terms = [f"{c:+.3f}{power}" for c, power in zip(form.coefficients, powers, strict=False)]
-    said = " ".join(f"{term[0]} {term[1:]}" for term in terms).removeprefix("+ ")
-    return f"s = {said}"
+    return "s = " + " ".join(f"{term[0]} {term[1:]}" for term in terms).removeprefix("+ ")
 
 
 def _slip_axes(axes: Axes, what: str, limit: float) -> None:

@@ -1,7 +1,4 @@
-"""The three camera tracks of figure 7: how far along the side, how crooked, how far from home.
-
-Everything the paper's data says, in one value: tables, tracks, transfer between surfaces.
-"""
+"""The paper regenerated: tables, the camera tracks of figure 7, and transfer between surfaces."""
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -18,14 +15,14 @@ from slipid.support.errors import DataError, bad_data
 
 @dataclass(frozen=True)
 class TrackFile:
-    """One camera track of the 2021 data set and how the paper describes it.
+    """File of one camera track of the 2021 data set, with the paper's description.
 
-    Args:
+    Attributes:
         name: key in results.
-        label: what steered the robot.
-        square: how files in the folder figure7 call it: `square_<this>_camera.csv`.
+        label: controller of the robot.
+        square: its part of the file name `square_<square>_camera.csv` in the folder figure7.
         authors_frames: camera frames of the first side, by the authors' own index.
-        side_frames: camera frames of the first side in this file, to where the robot turns off.
+        side_frames: camera frames of the first side in this file, up to the robot's turn.
         printed_path_length: length of the first side as the paper prints it [mm].
     """
 
@@ -52,13 +49,13 @@ COMMANDED_SIDES = (900.0, 400.0)
 
 @dataclass(frozen=True, eq=False)
 class SquareTrack:
-    """One camera track, with the numbers a reader of figure 7 asks for.
+    """One camera track, with the numbers of figure 7.
 
-    Args:
-        file: where it comes from.
-        time: [s], shape (frame,).
+    Attributes:
+        file: file of the track.
+        time: time of each frame [s].
         position: image x to the right and y down [mm], shape (frame, 2).
-        heading: heading as logged [deg], unwrapped, shape (frame,).
+        heading: logged heading, unwrapped [deg].
     """
 
     file: TrackFile
@@ -81,7 +78,7 @@ class SquareTrack:
 
     @property
     def displacement(self) -> float:
-        """Way gained along the commanded side, image y [mm]."""
+        """Displacement along the commanded side, image y [mm]."""
         return float(abs(self.side[-1, 1] - self.side[0, 1]))
 
     @property
@@ -90,7 +87,7 @@ class SquareTrack:
         return float(np.hypot(*(self.position[-1] - self.position[0])))
 
     def as_dict(self) -> dict[str, float | str | int]:
-        """The numbers by name, units in the names."""
+        """Return the numbers by name, with units in the names."""
         return {
             "label": self.file.label,
             "side_frames": self.file.side_frames,
@@ -105,7 +102,7 @@ class SquareTrack:
 
 
 def read_track(folder: Path, file: TrackFile) -> SquareTrack:
-    """One track of figure 7; DataError where the file is broken or ends within its first side."""
+    """Read one track of figure 7; DataError if the file is broken or ends within its first side."""
     path = folder / "figure7" / f"square_{file.square}_camera.csv"
     table = read_columns(path, "robotino2021_camera")
     frames = len(table["time_s"])
@@ -127,11 +124,11 @@ SCHEMA = "slipid.paper2021/1"
 class PaperResult:
     """The paper regenerated.
 
-    Args:
+    Attributes:
         field: figure 2, motor 1 over the whole site.
         motors: figures 3 and 4 and their table, by motor.
         tracks: figure 7.
-        transfer: one current curve across surfaces of the 2022 runs; None where they are absent.
+        transfer: transfer of a current curve between surfaces of the 2022 runs; None without them.
     """
 
     field: MotorTable
@@ -140,7 +137,7 @@ class PaperResult:
     transfer: Transfer | None
 
     def as_dict(self) -> dict[str, object]:
-        """All numbers by name, ready for JSON."""
+        """Return all numbers by name, ready for JSON."""
         return {
             "schema": SCHEMA,
             "figure2": _table_dict(1, self.field),
@@ -157,7 +154,7 @@ class PaperResult:
 
 
 def find_folder(data: Path) -> Path:
-    """The 2021 data set under a data root, or the root itself; DataError if it is neither."""
+    """Return the folder of the 2021 data set, below a data root or itself; DataError if absent."""
     for folder in (data / "robotino2021", data):
         if (folder / "experimental_data_gray.csv").is_file():
             return folder

@@ -1,6 +1,7 @@
 """Slip, current and torque of one motor, from the authors' half-second means, by their recipe.
 
-Does one curve of slip over current carry over to a surface unseen? The 2022 runs tell.
+`leave_one_surface_out` tests on the 2022 runs whether a curve of slip over current carries over to
+another surface.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,19 +28,19 @@ _TO_SI = np.array([1e-3, 1e-3, np.pi / 180.0])
 
 @dataclass(frozen=True)
 class Recipe:
-    """Every choice the authors made between the logged columns and the points of a figure.
+    """Processing of logged columns into the points of a figure, as chosen by the authors.
 
     w_eff = n J v / r; s = 1 - w_eff / w; U = C_e w + R I sign(w); M = U I / w, with w and w_eff at
     the motor shaft.
 
-    Args:
+    Attributes:
         wheel_radius: r [m].
         base_radius: L [m].
         gear_ratio: n [-].
-        azimuth_deg: wheel centres seen from the body's x axis [deg].
+        azimuth_deg: directions of the wheel centres from the body's x axis [deg].
         resistance: R [ohm], as in the authors' scripts.
         back_emf: C_e [V s/rad], as in the authors' scripts.
-        row_period: time each row's pose delta is divided by [s]; the rows are about 0.45 s apart.
+        row_period: divisor of each row's pose delta [s]; the rows are about 0.45 s apart.
         delta_columns: pose deltas used, x, y [mm] and heading [deg].
         drop_rotation: leave out rows with a rotation command.
         speed_limit: rows with any |w_eff| at or above it are taken for camera jumps [rpm, motor].
@@ -62,7 +63,7 @@ class Recipe:
 
     @property
     def rim(self) -> np.ndarray:
-        """J: rim speed of each wheel [m/s] from the body twist, (wheel, 3)."""
+        """Matrix J of rim speeds [m/s] by the body twist, shape (wheel, 3)."""
         azimuth = np.radians(self.azimuth_deg)
         arm = np.full(len(azimuth), self.base_radius)
         return np.stack([-np.sin(azimuth), np.cos(azimuth), arm], axis=1)
@@ -92,13 +93,13 @@ class SlipSamples:
 
 
 def pool(parts: Sequence[SlipSamples]) -> SlipSamples:
-    """All points of several sets of one motor, in order."""
+    """Return all points of several sets of one motor, in order."""
     columns = zip(*((p.current, p.torque, p.slip) for p in parts), strict=True)
     return SlipSamples(*map(np.concatenate, columns))
 
 
 def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> SlipSamples:
-    """Points of one motor that survive the recipe; the table is in the file's units."""
+    """Return the points of one motor within the recipe's cuts; the table is in file units."""
     effective = effective_speed(table, recipe)
     rpm = 2.0 * np.pi / 60.0
     keep = np.all(np.abs(effective) < recipe.speed_limit * rpm, axis=1)
@@ -107,7 +108,7 @@ def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Sl
     speed = table[f"Motor {motor} velocity, rpm"] * rpm
     current = table[f"Motor {motor} current, A"]
     with np.errstate(divide="ignore", invalid="ignore"):
-        # A wheel at rest has no slip ratio: not finite here, so no comparison below keeps it.
+        # a wheel at rest has no finite slip ratio, and no comparison below is true for it
         slip = 1.0 - effective[:, motor - 1] / speed
         voltage = recipe.back_emf * speed + recipe.resistance * current * np.sign(speed)
         torque = voltage * current / speed
@@ -117,9 +118,9 @@ def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Sl
 
 
 def effective_speed(table: dict[str, np.ndarray], recipe: Recipe) -> np.ndarray:
-    """Motor speeds at which wheels without slip would move the body as seen, w_eff = n J v / r.
+    """Return motor speeds of wheels without slip at the measured body motion, w_eff = n J v / r.
 
-    A component of v whose command is 0 counts as 0, as the authors did.
+    A component of v whose command is 0 is set to 0, as by the authors.
 
     Returns:
         [rad/s, motor shaft], shape (row, motor).
@@ -131,13 +132,13 @@ def effective_speed(table: dict[str, np.ndarray], recipe: Recipe) -> np.ndarray:
 
 
 def needed(recipe: Recipe) -> list[str]:
-    """Names of the columns that a recipe reads."""
+    """Return the names of the columns that a recipe reads."""
     motors = [f"Motor {m} {what}" for m in MOTORS for what in ("velocity, rpm", "current, A")]
     return [*_COMMAND, *recipe.delta_columns, *motors]
 
 
 def read_columns(path: Path, layout: str, needed: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """Every column of a file by name, in the file's own units, also those no channel reads.
+    """Return every column of a file by name, in the file's own units.
 
     Raises:
         DataError: the file cannot be read, holds a cell that is no finite number, or lacks a column
@@ -157,13 +158,13 @@ def read_columns(path: Path, layout: str, needed: Sequence[str] = ()) -> dict[st
 
 @dataclass(frozen=True)
 class Transfer:
-    """Error in slip [-] on each surface, from three sources of a prediction.
+    """Errors in slip [-] on each surface, by three predictions.
 
-    Args:
-        samples: number of them per surface.
+    Attributes:
+        samples: number of samples per surface.
         pooled: root mean square error of a curve fitted to the other surfaces.
-        constant: error of the other surfaces' mean slip.
-        own: error of a curve fitted to the surface itself.
+        constant: root mean square error of the other surfaces' mean slip.
+        own: root mean square error of a curve fitted to the surface itself.
     """
 
     samples: dict[str, int]
@@ -172,13 +173,13 @@ class Transfer:
     own: dict[str, float]
 
     def mean(self) -> dict[str, float]:
-        """Each error averaged over surfaces, every surface counting the same."""
+        """Return each error averaged over surfaces with equal weights."""
         rows = {"pooled": self.pooled, "constant": self.constant, "own": self.own}
         return {name: float(np.mean(list(row.values()))) for name, row in rows.items()}
 
 
 def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
-    """Mean current and slip of every wheel over a log's windows, nothing cut away.
+    """Return mean current and slip of every wheel in all windows of a log.
 
     A window is as long as a row of the 2021 files. s = 1 - J v / (r w), v the camera's body
     velocity over the window, w the encoders' mean speed.
@@ -190,7 +191,7 @@ def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"{log.name}: slip against current needs both pose and current")
     first = first_moved(log.wheel_angle, recipe.wheel_radius)
     start = log.time[-1] if first is None else log.time[first]
-    # unique: where rows are further apart than a window, two windows would begin at the same row
+    # unique, since two windows may start at the same row where rows are rare
     starts = np.arange(start, log.time[-1], recipe.row_period)
     edges = np.unique(np.searchsorted(log.time, starts))
     if len(edges) < 2:
@@ -198,7 +199,7 @@ def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
     span = np.diff(log.time[edges])[:, None]
     effective = body_steps(log.pose[edges]) / span @ recipe.rim.T
     driven = np.diff(log.wheel_angle[edges], axis=0) / span * recipe.wheel_radius
-    # Mean over the rows of each window, not the value at its edge: the current is 10-bit and rough.
+    # mean over the rows of each window, since a single 10-bit current is rough
     current = np.add.reduceat(np.abs(log.current), edges, axis=0)[:-1] / np.diff(edges)[:, None]
     slip = np.full_like(driven, np.nan)
     np.divide(effective, driven, out=slip, where=driven != 0)
@@ -206,16 +207,16 @@ def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
 
 
 def curve_points(log: Log, recipe: Recipe) -> np.ndarray:
-    """Current [A] and slip [-] of all wheels after the paper's cuts, shape (sample, 2)."""
+    """Return current [A] and slip [-] of all wheels within the paper's cuts, (sample, 2)."""
     current, slip = wheel_windows(log, recipe)
     keep = (slip > 0.0) & (slip <= 1.0) & (current > recipe.min_current)
     return np.stack([current[keep], slip[keep]], axis=1)
 
 
 def leave_one_surface_out(logs: Iterable[Log]) -> Transfer:
-    """Predict the slip of each surface from the others' curve, their mean, and its own curve.
+    """Return errors of predicting the slip of each surface by the others and by itself.
 
-    The camera is uncorrected.
+    Poses are those of the uncorrected camera.
 
     Raises:
         ValueError: if fewer than two surfaces are there, or one has too few samples for a curve.

@@ -1,4 +1,4 @@
-"""The paper's slip models: those it stored, its robot's, and each form refitted on its points."""
+"""The paper's slip models: as published, as deployed, and each form refitted to its points."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,9 +26,9 @@ TORQUE_SVR = (-0.072, 4.888, -5.456)
 DEPLOYED_GAIN, DEPLOYED_OFFSET = (-0.639, -0.4559, -0.6294), (0.988, 0.9678, 0.9913)
 """a [1/A] and b [-] of `deployed_slip`, motors 1, 2, 3."""
 DEPLOYED_THRESHOLD = 0.4
-"""Current below which a wheel is taken not to slip [A]."""
+"""Current below which a wheel counts as not slipping [A]."""
 DEPLOYED_MEMORY = 0.97
-"""Share of the smoothed current kept from sample to sample [-]."""
+"""Factor of the smoothed current from sample to sample [-]."""
 
 # name: (regressor, powers of it in the design matrix)
 _FORMS = {
@@ -41,11 +41,11 @@ _FORMS = {
 
 
 def deployed_slip(current: np.ndarray) -> np.ndarray:
-    """Slip [-] of each wheel from its own smoothed current [A], both (sample, wheel).
+    """Return slip [-] of each wheel by its own smoothed current [A], both (sample, wheel).
 
     1 - s_i = a_i I~_i + b_i where the smoothed current I~_i > threshold, else s_i = 0. The paper's
     robot smoothed from sample to sample, I~_k = memory I~_(k-1) + (1 - memory) I_k. The authors'
-    lines leave [0, 1] beyond 1.55 A, so 1 - s is held inside it: a wheel is never turned backwards.
+    lines leave [0, 1] beyond 1.55 A, so 1 - s is clipped to it: a wheel is never turned backwards.
 
     Source: Belyaev et al. 2021, section 3, coefficients as deployed.
     """
@@ -55,13 +55,13 @@ def deployed_slip(current: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class FittedForm:
-    """One form of slip model with its coefficients, rising in power from `first_power`.
+    """Polynomial slip model with its coefficients from the power `first_power` on.
 
-    Args:
+    Attributes:
         regressor: "torque" [N m] or "current" [A].
         coefficients: c_k of s = sum c_k x^(first_power + k).
         first_power: 0, or 1 for a line through the origin.
-        rmse: root mean square error in slip [-] on the samples given.
+        rmse: root mean square error in slip [-] on the given samples.
     """
 
     regressor: str
@@ -70,15 +70,15 @@ class FittedForm:
     rmse: float
 
     def slip(self, x: np.ndarray) -> np.ndarray:
-        """Slip [-] at values of the regressor."""
+        """Return slip [-] at values of the regressor."""
         return np.polynomial.polynomial.polyval(x, (0.0,) * self.first_power + self.coefficients)
 
 
 @dataclass(frozen=True, eq=False)
 class MotorTable:
-    """All forms of one motor, on the same samples, and what the samples are.
+    """All forms of one motor on the same samples.
 
-    Args:
+    Attributes:
         samples: the points fitted.
         by_surface: the same points, per surface.
         forms: the least-squares fits, by name.
@@ -92,7 +92,7 @@ class MotorTable:
 
 
 def fit_form(samples: SlipSamples, name: str) -> FittedForm:
-    """Least squares of one row of the table.
+    """Return the least-squares fit of one row of the table.
 
     Raises:
         ValueError: if there are fewer samples than coefficients.
@@ -112,7 +112,7 @@ def fit_form(samples: SlipSamples, name: str) -> FittedForm:
 
 
 def surface_tables(folder: Path) -> dict[int, MotorTable]:
-    """The table behind figures 3 and 4, motors 1 to 3, from experimental_data_<surface>.csv."""
+    """Return the tables of figures 3 and 4 by motor, from experimental_data_<surface>.csv."""
     recipe, tables = FIGURES_3_AND_4, {}
     for surface in SURFACES:
         path = folder / f"experimental_data_{surface}.csv"
@@ -128,7 +128,7 @@ def surface_tables(folder: Path) -> dict[int, MotorTable]:
 
 
 def field_table(folder: Path) -> MotorTable:
-    """Figure 2: motor 1 over the whole site, our least squares and the paper's SVR."""
+    """Return the table of figure 2: motor 1 over the whole site, least squares and the SVR."""
     path = folder / "experimental_data_on_whole_field.csv"
     table = read_columns(path, "robotino2021_field", needed(FIGURE_2))
     samples = slip_samples(table, 1, FIGURE_2)

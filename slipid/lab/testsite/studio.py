@@ -41,7 +41,7 @@ class Studio:
         self.camera, self._rng, self._cv2 = camera, np.random.default_rng(seed), cv2
         (x, y), half = camera.centre_m, 0.65 * camera.height_m / camera.focal_px
         wide, high = half * camera.width_px, half * camera.height_px
-        x0, y0, x1, y1 = x - wide, y - high, x + wide, y + high  # what is seen, with a margin
+        x0, y0, x1, y1 = x - wide, y - high, x + wide, y + high  # the visible floor and a margin
         carpet = _carpet(floor, site, (x0, y0, x1, y1), self._rng)
         assets = {"floor.png": _png(cv2, carpet), "marker.png": _png(cv2, _marker(cv2))}
         fovy = np.degrees(2 * np.arctan(0.5 * DRAWN_SHARE * camera.height_px / camera.focal_px))

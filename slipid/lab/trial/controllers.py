@@ -35,14 +35,6 @@ def _indiveri(robot: DeployedRobot) -> Law:
     return Indiveri(jnp.asarray(matrix), both, jnp.asarray(Limits().wheel_speed))
 
 
-def _goswami_padhy(robot: DeployedRobot) -> Law:
-    return GoswamiPadhy(jnp.asarray(_tuned_gains("swarm")))
-
-
-def _goswami_padhy_gradient(robot: DeployedRobot) -> Law:
-    return GoswamiPadhy(jnp.asarray(_tuned_gains("gradient")))
-
-
 @cache
 def _tuned_gains(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
     """Return gains tuned on the first two sides of the rectangle [1/s]; the others mirror them.
@@ -62,10 +54,14 @@ def _tuned_gains(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
 ROWS: Mapping[str, ControllerRow] = {
     **CONTROLLERS,
     "goswami_padhy": ControllerRow(
-        "encoder", "law of Goswami and Padhy, gains by a swarm", law=_goswami_padhy
+        "encoder",
+        "law of Goswami and Padhy, gains by a swarm",
+        law=lambda _: GoswamiPadhy(jnp.asarray(_tuned_gains("swarm"))),
     ),
     "goswami_padhy_gradient": ControllerRow(
-        "encoder", "and gains by the gradient", law=_goswami_padhy_gradient
+        "encoder",
+        "and gains by the gradient",
+        law=lambda _: GoswamiPadhy(jnp.asarray(_tuned_gains("gradient"))),
     ),
     "indiveri": ControllerRow(
         "encoder", "law of Indiveri, its limit keeps the direction", law=_indiveri
@@ -108,7 +104,7 @@ def unused_gains(robot: DeployedRobot, forced: bool) -> str:
     if tuned is None:
         return ""
     if tuned.load != robot.load_setup:
-        return f"gains were tuned for load set-up {tuned.load}: driving with those set by hand"
+        return f"gains were tuned for load set-up {tuned.load}: driving with hand-set gains"
     if not (tuned.is_better or forced):
         return (
             f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "

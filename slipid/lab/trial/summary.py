@@ -84,15 +84,20 @@ def summaries(runs: Sequence[TrialRun], draws: int = 2000) -> dict[str, Controll
     rng = np.random.default_rng(0)
     count = min(len(c["closure_error_median"]) for c in table.values())
     again = rng.integers(count, size=(draws, count))
+    base = table["encoder"]["closure_error_median"] if "encoder" in table else None
     out: dict[str, ControllerSummary] = {}
     for name, mine in table.items():
+        closes, worse = mine["closure_error_median"], None
+        if base is not None:
+            shared = min(len(closes), len(base))
+            worse = float(np.mean(closes[:shared] > base[:shared]))
         known = {k: v for k, v in mine.items() if np.all(np.isfinite(v))}
         out[name] = ControllerSummary(
             median={k: float(np.median(v)) for k, v in known.items()},
             interval90={k: _interval(np.median(v[again], axis=1)) for k, v in known.items()},
             runs=len(of[name]),
             finished_share=float(np.mean([run.metrics.finished for run in of[name]])),
-            worse_share=_worse_share(mine, table["encoder"]) if "encoder" in table else None,
+            worse_share=worse,
             to_encoder=_ratios(mine, table["encoder"], again) if "encoder" in table else None,
         )
     return out
@@ -141,11 +146,6 @@ def columns(runs: Sequence[TrialRun]) -> Columns:
         "seconds": np.array([x.seconds for x in m]),
         "believed_error_mm": np.array([run.believed_error_mm for run in runs]),
     }
-
-
-def _worse_share(mine: Columns, base: Columns) -> float:
-    pairs = zip(mine["closure_error_median"], base["closure_error_median"], strict=False)
-    return float(np.mean([a > b for a, b in pairs]))
 
 
 def _ratios(mine: Columns, base: Columns, again: np.ndarray) -> dict[str, MedianRatio]:

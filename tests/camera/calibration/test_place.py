@@ -79,7 +79,7 @@ def test_stated_place_is_that_of_repetitions():
 
 
 def test_a_lens_that_is_off_moves_the_place_as_stated():
-    """Points without noise through lenses drawn from a covariance: the place must scatter so."""
+    """Exact points through lenses drawn from a covariance give places that scatter as stated."""
     points, _ = floor_points(GRID, noise=0.0)
     covariance = np.diag([3.0, 3.0, 4.0, 4.0, 1e-3, 1e-3, 1e-4, 1e-4]) ** 2
     rng, places, lengths = np.random.default_rng(1), [], []
@@ -91,7 +91,7 @@ def test_a_lens_that_is_off_moves_the_place_as_stated():
         lengths.append(log_length(camera))
     spread = uncertainty(fit_place("here", LENS, points), covariance)
     np.testing.assert_allclose(np.std(places, axis=0), spread.place_std_m, rtol=0.35)
-    # the height follows the focal length, so that lengths hardly do
+    # the height follows the focal length, so that lengths hardly change
     assert np.std(lengths) == pytest.approx(spread.scale_std, rel=0.3)
     assert spread.scale_std < 0.5 * 3.0 / TRUE.fx
 
@@ -153,7 +153,7 @@ def test_a_camera_that_looks_up_is_refused():
     places = [(x, y, 0.0) for x in (-1.0, 0.0, 1.0) for y in (3.0, 4.0, 6.0)]
     points, rotation = floor_points(places, camera=(0.0, 0.0, 1.0), tilt=(-95.0, 0.0), noise=0.0)
     depths = (points.places - [0.0, 0.0, 1.0]) @ rotation[2]
-    assert (depths > 0).all()  # they are seen, beside an axis that points at the sky
+    assert (depths > 0).all()  # they are in view, although the axis points at the sky
     with pytest.raises(DataError, match="looks down"):
         fit_place("here", LENS, points)
 

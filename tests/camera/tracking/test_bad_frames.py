@@ -128,7 +128,7 @@ def test_hard_braking_is_accepted(fps):
 
 
 def test_many_wrong_poses_among_good_ones():
-    """A fifth of the poses is anywhere: exactly those are rejected."""
+    """A fifth of the poses is wrong by 0.1 to 0.6 m: exactly those are rejected."""
     rng = np.random.default_rng(4)
     time = np.arange(900) / 30
     std = np.broadcast_to([5e-4, 5e-4, 2e-3], (len(time), 3))

@@ -195,7 +195,7 @@ def test_a_device_needs_an_end_and_has_its_own_times():
 
 
 def test_a_device_gives_frames_with_times_from_zero_on(tmp_path):
-    """A video in its place: what matters is the clock."""
+    """A video stands in for the device; the test is of the clock."""
     device = Device.at(str(write_video(tmp_path / "a.avi", pictures())), 100.0)
     frames = list(device.frames())
     assert [frame.index for frame in frames] == list(range(COUNT))

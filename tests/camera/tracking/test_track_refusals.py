@@ -95,9 +95,9 @@ def test_no_file_of_another_kind_is_lost(made, tmp_path):
 @pytest.mark.parametrize("words", SIZES)
 def test_options_that_cannot_be(made, words, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    said = track(made, made.video("robot", ROBOT), tmp_path / "p.csv", *SIZES[words])
-    assert said.exit_code == 2
-    assert words in said.stderr
+    done = track(made, made.video("robot", ROBOT), tmp_path / "p.csv", *SIZES[words])
+    assert done.exit_code == 2
+    assert words in done.stderr
 
 
 def test_sources_that_cannot_be_read(made, tmp_path):

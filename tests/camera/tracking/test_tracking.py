@@ -85,7 +85,7 @@ def test_poses_are_accurate_and_their_covariance_holds(name, tmp_path):
 
 @pytest.mark.slow
 def test_covariance_is_not_much_too_large(tmp_path):
-    """Errors of single frames are about what noise makes of them, not a hundredth of it."""
+    """Errors of single frames are about as large as stated, not a hundredth of that."""
     stage = Stage(light=replace(PLAIN, noise=12.0, bright=0.5, flicker=0.0))
     body = Body(round_trip())
     (track,) = tracked(stage, stage.film([body], 40), tmp_path)
@@ -94,7 +94,7 @@ def test_covariance_is_not_much_too_large(tmp_path):
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_covariance_is_that_of_corners_with_known_noise(count):
-    """No pictures: corners err independently by 0.4 pixel, and the poses by what is stated."""
+    """No pictures: corners err independently by 0.4 pixel, and poses as stated."""
     rng, frames = np.random.default_rng(2), 400
     markers = tuple(Printed(id=k, size=0.1, ahead=0.2 * k - 0.1, yaw=0.3 * k) for k in range(count))
     target, body = target_of(markers), Body(round_trip(), markers)

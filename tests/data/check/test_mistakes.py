@@ -1,4 +1,4 @@
-"""Every mistake that was made on purpose is named, with what to do, on three kinds of drive."""
+"""The check finds every deliberate mistake and says how to correct it, on three kinds of drive."""
 
 from __future__ import annotations
 
@@ -94,15 +94,15 @@ def test_encoders_and_poses_alone_name_it(robot, name):
     found = alarms(runs, geometry)
     assert found
     assert found[0].severity == "wrong"
-    said = " ".join(str(f) for f in found)
-    assert {f.kind for f in found} & set(mistake.kinds) or mistake.says in said
+    text = " ".join(str(f) for f in found)
+    assert {f.kind for f in found} & set(mistake.kinds) or mistake.says in text
 
 
 def test_what_is_not_driven_is_a_note():
     (omni, *_) = DRIVES
     raws = [raw.less(*ONLY_POSES) for raw in driven(omni)]
-    said = [f for f in findings(as_runs(raws), omni.geometry) if f.severity == "note"]
-    assert any("no command is logged" in f.found for f in said)
+    notes = [f for f in findings(as_runs(raws), omni.geometry) if f.severity == "note"]
+    assert any("no command is logged" in f.found for f in notes)
 
 
 def test_two_mistakes_are_both_named():
@@ -115,7 +115,7 @@ def test_two_mistakes_are_both_named():
 
 
 def test_a_turned_marker_hides_no_other_unit_of_the_pose():
-    """The way is compared with that of the wheels in the axes that the heading was put right to."""
+    """Path lengths of body and wheels are compared in the corrected axes of the heading."""
     (omni, *_) = DRIVES
     by_name = {m.name: m for m in MISTAKES}
     raws = by_name["marker turned by 90 deg"].runs(
@@ -128,9 +128,9 @@ def test_a_turned_marker_hides_no_other_unit_of_the_pose():
 
 
 def test_a_heading_in_another_unit_makes_a_gyro_look_too_small():
-    """One cause explains both ratios, and no gyro is told to be wrong."""
+    """One cause explains both ratios, and no finding blames the gyro."""
     deg = 180 / pi
-    seen = ScaleRatios(
+    ratios = ScaleRatios(
         {
             "travel": ScaleRatio(0.8, 0.3, 0.8, 1.35),
             "turning": ScaleRatio(0.8 * deg, 0.35, 0.8, 1.35),
@@ -138,6 +138,6 @@ def test_a_heading_in_another_unit_makes_a_gyro_look_too_small():
         },
         speed_is_angle=False,
     )
-    found, alone = single_causes(seen, 0.05, 16.0)
+    found, alone = single_causes(ratios, 0.05, 16.0)
     assert alone
     assert [(e.name, e.factor) for e in found] == [("heading", pytest.approx(deg))]

@@ -1,4 +1,4 @@
-"""Columns of currents and voltages in another order than the wheels are told from turned signs."""
+"""The check tells columns of currents and voltages in another order from turned signs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ KINDS = ("current", "voltage")
 
 
 def found(robot, *order):
-    """Findings about currents and voltages whose columns are in some order."""
+    """Return findings about currents and voltages whose columns are in some order."""
     columns = list(order)
     raws = [
         replace(raw, current=raw.current[:, columns], voltage=raw.voltage[:, columns])

@@ -1,4 +1,4 @@
-"""`read_runs`: which files, floors, sessions and load set-ups a folder of logs holds."""
+"""`read_runs` finds the files, floors, sessions and load set-ups of a folder of logs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.helpers.broken_logs import GENERIC, GENERIC_LAYOUT, ROBOTINO, write_g
 
 @pytest.fixture
 def root(tmp_path):
-    """One run on gray as built, and the same once more as driven with its load moved."""
+    """Return a folder with one run on gray as built, and the same run with its load moved."""
     write_good(tmp_path)
     moved = tmp_path / "wheel_load" / "gray_surface" / "exp01.csv"
     moved.parent.mkdir(parents=True)
@@ -66,7 +66,7 @@ def test_a_layout_of_ones_own(root):
     assert runs.voltage is not None
 
 
-def test_what_is_not_there_is_said(root):
+def test_absent_files_are_named(root):
     with pytest.raises(DataError, match=r"no file matches 'one_surface/grey/\*\.csv'.*gray/"):
         read(root, "one_surface/grey/*.csv")
     with pytest.raises(DataError, match="no format 'robotino', did you mean robotino2022"):

@@ -1,4 +1,4 @@
-"""Sensors at their own rates: nothing is invented between two poses, nothing counts twice."""
+"""Sensors at different rates: no pose is invented between two others, no reading counts twice."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ ONE_FILE = {"columns": {"time": {"column": "t", "unit": "s"}, "wheel_angle": WHE
 
 
 def angle(t):
-    """Turns of both wheels, which start after half a second [rad]."""
+    """Return turns of both wheels, which start after half a second [rad]."""
     on = np.maximum(np.asarray(t) - 0.5, 0.0)
     return np.stack([3.0 * on + 0.2 * np.sin(on), 2.0 * on], axis=-1)
 
@@ -43,7 +43,7 @@ def csv(path, names, rows):
 
 
 def sparse(path, rate=50.0, poses=30.0, seconds=6.0):
-    """A file with a row for every time at which wheels or camera were read."""
+    """Write a file with a row for every time at which wheels or camera were read."""
     fast, slow = np.arange(0, seconds, 1 / rate), np.arange(0.007, seconds, 1 / poses)
     rows = [(t, *angle(t), None, None, None) for t in fast]
     rows += [(t, None, None, *pose(t)) for t in slow]
@@ -69,7 +69,7 @@ def test_poses_between_rows_are_read_as_they_are(tmp_path):
 def test_windows_are_cut_at_poses_and_turns_taken_there(tmp_path):
     sparse(tmp_path / "run.csv")
     w = windows(one(tmp_path, ONE_FILE), RADIUS, longest=1.0)
-    edges = w.pose[:, :, 1] / 0.02  # the time, as y tells it
+    edges = w.pose[:, :, 1] / 0.02  # the time, as y shows it
     np.testing.assert_allclose(np.diff(edges, axis=1), w.dt, atol=1e-7)
     np.testing.assert_allclose(w.turn, np.diff(angle(edges), axis=1), atol=5e-4)
 
@@ -84,7 +84,7 @@ def test_windows_keep_to_poses_whose_time_the_wheels_were_measured_at(tmp_path, 
     rows = [(t, *angle(t + 1.0), *pose(t + 1.0 - lag)) for t in fast.tolist()]
     csv(tmp_path / "run.csv", ["t", "left", "right", "x", "y", "yaw"], rows)
     w = windows(one(tmp_path, ONE_FILE), RADIUS, lag, longest=0.5)
-    edges = w.pose[:, :, 1] / 0.02  # the time that each pose shows, as y tells it
+    edges = w.pose[:, :, 1] / 0.02  # the time that each pose shows, as y shows it
     assert edges.min() >= 1.0 - 1e-6
     assert edges.max() <= 1.0 + fast[-1] + 1e-6
     np.testing.assert_allclose(w.turn, np.diff(angle(edges), axis=1), atol=5e-4)
@@ -115,7 +115,7 @@ def test_a_camera_that_sees_nothing_for_a_while_leaves_a_long_window(tmp_path):
 
 
 def beside(root, epoch=0.0, quaternion=False):
-    """A folder a run: joint states at 100 Hz, poses at 30 Hz, currents at 10 Hz."""
+    """Write a folder a run: joint states at 100 Hz, poses at 30 Hz, currents at 10 Hz."""
     t = np.arange(0, 6, 0.01)
     csv(root / "joint_states.csv", ["stamp", "l", "r"], [((epoch + s) * 1e9, *angle(s)) for s in t])
     # printing nanoseconds since 1970 with nine digits would round them
@@ -182,7 +182,7 @@ def test_a_file_that_should_lie_beside_is_named_with_what_does(tmp_path):
         one(tmp_path, layout_beside(), "*/joint_states.csv")
 
 
-def test_clocks_that_do_not_meet_are_told(tmp_path):
+def test_clocks_that_do_not_overlap_are_refused(tmp_path):
     beside(tmp_path / "run1", 0.0)
     beside(tmp_path / "run2", 1_721_300_000.0)
     (tmp_path / "run2" / "mocap.csv").replace(tmp_path / "run1" / "mocap.csv")
@@ -217,7 +217,7 @@ def test_the_heading_of_a_tilted_body_is_where_it_points():
     np.testing.assert_allclose(found.values[:, 0], np.arctan2(*ahead.T[1::-1]), atol=1e-12)
 
 
-def test_numbers_that_are_no_quaternion_are_told(tmp_path):
+def test_numbers_that_are_no_quaternion_are_refused(tmp_path):
     beside(tmp_path / "run1", quaternion=True)
     layout = layout_beside(quaternion=True)
     channel = {"columns": ["x", "y", "qz", "qw"], "unit": "1"}
@@ -230,7 +230,7 @@ def test_numbers_that_are_no_quaternion_are_told(tmp_path):
 
 
 def held(period_rows, rows=600, seed=0, change=1.0):
-    """A value that is read anew every few rows and repeated between."""
+    """Return values that are read anew every few rows and repeated between."""
     rng = np.random.default_rng(seed)
     fresh = np.cumsum(change * rng.normal(size=rows // period_rows + 1))
     return np.repeat(fresh, period_rows)[:rows]
@@ -253,7 +253,7 @@ def test_a_slow_sensor_that_reads_the_same_again_was_read_again():
 
 
 def test_a_slow_ammeter_counts_once_a_reading(tmp_path):
-    """At 1 Hz in rows of 20 Hz its noise averages over one reading a second and not over twenty."""
+    """At 1 Hz in rows of 20 Hz the noise averages over one reading a second and not over twenty."""
     rng = np.random.default_rng(1)
     columns = {**ONE_FILE["columns"], "current": {"columns": ["i1", "i2"], "unit": "A"}}
     names = ["t", "left", "right", "i1", "i2", "x", "y", "yaw"]
@@ -308,10 +308,10 @@ def test_real_skid_steer_logs_are_read_and_wild_poses_set_aside(real_data):
 
     config = read_config(Path("configs/husky.toml"))
     with Reporter(quiet=True) as report:
-        data, said = read_dataset(config, config.content.logs, real_data / "drive_skid", report)
+        data, skipped = read_dataset(config, config.content.logs, real_data / "drive_skid", report)
     assert len(data) + len(data.aside) == 40
     assert len(data.aside) == 21
-    assert all("the pose jumps by" in line for line in said)
+    assert all("the pose jumps by" in line for line in skipped)
     layout = declared_layout(config.content.layouts["skid"], "husky")
     path = real_data / "drive_skid" / "husky_wetgrass" / "step_01.csv"
     found = read_logs(path, layout, real_data, "wet_grass", "as_built")

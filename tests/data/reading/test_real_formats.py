@@ -1,4 +1,4 @@
-"""The published logs: each file reads with its preset; axes, signs and scales are as claimed."""
+"""Published logs: each file reads with its preset; axes, signs and scales are as claimed."""
 
 from __future__ import annotations
 
@@ -56,9 +56,11 @@ def test_every_run_of_2022_reads(robotino2022):
         assert log.notes == ()
         edges = np.linspace(log.time[0], log.time[-1], int(log.duration / 0.5) + 1)
         turned = np.diff(interpolate(log.time, log.wheel_angle, edges), axis=0)
-        asked = np.diff(interpolate(log.time, integral(log.time, log.twist_command), edges), axis=0)
-        asked = asked @ ROBOTINO.T / RADIUS
-        assert swapped_order(turned, asked) is None
+        commanded = np.diff(
+            interpolate(log.time, integral(log.time, log.twist_command), edges), axis=0
+        )
+        commanded = commanded @ ROBOTINO.T / RADIUS
+        assert swapped_order(turned, commanded) is None
 
 
 @pytest.mark.slow
@@ -70,7 +72,7 @@ def test_frames_repeat_as_a_29_hz_camera_does(robotino2022):
 
 @pytest.mark.slow
 def test_axes_and_scale_of_the_camera_on_the_table(robotino2022):
-    """Where wheels grip, pose and wheels must agree but for the scale: this fixes every sign."""
+    """Pose and wheels agree but for the scale where wheels grip, which fixes every sign."""
     ratios, turns = [], []
     for log in robotino2022["table"]:
         start = first_moved(log.wheel_angle, RADIUS)
@@ -110,13 +112,13 @@ def test_reported_speed_reads_high(robotino2022):
     for log in robotino2022["table"]:
         turned = log.wheel_angle[-1] - log.wheel_angle[0]
         reported = np.trapezoid(log.wheel_speed, log.time, axis=0)
-        far = np.abs(turned) > 20
-        ratios += list((reported / turned)[far])
+        long = np.abs(turned) > 20
+        ratios += list((reported / turned)[long])
     assert np.median(ratios) == pytest.approx(1.013, abs=0.005)
 
 
 def test_stalls_freeze_speeds_and_currents_too(robotino2022):
-    """All the robot reports stands still in a stall, on brown in most runs; on green in none."""
+    """All reported values are constant in a stall, on brown in most runs, on green in none."""
     stalls, frozen = 0, []
     for log in robotino2022["brown"]:
         _, stalled = bridge_stalls(log.time, log.wheel_angle)
@@ -129,7 +131,7 @@ def test_stalls_freeze_speeds_and_currents_too(robotino2022):
 
 
 def test_stalls_of_the_telemetry_are_found_and_bridged(robotino2022):
-    """In brown/exp05 ticks stand still for six rows, then 3022 come at once; the camera ran on."""
+    """In brown/exp05 ticks are constant for six rows, then 3022 come at once; the camera ran on."""
     log = next(log for log in robotino2022["brown"] if log.name.endswith("exp05.csv"))
     bridged, stalled = bridge_stalls(log.time, log.wheel_angle)
     assert set(range(61, 67)) <= set(np.flatnonzero(stalled) + 4)  # lines of the file
@@ -241,6 +243,6 @@ def test_omni3_metadata_is_what_the_preset_says(real_data):
     layout = preset("omni3_optitrack")
     for path in find_logs(real_data, "omni3_optitrack/*/*/*_metadata.csv"):
         with path.open(encoding="utf-8") as file:
-            said = {row[0]: row[1:] for row in csv.reader(file) if row}
-        assert float(said["ngear"][0]) == layout.gear_ratio
-        assert float(said["encRes"][0]) == layout.ticks_per_revolution
+            settings = {row[0]: row[1:] for row in csv.reader(file) if row}
+        assert float(settings["ngear"][0]) == layout.gear_ratio
+        assert float(settings["encRes"][0]) == layout.ticks_per_revolution

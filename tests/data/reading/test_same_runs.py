@@ -13,7 +13,7 @@ from tests.helpers import made_bags as bags
 
 RADIUS = 0.1
 START = 1_721_300_000.0
-"""Of the run, since 1970 [s]."""
+"""Start of the run, since 1970 [s]."""
 WHEELS, AMPS = START + np.arange(0.0, 6.0, 0.01), START + np.arange(0.001, 6.0, 0.1)
 POSES = START + np.sort(np.arange(0.01, 5.9, 0.04) + np.random.default_rng(1).uniform(0, 0.03, 148))
 JOINTS = ["left_wheel", "right_wheel"]

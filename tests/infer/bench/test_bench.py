@@ -1,4 +1,4 @@
-"""Motors on a bench: recovery, theorems, and what is wrong with a log."""
+"""Motors on a bench: recovery, theorems, and refused logs."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_a_noisy_ammeter_does_not_make_the_resistance_small():
 
 
 def test_units_scale_what_they_are_units_of(record):
-    """In half volts and in units of 2 A: R times 4, C_e times 2, and at last the same torque."""
+    """In half volts and in units of 2 A, R is 4 times and C_e twice as large at the same torque."""
     one = fitted(record).parameters
     scaled = replace(record, voltage=2 * record.voltage, current=record.current / 2)
     two = fitted(scaled).parameters
@@ -125,7 +125,7 @@ def test_units_scale_what_they_are_units_of(record):
 
 
 def test_energy_is_balanced(record):
-    """What goes in at the terminals is heat, friction, and motion that is over at the end."""
+    """Energy at the terminals becomes heat and friction, as the motor rests at the end."""
     m = bench_fit([fit_motor([record])]).fits[0].motor
     volts = record.voltage - float(m.voltage_offset)
     amps = record.current - float(m.current_offset)
@@ -135,7 +135,7 @@ def test_energy_is_balanced(record):
     assert np.sum(volts * amps * step) == pytest.approx(np.sum((heat + friction) * step), rel=0.05)
 
 
-def test_turned_around_it_is_the_same_motor(record):
+def test_a_reversed_motor_has_the_same_numbers(record):
     flipped = replace(record, **{k: -getattr(record, k) for k in ("voltage", "current", "speed")})
     one, two = fitted(record).parameters, fitted(flipped).parameters
     for path, e in one.items():
@@ -171,8 +171,8 @@ def test_windows_are_exact_for_straight_lines(record):
     volts = 2.0 * walk[0] + 0.3 * walk[1] + 1.5
     made_up = replace(record, current=walk[0], speed=walk[1], voltage=volts)
     for half in (electrical([made_up], 0.0).even, electrical([made_up], 0.0).odd):
-        left = half.measured - half.signals @ [2.0, 0.3, 0.0, 0.0, 1.5, 0.0]
-        assert np.abs(left).max() < 1e-9
+        residual = half.measured - half.signals @ [2.0, 0.3, 0.0, 0.0, 1.5, 0.0]
+        assert np.abs(residual).max() < 1e-9
     line = replace(record, speed=3.0 + 7.0 * record.time)
     assert mechanical([line]).odd.signals[:, 0] == pytest.approx(7.0)
 
@@ -205,7 +205,7 @@ def test_at_one_speed_nothing_is_identified(record):
 
 @pytest.mark.slow
 def test_a_misfit_is_named_and_lowers_verdicts(record):
-    """Friction that falls with speed is none of the model's."""
+    """The model has no friction that falls with speed."""
     odd = 0.15 * np.sin(record.speed / 60.0)
     found = fitted(replace(record, current=record.current + odd))
     assert misfits(found.fits[0])
@@ -215,7 +215,7 @@ def test_a_misfit_is_named_and_lowers_verdicts(record):
 
 
 @pytest.mark.slow
-def test_what_is_fixed_stays(record):
+def test_a_fixed_number_stays(record):
     found = fitted(record, choices=[Choice("motor.brush_drop", fixed=0.1)])
     e = found.parameters["motor.brush_drop"]
     assert (e.value, e.verdict, e.provenance) == (0.1, "fixed", "override")
@@ -225,7 +225,7 @@ def test_what_is_fixed_stays(record):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda r: {"current": 1000 * r.current}, "amperes"),
         (lambda r: {"current": r.voltage, "voltage": r.current}, "exchanged"),
@@ -238,7 +238,7 @@ def test_what_is_fixed_stays(record):
         (lambda r: {"current": np.zeros_like(r.current)}, "in every row"),
     ],
 )
-def test_a_wrong_log_is_refused_with_a_next_step(record, change, said):
-    with pytest.raises(DataError, match=said) as error:
+def test_a_wrong_log_is_refused_with_a_next_step(record, change, message):
+    with pytest.raises(DataError, match=message) as error:
         check_records([replace(record, **change(record))], "")
     assert "expected" in str(error.value)

@@ -54,7 +54,7 @@ def windows(drives, current, voltage):
 
 
 def log_variance(problem):
-    """What is typical; of a run's own effect with what it shares with its neighbours."""
+    """Return typical stds, a run's own effect including those shared with its neighbours."""
     variance = dict(zip(problem.noise.names, problem.noise.typical**2, strict=True))
     own = {n: v + variance.get(n.replace("run.", "neighbours."), 0.0) for n, v in variance.items()}
     runs = [name.startswith("run.") for name in variance]
@@ -67,7 +67,7 @@ def rows(current, voltage):
 
 
 def start(current, voltage):
-    """The prior alone."""
+    """Return the information of the prior alone."""
     this = planner(current, voltage)
     return info.information_of(np.diag(this.space.prior_std**2), this.is_electric)
 
@@ -80,8 +80,8 @@ CASES = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("current", "voltage"), CASES)
-def test_is_what_the_likelihood_says_of_the_same_windows(current, voltage):
-    """Of one run and of several: information of different runs adds, whatever the channels."""
+def test_information_is_that_of_the_likelihood_of_the_same_windows(current, voltage):
+    """Information of different runs adds, whatever the channels."""
     this = planner(current, voltage)
     problem = Problem(windows(DRIVES, current, voltage), robot(), CHOICES).without_shared_effects()
     log_v = log_variance(problem)
@@ -98,8 +98,8 @@ def test_is_what_the_likelihood_says_of_the_same_windows(current, voltage):
 
 
 @pytest.mark.slow
-def test_runs_of_a_session_cannot_average_away_what_they_share():
-    """Against the covariance of all runs together, written out."""
+def test_runs_of_a_session_cannot_average_away_its_effect():
+    """The std equals that of the covariance of all runs together, written out."""
     plain = planner(False, False)
     shared = {"session.firm.along": 1e-4, "session.firm.across": 4e-4, "session.firm.yaw": 1e-3}
     this = Planner(robot(), CHOICES, {**plain.variance, **shared}, Channels(False))
@@ -144,7 +144,7 @@ def test_known_undoes_covariance():
 
 
 def made_up(seed, electric=3, count=25):
-    """Knowledge, candidates and a goal without any physics."""
+    """Return information, candidates and a goal without any physics."""
     rng = np.random.default_rng(seed)
     free, m = 9, 4
     root = rng.normal(size=(free, free))
@@ -160,7 +160,7 @@ def made_up(seed, electric=3, count=25):
 
 @pytest.mark.parametrize("electric", [0, 3])
 @pytest.mark.parametrize("seed", range(5))
-def test_each_candidate_is_judged_as_if_driven(seed, electric):
+def test_each_candidate_has_the_criterion_of_driving_it(seed, electric):
     now, rows, goal = made_up(seed, electric)
     brute = [now.plus(rows.pick([k])).criterion(goal) for k in range(len(rows.motion))]
     np.testing.assert_allclose(now.after_each(rows, goal), brute, rtol=1e-9)
@@ -171,7 +171,7 @@ def test_each_candidate_is_judged_as_if_driven(seed, electric):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_criterion_of_the_motion_never_rises(seed):
-    """Of electric numbers it may: a cut is no posterior of one model."""
+    """A criterion of electric numbers may rise, as a cut is no posterior of one model."""
     now, rows, goal = made_up(seed, electric=0)
     chosen, found = info.greedy(now, rows, goal, 8)
     assert (np.diff(found) < 0).all()
@@ -203,12 +203,12 @@ def test_greedy_stops_at_its_target():
 def test_a_long_run_is_worth_less_than_two_and_a_second_one_its_share():
     this, prior = planner(False, False), start(False, False)
     one, long = this.rows([DRIVES[0], replace(DRIVES[0], distance=1.4)]).motion
-    once, twice, far = (x.T @ x for x in (one, np.concatenate([one, one]), long))
+    once, twice, longer = (x.T @ x for x in (one, np.concatenate([one, one]), long))
     np.testing.assert_allclose(twice, 2 * once, rtol=1e-12, atol=1e-12 * np.abs(once).max())
     shares = parameter_goal(this, "robot.load_share@as_built").rows
     after = [
         info.Information(prior.is_electric, prior.motion + x, prior.own, prior.cross)
-        for x in (once, twice, far)
+        for x in (once, twice, longer)
     ]
     std = [np.sqrt(k.criterion(shares)) for k in after]
     assert std[1] < std[2] < std[0]
@@ -224,7 +224,7 @@ def test_a_long_run_is_worth_less_than_two_and_a_second_one_its_share():
 
 @pytest.mark.slow
 def test_scrub_needs_turning():
-    """Along its axes of symmetry an even robot does not turn, and scrub does nothing."""
+    """Along its axes of symmetry an even robot does not turn, so scrub has no effect."""
     even = eqx.tree_at(
         lambda r: (r.body.load_share, r.camera.marker_place),
         robot(),

@@ -1,4 +1,4 @@
-"""Proposed runs: what `slipid design` writes and says, and whether they are worth what it says."""
+"""Proposed runs: files and messages of `slipid design`, and the information they promise."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from slipid.fit.optimise import Optimum
 from slipid.fit.problem import FitState, Problem
 from slipid.infer.design.planner import Planner
 from slipid.infer.fit_file import load, save
-from slipid.infer.result import summarise
+from slipid.infer.summary import summarise
 from slipid.lab.selftest.logs import (
     SimulatedSensors,
     heading_grid,
@@ -37,7 +37,7 @@ BASE = 0.125
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A fit that ended at the truth, of straight runs without voltage."""
+    """Write a fit of straight runs without voltage that ended at the truth."""
     robot = true_robot(DRIVES)
     data = collect(simulate_logs(robot, DRIVES, 0, SimulatedSensors(has_voltage=False)))
     choices = [
@@ -58,7 +58,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def one_planner(folder):
-    """Commands of these tests share what is compiled for the one fit."""
+    """Share compiled functions of the one fit between commands."""
     made = Planner.of(load(folder))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Planner, "of", lambda fit: made)
@@ -103,7 +103,7 @@ def test_writes_runs_commands_and_a_picture(folder):
         assert rim * time == pytest.approx(run["distance"], rel=2e-3)
 
 
-def test_without_a_wish_it_predicts_every_floor(folder):
+def test_without_goals_it_predicts_every_floor(folder):
     done = design(folder, "--runs", 2)
     assert done.exit_code == 0, done.output
     assert "prediction of every floor" in done.stdout
@@ -123,7 +123,7 @@ def test_limits_of_the_candidates_hold(folder):
         assert run["heading_deg"] == pytest.approx(0) or run["heading_deg"] == pytest.approx(90)
 
 
-def test_what_no_run_can_tell_is_1_and_names_the_channel(folder):
+def test_an_unreachable_goal_exits_with_1_and_names_the_channel(folder):
     done = design(folder, "--parameter", "motor.resistance")
     assert done.exit_code == 1
     assert "no candidate run shrinks motor.resistance" in done.stdout
@@ -134,7 +134,7 @@ def test_what_no_run_can_tell_is_1_and_names_the_channel(folder):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--parameter", "nonsense"), "nonsense: matches no parameter; expected one of"),
         (("--parameter", "robot.mass"), "robot.mass: is not free in this fit"),
@@ -148,13 +148,13 @@ def test_what_no_run_can_tell_is_1_and_names_the_channel(folder):
         (("--speeds", "0", "--turns", "0"), "no candidate run is left"),
     ],
 )
-def test_a_bad_wish_is_2_and_says_what_is_known(folder, words, said):
+def test_bad_options_exit_with_2_and_list_the_choices(folder, words, message):
     done = design(folder, *words)
     assert done.exit_code == 2
-    assert said in done.stderr
+    assert message in done.stderr
 
 
-def test_without_a_fit_it_is_2(tmp_path):
+def test_without_a_fit_it_exits_with_2(tmp_path):
     done = design(tmp_path)
     assert done.exit_code == 2
     assert "expected the result of `slipid identify`" in done.stderr

@@ -1,4 +1,4 @@
-"""What tests of the sampler share."""
+"""Fixtures of the tests of the sampler."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from slipid.infer.posterior.transport_map import learnt
 
 @pytest.fixture(scope="session")
 def bent():
-    """A map learnt from draws with a parabola, a funnel, two long tails and shared numbers."""
+    """Map learnt from draws with a parabola, a funnel, two long tails and shared numbers."""
     group = np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1])
     x = np.random.default_rng(0).normal(size=(5000, 9))
     x[:, 3] += x[:, 2] ** 2

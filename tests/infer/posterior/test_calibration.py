@@ -1,4 +1,4 @@
-"""Intervals and ranks over a few made experiments; `benchmarks/bench_calibration.py` has many."""
+"""Intervals and ranks over a few simulated experiments; `bench_calibration.py` has many."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def replicates():
 
 
 @pytest.mark.nightly
-def test_intervals_hold_the_truth_as_often_as_they_say(replicates):
+def test_intervals_contain_the_truth_as_often_as_stated(replicates):
     inside = np.concatenate([r.inside for r in replicates.values()])
     rank = np.concatenate([r.rank for r in replicates.values()])
     low, high = calibration.band(len(inside), 1)
@@ -33,7 +33,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(replicates):
 
 
 @pytest.mark.nightly
-def test_a_variance_that_may_be_anything_small_is_not_held_near_the_fit(replicates):
+def test_a_small_undetermined_variance_is_not_kept_near_the_fit(replicates):
     """In these experiments the ammeter hides the voltmeter's noise, whose truth is tiny."""
     place = replicates[SEEDS[0]].names.index("noise.voltage.window")
     for k in SEEDS:
@@ -43,8 +43,8 @@ def test_a_variance_that_may_be_anything_small_is_not_held_near_the_fit(replicat
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", kept([1, 3], [1]))
-def test_it_goes_on_from_any_block_as_if_it_had_not_ended(whole, count):
-    """Electric numbers and variances too, though they are drawn after the last block."""
+def test_sampling_continues_from_any_block(whole, count):
+    """Electric numbers and variances, drawn after the last block, are the same as well."""
     fit, plan, blocks, found = whole
     again = posterior.sample(
         fit, plan, draws=10, store=BlockStore(done=lambda part: blocks[part][:count])
@@ -56,7 +56,7 @@ def test_it_goes_on_from_any_block_as_if_it_had_not_ended(whole, count):
 
 @pytest.mark.slow
 def test_electric_numbers_are_drawn_anew_for_a_longer_chain(whole):
-    """Electric draws are of the very draws of the motion they were made with."""
+    """Electric draws belong to the draws of the motion that they are conditioned on."""
     fit, plan, blocks, found = whole
     longer = replace(plan, most=plan.most + 1)
     anew = posterior.sample(fit, longer, draws=10)
@@ -69,7 +69,7 @@ def test_electric_numbers_are_drawn_anew_for_a_longer_chain(whole):
 
 
 @pytest.mark.slow
-def test_electric_draws_that_never_moved_are_not_believed(whole, monkeypatch):
+def test_electric_draws_that_never_moved_prevent_convergence(whole, monkeypatch):
     fit, plan, blocks, _ = whole
     diagnose = posterior.diagnosis.diagnose
     monkeypatch.setattr(
@@ -90,7 +90,7 @@ def test_electric_draws_that_never_moved_are_not_believed(whole, monkeypatch):
 
 @pytest.fixture(scope="module")
 def whole():
-    """An experiment, and blocks and draws of its posterior."""
+    """Return an experiment, with blocks and draws of its posterior."""
     fit, _ = calibration.experiment(12)
     # as many walkers as in test_chain.py, for which the densities are compiled
     plan = Plan(ensembles=2, walkers=6, block=5, warm_up=(1, 2), most=4)

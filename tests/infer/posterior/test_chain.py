@@ -1,4 +1,4 @@
-"""A short chain of the sampler, and what is drawn beside it, against reviewed numbers."""
+"""A short chain of the sampler and the draws beside it equal reviewed numbers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PLAN = Plan(ensembles=2, walkers=6, block=4, warm_up=(1, 2), most=3)
 
 @pytest.mark.slow
 def test_a_short_chain(golden):
-    """Chains amplify rounding; so few steps do not."""
+    """Long chains amplify rounding, these few steps do not."""
     fit, _ = calibration.experiment(3)
     blocks = []
     found = posterior.sample(

@@ -1,4 +1,4 @@
-"""The density the sampler sees against its definition, written out with dense covariances."""
+"""The density of the sampler equals its definition, written out with dense covariances."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def problem():
 
 
 def fitted(problem):
-    """A place to hold variances and weights at, as a fit would."""
+    """Return fixed values of variances and weights, as a fit would."""
     z, log_v = problem.space.start, 2 * np.log(problem.noise.typical)
     return Fitted(z, log_v, 0.01 * np.eye(len(z)))
 
@@ -77,22 +77,22 @@ def near(d, count=4, width=0.1):
     return d.centre + width * rng.normal(size=(count, d.size))
 
 
-def seen(problem, z):
-    """Residuals of every block, and log |d residuals / d data| of the pieces, in plain numpy."""
+def residuals_at(problem, z):
+    """Return residuals by block, and log |d residuals / d data| of segments, in plain numpy."""
     volt = problem.electric(z, fitted(problem).log_variance)
     tree = problem.space.tree(jnp.asarray(z))
-    gaps = {k: np.asarray(r) for k, r in jax.jit(residuals)(tree, problem.batch, volt).items()}
+    blocks = {k: np.asarray(r) for k, r in jax.jit(residuals)(tree, problem.batch, volt).items()}
     camera, spread = (np.asarray(x) for x in lk.log_jacobians(tree, problem.batch, volt))
-    return gaps, {"motion": camera, "voltage": spread}
+    return blocks, {"motion": camera, "voltage": spread}
 
 
 def spread_of(problem, block):
-    """Covariance V of the residuals of a block at the fit, piece by piece."""
+    """Return the covariance V of the residuals of a block at the fit, segment by segment."""
     return np.asarray(problem.covariance(block, fitted(problem).log_variance))
 
 
 def shared_covariance(problem):
-    """What effects that runs share make of the covariance of all motion residuals (n m, n m)."""
+    """Return the covariance of all motion residuals from shared effects (n m, n m)."""
     w, index = problem.windows, problem.noise.names.index
     moved, v = of_noise.effects(w, problem.robot), np.exp(fitted(problem).log_variance)
     n, m, _ = moved.shape
@@ -110,12 +110,12 @@ def shared_covariance(problem):
 
 
 def weights(problem):
-    """Weight of every piece in every block: of a Student t at the fit, less what it tells less.
+    """Return weights of segments by block: of a Student t at the fit, times its information.
 
     A run is an outlier for what it does not share with others, found in turn with the weights.
     """
-    gaps, _ = seen(problem, fitted(problem).z)
-    shared, moved = shared_covariance(problem), np.zeros_like(gaps["motion"])
+    blocks, _ = residuals_at(problem, fitted(problem).z)
+    shared, moved = shared_covariance(problem), np.zeros_like(blocks["motion"])
 
     def weight(block, r):
         q = np.einsum(
@@ -124,16 +124,18 @@ def weights(problem):
         return (DEGREES + r.shape[1]) / (DEGREES + q)
 
     for _ in range(3):
-        own = spread_of(problem, "motion") / weight("motion", gaps["motion"] - moved)[:, None, None]
-        told = np.linalg.solve(shared + block_diag(*own), gaps["motion"].ravel())
-        moved = (shared @ told).reshape(moved.shape)
-    out = {k: weight(k, r - moved if k == "motion" else r) for k, r in gaps.items()}
-    less = {k: (DEGREES + r.shape[1]) / (DEGREES + r.shape[1] + 2) for k, r in gaps.items()}
+        own = (
+            spread_of(problem, "motion") / weight("motion", blocks["motion"] - moved)[:, None, None]
+        )
+        solved = np.linalg.solve(shared + block_diag(*own), blocks["motion"].ravel())
+        moved = (shared @ solved).reshape(moved.shape)
+    out = {k: weight(k, r - moved if k == "motion" else r) for k, r in blocks.items()}
+    less = {k: (DEGREES + r.shape[1]) / (DEGREES + r.shape[1] + 2) for k, r in blocks.items()}
     return {k: w * less[k] for k, w in out.items()}
 
 
 class Dense:
-    """Log density of each floor by the Gaussian of all its residuals, without what is constant."""
+    """Log density of each floor by the Gaussian of all its residuals, up to constants."""
 
     def __init__(self, problem, blocks, alone=False):
         self.problem, self.blocks, weight = problem, blocks, weights(problem)
@@ -142,28 +144,28 @@ class Dense:
 
     def floors(self, z):
         surface = np.asarray(self.problem.batch.surface)
-        gaps, jacobian = seen(self.problem, z)
+        blocks, jacobian = residuals_at(self.problem, z)
         out = np.zeros(surface.max() + 1)
         for k in self.blocks:
-            m = gaps[k].shape[1]
+            m = blocks[k].shape[1]
             whole = block_diag(*self.own[k]) + (self.shared if k == "motion" else 0.0)
             for g in range(len(out)):
                 rows = (surface[:, None] == g).repeat(m, axis=1).ravel()
-                r = gaps[k].ravel()[rows]
+                r = blocks[k].ravel()[rows]
                 out[g] -= 0.5 * r @ np.linalg.solve(whole[np.ix_(rows, rows)], r)
                 more = jacobian.get(k, np.zeros(len(surface)))[surface == g].sum()
                 out[g] += more * (DEGREES + m) / (DEGREES + m + 2)
         return out
 
     def effects(self, z):
-        """Conditional mean of what the shared effects move in the motion residuals (piece, m)."""
-        gap = seen(self.problem, z)[0]["motion"]
-        told = np.linalg.solve(self.shared + block_diag(*self.own["motion"]), gap.ravel())
-        return (self.shared @ told).reshape(gap.shape)
+        """Return the conditional mean of shared effects in the motion residuals (segment, m)."""
+        residual = residuals_at(self.problem, z)[0]["motion"]
+        solved = np.linalg.solve(self.shared + block_diag(*self.own["motion"]), residual.ravel())
+        return (self.shared @ solved).reshape(residual.shape)
 
 
 def prior(problem, d, x):
-    """Log prior of every coordinate, without what is constant."""
+    """Return the log prior of every coordinate, up to constants."""
     at, space = d.coordinates.structure, problem.space
     found = np.exp(0.5 * fitted(problem).log_variance[problem.noise.names.index(POOLED)])
     std = np.where(["load_bias" in name for name in space.names], found, space.prior_std)
@@ -171,7 +173,7 @@ def prior(problem, d, x):
 
 
 def terms_of(problem, d, dense, x):
-    """Terms of the log density of one vector, by definition."""
+    """Return the terms of the log density of one vector, by definition."""
     z = np.asarray(d.full(d.anchor, jnp.asarray(x)))
     of_prior, group = prior(problem, d, x), d.coordinates.group
     own = [of_prior[group == g].sum() for g in (0, 1)]
@@ -182,8 +184,8 @@ BLOCKS = {MOTION: ["motion"], EVERYTHING: ["motion", "current", "voltage"]}
 
 
 @pytest.mark.parametrize("part", [MOTION, EVERYTHING])
-def test_it_is_the_posterior_by_definition(problem, part):
-    """A Gaussian of all runs on a floor, which share effects; without these it would be another."""
+def test_terms_equal_the_posterior_by_definition(problem, part):
+    """The Gaussian of all runs on a floor includes their shared effects."""
     d, dense = density(problem, part), Dense(problem, BLOCKS[part])
     x = near(d)
     found = d.terms(x)
@@ -194,30 +196,30 @@ def test_it_is_the_posterior_by_definition(problem, part):
     assert (np.abs((other - other[0]) - (found - found[0]))[1:, :2] > 0.1).all()
 
 
-def test_what_is_left_of_runs_is_less_what_they_share(problem):
-    """Residuals less shared effects at their conditional mean, a Student t each."""
+def test_residuals_are_less_shared_effects(problem):
+    """Residuals less the conditional mean of shared effects have Student t likelihoods."""
     d, dense = density(problem, EVERYTHING), Dense(problem, BLOCKS[EVERYTHING])
     x = near(d)
-    left, told = d.residuals(x), d.pointwise(x)
-    assert left.keys() == told.keys() == set(BLOCKS[EVERYTHING])
+    found, likelihoods = d.residuals(x), d.pointwise(x)
+    assert found.keys() == likelihoods.keys() == set(BLOCKS[EVERYTHING])
     for j, one in enumerate(x):
         z = np.asarray(d.full(d.anchor, jnp.asarray(one)))
-        gaps, jacobian = seen(problem, z)
+        blocks, jacobian = residuals_at(problem, z)
         moved = dense.effects(z)
         assert np.abs(moved).max() > 0.001
-        gaps["motion"] = gaps["motion"] - moved
-        for k, r in gaps.items():
-            np.testing.assert_allclose(left[k][j], r, rtol=1e-8, atol=1e-10)
+        blocks["motion"] = blocks["motion"] - moved
+        for k, r in blocks.items():
+            np.testing.assert_allclose(found[k][j], r, rtol=1e-8, atol=1e-10)
             v = spread_of(problem, k)
             each = [
                 multivariate_t.logpdf(a, shape=b, df=DEGREES) for a, b in zip(r, v, strict=True)
             ]
             expected = np.array(each) + jacobian.get(k, 0.0)
-            np.testing.assert_allclose(told[k][j], expected, rtol=1e-8)
+            np.testing.assert_allclose(likelihoods[k][j], expected, rtol=1e-8)
 
 
 def test_the_electric_part_holds_the_motion_of_each_walker(problem):
-    """log p(electric | motion) is that of everything less that of the motion, but for constants."""
+    """log p(electric | motion) is that of everything less that of the motion, up to constants."""
     motion, electric, all_ = (density(problem, p) for p in (MOTION, ELECTRIC, EVERYTHING))
     of_motion, x = near(motion), near(electric)
     found = electric.terms(x, motion.hold(of_motion)).sum(axis=1)
@@ -231,7 +233,7 @@ def test_the_electric_part_holds_the_motion_of_each_walker(problem):
 
 
 def test_its_curvature_is_the_information_of_the_fit():
-    """At residuals of zero, where runs weigh (nu + m) / nu and no bend of the model counts."""
+    """At zero residuals runs weigh (nu + m) / nu, and the curvature of the model has no effect."""
     truth = robot()
     w = replace(made(truth), has_current=False, has_voltage=False)
     # the camera's scale is logarithmic, so that it does not bend the Jacobian
@@ -253,7 +255,7 @@ def test_its_curvature_is_the_information_of_the_fit():
     assert (np.diag(alone) / np.diag(precision)).max() > 1.2
 
 
-def test_numbers_of_one_floor_move_its_term_only(problem):
+def test_numbers_of_one_floor_change_its_term_only(problem):
     d = density(problem, EVERYTHING)
     x = near(d, 1)[0]
     base = d.terms(x[None])[0]
@@ -266,7 +268,7 @@ def test_numbers_of_one_floor_move_its_term_only(problem):
         assert changed, name
 
 
-def test_far_from_the_fit_the_root_is_found_from_scratch(problem):
+def test_far_from_the_fit_twists_are_solved_anew(problem):
     d, dense = density(problem, MOTION), Dense(problem, BLOCKS[MOTION])
     far = near(d, 3, width=2.0)
     for one, found in zip(far, d.terms(far), strict=True):
@@ -290,7 +292,7 @@ def test_a_single_floor_is_a_single_group():
 
 
 def test_a_density_is_forgotten_after_use():
-    """Chains around fit after fit must not keep the data of all of them."""
+    """Chains around one fit after another must not keep the data of all of them."""
     problem = stated()
     d = density(problem, MOTION)
     d.terms(near(d))

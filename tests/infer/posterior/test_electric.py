@@ -1,4 +1,4 @@
-"""Electric numbers drawn given the motion, against what they are drawn from; and the variances."""
+"""Electric numbers drawn given the motion follow their density, and so do variances."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ FREE = [
 
 
 def parts(choices, **std):
-    """Densities of motion and electric numbers where the fit ended, noise of these stds held."""
+    """Return densities of motion and electric numbers at the fit, with noise of these stds."""
     truth = robot()
     w = made(truth, std=STD)
     problem = Problem(replace(w, current_var=np.full_like(w.current_var, 1e-6)), truth, choices)
@@ -51,24 +51,24 @@ def parts(choices, **std):
 
 @pytest.fixture(scope="module")
 def usual():
-    """Those of all numbers, compiled once."""
+    """Return the densities of all numbers, compiled once."""
     return parts(FREE)
 
 
 def drawn(first, second, covariance, motion, seed=0):
-    """Draws for very many copies of one draw of the motion."""
+    """Return draws for very many copies of one draw of the motion."""
     many = np.broadcast_to(motion, (2, COPIES // 2, len(motion)))
     return electric_given_motion(first, second, covariance, many, seed)
 
 
 def log_prob(second, held, x):
-    """Log density at many vectors, all given the one draw of the motion that is held."""
+    """Return the log density at many vectors, all given one draw of the motion."""
     many = type(held)(*(np.repeat(h, len(x), axis=0) for h in held))
     return second.terms(x, many).sum(axis=1)
 
 
 def gaussian(second, held):
-    """Mode and covariance there, by scipy and by differences of the density itself."""
+    """Return the mode and the covariance there, by scipy and by finite differences."""
 
     def loss(x):
         return -log_prob(second, held, x[None])[0], -second.slope(x[None], held)[0]
@@ -80,7 +80,7 @@ def gaussian(second, held):
     return mode, np.linalg.inv(0.5 * (bend + bend.T))
 
 
-def test_they_are_the_gaussian_given_the_motion_where_data_tell_much(usual):
+def test_draws_are_the_gaussian_given_the_motion_where_data_are_informative(usual):
     first, second, covariance = usual
     motion = first.centre + 0.02
     mode, spread = gaussian(second, first.hold(motion[None]))
@@ -95,8 +95,8 @@ def test_they_are_the_gaussian_given_the_motion_where_data_tell_much(usual):
     )
 
 
-def test_they_follow_the_motion(usual):
-    """The start is a guess: for motion far from the fit the mode is another, and found."""
+def test_draws_follow_the_motion(usual):
+    """For motion far from the fit the mode differs from the start, and is found."""
     first, second, covariance = usual
     motion = first.centre + np.where(["drag" in name for name in first.names], 0.5, 0.0)
     mode, spread = gaussian(second, first.hold(motion[None]))
@@ -107,8 +107,8 @@ def test_they_follow_the_motion(usual):
     np.testing.assert_allclose(away, 0.0, atol=4 / np.sqrt(COPIES))
 
 
-def test_a_skewed_one_is_drawn_from_its_own_density():
-    """Against a grid; the Gaussian that is proposed from is far from it."""
+def test_a_skewed_density_is_drawn_from_exactly():
+    """Draws follow a density on a grid that is far from the Gaussian of the proposals."""
     first, second, covariance = parts(
         [*FREE[:3], Choice("motor.resistance", free=True)], **{"voltage.window": 3.0}
     )
@@ -123,7 +123,7 @@ def test_a_skewed_one_is_drawn_from_its_own_density():
     below = (np.cumsum(weight) - 0.5 * weight) / weight.sum()
 
     def apart(x):
-        """Distance of the empirical distribution of sorted draws from the grid's."""
+        """Return the distance of the empirical distribution of sorted draws from the grid's."""
         return np.abs(np.interp(x, grid, below) - (np.arange(len(x)) + 0.5) / len(x)).max()
 
     mode, spread = gaussian(second, held)

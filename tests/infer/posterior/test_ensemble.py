@@ -25,7 +25,7 @@ PLAN = Plan(ensembles=4, walkers=16, block=25, warm_up=(2, 4, 6), most=120, spre
 
 
 def known(terms, group, centre, covariance):
-    """A target with slopes by central differences."""
+    """Return a target with slopes by central differences."""
 
     def slope(x):
         step = 1e-5 * np.eye(x.shape[1])
@@ -56,7 +56,7 @@ def gaussian():
     precision = np.linalg.inv(covariance)
 
     def terms(x):
-        # the precision has no entries between groups: each group's own rows, and what is left
+        # the precision has no entries between groups: each group's own rows, and the remainder
         d = x - mean
         out = np.zeros((len(x), 3))
         for g in (0, 1):
@@ -95,7 +95,7 @@ def funnel():
 
 
 def two_modes():
-    """Three and seven tenths at -4 and 4; Laplace knows the first only."""
+    """Return modes with weights 0.3 and 0.7 at -4 and 4, with Laplace at the first only."""
 
     def terms(x):
         d = np.logaddexp(
@@ -108,7 +108,7 @@ def two_modes():
 
 
 def plateau():
-    """Log of a number of which data say little more than that it is small; another follows it."""
+    """Return a density of the log of a number that is only known to be small, and of another."""
 
     def below(x):
         return -0.5 * ((x + 1) / 2) ** 2 - 0.5 * ((np.exp(x) - 1) / 0.4) ** 2
@@ -129,8 +129,8 @@ def plateau():
 
 
 def run(target, plan, done=()):
-    """Blocks up to the plan's end."""
-    return extended(target, plan, "part", BlockStore(), done)
+    """Return the blocks up to the plan's limit."""
+    return extended(target, plan, "part", BlockStore(done=lambda part: done))
 
 
 def sampled(target, plan=PLAN):
@@ -152,7 +152,7 @@ def sampled(target, plan=PLAN):
         ),
     ],
 )
-def test_moments_are_within_three_monte_carlo_errors_or_it_says_so(case, seed):
+def test_moments_are_within_three_monte_carlo_errors_unless_convergence_is_denied(case, seed):
     target, mean, std = case()
     _, chain, found = sampled(target, replace(PLAN, seed=seed))
     if not found.converged:
@@ -171,7 +171,7 @@ def test_moments_are_within_three_monte_carlo_errors_or_it_says_so(case, seed):
 
 @pytest.mark.slow
 def test_ensembles_in_different_modes_are_not_reported():
-    """Modes so far apart that nothing leads from one to the other."""
+    """No move leads between modes that are so far apart."""
 
     def terms(x):
         d = np.logaddexp(-0.5 * (x[:, 0] + 50) ** 2, -0.5 * (x[:, 0] - 50) ** 2)
@@ -186,7 +186,7 @@ def test_ensembles_in_different_modes_are_not_reported():
 
 
 @pytest.mark.slow
-def test_an_interrupted_chain_goes_on_as_if_it_had_not_been():
+def test_an_interrupted_chain_continues_like_an_uninterrupted_one():
     target, _, _ = gaussian()
     plan = Plan(ensembles=2, walkers=8, block=5, warm_up=(1, 2), most=6)
     whole = run(target, plan)
@@ -212,7 +212,7 @@ def test_the_seed_decides():
 
 @pytest.fixture(scope="module")
 def exact():
-    """A Gaussian in the coordinates of the map that Laplace gives, and draws there."""
+    """Return a Gaussian in the coordinates of the Laplace map, and draws of it."""
     target, mean, _ = gaussian()
     target = replace(target, centre=mean, covariance=target.covariance / 0.6)
     u = np.random.RandomState(1).standard_normal((4000, 8))
@@ -220,7 +220,7 @@ def exact():
 
 
 def test_independence_accepts_nearly_everything_where_laplace_is_exact(exact):
-    """All but for the tails of the Student t; shared numbers take the groups along."""
+    """All moves are accepted but for the tails of the Student t; groups follow shared numbers."""
     target, u = exact
     before, random = target.terms(u), np.random.RandomState(0)
     assert len(families(target)) == 2
@@ -234,7 +234,7 @@ def test_independence_accepts_nearly_everything_where_laplace_is_exact(exact):
 
 
 def made_gaussian(map, group):
-    """Target that is a standard Gaussian in the coordinates of a map."""
+    """Return a target that is a standard Gaussian in the coordinates of a map."""
     onto = np.eye(3)[np.where(group < 0, 2, group)]
 
     def terms(u):
@@ -245,7 +245,7 @@ def made_gaussian(map, group):
 
 
 def model_of(target):
-    """What emcee gives to moves."""
+    """Model with the attributes that emcee gives to moves."""
 
     def compute(u):
         out = target.log_prob(u)
@@ -255,7 +255,7 @@ def model_of(target):
 
 
 def state_of(target, u):
-    """State of walkers, and the model that emcee gives to moves."""
+    """Return the state of walkers, and the model that emcee gives to moves."""
     from emcee.state import State
 
     model = model_of(target)
@@ -275,7 +275,7 @@ def test_a_hamiltonian_move_is_exact_and_independent_for_a_gaussian(exact, which
     np.testing.assert_allclose(state.log_prob, target.terms(state.coords).sum(axis=1), rtol=1e-9)
     own = np.concatenate(family.places)
     together = np.mean(u * state.coords, axis=0)
-    assert np.abs(together[own]).max() < 0.7  # some way towards a quarter turn
+    assert np.abs(together[own]).max() < 0.7  # part of a quarter turn
     others = np.setdiff1d(np.arange(8), own)
     np.testing.assert_array_equal(state.coords[:, others], u[:, others])
 
@@ -294,8 +294,8 @@ def two_widths():
 
 
 @pytest.mark.slow
-def test_each_group_goes_its_own_hamiltonian_way():
-    """With steps that are long for one group only that one is thrown back, and both stay exact."""
+def test_each_group_has_its_own_hamiltonian_trajectory():
+    """Steps too long for one group are refused for that group only, and both stay exact."""
     target, precision = two_widths()
     u = np.random.RandomState(1).standard_normal((4000, 5)) / np.sqrt(precision)
     model, state = state_of(target, u)
@@ -319,13 +319,13 @@ def test_a_walker_whose_slope_is_lost_stays_with_all_its_groups():
     state, _ = Hamiltonian(lost, families(target)[0], 0.1).propose(model, state)
     moved = (state.coords != u).any(axis=1)
     assert moved[100:].mean() > 0.7
-    assert moved[:100].mean() == 0  # they are refused, wherever the way led
+    assert moved[:100].mean() == 0  # they are refused, wherever the trajectory ended
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("groups", [(0, 1), None])
 def test_walking_along_a_coordinate_keeps_the_distribution(bent, groups):
-    """Exact draws of what a bent map makes of a Gaussian stay that."""
+    """Exact draws of a Gaussian seen through a curved map stay exact."""
     map, _ = bent
     target = made_gaussian(map, np.array([-1, -1, 0, 0, 0, 0, 1, 1, 1]))
     model, u = model_of(target), np.random.RandomState(1).standard_normal((4000, 9))
@@ -354,7 +354,7 @@ def test_whole_differences_lead_from_mode_to_mode():
 
 
 def test_autocorrelation_time_is_that_of_a_known_process():
-    """tau = (1 + a) / (1 - a) of an autoregression; a walker that stands still raises it."""
+    """An autoregression has tau = (1 + a) / (1 - a); a walker at rest raises it."""
     rng = np.random.default_rng(0)
     x = np.zeros((2, 4000, 8, 1))
     for k in range(1, 4000):

@@ -1,4 +1,4 @@
-"""What `sample` makes of chains: thinned draws, variances beside them, and whether to believe."""
+"""Thinned draws of chains, draws of variances beside them, and convergence."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def fitted(problem):
 
 
 def by_definition(problem, log_v):
-    """Fisher information of log variances, 1/2 tr(V^-1 dV V^-1 dV), and of their prior."""
-    told, h = np.eye(len(log_v)) / 9, 1e-4
+    """Return the information of log variances, 1/2 tr(V^-1 dV V^-1 dV), and of their prior."""
+    precision, h = np.eye(len(log_v)) / 9, 1e-4
     for k in ("motion", "current"):
         inverse = np.linalg.inv(np.asarray(problem.covariance(k, log_v)))
         grown = [
@@ -52,13 +52,13 @@ def by_definition(problem, log_v):
             / (2 * h)
             for e in np.eye(len(log_v))
         ]
-        told += 0.5 * np.array([[np.einsum("nij,nji", a, b) for b in grown] for a in grown])
-    return told
+        precision += 0.5 * np.array([[np.einsum("nij,nji", a, b) for b in grown] for a in grown])
+    return precision
 
 
 @pytest.mark.slow
 def test_variances_are_drawn_from_the_gaussian_of_their_information(problem):
-    """Those of single pieces by definition, those of effects by the fit's own scoring."""
+    """Information of segments is that of the definition, that of effects the one of the fit."""
     end = fitted(problem)
     log_v, names = end.log_variance, problem.noise.names
     draws = drawn_variances(problem, end, SHAPE, 0).reshape(-1, len(names))
@@ -69,23 +69,23 @@ def test_variances_are_drawn_from_the_gaussian_of_their_information(problem):
     motion = residual["motion"], jacobian["motion"]
     of_effects = effect_information(problem.objective, motion, weight, end.covariance, log_v)
     of_effects += np.eye(len(log_v)) / 9
-    told = np.where(single[:, None] & single, by_definition(problem, log_v), 0.0)
-    told += np.where(~single[:, None] & ~single, of_effects, 0.0)
+    precision = np.where(single[:, None] & single, by_definition(problem, log_v), 0.0)
+    precision += np.where(~single[:, None] & ~single, of_effects, 0.0)
     drawn = np.array([n != POOLED for n in names])
-    expected = np.linalg.inv(told)[np.ix_(drawn, drawn)]
+    expected = np.linalg.inv(precision)[np.ix_(drawn, drawn)]
     std, count = np.sqrt(np.diag(expected)), len(draws)
     away = (draws.mean(axis=0) - log_v)[drawn] / std
     np.testing.assert_allclose(away, 0.0, atol=4 / np.sqrt(count))
     found = np.cov(draws[:, drawn].T) / std / std[:, None]
     np.testing.assert_allclose(found, expected / std / std[:, None], atol=6 / np.sqrt(count))
-    # data tell some of them much, others next to nothing beside the prior's 3
+    # data determine some of them well, others hardly beside the prior's 3
     assert std.min() < 0.3
     assert std.max() > 2
 
 
 @pytest.mark.slow
-def test_runs_that_err_alike_are_no_outliers_to_variances(problem, monkeypatch):
-    """A wrong creep moves neighbouring runs alike, which is what they are known to share."""
+def test_runs_with_a_common_error_are_no_outliers_to_variances(problem, monkeypatch):
+    """A wrong creep changes neighbouring runs in the same way, like a shared effect."""
     weights = []
 
     def spied(target, motion, weight, *rest):
@@ -102,21 +102,21 @@ def test_runs_that_err_alike_are_no_outliers_to_variances(problem, monkeypatch):
 
 
 @pytest.mark.slow
-def test_how_far_floors_differ_is_drawn_by_how_likely_it_is(problem):
-    """Load biases that are known by themselves, with a half-normal prior of their common std."""
+def test_the_std_of_load_biases_is_drawn_from_its_likelihood(problem):
+    """Load biases with known likelihoods have a half-normal prior of their common std."""
     end, at = fitted(problem), problem.space.pooled
     now, typical = np.exp(0.5 * end.log_variance[problem.objective.pooled]), 0.05
-    sure = 0.02**-2  # what data alone tell of each
-    seen = np.array([0.06, -0.09, 0.12, -0.05])
+    sure = 0.02**-2  # precision of the data alone
+    measured = np.array([0.06, -0.09, 0.12, -0.05])
     covariance = np.diag(np.where(at, 1 / (sure + now**-2), 0.01))
     z = end.z.copy()
-    z[at] = seen * sure / (sure + now**-2)
+    z[at] = measured * sure / (sure + now**-2)
     draws = drawn_variances(problem, Fitted(z, end.log_variance, covariance), SHAPE, 0)
     std = np.exp(0.5 * draws[..., problem.objective.pooled]).ravel()
 
     def density(s, power=0):
         spread = np.sqrt(s**2 + 1 / sure)
-        return s**power * norm.pdf(s / typical) * np.prod(norm.pdf(seen / spread) / spread)
+        return s**power * norm.pdf(s / typical) * np.prod(norm.pdf(measured / spread) / spread)
 
     whole, first, second = (quad(density, 0, 1, (k,))[0] for k in range(3))
     mean, square = first / whole, second / whole
@@ -124,7 +124,7 @@ def test_how_far_floors_differ_is_drawn_by_how_likely_it_is(problem):
     assert std.mean() == pytest.approx(mean, rel=0.01)
     assert std.std() == pytest.approx(np.sqrt(square - mean**2), rel=0.03)
     others = drawn_variances(problem, end, (1, 2000), 0)[..., problem.objective.pooled]
-    assert np.exp(0.5 * others).mean() < 0.6 * mean  # biases of zero tell that floors are alike
+    assert np.exp(0.5 * others).mean() < 0.6 * mean  # biases of zero mean that floors are similar
 
 
 def test_thinned_draws_are_spread_over_steps_and_walkers_and_keep_their_log_density():

@@ -1,4 +1,4 @@
-"""Maps to nearly Gaussian coordinates: learnt from draws, undone, compiled once, kept in files."""
+"""Maps to nearly Gaussian coordinates: learnt, inverted, compiled once, stored in files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_a_map_makes_draws_gaussian(bent):
     assert np.abs(np.corrcoef(u.T) - np.eye(9)).max() < 0.06
 
 
-def test_a_map_is_undone_and_has_the_slopes_that_it_says(bent):
+def test_a_map_is_inverted_and_has_correct_slopes(bent):
     map, x = bent
     u = map.forward(x[:5])
     back, log = map.placed(u)
@@ -53,7 +53,7 @@ def test_maps_that_have_learnt_different_things_are_compiled_once(bent):
     np.testing.assert_allclose(other.forward(x), u, atol=1e-9)
 
 
-def test_a_map_is_kept_whole(bent, tmp_path):
+def test_a_map_is_stored_exactly(bent, tmp_path):
     map, _ = bent
     chain, log_prob = np.zeros((1, 2, 3, 9)), np.zeros((1, 2, 3))
     random = np.zeros((1, 624), np.uint32), np.zeros((1, 3))
@@ -67,7 +67,7 @@ def test_a_map_is_kept_whole(bent, tmp_path):
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_warp_is_undone_and_its_slope_is_a_derivative():
+def test_a_warp_is_inverted_and_its_slope_is_a_derivative():
     rng = np.random.default_rng(0)
     draws = np.stack([rng.gamma(2.0, size=3000), -np.log(rng.gamma(1.0, size=3000))], axis=1)
     warp = Warp.learnt(draws)

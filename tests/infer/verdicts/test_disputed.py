@@ -44,7 +44,7 @@ def problem():
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1.0, 4.0])
 def test_sigma_is_that_of_the_likelihood_alone(problem, size):
-    """What floors say is put together with the prior by Bayes' theorem, and taken apart again."""
+    """Estimates of floors are combined with the prior by Bayes' theorem, and separated again."""
     space, rng, pooled = problem.space, np.random.default_rng(1), 0.03**2
     root = 40 * rng.normal(size=(space.size, space.size))
     own = root @ root.T + np.eye(space.size)  # information, wide priors of the biases included
@@ -85,8 +85,8 @@ def test_only_loads_that_were_identified_are_disputed(problem):
     numbers = {
         e.path: e for e in estimates(space, CHOICES, space.start, tight, has_voltage=False, flat=())
     }
-    said = marked(numbers, (Dispute(("firm", "soft"), 3.2),))
-    for path, e in said.items():
+    found = marked(numbers, (Dispute(("firm", "soft"), 3.2),))
+    for path, e in found.items():
         loads = path.startswith("robot.load_share")
         assert e.verdict == ("disputed" if loads else numbers[path].verdict)
     assert marked(numbers, ()) == numbers

@@ -1,4 +1,4 @@
-"""Verdicts of ratios, flat directions with known truth, profiles against known shapes."""
+"""Verdicts of ratios, flat directions with known truth, profiles of known shapes."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def space_of(*patterns: str) -> Space:
 # sparse flat directions --------------------------------------------------------------------------
 
 
-def told(p):
+def precision_of(p):
     return flat_module._Precision(p)
 
 
 def information(size, flat, held=400.0):
-    """Information 1 along the columns of `flat`, `held` more across them."""
+    """Return information 1 along the columns of `flat`, and `held` more across them."""
     q, _ = np.linalg.qr(flat)
     return np.eye(size) + held * (np.eye(size) - q @ q.T)
 
@@ -56,7 +56,7 @@ def test_planted_directions_come_out_alone_and_exact():
     flat[2, 0] = 1.0
     flat[[0, 4], 1] = 0.6, -0.8
     flat[[1, 5, 8], 2] = 1.0, 1.0, -1.0
-    found = flat_module._sparse(told(information(9, flat)), list(range(9)), [], np.ones(9))
+    found = flat_module._sparse(precision_of(information(9, flat)), list(range(9)), [], np.ones(9))
     assert [sorted(picked) for picked, _ in found] == [[2], [0, 4], [1, 5, 8]]
     for (picked, u), column in zip(found, flat.T, strict=True):
         cosine = u @ column[picked] / np.linalg.norm(column)
@@ -68,7 +68,7 @@ def test_what_is_called_flat_is_and_nothing_is_left_out(seed):
     rng = np.random.default_rng(seed)
     q, _ = np.linalg.qr(rng.normal(size=(8, 8)))
     p = q @ np.diag([1.0, 1.0, 1.3, 1.5, 2.0, 5.0, 50.0, 1e4]) @ q.T
-    found = flat_module._sparse(told(p), list(range(8)), [], np.ones(8))
+    found = flat_module._sparse(precision_of(p), list(range(8)), [], np.ones(8))
     assert found
     pivots = []
     for picked, u in found:
@@ -84,7 +84,7 @@ def test_what_is_called_flat_is_and_nothing_is_left_out(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_nothing_is_flat_where_the_data_tell_every_direction(seed):
+def test_nothing_is_flat_where_the_data_determine_every_direction(seed):
     space = space_of("surface.*")
     rng = np.random.default_rng(seed)
     q, _ = np.linalg.qr(rng.normal(size=(space.size, space.size)))
@@ -177,8 +177,8 @@ def precision(voltage: bool, one_heading: bool = False) -> np.ndarray:
     return np.linalg.inv(this.laplace(this.space.start, typical, keep))
 
 
-def seen(*patterns: str, voltage: bool = True, one_heading: bool = False):
-    """Space in which only these are free, and the covariance to be expected in it."""
+def expected_posterior(*patterns: str, voltage: bool = True, one_heading: bool = False):
+    """Return a space in which only these are free, and its expected covariance."""
     space, names = space_of(*patterns), problem(voltage).space.names
     at = np.array([names.index(n) for n in space.names])
     whole, electric = precision(voltage, one_heading), problem(voltage).space.electric
@@ -195,10 +195,10 @@ def seen(*patterns: str, voltage: bool = True, one_heading: bool = False):
 
 
 @pytest.mark.slow
-def test_nothing_tells_the_unit_of_length():
-    """Robot, floor lengths and picture may all be larger by one factor."""
+def test_nothing_determines_the_unit_of_length():
+    """One factor may scale the robot, the floor's lengths and the picture."""
     lengths = ("camera.scale", "robot.*_radius", "surface.*.lead", "surface.*.scrub")
-    space, cov = seen(*lengths)
+    space, cov = expected_posterior(*lengths)
     [found] = flat_directions(space, cov, True, True)
     assert set(found.paths) == {"camera.scale", "robot.wheel_radius", "robot.base_radius"}
     assert found.powers == pytest.approx([1.0] * 3, abs=0.05)
@@ -206,18 +206,21 @@ def test_nothing_tells_the_unit_of_length():
     assert "a length in the camera's picture" in found.remedy
     by = {e.path: e for e in derived(space, space.start, cov, True)}
     assert by["camera.scale/robot.wheel_radius"].verdict == "identified"
-    assert flat_directions(*seen("camera.scale", *lengths[2:]), True, True) == ()
+    assert flat_directions(*expected_posterior("camera.scale", *lengths[2:]), True, True) == ()
 
 
 @pytest.mark.slow
 def test_marker_yaw_and_a_turn_of_all_drives_are_one_number():
-    space, cov = seen("camera.marker_yaw", "robot.drive_offset", "surface.*.creep")
+    space, cov = expected_posterior("camera.marker_yaw", "robot.drive_offset", "surface.*.creep")
     [found] = flat_directions(space, cov, True, True)
     assert set(found.paths) == {"camera.marker_yaw", "robot.drive_offset"}
     assert len(found.paths) == 4
     assert np.abs(found.powers) == pytest.approx(1.0, abs=0.05)
     assert "the marker's angle" in found.remedy
-    assert flat_directions(*seen("camera.marker_yaw", "surface.*.creep"), True, True) == ()
+    assert (
+        flat_directions(*expected_posterior("camera.marker_yaw", "surface.*.creep"), True, True)
+        == ()
+    )
 
 
 @pytest.mark.slow
@@ -226,24 +229,24 @@ def test_one_direction_of_travel_leaves_loads_open_and_many_do_not():
     free = ("robot.load_share@*", *floor)
     floors = {"firm": FLOOR, "soft": replace(FLOOR, loads=("as_built", "moved"))}
     one = {k: replace(v, headings_deg=(0.0,)) for k, v in floors.items()}
-    assert flat_directions(*seen(*free), True, True, floors) == ()
-    found = flat_directions(*seen(*free, one_heading=True), True, True, one)
+    assert flat_directions(*expected_posterior(*free), True, True, floors) == ()
+    found = flat_directions(*expected_posterior(*free, one_heading=True), True, True, one)
     assert any("robot.load_share" in p for f in found for p in f.paths)
     assert all("in other directions than 0 deg" in f.remedy for f in found)
 
 
 @pytest.mark.slow
-def test_the_torque_scale_is_open_without_voltage_and_said_once():
+def test_the_torque_scale_is_open_without_voltage_and_reported_once():
     free = ("motor.resistance", "motor.back_emf", "motor.*_friction", "surface.*.friction")
-    found = flat_directions(*seen(*free, voltage=False), True, False)
-    said = sentences(found)
-    assert f"the data hardly determine motor.resistance: {VOLTAGE}" in said
+    found = flat_directions(*expected_posterior(*free, voltage=False), True, False)
+    texts = sentences(found)
+    assert f"the data hardly determine motor.resistance: {VOLTAGE}" in texts
     [scale] = [f for f in found if "motor.back_emf" in f.paths]
     assert scale.powers == pytest.approx([1.0] * 5, abs=0.05)
     assert scale.text.endswith(
         "motor.viscous_friction/motor.back_emf, surface.*.friction/motor.back_emf: " + VOLTAGE
     )
-    assert flat_directions(*seen(*free), True, True) == ()
+    assert flat_directions(*expected_posterior(*free), True, True) == ()
 
 
 # ratios ------------------------------------------------------------------------------------------
@@ -262,8 +265,10 @@ def test_units_of_ratios_are_those_of_their_numbers():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("voltage", [True, False])
-def test_what_currents_and_voltages_tell(voltage):
-    space, cov = seen("motor.resistance", "motor.back_emf", "surface.*.friction", voltage=voltage)
+def test_verdicts_with_currents_and_voltages(voltage):
+    space, cov = expected_posterior(
+        "motor.resistance", "motor.back_emf", "surface.*.friction", voltage=voltage
+    )
     found = {e.path: e for e in derived(space, space.start, cov, voltage)}
     for floor in ("firm", "soft"):
         assert found[f"surface.{floor}.friction/motor.back_emf"].verdict == "identified"
@@ -288,7 +293,7 @@ def test_a_number_without_bounds_may_be_larger_than_any_exponent():
     assert e.interval90 == pytest.approx((1e4 - 1.6448536, 1e4 + 1.6448536))
 
 
-def test_what_nothing_is_known_of_has_ends_that_files_can_hold():
+def test_an_unknown_number_has_finite_interval_ends():
     space = space_of("motor.resistance", "motor.back_emf")
     wide = np.diag((1e4 * space.prior_std) ** 2)
     [e] = derived(space, space.start, wide, True)
@@ -363,7 +368,7 @@ def test_a_profile_refits_all_others():
 
 
 @pytest.mark.slow
-def test_a_profile_without_a_lower_end_says_bound():
+def test_a_profile_without_a_lower_end_ends_at_the_bound():
     this, end = fitted(scrub=1e-4)
     p = profile(this, end, "surface.firm.scrub")
     assert p.ends == ("at_bound", "closed")
@@ -374,7 +379,7 @@ def test_a_profile_without_a_lower_end_says_bound():
 
 @pytest.mark.slow
 def test_a_profile_goes_back_where_it_stepped_over_the_end_of_a_flat_stretch(monkeypatch):
-    """Level for a prior's std and a half, then a wall: points close in on it."""
+    """A likelihood level over 1.5 prior stds and then steep needs points near the edge."""
     this, end = fitted()
     at = this.space.slices["motor.inductance"].start
     start, std = end.state.z[at], this.space.prior_std[at]
@@ -397,7 +402,7 @@ def test_a_profile_goes_back_where_it_stepped_over_the_end_of_a_flat_stretch(mon
 
 
 @pytest.mark.slow
-def test_a_profile_of_what_no_datum_touches_is_level():
+def test_a_profile_of_a_number_without_data_is_level():
     this, end = fitted()
     p = profile(this, end, "motor.inductance")
     assert p.ends == ("open", "open")

@@ -1,4 +1,4 @@
-"""Whether a fit may be used is said by its errors, by its end and by its numbers."""
+"""Trust in a fit depends on its errors, its convergence and its numbers."""
 
 import pytest
 
@@ -33,7 +33,7 @@ def test_a_fit_that_predicts_and_settled_is_trusted():
 
 
 @pytest.mark.parametrize(
-    ("floors", "converged", "numbers", "word", "says"),
+    ("floors", "converged", "numbers", "word", "reason_text"),
     [
         (GOOD, False, [number()], "doubtful", "did not converge"),
         ({"ice": EndPoints(0.24, 0.2)}, True, [number()], "doubtful", "on ice it is off by 24.0 %"),
@@ -47,10 +47,10 @@ def test_a_fit_that_predicts_and_settled_is_trusted():
         (GOOD, True, [number("surface.gray.friction", 40.0)], "not to be trusted", "0.005 to 5"),
     ],
 )
-def test_every_reason_against_it_is_reported(floors, converged, numbers, word, says):
+def test_every_reason_against_it_is_reported(floors, converged, numbers, word, reason_text):
     found = verdict_of_trust(floors, converged, numbers)
     assert found.word == word
-    assert any(says in reason for reason in found.reasons)
+    assert any(reason_text in reason for reason in found.reasons)
 
 
 def test_errors_that_are_both_tiny_are_no_reason():

@@ -78,7 +78,7 @@ def test_one_command_makes_a_table_and_goes_on_from_what_was_kept(tmp_path, monk
     assert len(left["paper_code"].runs) == len(split_of(task).held_out)
 
 
-def test_every_part_of_every_kind_is_asked_or_one_of_headings_if_it_has_to_be_quick(tmp_path):
+def test_every_fold_of_every_kind_is_a_task_or_one_of_headings_if_quick(tmp_path):
     (tmp_path / "x").mkdir()
     options = BenchmarkOptions(tmp_path / "x", tmp_path / "out")
     kinds = ("headings", "sectors", "speeds", "floors")
@@ -89,7 +89,7 @@ def test_every_part_of_every_kind_is_asked_or_one_of_headings_if_it_has_to_be_qu
     assert {protocol for protocol, _ in keys_of(quick[0])} == {"known_floor"}
 
 
-def test_where_there_is_one_floor_nobody_is_asked_which_it_is(tmp_path, monkeypatch):
+def test_a_single_floor_has_no_protocol_with_unknown_floors(tmp_path, monkeypatch):
     (tmp_path / "x").mkdir()
     task = FoldTask(
         BenchmarkOptions(tmp_path / "x", tmp_path / "out", ("encoder",)), "testsite", "headings", 0

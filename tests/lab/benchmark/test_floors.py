@@ -150,7 +150,7 @@ def test_every_run_is_left_out_once_and_floors_are_in_every_fold():
     assert [np.sum(fold == k) for k in range(3)] == [6, 4, 4]
 
 
-def test_stretches_are_asked_after_each_time_that_they_last():
+def test_stretches_have_an_answer_after_each_time_that_they_last():
     runs = made_floor_runs({"grass": 2.0, "snow": 4.0}, rows=20)
     done = Meter().fit(runs, HUSKY)
     said = answers_of(done, runs[:1], HUSKY, (0.5, 1.0, 2.0))
@@ -163,7 +163,7 @@ def test_stretches_are_asked_after_each_time_that_they_last():
     assert said[2].probability == pytest.approx(beliefs[12, 0])
 
 
-def test_a_stretch_of_a_robot_that_stands_is_not_asked():
+def test_a_stretch_of_a_robot_at_rest_has_no_answer():
     runs = made_floor_runs({"grass": 2.0, "snow": 4.0}, rows=13)
     done = Meter().fit(runs, HUSKY)
     speed = runs[0].speed.copy()
@@ -208,7 +208,7 @@ class Memory(Meter):
 
 
 @pytest.mark.parametrize("judged", [1, 3])
-def test_nobody_is_asked_of_runs_that_it_was_fitted_to(judged):
+def test_training_runs_have_no_answers(judged):
     runs = made_floor_runs({"grass": 2.0, "snow": 4.0}, runs=6)
     table = classifier_table(
         [Memory()], runs, HUSKY, "made", EvaluationSettings((1.0,), 3, judged), "memory"
@@ -252,7 +252,7 @@ def test_stretches_of_one_run_are_no_independent_witnesses():
     assert width[0] == pytest.approx(2 * 1.645 * np.sqrt(0.25 / 20), rel=0.25)
 
 
-def test_what_was_named_on_each_floor_in_percent():
+def test_the_confusion_table_is_in_percent():
     said = [answer("a", 1), answer("a", 0), answer("b", 1, floor="snow")]
     assert confusion(said, 1.0) == {
         "grass": {"grass": 50.0, "other": 50.0, "snow": 0.0},
@@ -336,7 +336,7 @@ def test_cells_are_means_of_rows_at_the_same_speeds():
     assert (many.weight[4:] == 0).all()
 
 
-def test_what_motors_have_apart_is_seen_going_straight():
+def test_stiffness_is_measured_in_straight_motion():
     runs = made_floor_runs({"grass": 2.0, "snow": 4.0}, noise=0.0)
     stiff = [replace(f, current=f.current + np.array([-0.4, 0.4])) for f in runs]
     bend = replace(stiff[0], speed=np.tile([1.0, 3.0], (60, 1)), current=np.tile([0, 9.0], (60, 1)))
@@ -372,7 +372,7 @@ def ground(friction: dict[str, float]):
 
 def driven(robot, runs: int = 4, noise: float = 0.5, seed: int = 0):
     """Runs in which each pair of wheel speeds is kept for two seconds, as its meters show them."""
-    runs = []
+    made = []
     for k, floor in enumerate(robot.surfaces.labels):
         for n in range(runs):
             rng = np.random.default_rng(1000 * seed + 100 * k + n)
@@ -383,8 +383,8 @@ def driven(robot, runs: int = 4, noise: float = 0.5, seed: int = 0):
             current = np.asarray(amps) + ZERO_A + noise * rng.normal(size=speed.shape)
             gyro = np.asarray(turn) + 0.02 * rng.normal(size=len(speed))
             run = made_floor_run(floor, speed, 0.0, name=f"{floor}/{seed}{n}")
-            runs.append(replace(run, current=np.abs(current), gyro=gyro))
-    return runs
+            made.append(replace(run, current=np.abs(current), gyro=gyro))
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -407,7 +407,7 @@ def test_frictions_are_found_by_currents_and_turning(slippery):
 
 
 @pytest.mark.slow
-def test_slipid_tells_floors_that_differ_in_friction_only_and_looks_at_nothing_later(slippery):
+def test_slipid_classifies_floors_that_differ_in_friction_only_without_later_signals(slippery):
     method = SlipidFloorClassifier(robot=husky(), zero_a=ZERO_A).fit(driven(slippery), HUSKY)
     assert method.labels == ("grass", "ice", "snow")
     assert np.asarray(method.fitted.motor.stiffness) == pytest.approx([-0.5, 0.5], abs=0.2)
@@ -431,7 +431,7 @@ def test_slipid_tells_floors_that_differ_in_friction_only_and_looks_at_nothing_l
     assert not np.allclose(changed[half:], beliefs[0][half:])
 
 
-def test_slipid_says_what_it_lacks():
+def test_slipid_raises_without_robot_or_fit():
     with pytest.raises(ValueError, match="not fitted"):
         SlipidFloorClassifier(robot=husky()).probability(made_floor_runs({"grass": 2.0}), HUSKY)
     with pytest.raises(ValueError, match="no robot was given"):
@@ -517,7 +517,7 @@ def test_a_classifier_that_fails_in_one_fold_has_an_empty_row():
     assert joined([there, there]) == ScoredClassifier(there.row, there.answers * 2)
 
 
-def test_rows_on_the_robotino_hear_no_vibration():
+def test_rows_on_the_robotino_use_no_vibration():
     names = [method.name for method in robotino_classifiers()]
     assert "boosted_trees_vibration" not in names
     assert {"belyaev_kushnarev", "gaussian", "boosted_trees"} <= set(names)
@@ -535,7 +535,7 @@ def test_slipid_is_ahead_of_all_classifiers_on_the_robotino(real_data, tmp_path)
     assert after["slipid"] > 0.85
 
 
-def test_a_table_is_made_where_its_logs_are_and_a_row_is_wished_for(tmp_path):
+def test_a_table_is_made_if_its_logs_exist_and_a_row_is_requested(tmp_path):
     assert not HuskyFloorTask(BenchmarkOptions(tmp_path, tmp_path)).is_requested
     (tmp_path / "borealtc").mkdir()
     assert HuskyFloorTask(BenchmarkOptions(tmp_path, tmp_path)).is_requested

@@ -51,7 +51,7 @@ def text(content):
     return shown.text
 
 
-def test_the_best_row_comes_first_and_what_is_absent_is_said():
+def test_the_best_row_comes_first_and_absent_rows_have_reasons():
     lines = text(CONTENT).splitlines()
     first = next(k for k, line in enumerate(lines) if line.startswith("slipid"))
     assert lines[first + 1].startswith("encoder")
@@ -61,7 +61,7 @@ def test_the_best_row_comes_first_and_what_is_absent_is_said():
     assert "quann_slip: failed: ValueError: <no> rank" in text(CONTENT)
 
 
-def test_the_page_has_every_table_and_picture_and_escapes_what_it_is_told():
+def test_the_page_has_every_table_and_picture_and_escapes_its_texts():
     pictures = benchmark_pictures(CONTENT)
     assert list(pictures) == ["carpets"]
     assert pictures["carpets"].startswith(b"\x89PNG")
@@ -82,7 +82,7 @@ def test_a_data_set_in_which_nothing_ran_has_no_picture():
     assert "<img" not in page(content, {})
 
 
-def test_fits_that_did_not_come_to_rest_are_said():
+def test_fits_that_did_not_converge_are_reported():
     content = copy.deepcopy(CONTENT)
     content["sets"]["carpets"]["protocols"]["known_floor"]["slipid"]["unconverged"] = 2
     assert "slipid: fits did not come to rest: 2" in text(content)
@@ -94,7 +94,7 @@ def heard(name, absent=""):
     return {"name": name, "numbers": 3, "after": [] if absent else [after], "absent": absent}
 
 
-def test_a_classifier_that_failed_is_said_above_the_others():
+def test_a_failed_classifier_is_reported_above_the_others():
     content = copy.deepcopy(CONTENT)
     rows = [heard("gaussian"), heard("trees", "ValueError: no leaf")]
     content["floors"] = {"husky": {"about": "a Husky", "runs": 9, "chance": 0.3, "rows": rows}}
@@ -123,7 +123,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("broken", [None, *BROKEN])
-def test_the_exit_code_says_whether_anything_failed(broken, tmp_path, monkeypatch):
+def test_the_exit_code_is_one_if_anything_failed(broken, tmp_path, monkeypatch):
     content = clean() | (BROKEN[broken] if broken else {})
     monkeypatch.setattr("slipid.lab.benchmark.benchmark.benchmark", lambda *_: content)
     monkeypatch.setattr("slipid.lab.benchmark.plots.benchmark_pictures", lambda _: {})

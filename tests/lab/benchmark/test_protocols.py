@@ -9,7 +9,8 @@ from slipid.lab.benchmark.protocols import PROTOCOLS, base_of, facts_of_run, inn
 from slipid.lab.benchmark.tuning import _loss, tuned
 from slipid.lab.systems.motion.quann import QuannEnergy
 from slipid.predict.folds import FoldKey
-from slipid.predict.slip_model import FEWEST, ByFloor, PredictedRun, RobotSpec, SlipModel, path_of
+from slipid.predict.slip_model import PredictedRun, RobotSpec, SlipModel, path_of
+from slipid.predict.slip_models import FEWEST, ByFloor
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 
@@ -24,7 +25,7 @@ def test_every_protocol_has_splits_of_its_kind():
 
 
 @pytest.mark.parametrize("kind", ["headings", "sectors", "speeds", "floors"])
-def test_runs_are_judged_once_and_never_fitted_then(kind):
+def test_runs_are_held_out_once_and_never_trained_on_then(kind):
     every = facts()
     found = splits(every, kind)
     judged = np.concatenate([split.held_out for split in found])
@@ -34,7 +35,7 @@ def test_runs_are_judged_once_and_never_fitted_then(kind):
         assert len(split.held_out) + len(split.training) == len(every)
 
 
-def test_a_heading_that_is_left_out_is_seen_on_no_floor():
+def test_a_held_out_heading_is_trained_on_no_floor():
     every = facts()
     for split in splits(every, "headings"):
         left_out = {every[k].heading_deg for k in split.held_out}
@@ -72,7 +73,7 @@ def test_many_speeds_are_two_halves():
     assert fastest == sorted(fastest)
 
 
-def test_a_floor_nobody_else_has_is_not_judged_by_heading():
+def test_a_floor_with_one_heading_is_not_held_out_by_heading():
     lone = [FoldKey("ice", 0.0, 0.1)] * 3
     for split in splits([*facts(), *lone], "headings"):
         assert not [k for k in split.held_out if k >= len(facts())]
@@ -95,7 +96,7 @@ def runs(floors=("gray", "green"), slip=0.3):
     return out
 
 
-def test_inner_parts_are_of_the_kind_that_is_judged_by():
+def test_inner_parts_are_of_the_protocols_kind():
     training = runs()
     by_floor = inner(training, "floors")
     left_out = {run.floor for run, k in zip(training, by_floor, strict=True) if k == 0}
@@ -216,7 +217,7 @@ class Mean(Scaled):
         return replace(self, factor=float(slip / size))
 
 
-def test_a_method_by_floor_has_one_fit_for_all_where_nothing_is_told():
+def test_a_method_by_floor_has_one_fit_for_all_unknown_floors():
     told = ByFloor.of(Mean()).fit(runs(slip=0.5), ROBOTINO)
     untold = ByFloor.of(Mean()).fit([run.with_floor(False) for run in runs(slip=0.5)], ROBOTINO)
     way = made_run(straight(0.1), name="new")
@@ -272,7 +273,7 @@ def test_what_predicts_energy_is_tuned_by_it():
     assert ByFloor.of(QuannEnergy()).aim == "energy"
 
 
-def test_where_floors_are_not_told_each_load_has_a_fit_and_a_strange_one_that_of_the_usual():
+def test_with_unknown_floors_each_load_has_a_fit_and_a_new_load_that_of_the_usual():
     every = [run.with_floor(False) for run in runs(slip=0.5)]
     names = {"gray": "own", "green": "moved"}
 

@@ -31,7 +31,7 @@ def said(run, twist, **more):
     return PredictedRun(path_of(twist, run.signals.dt), **more)
 
 
-def test_the_end_is_judged_over_the_chord():
+def test_the_endpoint_error_is_over_the_chord():
     run = slipping_run()
     one = scored(run, said(run, run.signals.rolling(ROBOTINO)), ROBOTINO, "chord")
     assert one.endpoint_error == pytest.approx(1 / 3)
@@ -40,7 +40,7 @@ def test_the_end_is_judged_over_the_chord():
     assert one.twist_error == pytest.approx(0.05)
 
 
-def test_over_the_path_a_circle_counts_its_way():
+def test_the_endpoint_error_of_a_circle_is_over_its_path_length():
     rolling = np.tile([0.2, 0.0, np.pi / 2], (40, 1))
     run = made_run(rolling)
     one = scored(run, said(run, 0.5 * rolling), ROBOTINO, "path")
@@ -49,7 +49,7 @@ def test_over_the_path_a_circle_counts_its_way():
     assert one.endpoint_error == pytest.approx(ahead / 0.8, rel=2e-3)
 
 
-def test_lengths_are_of_what_ends_are_judged_over_and_headings_do_not_wind_up():
+def test_length_errors_are_of_chord_or_path_and_headings_do_not_wind_up():
     rolling = np.tile([0.2, 0.0, np.pi / 2], (80, 1))  # two whole turns
     run = made_run(rolling)
     one = scored(run, said(run, 0.5 * rolling), ROBOTINO, "path")
@@ -59,7 +59,7 @@ def test_lengths_are_of_what_ends_are_judged_over_and_headings_do_not_wind_up():
     assert scored(run, turned, ROBOTINO, "path").heading_error_deg == pytest.approx(120.0)
 
 
-def test_who_says_what_encoders_say_sees_no_slip():
+def test_the_path_of_encoders_has_no_slip_score():
     rng = np.random.default_rng(0)
     rolling = rng.normal(0.2, 0.1, (40, 3))
     run = made_run(rolling, 0.5 * rolling)
@@ -79,7 +79,7 @@ def test_the_start_may_lie_anywhere():
     assert other.endpoint_error < 1e-9
 
 
-def test_slip_is_told_from_the_twist_unless_a_method_says_it():
+def test_the_slip_score_is_by_the_twist_unless_a_method_has_its_own():
     run = slipping_run()
     right = scored(run, said(run, run.twist), ROBOTINO, "chord")
     assert all(right.slips)
@@ -90,7 +90,7 @@ def test_slip_is_told_from_the_twist_unless_a_method_says_it():
     assert not any(scored(steady, said(steady, steady.twist), ROBOTINO, "chord").slips)
 
 
-def test_turning_counts_with_the_way_of_the_wheels():
+def test_yaw_rates_count_at_the_base_radius():
     """A yaw rate is a speed at the base radius beside those ahead and sideways."""
     rolling = straight(0.0) + np.array([0.0, 0.0, 0.4])
     run = made_run(rolling, rolling - np.array([0.0, 0.0, 0.3]))
@@ -121,7 +121,7 @@ def test_floors_are_right_for_a_part_of_the_time():
     assert scored(run.with_floor(False), new, ROBOTINO, "chord").floor_right == pytest.approx(0.75)
 
 
-def test_energy_is_judged_as_a_whole():
+def test_the_energy_error_is_that_of_the_whole_run():
     run = slipping_run()
     power = run.signals.power(ROBOTINO)
     swung = power * np.where(np.arange(40) % 2, 1.4, 1.0)
@@ -177,7 +177,7 @@ def test_a_difference_is_paired():
 
 
 @pytest.mark.slow
-def test_intervals_hold_the_true_mean_as_often_as_they_say():
+def test_intervals_cover_the_true_mean_at_their_level():
     rng = np.random.default_rng(1)
     hits = 0
     for _ in range(100):
@@ -236,7 +236,7 @@ def ends(value, low=None, high=None, behind=None):
     return RowSummary(endpoint_error=error, behind=behind, runs=9)
 
 
-def test_the_reading_says_who_is_ahead():
+def test_the_reading_names_the_rows_that_are_ahead():
     ahead = {"slipid": ends(0.1), "rival": ends(0.05, behind=MeanInterval(-0.05, -0.07, -0.03))}
     assert sentence("carpet", "new_floor", ahead) == (
         "carpet, new floor: rival is ahead of slipid: 5.0 % against 10.0 %, "

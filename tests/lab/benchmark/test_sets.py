@@ -26,7 +26,7 @@ def test_every_source_has_a_config_and_kinds_that_there_are():
         assert ("all" in one.kinds) == (one.crossing is not None)
 
 
-def test_what_is_absent_is_absent(tmp_path):
+def test_a_source_without_a_folder_is_not_available(tmp_path):
     assert [one.name for one in SOURCES if is_available(one, tmp_path)] == ["testsite"]
     (tmp_path / "drive_skid").mkdir()
     assert is_available(source("husky"), tmp_path)
@@ -44,7 +44,7 @@ def test_recorded_runs_need_no_data_folder(testsite):
     assert {fact.floor for fact in testsite.facts} == {"firm", "soft", "soft@moved"}
 
 
-def test_a_part_of_the_runs_has_every_floor_and_speed(testsite):
+def test_thinned_runs_have_every_floor_and_speed(testsite):
     few = testsite.thinned(30)
     assert len(few.logged) == len(few.job.dataset) == len(few.facts) == 30
     assert {fact.floor for fact in few.facts} == {fact.floor for fact in testsite.facts}
@@ -53,7 +53,7 @@ def test_a_part_of_the_runs_has_every_floor_and_speed(testsite):
 
 
 @pytest.mark.slow
-def test_currents_are_heard_where_the_fit_does_without(real_data, tmp_path):
+def test_methods_use_currents_that_the_fit_leaves_out(real_data, tmp_path):
     for name, signed in (("warthog", True), ("husky", False)):
         data = read_set(source(name), real_data, tmp_path, QUIET)
         assert data.logged.current is not None

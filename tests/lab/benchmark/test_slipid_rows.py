@@ -47,7 +47,7 @@ def fit_of(made, current=True) -> SlipidFit:
     return fit
 
 
-def test_where_the_floor_is_told_the_region_is_that_of_a_student_t(made):
+def test_on_a_known_floor_the_region_is_that_of_a_student_t(made):
     one = run_batches(made.runs, made.robot)[0]
     spec = RobotSpec.of(made.robot)
     said = forecast(fit_of(made, current=False), one, spec)
@@ -107,7 +107,7 @@ def test_only_a_robot_that_may_stand_on_several_floors_looks_for_them(made, driv
     assert driven[1][0].settings.further_floor_penalty == MIXED_FLOORS_PENALTY
 
 
-def test_an_estimator_hears_currents_only_if_it_was_fitted_to_some(made, driven):
+def test_an_estimator_uses_currents_only_if_it_was_fitted_to_some(made, driven):
     labels(FloorKnowledge(), made, driven, current=True)
     labels(FloorKnowledge(), made, driven, current=False)
     (_, with_currents), (_, without) = driven

@@ -39,7 +39,7 @@ def test_it_moves_as_the_robot_that_drove_it(made):
             assert found[:2] == pytest.approx(expected[:2], abs=0.015)
 
 
-def test_the_load_is_heard_and_gyro_and_command_are_means_over_each_step(made):
+def test_the_load_is_given_and_gyro_and_command_are_means_over_each_step(made):
     logs = [
         replace(
             log,

@@ -288,7 +288,7 @@ def test_windows_refuse_a_log_without_pose(rng):
         wheel_windows(blind, FIGURES_3_AND_4)
 
 
-def test_transfer_tells_a_common_law_from_one_per_surface(rng):
+def test_transfer_separates_a_common_law_from_one_per_surface(rng):
     common = [made_log(rng, name, 0.1, 0.5) for name in "aabbcc"]
     same = leave_one_surface_out(common).mean()
     assert same["pooled"] < 1e-9
@@ -301,7 +301,7 @@ def test_transfer_tells_a_common_law_from_one_per_surface(rng):
     assert apart["pooled"] > 0.05
 
 
-def test_transfer_refuses_what_it_cannot_judge(rng):
+def test_transfer_refuses_too_few_surfaces_or_samples(rng):
     with pytest.raises(ValueError, match="at least two"):
         leave_one_surface_out([made_log(rng, "a", 0.1, 0.5)])
 
@@ -395,7 +395,7 @@ def test_samples_and_slopes_to_the_digits_given(result, motor, count, slope):
     assert sum(len(part) for part in table.by_surface.values()) == count
 
 
-def test_torque_says_less_than_raw_current(result):
+def test_torque_predicts_less_than_raw_current(result):
     for table in result.motors.values():
         assert table.forms["affine in I"].rmse < table.forms["affine in M"].rmse
 

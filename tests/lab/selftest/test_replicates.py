@@ -1,4 +1,4 @@
-"""The self-test: windows with known truth, replicates that are kept, and what it concludes."""
+"""The self test: windows with known truth, kept replicates, and its conclusions."""
 
 from __future__ import annotations
 
@@ -293,7 +293,7 @@ def test_a_replicate_depends_on_seed_and_number_alone(tmp_path, monkeypatch):
         ("headings = 0", "selftest.headings"),
     ],
 )
-def test_bad_wishes_are_2_and_write_nothing(tmp_path, more, said):
+def test_bad_options_exit_with_2_and_write_nothing(tmp_path, more, said):
     text = PLAN.replace("headings = 6\n", "") if more.startswith("headings") else PLAN
     path = config(tmp_path)
     path.write_text(path.read_text().replace(PLAN, text + more), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Physics of the virtual test site: what any plant must do, whatever its contact law."""
+"""Physics of the virtual test site that holds for any contact law."""
 
 from dataclasses import replace
 
@@ -225,7 +225,7 @@ def test_every_roller_feels_the_floor_beneath_it():
     assert sinkage[0] > 2 * sinkage[1]
 
 
-def test_a_map_is_felt_up_to_its_edges():
+def test_a_map_acts_up_to_its_edges():
     cells = np.array([[0, 1]])
     floor = FloorMap(("firm", "soft"), cells, (-3.0, -3.0), 3.0)
     plant = SimulatedRobot(Site(CENTRED, surfaces=EVEN), floor, "as_built", (-2.8, 1.0, 0.0))
@@ -281,7 +281,7 @@ def test_what_is_added_to_the_engine_only_takes_energy():
 # motors
 
 
-def test_a_held_motor_draws_what_ohm_says_and_a_free_one_nothing():
+def test_a_held_motor_draws_current_by_ohms_law_and_a_free_one_none():
     motor = MotorBuild(supply_ohm=0.0, efficiency=1.0)
     loop = SpeedLoop(kind="pi", gain=100.0, integral=0.0, filter_s=0.0)
     held = WheelDrives(motor, loop, 16.0, 1, 1e-3)

@@ -1,4 +1,4 @@
-"""What the test site's sensors make of the truth, and that its log files come back as they were."""
+"""Errors of the test site's sensors, and log files that read back as they were."""
 
 from dataclasses import replace
 
@@ -92,7 +92,7 @@ def test_the_camera_lags_shrinks_and_repeats_frames(trace):
     np.testing.assert_array_equal(log.pose[1:][again[1:]], log.pose[:-1][again[1:]])
 
 
-def test_lost_and_wrong_frames_are_as_many_as_asked_for(trace):
+def test_lost_and_wrong_frames_have_the_configured_frequency(trace):
     few = seen(trace, EXACT).pose_fresh.sum()
     lost = seen(trace, replace(EXACT, dropout=0.3)).pose_fresh.sum()
     assert lost == pytest.approx(0.7 * few, rel=0.2)
@@ -101,7 +101,7 @@ def test_lost_and_wrong_frames_are_as_many_as_asked_for(trace):
     assert off.mean() == pytest.approx(0.2, abs=0.1)
 
 
-def test_noise_has_the_size_asked_for(trace):
+def test_noise_has_the_configured_size(trace):
     log = seen(trace, replace(EXACT, current_noise_a=0.05, current_step_a=1e-6))
     assert np.std(log.current[:, 0]) == pytest.approx(0.05, rel=0.2)
     log = seen(trace, replace(EXACT, camera_noise_m=0.002, camera_scale=1.0))

@@ -1,4 +1,4 @@
-"""`slipid simulate`: files, seeds, interrupts, mistakes; and a camera whose frames can be read."""
+"""`slipid simulate`: files, seeds, interrupts, mistakes; and a camera with readable frames."""
 
 import hashlib
 import os
@@ -160,7 +160,7 @@ def test_another_config_does_not_mix_with_what_is_there(config, tmp_path):
         quietly(config, out)
 
 
-def test_known_surfaces_are_changed_and_others_made_anew(config):
+def test_known_surfaces_are_changed_and_others_are_new(config):
     found = plan(config, config.read_text())
     assert found.site.surfaces["soft"].friction == 0.7
     assert found.site.surfaces["soft"].rolling_m == SURFACES["soft"].rolling_m
@@ -425,7 +425,7 @@ def corners(pose, robot, camera):
 
 
 @pytest.mark.slow
-def test_the_marker_is_seen_where_the_camera_says(studio):
+def test_the_marker_is_detected_where_the_camera_projects_it(studio):
     book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     detector = cv2.aruco.ArucoDetector(book)
     for k, pose in enumerate(([0.3, 0.2, 0.4], [-0.9, -0.4, 2.0], [0.0, 0.0, -1.0])):

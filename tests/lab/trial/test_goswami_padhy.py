@@ -1,4 +1,4 @@
-"""The law of Goswami and Padhy: what is proven of it, and gains against another search."""
+"""The law of Goswami and Padhy: its proof, and its gains against another search."""
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ def v_of(reference, pose):
     return lyapunov(tracking_error(PlaneVector(*reference[:3]), PlaneVector(*pose)))
 
 
-def test_v_falls_as_the_proof_says_at_any_pose_and_rates():
+def test_v_falls_as_proven_at_any_pose_and_rates():
     rng = np.random.default_rng(0)
     gains, pose, reference = rng.uniform(0, 5, (50, 3)), *np.split(rng.normal(size=(50, 9)), [3], 1)
 
@@ -80,7 +80,7 @@ def driven(gains, begin):
     return jax.lax.scan(step, begin, h * jnp.arange(1500))[1]
 
 
-def test_v_falls_all_the_way_for_any_positive_gains():
+def test_v_falls_throughout_for_any_positive_gains():
     rng = np.random.default_rng(1)
     gains = rng.uniform(0.3, 5.0, (40, 3))
     begin = rng.uniform(-1, 1, (40, 3)) * [1.0, 1.0, 2.5]
@@ -90,7 +90,7 @@ def test_v_falls_all_the_way_for_any_positive_gains():
     assert (v[:, -1] < 1e-2 * v[:, 0]).all()
 
 
-def test_a_robot_on_its_path_is_asked_for_the_paths_rates_as_it_sees_them():
+def test_a_robot_on_its_path_is_commanded_the_paths_rates_in_its_own_frame():
     law = GoswamiPadhy(jnp.array([1.0, 2.0, 3.0]))
     pose = jnp.array([1.0, -2.0, 0.5 * np.pi])
     rates = jnp.array([0.2, 0.1, 0.3])  # to a body that looks along y, x is on its right
@@ -119,7 +119,7 @@ def test_the_integral_of_a_robot_that_does_not_lag_is_a_geometric_series():
     np.testing.assert_allclose(turned.integrals(k)[1], total, rtol=1e-12)
 
 
-def test_a_robot_that_lags_is_as_far_behind_as_delay_and_lag_say():
+def test_a_robot_that_lags_is_behind_by_delay_and_lag():
     """Without gains it is left behind by its rates times how late it is, on a line or a turn."""
     shares, h, follow = np.array([[0.0, 0.4, 0.6], [0.0, 1.0, 0.0]]), 0.025, 0.6
     lost = (0.05 + 0.6 * h) + h * (1 - follow) / follow

@@ -84,7 +84,7 @@ def test_the_loop_asks_for_rates_and_errors_as_the_body_sees_them():
     np.testing.assert_allclose(found, [0.1 + 2 * 0.2, -0.8, 0.3 + 3 * 0.1], atol=1e-12)
 
 
-def test_it_turns_the_short_way_and_no_less_where_it_is_far_off():
+def test_it_turns_the_shorter_direction_with_undiminished_rate():
     still = jnp.zeros(6)
     for heading, turn in ((6.0, 2 * np.pi - 6.0), (2.0, -2.0), (-2.0, 2.0)):
         found = pose_loop(jnp.array([1.0, 1.0]), still, jnp.array([0.0, 0.0, heading]))

@@ -1,4 +1,4 @@
-"""A particle swarm does what its formula says, and finds minima that are known."""
+"""A particle swarm moves by its formula, and finds known minima."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_a_minimum_on_the_edge_is_found_there():
     np.testing.assert_array_equal(found.place, [-2.0, 3.0, 0.0])
 
 
-def test_the_swarm_looks_inside_the_box_alone_as_often_as_it_is_told():
+def test_the_swarm_stays_in_the_box_for_the_given_iterations():
     seen = []
 
     def cost(x):
@@ -71,7 +71,7 @@ def slope(x):
 
 
 @pytest.mark.parametrize("cost_of", [sphere, slope])  # inside, and along the edges of the box
-def test_particles_move_as_the_formula_says(cost_of):
+def test_particles_move_by_the_formula(cost_of):
     """Written out particle by particle and coordinate by coordinate, with the same draws."""
     swarm = Swarm(particles=4, iterations=6, inertia=0.6, own=1.2, others=1.7)
     seen = []

@@ -61,7 +61,7 @@ def test_the_rectangle_is_that_of_the_paper_and_stops_at_its_corners():
     assert np.hypot(rows[:, 3], rows[:, 4]).max() <= 0.2 + 1e-9
 
 
-def test_a_way_too_short_for_its_speed_is_half_speeding_up_and_half_braking():
+def test_a_path_too_short_for_its_speed_is_half_acceleration_and_half_braking():
     path = reference.waypoints([(0.0, 0.0), (0.02, 0.0)], speed=0.5, acceleration=0.5, pause=0.1)
     place, rate = np.asarray(path.rows)[:, [0, 3]].T
     assert rate.max() == pytest.approx(0.1, rel=1e-6)  # the root of 0.02 * 0.5
@@ -108,7 +108,7 @@ def test_a_circle_is_round_an_eight_goes_both_ways_round_and_one_path_turns():
     np.testing.assert_allclose(np.asarray(turning.rows)[:, :2], still, atol=1e-12)
 
 
-def test_the_way_that_is_left_of_a_path_ends_with_it():
+def test_the_remaining_length_of_a_path_ends_with_it():
     path = reference.rectangle()
     left = [float(path.remaining(t)) for t in (0.0, *np.asarray(path.marks), 99.0)]
     np.testing.assert_allclose(left, [2.6, 1.7, 1.3, 0.4, 0.0, 0.0], atol=1e-6)
@@ -226,7 +226,7 @@ def test_encoders_close_the_rectangle_without_slip_and_metrics_say_so(deployed):
 
 
 @pytest.mark.slow
-def test_rates_are_asked_for_early_of_wheels_that_follow_late(deployed):
+def test_rates_are_commanded_early_for_wheels_with_a_lag(deployed):
     start, path = (0.0, 0.0, 0.0), reference.waypoints([(0.0, 0.0), (0.9, 0.0)])
     far = []
     for preview in (0.0, 0.2):
@@ -268,7 +268,7 @@ def test_of_a_curve_the_first_quarter_is_judged(deployed):
 
 
 @pytest.mark.slow
-def test_a_robot_that_does_not_move_has_its_whole_way_left(deployed):
+def test_a_robot_that_does_not_move_has_its_whole_path_left(deployed):
     path = reference.rectangle()
     plant = Perfect(deployed, (0.0, 0.0, 0.0), 0.0)
     course = closed_loop.run_closed_loop(control_loop(deployed), path, plant, (0.0, 0.0, 0.0))
@@ -386,7 +386,7 @@ def test_starts_are_spread_and_the_same_for_everyone():
 
 
 @pytest.mark.slow
-def test_a_robot_can_be_told_which_floors_there_are(deployed):
+def test_a_robot_can_be_restricted_to_some_floors(deployed):
     a, b = deployed.labels
     only = deployed.on(b)
     assert only.labels == (b,)
@@ -438,7 +438,7 @@ def test_a_map_file_reaches_an_estimator_and_a_robot_that_has_numpy_alone(tmp_pa
     np.testing.assert_array_equal(again.cells, unknown.cells)
 
 
-def test_a_map_that_says_nothing_and_a_damaged_one_are_refused(tmp_path, deployed):
+def test_an_empty_map_and_a_damaged_one_are_refused(tmp_path, deployed):
     (tmp_path / "lab.toml").write_text(LAB.replace("firm", "ice").replace("soft", "mud"))
     with pytest.raises(DataError, match="surfaces ice, mud; expected some of those identified: fi"):
         floor_map(tmp_path / "lab.toml", deployed)
@@ -496,7 +496,7 @@ def test_the_twin_is_another_robot_of_the_posterior_for_every_start():
     assert drawn_robot(known, 3).floors.friction[0] == drawn_robot(known, 3).floors.friction[0]
 
 
-def test_what_a_trial_cannot_do_is_said(tmp_path, deployed):
+def test_impossible_trials_are_refused(tmp_path, deployed):
     with pytest.raises(DataError, match="expected testsite or twin"):
         tr._tasks(tmp_path, tr.TrialOptions(plant="moon"))
     with pytest.raises(DataError, match="no controller 'magic'; expected some of encoder"):
@@ -538,7 +538,7 @@ def test_runs_of_another_path_or_speed_are_driven_anew(tmp_path, deployed):
         assert jobs(**other)[0].kept.load_json("mark") == {}
 
 
-def test_a_controller_is_told_another_map_than_the_true_one(tmp_path, deployed, monkeypatch):
+def test_a_controller_can_have_another_map_than_the_true_one(tmp_path, deployed, monkeypatch):
     deployed.save(tmp_path / "robot.json")
     labels = list(deployed.labels)
     maps = {"true": labels[:2], "told": labels[1::-1], "strange": [labels[0], "moss"]}
@@ -600,7 +600,7 @@ def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
     assert unused_gains(tuned, forced=False) == ""
     other = DeployedRobot.of(replace(deployed.record, gains=tuned_for("far")))
     assert values(Controller(other).gains) == values(Gains())
-    assert "tuned for load set-up far: driving with those set by hand" in unused_gains(other, False)
+    assert "tuned for load set-up far: driving with hand-set gains" in unused_gains(other, False)
     with pytest.raises(
         DataError, match=r"another load set-up \(far\), not for as_built; leave out"
     ):
@@ -609,7 +609,7 @@ def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
         check_gains(tmp_path, deployed)
 
 
-def test_tuned_gains_that_are_no_better_are_left_aside_and_that_is_said(deployed):
+def test_tuned_gains_that_are_no_better_are_not_used_and_that_is_reported(deployed):
     gains = tuned_for("as_built", "no better than by hand")
     robot = DeployedRobot.of(replace(deployed.record, gains=gains))
     said = unused_gains(robot, forced=False)
@@ -621,7 +621,7 @@ def test_tuned_gains_that_are_no_better_are_left_aside_and_that_is_said(deployed
     assert values(control_loop_of(robot, row, forced=True).controller.gains) == TUNED
 
 
-def test_a_file_with_the_gain_that_is_gone_drives_with_the_others_and_that_is_said(deployed):
+def test_a_file_with_a_removed_gain_drives_with_the_others_and_that_is_reported(deployed):
     gains = tuned_for("as_built", ahead=0.7)
     robot = DeployedRobot.of(replace(deployed.record, gains=gains))
     assert values(control_loop_of(robot, ROWS["contact"]).controller.gains) == TUNED
@@ -645,7 +645,7 @@ def run_of(name, k, closure, finished=True):
     return TrialRun(name, (0.0, 0.0, 0.1), k, metrics, 1.0)
 
 
-def test_the_best_is_told_apart_by_differences_from_the_same_starts():
+def test_the_best_controller_follows_from_differences_over_the_same_starts():
     rng = np.random.default_rng(0)
     base = rng.uniform(50, 500, 20)  # starts differ by far more than controllers do
 

@@ -122,18 +122,12 @@ class Definitions:
         if what == Nodetype.NAME:
             return self.message(str(description[1]))
         if what == Nodetype.BASE:
-            return _plain(str(description[1][0]))
+            base = str(description[1][0])
+            if base != "string" and base not in _DTYPES:
+                raise NoDefinition(base)
+            return TextType() if base == "string" else NumberType(_DTYPES[base])
         element, count = cast("tuple[rosbags.interfaces.typing.FieldDesc, int]", description[1])
         return ArrayType(self._kind(element), count if what == Nodetype.ARRAY else None)
-
-
-def _plain(base: str) -> NumberType | TextType:
-    """Return a number or a text by the name of its type."""
-    if base == "string":
-        return TextType()
-    if base not in _DTYPES:
-        raise NoDefinition(base)
-    return NumberType(_DTYPES[base])
 
 
 def definition_of(

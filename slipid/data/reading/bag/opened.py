@@ -114,17 +114,20 @@ class OpenBag:
         Raises:
             DataError: the bag is damaged.
         """
+        for connection, received, data in self._stored(topics, start):
+            if data.__class__ is not bytes:
+                error = TypeError(f"a message of type {type(data).__name__}")
+                raise damage_error(self.files, error)
+            yield RawMessage(connection.topic, received, data)
+
+    def _stored(self, topics: Sequence[str], start: int | None) -> Iterator[Any]:
+        """Yield connection, time of receipt [ns] and data of messages, as rosbags does."""
         for reader in self.readers:
-            wanted = [c for c in reader.connections if c.topic in topics]
-            if not wanted:
-                continue
-            try:
-                for connection, received, data in _source(reader)(wanted, start):
-                    if data.__class__ is not bytes:
-                        raise TypeError(f"a message of type {type(data).__name__}")
-                    yield RawMessage(connection.topic, received, data)
-            except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
-                raise damage_error(self.files, error) from error
+            if wanted := [c for c in reader.connections if c.topic in topics]:
+                try:
+                    yield from _source(reader)(wanted, start)
+                except Exception as error:  # rosbags raises many types of errors on damaged bytes
+                    raise damage_error(self.files, error) from error
 
     def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
         """Yield the same messages topic by topic, about a megabyte at a time.
@@ -136,22 +139,15 @@ class OpenBag:
         """
         waiting = {topic: MessageBatch(topic, [], []) for topic in topics}
         room = dict.fromkeys(topics, _BATCH_BYTES)
-        for reader in self.readers:
-            wanted = [c for c in reader.connections if c.topic in waiting]
-            if not wanted:
-                continue
-            try:
-                for connection, received, data in _source(reader)(wanted, None):
-                    topic = connection.topic
-                    batch = waiting[topic]
-                    batch.received.append(received)
-                    batch.data.append(data)
-                    room[topic] -= len(data)
-                    if room[topic] < 0:
-                        yield batch
-                        waiting[topic], room[topic] = MessageBatch(topic, [], []), _BATCH_BYTES
-            except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
-                raise damage_error(self.files, error) from error
+        for connection, received, data in self._stored(topics, None):
+            topic = connection.topic
+            batch = waiting[topic]
+            batch.received.append(received)
+            batch.data.append(data)
+            room[topic] -= len(data)
+            if room[topic] < 0:
+                yield batch
+                waiting[topic], room[topic] = MessageBatch(topic, [], []), _BATCH_BYTES
         yield from (batch for batch in waiting.values() if batch.data)
 
 
@@ -183,7 +179,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
 def _readers(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str]]":
     """Return open readers of a bag, which a stack closes, and notes on its defects."""
     notes = [
-        f"{part.name}-wal lies beside the bag: messages in it are not read; "
+        f"{part.name}-wal has messages of the bag that are not read; "
         f"to add them run: sqlite3 {part} 'PRAGMA wal_checkpoint'"
         for part in files.parts
         if (wal := part.with_name(part.name + "-wal")).exists() and wal.stat().st_size
@@ -228,7 +224,7 @@ def _reader(path: Path | RepairedMcap, files: BagFiles, stack: ExitStack) -> "Re
             return stack.enter_context(rosbag1.Reader(files.path))
         # a repaired file has the methods of a path that rosbags uses
         return stack.enter_context(rosbag2.Reader(cast(Path, path)))
-    except Exception as error:  # rosbags meets any bytes, and fails on them in many ways
+    except Exception as error:  # rosbags raises errors of many types on damaged bytes
         raise damage_error(files, error) from error
 
 

@@ -13,7 +13,7 @@ from slipid.data.log import Log
 from slipid.data.reading.bag.layout import BagLayout, RunRule
 from slipid.data.reading.bag.opened import OpenBag
 from slipid.data.reading.bag.plan import message_of
-from slipid.data.reading.bag.shape import STAMPS, MessageShape, shape_of, steps_of
+from slipid.data.reading.bag.shape import MessageShape, located_with_time, shape_of, steps_of
 from slipid.data.reading.bag.streams import topic_error
 from slipid.data.reading.layout import TURNS
 from slipid.data.reading.signal import Signal
@@ -258,21 +258,21 @@ def _timed_values(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[_Timed
             raise topic_error(bag.path, name, found, f"one of {', '.join(message.paths)}")
     marks = []
     for number, raw in enumerate(bag.messages((name,)), start=1):
+        block = np.frombuffer(raw.data, np.uint8)[None]
         try:
             shape = shape_of(raw.data, message, cdr=bag.cdr)
-            value = _value(shape, raw.data, rule.field)
+            value = _value(shape, block, rule.field)
         except ValueError as error:
             expected = "messages as their definition says; is the bag damaged?"
             raise topic_error(bag.path, name, str(error), expected, number) from error
         surface, load = (_text(shape, path) for path in (rule.surface, rule.load))
-        stamp = _stamp(shape, raw.data) if layout.stamp == "header" else None
-        marks.append(
-            _TimedValue((raw.received if stamp is None else stamp) / 1e9, value, surface, load)
-        )
+        stamp = located_with_time(shape, (), ()).stamp(block) if layout.stamp == "header" else None
+        time = raw.received if stamp is None else int(stamp[0])
+        marks.append(_TimedValue(time / 1e9, value, surface, load))
     return sorted(marks, key=lambda mark: mark.time)
 
 
-def _value(shape: MessageShape, raw: bytes, path: str) -> Value:
+def _value(shape: MessageShape, block: np.ndarray, path: str) -> Value:
     """Return the text or number at a path; ValueError where there is none."""
     steps = steps_of(path)
     if texts := shape.texts(steps):
@@ -280,25 +280,10 @@ def _value(shape: MessageShape, raw: bytes, path: str) -> Value:
     numbers = shape.places(steps)
     if not numbers:
         raise ValueError(f"nothing in field '{path}'")
-    return float(numbers[0].of(_block(raw))[0])
+    return float(numbers[0].of(block)[0])
 
 
 def _text(shape: MessageShape, path: str | None) -> str | None:
     """Return the text at a path, None where there is none or it is empty."""
     texts: Sequence[str] = shape.texts(steps_of(path)) if path else ()
     return (texts[0] or None) if texts else None
-
-
-def _stamp(shape: MessageShape, raw: bytes) -> int | None:
-    """Return the message's own time [ns], None where it has none."""
-    for path in STAMPS:
-        parts = [shape.places(steps_of(f"{path}.{unit}")) for unit in ("sec", "nanosec")]
-        if all(len(places) == 1 for places in parts):
-            whole, rest = (int(places[0].whole(_block(raw))[0]) for places in parts)
-            return whole * 10**9 + rest
-    return None
-
-
-def _block(raw: bytes) -> np.ndarray:
-    """Return the bytes of one message as a block."""
-    return np.frombuffer(raw, np.uint8)[None]

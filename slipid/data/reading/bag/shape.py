@@ -236,7 +236,7 @@ class _MessageWalk:
         return (text[:-1] if self.cdr else text).decode(errors="replace")
 
 
-STAMPS = ("header.stamp", "stamp")
+_STAMPS = ("header.stamp", "stamp")
 """Paths of the time in messages that have one."""
 POSITION = ("translation.x", "translation.y", "translation.z")
 ROTATION = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
@@ -255,6 +255,12 @@ class Located:
     seconds: BytePlace | None
     nanoseconds: BytePlace | None
     numbers: tuple[BytePlace | None, ...]
+
+    def stamp(self, block: UInt8[np.ndarray, "message byte"]) -> Int[np.ndarray, " message"] | None:
+        """Return the messages' own times [ns], None where they have none."""
+        if self.seconds is None or self.nanoseconds is None:
+            return None
+        return self.seconds.whole(block) * 10**9 + self.nanoseconds.whole(block)
 
 
 @runtime_checkable
@@ -295,7 +301,7 @@ class FieldPick:
         if not numbers:
             return ()
         self.names = self.names or tuple(names)
-        return (_located(shape, (), numbers),)
+        return (located_with_time(shape, (), numbers),)
 
 
 @dataclass(eq=False)
@@ -320,12 +326,12 @@ class JointPick:
         names = shape.texts((PathStep("name"),))
         self.names.update(dict.fromkeys(names))
         places = shape.places((PathStep(self.array),))
-        # an array may be left empty; of any other length it says nothing of the names
+        # an array may be empty; one of another length does not match the names
         have = dict(zip(names, places, strict=True)) if len(places) == len(names) else {}
         numbers = [have.get(joint) for joint in self.joints]
         if not any(numbers):
             return ()
-        return (_located(shape, (), numbers),)
+        return (located_with_time(shape, (), numbers),)
 
 
 @dataclass(frozen=True)
@@ -353,7 +359,7 @@ class TransformPick:
                 first = (PathStep("transforms", k),)
                 paths = [(*first, *steps_of(f"transform.{name}")) for name in self.columns]
                 numbers = [place for path in paths for place in shape.places(path)]
-                rows.append(_located(shape, first, numbers))
+                rows.append(located_with_time(shape, first, numbers))
         return tuple(rows)
 
 
@@ -365,11 +371,11 @@ def edges_of(shape: MessageShape) -> tuple[Edge, ...]:
     return tuple(Edge(parent.lstrip("/"), child.lstrip("/")) for parent, child in pairs)
 
 
-def _located(
+def located_with_time(
     shape: MessageShape, first: tuple[PathStep, ...], numbers: Sequence[BytePlace | None]
 ) -> Located:
     """Return places with the time of the message, or of its part at the path `first`."""
-    for stamp in STAMPS:
+    for stamp in _STAMPS:
         whole, part = (
             shape.places((*first, *steps_of(f"{stamp}.{unit}"))) for unit in ("sec", "nanosec")
         )

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from slipid.data.reading.bag.layout import GROUPS, BagLayout
-from slipid.data.reading.bag.meanings import first_names
 from slipid.data.reading.bag.plan import ChannelPlan
 from slipid.data.reading.bag.shape import Edge, JointPick, TransformPick
 from slipid.data.reading.bag.streams import Stream
@@ -18,12 +17,17 @@ from slipid.data.reading.bag.transforms import STATIC, TransformSeries, composed
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL
 from slipid.data.reading.signal import Signal, SignalSource
 from slipid.data.reading.units import factor
-from slipid.support.errors import DataError, did_you_mean
+from slipid.support.errors import DataError, did_you_mean, first_names
 
 APART_NOTED = 0.5
 """Difference between two clocks that is worth a note [s]."""
 APART_REFUSED = 60.0
 """Difference between two clocks that makes their times incomparable [s]."""
+ABSURD = 1e30
+"""Number above any sensor's range, in whatever unit; the bag is damaged."""
+TILT_NOTED = np.radians(20.0)
+"""Tilt of a robot on a floor that is worth a note, since the z axis may not point up [rad]."""
+_RECEIVED = 'to use the time of receipt set stamp = "received"'
 
 
 def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
@@ -35,10 +39,9 @@ def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream
     time = clock(stream, layout)
     zero = np.flatnonzero(time == 0)
     if len(zero) == len(time):
-        expected = 'stamps that count; to use the time of receipt say: stamp = "received"'
-        raise stream.error("every time stamp is zero", expected)
+        raise stream.error("every time stamp is zero", f"stamps that count; {_RECEIVED}")
     if len(zero):
-        expected = 'a stamp in every message; to use the time of receipt say: stamp = "received"'
+        expected = f"a stamp in every message; {_RECEIVED}"
         raise stream.error("the time stamp is zero", expected, int(zero[0]))
     steps = np.diff(time)
     if (steps > 0).all():
@@ -49,7 +52,7 @@ def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream
         found = f"the clock jumps back by {late[jumps[0]] / 1e9:.3g} s"
         expected = (
             f"messages late by at most max_disorder = {layout.max_disorder:g} s; was the clock "
-            'set, or a recording added? To use the time of receipt say: stamp = "received"'
+            f"set, or a recording added? Else {_RECEIVED}"
         )
         raise stream.error(found, expected, int(jumps[0]))
     if disordered := int((late > 0).sum()):
@@ -58,7 +61,7 @@ def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream
             f"{late.max() / 1e9:.3g} s were sorted"
         )
     order = np.argsort(time, kind="stable")
-    # of messages with one stamp the last one stands
+    # the last of several messages with the same stamp is kept
     last = np.append(np.diff(time[order]) != 0, True)
     if repeated := int((~last).sum()):
         notes.append(
@@ -72,11 +75,6 @@ def clock(stream: Stream, layout: BagLayout) -> Int[np.ndarray, " row"]:
     if layout.stamp == "header" and stream.stamp is not None:
         return stream.stamp
     return stream.received
-
-
-def seconds(time: Int[np.ndarray, " row"]) -> np.ndarray:
-    """Return nanoseconds in seconds, to the precision of a double."""
-    return time // 10**9 + (time % 10**9) / 1e9
 
 
 def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str]) -> None:
@@ -95,32 +93,24 @@ def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str])
             delays[stream.topic] = float(np.median(stream.received - stream.stamp)) / 1e9
     if not bare or not delays or layout.stamp == "received":
         return
-    topic = max(delays, key=lambda name: abs(delays[name]))
-    apart = delays[topic]
-    others = ", ".join(sorted({s.topic for s in bare}))
+    topic, apart = max(delays.items(), key=lambda item: abs(item[1]))
+    others = ", ".join(sorted({stream.topic for stream in bare}))
+    found = (
+        f"stamps of {topic} differ by {apart:.3g} s from the time of receipt, the only time of "
+        f"{others}"
+    )
     if abs(apart) > APART_REFUSED:
-        raise DataError(
-            f"{bare[0].path}: stamps of {topic} differ by {apart:.3g} s from the time of receipt, "
-            f"which is all that {others} has; expected one clock for all: say "
-            'stamp = "received"'
-        )
+        expected = 'one clock for all: set stamp = "received"'
+        raise DataError(f"{bare[0].path}: {found}; expected {expected}")
     if abs(apart) > APART_NOTED:
-        notes.append(
-            f"stamps of {topic} differ by {apart:.3g} s from the time of receipt, "
-            f"which is all that {others} has"
-        )
-
-
-ABSURD = 1e30
-"""Number above any sensor's range, in whatever unit; the bag is damaged."""
-TILT_NOTED = np.radians(20.0)
-"""Tilt of a robot on a floor that is worth a note, since the z axis may not point up [rad]."""
+        notes.append(found)
 
 
 def signal_of(stream: Stream, layout: BagLayout) -> Signal:
     """Return the rows of a stream as in the messages, no unit converted, at their times."""
     source = SignalSource(stream.path, stream.columns, stream.number, stream.topic)
-    return Signal(seconds(clock(stream, layout)), stream.values, source)
+    seconds, nanoseconds = np.divmod(clock(stream, layout), 10**9)
+    return Signal(seconds + nanoseconds / 1e9, stream.values, source)
 
 
 def whole_signal(stream: Stream, layout: BagLayout, notes: list[str]) -> Signal:
@@ -213,7 +203,7 @@ def finite(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
     if bad.all() or not layout.drop_nan or not np.isnan(stream.values[rows]).any(axis=1).all():
         found = f"{stream.columns[j]} is {numbers[j]:.3g} here, the first of {len(rows)} such"
         found += f" among {len(bad)} messages"
-        expected = "numbers; to leave out messages with nan say: drop_nan = true"
+        expected = "numbers; to leave out messages with nan set drop_nan = true"
         if bad.all():
             expected = "numbers; does the driver fill this field in?"
         raise stream.error(found, expected, int(rows[0]))

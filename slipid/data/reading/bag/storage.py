@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from slipid.support.errors import bad_data
+from slipid.support.errors import bad_data, first_names
 
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
@@ -72,10 +72,8 @@ def files_of(path: Path) -> BagFiles:
     found = [p for p in path.iterdir() if re.search(r"\.(mcap|db3)(\.zstd)?$", p.name)]
     if not found:
         inside = sorted(p.name for p in path.iterdir())
-        listed = ", ".join(inside[:8] + ["..."] * (len(inside) > 8))
-        raise bad_data(
-            path, f"a folder without a .db3 or .mcap file ({listed or 'empty'})", EXPECTED
-        )
+        listed = first_names(inside, "empty")
+        raise bad_data(path, f"a folder without a .db3 or .mcap file ({listed})", EXPECTED)
     parts = tuple(sorted(found, key=_numbers_in_name))
     storage: Storage = "mcap" if ".mcap" in parts[0].name else "sqlite3"
     metadata = path / "metadata.yaml"

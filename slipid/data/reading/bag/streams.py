@@ -174,12 +174,9 @@ class TopicStreams:
         """Return the picked numbers of some messages of one shape."""
         columns = [np.zeros(len(block)) if p is None else p.of(block) for p in located.numbers]
         absent = np.tile([place is None for place in located.numbers], (len(block), 1))
-        stamp = None
-        if located.seconds is not None and located.nanoseconds is not None:
-            stamp = located.seconds.whole(block) * 10**9 + located.nanoseconds.whole(block)
-        values = np.column_stack(columns)
         where = (self.path, self.topic, pick.columns)
-        return Stream(*where, stamp, received, number, values, absent)
+        values = np.column_stack(columns)
+        return Stream(*where, located.stamp(block), received, number, values, absent)
 
 
 def _concatenated(parts: Sequence[np.ndarray], none: np.ndarray) -> np.ndarray:

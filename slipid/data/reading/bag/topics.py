@@ -14,9 +14,8 @@ import numpy as np
 
 from slipid.data.reading.bag.definitions import MessageType, definition_of
 from slipid.data.reading.bag.layout import GROUPS, BagLayout
-from slipid.data.reading.bag.meanings import JOINT_STATE, fits
 from slipid.data.reading.bag.opened import OpenBag, StoredTopic, open_bag
-from slipid.data.reading.bag.plan import ChannelPlan, plan
+from slipid.data.reading.bag.plan import JOINT_STATE, ChannelPlan, fits, plan
 from slipid.data.reading.bag.runs import RunSpan, run_spans
 from slipid.data.reading.bag.shape import MessageShape, edges_of, shape_of, steps_of
 from slipid.data.reading.bag.signals import channel_signal, check_clocks, group_signals

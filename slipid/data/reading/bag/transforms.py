@@ -8,11 +8,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from slipid.data.reading.bag.definitions import MessageType
-from slipid.data.reading.bag.meanings import first_names
 from slipid.data.reading.bag.opened import OpenBag
 from slipid.data.reading.bag.shape import Edge, Located, MessageShape, edges_of
 from slipid.data.reading.bag.streams import TopicStreams, topic_error
-from slipid.support.errors import did_you_mean
+from slipid.support.errors import did_you_mean, first_names
 
 STATIC = "_static"
 """Suffix of the topic of constant transforms beside `/tf`."""

@@ -1,1 +1,1 @@
-"""Telling the floor from wheels, currents and a gyro: slipid's floor filter beside classifiers."""
+"""Floors by wheels, currents and a gyro: slipid's floor filter beside other classifiers."""

@@ -110,14 +110,12 @@ def after_seconds(
     for seconds in sorted({a.seconds for a in answers}):
         take = [k for k, a in enumerate(answers) if a.seconds == seconds]
         mine = [answers[k] for k in take]
-        other = None if rival is None else [rival[k] for k in take]
-        out.append(_after(seconds, mine, other))
+        out.append(_after(mine, None if rival is None else [rival[k] for k in take]))
     return tuple(out)
 
 
-def _after(
-    seconds: float, answers: Sequence[Answer], rival: Sequence[Answer] | None
-) -> AfterSeconds:
+def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> AfterSeconds:
+    """Return the accuracy by answers after the same time."""
     right = np.array([a.named == a.floor for a in answers], dtype=float)
     # whole runs are resampled, floor by floor
     run = np.unique([a.run for a in answers], return_inverse=True)[1]
@@ -128,7 +126,7 @@ def _after(
         theirs = np.array([a.named == a.floor for a in rival], dtype=float)
         behind = mean_interval(by.over_all(right - theirs))
     return AfterSeconds(
-        seconds=seconds,
+        seconds=answers[0].seconds,
         stretches=len(answers),
         accuracy=mean_interval(by.over_all(right)),
         balanced=mean_interval(by.mean(right)),

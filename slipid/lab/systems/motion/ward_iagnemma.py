@@ -17,7 +17,7 @@ Newton's method with the analytic Jacobian. The filter measures gyro = W + b, an
 `ward_iagnemma_current` also n C_e I_i / r = k sgn(w_i) T_i + f of every wheel that drives. A weak
 constraint keeps rho in its range: where rho is below 0, so that the force would push, or above
 C1 / (1 + c |p|), so that no traction could overcome it, a measurement with a tenth of rho's spread
-pulls it to that bound.
+moves it to that bound.
 
 A robot counts as immobilised where |v| < 0.2 of its wheels' twist, for 0.4 s. The score of
 slipping is 1 - |v| / |v by the wheels|, where turning is weighted by the base radius.

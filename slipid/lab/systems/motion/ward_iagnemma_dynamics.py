@@ -83,19 +83,6 @@ class DynamicsStep:
 
 
 @dataclass(frozen=True, eq=False)
-class NewtonIterate:
-    """Speeds after one Newton step.
-
-    Attributes:
-        speeds: iterate of q [m/s].
-        done: runs whose equation is solved.
-    """
-
-    speeds: Speeds
-    done: Bool[np.ndarray, " run"]
-
-
-@dataclass(frozen=True, eq=False)
 class Dynamics:
     """A robot on a floor.
 
@@ -169,8 +156,9 @@ class Dynamics:
         """Return q' of backward Euler, q' = q + dt a(q'), by Newton's method for each run."""
         solution, todo = speeds.copy(), np.arange(len(speeds))
         for _ in range(_MOST_STEPS):
-            nearer = self._nearer(solution[todo], speeds[todo], rolling[todo], rim[todo], dt[todo])
-            solution[todo], todo = nearer.speeds, todo[~nearer.done]
+            args = speeds[todo], rolling[todo], rim[todo], dt[todo]
+            solution[todo], done = self._newton(solution[todo], *args)
+            todo = todo[~done]
             if len(todo) == 0:
                 break
         at, wait = self.acceleration(solution, rolling, rim), dt[:, None]
@@ -179,10 +167,10 @@ class Dynamics:
             solution, inverse, (inverse @ (wait * at.by_rolling)[..., None])[..., 0]
         )
 
-    def _nearer(
+    def _newton(
         self, q: Speeds, start: Speeds, rolling: Each, rim: Drives, dt: Each
-    ) -> "NewtonIterate":
-        """Return one step of Newton's method from q.
+    ) -> tuple[Speeds, Bool[np.ndarray, " run"]]:
+        """Return speeds after one step of Newton's method from q, and the runs that are solved.
 
         Traction and resistance flatten out, so that the step may overshoot. Where the residual does
         not fall, the secants' step is used instead: apart from the turning axes, the forces have a
@@ -198,7 +186,7 @@ class Dynamics:
         if worse.any():
             secants = self.acceleration(q, rolling, rim, secant=True).slope
             trial = np.where(worse[:, None], q - solved(wait, secants, residual), trial)
-        return NewtonIterate(trial, done)
+        return trial, done
 
 
 def solved(
@@ -214,7 +202,7 @@ _DRIVING = 0.3
 
 @dataclass(frozen=True, eq=False)
 class PaddedRuns:
-    """Runs side by side, padded to the same number of steps with steps of no time.
+    """Runs side by side, padded to the same number of steps with steps of zero duration.
 
     Attributes:
         dt: duration of each step [s], 0 in padding.

@@ -1,4 +1,4 @@
-"""Messages of one's own: numbers by the paths of their fields."""
+"""Custom message types are read by the paths of their fields."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_plain_arrays_and_numbers(tmp_path):
 
 def test_a_pose_inside_a_message_of_ones_own(tmp_path):
     text = {"my_msgs/msg/Seen": "std_msgs/Header header\ngeometry_msgs/Pose robot\nfloat32 x\n"}
-    said = [
+    messages = [
         Message(
             "/seen",
             "my_msgs/msg/Seen",
@@ -116,22 +116,22 @@ def test_a_pose_inside_a_message_of_ones_own(tmp_path):
         )
         for t in TIME.tolist()
     ]
-    path = bag(tmp_path, "mcap", said, definitions=text)
+    path = bag(tmp_path, "mcap", messages, definitions=text)
     run = read(path, topics={"pose": {"topic": "/seen", "field": "robot"}})
     np.testing.assert_allclose(run.signals["pose_x"].values[:, 0], TIME - TIME[0], atol=1e-6)
     np.testing.assert_allclose(run.signals["pose_heading"].values, 0.5)
 
 
 def test_standard_types_need_no_definition_in_the_bag(tmp_path):
-    said = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
-    path = without_definitions(bag(tmp_path, "sqlite3", said))
+    messages = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
+    path = without_definitions(bag(tmp_path, "sqlite3", messages))
     run = read(path, topics={"wheel_angle": {"topic": "/joint_states"}})
     np.testing.assert_allclose(run.signals["wheel_angle"].values, ANGLE)
 
 
 @pytest.mark.slow
 def test_messages_with_ever_new_texts_are_read_too(tmp_path):
-    said = [
+    messages = [
         Message(
             "/joint_states",
             "sensor_msgs/msg/JointState",
@@ -141,19 +141,19 @@ def test_messages_with_ever_new_texts_are_read_too(tmp_path):
         for k, t in enumerate(TIME.tolist())
     ]
     topics = {"wheel_angle": {"topic": "/joint_states"}}
-    run = read(bag(tmp_path, "mcap", said), joints=("left",), topics=topics)
+    run = read(bag(tmp_path, "mcap", messages), joints=("left",), topics=topics)
     np.testing.assert_array_equal(run.signals["wheel_angle"].values[:, 0], np.arange(len(TIME)))
 
 
 def test_a_topic_for_each_motor(tmp_path):
     straight = TIME - TIME[0]
-    said = [
+    messages = [
         Message(f"/amps{j}", "std_msgs/msg/Float64", {"data": j + k * float(s)}, float(TIME[0] + s))
         for j, (k, times) in enumerate([(1.0, straight[::2]), (-3.0, straight)])
         for s in times
     ]
     topics = {"current": {"topic": ["/amps0", "/amps1"], "unit": "A"}}
-    signal = read(bag(tmp_path, "mcap", said), topics=topics).signals["current"]
+    signal = read(bag(tmp_path, "mcap", messages), topics=topics).signals["current"]
     s = straight[::2]
     np.testing.assert_allclose(signal.time, TIME[0] + s, rtol=0, atol=RESOLUTION)
     np.testing.assert_allclose(signal.values, np.column_stack([s, 1.0 - 3.0 * s]), atol=1e-6)

@@ -1,4 +1,4 @@
-"""What is refused, in words that say what is there and what to do."""
+"""Errors about bags say what is there and what to do."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ def commands(time=TIME):
     return [Message("/cmd_vel", "geometry_msgs/msg/Twist", {}, t) for t in time.tolist()]
 
 
-def refused(tmp_path, said, topics, *words, joints=("wheel_left", "wheel_right"), **given):
+def refused(tmp_path, messages, topics, *words, joints=("wheel_left", "wheel_right"), **given):
     options = {name: given.pop(name) for name in ("definitions", "empty") if name in given}
-    path = write_bag(tmp_path / "bag", given.pop("storage", "mcap"), said, **options)
+    path = write_bag(tmp_path / "bag", given.pop("storage", "mcap"), messages, **options)
     layout = declared_bag_layout({"joints": list(joints), "topics": topics, **given}, "layout")
     with pytest.raises(DataError) as caught:
         read_bag(path, layout)
@@ -62,8 +62,8 @@ def refused(tmp_path, said, topics, *words, joints=("wheel_left", "wheel_right")
     assert all(word in text for word in words), text
 
 
-def accepted(tmp_path, said, topics, **given):
-    path = write_bag(tmp_path / "bag", "mcap", said)
+def accepted(tmp_path, messages, topics, **given):
+    path = write_bag(tmp_path / "bag", "mcap", messages)
     joints = ["wheel_left", "wheel_right"]
     layout = declared_bag_layout({"joints": joints, "topics": topics, **given}, "layout")
     (run,) = read_bag(path, layout)
@@ -74,10 +74,12 @@ def accepted(tmp_path, said, topics, **given):
 
 
 def test_a_missing_topic_is_answered_with_near_names_and_fitting_topics(tmp_path):
-    said = in_order(wheels(), imu(), wheels(topic="/arm/states"))
+    messages = in_order(wheels(), imu(), wheels(topic="/arm/states"))
     topics = {"wheel_angle": {"topic": "/joint_state"}}
     words = ("no topic '/joint_state' for wheel_angle", "did you mean /joint_states")
-    refused(tmp_path, said, topics, *words, "one of /arm/states, /joint_states, which hold such")
+    refused(
+        tmp_path, messages, topics, *words, "one of /arm/states, /joint_states, which hold such"
+    )
 
 
 def test_where_no_topic_fits_all_are_listed(tmp_path):
@@ -163,15 +165,15 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
     ],
 )
 def test_types_and_fields_that_do_not_fit(tmp_path, channel, spec, words):
-    said = in_order(wheels(), imu(), poses())
-    refused(tmp_path, said, {channel: spec}, *words)
+    messages = in_order(wheels(), imu(), poses())
+    refused(tmp_path, messages, {channel: spec}, *words)
 
 
 def test_odometry_is_no_command(tmp_path):
     name = "nav_msgs/msg/Odometry"
-    said = [Message("/odom", name, pose_fields(name, t, 0, 0, 0), t) for t in TIME.tolist()]
+    messages = [Message("/odom", name, pose_fields(name, t, 0, 0, 0), t) for t in TIME.tolist()]
     words = ("the measured twist", "the commanded twist")
-    refused(tmp_path, said, {"twist_command": {"topic": "/odom"}}, *words)
+    refused(tmp_path, messages, {"twist_command": {"topic": "/odom"}}, *words)
 
 
 # joints
@@ -206,7 +208,7 @@ def test_an_array_of_joints_that_is_left_empty(tmp_path):
 
 
 def test_channels_that_disagree_on_the_number_of_wheels(tmp_path):
-    said = in_order(
+    messages = in_order(
         wheels(),
         [
             Message("/amps", "std_msgs/msg/Float32MultiArray", {"data": [1.0, 2.0, 3.0]}, t)
@@ -217,16 +219,18 @@ def test_channels_that_disagree_on_the_number_of_wheels(tmp_path):
         "wheel_angle": {"topic": "/joint_states"},
         "current": {"topic": "/amps", "unit": "A"},
     }
-    refused(tmp_path, said, topics, "2 in wheel_angle, 3 in current", "by index", stamp="received")
+    refused(
+        tmp_path, messages, topics, "2 in wheel_angle, 3 in current", "by index", stamp="received"
+    )
 
 
 def test_an_array_that_changes_its_length(tmp_path):
-    said = [
+    messages = [
         Message("/amps", "std_msgs/msg/Float32MultiArray", {"data": [1.0] * (2 + (k == 17))}, t)
         for k, t in enumerate(TIME.tolist())
     ]
     topics = {"current": {"topic": "/amps", "unit": "A"}}
-    refused(tmp_path, said, topics, "message 18", "3 numbers, and 2 of them before")
+    refused(tmp_path, messages, topics, "message 18", "3 numbers, and 2 of them before")
 
 
 # numbers
@@ -250,22 +254,24 @@ def test_all_poses_without_numbers(tmp_path):
 
 
 def test_a_quaternion_that_is_not_filled_in(tmp_path):
-    said = [
+    messages = [
         Message("/pose", POSE, {"header": header(t), "pose": {"position": vector(t)}}, t)
         for t in TIME.tolist()
     ]
-    refused(tmp_path, said, {"pose": {"topic": "/pose"}}, "quaternion of length 0", "filled in?")
+    refused(
+        tmp_path, messages, {"pose": {"topic": "/pose"}}, "quaternion of length 0", "filled in?"
+    )
 
 
 # clocks
 
 
 def test_stamps_that_are_all_zero(tmp_path):
-    said = imu(stamps=np.zeros(len(TIME)))
+    messages = imu(stamps=np.zeros(len(TIME)))
     topics = {"gyro": {"topic": "/imu"}}
     words = ("topic '/imu'", "every time stamp is zero", 'stamp = "received"')
-    refused(tmp_path, said, topics, *words)
-    run = accepted(tmp_path / "kept", said, topics, stamp="received")
+    refused(tmp_path, messages, topics, *words)
+    run = accepted(tmp_path / "kept", messages, topics, stamp="received")
     np.testing.assert_allclose(run.signals["gyro"].time, TIME, rtol=0, atol=1e-6)
 
 
@@ -301,12 +307,12 @@ def test_of_messages_with_one_stamp_the_last_stands(tmp_path):
     assert "1 messages with the stamp of another left out" in run.notes[0]
 
 
-@pytest.mark.parametrize(("apart", "said"), [(0.2, 0), (3.0, 1)])
-def test_two_clocks_are_compared(tmp_path, apart, said):
+@pytest.mark.parametrize(("apart", "notes"), [(0.2, 0), (3.0, 1)])
+def test_two_clocks_are_compared(tmp_path, apart, notes):
     messages = in_order(imu(stamps=TIME - apart), commands())
     topics = {"gyro": {"topic": "/imu"}, "twist_command": {"topic": "/cmd_vel"}}
     run = accepted(tmp_path, messages, topics)
-    assert len(run.notes) == said
+    assert len(run.notes) == notes
     assert all("/imu differ by 3 s" in note and "/cmd_vel" in note for note in run.notes)
 
 
@@ -321,8 +327,10 @@ def test_two_clocks_that_have_nothing_in_common(tmp_path):
 
 def test_a_definition_that_is_nowhere(tmp_path):
     text = {"my_msgs/msg/Amps": "my_msgs/Inner inner\n", "my_msgs/msg/Inner": "float32 x\n"}
-    said = [Message("/amps", "my_msgs/msg/Amps", {"inner": {"x": 1.0}}, t) for t in TIME.tolist()]
-    path = without_definitions(write_bag(tmp_path / "bag", "sqlite3", said, text))
+    messages = [
+        Message("/amps", "my_msgs/msg/Amps", {"inner": {"x": 1.0}}, t) for t in TIME.tolist()
+    ]
+    path = without_definitions(write_bag(tmp_path / "bag", "sqlite3", messages, text))
     topics = {"current": {"topic": "/amps", "field": "inner.x", "unit": "A"}}
     with pytest.raises(
         DataError, match=r"no definition of my_msgs/msg/Amps in the bag; .*definitions = "

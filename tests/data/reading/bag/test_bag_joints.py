@@ -1,4 +1,4 @@
-"""Joints by their names, in messages and topics of any order."""
+"""Joints are found by their names, in messages and topics of any order."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_joints_are_found_by_name_in_any_order(tmp_path):
 
 
 def with_arm(angle):
-    """Columns arm, right, left."""
+    """Return columns arm, right, left."""
     return np.column_stack([np.full(len(angle), 99.0), angle[:, 1], angle[:, 0]])
 
 
@@ -53,10 +53,10 @@ def test_joints_in_messages_of_their_own_are_laid_side_by_side(tmp_path):
 
 
 def test_a_message_without_one_of_the_joints_is_left_out_with_a_note(tmp_path):
-    said = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
-    said[7] = joint_states("/joint_states", TIME[7:8], ["left"], position=ANGLE[7:8, :1])[0]
+    messages = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
+    messages[7] = joint_states("/joint_states", TIME[7:8], ["left"], position=ANGLE[7:8, :1])[0]
     topics = {"wheel_angle": {"topic": "/joint_states"}}
-    run = read(bag(tmp_path, "mcap", said), topics=topics)
+    run = read(bag(tmp_path, "mcap", messages), topics=topics)
     np.testing.assert_allclose(run.signals["wheel_angle"].values, np.delete(ANGLE, 7, axis=0))
     assert "1 messages without all of left, right" in run.notes[0]
 
@@ -74,9 +74,9 @@ def test_a_message_without_one_of_the_joints_is_left_out_with_a_note(tmp_path):
     ],
 )
 def test_what_effort_may_mean(tmp_path, channel, unit, factor):
-    said = joint_states("/joint_states", TIME, ["left", "right"], effort=ANGLE)
+    messages = joint_states("/joint_states", TIME, ["left", "right"], effort=ANGLE)
     topics = {channel: {"topic": "/joint_states", "field": "effort", "unit": unit}}
-    run = read(bag(tmp_path, "mcap", said), topics=topics, torque_constant=0.05)
+    run = read(bag(tmp_path, "mcap", messages), topics=topics, torque_constant=0.05)
     np.testing.assert_allclose(run.signals[channel].values, ANGLE * factor)
 
 

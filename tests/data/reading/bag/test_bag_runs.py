@@ -18,10 +18,10 @@ FLICKER = 1e-3 * (np.arange(len(TIME)) % 2)
 ANGLE = np.column_stack([PHASE + FLICKER, -2 * PHASE])
 
 
-def runs(tmp_path, rule, *said, storage="mcap", topics=None, **given):
+def runs(tmp_path, rule, *messages, storage="mcap", topics=None, **given):
     topics = topics or {"wheel_angle": {"topic": "/joint_states"}}
     wheels = joint_states("/joint_states", TIME, ["l", "r"], position=ANGLE, velocity=speed())
-    path = write_bag(tmp_path / f"bag{SUFFIX[storage]}", storage, in_order(wheels, *said))
+    path = write_bag(tmp_path / f"bag{SUFFIX[storage]}", storage, in_order(wheels, *messages))
     table = {"joints": ["l", "r"], "topics": topics, "runs": rule, **given}
     return read_bag(path, declared_bag_layout(table, "layout"))
 
@@ -43,34 +43,36 @@ def markers(name, values):
 
 @pytest.mark.parametrize("storage", STORAGES)
 def test_a_bool_marks_begin_and_end(tmp_path, storage):
-    said = markers("Bool", [(1, True), (3, True), (8, False), (9, False), (11, True), (18, False)])
-    found = runs(tmp_path, {"topic": "/run"}, said, storage=storage)
+    messages = markers(
+        "Bool", [(1, True), (3, True), (8, False), (9, False), (11, True), (18, False)]
+    )
+    found = runs(tmp_path, {"topic": "/run"}, messages, storage=storage)
     assert spans(found) == [("#01", 1.0, 7.98), ("#02", 11.0, 17.98)]
 
 
 def test_a_value_lasts_until_it_changes(tmp_path):
-    said = markers("Int32", [(0.5, 1), (1, 1), (10, 2), (20, 0), (21, 3)])
-    found = runs(tmp_path, {"topic": "/run"}, said)
+    messages = markers("Int32", [(0.5, 1), (1, 1), (10, 2), (20, 0), (21, 3)])
+    found = runs(tmp_path, {"topic": "/run"}, messages)
     assert spans(found) == [("#01", 0.5, 9.98), ("#02", 10.0, 19.98), ("#03", 21.0, 29.98)]
 
 
 def test_a_counter_from_zero(tmp_path):
-    said = markers("Int32", [(1, 0), (10, 1)])
-    found = runs(tmp_path, {"topic": "/run", "between": []}, said)
+    messages = markers("Int32", [(1, 0), (10, 1)])
+    found = runs(tmp_path, {"topic": "/run", "between": []}, messages)
     assert spans(found) == [("#01", 1.0, 9.98), ("#02", 10.0, 29.98)]
 
 
 def test_a_text_may_name_the_floor(tmp_path):
-    said = markers("String", [(1, "gray"), (8, ""), (11, "green"), (18, "stop")])
+    messages = markers("String", [(1, "gray"), (8, ""), (11, "green"), (18, "stop")])
     rule = {"topic": "/run", "surface": "data", "between": ["", "stop"]}
-    found = runs(tmp_path, rule, said)
+    found = runs(tmp_path, rule, messages)
     assert spans(found) == [("#01", 1.0, 7.98), ("#02", 11.0, 17.98)]
     assert [(one.surface, one.load) for one in found] == [("gray", None), ("green", None)]
 
 
 def test_fields_of_a_marker_name_floor_and_load(tmp_path):
     text = {"my_msgs/msg/Run": "std_msgs/Header header\nuint8 trial\nstring floor\nstring load\n"}
-    said = [
+    messages = [
         Message(
             "/run",
             "my_msgs/msg/Run",
@@ -80,7 +82,7 @@ def test_fields_of_a_marker_name_floor_and_load(tmp_path):
         for t, n, floor in ((1, 1, "gray"), (10, 2, "gray"), (20, 2, "green"))
     ]
     wheels = joint_states("/joint_states", TIME, ["l", "r"], position=ANGLE)
-    path = write_bag(tmp_path / "bag", "mcap", in_order(wheels, said), definitions=text)
+    path = write_bag(tmp_path / "bag", "mcap", in_order(wheels, messages), definitions=text)
     rule = {"topic": "/run", "field": "trial", "surface": "floor", "load": "load"}
     table = {"joints": ["l", "r"], "topics": {"wheel_angle": {"topic": "/joint_states"}}}
     found = read_bag(path, declared_bag_layout({**table, "runs": rule}, "layout"))
@@ -145,7 +147,7 @@ def test_wrong_tables(tmp_path, text, words):
 
 
 @pytest.mark.parametrize(
-    ("rule", "said", "words"),
+    ("rule", "messages", "words"),
     [
         ({"topic": "/ran"}, [(1, True)], ("no topic '/ran'", "did you mean /run")),
         ({"topic": "/run", "field": "on"}, [(1, True)], ("no field 'on'", "one of data")),
@@ -154,9 +156,9 @@ def test_wrong_tables(tmp_path, text, words):
         ({"pause_s": 1.0}, [(1, True)], ("no wheel moves", "0.02 rad")),
     ],
 )
-def test_no_runs(tmp_path, rule, said, words, monkeypatch):
+def test_no_runs(tmp_path, rule, messages, words, monkeypatch):
     if "pause_s" in rule:
         monkeypatch.setattr(f"{__name__}.ANGLE", np.zeros((len(TIME), 2)))
     with pytest.raises(DataError) as caught:
-        runs(tmp_path, rule, markers("Bool", said))
+        runs(tmp_path, rule, markers("Bool", messages))
     assert all(word in str(caught.value) for word in words), caught.value

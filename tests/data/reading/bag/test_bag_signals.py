@@ -22,7 +22,7 @@ from tests.helpers.one_bag import ANGLE, RESOLUTION, TIME, bag, read
 
 @pytest.mark.parametrize("storage", STORAGES)
 def test_joint_states_come_back(tmp_path, storage):
-    said = joint_states(
+    messages = joint_states(
         "/joint_states", TIME, ["left", "right"], position=ANGLE, velocity=-ANGLE, effort=ANGLE / 7
     )
     topics = {
@@ -30,7 +30,7 @@ def test_joint_states_come_back(tmp_path, storage):
         "motor_speed": {"topic": "/joint_states", "scale": [1.0, -1.0]},
         "current": {"topic": "/joint_states", "field": "effort", "unit": "mA"},
     }
-    run = read(bag(tmp_path, storage, said), topics=topics)
+    run = read(bag(tmp_path, storage, messages), topics=topics)
     assert run.name_suffix == ""
     assert run.notes == ()
     for name, values in (
@@ -58,11 +58,11 @@ def test_joint_states_come_back(tmp_path, storage):
 )
 def test_poses_come_back(tmp_path, storage, name):
     heading = np.linspace(2.0, 9.0, len(TIME))  # beyond the half turn
-    said = [
+    messages = [
         Message("/pose", name, pose_fields(name, t, x, -x, h), t + 0.01)
         for t, x, h in zip(TIME.tolist(), ANGLE[:, 0].tolist(), heading.tolist(), strict=True)
     ]
-    run = read(bag(tmp_path, storage, said), topics={"pose": {"topic": "/pose"}})
+    run = read(bag(tmp_path, storage, messages), topics={"pose": {"topic": "/pose"}})
     assert list(run.signals) == ["pose_x", "pose_y", "pose_heading"]
     x, y, turn = (signal.values[:, 0] for signal in run.signals.values())
     np.testing.assert_allclose(x, ANGLE[:, 0], atol=1e-12)
@@ -139,16 +139,16 @@ def readings(t, k):
     ],
 )
 def test_compressed_bags(tmp_path, storage, compression):
-    said = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
-    path = bag(tmp_path, storage, said, compression=compression)
+    messages = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
+    path = bag(tmp_path, storage, messages, compression=compression)
     run = read(path, topics={"wheel_angle": {"topic": "/joint_states"}})
     np.testing.assert_allclose(run.signals["wheel_angle"].values, ANGLE, rtol=1e-14)
 
 
 def test_a_bag_is_named_by_its_file_its_folder_or_its_metadata(tmp_path):
-    said = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
+    messages = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
     for storage, suffix in (("sqlite3", "db3"), ("mcap", "mcap")):
-        folder = write_bag(tmp_path / storage, storage, said)
+        folder = write_bag(tmp_path / storage, storage, messages)
         topics = {"wheel_angle": {"topic": "/joint_states"}}
         (file,) = folder.glob(f"*.{suffix}")
         runs = [read(path, topics=topics) for path in (folder, folder / "metadata.yaml", file)]
@@ -160,11 +160,11 @@ def test_a_bag_is_named_by_its_file_its_folder_or_its_metadata(tmp_path):
 def test_the_hash_is_what_sha256sum_prints(tmp_path):
     import hashlib
 
-    said = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
+    messages = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
     topics = {"wheel_angle": {"topic": "/joint_states"}}
-    file = write_bag(tmp_path / "bag.bag", "rosbag1", said)
+    file = write_bag(tmp_path / "bag.bag", "rosbag1", messages)
     assert read(file, topics=topics).sha256 == hashlib.sha256(file.read_bytes()).hexdigest()
-    folder = write_bag(tmp_path / "bag", "mcap", said)
+    folder = write_bag(tmp_path / "bag", "mcap", messages)
     files = sorted(folder.iterdir())
     lines = "".join(f"{hashlib.sha256(f.read_bytes()).hexdigest()}  {f.name}\n" for f in files)
     assert read(folder, topics=topics).sha256 == hashlib.sha256(lines.encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""A look into a bag: what its topics hold."""
+"""Topics of a bag are listed with their fields, joints, frames and channels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ANGLE = np.zeros((len(TIME), 2))
 
 
 @pytest.fixture
-def said():
+def messages():
     motors = [
         Message(
             "/motors",
@@ -49,9 +49,9 @@ def said():
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-def test_topics_tell_what_they_hold(tmp_path, storage, said):
+def test_topics_are_described(tmp_path, storage, messages):
     empty = {"/imu": "sensor_msgs/msg/Imu"} if storage != "rosbag1" else {}
-    path = write_bag(tmp_path / f"bag{SUFFIX[storage]}", storage, said, ROBOTINO, empty)
+    path = write_bag(tmp_path / f"bag{SUFFIX[storage]}", storage, messages, ROBOTINO, empty)
     topics = {topic.name: topic for topic in topics_of(path)}
     assert topics.keys() == {"/cmd", "/joint_states", "/motors", "/tf", *empty}
     joints = topics["/joint_states"]
@@ -75,8 +75,8 @@ def test_topics_tell_what_they_hold(tmp_path, storage, said):
         assert (topics[name].count, topics[name].first, topics[name].fields) == (0, None, ())
 
 
-def test_a_type_that_is_defined_nowhere_is_a_problem_of_its_topic_alone(tmp_path, said):
-    path = without_definitions(write_bag(tmp_path / "bag", "sqlite3", said, ROBOTINO))
+def test_a_type_that_is_defined_nowhere_is_a_problem_of_its_topic_alone(tmp_path, messages):
+    path = without_definitions(write_bag(tmp_path / "bag", "sqlite3", messages, ROBOTINO))
     topics = {topic.name: topic for topic in topics_of(path)}
     assert topics["/joint_states"].joints == ("l", "r")
     assert topics["/motors"].count == 100

@@ -24,7 +24,7 @@ TIME = 100.0 + np.arange(0.0, 5.0, 0.02)
 TF = "tf2_msgs/msg/TFMessage"
 
 
-def said(topic, *transforms, received):
+def message(topic, *transforms, received):
     return Message(topic, TF, {"transforms": list(transforms)}, received)
 
 
@@ -37,13 +37,13 @@ def pose_of(path, frame, child, topic="/tf"):
 
 @pytest.fixture
 def parts():
-    """map -> odom (10 Hz), odom -> base (50 Hz), base -> camera (static), and another robot."""
+    """Return map -> odom (10 Hz), odom -> base (50 Hz), base -> camera (static), another robot."""
     odom = [
-        said("/tf", transform(t, "map", "odom", 1.0 + 0.1 * (t - 100), 2.0, 0.0), received=t)
+        message("/tf", transform(t, "map", "odom", 1.0 + 0.1 * (t - 100), 2.0, 0.0), received=t)
         for t in TIME[::5].tolist()
     ]
     base = [
-        said(
+        message(
             "/tf",
             transform(t, "elsewhere", "other", 5, 5, 5),
             transform(t, "odom", "base", t - 100, 0.5 * (t - 100), t - 100),
@@ -51,7 +51,9 @@ def parts():
         )
         for t in TIME.tolist()
     ]
-    camera = [said("/tf_static", transform(0.0, "/base", "/camera", 0.2, 0.1, pi / 2), received=99)]
+    camera = [
+        message("/tf_static", transform(0.0, "/base", "/camera", 0.2, 0.1, pi / 2), received=99)
+    ]
     return camera, odom, base
 
 
@@ -95,7 +97,7 @@ def test_a_frame_that_lies_on_its_side_is_noted(tmp_path):
     for t in TIME.tolist():
         one = transform(t, "mocap", "base", t, 0, 0)
         one["transform"] = {"translation": vector(t), "rotation": side}
-        messages.append(said("/tf", one, received=t))
+        messages.append(message("/tf", one, received=t))
     _, _, run = pose_of(write_bag(tmp_path / "bag", "mcap", messages), "mocap", "base")
     assert "tilts by up to 90 deg" in run.notes[0]
 

@@ -1,4 +1,4 @@
-"""Bags that are cut off, damaged, or none: read as far as they go, or refused in plain words."""
+"""Damaged bags are read up to the damage, or refused with a clear error."""
 
 from __future__ import annotations
 
@@ -42,19 +42,19 @@ def messages():
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A file of each storage."""
+    """Return a file of each storage."""
     folder = tmp_path_factory.mktemp("whole")
-    said = messages()
-    found = {"rosbag1": write_bag(folder / "bag.bag", "rosbag1", said)}
+    written = messages()
+    found = {"rosbag1": write_bag(folder / "bag.bag", "rosbag1", written)}
     for storage, suffix in (("sqlite3", "db3"), ("mcap", "mcap")):
-        found[storage] = next(write_bag(folder / storage, storage, said).glob(f"*.{suffix}"))
-    many = write_bag(folder / "chunks", "mcap", [*said, *filler()])
+        found[storage] = next(write_bag(folder / storage, storage, written).glob(f"*.{suffix}"))
+    many = write_bag(folder / "chunks", "mcap", [*written, *filler()])
     found["chunks"] = next(many.glob("*.mcap"))
     return found
 
 
 def filler():
-    """Two megabytes, so that an MCAP file has more than one chunk."""
+    """Return two megabytes, so that an MCAP file has more than one chunk."""
     pixels = np.zeros(300_000, dtype=np.uint8)
     return [
         Message("/camera", "sensor_msgs/msg/Image", {"data": pixels}, TIME[-1] + k)
@@ -138,8 +138,8 @@ def test_a_folder_without_metadata(tmp_path, whole, storage):
 
 
 def test_parts_of_a_recording_follow_each_other_by_number(tmp_path):
-    said = messages()
-    for number, half in ((9, said[: len(said) // 2]), (10, said[len(said) // 2 :])):
+    written = messages()
+    for number, half in ((9, written[: len(written) // 2]), (10, written[len(written) // 2 :])):
         folder = write_bag(tmp_path / f"part_{number}", "mcap", half)
         shutil.move(next(folder.glob("*.mcap")), tmp_path)
         shutil.rmtree(folder)
@@ -194,18 +194,18 @@ def test_a_bag_with_other_bytes_is_read_or_refused(tmp_path, whole, storage):
 
 
 def outcome(file):
-    """`read` or `refused`; anything else is an error that tells the user nothing."""
-    said = [outcome_of(lambda: read_bag(file, LAYOUT)), outcome_of(lambda: topics_of(file))]
-    for text in filter(None, said):
+    """Return `read` or `refused`; anything else is an error without information for the user."""
+    texts = [outcome_of(lambda: read_bag(file, LAYOUT)), outcome_of(lambda: topics_of(file))]
+    for text in filter(None, texts):
         assert str(file.parent) in text
         assert "expected " in text
         # a mistake of ours that would pass for a damaged bag
         assert "Type-check" not in text
-    return "read" if said[0] is None else "refused"
+    return "read" if texts[0] is None else "refused"
 
 
 def outcome_of(read):
-    """What the error says, None without one."""
+    """Return the text of the error, None without one."""
     try:
         read()
     except DataError as error:

@@ -130,7 +130,7 @@ def test_trees_with_the_driving_off_do_not_go_by_the_speed():
     assert believed(off) < 0.8
 
 
-def test_rows_of_trees_hear_what_their_names_say():
+def test_rows_of_trees_use_the_channels_of_their_names():
     plain, off, driving, vibration = tree_classifiers()
     assert [r.name for r in (plain, off, driving, vibration)] == [
         "boosted_trees",
@@ -236,7 +236,7 @@ def test_without_heat_a_coefficient_does_not_depend_on_how_fast_all_wheels_turn(
         assert np.allclose(one, other) == same
 
 
-def test_a_gaussian_treats_what_was_not_heard_as_the_mean():
+def test_a_gaussian_treats_missing_features_as_the_mean():
     runs = made_floor_runs({"grass": 2.0, "snow": 4.0})
     done = GaussianClassifier().fit(runs, HUSKY)
     deaf = replace(runs[0], gyro=np.full(60, np.nan))

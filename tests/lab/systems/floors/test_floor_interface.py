@@ -57,7 +57,7 @@ def test_a_row_without_a_likelihood_changes_nothing():
     assert np.isfinite(beliefs).all()
 
 
-def test_pieces_are_the_run_cut_up():
+def test_segments_are_the_run_cut_up():
     run = made_floor_run("grass", ahead(61), 2.0)
     segments = run.segments(2.0)
     assert [len(segment) for segment in segments] == [13, 13, 13, 13, 9]
@@ -80,7 +80,7 @@ def test_a_window_of_half_a_second_holds_two_rows_a_quarter_apart():
     assert TrailingWindow.of(0.25 * np.arange(5), 0.5).first.tolist() == [0, 0, 1, 2, 3]
 
 
-def test_windows_leave_out_what_was_not_heard():
+def test_windows_leave_out_missing_values():
     x = np.array([np.nan, 1.0, np.nan, 3.0])
     mean, std = TrailingWindow.of(np.arange(4.0), 10.0).mean_and_std(x)
     assert np.isnan(mean[0])
@@ -88,7 +88,7 @@ def test_windows_leave_out_what_was_not_heard():
     assert std[3] == pytest.approx(1.0)
 
 
-def test_features_are_of_the_channels_that_are_asked_for():
+def test_features_are_of_the_requested_channels():
     run = made_floor_run("grass", ahead(20), 2.0)
     other = replace(run, current=run.current + 1.0)
     driving = FeatureChannels(current=False, gyro=False)
@@ -111,7 +111,7 @@ def test_the_gyro_counts_as_what_it_falls_short_whichever_way_it_turns():
     assert features(left, HUSKY)[-1, -2] == pytest.approx(turn - 0.3)
 
 
-def test_features_of_a_run_heard_anew_are_those_of_its_pieces():
+def test_features_of_a_restarted_run_are_those_of_its_segments():
     run = made_floor_run("grass", ahead(61), 2.0)
     each = [features(segment, HUSKY) for segment in run.segments(2.0)]
     assert np.allclose(features(run, HUSKY, restart_s=2.0), np.concatenate(each), atol=1e-6)
@@ -138,7 +138,7 @@ def test_rows_to_train_on_are_apart_and_move():
     ],
     ids=lambda m: f"{m.name}{len(m.fitted)}" if isinstance(m, BoostedTreesClassifier) else m.name,
 )
-def test_what_is_heard_later_changes_no_belief(method):
+def test_later_signals_change_no_belief(method):
     runs = made_floor_runs({"grass": 2.0, "snow": 4.0})
     done = method.fit(runs, HUSKY)
     run = runs[0]
@@ -157,7 +157,7 @@ def test_what_is_heard_later_changes_no_belief(method):
 @pytest.mark.parametrize(
     "method", [GaussianClassifier(), CosineEnergyClassifier(), BoostedTreesClassifier(trees=20)]
 )
-def test_floors_that_differ_in_what_motors_draw_are_told(method):
+def test_floors_that_differ_in_current_are_classified(method):
     levels = {"grass": 2.0, "ice": 1.0, "snow": 4.0}
     done = method.fit(made_floor_runs(levels), HUSKY)
     assert done.labels == ("grass", "ice", "snow")
@@ -173,7 +173,7 @@ def test_floors_that_differ_in_what_motors_draw_are_told(method):
 @pytest.mark.parametrize(
     "method", [GaussianClassifier(), CosineEnergyClassifier(), BoostedTreesClassifier()]
 )
-def test_what_was_not_fitted_says_so(method):
+def test_an_unfitted_classifier_raises(method):
     with pytest.raises(ValueError, match="not fitted"):
         method.probability([made_floor_run("grass", ahead(), 2.0)], HUSKY)
     assert method.numbers == 0
@@ -187,7 +187,7 @@ def test_candidates_are_few_and_differ(method):
     assert len(set(map(repr, method.candidates()))) == len(method.candidates())
 
 
-def test_runs_without_a_gyro_are_heard_all_the_same():
+def test_runs_without_a_gyro_are_classified():
     runs = [
         made_floor_run(floor, ahead(), level, seed=k, gyro=False)
         for k, (floor, level) in enumerate([("grass", 2.0), ("snow", 4.0)] * 3)

@@ -52,7 +52,7 @@ def test_neurons_of_all_pairs_are_weighted_ridge_regressions():
         assert np.allclose(found, np.linalg.lstsq(tall, right, rcond=None)[0])
 
 
-def test_errors_of_neurons_are_those_of_what_they_say():
+def test_errors_of_neurons_are_those_of_their_outputs():
     x, y, weight = rows()
     layer = PairMoments.of(*rows(1)).solved(0.01)
     square = (layer.output(x) - y[:, None]) ** 2
@@ -87,7 +87,7 @@ def test_two_quadratics_of_other_inputs_take_two_layers():
     assert len(short.layers) == 1
 
 
-def test_growing_ends_where_the_unseen_half_gains_nothing():
+def test_growth_ends_where_the_held_out_half_does_not_improve():
     x, y, weight = rows(3, n=120, inputs=6)
     y = y + x[:, 0] * x[:, 1] + np.tanh(x[:, 2])
     in_a = np.arange(120) % 2 == 0
@@ -111,7 +111,7 @@ def test_growing_ends_where_the_unseen_half_gains_nothing():
     assert following >= (1 - GAIN) * errors[-1]
 
 
-def test_a_pruned_network_says_the_same():
+def test_a_pruned_network_has_the_same_output():
     rng = np.random.default_rng(5)
     sizes = [5, 7, 6, 4]
     layers = [
@@ -153,7 +153,7 @@ def test_older_evidence_fades_and_no_run_remembers_another():
     assert got[:, 0] == pytest.approx(expected)
 
 
-def test_networks_say_nothing_beyond_what_they_were_taught():
+def test_outputs_of_networks_are_clipped_to_the_training_range():
     x = np.random.default_rng(0).uniform([-1, -1, -3], [1, 1, 1], (100, 3))
     y = np.stack([x[:, 0] * x[:, 1], x[:, 2] ** 2], axis=1)
     networks = NetworkSet.grown(x, y, np.ones(100), np.arange(100) % 2 == 0, EXACT)
@@ -186,7 +186,7 @@ def error(said, run: Run) -> float:
     return float(np.hypot(*(said.path - path_of(run.twist, run.signals.dt))[-1, :2]))
 
 
-def test_floors_are_told_by_currents_and_slip_is_that_of_the_floor(classes):
+def test_floors_are_classified_by_currents_and_slip_is_that_of_the_floor(classes):
     for floor in ("gray", "ice"):
         new = slipping(1.1, floor, seed=7).with_floor(False)
         (said,) = classes.predict([new.signals], ROBOTINO)
@@ -198,7 +198,7 @@ def test_floors_are_told_by_currents_and_slip_is_that_of_the_floor(classes):
         assert error(said, new) < 0.02 * 0.8
 
 
-def test_a_floor_that_is_told_is_used_if_it_was_seen(classes):
+def test_a_given_floor_is_used_if_it_was_trained_on(classes):
     new = slipping(1.1, "gray", seed=7)
     wrong = replace(new, signals=replace(new.signals, floor="ice"))
     unseen = replace(new, signals=replace(new.signals, floor="sand"))
@@ -211,7 +211,7 @@ def test_a_floor_that_is_told_is_used_if_it_was_seen(classes):
     assert said[1].floors["gray"][-1] > 0.95
 
 
-def test_floors_are_told_without_what_comes_later(classes):
+def test_floors_are_classified_without_later_signals(classes):
     whole = slipping(1.1, "gray", seed=7).signals
     other = slipping(1.1, "ice", seed=7).signals
     mixed = np.concatenate([whole.current[:20], other.current[20:]])
@@ -220,7 +220,7 @@ def test_floors_are_told_without_what_comes_later(classes):
     assert second.floors["ice"][-1] > 0.5 > first.floors["ice"][-1]
 
 
-def test_a_floor_that_was_never_seen_with_this_load_is_left_out():
+def test_a_floor_without_training_runs_in_this_load_is_left_out():
     loads = {"gray": "moved", "ice": "as_built"}
     runs = [replace(run, signals=replace(run.signals, load=loads[run.floor])) for run in RUNS]
     method = GmdhClass().fit(runs, ROBOTINO)

@@ -19,7 +19,8 @@ from slipid.lab.systems.motion.learners import (
     BoostedTrees,
     NeuralNetwork,
 )
-from slipid.predict.slip_model import ByFloor, Run, path_of
+from slipid.predict.slip_model import Run, path_of
+from slipid.predict.slip_models import ByFloor
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
 SIZES = np.array([1.0, 1.0, 0.125])
@@ -106,7 +107,7 @@ def test_values_of_windows_are_those_of_their_steps():
     assert second[:, 0].tolist() == [3.0] * 7
 
 
-def test_scaled_columns_have_no_mean_and_unit_spread_and_end_where_nothing_was_seen():
+def test_scaled_columns_have_zero_mean_and_unit_std_and_are_clipped():
     x = np.random.default_rng(0).normal([1.0, -2.0], [3.0, 0.1], (500, 2))
     scale = Scale.of(np.column_stack([x, np.full(500, 0.7)]))
     scaled = scale.scaled(np.column_stack([x, np.full(500, 0.7)]))
@@ -169,7 +170,7 @@ def test_a_network_that_has_not_converged_does_not_warn():
     assert NeuralNetwork().fit(runs, ROBOTINO).network.n_iter_ == PASSES
 
 
-def test_a_network_says_nothing_beyond_what_it_was_taught():
+def test_the_output_of_a_network_is_clipped_to_the_training_range():
     runs = [slipping(angle, [0.2 * np.cos(angle), 0.0, 0.0]) for angle in np.linspace(0, 6, 40)]
     method = NeuralNetwork().fit(runs, ROBOTINO)
     fast = made_run(straight(0.0, speed=5.0))
@@ -193,7 +194,7 @@ def test_learned_slip_of_a_skid_steer_without_currents_is_that_of_each_floor(met
 
 
 @pytest.mark.parametrize("method", LEARNERS, ids=lambda method: method.name)
-def test_learned_methods_say_the_same_again_and_rest_where_wheels_rest(method):
+def test_learned_methods_are_reproducible_and_rest_where_wheels_rest(method):
     runs = [slipping(angle, [0.2, -0.1, 0.3]) for angle in np.linspace(0, 6, 12)]
     at_rest = made_run(np.zeros((40, 3))).signals
     one, other = (

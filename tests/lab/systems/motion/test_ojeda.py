@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from slipid.lab.systems.motion.ojeda import HardFloor, Ojeda, forgetful, hard_runs, ojeda_rows
-from slipid.predict.slip_model import TRIES, ByFloor
+from slipid.predict.slip_model import TRIES
+from slipid.predict.slip_models import ByFloor
 from slipid.predict.steps import Steps
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
@@ -75,7 +76,7 @@ def test_both_numbers_of_a_skid_steer_come_back(rng, method):
     assert path_error(fitted, soft, HUSKY) < 1e-3
 
 
-def test_places_are_seen_from_where_a_run_began(rng):
+def test_places_are_relative_to_the_start_of_a_run(rng):
     hard, soft = two_floors(rng, (0.02, 0.05))
     c, s = np.cos(2.0), np.sin(2.0)
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -85,7 +86,7 @@ def test_places_are_seen_from_where_a_run_began(rng):
     assert hard_runs(elsewhere + hard, ROBOTINO) == hard
 
 
-def test_a_gyro_that_cannot_tell_leaves_no_slip_at_the_hard_floors_current(rng):
+def test_a_gyro_without_information_gives_no_slip_at_the_hard_floors_current(rng):
     straight_on = np.tile([0.5, 0.0, 0.0], (60, 1))
     hard, soft = two_floors(rng, (0.05, 0.1), spec=HUSKY, rolling=straight_on)
     fitted = GYRO.fit(hard + soft, HUSKY)
@@ -172,7 +173,7 @@ def test_the_hard_floor_is_where_encoders_err_least(rng):
     assert fitted.hard.std == pytest.approx(means.std())
 
 
-def test_standing_still_says_nothing_of_the_hard_floor():
+def test_standing_still_does_not_change_the_hard_floor():
     moving = made_run(straight(0.3), current=np.full((40, 3), 0.4), floor="hard")
     still = made_run(straight(0.3) * 0.0, current=np.zeros((40, 3)), floor="hard")
     soft = made_run(straight(0.3), straight(0.3) * 0.5, current=np.ones((40, 3)), floor="soft")
@@ -189,7 +190,7 @@ def test_of_one_floor_the_quarter_that_slips_least_is_the_hard_one():
     assert hard_runs(runs[:1], ROBOTINO) == runs[:1]
 
 
-def test_turning_on_the_spot_is_judged_by_its_yaw():
+def test_the_error_of_turning_on_the_spot_is_its_yaw():
     spin = np.tile([0.0, 0.0, 1.0], (40, 1))
     firm, loose = (made_run(spin, spin * k, floor=f) for k, f in ((0.9, "firm"), (0.5, "loose")))
     assert hard_runs([loose, firm], ROBOTINO) == [firm]
@@ -262,7 +263,7 @@ def test_rows_differ_in_what_they_need():
     assert isinstance(GYRO, Ojeda)
 
 
-def test_without_what_it_needs_it_says_so(rng):
+def test_missing_channels_raise(rng):
     _, soft = two_floors(rng, (0.02, 0.05))
     with pytest.raises(ValueError, match="not fitted"):
         CONTINUOUS.predict([soft[0].signals], ROBOTINO)

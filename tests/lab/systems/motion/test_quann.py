@@ -236,14 +236,14 @@ def test_a_law_leaves_the_least_squares_of_power():
     assert np.allclose(terms.T @ (power - terms @ method.law), 0.0, atol=1e-6)
 
 
-def test_places_are_in_the_middle_of_windows_and_seen_from_the_start():
+def test_places_are_in_the_middle_of_windows_relative_to_the_start():
     runs = [made_run(straight(0.0)).signals, made_run(straight(np.pi / 2)).signals]
     found = places(SignalWindows.of(runs, ROBOTINO), ROBOTINO)
     assert np.allclose(found[:2], [[0.05, 0.0], [0.15, 0.0]])
     assert np.allclose(found[8:10], [[0.0, 0.05], [0.0, 0.15]])
 
 
-def test_beyond_the_speeds_seen_energy_is_that_of_the_fastest():
+def test_above_the_training_speeds_energy_is_that_of_the_fastest():
     runs = [drawing(straight(0.0, speed)) for speed in np.linspace(0.05, 0.2, 30)]
     method = QuannEnergy().fit(runs, ROBOTINO)
     fast = made_run(straight(0.0, 0.8, 5) + np.array([0.0, 0.0, 0.5])).signals

@@ -44,7 +44,7 @@ def test_trained_consequents_are_those_of_ridge_regression_around_the_untrained(
     assert start.trained(x, wanted).consequents == pytest.approx(start.consequents + ridge.coef_)
 
 
-def test_a_rule_that_never_fires_keeps_its_moving_score():
+def test_a_rule_that_never_fires_keeps_its_output():
     start = Sugeno.logical_or(2, 2)
     trained = start.trained(np.tile([1.0, 0.0], (500, 1)), np.zeros(500))
     assert trained.consequents[[0, 1, 3]] == pytest.approx(start.consequents[[0, 1, 3]])

@@ -33,7 +33,7 @@ def test_smoothing_of_uneven_steps_weighs_them_by_their_length():
     assert mean[1] == pytest.approx([*(weights / weights.sum()), 0.0])
 
 
-def test_a_wheel_off_the_commanded_shape_is_told_by_the_encoder_indicator():
+def test_a_wheel_off_the_commanded_shape_raises_the_encoder_indicator():
     run = made_run(np.tile([1.0, 0.0, 0.0], (20, 1)), current=np.ones((20, 2)), spec=HUSKY)
     heard = replace(run.signals, turn=run.signals.turn * [1.0, 1.4])
     signals = SmoothedSignals.of(heard, HUSKY, 0.3)

@@ -13,7 +13,8 @@ from slipid.lab.systems.motion.reina_indicators import (
     SmoothedSignals,
     Sugeno,
 )
-from slipid.predict.slip_model import TRIES, ByFloor, groups, path_of
+from slipid.predict.slip_model import TRIES, groups, path_of
+from slipid.predict.slip_models import ByFloor
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 from tests.helpers.patchy_runs import LOST, patchy, slipping
 
@@ -41,7 +42,7 @@ def test_slip_is_flagged_by_the_gyro_or_by_all_currents_but_not_by_the_encoders(
 
 @pytest.mark.parametrize("method", BOTH, ids=lambda method: method.name)
 @pytest.mark.parametrize("gyro", [False, True])
-def test_slip_is_detected_where_it_is_told_by_the_currents(method, gyro):
+def test_slip_is_detected_by_the_currents(method, gyro):
     fitted = method.fit([patchy(k, gyro) for k in range(8)], ROBOTINO)
     tests = [patchy(k, gyro) for k in range(100, 105)]
     said = fitted.predict([run.signals for run in tests], ROBOTINO)
@@ -67,7 +68,7 @@ def test_without_other_signs_the_area_is_that_of_the_currents_themselves():
     )
 
 
-def test_fuzzy_rules_tell_more_than_thresholds_where_the_gyro_misleads():
+def test_fuzzy_rules_detect_more_than_thresholds_where_the_gyro_misleads():
     """Here the yaw rate is off where nothing slips; training turns that sign around."""
     runs = []
     for k in range(12):
@@ -109,7 +110,7 @@ def test_where_nothing_slipped_the_path_is_that_of_the_encoders(method):
 
 
 @pytest.mark.parametrize("method", BOTH, ids=lambda method: method.name)
-def test_where_all_slips_all_is_threshold(method):
+def test_where_all_slips_all_is_flagged(method):
     runs = [made_run(straight(a), straight(a) * 0.5, current=np.ones((40, 3))) for a in (0.3, 1.1)]
     rng = np.random.default_rng(0)
     runs = [
@@ -138,7 +139,7 @@ def test_a_gyro_that_some_runs_lack_does_not_count():
         assert with_.slipping == pytest.approx(bare.slipping)
 
 
-def test_a_gyro_that_is_lacking_only_later_says_nothing():
+def test_a_gyro_that_is_missing_after_training_indicates_no_slip():
     fitted = ReinaFuzzy().fit([patchy(k, gyro=True) for k in range(8)], ROBOTINO)
     run = patchy(50, gyro=True)
     rolling = run.signals.rolling(ROBOTINO)[:, 2]

@@ -9,7 +9,8 @@ from scipy.stats import chi2
 from slipid.lab.systems.motion.ward_iagnemma import WardIagnemma
 from slipid.lab.systems.motion.ward_iagnemma_dynamics import ForceLaw
 from slipid.lab.systems.motion.ward_iagnemma_filter import FilterNoise
-from slipid.predict.slip_model import TRIES, ByFloor, body_increments
+from slipid.predict.slip_model import TRIES, body_increments
+from slipid.predict.slip_models import ByFloor
 from tests.helpers.driven_runs import FLOOR, MACHINES, TRUE, driven, pulling, scattered
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
@@ -24,7 +25,7 @@ def test_a_robot_that_stands_keeps_standing():
     assert WardIagnemma().predict([without], ROBOTINO)[0].path == pytest.approx(np.zeros((41, 3)))
 
 
-def test_wheels_that_spin_on_the_spot_are_told():
+def test_wheels_that_spin_on_the_spot_are_detected():
     run = made_run(straight(0.0), current=np.ones((40, 3)))
     stuck = WardIagnemma(law=ForceLaw(rolling=2.0), noise=FilterNoise(rolling=1e-6))
     rolls = WardIagnemma(law=ForceLaw(rise=200.0, rolling=1e-3), noise=FilterNoise(rolling=1e-6))
@@ -34,7 +35,7 @@ def test_wheels_that_spin_on_the_spot_are_told():
 
 @pytest.mark.slow
 @MACHINES
-def test_what_was_driven_by_the_law_is_foretold(spec):
+def test_runs_by_the_law_are_predicted(spec):
     runs = [driven(FLOOR, k, spec) for k in range(14)]
     fitted = WardIagnemma().fit(runs[:10], spec)
     foretold = fitted.predict([run.signals for run in runs[10:]], spec)
@@ -71,7 +72,7 @@ def test_the_gyro_makes_the_end_surer():
         assert np.linalg.det(sure.end_covariance) < 0.2 * np.linalg.det(unsure.end_covariance)
 
 
-def test_currents_tell_runs_that_resist_more():
+def test_currents_identify_runs_with_more_resistance():
     heavier = replace(FLOOR, rolling=0.25)
     noise = FilterNoise(rolling=0.05, drift=(1e-3, 1e-3, 1e-3), force=0.5)
     run = pulling(driven(heavier, 5), FLOOR, 1.0, 0.0)
@@ -82,7 +83,7 @@ def test_currents_tell_runs_that_resist_more():
     assert off[0] < 0.3 * off[1]
 
 
-def test_runs_do_not_tell_on_those_beside_them():
+def test_runs_do_not_affect_those_beside_them():
     short = driven(FLOOR, 1).signals
     long = made_run(straight(1.0, 0.2, 70), gyro=np.zeros(70), current=np.ones((70, 3))).signals
     method = WardIagnemma(law=FLOOR)

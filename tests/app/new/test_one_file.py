@@ -1,4 +1,4 @@
-"""A config proposed from a file: units, signs, sums, rates, and what is left open."""
+"""A config proposed from a file: units, signs, sums, rates, and open questions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_plain_file_leaves_nothing_open_and_reads(tmp_path):
     assert "2 like" in proposal.sentences[0]
 
 
-def test_other_units_are_told_by_names_units_row_and_magnitude(tmp_path):
+def test_other_units_follow_from_names_units_row_and_magnitude(tmp_path):
     si = plain()
     lines = {
         "time": si["t"] * 1e3,
@@ -107,7 +107,7 @@ def test_ticks_add_up_or_are_increments(tmp_path, increments):
     np.testing.assert_allclose(log.wheel_angle, angle - angle[0], atol=0.02)
 
 
-def test_a_voltage_of_the_battery_is_left_out_and_effort_is_asked_for(tmp_path):
+def test_a_voltage_of_the_battery_is_left_out_and_effort_raises_a_question(tmp_path):
     si = plain()
     lines = {**si, "vl": 24.0 - 0.1 * np.abs(si["cur_left"]), "vr": 24.0 + 0 * si["t"]}
     lines |= {"effort_left": si["cur_left"], "effort_right": si["cur_right"]}
@@ -138,7 +138,7 @@ def test_a_motor_that_drives_one_way_in_the_first_run_is_no_battery(tmp_path):
     assert "voltage" in layout_in(config)["columns"]
 
 
-def test_rates_and_repeats_are_said(tmp_path):
+def test_rates_and_repeats_are_commented(tmp_path):
     si = plain()
     every = np.arange(len(si["t"])) % 5 == 0
     held = np.maximum.accumulate(
@@ -152,7 +152,7 @@ def test_rates_and_repeats_are_said(tmp_path):
     assert "50 Hz; read anew 7.14 Hz" in config.text
 
 
-def test_files_without_names_are_by_position_and_all_is_asked(tmp_path):
+def test_files_without_names_are_read_by_position_with_questions(tmp_path):
     si = plain()
     lines = {name: si[name] for name in ("t", "x", "y", "yaw")}
     angle, _ = motion(si["t"])
@@ -190,7 +190,7 @@ def test_a_drive_that_does_not_fit_the_columns_is_a_question(tmp_path):
     assert not any("have columns" in question for question in config.questions)
 
 
-def test_what_the_reader_refuses_is_said(tmp_path):
+def test_errors_of_the_reader_are_questions(tmp_path):
     si = plain()
     path = table(tmp_path / "run.csv", si)
     rows = path.read_text().splitlines()
@@ -200,7 +200,7 @@ def test_what_the_reader_refuses_is_said(tmp_path):
     assert any("the reader says" in q and "row 101" in q for q in config.questions)
 
 
-def test_a_heading_beyond_a_turn_is_told_by_the_turn_rate(tmp_path):
+def test_the_unit_of_a_heading_beyond_a_turn_follows_from_the_turn_rate(tmp_path):
     columns = plain(60.0)
     unwrapped = 1.5 * np.abs(columns["yaw"]).max() + columns["yaw"] + 7.0
     for unit, heading in (("rad", unwrapped), ("deg", np.degrees(columns["yaw"]) / 3)):
@@ -221,7 +221,7 @@ def test_currents_of_the_battery_are_left_out(tmp_path):
     layout = layout_in(config)
     assert "current" not in layout["columns"]
     assert "current_is_signed" not in layout
-    assert "what the battery gives" in config.text.replace("\n# ", " ")
+    assert "so it is the battery's" in config.text.replace("\n# ", " ")
 
 
 def test_currents_without_voltages_ask_for_the_datasheet(tmp_path):

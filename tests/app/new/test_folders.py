@@ -1,4 +1,4 @@
-"""A config proposed from several files: which belong together, and which are no logs."""
+"""A config proposed from several files: files of one run, and files that are no logs."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_a_file_of_which_no_column_is_known_is_a_question_and_still_a_config(tmp
     assert any("which column holds what? There are: foo, bar, baz" in q for q in config.questions)
 
 
-def test_magnitudes_of_currents_in_a_file_of_their_own_are_asked_for(tmp_path):
+def test_magnitudes_of_currents_in_a_file_of_their_own_raise_a_question(tmp_path):
     three_files(tmp_path / "run1")
     path = tmp_path / "run1" / "drivers.csv"
     path.write_text(path.read_text().replace("-", ""))
@@ -153,7 +153,7 @@ def test_magnitudes_of_currents_in_a_file_of_their_own_are_asked_for(tmp_path):
     assert any("do currents have a sign" in q for q in config.questions)
 
 
-def test_a_folder_above_those_of_the_runs_is_proposed_as_the_floor_and_asked_for(tmp_path):
+def test_a_folder_above_those_of_the_runs_is_proposed_as_the_floor_with_a_question(tmp_path):
     for floor in ("grass", "ice"):
         for run in ("run1", "run2"):
             three_files(tmp_path / floor / run)

@@ -1,4 +1,4 @@
-"""Windows are cut anew where a fit finds another lag than they were cut at."""
+"""Windows are cut again where the fitted lag differs from the lag they were cut at."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -35,7 +35,7 @@ def at_lag(task, lag):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("off", "moves"), [(0.9 * RECUT_LAG_S, False), (1.1 * RECUT_LAG_S, True)])
-def test_windows_are_cut_at_the_expected_lag_unless_another_is_farther_off(task, off, moves):
+def test_windows_are_cut_at_the_expected_lag_unless_the_fitted_one_is_far_from_it(task, off, moves):
     found = task.problem(at_lag(task, EXPECTED + off)).windows
     lag = EXPECTED + off * moves
     assert found.lag == pytest.approx(lag)

@@ -1,4 +1,4 @@
-"""A config proposed from bags: topics, joints in the order of the wheels, what is left to say."""
+"""A config proposed from bags: topics, joints in the order of the wheels, open questions."""
 
 from __future__ import annotations
 
@@ -81,14 +81,14 @@ def test_joints_stand_in_the_order_of_the_wheels_and_the_bag_reads(tmp_path):
     np.testing.assert_allclose(ends, [2, 3, 1, 4])
 
 
-def test_effort_odometry_and_other_joints_are_asked_for(tmp_path):
+def test_effort_odometry_and_other_joints_raise_questions(tmp_path):
     path = tmp_path / "run.bag"
     write_bag(path, "rosbag1", messages("nav_msgs/msg/Odometry", effort=True, more=("arm",)))
     config = proposed(path, **SKID)
     said = "\n".join(config.questions)
     assert "what is the effort: a current (A)" in said
     assert "Odometry of wheels is of no use" in said
-    assert "joints that are taken for no wheels: arm" in said
+    assert "joints that are not taken for wheels: arm" in said
     assert "current" not in tomllib.loads(config.text)["layouts"]["mine"]["topics"]
 
 
@@ -106,7 +106,7 @@ def test_motor_readings_have_ticks_and_currents(tmp_path):
     assert "no topic with a pose was found" in said
 
 
-def test_frames_of_transforms_are_asked_for(tmp_path):
+def test_frames_of_transforms_raise_a_question(tmp_path):
     tf = [
         Message(
             "/tf",
@@ -149,7 +149,7 @@ def _drive_with_pauses(fields_per_wheel: int = 4):
     return in_order(states, pose, motors)
 
 
-def test_currents_in_messages_of_an_unknown_type_are_proposed_and_asked_for(tmp_path):
+def test_currents_in_messages_of_an_unknown_type_are_proposed_with_a_question(tmp_path):
     bag = write_bag(tmp_path / "run1", "mcap", _drive_with_pauses(), MOTOR_STATE)
     config = proposed(tmp_path, **SKID)
     layout = tomllib.loads(config.text)["layouts"]["mine"]
