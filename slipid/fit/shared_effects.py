@@ -299,7 +299,7 @@ class EffectForecast(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class EffectTable:
+class FittedEffects:
     """Effects that neighbouring runs on a floor were found to share.
 
     Attributes:
@@ -331,7 +331,7 @@ class EffectTable:
 
 
 def forecast_effects(
-    found: Mapping[str, EffectTable], w: Windows, robot: Robot, free: int
+    found: Mapping[str, FittedEffects], w: Windows, robot: Robot, free: int
 ) -> EffectForecast:
     """Return the effects expected in runs on any floor; zero where a floor has no table."""
     n, axes = len(w), len(AXES)

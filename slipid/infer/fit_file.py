@@ -15,7 +15,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.fit.shared_effects import EffectTable, SpeedAndLoad
+from slipid.fit.shared_effects import FittedEffects, SpeedAndLoad
 from slipid.infer.result import Channels, Fit
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.estimates import Estimate
@@ -217,7 +217,7 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         baselines=content["baselines"],
         current_trend=(content["current_trend"][0], content["current_trend"][1]),
         shared={
-            floor: EffectTable(
+            floor: FittedEffects(
                 tuple(SpeedAndLoad(**pace) for pace in paces),
                 **{name: arrays[f"shared/{floor}/{name}"] for name in _SHARED},
             )

@@ -157,17 +157,14 @@ class Saturating(WheelSlip):
     name: str = "saturating"
 
     def learn(self, w: TrainingWindows, spec: RobotSpec) -> "Saturating":
-        scale = w.dt[:, None] * spec.size
-
-        def gap(shape: np.ndarray) -> np.ndarray:
-            found = w.means(replace(self, coefficients=shape).twist(w.steps, spec))
-            return np.asarray(((found - w.twist) * scale).ravel())
+        def errors(shape: np.ndarray) -> np.ndarray:
+            return w.errors(replace(self, coefficients=shape).twist(w.steps, spec), spec)
 
         torque = soft_torque(w.steps.signals, spec)
         top = float(np.log(max(torque.max(), 1e-3) * 1.5))
         # the cap makes several minima: with one-sided differences rounding decides between them
         starts = ([np.log(k), top] for k in (0.05, 0.3, 1.0))
-        tries = [least_squares(gap, x, jac="3-point", max_nfev=200) for x in starts]
+        tries = [least_squares(errors, x, jac="3-point", max_nfev=200) for x in starts]
         return replace(self, coefficients=min(tries, key=lambda r: r.cost).x)
 
     def slip(self, steps: Steps, spec: RobotSpec) -> Slips:

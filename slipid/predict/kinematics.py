@@ -115,13 +115,11 @@ class Corrected(TwistModel):
         start[:2], start[count:] = 1.0, lag
         low, high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
         low[count:], high[count:] = lag - LONGEST_LAG, lag + LONGEST_LAG
-        scale = w.dt[:, None] * spec.size
 
-        def gap(numbers: np.ndarray) -> np.ndarray:
-            found = w.means(replace(self, coefficients=numbers).twist(w.steps, spec))
-            return np.asarray(((found - w.twist) * scale).ravel())
+        def errors(numbers: np.ndarray) -> np.ndarray:
+            return w.errors(replace(self, coefficients=numbers).twist(w.steps, spec), spec)
 
-        found = least_squares(gap, start, bounds=(low, high), x_scale="jac").x
+        found = least_squares(errors, start, bounds=(low, high), x_scale="jac").x
         return replace(self, coefficients=found)
 
     def twist(self, steps: Steps, spec: RobotSpec) -> Twists:

@@ -34,7 +34,7 @@ from slipid.fit.session_effects import LinearModel, by_axis, with_session_effect
 from slipid.fit.shared_effects import (
     AXES,
     EffectForecast,
-    EffectTable,
+    FittedEffects,
     TravelConditions,
     forecast_effects,
 )
@@ -171,7 +171,7 @@ class ForceBalance(PredictiveModel):
 
     space: Space
     z: Search
-    shared: Mapping[str, EffectTable]
+    shared: Mapping[str, FittedEffects]
     extrapolation: Mapping[str, float]
 
     @property
@@ -261,14 +261,14 @@ def force_balance_of(
         np.asarray(covariance),
         problem.space,
         z,
-        shared=effect_tables(problem, state, keep),
+        shared=fitted_effects(problem, state, keep),
         extrapolation=grown,
     )
 
 
-def effect_tables(
+def fitted_effects(
     problem: Problem, state: FitState, keep: Float[np.ndarray, " segment"]
-) -> dict[str, EffectTable]:
+) -> dict[str, FittedEffects]:
     """Return the effects that neighbouring runs share on every floor, by a fit of some segments."""
     log_v, free = jnp.asarray(state.log_variance), problem.space.size
     residual, jacobian = problem.linear(state.z, problem.electric(state.z, log_v))
@@ -285,7 +285,7 @@ def effect_tables(
         inverse = np.linalg.inv(np.asarray(to.factor))
         covariance = (inverse.T @ inverse).reshape(3, count, 3, count)
         slope = jax.vmap(to.coefs, in_axes=-1, out_axes=-1)(half)
-        out[floor] = EffectTable(
+        out[floor] = FittedEffects(
             speeds_and_loads=problem.speeds_and_loads[floor],
             std=std[np.asarray(of.numbers)[1]],
             coefs=np.asarray(fitted.coefs(white)).reshape(3, count)[:, :near],

@@ -1,6 +1,7 @@
 """Slip models that are compared with the force balance, fitted floor by floor.
 
-`slip_models` lists them, `restored` builds them again from files.
+`slip_models` lists them, `restored` builds them again from files. `FloorModels` fits a model to
+the windows of each floor, `ByFloor` to the runs of each floor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +14,16 @@ from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 from slipid.predict.curves import CurveModel, Saturating, above, powers, ramps, soft_torque
 from slipid.predict.kinematics import TERMS, Corrected, Encoder, HeadingLookup, Together, nominal
-from slipid.predict.slip_model import Increments, RobotSpec, RunSignals, as_increments, body_twist
+from slipid.predict.slip_model import (
+    Increments,
+    PredictedRun,
+    RobotSpec,
+    Run,
+    RunSignals,
+    SlipModel,
+    as_increments,
+    body_twist,
+)
 from slipid.predict.steps import Steps, TrainingWindows, TwistModel
 
 
@@ -124,6 +134,8 @@ def training_windows(w: Windows, robot: Robot) -> TrainingWindows:
     return TrainingWindows(steps_of(w), np.arange(w.dt.size), w.dt.ravel(), twist, run)
 
 
+FEWEST = 5
+"""Runs on a floor, or with a load, below which a model uses its fit to all runs for them."""
 KNOTS = (0.0, 0.02, 0.04, 0.06, 0.1, 0.15, 0.25)
 """Knots of the monotone spline [N m]."""
 PAPER_THRESHOLD = 0.4
@@ -173,3 +185,68 @@ def restored(shape: Geometry, states: Mapping[str, Mapping[str, Sequence]]) -> l
         known[name].with_state({floor: np.asarray(v, float) for floor, v in state.items()})
         for name, state in states.items()
     ]
+
+
+@dataclass(frozen=True)
+class ByFloor(SlipModel):
+    """A slip model fitted by floor where floors are known, else by load set-up.
+
+    Groups of fewer than `FEWEST` runs use the fit to all runs.
+
+    Attributes:
+        method: the model, not fitted.
+        pooled: whether it ignores floors and loads, and is fitted once to all runs.
+        fitted: the model fitted to the runs of each group, by name, the largest group first; under
+            None to all runs.
+    """
+
+    method: SlipModel
+    pooled: bool = False
+    fitted: Mapping[str | None, SlipModel] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, method: SlipModel) -> "ByFloor":
+        return cls(method.name, method, needs=method.needs, aim=method.aim)
+
+    def candidates(self) -> Sequence["ByFloor"]:
+        return [replace(self, method=method) for method in self.method.candidates()]
+
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "ByFloor":
+        groups: dict[str | None, list[Run]] = {}
+        for run in runs:
+            groups.setdefault(self.group_of(run.signals), []).append(run)
+        order = sorted(groups, key=lambda name: -len(groups[name]))
+        few = [name for name in order if len(groups[name]) < FEWEST] if len(order) > 1 else []
+        fitted = {n: self.method.fit(groups[n], spec) for n in order if n not in few}
+        if few:
+            fitted |= dict.fromkeys(few, self.method.fit(runs, spec))
+        return replace(self, fitted=fitted)
+
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
+        found: dict[int, PredictedRun] = {}
+        groups = [self._fitted_group(run) for run in runs]
+        for group in dict.fromkeys(groups):
+            mine = [k for k, name in enumerate(groups) if name == group]
+            of_group = self.fitted[group].predict([runs[k] for k in mine], spec)
+            found.update(zip(mine, of_group, strict=True))
+        return [found[k] for k in range(len(runs))]
+
+    def _fitted_group(self, signals: RunSignals) -> str | None:
+        """Return the group of a run; the usual one for a load set-up that no training run had."""
+        group = self.group_of(signals)
+        if group not in self.fitted:
+            if signals.floor is not None:
+                known = ", ".join(map(str, self.fitted))
+                raise ValueError(f"{self.name}: no floor '{signals.floor}'; fitted: {known}")
+            return next(iter(self.fitted))
+        return group
+
+    def group_of(self, signals: RunSignals) -> str | None:
+        """Return the group a run is fitted with: its floor where known, else its load set-up."""
+        if self.pooled:
+            return None
+        return signals.load if signals.floor is None else signals.floor
+
+    @property
+    def numbers(self) -> int:
+        return sum(method.numbers for method in {id(m): m for m in self.fitted.values()}.values())

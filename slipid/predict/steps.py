@@ -167,13 +167,21 @@ class TrainingWindows:
         total = np.add.reduceat(values * self.steps.signals.dt.reshape(-1, *one), self.first)
         return np.asarray(total / self.dt.reshape(-1, *one))
 
+    def errors(self, twist: Twists, spec: RobotSpec) -> Float[np.ndarray, " row"]:
+        """Return displacement errors of the twists of all steps, yaw times the base radius."""
+        return np.asarray(((self.means(twist) - self.twist) * self._scale(spec)).ravel())
+
+    def _scale(self, spec: RobotSpec) -> Float[np.ndarray, "window 3"]:
+        """Return the factor from twists to displacements of every window."""
+        return self.dt[:, None] * spec.size
+
     def rows(self, parts: Float[np.ndarray, "step 3 k"], spec: RobotSpec) -> "SlipEquations":
         """Return equations for the excess of the encoders' displacement as a weighted sum of parts.
 
         gap = (rolling - twist) dt = sum_k weight_k part_k dt, yaw times the base radius.
         """
         gap = self.means(self.steps.signals.rolling(spec)) - self.twist
-        scale = self.dt[:, None] * spec.size
+        scale = self._scale(spec)
         return SlipEquations(self.means(parts) * scale[..., None], gap * scale)
 
 

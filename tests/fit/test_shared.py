@@ -19,7 +19,7 @@ from slipid.fit.shared_effects import (
     OTHER_LOAD,
     OTHER_SIDE,
     SPEED_LENGTH,
-    EffectTable,
+    FittedEffects,
     SpeedAndLoad,
     TravelConditions,
     forecast_effects,
@@ -105,7 +105,7 @@ def test_new_paces_keep_the_variance_of_the_process(mirror):
     """What neighbours cannot tell is left, so that far from them all of it is."""
     seen, other = SpeedAndLoad(-2.0, "a"), SpeedAndLoad(-1.4, "b")
     turn, count = np.array([0.0, 0.05, 1.0, np.nan]), 3 * 31
-    of = EffectTable(
+    of = FittedEffects(
         speeds_and_loads=(seen,),
         std=np.array([0.1, 0.2, 0.3]),
         coefs=np.zeros((3, 31)),

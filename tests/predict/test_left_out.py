@@ -125,7 +125,7 @@ def test_nothing_of_a_left_out_run_is_learnt(logs, judged, learnt):
 def judge_as(found, task, judged):
     """Rows of `judge` where all has been learnt."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(folds, "learn", lambda *_: found)
+        patch.setattr(folds, "fit_fold", lambda *_: found)
         return folds.judge(found.problem, CHOICES, task.dataset, QUESTION, judged).rows
 
 
@@ -150,7 +150,9 @@ def test_regions_of_left_out_runs_know_what_sessions_share(logs, judged, learnt,
             growth = np.linalg.eigvalsh(wide - plain)[:, -1]
             assert (growth > 0.01 * np.linalg.eigvalsh(plain)[:, -1]).all(), model.name
     nothing = {name: 1e-30 for name in learnt.models[0].variance if name.startswith("session.")}
-    monkeypatch.setattr(predictive, "shared", lambda model, *_: (nothing, model.covariance))
+    monkeypatch.setattr(
+        predictive, "with_session_effects", lambda model, *_: (nothing, model.covariance)
+    )
     held = partial(folds.fit_fold, fit=lambda *_, **__: learnt.optimum)
     alone = held(task.problem(), CHOICES, task.dataset, QUESTION, judged)
     problem, state = learnt.problem, learnt.optimum.state

@@ -8,7 +8,8 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from slipid.predict.kinematics import Corrected, Encoder, HeadingLookup
-from slipid.predict.slip_model import TRIES, ByFloor, path_of
+from slipid.predict.slip_model import TRIES, path_of
+from slipid.predict.slip_models import ByFloor
 from slipid.predict.steps import Steps, TrainingWindows, scaled_least_squares
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 

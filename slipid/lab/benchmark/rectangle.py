@@ -15,10 +15,7 @@ from slipid.lab.trial import trial
 from slipid.robot.record import LogSensors
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
 from slipid.support.content import Content
-from slipid.support.files import (
-    read_json,
-    write_json,
-)
+from slipid.support.files import read_json, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 

@@ -8,7 +8,8 @@ from slipid.lab.systems.motion.quann import QuannEnergy, QuannSlip
 from slipid.lab.systems.motion.reina import ReinaDeterministic, ReinaFuzzy
 from slipid.lab.systems.motion.ward_iagnemma import WardIagnemma
 from slipid.predict.kinematics import Corrected, Encoder, HeadingLookup
-from slipid.predict.slip_model import ByFloor, RobotSpec, SlipModel
+from slipid.predict.slip_model import RobotSpec, SlipModel
+from slipid.predict.slip_models import ByFloor
 
 KINEMATIC = ("effective_track", "instantaneous_centres")
 """Names of the rows for wheels that do not determine the twist."""

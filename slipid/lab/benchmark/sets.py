@@ -26,19 +26,6 @@ Over = Literal["chord", "path"]
 
 
 @dataclass(frozen=True)
-class CurrentColumns:
-    """Columns of currents that a config leaves out of the fit, and that methods use nevertheless.
-
-    Attributes:
-        columns: names of the columns.
-        signed: the currents have a sign.
-    """
-
-    columns: tuple[str, ...]
-    signed: bool
-
-
-@dataclass(frozen=True)
 class LogSource:
     """One set of logs.
 
@@ -50,7 +37,8 @@ class LogSource:
         kinds: kinds of splits, see `slipid.lab.benchmark.protocols`.
         over: denominator of end-point errors.
         poses_per_step: see `slipid.lab.benchmark.steps.run_batches`.
-        currents: additional columns of currents for methods.
+        currents: columns of currents that the config leaves out of the fit, for other methods.
+        current_is_signed: these currents have a sign.
         crossing: glob of the runs from one floor to another, and the file of their map.
     """
 
@@ -61,7 +49,8 @@ class LogSource:
     kinds: tuple[str, ...]
     over: Over = "chord"
     poses_per_step: int = POSES_PER_STEP
-    currents: CurrentColumns | None = None
+    currents: tuple[str, ...] = ()
+    current_is_signed: bool = False
     crossing: tuple[str, str] | None = None
 
 
@@ -90,7 +79,8 @@ SOURCES = (
         config="warthog.toml",
         kinds=("headings", "speeds", "floors"),
         over="path",
-        currents=CurrentColumns(("il", "ir"), signed=True),
+        currents=("il", "ir"),
+        current_is_signed=True,
     ),
     LogSource(
         name="husky",
@@ -99,7 +89,7 @@ SOURCES = (
         config="husky.toml",
         kinds=("headings",),
         over="path",
-        currents=CurrentColumns(("il", "ir"), signed=False),
+        currents=("il", "ir"),
     ),
     LogSource(
         name="testsite",
@@ -182,7 +172,7 @@ def read_set(source: LogSource, data: Path, out: Path, report: Reporter) -> Data
             for one in sections
             for part in ("fit", "unseen")
         ]
-    logged, _ = read_dataset(_with_currents(config, source.currents), sections, root, report)
+    logged, _ = read_dataset(_with_currents(config, source), sections, root, report)
     job = _job(config, logged, source)
     facts = facts_of(logged, float(job.robot.geometry.base_radius))
     crossing, floor = None, None
@@ -194,19 +184,19 @@ def read_set(source: LogSource, data: Path, out: Path, report: Reporter) -> Data
     return DataSet(source, job, logged, tuple(facts), crossing, floor)
 
 
-def _with_currents(config: Config, currents: CurrentColumns | None) -> Config:
+def _with_currents(config: Config, source: LogSource) -> Config:
     """Return the config with additional columns of currents in its layouts."""
-    if currents is None:
+    if not source.currents:
         return config
     layouts = {}
     for name, layout in config.content.layouts.items():
         columns = layout["columns"]
         assert isinstance(columns, dict)
-        channel = {"columns": list(currents.columns), "unit": "A"}
+        channel = {"columns": list(source.currents), "unit": "A"}
         layouts[name] = {
             **layout,
             "columns": {**columns, "current": channel},
-            "current_is_signed": currents.signed,
+            "current_is_signed": source.current_is_signed,
         }
     return replace(config, content=config.content.model_copy(update={"layouts": layouts}))
 
@@ -214,7 +204,7 @@ def _with_currents(config: Config, currents: CurrentColumns | None) -> Config:
 def _job(config: Config, logged: Runs, source: LogSource) -> ConfigFitTask:
     """Return the task of slipid's fit to runs, with currents only if its config reads them."""
     fitted = logged
-    if source.currents is not None:
+    if source.currents:
         logs = [replace(log, current=None, current_fresh=None) for log in logged.logs]
         fitted = collect(logs, logged.session)
     return fit_task(config, fitted, (), Reporter(quiet=True))

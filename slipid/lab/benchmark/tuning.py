@@ -8,7 +8,8 @@ import numpy as np
 
 from slipid.lab.benchmark.protocols import INNER, inner
 from slipid.lab.benchmark.scores import scored
-from slipid.predict.slip_model import TRIES, ByFloor, RobotSpec, Run, SlipModel
+from slipid.predict.slip_model import TRIES, RobotSpec, Run, SlipModel
+from slipid.predict.slip_models import ByFloor
 
 WORST = 2.0
 """Relative error above which all errors of a setting count the same."""
@@ -93,7 +94,7 @@ def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, spec: RobotS
 
 
 def settings_of(best: object, candidates: Sequence[object]) -> str:
-    """Return the best candidate's values of fields in which candidates differ: `ridge = 0.01`."""
+    """Return the settings in which candidates differ, of the best one, such as `ridge = 0.01`."""
     inside = [vars(c.method if isinstance(c, ByFloor) else c) for c in (best, *candidates)]
     names = [name for name in inside[0] if len({repr(one[name]) for one in inside}) > 1]
     return ", ".join(f"{name} = {inside[0][name]!r}" for name in names)

@@ -262,7 +262,7 @@ def _published(
 
 
 def _slipid(data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], name: str) -> FoldScore:
-    """Return the score of slipid: the force balance, or its estimator where that adds something."""
+    """Return the score of slipid: its estimator on unknown floors or with a gyro, else its fit."""
     fit, known = data.fit, protocol.floor_known
     if isinstance(fit, FoldScore):
         return fit

@@ -372,7 +372,7 @@ def ground(friction: dict[str, float]):
 
 def driven(robot, runs: int = 4, noise: float = 0.5, seed: int = 0):
     """Runs in which each pair of wheel speeds is kept for two seconds, as its meters show them."""
-    runs = []
+    made = []
     for k, floor in enumerate(robot.surfaces.labels):
         for n in range(runs):
             rng = np.random.default_rng(1000 * seed + 100 * k + n)
@@ -383,8 +383,8 @@ def driven(robot, runs: int = 4, noise: float = 0.5, seed: int = 0):
             current = np.asarray(amps) + ZERO_A + noise * rng.normal(size=speed.shape)
             gyro = np.asarray(turn) + 0.02 * rng.normal(size=len(speed))
             run = made_floor_run(floor, speed, 0.0, name=f"{floor}/{seed}{n}")
-            runs.append(replace(run, current=np.abs(current), gyro=gyro))
-    return runs
+            made.append(replace(run, current=np.abs(current), gyro=gyro))
+    return made
 
 
 @pytest.fixture(scope="module")

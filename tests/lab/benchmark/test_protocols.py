@@ -9,7 +9,8 @@ from slipid.lab.benchmark.protocols import PROTOCOLS, base_of, facts_of_run, inn
 from slipid.lab.benchmark.tuning import _loss, tuned
 from slipid.lab.systems.motion.quann import QuannEnergy
 from slipid.predict.folds import FoldKey
-from slipid.predict.slip_model import FEWEST, ByFloor, PredictedRun, RobotSpec, SlipModel, path_of
+from slipid.predict.slip_model import PredictedRun, RobotSpec, SlipModel, path_of
+from slipid.predict.slip_models import FEWEST, ByFloor
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Int
@@ -74,10 +75,7 @@ def folds_of(runs: Sequence[FloorSignals], count: int) -> Int[np.ndarray, " run"
 
 
 def answers_of(
-    method: FloorClassifier,
-    runs: Sequence[FloorSignals],
-    spec: RobotSpec,
-    seconds: Sequence[float],
+    method: FloorClassifier, runs: Sequence[FloorSignals], spec: RobotSpec, seconds: Sequence[float]
 ) -> list[Answer]:
     """Return the answers of a fitted classifier to all stretches of runs."""
     stretches = [part for run in runs for part in run.segments(max(seconds))]
@@ -260,19 +258,13 @@ class FloorTask(abc.ABC):
 
     Attributes:
         options: options of the benchmark.
+        name: name of the task, and of its table in benchmark.json.
+        folder: folder of its logs, below the data folder.
     """
 
     options: BenchmarkOptions
-
-    @property
-    @abc.abstractmethod
-    def name(self) -> str:
-        """Name of the task, and of its table in benchmark.json."""
-
-    @property
-    @abc.abstractmethod
-    def folder(self) -> str:
-        """Folder of its logs, below the data folder."""
+    name: ClassVar[str]
+    folder: ClassVar[str]
 
     @property
     @abc.abstractmethod

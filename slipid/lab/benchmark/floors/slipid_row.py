@@ -260,9 +260,7 @@ def _beliefs(
     def one(run: _FilterRows) -> Array:
         state = estimator.init()
         state = replace(
-            state,
-            wheels=replace(state.wheels, speed=run.speed[0]),
-            current=run.current[0],
+            state, wheels=replace(state.wheels, speed=run.speed[0]), current=run.current[0]
         )
         return jax.lax.scan(step, state, run)[1]
 

@@ -50,7 +50,7 @@ from slipid.lab.systems.floors.interface import (
 from slipid.predict.slip_model import RobotSpec
 
 GRAVITY = 9.81
-"""[m/s^2]"""
+"""Acceleration of gravity [m/s^2]."""
 SLOW = 0.02
 """Speed below which a direction of travel is undefined [m/s]."""
 

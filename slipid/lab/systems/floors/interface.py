@@ -139,9 +139,7 @@ def floors_of(runs: Sequence[FloorSignals]) -> tuple[str, ...]:
 
 
 def training_rows(
-    runs: Sequence[FloorSignals],
-    features: Callable[[FloorSignals], Features],
-    every_s: float = 0.0,
+    runs: Sequence[FloorSignals], features: Callable[[FloorSignals], Features], every_s: float = 0.0
 ) -> tuple[Features, np.ndarray]:
     """Return features and floor names of the moving rows of runs, about `every_s` [s] apart."""
     found, floors = [], []
@@ -231,7 +229,7 @@ def yaw_rate_shortfall(
 
 @dataclass(frozen=True, eq=False)
 class TrailingWindow:
-    """The rows of the last so many seconds before every row.
+    """Rows of the last seconds up to and including every row.
 
     Attributes:
         first: first row in the window of each row.

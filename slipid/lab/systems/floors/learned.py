@@ -248,9 +248,7 @@ class BoostedTreesClassifier(FloorClassifier):
         from sklearn.ensemble import HistGradientBoostingClassifier
 
         rows, floor = training_rows(
-            runs,
-            lambda run: features(run, spec, channels, restart_s=self.restart_s),
-            self.rows_s,
+            runs, lambda run: features(run, spec, channels, restart_s=self.restart_s), self.rows_s
         )
         trees = HistGradientBoostingClassifier(
             max_iter=self.trees,

@@ -135,7 +135,7 @@ class _Detector(SlipModel):
 @final
 @dataclass(frozen=True)
 class ReinaDeterministic(_Detector):
-    """Slip flags where GI >= 1 or CI >= 1; without a gyro, where EI >= 1 or CI >= 1."""
+    """Detector that flags slip where GI >= 1 or CI >= 1; EI replaces GI without a gyro."""
 
     name: str = "reina_deterministic"
 
@@ -158,7 +158,7 @@ class ReinaDeterministic(_Detector):
 @final
 @dataclass(frozen=True)
 class ReinaFuzzy(_Detector):
-    """Slip flags where Sugeno's inference from EI, CI and, with a gyro, GI is at least one half.
+    """Detector that flags slip where Sugeno's inference from EI, CI and GI is at least one half.
 
     Attributes:
         sets: number of fuzzy sets of every indicator.

@@ -202,7 +202,7 @@ _DRIVING = 0.3
 
 @dataclass(frozen=True, eq=False)
 class PaddedRuns:
-    """Runs side by side, padded to the same number of steps with steps of no time.
+    """Runs side by side, padded to the same number of steps with steps of zero duration.
 
     Attributes:
         dt: duration of each step [s], 0 in padding.

@@ -19,7 +19,8 @@ from slipid.lab.systems.motion.learners import (
     BoostedTrees,
     NeuralNetwork,
 )
-from slipid.predict.slip_model import ByFloor, Run, path_of
+from slipid.predict.slip_model import Run, path_of
+from slipid.predict.slip_models import ByFloor
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
 SIZES = np.array([1.0, 1.0, 0.125])

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from slipid.lab.systems.motion.ojeda import HardFloor, Ojeda, forgetful, hard_runs, ojeda_rows
-from slipid.predict.slip_model import TRIES, ByFloor
+from slipid.predict.slip_model import TRIES
+from slipid.predict.slip_models import ByFloor
 from slipid.predict.steps import Steps
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 

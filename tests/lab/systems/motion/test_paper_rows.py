@@ -20,7 +20,8 @@ from slipid.lab.paper2021.deployed_form import (
 from slipid.lab.paper2021.table import CURRENT_SVR, field_table
 from slipid.model.geometry import omni
 from slipid.model.robot import build
-from slipid.predict.slip_model import SHAFT_W0, TRIES, ByFloor, RobotSpec
+from slipid.predict.slip_model import SHAFT_W0, TRIES, RobotSpec
+from slipid.predict.slip_models import ByFloor
 from slipid.predict.steps import TrainingWindows
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 

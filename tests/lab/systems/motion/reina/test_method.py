@@ -13,7 +13,8 @@ from slipid.lab.systems.motion.reina_indicators import (
     SmoothedSignals,
     Sugeno,
 )
-from slipid.predict.slip_model import TRIES, ByFloor, groups, path_of
+from slipid.predict.slip_model import TRIES, groups, path_of
+from slipid.predict.slip_models import ByFloor
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 from tests.helpers.patchy_runs import LOST, patchy, slipping
 

@@ -9,7 +9,8 @@ from scipy.stats import chi2
 from slipid.lab.systems.motion.ward_iagnemma import WardIagnemma
 from slipid.lab.systems.motion.ward_iagnemma_dynamics import ForceLaw
 from slipid.lab.systems.motion.ward_iagnemma_filter import FilterNoise
-from slipid.predict.slip_model import TRIES, ByFloor, body_increments
+from slipid.predict.slip_model import TRIES, body_increments
+from slipid.predict.slip_models import ByFloor
 from tests.helpers.driven_runs import FLOOR, MACHINES, TRUE, driven, pulling, scattered
 from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 
