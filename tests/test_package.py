@@ -19,6 +19,11 @@ def test_version_is_the_installed_one():
     assert slipid.__version__ == importlib.metadata.version("slipid")
 
 
+def test_older_public_names_still_work():
+    assert slipid.made_runs is slipid.simulate_runs
+    assert slipid.move is slipid.steady_motion
+
+
 def test_import_is_light_and_silent():
     code = (
         f"import json, sys, slipid\nprint(json.dumps([m for m in {HEAVY!r} if m in sys.modules]))"
@@ -66,7 +71,6 @@ def test_xla_gets_only_flags_that_it_knows_and_that_are_not_set(monkeypatch):
         assert jax_setup.os.environ["XLA_FLAGS"] == after
 
 
-@pytest.mark.xfail(strict=False)  # until the last of them has a name of its own
 def test_a_class_name_stands_for_one_class():
     paths = Path(slipid.__file__).parent.rglob("*.py")
     trees = (ast.parse(path.read_text(encoding="utf-8")) for path in paths)

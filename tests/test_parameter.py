@@ -1,4 +1,4 @@
-"""Declared numbers: the ways between SI and search space, and names."""
+"""Declared numbers: conversion between SI and search space, and names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The free numbers as a vector: both ways, choices, priors and what is refused."""
+"""The free numbers as a vector: conversions, choices, priors and refusals."""
 
 from __future__ import annotations
 

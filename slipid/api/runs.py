@@ -164,11 +164,11 @@ def _steady(
     def one(row: Float[Array, "3"]) -> tuple[Array, ...]:
         driven = robot.geometry.forward() @ row / frame.radius
         speed = robot.geometry.at_wheels(driven)
-        way, stands = jnp.sign(speed), jnp.abs(speed) < 1e-6
+        direction, stands = jnp.sign(speed), jnp.abs(speed) < 1e-6
         xi = twist(robot, frame, speed, floor, load)
         torque = wheel_torque(robot, frame, xi, speed, floor, load)
         rim = jnp.where(stands, jnp.nan, frame.radius * frame.drive_share * speed)
         current = motor_current(robot, frame, xi, driven, floor, load) * jnp.sign(driven)
-        return xi, speed, 1 - frame.hold @ xi / rim, torque * way, current
+        return xi, speed, 1 - frame.hold @ xi / rim, torque * direction, current
 
     return jax.vmap(one)(command)

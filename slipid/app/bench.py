@@ -82,13 +82,16 @@ def read_bench_task(config: Config, root: Path, report: Reporter) -> BenchTask:
     names = robot.names if isinstance(robot, BenchMotors) else []
     labels = _labels(names, counts.pop(), str(config.path))
     with_voltage = [p for p in parts if p[0].voltage is not None]
-    left: list[str] = []
+    dropped: list[str] = []
     if 0 < len(with_voltage) < len(parts):
         without = len(parts) - len(with_voltage)
-        left, parts = [f"skipped: {without} logs without a voltage, others have one"], with_voltage
+        dropped, parts = (
+            [f"skipped: {without} logs without a voltage, others have one"],
+            with_voltage,
+        )
     records = {label: tuple(p[k] for p in parts) for k, label in enumerate(labels)}
     choices = {label: _choices(config, label) for label in labels}
-    lines = (*skipped, *left)
+    lines = (*skipped, *dropped)
     for line in lines:
         report.line(line)
     unit_is_known = any(

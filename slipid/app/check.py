@@ -235,9 +235,9 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
         found = estimates(space, task.choices, space.start, covariance, volt, members(flat))
         _least(parameters, found)
         _least(ratios, derived(space, space.start, covariance, volt))
-        left = float(np.linalg.slogdet(covariance)[1])
-        if left > most:
-            most, open_ = left, flat
+        uncertainty = float(np.linalg.slogdet(covariance)[1])
+        if uncertainty > most:
+            most, open_ = uncertainty, flat
     return ExpectedEstimates(parameters, ratios, sentences(open_))
 
 

@@ -20,7 +20,8 @@ from slipid.fit.multi_floor_fit import fit_multi_floor
 from slipid.fit.optimise import Optimum, optimise
 from slipid.fit.problem import FitState, Problem
 from slipid.infer.fit_file import save
-from slipid.infer.result import Fit, summarise
+from slipid.infer.result import Fit
+from slipid.infer.summary import summarise
 from slipid.infer.verdicts.profile import Profile, profile, profiled
 from slipid.predict.agreement import contradiction, floor_errors, largest_shift
 from slipid.predict.slip_models import slip_models
@@ -165,7 +166,7 @@ def optimised(
 ) -> tuple[Problem, Optimum]:
     """Return the optimum of a task and the problem it belongs to, starting from `task.problem()`.
 
-    Windows are cut again, which makes another problem, where the fitted lag is far from the
+    Windows are cut again, which makes another problem, where the fitted lag differs from the
     expected one (see `FitTask.cutting_robot`). The fit continues from the checkpoint of this very
     task, and every round is kept there.
     """

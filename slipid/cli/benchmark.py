@@ -54,11 +54,11 @@ def benchmark(
         for row in protocol.values()
     ]
     others = [*found["floors"].values(), found["rectangle"] or {}]
-    felt = [row for one in others for row in one.get("rows", [])]
+    floor_rows = [row for one in others for row in one.get("rows", [])]
     failed = [
         *found["unread"],
         *(row for row in every if row["failed"]),
         *(one for one in others if "failed" in one),
-        *(row for row in felt if row["absent"]),
+        *(row for row in floor_rows if row["absent"]),
     ]
     return 1 if failed else 0

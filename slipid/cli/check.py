@@ -22,7 +22,7 @@ def check(
 
     Exit code 1 where logs and config contradict each other.
     """
-    from slipid.app import check as job
+    from slipid.app import check as checks
     from slipid.app.config import BenchMotors, read_config
     from slipid.report.estimates import show_check
 
@@ -30,7 +30,7 @@ def check(
     if isinstance(wanted.content.robot, BenchMotors):
         return bench(wanted, data, out, json, quiet)
     with Reporter(quiet=quiet) as report:
-        logs, found = job.check(config, data, out, report)
+        logs, found = checks.check(config, data, out, report)
         if out is not None:
             from slipid.plots.fit import raw_plots
 

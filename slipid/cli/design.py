@@ -60,8 +60,8 @@ def design(
     from slipid.report.answers import show_design
     from slipid.support.jax_setup import setup_jax
 
-    ways = headings, speeds, turns, distance
-    wanted = DesignOptions(parameter or (), predict or (), runs, *ways, floor or (), load or ())
+    motions = headings, speeds, turns, distance
+    wanted = DesignOptions(parameter or (), predict or (), runs, *motions, floor or (), load or ())
     with Reporter(quiet=quiet) as report:
         setup_jax(quiet=True)
         fit = load_fit(out)

@@ -8,9 +8,8 @@ from importlib.metadata import PackageNotFoundError, version
 import numpy as np
 
 from slipid.export.text import listed, one_line, wrapped
-from slipid.parameter import Entry
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.record import Pair, Provenance, RecordedNumber, Source, Verdict
+from slipid.robot.record import Pair, Provenance, Source, Verdict
 from slipid.robot.robot_file import declared_numbers
 
 VERDICTS: Mapping[Verdict, str] = {
@@ -34,34 +33,37 @@ WARNED_VERDICTS: tuple[Verdict, ...] = ("not_identified", "at_bound", "disputed"
 
 @dataclass(frozen=True)
 class NumberRow:
-    """One number of a robot.
+    """One number of a robot, as a row of a table.
 
     Attributes:
-        path: path in robot.json.
+        group: key of its table.
+        name: name of the number, which is its path if it is in robot.json.
         entry: "wheel 2" for example, empty for a number of the whole robot.
         symbol: symbol in equations.
-        about: meaning in words.
-        unit: unit of the value.
         value: value [unit].
-        interval90: equal-tailed 90 % interval [unit]; None where the number was fixed.
-        verdict: how well the logs determine it.
-        provenance: whether the logs, a prior or an explicit choice determine it.
+        unit: unit of the value.
+        interval90: 90 % interval [unit]; None where there is none.
+        verdict: how certain it is, as people read it.
+        provenance: its origin, as people read it.
+        about: meaning in words.
     """
 
-    path: str
+    group: str
+    name: str
     entry: str
     symbol: str
-    about: str
-    unit: str
     value: float
+    unit: str
     interval90: Pair | None
-    verdict: Verdict
-    provenance: Provenance
+    verdict: str
+    provenance: str
+    about: str
 
     @property
-    def name(self) -> str:
-        """Path and entry together."""
-        return f"{self.path}, {self.entry}" if self.entry else self.path
+    def verdict_markdown(self) -> str:
+        """The verdict for Markdown, in bold where users must be warned."""
+        warned = self.verdict in map(verdict_text, WARNED_VERDICTS)
+        return f"**{self.verdict}**" if warned else self.verdict
 
 
 def verdict_text(verdict: Verdict) -> str:
@@ -70,39 +72,22 @@ def verdict_text(verdict: Verdict) -> str:
     return words.upper() if verdict in WARNED_VERDICTS else words
 
 
-def verdict_markdown(verdict: Verdict) -> str:
-    """Return a verdict for Markdown, in bold where users must be warned."""
-    text = verdict_text(verdict)
-    return f"**{text}**" if verdict in WARNED_VERDICTS else text
-
-
-def values_of(number: RecordedNumber) -> tuple[float, ...]:
-    """Return the values of a number, one or as many as wheels."""
-    return number.value if isinstance(number.value, tuple) else (number.value,)
-
-
-def number_rows(robot: DeployedRobot) -> tuple[NumberRow, ...]:
-    """Return every number of a robot, those per wheel one by one."""
-    known, numbers = robot.record.parameters, declared_numbers(robot.record)
-    return tuple(row for e in numbers for row in _of_entry(e, known[e.path]))
+def number_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
+    """Yield every number of a robot, those per wheel one by one."""
+    for e in declared_numbers(robot.record):
+        number, d, group = robot.record.parameters[e.path], e.declaration, e.path.partition(".")[0]
+        ends = np.reshape([] if number.interval90 is None else number.interval90, (-1, 2)).tolist()
+        for k, value in enumerate(np.ravel(number.value).tolist()):
+            entry = f"wheel {k + 1}" if isinstance(number.value, tuple) else ""
+            about = (d.symbol, value, d.unit, (ends[k][0], ends[k][1]) if ends else None)
+            sure = (verdict_text(number.verdict), number.provenance, d.doc)
+            yield NumberRow(group, e.path, entry, *about, *sure)
 
 
 def paths_with_verdict(robot: DeployedRobot, verdict: Verdict) -> tuple[str, ...]:
     """Return the paths of the numbers with a verdict."""
     known, numbers = robot.record.parameters, declared_numbers(robot.record)
     return tuple(e.path for e in numbers if known[e.path].verdict == verdict)
-
-
-def _of_entry(e: Entry, number: RecordedNumber) -> tuple[NumberRow, ...]:
-    """Return the rows of a number, one per wheel if it has several values."""
-    ends = np.reshape([] if number.interval90 is None else number.interval90, (-1, 2))
-    d, rows = e.declaration, []
-    for k, value in enumerate(values_of(number)):
-        pair = (float(ends[k][0]), float(ends[k][1])) if len(ends) else None
-        name = f"wheel {k + 1}" if isinstance(number.value, tuple) else ""
-        about, sure = (d.symbol, d.doc, d.unit), (number.verdict, number.provenance)
-        rows.append(NumberRow(e.path, name, *about, value, pair, *sure))
-    return tuple(rows)
 
 
 LIMITS: Mapping[str, tuple[str, str]] = {

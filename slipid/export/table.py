@@ -7,14 +7,12 @@ rows with all digits; its lines that start with # are comments.
 import csv
 import io
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-
-from jaxtyping import Array, Float
+from dataclasses import asdict
 
 from slipid.export.description import (
     LIMITS,
     VERDICTS,
-    WARNED_VERDICTS,
+    NumberRow,
     gains_origin,
     header,
     in_markdown,
@@ -25,7 +23,6 @@ from slipid.export.text import interval, one_line, short, table
 from slipid.parameter import entries
 from slipid.robot.controller import Gains, Limits
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.record import Pair
 
 _NUMBER = ("symbol", "value", "unit", "low90", "high90")
 HEAD = ("group", "name", "entry", *_NUMBER, "verdict", "provenance", "meaning")
@@ -45,53 +42,27 @@ _FITTED = "from the motor and all floors"
 _TWIST = (("vx", "m/s"), ("vy", "m/s"), ("W", "rad/s"))
 
 
-@dataclass(frozen=True)
-class TableRow:
-    """One number.
-
-    Attributes:
-        group: key of its table.
-        name: name of the number.
-        entry: entry of the number, such as a wheel.
-        symbol: symbol in equations.
-        value: value [unit].
-        unit: unit of the value.
-        low_high: 90 % interval; None where there is none.
-        verdict: how certain it is, as people read it.
-        provenance: its origin, as people read it.
-        meaning: meaning in words.
-    """
-
-    group: str
-    name: str
-    entry: str
-    symbol: str
-    value: float
-    unit: str
-    low_high: Pair | None
-    verdict: str
-    provenance: str
-    meaning: str
-
-
 def table_files(robot: DeployedRobot) -> dict[str, str]:
     """Return the text of gains.md and gains.csv, for the robot's load set-up."""
     lines = tuple(_lines(robot))
     return {"gains.md": _markdown(robot, lines), "gains.csv": _csv(robot, lines)}
 
 
-def _lines(robot: DeployedRobot) -> Iterator[TableRow]:
+def _lines(robot: DeployedRobot) -> Iterator[NumberRow]:
     yield from _gains(robot)
     for name, value in asdict(Limits()).items():
         unit, about = LIMITS[name]
         sure = ("by hand", "default of slipid")
-        yield TableRow("limits", f"limits.{name}", "", "", float(value), unit, None, *sure, about)
+        yield NumberRow("limits", f"limits.{name}", "", "", float(value), unit, None, *sure, about)
     yield from _matrices(robot)
     yield from _curve(robot)
-    yield from _numbers(robot)
+    ratio, about = float(robot.record.wheels.gear_ratio), "motor speed over wheel speed"
+    gear = ("n", ratio, "1", None, "fixed", "override", about)
+    yield NumberRow("motor", "wheels.gear_ratio", "", *gear)
+    yield from number_rows(robot)
 
 
-def _gains(robot: DeployedRobot) -> Iterator[TableRow]:
+def _gains(robot: DeployedRobot) -> Iterator[NumberRow]:
     gains, tuned = Gains.of(robot), robot.record.gains
     taken = tuned is not None and tuned.is_better and tuned.load == robot.load_setup
     sure = ("tuned, better than by hand", "robot.json") if taken else ("by hand", "default")
@@ -100,10 +71,10 @@ def _gains(robot: DeployedRobot) -> Iterator[TableRow]:
         spread = getattr(tuned.values, e.path).spread if tuned is not None and taken else None
         doc = d.doc if spread is None else f"{d.doc}; std at the end of the search {short(spread)}"
         about = (d.symbol, float(e.get(gains)), d.unit, None)
-        yield TableRow("gains", f"gains.{e.path}", "", *about, *sure, doc)
+        yield NumberRow("gains", f"gains.{e.path}", "", *about, *sure, doc)
 
 
-def _matrices(robot: DeployedRobot) -> Iterator[TableRow]:
+def _matrices(robot: DeployedRobot) -> Iterator[NumberRow]:
     known = robot.record.parameters
     made_of = [f"{path} ({verdict_text(known[path].verdict)})" for path in _GEOMETRY]
     sure = ("derived", f"from {', '.join(made_of)}")
@@ -111,49 +82,36 @@ def _matrices(robot: DeployedRobot) -> Iterator[TableRow]:
         for axis, (name, unit) in enumerate(_TWIST):
             about = ("J", float(robot.forward[k, axis]), f"m/s per {unit}", None, *sure)
             meaning = f"rim speed of wheel {k + 1} per {name}"
-            yield TableRow("forward", f"forward[{k + 1}]", name, *about, meaning)
+            yield NumberRow("forward", f"forward[{k + 1}]", name, *about, meaning)
     for axis, (name, unit) in enumerate(_TWIST):
         for k in range(robot.wheels):
             about = ("J^+", float(robot.inverse[axis, k]), f"{unit} per m/s", None, *sure)
             meaning = f"{name} per rim speed of wheel {k + 1}"
-            yield TableRow("inverse", f"inverse[{name}]", f"wheel {k + 1}", *about, meaning)
+            yield NumberRow("inverse", f"inverse[{name}]", f"wheel {k + 1}", *about, meaning)
 
 
-def _curve(robot: DeployedRobot) -> Iterator[TableRow]:
-    curve: Float[Array, "wheel 2"] = robot.wheel_curve
-    for k in range(robot.wheels):
-        for column, (name, unit, meaning) in enumerate(
-            (("a", "1", "slip ratio without current"), ("b", "1/A", "slip ratio per current"))
-        ):
-            about = (name, float(curve[k, column]), unit, None, "derived", _FITTED, meaning)
-            yield TableRow("wheel_curve", f"wheel_curve.{name}", f"wheel {k + 1}", *about)
+def _curve(robot: DeployedRobot) -> Iterator[NumberRow]:
+    columns = (("a", "1", "slip ratio without current"), ("b", "1/A", "slip ratio per current"))
+    for k, row in enumerate(robot.wheel_curve.tolist()):
+        for value, (name, unit, meaning) in zip(row, columns, strict=True):
+            about = (name, value, unit, None, "derived", _FITTED, meaning)
+            yield NumberRow("wheel_curve", f"wheel_curve.{name}", f"wheel {k + 1}", *about)
 
 
-def _numbers(robot: DeployedRobot) -> Iterator[TableRow]:
-    """Yield the robot's numbers, with the gear ratio among those of the motor."""
-    ratio = robot.record.wheels.gear_ratio
-    about = ("fixed", "override", "motor speed over wheel speed")
-    yield TableRow("motor", "wheels.gear_ratio", "", "n", float(ratio), "1", None, *about)
-    for row in number_rows(robot):
-        number = (row.symbol, row.value, row.unit, row.interval90)
-        sure = (verdict_text(row.verdict), row.provenance, row.about)
-        yield TableRow(row.path.partition(".")[0], row.path, row.entry, *number, *sure)
-
-
-def _csv(robot: DeployedRobot, lines: tuple[TableRow, ...]) -> str:
+def _csv(robot: DeployedRobot, lines: tuple[NumberRow, ...]) -> str:
     text = io.StringIO()
     for line in header(robot):
-        text.write(f"# {line}".replace('"', "'") + "\n")  # a quote might hold lines together
+        text.write(f"# {line}".replace('"', "'") + "\n")  # a quote could join lines
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(HEAD)
     for x in lines:
-        ends = ("", "") if x.low_high is None else tuple(repr(end) for end in x.low_high)
+        ends = ("", "") if x.interval90 is None else tuple(repr(end) for end in x.interval90)
         words = (x.group, one_line(x.name), x.entry, x.symbol, repr(x.value), x.unit, *ends)
-        writer.writerow((*words, x.verdict, x.provenance, x.meaning))
+        writer.writerow((*words, x.verdict, x.provenance, x.about))
     return text.getvalue()
 
 
-def _markdown(robot: DeployedRobot, lines: tuple[TableRow, ...]) -> str:
+def _markdown(robot: DeployedRobot, lines: tuple[NumberRow, ...]) -> str:
     text = ["# Numbers of a robot identified by slipid", "", *in_markdown(robot)]
     text += [gains_origin(robot), ""]
     for group, title in _TITLES.items():
@@ -165,8 +123,6 @@ def _markdown(robot: DeployedRobot, lines: tuple[TableRow, ...]) -> str:
     return "\n".join(text) + "\n"
 
 
-def _shown(x: TableRow) -> tuple[str, ...]:
-    warned = x.verdict in {verdict_text(v) for v in WARNED_VERDICTS}
-    verdict = f"**{x.verdict}**" if warned else x.verdict
-    number = (short(x.value), repr(x.value), x.unit, interval(x.low_high))
-    return (f"`{x.name}`", x.entry, x.symbol, *number, verdict, x.provenance, x.meaning)
+def _shown(x: NumberRow) -> tuple[str, ...]:
+    number = (short(x.value), repr(x.value), x.unit, interval(x.interval90))
+    return (f"`{x.name}`", x.entry, x.symbol, *number, x.verdict_markdown, x.provenance, x.about)

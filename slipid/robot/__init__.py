@@ -1,1 +1,1 @@
-"""What runs on the robot: the deployed robot, estimators, controllers. Needs jax alone."""
+"""Software that runs on the robot: deployed robot, estimators, controllers. It needs jax alone."""

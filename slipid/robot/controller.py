@@ -310,7 +310,7 @@ class Controller(eqx.Module):
             off = force.at[:2].add(-(force[:2] @ u) * u).at[2].multiply(straight)
         if self.correction == "torque":
             moment = f.frame.radius * f.inverse.T @ off
-        else:  # as printed: the lever is divided by, not multiplied
+        else:  # as printed: divided by the lever, not multiplied
             printed = f.forward.at[:, 2].divide(f.frame.base**2)
             moment = f.frame.radius * printed @ off
         moves = jnp.max(jnp.abs(e.wheel_speed)) > 0.5

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Geometry, WheelFrame, at_drives, at_wheels
 from slipid.model.motor import Motor
-from slipid.robot.filter.effects import EffectTable
+from slipid.robot.filter.effects import EffectLookup
 from slipid.robot.record import LoadRecord, Numbers, RobotRecord
 from slipid.robot.robot_file import REWRITE_HINT, check_record, geometry_of, read_robot, write_robot
 from slipid.robot.unseen import with_unseen
@@ -64,7 +64,7 @@ class RobotArrays(eqx.Module):
     mass: Float[Array, ""]
     process: Float[Array, "floor 3"]
     effect: Float[Array, "floor 3"]
-    effect_table: EffectTable
+    effect_table: EffectLookup
     friction_covariance: Float[Array, "floor floor"]
     current_std: Float[Array, " floor"]
     current_trend: Float[Array, "2"]
@@ -288,13 +288,13 @@ def _array(value: Numbers | Sequence[object]) -> Array:
     return jnp.asarray(value, dtype=float)
 
 
-def _effect_table(load: LoadRecord, whole: Array) -> EffectTable:
+def _effect_table(load: LoadRecord, whole: Array) -> EffectLookup:
     """Return the effect table of a load set-up, its stds relative to the whole std of a floor."""
     if load.told is None:
-        return EffectTable.empty(len(whole))
+        return EffectLookup.empty(len(whole))
     mean, left = _array(load.told.mean), _array(load.told.left)
     part = left / jnp.maximum(whole[:, None, None], 1e-12)
-    return EffectTable(jnp.log(_array(load.told.speeds)), jnp.concatenate([mean, part], axis=-1))
+    return EffectLookup(jnp.log(_array(load.told.speeds)), jnp.concatenate([mean, part], axis=-1))
 
 
 def _friction_covariance(record: RobotRecord) -> Array:

@@ -85,7 +85,7 @@ def _middle(record: RobotRecord) -> dict[str, RecordedNumber]:
         signed = quantity in _SIGNED
         middle = each.mean(axis=0) if signed else np.exp(np.log(each).mean(axis=0))
         middle_floor[quantity] = RecordedNumber.without_std(
-            plain(middle), number.unit, "not_identified", "borrowed"
+            plain(np.asarray(middle)), number.unit, "not_identified", "borrowed"
         )
     return middle_floor
 
@@ -100,11 +100,7 @@ def _load(load: LoadRecord, count: int) -> LoadRecord:
     one = replace(load, spread=load.spread + (spread,) * count)
     if load.told is None:
         return one
-    zero, left = (0.0, 0.0, 0.0), axes_of(np.hypot(EFFECT, spread))
-    around, speeds = len(load.told.mean[0][0]), len(load.told.speeds)
-
-    def more(axes: Axes) -> tuple[tuple[tuple[Axes, ...], ...], ...]:
-        return ((((axes,) * around),) * speeds,) * count
-
-    mean, rest = load.told.mean + more(zero), load.told.left + more(left)
-    return replace(one, told=replace(load.told, mean=mean, left=rest))
+    left, shape = axes_of(np.hypot(EFFECT, spread)), np.shape(load.told.mean)
+    zeros, lefts = ((((axes,) * shape[2],) * shape[1],) * count for axes in ((0.0, 0.0, 0.0), left))
+    effects = replace(load.told, mean=load.told.mean + zeros, left=load.told.left + lefts)
+    return replace(one, told=effects)

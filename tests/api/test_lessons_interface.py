@@ -1,4 +1,4 @@
-"""What a notebook has beside fits: made runs, steady motion, a check, a comparison, a drive."""
+"""The public interface beside fits: simulated runs, steady motion, check, comparison, drive."""
 
 from __future__ import annotations
 

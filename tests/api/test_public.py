@@ -1,4 +1,4 @@
-"""The README's example, word by word, and what is beside it on the public interface."""
+"""The README's example, word by word, and the rest of the public interface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configs: what may be said, what is refused and in which words; from a config to a job."""
+"""Configs: accepted keys, refusals and their messages, and the fit task of a config."""
 
 from __future__ import annotations
 

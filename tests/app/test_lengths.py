@@ -1,4 +1,4 @@
-"""Which lengths are trusted, and what is found of a lag, before the user says otherwise."""
+"""Trusted lengths, and the lag that the motion shows, unless the config decides otherwise."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A new config: what each drive is asked, what is written, and the robot as it is drawn."""
+"""A new config: questions of each drive, the written text, and the drawing of the robot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs and config that do not go together are named, and not fitted unless that is wanted."""
+"""Logs and config that contradict each other are named, and fitted only on request."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far a fit may be trusted stands in run.json, in pictures and in the exit code."""
+"""The trust in a fit is in run.json, in pictures and in the exit code."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""What is known of the weight on the wheels becomes the prior of the load shares."""
+"""Known weight on the wheels becomes the prior of the load shares."""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ static void pose_loop(const slipid_controller *held, const double ref[6], const 
   out[1] = c * vy - s * vx;
   out[2] = ref[5] + YAW * sin(ref[2] - pose[2]);
   if (tried > 0.0) {
-    const double more = 1.0 + HARDER * tried;
+    const double more = 1.0 + RECOVERY_GROWTH * tried;
     const bool turning = turns(tried);
     out[0] *= turning ? 0.0 : more;
     out[1] *= turning ? 0.0 : more;

@@ -1,4 +1,4 @@
-"""The demo: recorded logs of the test site, and what slipid makes of a physics it does not know."""
+"""The demo: recorded logs of the test site, and a fit to a physics that slipid does not know."""
 
 import json
 import subprocess

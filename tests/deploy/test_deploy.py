@@ -69,7 +69,7 @@ def test_a_fit_writes_its_robot(fitted):
         np.testing.assert_array_equal(a, b)
 
 
-def test_what_it_is_told_of_effects_is_what_forecasts_know(fitted):
+def test_its_effect_table_equals_the_forecasts(fitted):
     robot, contact = read_robot(fitted), load(fitted).contact
     told = robot.record.loads[0].told
     for n, speed in enumerate(told.speeds):
@@ -114,7 +114,7 @@ def test_gains_of_an_older_file_outlive_the_same_numbers_and_are_driven_with(fit
 
 
 def older_gains() -> dict[str, object]:
-    """As `slipid tune` of earlier versions wrote them into robot.json."""
+    """Tuned gains, as `slipid tune` of earlier versions wrote them into robot.json."""
     rows = (
         ("place", "1/s"),
         ("yaw", "1/s"),

@@ -187,7 +187,7 @@ def test_a_robot_is_found_in_a_folder_or_a_file_with_some_of_its_floors(tmp_path
         (ExportOptions(speed=9.0), "speed 9 m/s"),
     ],
 )
-def test_what_cannot_be_exported_is_said_before_anything_is_written(tmp_path, wish, said):
+def test_invalid_options_are_refused_before_anything_is_written(tmp_path, wish, said):
     with pytest.raises(DataError, match=said):
         export(ROBOT, tmp_path / "out", wish, QUIET)
     assert not (tmp_path / "out").exists()
@@ -195,6 +195,8 @@ def test_what_cannot_be_exported_is_said_before_anything_is_written(tmp_path, wi
 
 def test_a_folder_with_other_files_is_refused_before_anything_is_made(tmp_path, monkeypatch):
     (tmp_path / "mine.txt").write_text("kept")
-    monkeypatch.setattr("slipid.deploy.export._form", lambda *_: pytest.fail("made a form"))
+    monkeypatch.setattr(
+        "slipid.deploy.export.control_loop_of", lambda *_, **__: pytest.fail("made")
+    )
     with pytest.raises(DataError, match="files that no export wrote"):
         export(ROBOT, tmp_path, ExportOptions(), QUIET)

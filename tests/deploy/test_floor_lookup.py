@@ -1,4 +1,4 @@
-"""Which floor is under each wheel, and how far its border is."""
+"""Floor under each wheel, and distance of its border."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from slipid.model.robot import build
 from tests.helpers.shared import invoke
 
 EDGE = 0.1
-"""Where the carpet begins, x [m]."""
+"""Edge of the carpet, x [m]."""
 COLOURS = {"table": "#ffffff", "carpet": "#206030"}
 GLOB = "as_built/soft/run00[0-3].csv"
 

@@ -123,7 +123,7 @@ int main() {
   printf("%g %g", (double)estimate.pose[0], (double)command[0]);
 }
 """
-"""What an Arduino's core does around a sketch."""
+"""Main loop that an Arduino core runs around a sketch."""
 
 
 @pytest.mark.slow

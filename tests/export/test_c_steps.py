@@ -119,10 +119,10 @@ def test_every_field_has_a_unit():
 
 
 def test_a_docstring_says_what_each_attribute_is():
-    said = attribute_docs(Measurement)
-    assert said["gyro"] == "yaw rate [rad/s]"
-    assert said["fix_std"].startswith("of its place [m] and of its heading [rad]")
-    assert set(said) == set(vars(Measurement()))
+    docs = attribute_docs(Measurement)
+    assert docs["gyro"] == "yaw rate [rad/s]"
+    assert docs["fix_std"].startswith("std of the fix's position [m] and heading [rad]")
+    assert set(docs) == set(vars(Measurement()))
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ def test_what_was_written_is_whole(folder):
 
 
 @pytest.mark.parametrize("name", CONTENT)
-def test_a_changed_byte_is_told_with_its_file(folder, name):
+def test_a_changed_byte_is_reported_with_its_file(folder, name):
     data = bytearray((folder / name).read_bytes())
     data[0] ^= 1
     (folder / name).write_bytes(bytes(data))
@@ -34,13 +34,13 @@ def test_a_changed_byte_is_told_with_its_file(folder, name):
         check_folder(folder)
 
 
-def test_a_file_that_was_added_is_told(folder):
+def test_an_added_file_is_reported(folder):
     (folder / "c/src/more.c").write_text("int y;\n")
     with pytest.raises(DataError, match=r"more\.c: not there when the folder was written"):
         check_folder(folder)
 
 
-def test_a_lost_file_is_told(folder):
+def test_a_lost_file_is_reported(folder):
     (folder / "c/src/slipid.c").unlink()
     with pytest.raises(DataError, match=r"slipid\.c: No such file"):
         check_folder(folder)

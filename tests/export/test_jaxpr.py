@@ -1,4 +1,4 @@
-"""What JAX has traced is read from the form of every version that is admitted, and of no other."""
+"""Traced functions are read from every supported version of JAX, and from no other."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _numbers(params):
         pytest.param(lambda: _written(ft_in=_Tree([(0, 0), (0, 0), (0,)])), id="since jax 0.11"),
     ],
 )
-def test_a_scan_is_read_alike_from_every_form(params):
+def test_a_scan_is_read_the_same_from_every_form(params):
     assert _numbers(params()) == (3, 2, 2)
 
 

@@ -383,7 +383,7 @@ def test_a_primitive_without_a_form_in_c_is_refused_by_name_and_line():
         (lambda x: jax.lax.scan(lambda c, y: (c + y, c), 0.0, x)[1], "goes through an array"),
     ],
 )
-def test_what_would_be_other_numbers_in_c_is_refused(run, said):
+def test_operations_with_other_results_in_c_are_refused(run, said):
     with pytest.raises(UnsupportedError, match=said):
         function(Names(), "f", "", _arguments(run, [LANES])[0], traced(run, jnp.ones(N)))
 

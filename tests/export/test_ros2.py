@@ -100,7 +100,7 @@ KEYS = {"type", "default_value", "description", "read_only", "validation"}
 
 
 def faults(given: Mapping[str, object], declared: Mapping[str, dict]) -> list[str]:
-    """What is wrong with parameters, by their declaration."""
+    """Return the errors of parameters by their declaration."""
     wrong = [f"{name} is not declared" for name in given if name not in declared]
     for name, d in declared.items():
         if name not in given:

@@ -115,7 +115,7 @@ def test_identified_sizes_stand_in_exactly(robot, files):
 
 
 @pytest.mark.slow
-def test_drives_that_are_off_are_met_on_average_and_told(robot, files):
+def test_deviating_drives_are_averaged_and_reported(robot, files):
     p = parameters(files, "drive_controller.yaml", OMNI)
     mean = np.mean(robot.record.parameters["robot.drive_offset"].value)
     assert p["wheel_offset"] == pytest.approx(np.radians(60) + mean, abs=1e-12)

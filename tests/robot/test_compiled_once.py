@@ -1,4 +1,4 @@
-"""What is compiled depends on a robot's structure, and on no number of it."""
+"""Compiled code depends on a robot's structure, and on none of its numbers."""
 
 from dataclasses import replace
 

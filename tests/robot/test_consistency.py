@@ -62,7 +62,7 @@ def sure_of(state, hypothesis, count, of_others=1e-9):
 
 
 @pytest.mark.slow
-def test_news_that_comes_late_corrects_the_pose_by_the_difference_of_the_ways_once():
+def test_late_evidence_corrects_the_pose_by_the_difference_of_the_paths_once():
     robot = deployed()
     est = Estimator(robot, Settings(patch_m=1e9))  # floors do not change on the way
     run = partial(stepped(est), dt=DT)
@@ -263,7 +263,7 @@ def test_a_reading_moves_what_learns_and_leaves_the_rest_with_the_right_covarian
 
 @pytest.mark.slow
 def test_a_gyro_leaves_what_pushes_the_body_as_it_is():
-    """The belief about the floors has heard the same gyro."""
+    """The belief about the floors already uses the same gyro."""
     robot = deployed(process=1.0, run=1.0, current=1.0)
     state, speed = Estimator(robot).init(), rolling(robot, (0.2, 0.0, 0.0))
     est = Estimator(robot)
@@ -359,7 +359,7 @@ def within(values, freedom):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gyro", [False, True])
-def test_nees_of_the_pose_after_each_of_four_ways(gyro):
+def test_nees_of_the_pose_after_each_of_four_paths(gyro):
     """Right to a fifth: 200 runs tell the mean to a ninth, and the filter is a linearised one."""
     nees, _, _ = runs(gyro, False)
     after = nees[:, 79::60].mean(axis=0)

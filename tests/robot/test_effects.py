@@ -1,4 +1,4 @@
-"""What is told of effects: at its rows, between and beyond them, and in what the estimator says."""
+"""Effect tables at their rows, between and beyond them, and in the estimator's results."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from slipid.fit import shared_effects as shared
 from slipid.robot.estimator import Estimator
-from slipid.robot.filter.effects import FORGETS, EffectTable, RolledMotion
+from slipid.robot.filter.effects import FORGETS, EffectLookup, RolledMotion
 from slipid.robot.interface import Measurement, Settings
 from tests.helpers.small_twin import deployed
 from tests.helpers.stepped import stepped
@@ -26,7 +26,7 @@ def table():
     rows = np.zeros((2, 3, 8, 6))
     rows[1, :, :, 0] = 0.01 * np.arange(8)
     rows[..., 3:] = np.array([0.3, 0.5, 0.7])[:, None, None]
-    return EffectTable(jnp.log(jnp.asarray(SPEEDS)), jnp.asarray(rows))
+    return EffectLookup(jnp.log(jnp.asarray(SPEEDS)), jnp.asarray(rows))
 
 
 def at(angle, speed, turn=0.0):
@@ -46,7 +46,7 @@ def test_the_table_is_met_at_its_rows_and_is_linear_between_them():
     np.testing.assert_allclose(part**2, 0.4**2, atol=1e-9)
 
 
-def test_beyond_its_speeds_and_on_the_spot_nothing_is_told_in_the_end():
+def test_estimates_fade_beyond_the_table_and_on_the_spot():
     mean, part = at(np.pi / 4, 0.4 * np.exp(FORGETS))
     keep = np.exp(-0.5)
     np.testing.assert_allclose(mean[1, 0], keep * 0.01, rtol=1e-6)
@@ -71,7 +71,7 @@ def driven(told, hypothesis):
     if told:
         rows = jnp.concatenate([MISSED, PARTS], axis=1)[:, None, None]
         robot = eqx.tree_at(
-            lambda r: r.effect_table, robot, EffectTable(jnp.log(jnp.asarray([0.2])), rows)
+            lambda r: r.effect_table, robot, EffectLookup(jnp.log(jnp.asarray([0.2])), rows)
         )
     watched = Estimator(robot, Settings(patch_m=1e9))
     run = partial(stepped(watched), dt=DT)
@@ -84,7 +84,7 @@ def driven(told, hypothesis):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("under", [0, 1])
-def test_the_twist_is_that_of_the_contact_and_what_is_told_of_its_floor(under):
+def test_the_twist_is_the_contact_models_plus_the_effect_of_the_floor(under):
     """Along, across and in yaw, per metre of wheels that do not slip; what is left is the std."""
     robot, said, state = driven(told=True, hypothesis=7 * under)
     along, across, yaw = np.asarray(MISSED[under])
@@ -98,8 +98,8 @@ def test_the_twist_is_that_of_the_contact_and_what_is_told_of_its_floor(under):
 
 
 @pytest.mark.slow
-def test_of_wheels_on_several_floors_nothing_is_told():
-    """Twist and std are those of a robot that is told nothing: what is told is of one floor."""
+def test_wheels_on_several_floors_have_no_estimated_effect():
+    """Twist and std equal those without an effect table, whose effects are of single floors."""
     (_, said, state), (_, alone, bare) = (driven(told, hypothesis=1) for told in (True, False))
     np.testing.assert_allclose(said.twist, alone.twist, atol=1e-5)
     np.testing.assert_allclose(

@@ -96,7 +96,7 @@ def test_the_estimator_ends_nearer_than_encoders(driven):
 
 
 @pytest.mark.slow
-def test_wheels_of_a_drive_that_turn_alike_move_the_body_as_it_says(driven):
+def test_wheels_of_a_drive_with_one_speed_move_the_body_as_declared(driven):
     robot, _ = driven
     rim = jnp.arange(1.0, robot.drives + 1)
     np.testing.assert_allclose(robot.by_wheels @ robot.at_wheels(rim), robot.inverse @ rim)

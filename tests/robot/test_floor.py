@@ -1,4 +1,4 @@
-"""What a map tells the estimator: floors where the robot is, and where it is."""
+"""A floor map informs the estimator about the floors under the wheels, and about the pose."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_beliefs_that_nothing_has_changed_move_no_pose(belief):
 
 @eqx.filter_jit
 def driven(there, paths, starts, keys, habits, known):
-    """True poses and what is believed on chess patches, told the map `known`."""
+    """Return true and estimated poses on chess patches, with the map `known`."""
     robot = ROBOT
     control_loop = ControlLoop(Estimator(robot, SETTINGS, known), Controller(robot, Gains()))
 
@@ -128,10 +128,7 @@ def driven(there, paths, starts, keys, habits, known):
 
 
 def errors(known, habits=HABITS):
-    """Of every case in the end, the believed place's error [m] and the squared error of the pose.
-
-    The latter is over the covariance that the estimator gives.
-    """
+    """Return the final position errors [m] and the squared normalized error of the pose."""
     rng = np.random.default_rng(1)
     starts = np.concatenate(
         [rng.uniform(-0.5, 0.2, (CASES, 2)), rng.uniform(-3, 3, (CASES, 1))], axis=1

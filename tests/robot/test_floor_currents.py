@@ -65,7 +65,7 @@ def test_where_frictions_are_open_currents_rule_out_no_mixture_of_floors():
 
 
 @pytest.mark.parametrize("turn", [0.3, np.nan])
-def test_evidence_is_that_of_normal_errors_of_what_was_heard(turn):
+def test_evidence_is_that_of_normal_errors_of_the_readings(turn):
     """Up to what is the same under every hypothesis and under none of them."""
     robot, s = deployed(1.0, 1.0, 0.3), Settings()
     floors, rng = FloorFilter(robot, s), np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Ways in which wheels may stand on floors."""
+"""Hypotheses of the floors under the wheels."""
 
 import itertools
 
@@ -10,7 +10,7 @@ from slipid.robot.filter.hypotheses import CHANGES, _hypotheses
 
 
 def ways(place, floors, changes=CHANGES, unseen=0):
-    """So many floors that were driven on, and after them so many that were not."""
+    """Return the hypotheses of known floors and, after them, unseen ones."""
     around = general(place, [0.0] * len(place), [90.0] * len(place), 0.05).around
     return _hypotheses(around, (False,) * floors + (True,) * unseen, changes)
 
@@ -59,7 +59,7 @@ def test_all_wheels_on_a_floor_and_floors_under_wheels():
     assert (found.on.sum(axis=2) == 1).all()
 
 
-def test_all_ways_are_there_if_any_edge_may_be():
+def test_all_assignments_are_there_if_edges_may_be_anywhere():
     assert len(ways(FOUR, 5, changes=4)) == 625
 
 

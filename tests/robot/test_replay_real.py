@@ -77,7 +77,7 @@ def rows(
     return replayed.judged(robot, deployed.labels, data, said, noise)
 
 
-def test_it_says_what_was_reviewed(data: Runs, said: list[Any], golden) -> None:
+def test_it_repeats_the_reviewed_numbers(data: Runs, said: list[Any], golden) -> None:
     """Pose, covariance, slip and belief half-way and at the end of every run."""
     table = []
     for log, of in zip(data.logs, said, strict=True):

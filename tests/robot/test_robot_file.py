@@ -34,7 +34,7 @@ SEEN = Validity(
     3, ("as_built",), (0.0, 8.0), (0.0, 0.4), (0.0, 0.3), (0.0, 1.0), (0.0,), (), (), 1.1
 )
 ONE = (((0.01, -0.02, 1 / 3), (0.0, 0.1 + 0.2, 0.0)), ((0.0, 0.0, 0.0), (0.001, 0.0, -0.1)))
-"""What is told of a floor at two speeds and in two directions."""
+"""Effects of a floor at two speeds and in two directions."""
 LEFT = (((0.01, 0.02, 0.03), (0.03, 0.02, 0.01)), ((0.01, 0.01, 0.01), (0.02, 0.02, 0.0)))
 TOLD = EffectRecord((0.1, 0.3), (ONE, ONE[::-1]), (LEFT, LEFT[::-1]))
 
@@ -330,7 +330,7 @@ def test_a_changed_digit_is_refused(path):
         (lambda c: c.update(floors=[]), "floors []; expected one or more"),
     ],
 )
-def test_what_is_missing_or_wrong_is_named(path, change, said):
+def test_missing_and_wrong_fields_are_named(path, change, said):
     if "checksum" in said:
         content = json.loads(path.read_text())
         change(content)

@@ -35,7 +35,7 @@ def value(robot: DeployedRobot, path: str) -> float:
     return number
 
 
-def test_they_lie_about_the_middle_of_the_floors_that_were_driven_on():
+def test_unseen_floors_surround_the_middle_of_the_known_floors():
     known, wider = deployed(process=1.0), deployed(process=1.0).with_unseen()
     names = wider.labels[2:]
     assert names == tuple(f"unseen_{k + 1}" for k in range(COUNT))
@@ -56,14 +56,14 @@ def test_they_lie_about_the_middle_of_the_floors_that_were_driven_on():
     }
 
 
-def test_currents_on_them_are_less_sure_than_on_any_floor_of_the_robot():
+def test_currents_on_unseen_floors_are_less_certain_than_on_any_known_floor():
     wider = deployed(current=1.0).with_unseen()
     known, made = np.asarray(wider.current_std[:2]), np.asarray(wider.current_std[2:])
     assert made == pytest.approx(1.5 * known.mean())
     assert made.min() > known.max()
 
 
-def test_nothing_is_told_of_them_but_how_far_off_they_are():
+def test_effects_of_unseen_floors_are_unknown_and_have_a_large_std():
     made = build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["firm", "soft"])
     cell = ((0.01, -0.02, 0.3), (0.0, 0.1, 0.0))
     left = ((0.01, 0.02, 0.3), (0.0, 0.1, 0.0))
@@ -81,7 +81,7 @@ def test_nothing_is_told_of_them_but_how_far_off_they_are():
     assert np.asarray(load.told.left[2:]) == pytest.approx(np.tile(both, (COUNT, 1, 2, 1)))
 
 
-def test_together_they_are_as_rare_as_a_second_floor_under_the_robot():
+def test_unseen_floors_together_are_as_rare_as_a_second_floor():
     known, wider = deployed(), deployed().with_unseen()
     settings = Settings(further_floor_penalty=2.0)
     prior = np.asarray(FloorFilter(wider, settings).prior())
@@ -92,18 +92,18 @@ def test_together_they_are_as_rare_as_a_second_floor_under_the_robot():
     assert prior[ways.uniform[2:]].sum() == pytest.approx(np.exp(-2.0) * prior[ways.uniform[0]])
 
 
-def test_a_robot_has_them_once():
+def test_unseen_floors_are_added_once():
     record = with_unseen(deployed().record)
     assert with_unseen(record) is record
 
 
-def test_a_floor_that_has_their_name_already_is_refused():
+def test_a_floor_with_the_name_of_an_unseen_floor_is_refused():
     made = deploy_known(build(omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0), ["unseen_3"]))
     with pytest.raises(ValueError, match="floor 'unseen_3'"):
         made.with_unseen()
 
 
-def test_a_robot_comes_to_them_and_from_them_as_a_whole():
+def test_a_robot_enters_and_leaves_unseen_floors_as_a_whole():
     wider = deployed().with_unseen()
     by_floor, ways = FloorFilter(wider, Settings()), hypotheses_of(wider)
     for start in (0, 5):
@@ -148,7 +148,7 @@ def driven(estimator: Estimator, w: jax.Array, amps: jax.Array) -> jax.Array:
 def end_after(
     robot: DeployedRobot, numbers: dict[str, float], way: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the strange floor leads in 4 s, and where the robot believes to be."""
+    """Return true and estimated poses after 4 s on an unfamiliar floor."""
     truth, settings = strange(tuple(numbers.items())), Settings(current_is_signed=True)
     w = truth.forward @ jnp.asarray([0.2 * np.cos(way), 0.2 * np.sin(way), 0.0]) / 0.04
     xi = jnp.zeros((1, 3))
@@ -163,7 +163,7 @@ def end_after(
 @pytest.mark.slow
 @pytest.mark.parametrize("way", [0.3, 1.2, 2.5])
 @pytest.mark.parametrize(("numbers", "part"), [(SOFT, 0.7), (OTHER, 0.9)])
-def test_a_strange_floor_is_taken_for_what_its_currents_are_like(numbers, part, way):
+def test_an_unfamiliar_floor_is_identified_by_its_currents(numbers, part, way):
     true, pose = end_after(deployed(), numbers, way)
     _, wider = end_after(deployed().with_unseen(), numbers, way)
     before, after = (float(np.hypot(*(p - true)[:2])) for p in (pose, wider))

@@ -68,7 +68,7 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
     Args:
         bags: the files, as from `bags_in`.
         path: the log or folder that the user named.
-        options: what the user said about the robot.
+        options: command-line options that describe the robot.
     """
     bag = bags[0]
     topics = topics_of(bag)

@@ -37,16 +37,16 @@ class ConfigLine:
 
     def text(self) -> str:
         """Return the line, below its question."""
-        asked = _question_lines(self.question)
+        question = _question_lines(self.question)
         line = f"{'# ' if self.commented_out else ''}{self.key} = {self.value}"
         if not self.comment:
-            return asked + line
+            return question + line
         if len(line) < _COLUMN:
             line = line.ljust(_COLUMN - 1)
         elif len(line) + len(self.comment) + 3 > _WIDTH + 4:
             above = "".join(f"# {part}\n" for part in wrapped(self.comment, _WIDTH - 2))
-            return asked + above + line
-        return f"{asked}{line} # {self.comment}"
+            return question + above + line
+        return f"{question}{line} # {self.comment}"
 
 
 @dataclass(frozen=True)
@@ -214,14 +214,14 @@ def _wheel_line(robot: Geometry, wheel: int) -> str:
     """Return a line with the place, direction and rollers of a wheel."""
     x, y = (float(robot.base_radius) * c for c in robot.place[wheel])
     degrees = math.degrees(robot.drive_angle[wheel]) % 360
-    way = f"drives {direction(degrees)}" + (f" ({degrees:.0f} deg)" if degrees % 90 else "")
+    motion = f"drives {direction(degrees)}" + (f" ({degrees:.0f} deg)" if degrees % 90 else "")
     if robot.grips[wheel]:
         rollers = "no rollers"
     else:
         rollers = f"rollers at {math.degrees(robot.roller_angle[wheel]):.0f} deg"
         rollers += _tilt(degrees, math.degrees(robot.roller_angle[wheel]))
     at = f"{_corner(x, y):<12} x = {x:+.3f} m, y = {y:+.3f} m"
-    return f"wheel {wheel + 1}: {at}, {way}, {rollers}"
+    return f"wheel {wheel + 1}: {at}, {motion}, {rollers}"
 
 
 def _tilt(drive: float, roller: float) -> str:
@@ -234,9 +234,9 @@ def _tilt(drive: float, roller: float) -> str:
 
 def _corner(x: float, y: float) -> str:
     """Return the corner of the robot that a place is in."""
-    far = 0.2 * math.hypot(x, y)
-    along = "front" if x > far else "rear" if x < -far else ""
-    return f"{along} {'left' if y > far else 'right' if y < -far else ''}".strip()
+    edge = 0.2 * math.hypot(x, y)
+    along = "front" if x > edge else "rear" if x < -edge else ""
+    return f"{along} {'left' if y > edge else 'right' if y < -edge else ''}".strip()
 
 
 def _motor_lines(robot: Geometry) -> list[str]:

@@ -140,9 +140,11 @@ def ticks_are_increments(found: FileChannel, one: FileStudy, by_pose: PoseMotion
         np.abs(np.diff(values, axis=0)).sum(axis=1),
     )
     if by_pose.time is not None and by_pose.steps is not None and len(by_pose.time) > 20:
-        way = np.interp(one.time, by_pose.time, np.cumsum(by_pose.steps))
-        width = max(1, len(way) // 60)
-        sums = [_block_sums(row, width) for row in (of_rows, of_changes, np.abs(np.diff(way)))]
+        travelled = np.interp(one.time, by_pose.time, np.cumsum(by_pose.steps))
+        width = max(1, len(travelled) // 60)
+        sums = [
+            _block_sums(row, width) for row in (of_rows, of_changes, np.abs(np.diff(travelled)))
+        ]
         if all(float(np.std(part)) > 0 for part in sums):
             rows, changes = (float(np.corrcoef(part, sums[2])[0, 1]) for part in sums[:2])
             if abs(rows - changes) > 0.15:
@@ -168,7 +170,7 @@ def pose_over_wheel_speed(one: FileStudy, speed: FileChannel, by_pose: PoseMotio
     """
     if by_pose.time is None or by_pose.x is None or by_pose.y is None or one.clock is None:
         return None
-    # two wheels point ahead: their mean has the sign of the way; of others the sizes are as good
+    # two wheels point ahead: their mean has the sign of the motion; others give its size only
     ahead = speed.values.shape[1] <= _ALIGNED_DRIVES
     rows = speed.values.mean(axis=1) if ahead else np.sqrt((speed.values**2).mean(axis=1))
     there = ~(np.isnan(rows) | np.isnan(one.time))
@@ -181,11 +183,11 @@ def pose_over_wheel_speed(one: FileStudy, speed: FileChannel, by_pose: PoseMotio
         return None
     edges = np.linspace(start, end, max(2, int(end - start)))
     by_wheels = np.abs(np.diff(np.interp(edges, time, turned)))
-    # chords and not the way along all poses, which noise makes longer
+    # chords instead of the path length along all poses, which noise increases
     x, y = (np.interp(edges, by_pose.time, part) for part in (by_pose.x, by_pose.y))
-    way = np.hypot(np.diff(x), np.diff(y))
+    chords = np.hypot(np.diff(x), np.diff(y))
     good = by_wheels > 0.3 * by_wheels.max(initial=0.0)
-    ratio = float(np.median(way[good] / by_wheels[good])) if good.any() else 0.0
+    ratio = float(np.median(chords[good] / by_wheels[good])) if good.any() else 0.0
     return ratio if ratio > 0 else None
 
 

@@ -60,11 +60,11 @@ def purpose(kind: type) -> str:
     return " ".join(text.split())
 
 
-def keys(kind: type) -> tuple[str, ...]:
-    """Return the keys in the order of declaration, as a config spells them."""
+def keys(kind: type) -> dict[str, str]:
+    """Return attributes in the order of declaration, with their keys as a config spells them."""
     if issubclass(kind, BaseModel):
-        return tuple(field.alias or name for name, field in kind.model_fields.items())
-    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()
+        return {name: field.alias or name for name, field in kind.model_fields.items()}
+    return {field.name: field.name for field in fields(kind)} if is_dataclass(kind) else {}
 
 
 def _attributes(docstring: str) -> dict[str, str]:
@@ -92,8 +92,8 @@ def _split_line(key: str, text: str) -> list[tuple[str, str]]:
     first, *others = _NEXT_ATTRIBUTE.split(text)
     pairs = [(key, first)]
     for other in others:
-        name, _, said = other.partition(": ")
-        pairs.append((name, said))
+        name, _, text = other.partition(": ")
+        pairs.append((name, text))
     return pairs
 
 
@@ -149,14 +149,14 @@ def _row(
     one = entry.declaration
     value = np.atleast_1d(np.asarray(entry.get(robot), float))
     start = f"{value[0]:.4g}" if np.ptp(value) == 0 else ", ".join(f"{v:.4g}" for v in value)
-    said = [
+    choices = [
         _setting_text(choice)
         for pattern, choice in settings.items()
         if fnmatchcase(entry.path, pattern)
     ]
     return ParameterRow(
         *(entry.path, entry.size, one.symbol, one.unit, one.doc, start, prior(one)),
-        here="; ".join(said),
+        here="; ".join(choices),
     )
 
 
@@ -180,12 +180,12 @@ def _setting_text(choice: ParameterSection) -> str:
     """Return a config's choice for a parameter in words."""
     if choice.fixed is not None:
         return f"fixed = {choice.fixed}"
-    said = [] if choice.start is None else [f"start = {choice.start}"]
+    parts = [] if choice.start is None else [f"start = {choice.start}"]
     if choice.free is not None:
-        said.append("fitted" if choice.free else "not fitted")
+        parts.append("fitted" if choice.free else "not fitted")
     if choice.prior is not None:
-        said.append(f"prior {choice.prior.mean} +- {choice.prior.std}")
-    return ", ".join(said)
+        parts.append(f"prior {choice.prior.mean} +- {choice.prior.std}")
+    return ", ".join(parts)
 
 
 _PLAIN = {
@@ -212,33 +212,17 @@ class ConfigKey:
 def keys_of(kind: type, hidden: tuple[str, ...] = ()) -> list[ConfigKey]:
     """Return every key of a model or a dataclass."""
     hints = get_type_hints(kind, include_extras=True)
-    named = {_declared(kind, key): key for key in keys(kind) if key not in hidden}
-    return [
-        ConfigKey(
-            key,
-            in_words(hints[name], _field_limits(kind, name)),
-            _default(kind, name),
-            _key_meaning(kind, key, hints[name]),
-        )
-        for name, key in named.items()
-    ]
-
-
-def _declared(kind: type, key: str) -> str:
-    """Return the name of the attribute that a key is read into."""
-    if not issubclass(kind, BaseModel):
-        return key
-    return next(name for name, field in kind.model_fields.items() if (field.alias or name) == key)
-
-
-def _field_limits(kind: type, name: str) -> tuple[object, ...]:
-    """Return the limits of a model's field beside its type."""
-    return tuple(kind.model_fields[name].metadata) if issubclass(kind, BaseModel) else ()
-
-
-def _key_meaning(kind: type, key: str, hint: object) -> str:
-    """Return the meaning of a key; empty for a drive, whose type lists its few values."""
-    return "" if key == "drive" and get_origin(hint) is Literal else meaning(kind, key)
+    found = []
+    for name, key in keys(kind).items():
+        if key in hidden:
+            continue
+        hint = hints[name]
+        limits = tuple(kind.model_fields[name].metadata) if issubclass(kind, BaseModel) else ()
+        # the type of a drive lists its few values, which need no meaning
+        listed = key == "drive" and get_origin(hint) is Literal
+        means = "" if listed else meaning(kind, key)
+        found.append(ConfigKey(key, in_words(hint, limits), _default(kind, name), means))
+    return found
 
 
 def in_words(hint: object, limits: tuple[object, ...] = ()) -> str:
@@ -284,13 +268,13 @@ def _length_text(limits: tuple[object, ...]) -> str:
 
 def _limits(limits: tuple[object, ...]) -> str:
     signs = {Gt: (">", "gt"), Ge: (">=", "ge"), Lt: ("<", "lt"), Le: ("<=", "le")}
-    said = {
+    bounds = {
         f"{sign} {getattr(one, attribute):g}"
         for one in _unpacked(limits)
         for kind, (sign, attribute) in signs.items()
         if isinstance(one, kind)
     }
-    return f" {' and '.join(sorted(said, reverse=True))}" if said else ""
+    return f" {' and '.join(sorted(bounds, reverse=True))}" if bounds else ""
 
 
 def _unpacked(limits: tuple[object, ...]) -> list[object]:
@@ -302,8 +286,8 @@ def _default(kind: type, name: str) -> str:
     """Return the default in words; "required" where there is none."""
     if issubclass(kind, BaseModel):
         field = kind.model_fields[name]
-        made = field.get_default(call_default_factory=True)
-        return "required" if made is PydanticUndefined else _toml_text(made)
+        value = field.get_default(call_default_factory=True)
+        return "required" if value is PydanticUndefined else _toml_text(value)
     assert is_dataclass(kind)
     one = next(f for f in fields(kind) if f.name == name)
     if one.default_factory is not MISSING:

@@ -56,30 +56,23 @@ def _table(declared: str, values: np.ndarray) -> list[str]:
 
 
 def _filling(struct: Struct) -> list[str]:
-    lines = [f"static void golden_reading({struct.name} *reading, const double *row) {{"]
-    place = 0
-    for field in struct.fields:
-        for k in range(field.size):
-            at = f"[{k}]" if field.shape else ""
-            lines.append(f"  reading->{field.name}{at} = (slipid_real)row[{place}];")
-            place += 1
-    return [*lines, "}", ""]
+    names = [f"{f.name}[{k}]" if f.shape else f.name for f in struct.fields for k in range(f.size)]
+    return [
+        f"static void golden_reading({struct.name} *reading, const double *row) {{",
+        *(f"  reading->{name} = (slipid_real)row[{k}];" for k, name in enumerate(names)),
+        "}",
+        "",
+    ]
 
 
 def _reading_out(struct: Struct) -> list[str]:
     lines = [f"static void golden_said_of(const {struct.name} *estimate, double *out) {{"]
     place = 0
-    for field in struct.fields:
-        if field.size:
-            index = "[k]" if field.shape else ""
-            value = f"(double)estimate->{field.name}{index}"
-            if field.kind == "bool":
-                value = f"estimate->{field.name}{index} ? 1.0 : 0.0"
-            lines.append(
-                f"  for (int k = 0; k < {field.size}; ++k) out[{place} + k] = {value};"
-                if field.shape
-                else f"  out[{place}] = {value};"
-            )
+    for field in filter(lambda field: field.size, struct.fields):
+        member = f"estimate->{field.name}{'[k]' if field.shape else ''}"
+        value = f"{member} ? 1.0 : 0.0" if field.kind == "bool" else f"(double){member}"
+        loop = f"for (int k = 0; k < {field.size}; ++k) out[{place} + k]"
+        lines.append(f"  {loop if field.shape else f'out[{place}]'} = {value};")
         place += field.size
     return [*lines, "}", ""]
 

@@ -91,12 +91,12 @@ class Function:
 
     @property
     def head(self) -> str:
-        """Declaration without the semicolon."""
+        """Text of the declaration without the semicolon."""
         return f"void {self.name}({', '.join(a.declared for a in self.arguments)})"
 
     @property
     def text(self) -> list[str]:
-        """Definition."""
+        """Lines of the definition."""
         return [*folded(f"{self.head} {{", ""), *self.lines, "}", ""]
 
 

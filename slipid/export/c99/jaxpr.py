@@ -49,10 +49,10 @@ class Traced:
 
     @classmethod
     def of(cls, written: object) -> Traced:
-        """Return the function from what JAX 0.10 has two classes for, and later ones a single one.
+        """Return a traced function, which JAX 0.10 keeps in two classes and later versions in one.
 
         Raises:
-            DataError: it is written in another way.
+            DataError: it is written in an unsupported way.
         """
         jaxpr, constants = getattr(written, "jaxpr", written), getattr(written, "consts", ())
         if not isinstance(jaxpr, Jaxpr) or len(jaxpr.constvars) != len(constants):
@@ -80,7 +80,7 @@ class ScanParameters:
         """Return the parameters from the numbers of JAX 0.10 or the trees of later versions.
 
         Raises:
-            DataError: they are written in another way.
+            DataError: they are written in an unsupported way.
         """
         if "num_carry" in params:
             constants, carried = params["num_consts"], params["num_carry"]

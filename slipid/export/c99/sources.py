@@ -112,7 +112,7 @@ class Sources:
         return At(cell.memory, cell.offset + cell.stride * lane, index=cell.index)
 
     def row(self, row: np.ndarray) -> Cell:
-        """The lanes that stand at these places."""
+        """Return the cell whose lanes are the numbers at these places."""
         lanes = self._lanes(row)
         if lanes is not None:
             return lanes

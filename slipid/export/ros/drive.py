@@ -134,7 +134,7 @@ def _omni(robot: DeployedRobot) -> DriveController | None:
     """Return the controller of wheels evenly on a circle, the robot's first wheel first."""
     places, count = np.asarray(robot.places), robot.wheels
     azimuth = np.arctan2(places[:, 1], places[:, 0])
-    # the first wheel itself, and those a rounding error before it, count as at 0
+    # wheels a rounding error before the first one count as being at 0
     order = np.argsort(np.mod(azimuth - azimuth[0] + 1e-6, 2 * np.pi))
     wheels = _OrderedWheels.of(robot, order, axis=2, sign=-1.0)
     even = 2 * np.pi * np.arange(count) / count

@@ -15,7 +15,6 @@ from slipid.export.description import (
     header,
     in_markdown,
     number_rows,
-    verdict_markdown,
 )
 from slipid.export.ros import localization, node
 from slipid.export.ros import localization as noise
@@ -154,12 +153,12 @@ def _floors_and_loads(folder: ReadmeContent) -> Iterator[str]:
 def _numbers(folder: ReadmeContent) -> Iterator[str]:
     """Yield every number with its origin."""
     yield from ("## Numbers", "")
-    yield "Where each comes from; `slipid.yaml` has them to the last digit."
+    yield "Every number with its origin; `slipid.yaml` has them to the last digit."
     lines = []
     for row in number_rows(folder.robot):
         number = (short(row.value), row.unit, interval(row.interval90))
-        known = (*number, verdict_markdown(row.verdict), row.provenance)
-        lines.append((f"`{row.path}`", row.entry, row.about, *known))
+        known = (*number, row.verdict_markdown, row.provenance)
+        lines.append((f"`{row.name}`", row.entry, row.about, *known))
     head = ("robot.json", "", "", "value", "unit", "90 % interval", "verdict", "provenance")
     yield from ("", *table(head, lines), "", "What the verdicts mean:", "")
     yield from (f"- *{v.replace('_', ' ')}*: {text}." for v, text in VERDICTS.items())
@@ -185,18 +184,19 @@ _REVERSE = (
     "as a turn of the robot clockwise, `mecanum_drive_controller` as a way ahead."
 )
 _DRIFT = (
-    "Columns two and three are those of the drive controller, which believes its encoders: they "
-    "hold the slip of the wheels by the identified contact model and what that model misses. The "
-    "last one is what an estimator that knows slip and floor errs by. Velocities are at {speed} "
-    "m/s, the highest rim speed seen by the fit, and one message every {period} s. Messages carry "
-    "the same numbers always, while true uncertainty grows with the way: `pose` is right about "
-    "{way} m after the pose was last right, and too sure beyond. Slip and effects are no noise: "
-    "they push the same way over metres, as no covariance in a message can say."
+    "Columns two and three are those of the drive controller, which ignores slip: they include the "
+    "slip of the wheels by the identified contact model and the errors of that model. The last "
+    "column is that of an estimator that knows slip and floor. Velocities are at {speed} m/s, the "
+    "highest rim speed of the fitted runs, with one message every {period} s. Every message has "
+    "the same numbers, while the true uncertainty grows with the path: `pose` is right about "
+    "{way} m after the pose was last corrected, and too small beyond. Slip and effects are not "
+    "noise: they push in the same direction over metres, which no covariance in a message can "
+    "express."
 )
 _ONLY = (
     "`slipid.yaml` has the numbers of the robot, not how they hang together: draws of the "
-    "posterior, the covariance of frictions and what single runs told of effects are in robot.json "
-    "alone, which slipid's own estimator reads. Older releases of `mecanum_drive_controller` leave "
+    "posterior, the covariance of frictions and the effect tables are in robot.json alone, which "
+    "slipid's own estimator reads. Older releases of `mecanum_drive_controller` leave "
     "the covariance of the pose at zero, whatever its parameter says; that of the twist is right."
 )
 
@@ -274,15 +274,15 @@ def _covariances(
     own, slip = (", ".join(map(short, axes)) for axes in (e.effect, e.slip))
     pose = (
         f"On '{e.floor}'. Variances of x, y [m^2], z, roll, pitch, yaw [rad^2] of odometry that "
-        f"believes its encoders, d = {short(DISTANCE_M)} m after its pose was last right: "
+        f"ignores slip, d = {short(DISTANCE_M)} m after its pose was last corrected: "
         f"(effect^2 + slip^2) d^2 + process^2 d, the larger of along and across for x and y, and "
         f"with what the heading's error carries sideways. Effect {own}, slip {slip} (along, across "
         f"[m/m], yaw [rad/m]), process {', '.join(map(short, e.process))} (per sqrt(m)). They are "
-        f"constant here while true ones grow with the way; wheels do not tell z, roll and pitch."
+        f"constant here while true ones grow with the path; wheels measure no z, roll and pitch."
     )
     twist = (
         f"Variances of velocities [m^2/s^2, rad^2/s^2]: (effect^2 + slip^2) v^2 + process^2 v / T "
-        f"at v = {short(speed)} m/s, the highest rim speed seen by the fit, and a message every "
+        f"at v = {short(speed)} m/s, the highest rim speed of the fitted runs, and a message every "
         f"T = {short(PERIOD_S)} s."
     )
     return (
@@ -293,5 +293,5 @@ def _covariances(
     )
 
 
-_ENCODERS = "the drive controller, which believes its encoders"
+_ENCODERS = "the drive controller, which ignores slip"
 _ESTIMATED = "slipid's estimator or another one that knows the slip of the wheels"

@@ -153,7 +153,7 @@ def filter_parameters(
         "twice. Order: " + ", ".join(STATE) + "."
     )
     return (
-        Parameter("frequency", 1 / PERIOD_S, "As often as odometry is taken to come [Hz]."),
+        Parameter("frequency", 1 / PERIOD_S, "Assumed rate of the odometry [Hz]."),
         Parameter("two_d_mode", True, "The robot stays on a plane."),
         Parameter("publish_tf", True, _TF),
         Parameter("odom_frame", "odom"),
@@ -172,10 +172,10 @@ def process_noise(robot: DeployedRobot, errs: OdometryErrors) -> Parameter:
     """Return the process noise on a floor, 15 x 15 as rows."""
     matrix, most = np.diag(_diagonal(robot, errs)), float(Limits().acceleration)
     about = (
-        f"On '{errs.floor}'. Pose: what stays the same all the way and so is no noise of single "
-        f"velocities, as a random walk that is as far off after {short(DISTANCE_M)} m, at the "
-        f"highest speed seen by the fit, {short(top_speed(robot))} m/s. Velocity: the change that "
-        f"the limit of wheel acceleration, {short(most)} rad/s^2, allows within "
+        f"On '{errs.floor}'. Pose: errors that stay the same over the path, and so are no noise "
+        f"of single velocities, as a random walk with the same error after {short(DISTANCE_M)} m, "
+        f"at the highest speed of the fitted runs, {short(top_speed(robot))} m/s. Velocity: the "
+        f"change that the limit of wheel acceleration, {short(most)} rad/s^2, allows within "
         f"{short(PERIOD_S)} s. Accelerations: the package's default. two_d_mode holds the rest."
     )
     entries = tuple(float(x) for x in matrix.reshape(-1))
@@ -197,5 +197,5 @@ _TF = (
 )
 _DYNAMIC = (
     "False: the pose grows uncertain while the robot stands, too. True would scale it with the "
-    "square of the speed, which forgets slow ways."
+    "square of the speed, which ignores slow motion."
 )

@@ -122,7 +122,9 @@ def _errors(robot: DeployedRobot) -> Iterator[Parameter]:
         yield Parameter(f"errors.{name}.current_std", std, _CURRENT, (_ZERO,))
     yield _flat("seen.current_trend", robot.current_trend, _TREND, two)
     speed, current = (float(x) for x in robot.highest)
-    yield Parameter("seen.highest_speed", speed, "highest wheel speed seen [rad/s]", (_ZERO,))
+    yield Parameter(
+        "seen.highest_speed", speed, "highest wheel speed of the fitted runs [rad/s]", (_ZERO,)
+    )
     yield Parameter("seen.highest_current", current, _HIGHEST, (_ZERO,))
     curve = (Check("fixed_size<>", (2 * robot.wheels,)),)
     yield _flat("seen.wheel_curve", robot.wheel_curve, _CURVE, curve)
@@ -158,9 +160,9 @@ _DRIVE = "direction of travel of a positive wheel speed [rad], drive_offset left
 _ROLLER = "from the free rolling direction to the drive direction [rad]"
 _FORWARD = "J: rim speed of each wheel from vx, vy [m/s], yaw rate [rad/s], a row per wheel"
 _INVERSE = "pseudo-inverse of J: vx, vy, yaw rate from rim speeds [m/s], a row each"
-_PROCESS = "std of what the model misses, per root of the way, along, across [m/sqrt(m)], in yaw"
-_EFFECT = "std of what the model misses all the way, along, across [m/m], in yaw [rad/m]"
-_CURRENT = "std of the current that flows from the model's [A]"
-_TREND = "a + b v, measured currents over the model's [A, A s/m]"
+_PROCESS = "std of random errors, per root of the path length, along, across [m/sqrt(m)], in yaw"
+_EFFECT = "std of effects, the same over a path, along, across [m/m], in yaw [rad/m]"
+_CURRENT = "std of measured currents about the model's [A]"
+_TREND = "a + b v, excess of measured currents over the model's [A, A s/m]"
 _HIGHEST = "largest current of the model up to 0.8 of the highest speed [A]"
 _CURVE = "a, b of each wheel: slip ratio a + b |I| over all floors [1, 1/A]"

@@ -130,22 +130,23 @@ def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
     return tuple(p for p in paths if any(matching([p], pattern) for pattern in chosen))
 
 
-def summary(made: Sequence[Replicate], wanted: Sequence[str]) -> Content:
+def summary(replicates: Sequence[Replicate], wanted: Sequence[str]) -> Content:
     """Return error, coverage, verdict and recovery of everything that was compared.
 
     Returns:
         `parameters` (ratios included), `curves`, `predictions`, `failed` (wanted and not
         recovered), `recovered`.
     """
-    first = made[0]
+    first = replicates[0]
     numbers = {
-        path: number_summary([one.parameters[path] for one in made]) for path in first.parameters
+        path: number_summary([one.parameters[path] for one in replicates])
+        for path in first.parameters
     }
-    curves = {floor: [one.curves[floor] for one in made] for floor in first.curves}
+    curves = {floor: [one.curves[floor] for one in replicates] for floor in first.curves}
     failed = [p for p in wanted if numbers[p]["recovered"] in ("no", "wrong")]
-    converged = sum(one.converged for one in made)
+    converged = sum(one.converged for one in replicates)
     return {
-        "replicates": len(made),
+        "replicates": len(replicates),
         "converged": converged,
         "parameters": numbers,
         "curves": {
@@ -158,14 +159,14 @@ def summary(made: Sequence[Replicate], wanted: Sequence[str]) -> Content:
         },
         "predictions": {
             floor: {
-                model: float(np.mean([one.predictions[floor][model] for one in made]))
+                model: float(np.mean([one.predictions[floor][model] for one in replicates]))
                 for model in models
             }
             for floor, models in first.predictions.items()
         },
         "wanted": list(wanted),
         "failed": failed,
-        "recovered": not failed and converged >= LEAST_CONVERGED * len(made),
+        "recovered": not failed and converged >= LEAST_CONVERGED * len(replicates),
     }
 
 

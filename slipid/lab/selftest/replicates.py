@@ -49,7 +49,7 @@ def simulate_windows(
 
     Args:
         truth: robot with the floors, loads and sessions of the windows.
-        w: windows that were driven; channels that they lack are not made.
+        w: windows that were driven; channels that they lack are not simulated.
         rng: random numbers of the noise.
         std: std of the variance components by name (`fit.noise`); a name without its floor stands
             for every floor, and missing ones are zero.
@@ -244,8 +244,8 @@ def replicates(
     for k in range(len(found), count):
         rng = np.random.default_rng([seed, k])
         z = center + scatter * rng.standard_normal(len(center))
-        made = simulate_windows(problem.space.tree(jnp.asarray(z)), problem.windows, rng, std)
-        this = problem.of(made)
+        windows = simulate_windows(problem.space.tree(jnp.asarray(z)), problem.windows, rng, std)
+        this = problem.of(windows)
         end = optimise(this, most_rounds=fit.rounds, tolerance=fit.tolerance, tell=tell)
         found.append(recovery(this, choices, z, end))
         kept.save_json(FILE, [asdict(one) for one in found])
@@ -263,11 +263,11 @@ def recovery(
     off = (z - true) / np.sqrt(np.diag(covariance))
     values = {e.path: np.atleast_1d(np.asarray(e.get(truth), float)) for e in space.free}
     flat = members(flat_directions(space, covariance, problem.windows.has_current, volt))
-    judged = {e.path for e in space.free if e.session is None}
+    shared = {e.path for e in space.free if e.session is None}
     numbers = {
         e.path: _number(e, values[e.path], off[space.slices[e.path]])
         for e in estimates(space, choices, z, covariance, volt, flat)
-        if e.path in judged
+        if e.path in shared
     }
     known = {e.path: e.value for e in derived(space, true, covariance, volt)}
     for e in derived(space, z, covariance, volt):

@@ -90,16 +90,16 @@ def _camera(
     first = -(s.lag_s + 3 * s.frame_s)  # so that the first row has a frame
     taken = np.arange(first, trace.time[-1] + s.frame_s, s.frame_s) + rng.uniform(0, s.frame_s)
     taken = taken[(rng.uniform(size=len(taken)) >= s.dropout) | (taken + delay <= 0.0)]
-    seen = interpolate(trace.time, trace.pose, taken)
-    seen[:, 2] += float(np.radians(site.robot.marker_yaw_deg))
-    seen[:, :2] += s.camera_noise_m * rng.normal(size=(len(taken), 2))
-    seen[:, 2] += s.camera_noise_rad * rng.normal(size=len(taken))
+    poses = interpolate(trace.time, trace.pose, taken)
+    poses[:, 2] += float(np.radians(site.robot.marker_yaw_deg))
+    poses[:, :2] += s.camera_noise_m * rng.normal(size=(len(taken), 2))
+    poses[:, 2] += s.camera_noise_rad * rng.normal(size=len(taken))
     wrong = rng.uniform(size=len(taken)) < s.outlier
-    seen[:, :2] += np.where(wrong[:, None], s.outlier_m * rng.normal(size=(len(taken), 2)), 0.0)
-    seen[:, :2] /= s.camera_scale
+    poses[:, :2] += np.where(wrong[:, None], s.outlier_m * rng.normal(size=(len(taken), 2)), 0.0)
+    poses[:, :2] /= s.camera_scale
     newest = np.searchsorted(taken + delay, time, side="right") - 1
     fresh = np.concatenate([[True], np.diff(newest) > 0])
-    return seen[newest], fresh
+    return poses[newest], fresh
 
 
 MANIFEST = "simulate.json"

@@ -216,7 +216,7 @@ class TuningTask:
         """Return the mean over starts of the integral of V over the path [s], for many gains."""
         k, h = PlaneVector(*gains.T[..., None]), self.period / len(self.shares)
         pose = np.repeat(self.begin.T[:, None], len(gains), axis=1)
-        goes, total = np.zeros(pose.shape), np.zeros(pose.shape[1:])
+        velocity, total = np.zeros(pose.shape), np.zeros(pose.shape[1:])
         ring = np.zeros((self.shares.shape[1], *pose.shape))
         for row in self.reference:
             here = PlaneVector(*pose)
@@ -226,8 +226,8 @@ class TuningTask:
             ring[0] = twist(k, e, PlaneVector(*row[3:]), here.yaw)
             arrives = self.shares @ ring.reshape(len(ring), -1)
             for arrived in arrives.reshape(-1, *pose.shape):
-                goes = goes + self.follow * (arrived - goes)
-                pose = _next_pose(pose, goes, h)
+                velocity = velocity + self.follow * (arrived - velocity)
+                pose = _next_pose(pose, velocity, h)
         return self.period * total.mean(axis=1)
 
     def slope(self, gains: Float[np.ndarray, "3"]) -> tuple[float, Float[np.ndarray, "3"]]:
@@ -238,10 +238,10 @@ class TuningTask:
 
 
 def _next_pose(
-    pose: Float[np.ndarray, "3 *batch"], goes: Float[np.ndarray, "3 *batch"], h: float
+    pose: Float[np.ndarray, "3 *batch"], velocity: Float[np.ndarray, "3 *batch"], h: float
 ) -> Float[np.ndarray, "3 *batch"]:
     """Return poses after a short time at constant twists, their chord at the heading half-way."""
-    x, y, turn = goes
+    x, y, turn = velocity
     middle = pose[2] + 0.5 * h * turn
     c, s = np.cos(middle), np.sin(middle)
     return pose + h * np.array([c * x - s * y, s * x + c * y, turn])

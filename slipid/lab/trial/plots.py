@@ -42,16 +42,16 @@ def trial_plot(
     rows = -(-len(names) // 3)
     path_name = f"{content['path'].capitalize()} at {content['speed_m_s']:g} m/s"
     title = f"{path_name} on the {content['plant']}: {_verdict(content)}"
-    made = figure(13.0, 3.1 * rows + 3.4, title)
-    grid = made.add_gridspec(rows + 1, 3, height_ratios=[1.0] * rows + [1.1])
+    drawing = figure(13.0, 3.1 * rows + 3.4, title)
+    grid = drawing.add_gridspec(rows + 1, 3, height_ratios=[1.0] * rows + [1.1])
     one = _typical_start(content)
     for k, name in enumerate(names):
-        axes = made.add_subplot(grid[k // 3, k % 3])
+        axes = drawing.add_subplot(grid[k // 3, k % 3])
         _paths_panel(axes, name, content, paths, wanted, floor, one)
-    _legend(made, floor)
+    _legend(drawing, floor)
     for k, (key, label) in enumerate(ERRORS.items()):
-        _bars(made.add_subplot(grid[rows, k]), content["summary"], key, label)
-    return save(made, path)
+        _bars(drawing.add_subplot(grid[rows, k]), content["summary"], key, label)
+    return save(drawing, path)
 
 
 def _verdict(content: Content) -> str:
@@ -111,7 +111,7 @@ def _paths_panel(
     axes.tick_params(labelsize=7)
 
 
-def _legend(made: Figure, floor: FloorMap) -> None:
+def _legend(drawing: Figure, floor: FloorMap) -> None:
     """Explain tints and lines."""
     patches = [
         Patch(facecolor=tint, edgecolor=SHADE, label=name)
@@ -124,7 +124,7 @@ def _legend(made: Figure, floor: FloorMap) -> None:
             [], [], color=MARKED, lw=1.8, marker="o", ms=5, label="the start typical of encoders"
         ),
     ]
-    made.legend(handles=[*patches, *lines], loc="outside lower center", ncols=8, fontsize=8)
+    drawing.legend(handles=[*patches, *lines], loc="outside lower center", ncols=8, fontsize=8)
 
 
 def _rotation(heading: float) -> np.ndarray:

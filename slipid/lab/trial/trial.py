@@ -122,8 +122,8 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
     setup_jax(quiet=True)
     tasks = _tasks(out, options)
     rows = tuple(dict.fromkeys(task.row for task in tasks))
-    if left := [name for name in options.controllers if name not in rows]:
-        report.line(f"left out, for robots with three wheels: {', '.join(left)}")
+    if unsuited := [name for name in options.controllers if name not in rows]:
+        report.line(f"left out, for robots with three wheels: {', '.join(unsuited)}")
     if unused := unused_gains(tasks[0].robot, options.tuned_gains):
         report.line(unused)
     todo = {task.name: task for task in tasks if _finished_run(task) is None}
@@ -225,17 +225,17 @@ def drive(task: TrialTask) -> None:
         plant = SitePlant(task.floor, robot.load_setup, task.start, task.seed, row.gyro)
     there = floor_of(task.known_map, robot.labels)
     loop = control_loop_of(robot, row, task.settings, task.forced, there)
-    course = closed_loop.run_closed_loop(loop, path, plant, task.start)
-    off = course.pose[-1] - course.estimated_pose[-1]
+    driven = closed_loop.run_closed_loop(loop, path, plant, task.start)
+    off = driven.pose[-1] - driven.estimated_pose[-1]
     run = TrialRun(
         controller=task.row,
         start=task.start,
         seed=task.seed,
-        metrics=closed_loop.path_metrics(course),
+        metrics=closed_loop.path_metrics(driven),
         believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
     )
     # the path first, because a run with metrics counts as finished
-    poses = {"time": course.time, "pose": course.pose, "believed": course.estimated_pose}
+    poses = {"time": driven.time, "pose": driven.pose, "believed": driven.estimated_pose}
     task.kept.save(task.name, poses)
     task.kept.save_json(task.name, asdict(run))
 

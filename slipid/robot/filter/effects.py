@@ -3,7 +3,7 @@
 An effect is what the model misses all the way on a floor: a motion along, across and in yaw per
 metre that the wheels would roll without slip. It belongs to a floor and to a direction of travel u,
 the unit vector of the twist without slip, yaw as rim speed. Its estimates from the fitted runs, a
-mean and a remaining std, are a table over directions and speeds (`EffectTable`). An effect e is
+mean and a remaining std, are a table over directions and speeds (`EffectLookup`). An effect e is
 counted in remaining stds; it decorrelates as the direction changes, and once the robot has left the
 floor:
 
@@ -66,7 +66,7 @@ class RolledMotion(eqx.Module):
         )
 
 
-class EffectTable(eqx.Module):
+class EffectLookup(eqx.Module):
     """Effects of every floor estimated from the fitted runs, at evenly spaced directions.
 
     Attributes:
@@ -78,7 +78,7 @@ class EffectTable(eqx.Module):
     table: Float[Array, "floor speed direction 6"]
 
     @classmethod
-    def empty(cls, floors: int) -> "EffectTable":
+    def empty(cls, floors: int) -> "EffectLookup":
         """Return the table of unknown effects."""
         row = jnp.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
         return cls(jnp.zeros(1), jnp.broadcast_to(row, (floors, 1, 1, 6)))

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from slipid.support.errors import DataError
-from slipid.support.files import write_bytes
+from slipid.support.files import write_arrays
 
 LEAK = 0.1
 """Probability that a map is wrong under a wheel."""
@@ -80,11 +80,8 @@ class Floor(eqx.Module):
         Raises:
             DataError: the file cannot be written.
         """
-        parts = (labels, self.cells, self.corner, self.cell)
-        names, cells, corner, cell = map(np.asarray, parts)
-        out = BytesIO()
-        np.savez_compressed(out, labels=names, cells=cells, corner=corner, cell=cell)
-        write_bytes(Path(path), out.getvalue())
+        arrays = {name: np.asarray(array) for name, array in vars(self).items()}
+        write_arrays(Path(path), {"labels": np.array(labels), **arrays})
 
     @classmethod
     def load(cls, path: Path | str, labels: Sequence[str]) -> "Floor":
@@ -108,16 +105,8 @@ class Floor(eqx.Module):
 
         Beyond the edge it is that of the nearest cell.
         """
-        row, column = self.cell_under(pose, wheels)
-        return self.cells[row, column]
-
-    def cell_under(
-        self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
-    ) -> tuple[Int[Array, " wheel"], Int[Array, " wheel"]]:
-        """Return row and column of the cell under each wheel, of the nearest beyond the edge."""
-        row, column = self.steps_to(pose, wheels)
-        rows, columns = self.cells.shape
-        return row.clip(0, rows - 1), column.clip(0, columns - 1)
+        (row, column), (rows, columns) = self.steps_to(pose, wheels), self.cells.shape
+        return self.cells[row.clip(0, rows - 1), column.clip(0, columns - 1)]
 
     def steps_to(
         self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]

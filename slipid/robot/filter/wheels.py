@@ -67,9 +67,8 @@ def read_wheels(
     by_speed = jnp.isfinite(z.wheel_speed) & (jnp.abs(z.wheel_speed) < most)
     read = jnp.where(by_angle, turned, jnp.where(by_speed, z.wheel_speed, old.speed))
     known = jnp.isfinite(z.wheel_angle) & (jnp.abs(z.wheel_angle) < 1e7)
-    first = (
-        known & ~jnp.isfinite(old.angle) & ~by_speed
-    )  # without an earlier angle it counts as standing
+    # without an earlier angle a wheel counts as standing
+    first = known & ~jnp.isfinite(old.angle) & ~by_speed
     good = by_angle | by_speed | first
     # readings without a valid time step do not refresh their age
     age = jnp.where(good & (dt > 0), 0.0, jnp.minimum(old.age + jnp.maximum(dt, UNTIMED_S), 1e3))

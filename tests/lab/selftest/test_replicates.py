@@ -1,4 +1,4 @@
-"""The self-test: windows with known truth, replicates that are kept, and what it concludes."""
+"""The self test: windows with known truth, kept replicates, and its conclusions."""
 
 from __future__ import annotations
 

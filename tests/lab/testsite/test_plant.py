@@ -1,4 +1,4 @@
-"""Physics of the virtual test site: what any plant must do, whatever its contact law."""
+"""Physics of the virtual test site that holds for any contact law."""
 
 from dataclasses import replace
 

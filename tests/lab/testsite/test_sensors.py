@@ -1,4 +1,4 @@
-"""What the test site's sensors make of the truth, and that its log files come back as they were."""
+"""Errors of the test site's sensors, and log files that read back as they were."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""`slipid simulate`: files, seeds, interrupts, mistakes; and a camera whose frames can be read."""
+"""`slipid simulate`: files, seeds, interrupts, mistakes; and a camera with readable frames."""
 
 import hashlib
 import os

@@ -1,4 +1,4 @@
-"""The law of Goswami and Padhy: what is proven of it, and gains against another search."""
+"""The law of Goswami and Padhy: its proof, and its gains against another search."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""A particle swarm does what its formula says, and finds minima that are known."""
+"""A particle swarm moves by its formula, and finds known minima."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A config proposed from a file: units, signs, sums, rates, and what is left open."""
+"""A config proposed from a file: units, signs, sums, rates, and open questions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A config proposed from several files: which belong together, and which are no logs."""
+"""A config proposed from several files: files of one run, and files that are no logs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Windows are cut anew where a fit finds another lag than they were cut at."""
+"""Windows are cut again where the fitted lag differs from the lag they were cut at."""
 
 from dataclasses import replace
 from types import SimpleNamespace

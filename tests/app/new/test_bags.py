@@ -1,4 +1,4 @@
-"""A config proposed from bags: topics, joints in the order of the wheels, what is left to say."""
+"""A config proposed from bags: topics, joints in the order of the wheels, open questions."""
 
 from __future__ import annotations
 

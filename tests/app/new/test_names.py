@@ -1,4 +1,4 @@
-"""What columns hold: by the names that people use, and by how large their numbers are."""
+"""Channels of columns, by their names and by the size of their numbers."""
 
 from __future__ import annotations
 
