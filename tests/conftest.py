@@ -140,6 +140,9 @@ def _room_for_compiled_code(request):
             clear()
     if gc.get_count()[0] > MANY:
         gc.collect()
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 15_000:
+        _forget()
     _make_room(MOST_MB)
 
 
@@ -155,20 +158,23 @@ _taken = 0.0
 
 
 def _make_room(most_mb: float) -> None:
-    """Forget what was compiled where it is too much; it comes back from the cache on disk.
+    """Forget what was compiled where memory is more than this and grew since that was last done."""
+    if _resident_mb() > max(most_mb, _taken + 0.2 * most_mb):
+        _forget()
+
+
+def _forget() -> None:
+    """Forget what was compiled; it comes back from the cache on disk.
 
     Compiled functions hold memory, and memory maps as well: at vm.max_map_count (65 530 by default)
     the next compilation is a segmentation fault.
     """
     global _taken
-    maps = Path("/proc/self/maps")
-    is_full = _resident_mb() > max(most_mb, _taken + 0.2 * most_mb)
-    if is_full or (maps.exists() and maps.read_bytes().count(b"\n") > 15_000):
-        jax.clear_caches()
-        gc.collect()
-        with suppress(OSError, AttributeError):
-            CDLL(None).malloc_trim(0)
-        _taken = _resident_mb()
+    jax.clear_caches()
+    gc.collect()
+    with suppress(OSError, AttributeError):
+        CDLL(None).malloc_trim(0)
+    _taken = _resident_mb()
 
 
 def _resident_mb() -> float:

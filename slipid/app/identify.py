@@ -20,7 +20,8 @@ from slipid.fit.multi_floor_fit import fit_multi_floor
 from slipid.fit.optimise import Optimum, optimise
 from slipid.fit.problem import FitState, Problem
 from slipid.infer.fit_file import save
-from slipid.infer.result import Fit, summarise
+from slipid.infer.result import Fit
+from slipid.infer.summary import summarise
 from slipid.infer.verdicts.profile import Profile, profile, profiled
 from slipid.predict.agreement import contradiction, floor_errors, largest_shift
 from slipid.predict.slip_models import slip_models

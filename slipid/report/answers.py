@@ -142,15 +142,8 @@ def show_export(page: Page, done: Exported) -> None:
 
 def show_trial(page: Page, found: Content, out: Path) -> None:
     """Write the errors of every controller, medians over the starts."""
-    numbers = (
-        "closure",
-        "of encoders'",
-        "worse",
-        "finished",
-        "cross-track",
-        "first side",
-        "heading",
-    )
+    errors = ("cross-track", "first side", "heading")
+    numbers = ("closure", "of encoders'", "worse", "finished", *errors)
     made = table(("controller", *numbers), right=numbers)
     for name, row in found["summary"].items():
         ratio = row.get("to_encoder", {}).get("closure_error_median")

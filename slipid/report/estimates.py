@@ -32,15 +32,10 @@ def estimates(items: "Iterable[Estimate]", title: str) -> Table:
         if "session_yaw" in e.path or (e.verdict == "fixed" and e.provenance == "borrowed"):
             continue
         for k, (label, value, interval) in enumerate(rows_of(e)):
-            name = "" if k else e.path
-            made.add_row(
-                Text(f"{name} [{label}]".strip() if label else name),
-                f"{value:.4g}",
-                e.unit,
-                "" if interval is None else f"{interval[0]:.4g} .. {interval[1]:.4g}",
-                "" if k else verdict(e.verdict),
-                "" if k else e.provenance,
-            )
+            first = ("", "", "") if k else (e.path, verdict(e.verdict), e.provenance)
+            name = Text(f"{first[0]} [{label}]".strip() if label else first[0])
+            ends = "" if interval is None else f"{interval[0]:.4g} .. {interval[1]:.4g}"
+            made.add_row(name, f"{value:.4g}", e.unit, ends, *first[1:])
     return made
 
 
@@ -102,9 +97,6 @@ def show_trust(page: Page, found: "TrustReport") -> None:
     page.line(f"verdict: {found.trust}")
 
 
-_COMMANDED = ("commanded headings", r"and speeds \[m/s]")
-
-
 LARGEST_DRIFT = 3e-4
 """Difference of the rates of two clocks above that of any quartz [1]."""
 
@@ -126,7 +118,8 @@ def _clocks(clocks: Mapping[str, Content]) -> str:
 def show_check(page: Page, found: Content) -> None:
     """Write check.json, with its findings first."""
     page.findings(found["findings"])
-    groups = table((*("surface", "load", "session", "runs", "minutes"), *_COMMANDED))
+    commanded = ("commanded headings", r"and speeds \[m/s]")
+    groups = table(("surface", "load", "session", "runs", "minutes", *commanded))
     for row in found["groups"]:
         groups.add_row(
             row["surface"],
@@ -143,18 +136,32 @@ def show_check(page: Page, found: Content) -> None:
         page.line(_clocks(found["clocks"]))
     for note, count in found["notes"].items():
         page.line(f"repaired in {count} runs: {note}")
-    before = table(
-        ("parameter", "unit", "std after / before", "verdict"),
+    title = (
         "before any fit: expected information of the logs, for the least informative of the "
-        "floors that a fit starts from",
+        "floors that a fit starts from"
     )
-    for path, e in (found["parameters"] | found["derived"]).items():
+    page.table(_expected(found["parameters"] | found["derived"], title))
+    page.notes(found["messages"])
+
+
+def _expected(numbers: Mapping[str, Content], title: str) -> Table:
+    """Return the table of the expected posterior over prior std of numbers."""
+    made = table(("parameter", "unit", "std after / before", "verdict"), title)
+    for path, e in numbers.items():
         if e["ratio"] is not None and "session_yaw" not in path:
             # above 1 where the motion's uncertainty widens the prior of an electric number
-            shown = f"{min(e['ratio'], 1.0):.3f}"
-            before.add_row(Text(path), e["unit"], shown, verdict(e["verdict"]))
-    page.table(before)
-    page.notes(found["messages"])
+            ratio = f"{min(e['ratio'], 1.0):.3f}"
+            made.add_row(Text(path), e["unit"], ratio, verdict(e["verdict"]))
+    return made
+
+
+_ERRORS = (
+    "endpoint_error_mean",
+    "endpoint_error_median",
+    "endpoint_error_over_path_mean",
+    "length_error_mean",
+)
+"""Errors of a validation file that are shown, in order of columns."""
 
 
 def show_validation(page: Page, found: Content) -> None:
@@ -164,17 +171,9 @@ def show_validation(page: Page, found: Content) -> None:
     for surface, models in found["summary"].items():
         for model, s in models.items():
             heading = s["heading_error_median_deg"]
-            made.add_row(
-                surface,
-                model,
-                percent(s["endpoint_error_mean"]),
-                percent(s["endpoint_error_median"]),
-                percent(s["endpoint_error_over_path_mean"]),
-                percent(s["length_error_mean"]),
-                "" if heading is None else f"{heading:.2f} deg",
-                percent(s["coverage90"]),
-                str(s["runs"]),
-            )
+            turn = "" if heading is None else f"{heading:.2f} deg"
+            errors = (percent(s[key]) for key in _ERRORS)
+            made.add_row(surface, model, *errors, turn, percent(s["coverage90"]), str(s["runs"]))
     page.table(made)
 
 
@@ -234,7 +233,7 @@ def show_truth(page: Page, fit: "Fit", truth: Content) -> None:
 
 
 def show_selftest(page: Page, found: Content) -> None:
-    """Write the content of selftest.json."""
+    """Write selftest.json."""
     numbers = table(
         ("parameter", "unit", "error", "of truth", "z rms", "in 90 %", "verdict", "recovered"),
         f"{found['replicates']} simulated experiments like this one ({found['runs']} runs), "
@@ -290,16 +289,8 @@ def show_bench(page: Page, fit: BenchFit, taken: Sequence[str] = ()) -> None:
 
 def show_bench_check(page: Page, found: Content) -> None:
     """Write check.json of motors."""
-    columns = (
-        "log",
-        "rows",
-        "seconds",
-        "rows/s",
-        r"voltage \[V]",
-        r"current \[A]",
-        r"speed \[rad/s]",
-    )
-    made = table(columns)
+    channels = (r"voltage \[V]", r"current \[A]", r"speed \[rad/s]")
+    made = table(("log", "rows", "seconds", "rows/s", *channels))
     for row in found["logs"]:
         spans = [
             "none" if row[k] is None else f"{row[k][0]:.3g} .. {row[k][1]:.3g}"
@@ -308,11 +299,5 @@ def show_bench_check(page: Page, found: Content) -> None:
         rate = f"{1 / row['row_period_s']:.4g}"
         made.add_row(Text(row["name"]), str(row["rows"]), f"{row['seconds']:.1f}", rate, *spans)
     page.table(made)
-    before = table(
-        ("parameter", "unit", "std after / before", "verdict"), "\nexpected information of the logs"
-    )
-    for path, e in found["parameters"].items():
-        if e["ratio"] is not None:
-            before.add_row(Text(path), e["unit"], f"{e['ratio']:.3f}", verdict(e["verdict"]))
-    page.table(before)
+    page.table(_expected(found["parameters"], "\nexpected information of the logs"))
     page.notes(found["messages"])

@@ -10,7 +10,7 @@ from slipid.app.config import FitSection
 from slipid.app.problem import FitTask, robot_for_runs
 from slipid.data.runs import collect
 from slipid.fit.optimise import optimise
-from slipid.infer.result import summarise
+from slipid.infer.summary import summarise
 from slipid.lab.selftest.logs import (
     SimulatedSensors,
     heading_grid,

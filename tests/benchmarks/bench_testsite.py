@@ -189,7 +189,7 @@ def _experiment(seed: int) -> dict:
 def _fitted(job):
     """What `identify` finds of a job, without the simpler models."""
     from slipid.fit.optimise import optimise
-    from slipid.infer.result import summarise
+    from slipid.infer.summary import summarise
 
     problem = job.problem()
     return summarise(problem, optimise(problem), job.dataset, job.choices)

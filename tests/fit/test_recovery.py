@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from slipid.data.windows import windows
 from slipid.fit.optimise import optimise
 from slipid.fit.problem import FitState, linear
-from slipid.infer.result import summarise
+from slipid.infer.summary import summarise
 from slipid.lab.selftest.logs import nominal_robot, true_robot
 from tests.helpers import recovery
 

@@ -60,6 +60,23 @@ class Kinds:
         return np.dtype([(f.name, kinds[f.kind], f.shape) for f in struct.fields], align=True)
 
 
+_LIBRARIES: dict[tuple[str, ...], ctypes.CDLL] = {}
+"""What was compiled, by its text, compiler and flags; it stays loaded without its folder."""
+
+
+def _built(of: tuple[str, ...], folder: Path) -> ctypes.CDLL:
+    """The library of a header, a source, a compiler and its flags, compiled once in a process."""
+    if of not in _LIBRARIES:
+        header, source, compiler, *flags = of
+        (folder / "slipid.h").write_text(header)
+        (folder / "slipid.c").write_text(source)
+        library = folder / f"slipid{len(list(folder.iterdir()))}.so"
+        shared = ["-shared", "-fPIC", "-o", str(library), "slipid.c", "-lm"]
+        subprocess.run([compiler, "-std=c99", *flags, *shared], cwd=folder, check=True)
+        _LIBRARIES[of] = ctypes.CDLL(str(library))
+    return _LIBRARIES[of]
+
+
 class CompiledC:
     """A control loop's code, compiled: its structs as numpy records, its functions on them.
 
@@ -75,22 +92,8 @@ class CompiledC:
         single = "-DSLIPID_FLOAT" in flags
         self.kinds = Kinds(np.float32 if single else np.float64)
         self._number = ctypes.c_float if single else ctypes.c_double
-        (folder / "slipid.h").write_text(code.header())
-        (folder / "slipid.c").write_text(code.source() + MANY)
-        library = folder / f"slipid{len(list(folder.iterdir()))}.so"
-        command = [
-            compiler,
-            "-std=c99",
-            *flags,
-            "-shared",
-            "-fPIC",
-            "-o",
-            library,
-            "slipid.c",
-            "-lm",
-        ]
-        subprocess.run([str(word) for word in command], cwd=folder, check=True)
-        self._library = ctypes.CDLL(str(library))
+        text = code.header(), code.source() + MANY
+        self._library = _built((*text, compiler, *flags), folder)
         self.estimator = np.zeros((), self.kinds.of(code.estimator))
         self.controller = np.zeros((), self.kinds.of(code.controller))
         self.reading = np.zeros((), self.kinds.of(code.reading))

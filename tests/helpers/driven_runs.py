@@ -1,4 +1,4 @@
-"""Robots drive these runs as the law of traction of Ward and Iagnemma says."""
+"""Simulated runs by the law of traction of Ward and Iagnemma."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ TRUE = FilterNoise(0.03, (0.003, 0.004, 0.002), 0.02, 0.03)
 
 
 def held(rolling: np.ndarray, law: ForceLaw, spec=ROBOTINO, seconds: float = 20.0) -> np.ndarray:
-    """Twist of a robot whose wheels have long turned as the rolling twist says."""
+    """Return the steady twist of a robot at a rolling twist."""
     dynamics = Dynamics.of(spec, law)
     q = np.atleast_2d(rolling) * spec.size
     each = np.ones(len(q))
@@ -25,7 +25,7 @@ def held(rolling: np.ndarray, law: ForceLaw, spec=ROBOTINO, seconds: float = 20.
 
 
 def driven(law: ForceLaw, seed: int, spec=ROBOTINO, **more) -> Run:
-    """A run of 4 s with two twists that the wheels keep, the body moving by the law."""
+    """Return a run of 4 s with two wheel twists and the body motion of the law."""
     rng = np.random.default_rng(seed)
     rolling = rng.uniform([-0.3, -0.3, -0.5], [0.3, 0.3, 0.5], (2, 3)) * [1, spec is ROBOTINO, 1]
     twice = np.repeat(rolling, 20, axis=0)
@@ -34,7 +34,7 @@ def driven(law: ForceLaw, seed: int, spec=ROBOTINO, **more) -> Run:
 
 
 def scattered(count: int, gyro: bool, noise: FilterNoise = TRUE) -> list[Run]:
-    """Runs as the filter believes in: rho, bias and twists scatter as its noise says."""
+    """Return runs whose rho, bias and twists scatter by the filter's noise."""
     rng = np.random.default_rng(0)
     dynamics, dt = Dynamics.of(ROBOTINO, FLOOR), np.full(count, 0.1)
     rolling = np.stack([straight(angle, 0.25, 60) for angle in rng.uniform(-3, 3, count)])
@@ -50,7 +50,7 @@ def scattered(count: int, gyro: bool, noise: FilterNoise = TRUE) -> list[Run]:
 
 
 def pulling(run: Run, law: ForceLaw, gain: float, offset: float, noise: float = 0.0) -> Run:
-    """The run with currents of the traction, as a motor's constant and friction make of it."""
+    """Return the run with currents of the traction by a motor's constant and friction."""
     dynamics = Dynamics.of(ROBOTINO, law)
     rim = run.signals.speed * ROBOTINO.wheel_radius
     slide = rim - (run.twist * ROBOTINO.size) @ dynamics.rims.T

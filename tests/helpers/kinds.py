@@ -11,7 +11,8 @@ from slipid.data.windows import windows
 from slipid.fit.optimise import optimise
 from slipid.fit.problem import Problem
 from slipid.infer.design.planned_runs import PlannedRun
-from slipid.infer.result import Fit, summarise
+from slipid.infer.result import Fit
+from slipid.infer.summary import summarise
 from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, turning_grid
 from slipid.model.geometry import Geometry, differential, mecanum, omni, skid_steer
 from slipid.model.robot import Robot, build

@@ -1,4 +1,4 @@
-"""Runs without poses of which everything is known, as classifiers of floors hear them."""
+"""Simulated runs without poses for floor classifiers."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ def made_floor_run(
     seed: int = 0,
     gyro: bool = True,
 ) -> FloorSignals:
-    """A run whose motors draw `level` [A] and a little noise at wheel speeds (row, drive)."""
+    """Return a run with currents of `level` [A] plus noise at wheel speeds (row, drive)."""
     rng = np.random.default_rng(seed)
     rows = len(speed)
     return FloorSignals(
@@ -32,14 +32,14 @@ def made_floor_run(
 
 
 def ahead(rows: int = 60, rate: float = 1.5, drives: int = 2) -> np.ndarray:
-    """Wheel speeds of going straight ahead (row, drive) [rad/s]."""
+    """Return wheel speeds of straight motion (row, drive) [rad/s]."""
     return np.full((rows, drives), rate)
 
 
 def made_floor_runs(
     levels: dict[str, float], runs: int = 4, rows: int = 60, **kw: float
 ) -> list[FloorSignals]:
-    """Runs straight ahead on floors that differ in what motors draw there [A]."""
+    """Return straight runs on floors that differ in their currents [A]."""
     return [
         made_floor_run(floor, ahead(rows), level, seed=100 * n + k, name=f"{floor}/{k}", **kw)
         for n, (floor, level) in enumerate(levels.items())

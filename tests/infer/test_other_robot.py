@@ -14,7 +14,7 @@ from slipid.app.logs import read_dataset
 from slipid.app.problem import read_fit_task
 from slipid.fit import likelihood as lk
 from slipid.fit.optimise import optimise
-from slipid.infer.result import summarise
+from slipid.infer.summary import summarise
 from slipid.predict import open_loop as replay
 from slipid.support.progress import Reporter
 

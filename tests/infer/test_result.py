@@ -23,8 +23,9 @@ from slipid.infer import fit_file
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.fit_file import identified_json, load, save, to_json
 from slipid.infer.posterior import diagnosis
-from slipid.infer.result import Fit, summarise
+from slipid.infer.result import Fit
 from slipid.infer.slip_curves import by_encoders, has_steady_command, validity
+from slipid.infer.summary import summarise
 from slipid.infer.verdicts.estimates import estimates
 from slipid.infer.verdicts.unidentified import flat_directions, members
 from slipid.lab.selftest.logs import (

@@ -15,7 +15,8 @@ from slipid.data.windows import windows
 from slipid.fit.optimise import Optimum
 from slipid.fit.problem import FitState, Problem
 from slipid.infer.design.planned_runs import PlannedRun
-from slipid.infer.result import Fit, summarise
+from slipid.infer.result import Fit
+from slipid.infer.summary import summarise
 from slipid.lab.selftest.logs import (
     SimulatedSensors,
     heading_grid,

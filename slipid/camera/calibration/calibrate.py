@@ -7,13 +7,20 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.calibration.board import LEAST_CORNERS, Board, Picture, named_pictures, view_of
+from slipid.camera.calibration.board import (
+    LEAST_CORNERS,
+    Board,
+    Picture,
+    named_pictures,
+    not_detected,
+    usable,
+    view_of,
+)
 from slipid.camera.calibration.lens import fit_robustly
 from slipid.camera.calibration.place import FloorFit, fit_place, fit_place_robustly, uncertainty
 from slipid.camera.calibration.points import FloorPoints, read_points
 from slipid.camera.calibration.quality import Quality, quality_of
 from slipid.camera.calibration.report import floor_report, lens_report, scale_std, straight_report
-from slipid.camera.calibration.views import not_detected, usable
 from slipid.camera.opencv import read_picture, size_of
 from slipid.camera.overhead import Lens, OverheadCamera, read_camera
 from slipid.support.content import Content

@@ -98,12 +98,14 @@ def fit_place_robustly(source: str, lens: Lens, points: FloorPoints) -> FloorFit
             return replace(fit_place(source, lens, points), left_out=left_out)
         few = len(points.names) < LEAST_TO_DROP or first - len(points.names) >= int(MOST * first)
         if few:
-            doubt = f"{bad}; it was NOT left out, for the points are too few: measure again"
+            doubt = (
+                f"{bad.sentence}; it was NOT left out, for the points are too few: measure again"
+            )
             fit = _fitted(lens, points)
             if fit is None:
                 raise DataError(f"{source}: {doubt}")
             return replace(fit, left_out=(*left_out, doubt), disputed=True)
-        left_out = (*left_out, f"{bad}: left out")
+        left_out = (*left_out, f"{bad.sentence}: left out")
         points = points.without(bad.index)
     fit = fit_place(source, lens, points)
     vague = fit.rms_px > LEAST_BAD_PX
@@ -118,26 +120,10 @@ def fit_place_robustly(source: str, lens: Lens, points: FloorPoints) -> FloorFit
 
 @dataclass(frozen=True)
 class _BadPoint:
-    """A point that does not fit the others.
-
-    Attributes:
-        index: index of the point.
-        name: name of the point.
-        off_px, off_mm: its distance from the place that the others imply.
-        others_px: error of the others without it.
-    """
+    """Index of a point that does not fit the others, and a sentence about it."""
 
     index: int
-    name: str
-    off_px: float
-    off_mm: float
-    others_px: float
-
-    def __str__(self) -> str:
-        return (
-            f"point {self.name} is off by {self.off_px:.1f} pixels ({self.off_mm:.0f} mm), the "
-            f"others by {self.others_px:.1f}"
-        )
+    sentence: str
 
 
 def _bad_point(lens: Lens, points: FloorPoints) -> _BadPoint | None:
@@ -155,7 +141,11 @@ def _bad_point(lens: Lens, points: FloorPoints) -> _BadPoint | None:
     if not (error < limit and off_px > LEAST_BAD_PX):
         return None
     off_mm = float(np.hypot(*_off_mm(rest.camera, one)[0]))
-    return _BadPoint(index, points.names[index], off_px, off_mm, error)
+    return _BadPoint(
+        index,
+        f"point {points.names[index]} is off by {off_px:.1f} pixels ({off_mm:.0f} mm), the others "
+        f"by {error:.1f}",
+    )
 
 
 def _fitted(lens: Lens, points: FloorPoints) -> FloorFit | None:

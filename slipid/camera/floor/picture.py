@@ -7,9 +7,18 @@ import numpy as np
 
 from slipid.camera.floor.grid import RobotShape
 from slipid.camera.floor.light import Features, features_of
-from slipid.camera.floor.palette import SCHEMA, Palette, ProposedSurface, palette_text, read_palette
 from slipid.camera.floor.proposal import matched, proposed
-from slipid.camera.floor.region import FloorPicture, FloorRegion, requested_region, seeds_of
+from slipid.camera.floor.region import (
+    SCHEMA,
+    FloorPicture,
+    FloorRegion,
+    Palette,
+    palette_text,
+    points_text,
+    read_palette,
+    requested_region,
+    seeds_of,
+)
 from slipid.camera.floor.result import PictureMap, Segmentation, map_from
 from slipid.camera.floor.surfaces import (
     AROUND,
@@ -126,6 +135,5 @@ def _config_of(path: Path, palette: Palette, result: PictureMap, points: MarkedC
     surfaces = []
     for k, (name, colour) in enumerate(result.vector.colours.items()):
         own = points.surface == int(name.removeprefix("surface_")) - 1
-        places = tuple((float(x), float(y)) for x, y in pixels[own])
-        surfaces.append(ProposedSurface(name, colour, result.share(k), places))
+        surfaces.append(points_text(name, colour, result.share(k), pixels[own]))
     return palette_text(surfaces, path.name, palette)

@@ -9,8 +9,7 @@ import numpy as np
 from slipid.camera.floor.grid import DetectedRobot, Rectified
 from slipid.camera.floor.light import Features, code_of_linear
 from slipid.camera.floor.outline import PatchOutline, outlines_of, signed_area
-from slipid.camera.floor.palette import Palette
-from slipid.camera.floor.region import FloorPicture, FloorRegion
+from slipid.camera.floor.region import FloorPicture, FloorRegion, Palette
 from slipid.camera.floor.surfaces import UNKNOWN, Costs, Surfaces
 from slipid.camera.frame_source import is_picture
 from slipid.camera.opencv import Labels, Mask

@@ -73,7 +73,7 @@ class Commanded:
     commanded: float
 
     def product(self, meant: Interpretation) -> float:
-        """Return the product of turns and commanded turns under an interpretation [rad^2]."""
+        """Return the sum of turns times commanded turns under an interpretation [rad^2]."""
         wheels = len(self.across)
         turned, command = (
             columns(meant, wheels),

@@ -200,7 +200,7 @@ def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
 def wanted_names(
     path: Path, header: list[str], layout: Layout, all_columns: bool
 ) -> tuple[str | int, ...]:
-    """Names or positions of the columns to read, each of them there once."""
+    """Return names or positions of the columns to read; `DataError` unless each occurs once."""
     if not layout.names_row:
         for position in layout.columns:
             if int(position) >= len(header):

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from slipid.camera.calibration.board import Board, Picture, board_of, view_of
+from slipid.camera.calibration.board import Board, Picture, board_of, usable, view_of
 from slipid.camera.calibration.calibrate import floor_from_points, lens_from_file
-from slipid.camera.calibration.views import usable
 from slipid.camera.overhead import OverheadCamera
 from slipid.support.errors import DataError
 from tests.helpers import made_boards as made

@@ -18,7 +18,7 @@ from slipid.fit.optimise import Optimum
 from slipid.fit.problem import FitState, Problem
 from slipid.infer.design.planner import Planner
 from slipid.infer.fit_file import load, save
-from slipid.infer.result import summarise
+from slipid.infer.summary import summarise
 from slipid.lab.selftest.logs import (
     SimulatedSensors,
     heading_grid,

@@ -49,6 +49,12 @@ def parts(choices, **std):
     return (*(Density(problem, fitted, part) for part in (MOTION, ELECTRIC)), covariance)
 
 
+@pytest.fixture(scope="module")
+def usual():
+    """Return the densities of all numbers, compiled once."""
+    return parts(FREE)
+
+
 def drawn(first, second, covariance, motion, seed=0):
     """Return draws for very many copies of one draw of the motion."""
     many = np.broadcast_to(motion, (2, COPIES // 2, len(motion)))
@@ -74,8 +80,8 @@ def gaussian(second, held):
     return mode, np.linalg.inv(0.5 * (bend + bend.T))
 
 
-def test_draws_are_the_gaussian_given_the_motion_where_data_are_informative():
-    first, second, covariance = parts(FREE)
+def test_draws_are_the_gaussian_given_the_motion_where_data_are_informative(usual):
+    first, second, covariance = usual
     motion = first.centre + 0.02
     mode, spread = gaussian(second, first.hold(motion[None]))
     found = drawn(first, second, covariance, motion)
@@ -89,9 +95,9 @@ def test_draws_are_the_gaussian_given_the_motion_where_data_are_informative():
     )
 
 
-def test_draws_follow_the_motion():
+def test_draws_follow_the_motion(usual):
     """For motion far from the fit the mode differs from the start, and is found."""
-    first, second, covariance = parts(FREE)
+    first, second, covariance = usual
     motion = first.centre + np.where(["drag" in name for name in first.names], 0.5, 0.0)
     mode, spread = gaussian(second, first.hold(motion[None]))
     found = drawn(first, second, covariance, motion)

@@ -29,8 +29,11 @@ def known(terms, group, centre, covariance):
 
     def slope(x):
         step = 1e-5 * np.eye(x.shape[1])
-        ends = [terms(x + s).sum(axis=1) - terms(x - s).sum(axis=1) for s in step]
-        return np.stack(ends, axis=1) / 2e-5
+        ends = x + np.stack([step, -step])[:, :, None]  # all at once: calls take longer than sums
+        above, below = (
+            terms(ends.reshape(-1, x.shape[1])).sum(axis=1).reshape(2, x.shape[1], len(x))
+        )
+        return (above - below).T / 2e-5
 
     return LogDensity(terms, slope, group, centre, covariance)
 

@@ -1,4 +1,4 @@
-"""The command on the recorded runs of the test site: one table, kept work, rows that fail."""
+"""The command on the recorded runs of the test site: one table, checkpoints, rows that fail."""
 
 import json
 from dataclasses import replace

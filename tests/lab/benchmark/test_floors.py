@@ -1,4 +1,4 @@
-"""Telling the floor without a pose: reading, folds, answers, intervals, and slipid's own row."""
+"""Floor classification without a pose: reading, folds, answers, intervals, slipid's own row."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -189,7 +189,7 @@ def test_settings_are_picked_by_runs_that_the_candidate_was_not_fitted_to():
 
 @dataclass(frozen=True)
 class Memory(Meter):
-    """Takes the first floor in runs that it was fitted to, and the last in all others."""
+    """Classifier that names the first floor in its training runs, and the last in all others."""
 
     name: str = "memory"
     known: frozenset[str] = frozenset()
@@ -358,7 +358,7 @@ def test_kinds_of_motion_are_straight_bends_and_on_the_spot():
 
 
 def ground(friction: dict[str, float]):
-    """A Husky with a meter on floors that differ in friction only."""
+    """Return a Husky with ammeters on floors that differ in friction only."""
     robot = husky().on(tuple(friction))
     surfaces = replace(
         robot.surfaces, lead=jnp.zeros(len(friction)), drag_exponent=jnp.ones(len(friction))
@@ -371,7 +371,7 @@ def ground(friction: dict[str, float]):
 
 
 def driven(robot, runs: int = 4, noise: float = 0.5, seed: int = 0):
-    """Runs in which each pair of wheel speeds is kept for two seconds, as its meters show them."""
+    """Return runs with pairs of wheel speeds of two seconds each, and their ammeter readings."""
     made = []
     for k, floor in enumerate(robot.surfaces.labels):
         for n in range(runs):
@@ -439,7 +439,7 @@ def test_slipid_raises_without_robot_or_fit():
 
 
 class Broken(Meter):
-    """Cannot be fitted."""
+    """Classifier whose fit raises."""
 
     def fit(self, runs, spec):
         raise ZeroDivisionError("no wheel")
@@ -463,7 +463,7 @@ def test_a_classifier_that_fails_has_an_empty_row_beside_the_others():
 
 
 def in_the_air(root: Path) -> tuple[float, float, float]:
-    """`ZERO_A`, `FREE_A` and `FREE_AS` by runs of a Husky with its wheels in the air.
+    """Return `ZERO_A`, `FREE_A` and `FREE_AS` by runs of a Husky with its wheels in the air.
 
     Rows count in which a wheel keeps its speed.
     """

@@ -1,4 +1,4 @@
-"""What is left out together, and that methods are tuned on training runs of the same kind alone."""
+"""Splits of the protocols, and tuning of methods on training runs alone."""
 
 from dataclasses import dataclass, replace
 
@@ -119,7 +119,7 @@ def test_headings_are_held_back_where_every_other_sector_is_missing_already():
 
 @dataclass(frozen=True)
 class Scaled(SlipModel):
-    """Encoders, times a number that is a setting."""
+    """Encoders times a factor, which is a setting."""
 
     name: str = "scaled"
     factor: float = 1.0
@@ -150,7 +150,7 @@ def test_the_best_setting_of_training_runs_is_picked():
 
 @dataclass(frozen=True)
 class Hungry(Scaled):
-    """Encoders that are right if they were fitted to runs on several floors."""
+    """Encoders with the right factor if they were fitted to runs on several floors."""
 
     factor: float = 1.0
 
@@ -195,7 +195,7 @@ def test_runs_whose_floor_was_left_out_altogether_do_not_count():
 
 
 class Stubborn(Scaled):
-    """One setting cannot be fitted."""
+    """Model with one setting whose fit raises."""
 
     def fit(self, runs, spec: RobotSpec):
         if self.factor == 0.5:
@@ -209,7 +209,7 @@ def test_a_setting_that_fails_is_not_picked():
 
 @dataclass(frozen=True)
 class Mean(Scaled):
-    """Encoders, times what they are off by in the mean."""
+    """Encoders times the mean factor of the training runs."""
 
     def fit(self, runs, spec: RobotSpec):
         slip = np.mean([r.twist[0, :2] @ r.signals.rolling(spec)[0, :2] for r in runs])
@@ -246,7 +246,7 @@ def test_a_floor_of_few_runs_has_the_fit_to_all():
 
 @dataclass(frozen=True)
 class Powered(Scaled):
-    """Encoders, and a power that is a setting."""
+    """Encoders with a power, which is a setting."""
 
     watts: float = 1.0
 

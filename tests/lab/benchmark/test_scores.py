@@ -1,4 +1,4 @@
-"""What a prediction is worth, and how folds are put together, against plain formulas."""
+"""Scores of predictions and summaries of folds against plain formulas."""
 
 from dataclasses import asdict, replace
 
@@ -22,7 +22,7 @@ from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 
 def slipping_run(**more):
-    """Drives 0.8 m by its wheels and 0.6 m in truth."""
+    """Return a run of 0.8 m by its wheels and 0.6 m in truth."""
     rolling = straight(0.0)
     return made_run(rolling, 0.75 * rolling, current=np.full((40, 3), 0.5), **more)
 
@@ -91,7 +91,7 @@ def test_the_slip_score_is_by_the_twist_unless_a_method_has_its_own():
 
 
 def test_yaw_rates_count_at_the_base_radius():
-    """A yaw rate is a speed at the base radius beside those ahead and sideways."""
+    """A yaw rate counts as the speed at the base radius."""
     rolling = straight(0.0) + np.array([0.0, 0.0, 0.4])
     run = made_run(rolling, rolling - np.array([0.0, 0.0, 0.3]))
     one = scored(run, said(run, run.signals.rolling(ROBOTINO)), ROBOTINO, "chord")
@@ -138,7 +138,7 @@ def test_the_area_is_that_of_scikit_learn():
 
 
 def rows(errors, floor="gray"):
-    """A fold whose runs err by so much."""
+    """Return a fold whose runs have these end-point errors."""
     base = scored(slipping_run(), said(slipping_run(), straight(0.0)), ROBOTINO, "chord")
     runs = [
         replace(base, name=f"{floor}{k}", floor=floor, cluster=k, endpoint_error=e)

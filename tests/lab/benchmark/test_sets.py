@@ -1,4 +1,4 @@
-"""The data sets: what is there, what methods hear of it, and what slipid fits."""
+"""The data sets: availability, channels for methods, and runs that slipid fits."""
 
 from pathlib import Path
 

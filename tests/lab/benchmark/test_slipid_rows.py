@@ -1,4 +1,4 @@
-"""What slipid's own rows are told, and what they say, without a fit."""
+"""Inputs and predictions of slipid's own rows, without a fit."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -29,7 +29,7 @@ def made():
 
 
 def fit_of(made, current=True) -> SlipidFit:
-    """The robot that drove the runs, as if it had been fitted to them."""
+    """Return the robot of the simulated runs in the form of a fit."""
 
     def ends(w):
         return SimpleNamespace(predicted=w.pose), np.tile(np.diag([4.0, 1.0]), (len(w), 1, 1))
@@ -63,7 +63,7 @@ def test_on_a_known_floor_the_region_is_that_of_a_student_t(made):
 
 @pytest.fixture
 def driven(made, monkeypatch):
-    """Estimators that were driven, and what each of them heard."""
+    """Estimators that were replayed, with the signals of each."""
     calls = []
 
     def caught(estimator, heard, start):
@@ -75,7 +75,7 @@ def driven(made, monkeypatch):
 
 
 def labels(floors, made, driven, current=True):
-    """Floors of each estimator that is driven for some runs."""
+    """Return the floors of each estimator that is replayed on the runs."""
     batches = run_batches(made.runs, made.robot)
     said = estimator_runs(fit_of(made, current), batches, made.runs, floors)
     assert len(said) == len(made.runs)

@@ -1,4 +1,4 @@
-"""Runs as methods are given them: what was signals, and where the body was in truth."""
+"""Runs as methods get them: signals, and true poses of the body."""
 
 from dataclasses import replace
 

@@ -43,7 +43,7 @@ RIM = np.stack([-np.sin(AZIMUTH), np.cos(AZIMUTH), np.full(3, 0.125)], axis=1)
 
 
 def made_table(twist, slip, current, command=None):
-    """Columns of a 2021 file: twist (row, 3) in m/s and rad/s, slip and current (row, 3)."""
+    """Return columns of a 2021 file: twist (row, 3) in m/s and rad/s, slip and current (row, 3)."""
     command = twist if command is None else command
     speed = twist @ RIM.T / 0.040 * 16 / (1 - slip)
     table = {
@@ -234,7 +234,7 @@ def test_track_numbers_of_a_made_square():
 
 
 def made_log(rng, surface, offset, slope, seconds=12.0):
-    """A straight run whose wheels slip by offset + slope I, with a different current each."""
+    """Return a straight run with slip offset + slope I, with a different current for each wheel."""
     time = np.arange(0.0, seconds, 0.03)
     heading = 0.4
     twist = np.array([0.2 * np.cos(0.3), 0.2 * np.sin(0.3), 0.0])

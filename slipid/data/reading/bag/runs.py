@@ -216,7 +216,7 @@ def _time(file: Path, row: int, column: str, cell: str | None) -> float:
 
 @dataclass(frozen=True)
 class _TimedValue:
-    """Content of one message: its time [s], value, and names of the floor and the load set-up."""
+    """Value of one message with its time [s], and names of the floor and the load set-up."""
 
     time: float
     value: Value

@@ -1,4 +1,4 @@
-"""Classifiers against what is known: other libraries, and series that data were made from."""
+"""Classifiers against other libraries, and against the series behind simulated data."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ from tests.helpers.made_runs import HUSKY, ROBOTINO
 
 
 def mixed_runs(seed: int = 0):
-    """Runs at speeds that change, on floors whose currents overlap."""
+    """Return runs at varying speeds on floors with overlapping currents."""
     rng = np.random.default_rng(seed)
     runs = []
     for k in range(12):
@@ -40,7 +40,7 @@ def mixed_runs(seed: int = 0):
 
 
 def training(method, runs):
-    """Features and floors as a method trains on them."""
+    """Return the features and floors that a method trains on."""
     if isinstance(method, GaussianClassifier):
         return training_rows(runs, lambda f: method._features(f, HUSKY, method.restart_s))
 
@@ -101,7 +101,7 @@ def test_trees_are_those_of_the_library():
 
 
 def test_how_often_a_floor_was_driven_is_no_evidence():
-    """Ten times as many runs on one of two floors that feel alike do not make it more probable."""
+    """Of two floors with equal signals, the one with ten times the runs is not more probable."""
     many = [made_floor_run("grass", ahead(), 2.0, seed=k) for k in range(20)]
     few = [made_floor_run("snow", ahead(), 2.0, seed=100 + k) for k in range(2)]
     done = BoostedTreesClassifier(trees=10).fit([*many, *few], HUSKY)
@@ -111,7 +111,7 @@ def test_how_often_a_floor_was_driven_is_no_evidence():
 
 
 def test_trees_with_the_driving_off_do_not_go_by_the_speed():
-    """On one floor people drive fast; motors draw the same. Only trees that hear all believe it."""
+    """One floor is driven faster with the same currents; only trees without it ignore the speed."""
 
     def runs(start: int):
         return [
@@ -146,7 +146,7 @@ def test_rows_of_trees_use_the_channels_of_their_names():
 
 
 def circle_run(weight: np.ndarray, floor: str, seed: int = 0, noise: float = 0.0):
-    """A Robotino that goes in all directions; its energy coefficient is a series, and noise."""
+    """Return a run in all directions whose energy coefficient is a series plus noise."""
     rng = np.random.default_rng(seed)
     rows = 72
     angle = np.linspace(-np.pi, np.pi, rows, endpoint=False) + 1e-3

@@ -1,4 +1,4 @@
-"""What classifiers of floors hear, and how what they hear adds up."""
+"""Features of floor classifiers, and accumulation of their evidence."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Polynomial networks against least squares written out, and what GMDH tells of made floors."""
+"""Polynomial networks against plain least squares, and GMDH on simulated floors."""
 
 from dataclasses import replace
 from itertools import pairwise, product
@@ -164,7 +164,7 @@ def test_outputs_of_networks_are_clipped_to_the_training_range():
 
 
 def slipping(angle: float, floor: str, seed: int = 0, steps: int = 40) -> Run:
-    """Runs that slip by their direction on ice, where motors draw little, and not on gray."""
+    """Return runs that slip by their direction on ice, with low currents, and not on gray."""
     ratio = np.array([-0.4 - 0.2 * np.cos(angle), 0.2 * np.sin(angle), 0.1])
     ratio = ratio if floor == "ice" else np.zeros(3)
     amps = 0.3 if floor == "ice" else 0.9

@@ -1,4 +1,4 @@
-"""Windows and slip ratios, and what trees and networks learn of runs whose slip is known."""
+"""Windows and slip ratios, and trees and networks on runs with known slip."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ LEARNERS = [BoostedTrees(), NeuralNetwork()]
 
 
 def slipping(angle, ratio, speed=0.2, steps=40, **heard) -> Run:
-    """A straight run whose body slips by this ratio: ahead, to the left, turning."""
+    """Return a straight run with this slip ratio: ahead, to the left, turning."""
     rolling = straight(angle, speed, steps)
     return made_run(rolling, rolling + speed * np.asarray(ratio) / SIZES, **heard)
 

@@ -1,4 +1,4 @@
-"""Ojeda's correction by currents: when it flags, and its two numbers by each way of tuning."""
+"""Ojeda's correction by currents: its flags, and k0 and k1 by each way of tuning."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ def rng():
 
 
 def corrected_run(rng, line, *, floor, level, spec=ROBOTINO, rolling=None, spread=0.15):
-    """A run on a floor that takes so much current [A], which slips as the method assumes."""
+    """Return a run on a floor with this current level [A] that slips as the method assumes."""
     while rolling is None or np.abs(rolling @ spec.forward.T).min() < 0.15:
         # no wheel so slow that slip would turn it backwards
         rolling = straight(rng.uniform(-np.pi, np.pi), 0.6, 60) + np.array(
@@ -36,7 +36,7 @@ def corrected_run(rng, line, *, floor, level, spec=ROBOTINO, rolling=None, sprea
 
 
 def two_floors(rng, line, count=12, **extra):
-    """Runs on a hard floor, where nothing slips, and on a soft one."""
+    """Return runs on a hard floor without slip, and on a soft one."""
     hard = [corrected_run(rng, (0, 0), floor="hard", level=0.3, **extra) for _ in range(count)]
     soft = [corrected_run(rng, line, floor="soft", level=1.2, **extra) for _ in range(count)]
     return hard, soft
@@ -130,7 +130,7 @@ def test_the_pose_known_all_the_time_is_forgotten_and_that_known_now_and_then_is
 
 
 def with_level(current):
-    """Steps that take so much current in all wheels [A]."""
+    """Return steps with these currents in all wheels [A]."""
     return made_run(straight(0.3), current=np.tile(np.reshape(current, (-1, 1)), (1, 3))).signals
 
 

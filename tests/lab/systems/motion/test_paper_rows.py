@@ -35,7 +35,7 @@ def rng():
 
 
 def slipping(rng, curve, *, angle=None, low=0.2, high=0.8, dt=0.1, spec=ROBOTINO, noise=0.0):
-    """A run with currents at random, constant over half a second, whose slip is `curve` of it."""
+    """Return a run with random currents, constant over half a second, and slip `curve` of them."""
     angle = rng.uniform(-np.pi, np.pi) if angle is None else angle
     rolling = straight(angle) + np.array([0.0, 0.0, 0.2])
     hold = round(0.5 / dt)
@@ -57,7 +57,7 @@ def path_error(method, runs, spec=ROBOTINO):
 
 
 def said_slip(method, heard, spec=ROBOTINO):
-    """Slip of each drive in the first step, back from the path that is said."""
+    """Return the slip of each drive in the first step, by the predicted path."""
     path = method.predict([heard], spec)[0].path
     run = replace(made_run(straight(0.0)), signals=heard, pose=path)
     return 1 - run.twist @ spec.forward.T / (heard.speed * spec.wheel_radius)

@@ -1,4 +1,4 @@
-"""Gaussian processes against their closed form, spread of a path's end, and made laws of energy."""
+"""Gaussian processes against closed forms, covariance of a path's end, and laws of energy."""
 
 from dataclasses import replace
 
@@ -51,7 +51,7 @@ def test_a_posterior_is_that_of_the_closed_form():
 
 
 def likelihood(known, kernel):
-    """Logarithm of the probability of all outputs, up to a constant."""
+    """Return the log probability of all outputs, up to a constant."""
     z = (known.y - known.y.mean(axis=0)) / known.y.std(axis=0)
     gram = matern(known.x, known.x, kernel) + kernel.noise * np.eye(len(z))
     return -0.5 * (z * np.linalg.solve(gram, z)).sum() - 0.5 * 2 * np.linalg.slogdet(gram)[1]
@@ -100,7 +100,7 @@ def test_the_end_spreads_as_errors_that_last_for_the_run_move_it():
 
 
 def slipping(angle: float, seed: int, scatter: float = 0.0) -> Run:
-    """Half the current, half the slip; with a part of the slip that is each run's own."""
+    """Return runs with slip in proportion to the current, and a random part for each run."""
     rng = np.random.default_rng(seed)
     amps = rng.uniform(0.4, 1.2)
     ratio = np.array([-0.3 * amps, 0.1 * np.sin(angle), 0.1]) + scatter * rng.normal(size=3)
@@ -185,11 +185,11 @@ def test_a_single_run_is_enough_and_rest_is_certain_to_a_millimetre():
 
 
 LAW = np.array([20.0, 30.0, 80.0, 15.0])
-"""Energy per way: constant, with speed, with its square, with the yaw rate."""
+"""Coefficients of the energy per metre: constant, speed, its square, yaw rate."""
 
 
 def drawing(twist: np.ndarray, energy_factor: np.ndarray | float = 1.0) -> RunSignals:
-    """A run whose motors draw so much that its energy is by `LAW` times a factor."""
+    """Return a run whose energy is that of `LAW` times a factor."""
     run = made_run(twist)
     speed = np.hypot(twist[:, 0], twist[:, 1])
     energy = LAW[0] + LAW[1] * speed + LAW[2] * speed**2 + LAW[3] * np.abs(twist[:, 2])

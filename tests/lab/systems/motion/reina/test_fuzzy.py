@@ -1,4 +1,4 @@
-"""Fuzzy rules are checked by hand and by scikit-learn."""
+"""Fuzzy rules against hand calculations and scikit-learn."""
 
 import numpy as np
 import pytest

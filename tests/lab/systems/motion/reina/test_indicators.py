@@ -1,4 +1,4 @@
-"""Signals, limits and indicators are those that made runs were given."""
+"""Signals, thresholds and indicators against those of simulated runs."""
 
 from dataclasses import replace
 

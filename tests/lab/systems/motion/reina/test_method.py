@@ -1,4 +1,4 @@
-"""Thresholds and fuzzy rules flag slip where made runs slip, and correct their paths."""
+"""Thresholds and fuzzy rules flag slip of simulated runs, and correct their paths."""
 
 from dataclasses import replace
 
@@ -52,7 +52,7 @@ def test_slip_is_detected_by_the_currents(method, gyro):
 
 
 def test_without_other_signs_the_area_is_that_of_the_currents_themselves():
-    """Any rising function of a signal has its area under the curve."""
+    """Every increasing function of a signal has the same area under the curve."""
     runs = [patchy(k, overlap=0.3) for k in range(8)]
     steady = [replace(run, signals=replace(run.signals, command=None)) for run in runs]
     method = ReinaDeterministic(smoothing=1e-3).fit(steady, ROBOTINO)
@@ -177,7 +177,7 @@ def test_settings_to_try_and_numbers_fitted():
 
 
 def test_windows_that_slip_are_those_of_more_than_a_fifth_with_turning_in_metres():
-    """Turning 0.15 of 1 rad/s too little is 0.15 of what the encoders say; 0.25 is a fifth more."""
+    """A yaw rate 0.15 rad/s below 1 rad/s is a slip of 0.15; one of 0.25 is above the limit."""
     for short, slips in ((0.15, False), (0.25, True)):
         rolling = np.tile([0.0, 0.0, 1.0], (40, 1))
         run = made_run(rolling, rolling * (1.0 - short), current=np.ones((40, 3)))

@@ -22,7 +22,7 @@ def test_at_constant_speed_traction_equals_resistance():
 
 
 def test_an_omni_robot_between_two_wheels_slides_by_what_both_must_pull():
-    """Along x two of three wheels pull, at 30 deg: 2 (N T) cos 30 = rho m g, and N = m g / 3."""
+    """Along x two of three wheels drive, at 30 deg: 2 (N T) cos 30 = rho m g, and N = m g / 3."""
     law = ForceLaw(rise=12.0, viscous=0.0, rolling=0.25, turning=0.3)
     v = held(np.array([0.5, 0.0, 0.0]), law, seconds=1e6)[0]
     share = law.rolling * v[0] / np.hypot(v[0], REST) * np.sqrt(3.0) / law.grip
@@ -31,7 +31,7 @@ def test_an_omni_robot_between_two_wheels_slides_by_what_both_must_pull():
 
 
 def test_viscous_forces_alone_share_speeds_by_their_slopes():
-    """C2 u = rho c v along, and rollers leave the other speeds alike."""
+    """C2 u = rho c v along the drive, and free rollers leave the other speeds unchanged."""
     law = ForceLaw(grip=0.0, viscous=0.3, rolling=1e-9, turning=0.0, drag=0.2e9)
     v = held(np.array([0.2, -0.1, 0.0]), law, seconds=1e6)[0]
     # J^T J = 1.5 on three wheels with N = m g / 3: half of all wheels' slope

@@ -97,7 +97,7 @@ def test_the_force_of_a_current_is_that_of_gear_motor_and_wheel():
 
 
 def test_the_spread_of_the_end_is_that_of_paths_with_other_twists():
-    """Turning fast: by differences of the end with noise in the twist of each of two steps."""
+    """The end covariance of a fast turn is that by differences in the twists of two steps."""
     noise = FilterNoise(rolling=0.0, drift=(0.01, 0.02, 0.03))
     heard = made_run(np.tile([0.3, -0.2, 2.0], (2, 1)), dt=0.2).signals
     dynamics = Dynamics.of(ROBOTINO, FLOOR)

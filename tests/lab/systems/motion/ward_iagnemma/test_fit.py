@@ -1,4 +1,4 @@
-"""The law and the noise by which runs were made are found again."""
+"""The law and the noise of simulated runs are recovered."""
 
 from dataclasses import replace
 
@@ -44,7 +44,7 @@ def test_gain_and_offset_of_the_currents_are_found_again():
 
 @pytest.mark.slow
 def test_the_noise_of_currents_is_that_of_the_means_of_runs():
-    """What is the same all along a run counts as much as it moves the mean of a run's wheel."""
+    """A constant error of a run has the weight of its effect on the run's mean."""
     rng = np.random.default_rng(1)
     runs = []
     for k in range(30):

@@ -1,4 +1,4 @@
-"""Ends and scores of made runs are foretold as surely as the method says."""
+"""Ends and scores of simulated runs agree with the method's uncertainty."""
 
 from dataclasses import replace
 

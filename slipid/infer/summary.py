@@ -1,0 +1,121 @@
+"""Summary of an optimisation as a fit, with a check of its convergence."""
+
+from collections.abc import Iterable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from slipid.data.runs import Runs
+from slipid.fit.optimise import Optimum
+from slipid.fit.problem import Problem, log_jacobian
+from slipid.fit.shared_effects import (
+    EffectPosterior,
+    marginal_residuals,
+    marginal_slopes,
+)
+from slipid.fit.variances import MOTION_BLOCKS
+from slipid.infer import slip_curves as curves_of
+from slipid.infer.result import Channels, Fit, draws
+from slipid.predict.predictive import force_balance_of
+from slipid.search_space import Choice
+
+REMAINING = 0.3
+"""Largest remaining Gauss-Newton step of a converged fit [posterior std]."""
+
+
+def summarise(
+    problem: Problem, optimum: Optimum, data: Runs, choices: Iterable[Choice], seed: int = 0
+) -> Fit:
+    """Return the fit at the end of an optimisation.
+
+    Args:
+        problem: likelihood of the runs.
+        optimum: end of the search.
+        data: runs on one floor each that the problem's windows were cut from.
+        choices: user's choices that the problem was built with.
+        seed: seed of the draws behind the curves' bands.
+    """
+    z, log_v = optimum.state.z, optimum.state.log_variance
+    contact = force_balance_of(problem, optimum.state, optimum.covariance, problem.full_weight)
+    remaining, name = _remaining(problem, optimum)
+    settled = remaining < REMAINING
+    stuck = f"the solver stopped {remaining:.2g} stds of {name} away from where its own step leads"
+    windows, robot = problem.windows, contact.robot
+    several = draws(z, contact.covariance, 400, seed)
+    unit = {c.name: c.unit for c in problem.noise.components}
+    return Fit(
+        space=problem.space,
+        choices=tuple(choices),
+        z=np.asarray(z),
+        covariance=contact.covariance,
+        laplace=problem.laplace(z, log_v, problem.full_weight, alone=True),
+        shared=contact.shared,
+        extrapolation=contact.extrapolation,
+        variance=contact.variance,
+        variance_unit={name: unit[name] for name in contact.variance},
+        runs=tuple((log.name, log.sha256) for log in data.logs)
+        + (() if problem.multi_floor is None else problem.multi_floor.runs),
+        channels=Channels(
+            current=bool(windows.has_current),
+            voltage=bool(windows.has_voltage),
+            signed=bool(windows.current_is_signed),
+            windows=int(windows.dt.shape[1]),
+        ),
+        curves=curves_of.curves(problem.space, z, several, problem.batch),
+        validity=curves_of.validity(data, robot, problem.batch),
+        converged=bool(optimum.converged) and settled,
+        reason=optimum.reason if settled or not optimum.converged else stuck,
+        remaining=remaining,
+        rounds=int(optimum.state.round),
+        history=tuple(float(x) for x in optimum.history),
+        lag=float(windows.lag),
+        seed=seed,
+        current_trend=curves_of.current_trend(robot, problem.batch)
+        if windows.has_current
+        else (0.0, 0.0),
+        data=data,
+        problem=problem,
+        optimum=optimum,
+    )
+
+
+def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
+    """Return the largest coordinate of a full Gauss-Newton step [posterior std], and its name.
+
+    The stds are those of the Laplace covariance, as in the stopping rule of the rounds: the
+    solver's own rows take contact forces as exact, and so determine friction far better than logs.
+
+    delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), W with the weights of outliers, g
+    the slope of log |d residuals / d data|; where currents were logged, their rows move the
+    electric numbers only.
+    """
+    state, every = optimum.state, problem.full_weight
+    z, log_v = state.z, state.log_variance
+    electric = problem.electric(z, log_v)
+    residual, jacobian = problem.linear(z, electric)
+    seen = problem.weighed(residual, log_v, every, state.shared(len(problem.windows)))
+    roots = seen.whitening.root
+    own = problem.space.electric.astype(float)
+    prior = np.asarray(problem.objective.prior_std(log_v)) ** -2
+    _, slope = log_jacobian(problem.objective, z, electric, every)
+    gradient = prior * (z - problem.space.prior_mean) - np.asarray(slope)
+    info = np.diag(prior)
+    for k, root in roots.items():
+        white = jnp.einsum("nij,nj->ni", root, residual[k])
+        half = jnp.einsum("nij,njp->nip", root, jacobian[k])
+        if k == "motion":
+            white, half = _freed(seen.effects, white, half)
+        flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k in MOTION_BLOCKS else own)
+        gradient = gradient + flat.T @ np.asarray(white).ravel()
+        info = info + flat.T @ flat
+    std = np.sqrt(np.diag(optimum.covariance))
+    steps = np.abs(np.linalg.solve(info, gradient)) / std
+    worst = int(np.argmax(steps))
+    return float(steps[worst]), problem.space.names[worst]
+
+
+@jax.jit
+def _freed(tied: tuple[EffectPosterior, ...], white: Array, half: Array) -> tuple[Array, Array]:
+    return marginal_residuals(tied, white), marginal_slopes(tied, half)
