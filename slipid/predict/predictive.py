@@ -8,9 +8,9 @@ scale
 V of its own camera, process and run variances, found by restricted likelihood from its own
 residuals; v the variances of shared effects and E their derivative; J the derivative by its own
 numbers and the camera's, C their covariance. Simpler models have v of sessions
-(`slipid.fitting.session_effects`); the force balance has the effects of sessions and neighbours of its
-fit (`slipid.fitting.shared_effects`), and its v grows where held-out sectors ask for it. All models
-share the fitted camera; the numbers of a simpler model follow it.
+(`slipid.fitting.session_effects`); the force balance has the effects of sessions and neighbours of
+its fit (`slipid.fitting.shared_effects`), and its v grows where held-out sectors ask for it. All
+models share the fitted camera; the numbers of a simpler model follow it.
 """
 
 import abc
