@@ -25,7 +25,7 @@ from scipy.stats import f as fisher
 
 from slipid.fit.session_effects import remaining_effects
 from slipid.fit.shared_effects import AXES, SharedEffects
-from slipid.fit.variances import DEGREES, VARIANCE_SPREAD, Objective, Search, Square
+from slipid.fit.variances import DEGREES, VARIANCE_SPREAD, Objective, Search, Square, Variances
 
 _STEPS, _SETTLED = 20, 1e-5
 """Largest number of scoring steps per round, and the log-variance step that counts as rest."""
@@ -66,8 +66,8 @@ def effect_variances(
     motion: tuple[Array, Array],
     weight: Array,
     covariance: Square,
-    log_v: Float[np.ndarray, " variance"],
-) -> Float[np.ndarray, " variance"]:
+    log_v: Variances,
+) -> Variances:
     """Return the log variances after scoring steps of those of the run effects.
 
     Args:
@@ -87,7 +87,7 @@ def effect_information(
     motion: tuple[Array, Array],
     weight: Array,
     covariance: Square,
-    log_v: Float[np.ndarray, " variance"],
+    log_v: Variances,
 ) -> Float[np.ndarray, "variance variance"]:
     """Return the expected information of the same log variances, zero for the others."""
     out = np.zeros((len(log_v), len(log_v)))
@@ -118,7 +118,7 @@ def extrapolation(
     motion: tuple[Array, Array],
     keep: Float[np.ndarray, " segment"],
     covariance: Square,
-    log_v: Float[np.ndarray, " variance"],
+    log_v: Variances,
     travel: TravelDirections,
 ) -> dict[str, float]:
     """Return the factors by which variances are too small far from fitted runs, by set-up.
@@ -158,9 +158,7 @@ class _HeldOutEffects(NamedTuple):
 
 
 def _held_out_effects(
-    axes: Iterable[_AxisEffects],
-    log_v: Float[np.ndarray, " variance"],
-    direction: Float[np.ndarray, " segment"],
+    axes: Iterable[_AxisEffects], log_v: Variances, direction: Float[np.ndarray, " segment"]
 ) -> _HeldOutEffects:
     """Return the effects of every sector as predicted from the other sectors."""
     found = _HeldOutEffects(*(np.full((len(direction), len(AXES)), np.nan) for _ in range(3)))
@@ -226,7 +224,7 @@ def _axes(
     motion: tuple[Array, Array],
     weight: Array,
     covariance: Square,
-    log_v: Float[np.ndarray, " variance"],
+    log_v: Variances,
 ) -> Iterator[_AxisEffects]:
     """Yield the remaining effects of every floor and axis."""
     space = objective.space
@@ -306,9 +304,7 @@ def _scoring_steps(axis: _AxisEffects, log_v: np.ndarray, typical: np.ndarray) -
     return log_v
 
 
-def pooled(
-    precision: Square, z: Search, objective: Objective, log_v: Float[np.ndarray, " variance"]
-) -> float:
+def pooled(precision: Square, z: Search, objective: Objective, log_v: Variances) -> float:
     """Return the log mean variance of the load biases of floors; arguments as in `pooled_stds`."""
     found = pooled_stds(precision, z, objective, log_v)
     return float(np.log(found.weight @ found.std**2))
@@ -321,9 +317,7 @@ class PooledStds(NamedTuple):
     weight: Float[np.ndarray, " grid"]
 
 
-def pooled_stds(
-    precision: Square, z: Search, objective: Objective, log_v: Float[np.ndarray, " variance"]
-) -> PooledStds:
+def pooled_stds(precision: Square, z: Search, objective: Objective, log_v: Variances) -> PooledStds:
     """Return the posterior of the std of the load biases with a half-normal prior, on a grid.
 
     The fit is a Gaussian of that precision around z; its evidence for every std is known.

@@ -165,7 +165,7 @@ def marker_increments(
 
 def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDrive:
     """Return the motor current of every window [A], its magnitude if logs are unsigned."""
-    friction = robot.surfaces.friction[b.surface]  # of the wheels on average, as `felt` has it
+    friction = robot.surfaces.friction[b.surface]  # mean over wheels, as for forces
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
     weight = friction * robot.body.mass * model.GRAVITY
     torque = (

@@ -88,7 +88,7 @@ def optimise(
     covariance = problem.laplace(state.z, state.log_variance, keep)
     reason = f"{most_rounds} rounds without settling"
     if settled := state.moved < tolerance:
-        reason = f"no number moved {tolerance:g} of its std in round {state.round}"
+        reason = f"no number changed by {100 * tolerance:g} % of its std in round {state.round}"
     return Optimum(state, covariance, settled, reason, tuple(history))
 
 

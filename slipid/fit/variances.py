@@ -30,6 +30,8 @@ Vector = Array | np.ndarray
 """One-dimensional array of jax or numpy."""
 Search = Float[np.ndarray, " free"]
 """A search vector, or one number for each of its coordinates."""
+Variances = Float[np.ndarray, " variance"]
+"""One number for each variance."""
 Square = Float[np.ndarray, "free free"]
 """Covariance or information of the search vector."""
 Blocks = dict[str, Array]

@@ -29,7 +29,12 @@ class Camera(eqx.Module):
     lag: Array = known("s", "t_c", "camera behind the encoders", start=0.0, spread=0.03)
     marker_yaw: Array = known("rad", "psi", "marker heading less body's", start=0.0, spread=0.03)
     session_yaw: Array = known(
-        "rad", "dpsi", "its change in a session", start=0.0, spread=0.01, per="sessions"
+        "rad",
+        "dpsi",
+        "deviation of the marker heading in a session",
+        start=0.0,
+        spread=0.01,
+        per="sessions",
     )
     marker_place: Array = plane("m", "p_m", "marker from the body's centre", start=0.0, spread=0.02)
     tilt: Array = plane("1/m", "h", "perspective of a tilted camera", start=0.0, spread=0.03)

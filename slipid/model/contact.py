@@ -65,7 +65,7 @@ def _damped(balance: Balance, xi: Planar) -> Planar:
     damping = jnp.asarray(_DAMPING)
     tried = jax.vmap(merit)(damping)
     best = jnp.argmin(tried)
-    # where all wheels slide the balance is flat and Newton's direction leads far away
+    # where all wheels slide, the balance is nearly flat and Newton's step leads far away
     stuck = (tried[best] >= before) & (before > _ROUNDING)
     return jax.tree.map(partial(jnp.where, stuck), balance.chord(xi), less(damping[best]))
 
@@ -210,12 +210,12 @@ def settle(
     def chord(xi: Planar, _: None) -> tuple[Planar, None]:
         return balance.chord(xi), None
 
-    # XLA is to write the steps out, generated code keeps them a loop
+    # unrolled for XLA; generated C code keeps the loop
     near, _ = jax.lax.scan(chord, Planar(*start), length=CHORD, unroll=CHORD)
     xi = near
     for _ in range(NEWTON):
         xi = jax.tree.map(jnp.subtract, xi, balance.newton(xi))
-    # NaN is not nearer
+    # a comparison with NaN is false, so that NaN is never nearer
     nearer = balance.size(balance.force(xi)) <= balance.size(balance.force(near))
     found = jax.tree.map(lambda x, n: jnp.where(nearer, x, n), xi, near)
     sound = jnp.isfinite(found.x + found.y + found.yaw)

@@ -61,7 +61,7 @@ def stand(frame: WheelFrame, surface: ContactSurface, rest: Float[Array, " wheel
         )
     roller_scale = (1 - frame.grip) * floor.friction * floor.roller_drag / len(rest)
     floor, onset = law.sideways(law.at_load(floor, len(rest) * rest), frame.grip)
-    # parts first: XLA then keeps what belongs to a part, and its derivatives, side by side
+    # components are the first axis: XLA then keeps each, and its derivatives, contiguous
     hold, roll, shift = (jnp.moveaxis(r, 1, 0) for r in (frame.hold, frame.roll, frame.shift))
     return Stance(
         frame, Planar(*hold), Planar(*roll), shift, rest, floor, onset, friction, roller_scale
@@ -95,7 +95,7 @@ class Balance(eqx.Module):
         (along, roll), load, rows = self._speeds(xi), self.load(xi), self.on
         w = self.wheels(along, roll)
         push, drag = w.push(), -w.drag.force()
-        by_roll = roll / w.active  # of the activity
+        by_roll = roll / w.active  # derivative of the activity by the roller speed
         by_along = -w.traction.by_speed() - w.resistance.by_speed()
         across = (w.traction.by_activity() - w.resistance.by_activity()) * by_roll
         rolls = -w.drag.by_speed() - w.drag.by_activity() * by_roll
@@ -129,7 +129,7 @@ class Balance(eqx.Module):
         where Newton's does; near the root it is slow (Weiszfeld's iteration).
         """
         on, f, w = self.on, self.on.frame, self.wheels(*self._speeds(xi))
-        # a lifted wheel would push the chord the wrong way
+        # the chord of a lifted wheel would have the wrong sign
         load = law.load_force(jnp.maximum(self.share(xi), _LEAST_LOAD), on.floor)
         pulls, rolls = load * w.traction.chord(), load * w.drag.chord()
         both = pulls + load * w.resistance.chord()

@@ -97,7 +97,7 @@ class ContactSurface(eqx.Module):
     load_bias: Array = parameter(
         "1",
         "delta",
-        "log of the load on each wheel as this floor seems to see it, over the true one",
+        "log of the apparent load on each wheel over the true one",
         start=0.0,
         spread=0.05,
         deviation=True,

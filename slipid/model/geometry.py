@@ -134,7 +134,7 @@ class Geometry(eqx.Module):
         drive = np.asarray(self.drive_angle)
         free = np.where(self.grips, drive, drive - np.asarray(self.roller_angle))
         place = np.asarray(self.place) @ (1, 1j)
-        # a line is the same half a turn on
+        # a line is the same after half a turn, hence the doubled angles
         wheels = np.stack([place, np.exp(2j * drive), np.exp(2j * free)], axis=1)
         for axis in (0.0, 0.5 * math.pi):
             mirrored = np.exp(2j * axis * np.array([1, 2, 2])) * wheels.conj()
@@ -224,7 +224,7 @@ def _wheel_frame(
         c, s = jnp.cos(angle), jnp.sin(angle)
         return jnp.stack([c, s, p[:, 0] * s - p[:, 1] * c], axis=-1)
 
-    # loads move when the contact patches do: N = N0 - shift @ (displacement), minimum change
+    # loads shift with the contact patches, as little as possible: N = N0 - shift @ displacement
     lever = jnp.concatenate([jnp.ones((1, len(p))), p.T], axis=0)
     return WheelFrame(
         hold=row(hold),

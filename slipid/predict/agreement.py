@@ -84,7 +84,7 @@ def compared(
         grown = new[mine] - old[mine]
         _, error, _ = mean_error(grown, np.arange(len(grown)))
         much = new[mine].mean() > WORSE * old[mine].mean()
-        total = max(float(distance[mine].sum()), 1e-9)  # runs may only have turned
+        total = max(float(distance[mine].sum()), 1e-9)  # runs may turn on the spot
         out[name] = FloorErrors(
             float(old[mine].sum() / total),
             float(new[mine].sum() / total),

@@ -162,7 +162,7 @@ class Saturating(WheelSlip):
 
         torque = soft_torque(w.steps.signals, spec)
         top = float(np.log(max(torque.max(), 1e-3) * 1.5))
-        # the cap makes several minima: with one-sided differences rounding decides between them
+        # the cap makes several minima, between which one-sided differences choose by rounding
         starts = ([np.log(k), top] for k in (0.05, 0.3, 1.0))
         tries = [least_squares(errors, x, jac="3-point", max_nfev=200) for x in starts]
         return replace(self, coefficients=min(tries, key=lambda r: r.cost).x)

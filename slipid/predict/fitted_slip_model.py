@@ -18,8 +18,8 @@ from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.predict.predictive import (
     ForceBalance,
-    Gaps,
     PredictiveModel,
+    Residuals,
     Slopes,
     by_name,
     parameter_covariance,
@@ -53,16 +53,16 @@ class FittedSlipModel(PredictiveModel):
             sizes[next(f for f in sizes if key == f or key.startswith(f"{f}@"))] += value.size
         return sizes | {"shared": 0}
 
-    def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
+    def linear(self, problem: Problem) -> tuple[Residuals, Slopes]:
         model, z, b = self.model, self.contact.z, problem.batch
         w = problem.windows.at_lag(float(self.robot.camera.lag))
 
-        def gap(some: FloorModels) -> np.ndarray:
-            return np.asarray(_gap(problem.space, z, some.twist(w, self.robot), b))
+        def residual(model: FloorModels) -> np.ndarray:
+            return np.asarray(_residual(problem.space, z, model.twist(w, self.robot), b))
 
-        by_z = np.asarray(_gap_jacobian(problem.space, z, model.twist(w, self.robot), b))
+        by_z = np.asarray(_residual_jacobian(problem.space, z, model.twist(w, self.robot), b))
         by_camera = by_z[..., self.contact.camera]
-        return gap(model), np.concatenate([slopes(model, w, gap), by_camera], axis=-1)
+        return residual(model), np.concatenate([slopes(model, w, residual), by_camera], axis=-1)
 
     def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
         robot, contact = self.robot, self.contact
@@ -91,7 +91,7 @@ def fit_with_noise(
     before = _prior_precision(model, w, robot)
     common = contact.covariance[np.ix_(contact.camera, contact.camera)]
     plain = FittedSlipModel(robot, contact.variance, common, model, contact)
-    gap, slope = plain.linear(problem)
+    residual, slope = plain.linear(problem)
     log_v, count = jnp.asarray(contact.log_variance(problem)), jnp.asarray(keep, float)
     own_effects = np.array([c.kind == "run" for c in problem.noise.components])
     objective = replace(problem.objective, scored=problem.objective.scored | own_effects)
@@ -100,7 +100,7 @@ def fit_with_noise(
         scale = np.asarray(problem.covariance("motion", log_v))
         covariance = _number_covariance(before, common, scale, slope, keep)
         spread = jnp.asarray(parameter_covariance(slope, covariance))
-        blocks = {"motion": jnp.asarray(gap)}, {"motion": spread}
+        blocks = {"motion": jnp.asarray(residual)}, {"motion": spread}
         for _ in range(SCORING):
             log_v = scoring_step(objective, *blocks, log_v, count, None)
         if float(jnp.abs(log_v - last).max()) < SETTLED:
@@ -109,7 +109,7 @@ def fit_with_noise(
     own = len(before)
     wide = np.zeros_like(covariance)
     wide[:own, :own], wide[own:, own:] = np.linalg.inv(before), common
-    return plain.with_sessions(problem, (gap, slope), wide, keep)
+    return plain.with_sessions(problem, (residual, slope), wide, keep)
 
 
 def _prior_precision(model: FloorModels, w: Windows, robot: Robot) -> np.ndarray:
@@ -137,15 +137,15 @@ def _number_covariance(
 
 
 @eqx.filter_jit
-def _gap(space: Space, z: replay.Numbers, twist: replay.Numbers, b: lk.Batch) -> Array:
+def _residual(space: Space, z: replay.Numbers, twist: replay.Numbers, b: lk.Batch) -> Array:
     robot = space.tree(z)
-    gap = lk.marker_increments(robot, jnp.asarray(twist), b.dt, b.session) - lk.measured_increments(
-        robot, b.pose
-    )
-    return gap.reshape(gap.shape[0], -1)
+    residual = lk.marker_increments(
+        robot, jnp.asarray(twist), b.dt, b.session
+    ) - lk.measured_increments(robot, b.pose)
+    return residual.reshape(residual.shape[0], -1)
 
 
-_gap_jacobian = eqx.filter_jit(jax.jacfwd(_gap, argnums=1))
+_residual_jacobian = eqx.filter_jit(jax.jacfwd(_residual, argnums=1))
 
 
 def slopes(model: FloorModels, w: Windows, of: Callable[[FloorModels], np.ndarray]) -> np.ndarray:

@@ -213,10 +213,11 @@ def problem_of_runs(
     problem: Problem, choices: Sequence[Choice], data: Runs, fitted: np.ndarray
 ) -> Problem:
     """Return the problem of a fit to some of its runs; what these cannot determine is fixed."""
-    held = [*fixed_viscosities(data, fitted), *choices]
-    if Space(problem.robot, held).names == problem.space.names:
+    fixed = [*fixed_viscosities(data, fitted), *choices]
+    if Space(problem.robot, fixed).names == problem.space.names:
         return problem
-    return Problem(problem.windows, problem.robot, held)  # they saw a floor at one speed
+    # the fitted runs had one speed only on some floor
+    return Problem(problem.windows, problem.robot, fixed)
 
 
 def judge(

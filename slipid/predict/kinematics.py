@@ -212,7 +212,7 @@ class _HeadingTable(NamedTuple):
         return np.asarray(weight * np.sum(self.phi[:, 0] ** 2) * np.diag(rough))
 
     def solved(self, weight: float) -> np.ndarray:
-        # a robot that never moved has no direction of travel, and gets no correction
+        # a robot that never moved has no direction of travel and no correction: minimum norm
         gram = self.phi.T @ self.phi + self.penalty(weight)
         return np.asarray(np.linalg.lstsq(gram, self.phi.T @ self.gap, rcond=None)[0])
 

@@ -166,7 +166,7 @@ def end_covariance(
     far, u = travel(w, robot)
     p = tracks.predicted
     cov = of_parameters.copy()
-    lever = turned_left(p[:, -1:, :2] - p[:, 1:, :2])  # what a turn at each step moves
+    lever = turned_left(p[:, -1:, :2] - p[:, 1:, :2])  # motion of the end per turn at each step
     way = p[:, :-1, 2]
     along, across = turned(way, u), turned(way, turned_left(u))
     process, run = (by_axis(variance, k, w) for k in ("process", "run"))

@@ -43,7 +43,7 @@ from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.search_space import Space
 
-Gaps = Float[np.ndarray, "segment m"]
+Residuals = Float[np.ndarray, "segment m"]
 Slopes = Float[np.ndarray, "segment m number"]
 Fitted = TypeVar("Fitted", bound="PredictiveModel")
 
@@ -78,7 +78,7 @@ class PredictiveModel(abc.ABC):
         return np.log([self.variance[name] for name in problem.noise.names])
 
     @abc.abstractmethod
-    def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
+    def linear(self, problem: Problem) -> tuple[Residuals, Slopes]:
         """Return predicted less measured increments of every segment, and their derivative."""
 
     @abc.abstractmethod
@@ -91,14 +91,14 @@ class PredictiveModel(abc.ABC):
         numbers, effect = self._number_covariance(w, slope), self.effect_covariance(w)
         return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, numbers)
 
-    def scale(self, problem: Problem) -> tuple[Gaps, Float[np.ndarray, "segment m m"]]:
+    def scale(self, problem: Problem) -> tuple[Residuals, Float[np.ndarray, "segment m m"]]:
         """Return the residuals of every segment, and the scale matrix of their distribution."""
-        gap, slope = self.linear(problem)
+        residual, slope = self.linear(problem)
         noise = np.asarray(problem.covariance("motion", self.log_variance(problem)))
         e = effects(problem.windows, problem.robot)
         v = self.effect_covariance(problem.windows)
         numbers = self._number_covariance(problem.windows, slope)
-        return gap, noise + np.einsum("nma,nab,nlb->nml", e, v, e) + numbers
+        return residual, noise + np.einsum("nma,nab,nlb->nml", e, v, e) + numbers
 
     def _number_covariance(self, w: Windows, slope: Slopes) -> Float[np.ndarray, "segment m m"]:
         """Return the covariance due to the uncertain numbers, grown for new runs."""
@@ -121,7 +121,7 @@ class PredictiveModel(abc.ABC):
     def with_sessions(
         self: Fitted,
         problem: Problem,
-        linear: tuple[Gaps, Slopes],
+        linear: tuple[Residuals, Slopes],
         wide: np.ndarray,
         keep: np.ndarray,
     ) -> Fitted:
@@ -139,15 +139,15 @@ class PredictiveModel(abc.ABC):
 
 
 def log_student(
-    gap: Gaps, scale: Float[np.ndarray, "segment m m"] | Float[np.ndarray, "m m"]
+    residual: Residuals, scale: Float[np.ndarray, "segment m m"] | Float[np.ndarray, "m m"]
 ) -> Float[np.ndarray, " segment"]:
     """Return the log density of a multivariate Student t around zero, `DEGREES` degrees of freedom.
 
     Source: Kotz and Nadarajah 2004, Multivariate t Distributions, eq. 1.1.
     """
-    m = gap.shape[-1]
+    m = residual.shape[-1]
     root = np.linalg.cholesky(scale)
-    white = np.linalg.solve(root, gap[..., None])[..., 0]
+    white = np.linalg.solve(root, residual[..., None])[..., 0]
     log_det = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
     norm = gammaln((DEGREES + m) / 2) - gammaln(DEGREES / 2) - 0.5 * m * np.log(DEGREES * np.pi)
     tail = 0.5 * (DEGREES + m) * np.log1p((white**2).sum(-1) / DEGREES)
@@ -214,13 +214,13 @@ class ForceBalance(PredictiveModel):
         """Coordinates of the search vector that belong to the camera."""
         return np.flatnonzero(self.space.where(lambda e: e.part == "camera"))
 
-    def linear(self, problem: Problem) -> tuple[Gaps, Slopes]:
+    def linear(self, problem: Problem) -> tuple[Residuals, Slopes]:
         electric = problem.electric(self.z, self.log_variance(problem))
         blocks, jac = problem.linear(self.z, electric)
-        gap, slope = self._correction(problem.windows)
-        return np.asarray(blocks["motion"]) - gap, np.asarray(jac["motion"]) - slope
+        residual, slope = self._correction(problem.windows)
+        return np.asarray(blocks["motion"]) - residual, np.asarray(jac["motion"]) - slope
 
-    def _correction(self, w: Windows) -> tuple[Gaps, Slopes]:
+    def _correction(self, w: Windows) -> tuple[Residuals, Slopes]:
         """Return the expected effects on increments, and their derivative; both are subtracted."""
         expected, e = self.expected_effects(w), effects(w, self.robot)
         mean = np.einsum("nma,na->nm", e, expected.mean)

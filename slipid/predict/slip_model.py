@@ -171,7 +171,7 @@ class RunSignals:
             ValueError: no current was logged.
         """
         if self.current is None:
-            raise ValueError(f"{self.name}: no current; this method needs one")
+            raise ValueError(f"{self.name}: no current was logged; this model needs currents")
         signed = self.current_is_signed
         return np.asarray(self.current * np.sign(self.speed) if signed else self.current)
 

@@ -55,7 +55,7 @@ class Steps:
             runs[0],
             dt=np.concatenate([run.dt for run in runs]),
             turn=np.concatenate([run.turn for run in runs]),
-            # a channel that one run lacks is a channel that is not there for all of them
+            # a channel that one run lacks is missing for all of them
             current=np.concatenate(currents) if len(currents) == len(runs) else None,
             gyro=np.concatenate(gyros) if len(gyros) == len(runs) else None,
             command=None,
@@ -98,7 +98,7 @@ class Steps:
         memory, x = np.ones((*shape, 1)), np.zeros((*shape, values.shape[1]))
         memory[run, step, 0] = np.exp(-self.signals.dt / time_constant)
         x[run, step] = values
-        # all runs at once: the only loop is over the steps of the longest of them
+        # all runs at once: the only loop is over the steps of the longest run
         for k in range(1, shape[1]):
             x[:, k] += memory[:, k] * (x[:, k - 1] - x[:, k])
         return x[run, step]
@@ -203,7 +203,7 @@ def scaled_least_squares(
 ) -> Float[np.ndarray, " k"]:
     """Return least squares with columns scaled to one length; the shortest of many solutions."""
     size = np.linalg.norm(a, axis=0)
-    # a column of nothing but rounding says nothing
+    # a column that contains only rounding errors is ignored
     size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
     return np.asarray(np.linalg.lstsq(a / size, b, rcond=1e-6)[0] / size)
 
