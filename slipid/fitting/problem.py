@@ -40,6 +40,8 @@ from slipid.search_space import Choice, Space
 
 CREEPS = (0.05, 0.4, 1.0)
 """Start values of the creep of every floor; other starts end in poor minima."""
+FEW = 200
+"""Number of pieces up to which effects of no size cost less time than compiling a fit without."""
 
 
 @dataclass(frozen=True)
@@ -141,9 +143,13 @@ class Problem:
         return replace(state, log_variance=np.array(log_v), moved=np.inf)
 
     def without_shared_effects(self) -> "Problem":
-        """Return the same problem as if runs shared no effects."""
-        other = copy.copy(self)
-        other.objective = replace(self.objective, shared=())
+        """Return the same problem as if runs shared no effects.
+
+        Effects of few runs are kept at no size, so that one compiled fit serves both problems.
+        """
+        other, shared = copy.copy(self), self.objective.shared
+        none = tuple(replace(of, numbers=jnp.full_like(of.numbers, -1)) for of in shared)
+        other.objective = replace(self.objective, shared=none if len(self.windows) <= FEW else ())
         return other
 
     @property
