@@ -78,3 +78,9 @@ def test_a_class_name_stands_for_one_class():
         node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)
     )
     assert [name for name, count in names.items() if count > 1] == []
+
+
+def test_no_public_name_is_that_of_a_room():
+    """A module that is imported would hide the function of its name."""
+    rooms = {path.stem for path in Path(slipid.__file__).parent.iterdir()}
+    assert not rooms & set(slipid.__all__)

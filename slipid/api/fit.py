@@ -10,7 +10,7 @@ from slipid.app.identify import optimised, summarised
 from slipid.app.problem import FitTask, robot_for_runs, stated_sizes
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
-from slipid.fit.problem import fixed_viscosities
+from slipid.fitting.problem import fixed_viscosities
 from slipid.infer.result import Fit
 from slipid.model.robot import Robot
 from slipid.search_space import Choice
@@ -61,7 +61,7 @@ def fit(
         DataError: the runs cannot be cut into windows, or columns of wheels are exchanged.
         ValueError: no such number, or a value outside its bounds.
 
-    Source: the contact law of `slipid.model.contact_law`, the likelihood of `slipid.fit`.
+    Source: the contact law of `slipid.model.contact_law`, the likelihood of `slipid.fitting`.
     """
     refuse_misordered(runs.logs)
     wishes = priors or {}, fixed or {}, start or {}, free

@@ -15,7 +15,7 @@ from slipid.data.check.findings import Finding, worst_first, wrong
 from slipid.data.check.sanity import findings
 from slipid.data.log import Log
 from slipid.data.runs import Runs
-from slipid.fit.problem import CREEPS, Problem
+from slipid.fitting.problem import CREEPS, Problem
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences

@@ -15,8 +15,8 @@ from slipid.app.logs import read_dataset
 from slipid.app.problem import ConfigFitTask, read_fit_task
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.runs import Runs
-from slipid.fit.optimise import optimise
-from slipid.fit.problem import FitState, Problem
+from slipid.fitting.optimise import optimise
+from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import load
 from slipid.infer.result import Fit
 from slipid.model.robot import Robot

@@ -15,10 +15,10 @@ from slipid.app.config import read_config
 from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
 from slipid.app.trust import TrustReport, trust_report
-from slipid.fit.multi_floor import multi_floor_runs
-from slipid.fit.multi_floor_fit import fit_multi_floor
-from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import FitState, Problem
+from slipid.fitting.multi_floor import multi_floor_runs
+from slipid.fitting.multi_floor_fit import fit_multi_floor
+from slipid.fitting.optimise import Optimum, optimise
+from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import save
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise

@@ -29,7 +29,7 @@ from slipid.data.floor_map import FloorMap, read_map
 from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
-from slipid.fit.problem import Problem, fixed_viscosities
+from slipid.fitting.problem import Problem, fixed_viscosities
 from slipid.infer.bench.motor import BenchRoot
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot

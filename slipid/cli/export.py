@@ -51,7 +51,7 @@ def export(
     """
     from slipid.deploy.export import ExportOptions, robot_at
     from slipid.deploy.export import export as run
-    from slipid.export.folder import check_folder
+    from slipid.exports.folder import check_folder
     from slipid.lab.trial.controllers import ROWS
     from slipid.report.answers import show_export
     from slipid.support.errors import DataError
@@ -61,7 +61,7 @@ def export(
     if check:
         names = check_folder(source)
         if any(name.startswith("stablehlo/") for name in names):
-            from slipid.export.stablehlo import load_program
+            from slipid.exports.stablehlo import load_program
 
             load_program(source / "stablehlo")
         found = {"folder": str(source), "files": list(names), "intact": True}
@@ -75,7 +75,7 @@ def export(
         options = ExportOptions(_names(to), controller, path, speed, map)
         done = run(robot, out, options, report, ROWS)
     content = {
-        "schema": "slipid.export/1",
+        "schema": "slipid.exports/1",
         "folder": str(done.folder),
         "robot": done.robot,
         "forms": list(done.forms),

@@ -23,13 +23,13 @@ from slipid.deploy.twin_run import (
     twin_floor,
     twin_plant,
 )
-from slipid.export.c99.folder import Recording, c_files
-from slipid.export.c99.lower import UnsupportedError
-from slipid.export.description import readme, warnings
-from slipid.export.folder import check_folder, check_writable, write_folder
-from slipid.export.ros.folder import ros2_files
-from slipid.export.stablehlo import load_program, stablehlo_files
-from slipid.export.table import table_files
+from slipid.exports.c99.folder import Recording, c_files
+from slipid.exports.c99.lower import UnsupportedError
+from slipid.exports.description import readme, warnings
+from slipid.exports.folder import check_folder, check_writable, write_folder
+from slipid.exports.ros.folder import ros2_files
+from slipid.exports.stablehlo import load_program, stablehlo_files
+from slipid.exports.table import table_files
 from slipid.robot import trajectory
 from slipid.robot.closed_loop import PERIOD, ControlLoop, Plant, run_closed_loop
 from slipid.robot.deployed import DeployedRobot

@@ -5,7 +5,7 @@ along, across and in yaw, of wheels without slip, is predicted to be
 
     contact(z) - shared(z),   shared(z) = mean + slope (z - z_fit)
 
-as forecasts have it (`slipid.fit.shared_effects`). The table's mean is the second term at the
+as forecasts have it (`slipid.fitting.shared_effects`). The table's mean is the second term at the
 robot's numbers. Its remaining variance is the covariance of the effects given the numbers, extended
 as in forecasts, and the scatter of this whole sum over draws of the numbers: near fitted runs,
 another number is compensated by another effect.
@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.fit.noise import SHARED
-from slipid.fit.shared_effects import AXES, SpeedAndLoad, TravelConditions
+from slipid.fitting.noise import SHARED
+from slipid.fitting.shared_effects import AXES, SpeedAndLoad, TravelConditions
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import WheelFrame, at_drives, at_wheels

@@ -15,7 +15,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.fit.shared_effects import FittedEffects, SpeedAndLoad
+from slipid.fitting.shared_effects import FittedEffects, SpeedAndLoad
 from slipid.infer.result import Channels, Fit
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.estimates import Estimate
@@ -29,7 +29,7 @@ from slipid.support.files import checksum, json_text, read_json, write_bytes
 
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
-SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/6"
+SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fitting/6"
 _PLAIN = ("converged", "reason", "rounds", "remaining")
 _CURVE = ("torque_nm", "slip", "slip_lo", "slip_hi")
 _SHARED = ("std", "coefs", "by_number", "covariance")

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.runs import Runs
-from slipid.fit.noise import POOLED
-from slipid.fit.optimise import Optimum
-from slipid.fit.problem import Problem
-from slipid.fit.shared_effects import FittedEffects
-from slipid.fit.variances import Search, Square
+from slipid.fitting.noise import POOLED
+from slipid.fitting.optimise import Optimum
+from slipid.fitting.problem import Problem
+from slipid.fitting.shared_effects import FittedEffects
+from slipid.fitting.variances import Search, Square
 from slipid.infer.slip_curves import SlipCurve
 from slipid.infer.verdicts.disputed import Dispute, disputes, marked
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates

@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from slipid.data.log import Log
 from slipid.data.runs import Runs
-from slipid.fit import likelihood as lk
-from slipid.fit.noise import travel
+from slipid.fitting import likelihood as lk
+from slipid.fitting.noise import travel
 from slipid.model import contact_law as law
 from slipid.model import robot as model
 from slipid.model.contact_law import ContactSurface

@@ -8,14 +8,10 @@ import numpy as np
 from jaxtyping import Array
 
 from slipid.data.runs import Runs
-from slipid.fit.optimise import Optimum
-from slipid.fit.problem import Problem, log_jacobian
-from slipid.fit.shared_effects import (
-    EffectPosterior,
-    marginal_residuals,
-    marginal_slopes,
-)
-from slipid.fit.variances import MOTION_BLOCKS
+from slipid.fitting.optimise import Optimum
+from slipid.fitting.problem import Problem, log_jacobian
+from slipid.fitting.shared_effects import EffectPosterior, marginal_residuals, marginal_slopes
+from slipid.fitting.variances import MOTION_BLOCKS
 from slipid.infer import slip_curves as curves_of
 from slipid.infer.result import Channels, Fit, draws
 from slipid.predict.predictive import force_balance_of

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from slipid.data.runs import Runs
 from slipid.data.windows import windows
-from slipid.fit import likelihood as lk
+from slipid.fitting import likelihood as lk
 from slipid.infer import slip_curves as curves
 from slipid.model import robot as model
 from slipid.model.robot import Robot

@@ -29,10 +29,10 @@ from jaxtyping import Float
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows
-from slipid.fit.noise import travel
-from slipid.fit.problem import Problem
-from slipid.fit.shared_effects import AXES
-from slipid.fit.variances import Search, Square
+from slipid.fitting.noise import travel
+from slipid.fitting.problem import Problem
+from slipid.fitting.shared_effects import AXES
+from slipid.fitting.variances import Search, Square
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.predict.kinematics import fourier

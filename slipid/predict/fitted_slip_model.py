@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 from scipy.linalg import block_diag
 
 from slipid.data.windows import Windows
-from slipid.fit import likelihood as lk
-from slipid.fit.problem import Problem
-from slipid.fit.variances import DEGREES, scoring_step
+from slipid.fitting import likelihood as lk
+from slipid.fitting.problem import Problem
+from slipid.fitting.variances import DEGREES, scoring_step
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.predict.predictive import (

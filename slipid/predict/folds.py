@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from slipid.data.runs import Runs
-from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, fixed_viscosities
+from slipid.fitting.optimise import Optimum, optimise
+from slipid.fitting.problem import Problem, fixed_viscosities
 from slipid.predict import open_loop as replay
 from slipid.predict.fitted_slip_model import fit_with_noise
 from slipid.predict.predictive import PredictiveModel, force_balance_of

@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows, windows
-from slipid.fit import likelihood as lk
-from slipid.fit.noise import travel
-from slipid.fit.session_effects import by_axis
+from slipid.fitting import likelihood as lk
+from slipid.fitting.noise import travel
+from slipid.fitting.session_effects import by_axis
 from slipid.model.robot import Robot
 from slipid.model.se2 import compose
 from slipid.predict.slip_model import turned, turned_left

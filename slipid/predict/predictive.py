@@ -8,9 +8,9 @@ scale
 V of its own camera, process and run variances, found by restricted likelihood from its own
 residuals; v the variances of shared effects and E their derivative; J the derivative by its own
 numbers and the camera's, C their covariance. Simpler models have v of sessions
-(`slipid.fit.session_effects`); the force balance has the effects of sessions and neighbours of its
-fit (`slipid.fit.shared_effects`), and its v grows where held-out sectors ask for it. All models
-share the fitted camera; the numbers of a simpler model follow it.
+(`slipid.fitting.session_effects`); the force balance has the effects of sessions and neighbours of
+its fit (`slipid.fitting.shared_effects`), and its v grows where held-out sectors ask for it. All
+models share the fitted camera; the numbers of a simpler model follow it.
 """
 
 import abc
@@ -26,19 +26,19 @@ from jaxtyping import Float
 from scipy.special import gammaln
 
 from slipid.data.windows import Windows
-from slipid.fit import likelihood as lk
-from slipid.fit.hierarchy import TravelDirections, extrapolation
-from slipid.fit.noise import SHARED, effects, travel
-from slipid.fit.problem import FitState, Problem
-from slipid.fit.session_effects import LinearModel, by_axis, with_session_effects
-from slipid.fit.shared_effects import (
+from slipid.fitting import likelihood as lk
+from slipid.fitting.hierarchy import TravelDirections, extrapolation
+from slipid.fitting.noise import SHARED, effects, travel
+from slipid.fitting.problem import FitState, Problem
+from slipid.fitting.session_effects import LinearModel, by_axis, with_session_effects
+from slipid.fitting.shared_effects import (
     AXES,
     EffectForecast,
     FittedEffects,
     TravelConditions,
     forecast_effects,
 )
-from slipid.fit.variances import DEGREES, Search, Square, Vector, expected_posteriors, whitened
+from slipid.fitting.variances import DEGREES, Search, Square, Vector, expected_posteriors, whitened
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.search_space import Space

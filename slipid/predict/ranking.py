@@ -14,7 +14,7 @@ from scipy.stats import binom
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows
-from slipid.fit.problem import Problem
+from slipid.fitting.problem import Problem
 from slipid.model.robot import Robot
 from slipid.predict.folds import folds_of, judge
 from slipid.predict.score import Score, clusters, main_load, mean_error

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import f as fisher
 
-from slipid.fit.variances import DEGREES
+from slipid.fitting.variances import DEGREES
 
 CLUSTER_DEG = 30.0
 """Width of a sector of headings that counts as one observation of a clustered standard error.

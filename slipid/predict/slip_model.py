@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.data.windows import Windows
-from slipid.fit.likelihood import marker_increments, measured_increments
+from slipid.fitting.likelihood import marker_increments, measured_increments
 from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 

@@ -9,7 +9,7 @@ from slipid.app.check import expected
 from slipid.app.config import FitSection
 from slipid.app.problem import FitTask, robot_for_runs
 from slipid.data.runs import collect
-from slipid.fit.optimise import optimise
+from slipid.fitting.optimise import optimise
 from slipid.infer.summary import summarise
 from slipid.lab.selftest.logs import (
     SimulatedSensors,

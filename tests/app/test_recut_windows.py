@@ -10,8 +10,8 @@ import pytest
 from slipid.app import identify, sample
 from slipid.app.config import FitSection
 from slipid.app.problem import RECUT_LAG_S, FitTask
-from slipid.fit.optimise import Optimum
-from slipid.fit.problem import FitState
+from slipid.fitting.optimise import Optimum
+from slipid.fitting.problem import FitState
 from slipid.model.robot import build
 from slipid.search_space import Choice
 from slipid.support.progress import Reporter

@@ -17,7 +17,7 @@ import pytest
 
 from slipid.app.config import read_config
 from slipid.app.problem import ConfigFitTask, read_fit_task
-from slipid.fit.optimise import optimise
+from slipid.fitting.optimise import optimise
 from slipid.predict.folds import folds_of
 from slipid.predict.predictive import log_student
 from slipid.search_space import Choice

@@ -19,8 +19,8 @@ from scipy.special import gammaln
 
 from slipid.app.config import read_config
 from slipid.app.problem import read_fit_task
-from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, without_effects
+from slipid.fitting.optimise import Optimum, optimise
+from slipid.fitting.problem import Problem, without_effects
 from slipid.predict import open_loop
 from slipid.predict.folds import folds_of
 from slipid.predict.predictive import force_balance_of

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slipid.export.c99.code import Code
-from slipid.export.c99.folder import c_files
-from slipid.export.golden import golden
+from slipid.exports.c99.code import Code
+from slipid.exports.c99.folder import c_files
+from slipid.exports.golden import golden
 from slipid.robot.trajectory import rectangle
 from tests.benchmarks.export_builds import HERE, KINDS, control_loop, needs, ran, three_floors
 from tests.benchmarks.quick import QUICK, quick

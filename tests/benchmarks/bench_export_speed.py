@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from slipid.deploy.controllers import control_loop_of
-from slipid.export.c99.builder import Names
-from slipid.export.c99.code import Code, template
-from slipid.export.c99.function import Argument, function, traced
-from slipid.export.c99.text import table
+from slipid.exports.c99.builder import Names
+from slipid.exports.c99.code import Code, template
+from slipid.exports.c99.function import Argument, function, traced
+from slipid.exports.c99.text import table
 from slipid.lab.trial.controllers import ROWS
 from slipid.model import contact
 from slipid.model.contact_balance import stand

@@ -22,8 +22,8 @@ import pytest
 from slipid.app.config import read_config
 from slipid.app.problem import ConfigFitTask, read_fit_task
 from slipid.data.runs import Runs
-from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem, fixed_viscosities
+from slipid.fitting.optimise import Optimum, optimise
+from slipid.fitting.problem import Problem, fixed_viscosities
 from slipid.infer.result import draws
 from slipid.model.robot import build
 from slipid.predict.folds import judge

@@ -28,8 +28,8 @@ from slipid.app.config import parsed
 from slipid.app.problem import ConfigFitTask, read_fit_task, with_mixed
 from slipid.deploy.deploy import robot_of_force_balance
 from slipid.deploy.floors import floor_of
-from slipid.fit.likelihood import batch
-from slipid.fit.optimise import optimise
+from slipid.fitting.likelihood import batch
+from slipid.fitting.optimise import optimise
 from slipid.infer.slip_curves import current_trend
 from slipid.predict.folds import fold_keys, sectors
 from slipid.predict.predictive import ForceBalance, force_balance_of

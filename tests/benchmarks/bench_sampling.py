@@ -50,7 +50,7 @@ def problem_of(floor):
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
     """The problem, where its fit ended, and a file of the latter."""
-    from slipid.fit.optimise import optimise
+    from slipid.fitting.optimise import optimise
     from slipid.infer.posterior.coordinates import Fitted
 
     problem = problem_of(FLOOR)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.fit.problem import Problem
+from slipid.fitting.problem import Problem
 from slipid.search_space import Choice
 from tests.benchmarks.quick import QUICK, quick
 from tests.helpers.made_windows import made, robot
@@ -147,7 +147,7 @@ def test_whole_2022_fit_cold_and_warm(tmp_path):
 def main():
     """The whole 2022 fit, once, with the time of each stage."""
     began = time.perf_counter()
-    from slipid.fit.optimise import optimise
+    from slipid.fitting.optimise import optimise
     from slipid.support.jax_setup import setup_jax
 
     setup_jax(quiet=True)

@@ -188,7 +188,7 @@ def _experiment(seed: int) -> dict:
 
 def _fitted(job):
     """What `identify` finds of a job, without the simpler models."""
-    from slipid.fit.optimise import optimise
+    from slipid.fitting.optimise import optimise
     from slipid.infer.summary import summarise
 
     problem = job.problem()

@@ -27,7 +27,7 @@ from slipid.deploy.controllers import control_loop_of
 from slipid.deploy.deploy import actuator_model_of, read_robot
 from slipid.deploy.floors import floor_of
 from slipid.deploy.twin_run import starts, twin_floor
-from slipid.export.c99.code import Code
+from slipid.exports.c99.code import Code
 from slipid.lab.trial.controllers import ROWS
 from slipid.model.geometry import omni
 from slipid.robot import trajectory

@@ -12,7 +12,7 @@ import pytest
 
 from slipid.deploy.deploy import DRAWS, deploy, read_robot, write_robot
 from slipid.deploy.robot_record import DIRECTIONS
-from slipid.fit.shared_effects import SpeedAndLoad, TravelConditions
+from slipid.fitting.shared_effects import SpeedAndLoad, TravelConditions
 from slipid.infer.fit_file import load
 from slipid.robot.controller import Gains
 from slipid.robot.deployed import DeployedRobot

@@ -15,8 +15,8 @@ import pytest
 from slipid.deploy.controllers import control_loop_of
 from slipid.deploy.export import FORMS, ExportOptions, export, robot_at
 from slipid.deploy.twin_run import REST_S, starts, twin_floor
-from slipid.export.c99.folder import c_files
-from slipid.export.folder import check_folder
+from slipid.exports.c99.folder import c_files
+from slipid.exports.folder import check_folder
 from slipid.lab.trial.controllers import ROWS
 from slipid.lab.trial.plants import SitePlant
 from slipid.robot import closed_loop

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import binom
 
-from slipid.fit import likelihood as lk
-from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import Problem
-from slipid.fit.variances import DEGREES, VARIANCE_SPREAD
+from slipid.fitting import likelihood as lk
+from slipid.fitting.optimise import Optimum, optimise
+from slipid.fitting.problem import Problem
+from slipid.fitting.variances import DEGREES, VARIANCE_SPREAD
 from slipid.infer.posterior import sample as posterior
 from slipid.infer.posterior.blocks import Plan
 from slipid.infer.result import Channels, Fit

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from slipid.deploy.controllers import control_loop_of
-from slipid.export.c99.code import Code
-from slipid.export.fields import Struct
+from slipid.exports.c99.code import Code
+from slipid.exports.fields import Struct
 from slipid.lab.trial.controllers import ROWS
 from slipid.robot.trajectory import rectangle
 from tests.helpers import small_twin

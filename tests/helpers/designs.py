@@ -13,10 +13,10 @@ import numpy as np
 
 from slipid.data.runs import collect
 from slipid.data.windows import windows
-from slipid.fit import likelihood as lk
-from slipid.fit import noise as of_noise
-from slipid.fit.optimise import optimise
-from slipid.fit.problem import FitState, Problem
+from slipid.fitting import likelihood as lk
+from slipid.fitting import noise as of_noise
+from slipid.fitting.optimise import optimise
+from slipid.fitting.problem import FitState, Problem
 from slipid.infer.design import fisher as info
 from slipid.infer.design.planned_runs import (
     HEADINGS,

@@ -8,8 +8,8 @@ import numpy as np
 from slipid.app.problem import lag_from_motion
 from slipid.data.runs import Runs, collect
 from slipid.data.windows import windows
-from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem
+from slipid.fitting.optimise import optimise
+from slipid.fitting.problem import Problem
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from slipid.data.windows import Windows
-from slipid.fit import likelihood as lk
+from slipid.fitting import likelihood as lk
 from slipid.lab.selftest.replicates import simulate_windows
 from slipid.model.geometry import omni
 from slipid.model.robot import build

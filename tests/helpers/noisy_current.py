@@ -13,8 +13,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from slipid.fit.optimise import optimise
-from slipid.fit.problem import FitState, Problem
+from slipid.fitting.optimise import optimise
+from slipid.fitting.problem import FitState, Problem
 from slipid.lab.selftest.replicates import simulate_windows
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made, robot

@@ -8,7 +8,7 @@ from functools import reduce
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from slipid.fit.likelihood import SMOOTH
+from slipid.fitting.likelihood import SMOOTH
 from slipid.model import contact, contact_law
 from slipid.parameter import entries, share_basis
 

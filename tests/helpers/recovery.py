@@ -9,8 +9,8 @@ import numpy as np
 
 from slipid.data.runs import collect
 from slipid.data.windows import windows
-from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem
+from slipid.fitting.optimise import optimise
+from slipid.fitting.problem import Problem
 from slipid.infer.slip_curves import curves, slip_on
 from slipid.infer.verdicts.estimates import by_ratio, from_zero
 from slipid.lab.selftest.logs import (

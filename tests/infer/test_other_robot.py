@@ -12,8 +12,8 @@ import pytest
 from slipid.app.config import read_config
 from slipid.app.logs import read_dataset
 from slipid.app.problem import read_fit_task
-from slipid.fit import likelihood as lk
-from slipid.fit.optimise import optimise
+from slipid.fitting import likelihood as lk
+from slipid.fitting.optimise import optimise
 from slipid.infer.summary import summarise
 from slipid.predict import open_loop as replay
 from slipid.support.progress import Reporter

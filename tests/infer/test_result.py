@@ -16,9 +16,9 @@ from scipy.stats import f as fisher
 
 from slipid.data.runs import collect
 from slipid.data.windows import windows
-from slipid.fit.optimise import Optimum, one_round
-from slipid.fit.problem import FitState, Problem
-from slipid.fit.variances import DEGREES
+from slipid.fitting.optimise import Optimum, one_round
+from slipid.fitting.problem import FitState, Problem
+from slipid.fitting.variances import DEGREES
 from slipid.infer import fit_file
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.fit_file import identified_json, load, save, to_json

@@ -12,8 +12,8 @@ from matplotlib.image import imread
 
 from slipid.data.runs import collect
 from slipid.data.windows import windows
-from slipid.fit.optimise import Optimum
-from slipid.fit.problem import FitState, Problem
+from slipid.fitting.optimise import Optimum
+from slipid.fitting.problem import FitState, Problem
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise

@@ -17,10 +17,10 @@ from slipid.app.compare import finished
 from slipid.app.logs import packaged_config
 from slipid.cli.main import app
 from slipid.data.runs import collect
-from slipid.fit.likelihood import batch
-from slipid.fit.problem import Problem
-from slipid.fit.session_effects import LinearModel, with_session_effects
-from slipid.fit.variances import DEGREES
+from slipid.fitting.likelihood import batch
+from slipid.fitting.problem import Problem
+from slipid.fitting.session_effects import LinearModel, with_session_effects
+from slipid.fitting.variances import DEGREES
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.predict import open_loop as replay
@@ -200,7 +200,7 @@ def driven(name, state, seed, runs=96):
 
 
 def increments_of(w):
-    from slipid.fit.likelihood import measured_increments
+    from slipid.fitting.likelihood import measured_increments
 
     return np.asarray(measured_increments(ROBOT, jnp.asarray(w.pose)))
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slipid.fit.problem import Problem
+from slipid.fitting.problem import Problem
 from slipid.predict.agreement import scatter
 from slipid.search_space import Choice
 from tests.helpers.made_windows import made

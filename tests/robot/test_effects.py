@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from slipid.fit import shared_effects as shared
+from slipid.fitting import shared_effects as shared
 from slipid.robot.estimator import Estimator
 from slipid.robot.filter.effects import FORGETS, EffectLookup, RolledMotion
 from slipid.robot.interface import Measurement, Settings

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.data.windows import Windows
-from slipid.fit import likelihood as lk
+from slipid.fitting import likelihood as lk
 from slipid.infer.result import Channels
 from slipid.model.robot import Robot
 from slipid.predict.open_loop import chain

@@ -11,12 +11,12 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 
 from slipid.data.windows import Windows
-from slipid.fit import likelihood as lk
-from slipid.fit.noise import effects
-from slipid.fit.problem import Problem
-from slipid.fit.session_effects import by_axis
-from slipid.fit.shared_effects import AXES
-from slipid.fit.variances import whitened
+from slipid.fitting import likelihood as lk
+from slipid.fitting.noise import effects
+from slipid.fitting.problem import Problem
+from slipid.fitting.session_effects import by_axis
+from slipid.fitting.shared_effects import AXES
+from slipid.fitting.variances import whitened
 from slipid.infer.design.fisher import Information, RunJacobians, information_of
 from slipid.infer.design.planned_runs import SESSION, PlannedRun, Setup, steady_windows
 from slipid.infer.result import Channels, Fit

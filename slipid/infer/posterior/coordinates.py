@@ -9,10 +9,10 @@ import numpy as np
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float, Int
 
-from slipid.fit import likelihood as lk
-from slipid.fit.problem import Problem, effects_given, twists
-from slipid.fit.shared_effects import EffectPosterior, SharedEffects
-from slipid.fit.variances import DEGREES, Blocks, Square, Vector, expected, inverse_root
+from slipid.fitting import likelihood as lk
+from slipid.fitting.problem import Problem, effects_given, twists
+from slipid.fitting.shared_effects import EffectPosterior, SharedEffects
+from slipid.fitting.variances import DEGREES, Blocks, Square, Vector, expected, inverse_root
 from slipid.infer.result import Fit, required
 from slipid.model.robot import Robot
 

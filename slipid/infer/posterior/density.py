@@ -6,9 +6,9 @@ squares,
 
     log p(x | data) = -1/2 |y(x)|^2 - 1/2 |(x - mean) / std|^2 + f log |d residuals / d data|
 
-with y from `slipid.fit.shared_effects.marginal_residuals`, and f the information of a Student t on
-its centre over that of a Gaussian, as in y. Floors share some coordinates and have others of their
-own, so that the log posterior is a sum
+with y from `slipid.fitting.shared_effects.marginal_residuals`, and f the information of a Student t
+on its centre over that of a Gaussian, as in y. Floors share some coordinates and have others of
+their own, so that the log posterior is a sum
 
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
 
@@ -30,10 +30,10 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
-from slipid.fit import likelihood as lk
-from slipid.fit.problem import Problem
-from slipid.fit.shared_effects import EffectPosterior, mean_effects
-from slipid.fit.variances import Square, expected
+from slipid.fitting import likelihood as lk
+from slipid.fitting.problem import Problem
+from slipid.fitting.shared_effects import EffectPosterior, mean_effects
+from slipid.fitting.variances import Square, expected
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Coordinates, Fitted
 from slipid.model.robot import Robot
 

@@ -19,10 +19,10 @@ from arviz_base import from_dict
 from jaxtyping import Float
 from xarray import DataTree
 
-from slipid.fit import likelihood as lk
-from slipid.fit.hierarchy import effect_information, pooled_stds
-from slipid.fit.problem import Problem, linear
-from slipid.fit.variances import DEGREES, VARIANCE_SPREAD, information
+from slipid.fitting import likelihood as lk
+from slipid.fitting.hierarchy import effect_information, pooled_stds
+from slipid.fitting.problem import Problem, linear
+from slipid.fitting.variances import DEGREES, VARIANCE_SPREAD, information
 from slipid.infer.posterior import diagnosis, ensemble
 from slipid.infer.posterior.blocks import (
     BlockStore,

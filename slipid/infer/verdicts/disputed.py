@@ -23,7 +23,7 @@ from typing import Literal
 import numpy as np
 from scipy.stats import chi2, norm
 
-from slipid.fit.variances import Search, Square
+from slipid.fitting.variances import Search, Square
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.search_space import Space
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from slipid.fit.variances import Search, Square
+from slipid.fitting.variances import Search, Square
 from slipid.parameter import Declaration, Entry
 from slipid.search_space import Choice, Space
 

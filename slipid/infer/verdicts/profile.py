@@ -21,9 +21,9 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.stats import chi2
 
-from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import FitState, Problem
-from slipid.fit.variances import MOTION_BLOCKS
+from slipid.fitting.optimise import Optimum, optimise
+from slipid.fitting.problem import FitState, Problem
+from slipid.fitting.variances import MOTION_BLOCKS
 from slipid.infer.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.parameter import Entry
 from slipid.search_space import Space

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from slipid.fit.variances import Search, Square
+from slipid.fitting.variances import Search, Square
 from slipid.infer.verdicts.estimates import WEAK
 from slipid.infer.verdicts.wording import NOTHING, SMALL, Axis, axes_of, formula, remedy
 from slipid.model.robot import Validity

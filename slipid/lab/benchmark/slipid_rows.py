@@ -17,10 +17,10 @@ from slipid.data.floor_map import FloorMap
 from slipid.data.runs import Runs
 from slipid.deploy.deploy import robot_of_force_balance
 from slipid.deploy.floors import floor_of
-from slipid.fit import likelihood as lk
-from slipid.fit.optimise import optimise
-from slipid.fit.problem import FitState, Problem
-from slipid.fit.variances import DEGREES
+from slipid.fitting import likelihood as lk
+from slipid.fitting.optimise import optimise
+from slipid.fitting.problem import FitState, Problem
+from slipid.fitting.variances import DEGREES
 from slipid.infer.slip_curves import current_trend
 from slipid.lab.benchmark.steps import RunBatch, body_poses
 from slipid.predict.folds import problem_of_runs

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from slipid.data.runs import Runs
-from slipid.fit.problem import Problem
+from slipid.fitting.problem import Problem
 from slipid.lab.benchmark import slipid_rows
 from slipid.lab.benchmark.protocols import PROTOCOLS, BenchmarkProtocol, Split, base_of, splits
 from slipid.lab.benchmark.rows import rows
@@ -30,7 +30,7 @@ OWN_MAP = "slipid_map"
 
 
 OF_FITS = (
-    *("parameter", "search_space", "model", "data", "fit", "predict", "infer", "app"),
+    *("parameter", "search_space", "model", "data", "fitting", "predict", "infer", "app"),
     "lab/benchmark/slipid_rows",
 )
 """Packages and modules that slipid's fits depend on."""

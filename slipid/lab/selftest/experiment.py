@@ -14,7 +14,7 @@ from slipid.app.config import Config, read_config, single_floor_sections
 from slipid.app.logs import layout_of
 from slipid.app.problem import ConfigFitTask, fit_task, read_fit_task, shape_of
 from slipid.data.runs import collect
-from slipid.fit.problem import Problem
+from slipid.fitting.problem import Problem
 from slipid.infer.verdicts.estimates import derived
 from slipid.lab.selftest import replicates as test
 from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, turning_grid

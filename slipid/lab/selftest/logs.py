@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from slipid.data.log import Log
 from slipid.data.wheel_signals import interpolate
-from slipid.fit.shared_effects import AXES
+from slipid.fitting.shared_effects import AXES
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.model.geometry import omni
 from slipid.model.robot import Robot, build, motor_current, twist
@@ -125,7 +125,7 @@ def turning_grid(
 
 @dataclass(frozen=True)
 class SimulatedSensors:
-    """Disturbances of simulated logs, with stds by the names of `slipid.fit.noise.noise`.
+    """Disturbances of simulated logs, with stds by the names of `slipid.fitting.noise.noise`.
 
     Attributes:
         std: std of every variance component; `floor` in a name stands for every floor without its

@@ -21,11 +21,11 @@ from pydantic import TypeAdapter
 
 from slipid.app.config import Config
 from slipid.data.windows import Windows
-from slipid.fit import likelihood as lk
-from slipid.fit.noise import SHARED, axes, noise, travel
-from slipid.fit.optimise import Optimum, optimise
-from slipid.fit.problem import FitState, Problem
-from slipid.fit.shared_effects import AXES, effects_by_floor
+from slipid.fitting import likelihood as lk
+from slipid.fitting.noise import SHARED, axes, noise, travel
+from slipid.fitting.optimise import Optimum, optimise
+from slipid.fitting.problem import FitState, Problem
+from slipid.fitting.shared_effects import AXES, effects_by_floor
 from slipid.infer.result import draws
 from slipid.infer.slip_curves import curves, slip_on
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates

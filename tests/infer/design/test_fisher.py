@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from slipid.fit import noise as of_noise
-from slipid.fit.problem import Problem
+from slipid.fitting import noise as of_noise
+from slipid.fitting.problem import Problem
 from slipid.infer.design import fisher as info
 from slipid.infer.design.planned_runs import PlannedRun, candidates, steady_windows
 from slipid.infer.design.planner import Planner, parameter_goal

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 from slipid.cli.main import app
 from slipid.data.runs import collect
 from slipid.data.windows import windows
-from slipid.fit.optimise import Optimum
-from slipid.fit.problem import FitState, Problem
+from slipid.fitting.optimise import Optimum
+from slipid.fitting.problem import FitState, Problem
 from slipid.infer.design.planner import Planner
 from slipid.infer.fit_file import load, save
 from slipid.infer.summary import summarise

@@ -13,12 +13,12 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.stats import multivariate_t
 
-from slipid.fit import likelihood as lk
-from slipid.fit import noise as of_noise
-from slipid.fit.noise import POOLED
-from slipid.fit.problem import Problem
-from slipid.fit.shared_effects import AXES
-from slipid.fit.variances import DEGREES
+from slipid.fitting import likelihood as lk
+from slipid.fitting import noise as of_noise
+from slipid.fitting.noise import POOLED
+from slipid.fitting.problem import Problem
+from slipid.fitting.shared_effects import AXES
+from slipid.fitting.variances import DEGREES
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted
 from slipid.infer.posterior.density import Density
 from slipid.search_space import Choice

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import norm
 
-from slipid.fit.problem import Problem
+from slipid.fitting.problem import Problem
 from slipid.infer.posterior.coordinates import ELECTRIC, MOTION, Fitted
 from slipid.infer.posterior.density import Density, electric_given_motion
 from slipid.search_space import Choice

@@ -9,9 +9,9 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from slipid.fit.hierarchy import effect_information
-from slipid.fit.noise import POOLED
-from slipid.fit.problem import Problem
+from slipid.fitting.hierarchy import effect_information
+from slipid.fitting.noise import POOLED
+from slipid.fitting.problem import Problem
 from slipid.infer.posterior.blocks import ChainBlock
 from slipid.infer.posterior.coordinates import Fitted, effects_at
 from slipid.infer.posterior.sample import drawn_variances, thinned

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem
+from slipid.fitting.optimise import optimise
+from slipid.fitting.problem import Problem
 from slipid.infer.verdicts.disputed import Dispute, disputes, marked
 from slipid.infer.verdicts.estimates import estimates
 from slipid.search_space import Choice

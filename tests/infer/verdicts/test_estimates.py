@@ -12,8 +12,8 @@ import pint
 import pytest
 from scipy.stats import chi2
 
-from slipid.fit.optimise import optimise
-from slipid.fit.problem import Problem
+from slipid.fitting.optimise import optimise
+from slipid.fitting.problem import Problem
 from slipid.infer.verdicts import unidentified as flat_module
 from slipid.infer.verdicts import wording
 from slipid.infer.verdicts.estimates import RATIOS, derived, estimates
@@ -22,7 +22,7 @@ from slipid.infer.verdicts.unidentified import NOTICED, flat_directions, sentenc
 from slipid.infer.verdicts.wording import VOLTAGE, remedy
 from slipid.model.robot import Validity
 from slipid.search_space import Choice, Space
-from tests.fit.test_optimise import NOISE, begin
+from tests.fitting.test_optimise import NOISE, begin
 from tests.helpers.made_windows import made, robot
 
 NOTHING = Choice("*", free=False)

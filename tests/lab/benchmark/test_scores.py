@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sklearn.metrics import roc_auc_score
 
-from slipid.fit.variances import DEGREES
+from slipid.fitting.variances import DEGREES
 from slipid.lab.benchmark.scores import FoldScore, scored
 from slipid.lab.benchmark.summary import (
     Bootstrap,

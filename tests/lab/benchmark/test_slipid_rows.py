@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slipid.api.runs import simulate_runs
-from slipid.fit.variances import DEGREES
+from slipid.fitting.variances import DEGREES
 from slipid.lab.benchmark import slipid_rows
 from slipid.lab.benchmark.slipid_rows import (
     FloorKnowledge,

@@ -11,8 +11,8 @@ from slipid.data.reading.presets import declared_layout
 from slipid.data.reading.reader import find_logs
 from slipid.data.runs import collect, default_session
 from slipid.data.windows import windows
-from slipid.fit.likelihood import batch
-from slipid.fit.noise import noise
+from slipid.fitting.likelihood import batch
+from slipid.fitting.noise import noise
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.lab.selftest.logs import (
     TRUTH,

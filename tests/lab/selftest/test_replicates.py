@@ -19,11 +19,11 @@ from slipid.app.config import parsed
 from slipid.app.logs import packaged_config
 from slipid.app.problem import ConfigFitTask
 from slipid.cli.main import app
-from slipid.fit import likelihood as lk
-from slipid.fit import noise as of_noise
-from slipid.fit.optimise import Optimum
-from slipid.fit.problem import Problem
-from slipid.fit.shared_effects import AXES
+from slipid.fitting import likelihood as lk
+from slipid.fitting import noise as of_noise
+from slipid.fitting.optimise import Optimum
+from slipid.fitting.problem import Problem
+from slipid.fitting.shared_effects import AXES
 from slipid.lab.selftest import replicates as selftest
 from slipid.lab.selftest.experiment import number_summary, summary
 from slipid.lab.selftest.replicates import (
@@ -34,7 +34,7 @@ from slipid.lab.selftest.replicates import (
 )
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.progress import Reporter
-from tests.fit.test_optimise import begin
+from tests.fitting.test_optimise import begin
 from tests.helpers.dense import of_shared
 from tests.helpers.made_windows import electric_noise, made, residuals, robot
 

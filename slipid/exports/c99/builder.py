@@ -1,0 +1,153 @@
+"""Builder that decides where every statement of a function stands.
+
+Every number is computed once, in the earliest block that has its inputs. A block is straight code,
+or one loop over lanes, so that many operations on the same lanes form one loop. Values that are the
+same in every turn of a repetition are computed before it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slipid.exports.c99.ir import Array, At, Cell, CodeBlock, Memory, Nested, Statement, Variable
+from slipid.exports.fields import DTYPES, Kind
+
+CALLS = ("r_atan2", "r_cos", "r_exp", "r_log", "r_pow", "r_rem", "r_sin", "r_floor")
+"""Functions of C's library, which no compiler reduces to a few instructions."""
+
+
+class Names:
+    """Numbers for names, and the tables of constants of a whole file."""
+
+    def __init__(self) -> None:
+        self._last = 0
+        self.tables: dict[tuple[Kind, bytes], Memory] = {}
+
+    def number(self) -> int:
+        """Return a new number."""
+        self._last += 1
+        return self._last
+
+    def table(self, values: np.ndarray, kind: Kind) -> Memory:
+        """Return memory with constants; an existing one if it holds the same."""
+        flat = np.ascontiguousarray(values.reshape(-1), dtype=DTYPES[kind])
+        key = (kind, flat.tobytes())
+        if key not in self.tables:
+            name = f"k{len(self.tables)}"
+            self.tables[key] = Memory(name, kind, flat.size, None, flat.tobytes())
+        return self.tables[key]
+
+
+class Builder:
+    """Collector of the statements of a function, or of the body of a condition or repetition.
+
+    Attributes:
+        parent: builder of the code around it.
+        turns: block that repeats this code; None if none does.
+        blocks: blocks in their order.
+        source: line of Python that asks for the next statement.
+        contiguous: arrays that are in row-major order in memory as well, by their cells.
+    """
+
+    def __init__(self, names: Names, parent: Builder | None = None):
+        self.names, self.parent = names, parent
+        self.turns: CodeBlock | None = None
+        self.blocks: list[CodeBlock] = []
+        self.source = ""
+        self.contiguous: dict[int, tuple[Array, Memory]] = {}
+        self._known: dict[tuple[object, ...], Variable] = {}
+
+    def compute(
+        self,
+        kind: Kind,
+        template: str,
+        cells: tuple[Cell, ...],
+        lanes: int = 0,
+        start: str = "",
+    ) -> Variable:
+        """Return a variable computed from cells; an existing one if it was computed before.
+
+        With `start`, lanes are reduced to one number.
+        """
+        around = self._around(cells)
+        if around is not self:
+            around.source = self.source
+            return around.compute(kind, template, cells, lanes, start)
+        key = (kind, template, cells, lanes, start)
+        if key not in self._known and self.parent is not None and key in self.parent._known:
+            return self.parent._known[key]
+        if key not in self._known:
+            block = self._place(cells, lanes, bool(start) or any(f in template for f in CALLS))
+            own_lanes, made_by = 0 if start else lanes, (template, cells)
+            target = Variable(kind, self.names.number(), own_lanes, block, made_by)
+            block.statements.append(
+                Statement(target, template, cells, start=start, source=self.source)
+            )
+            self._known[key] = target
+        return self._known[key]
+
+    def array(self, kind: Kind, size: int, cells: tuple[Cell, ...], lanes: int = 0) -> Memory:
+        """Return memory that straight code, or a loop over lanes, fills from these cells."""
+        home = self._around(cells)._place(cells, lanes)
+        return Memory(f"m{self.names.number()}", kind, size, home)
+
+    def fill(self, memory: Memory, template: str, cell: Cell, times: int = 0) -> None:
+        """Append a statement of C that fills memory made by `array`, repeated `times` if not 0."""
+        block = memory.home
+        assert block is not None
+        block.statements.append(
+            Statement(None, template, (cell,), memory, times, source=self.source)
+        )
+
+    def append(
+        self, lanes: int = 0, nested: Nested | None = None, calls: bool = False
+    ) -> CodeBlock:
+        """Return a new block after all others."""
+        return self.put(CodeBlock(self, 0, lanes, calls, nested=nested))
+
+    def put(self, block: CodeBlock) -> CodeBlock:
+        """Return a block that was put after all others."""
+        block.place = len(self.blocks)
+        self.blocks.append(block)
+        return block
+
+    def _around(self, cells: tuple[Cell, ...]) -> Builder:
+        """Return the builder in which a statement stands: outside of turns that change no cell."""
+        if self.parent is None or self.turns is None or any(map(self._changes, cells)):
+            return self
+        return self.parent._around(cells)
+
+    def _changes(self, cell: Cell) -> bool:
+        """Return whether a cell may change from turn to turn."""
+        if isinstance(cell, At):
+            home = cell.memory.home
+            by_index = cell.index is not None and self._changes(cell.index)
+            return by_index or (home is not None and (home is self.turns or home.owner is self))
+        return isinstance(cell, Variable) and cell.home.owner is self
+
+    def _place(self, cells: tuple[Cell, ...], lanes: int, calls: bool = False) -> CodeBlock:
+        """Return the earliest block for a statement over these lanes that uses these cells.
+
+        Loops whose statements call functions are kept apart from loops that a compiler can
+        vectorize.
+        """
+        apart = calls and lanes > 0
+        first = max((self._after(cell, lanes) for cell in cells), default=0)
+        for block in self.blocks[first:]:
+            if (block.lanes, block.calls, block.nested) == (lanes, apart, None):
+                return block
+        return self.append(lanes, calls=apart)
+
+    def _after(self, cell: Cell, lanes: int) -> int:
+        """Return the place of the first block in which a statement can use a cell."""
+        if isinstance(cell, At):
+            inner = 0 if cell.index is None else self._after(cell.index, lanes)
+            return max(inner, self._behind(cell.memory.home, False))
+        if not isinstance(cell, Variable):
+            return 0
+        return self._behind(cell.home, lanes == cell.lanes)
+
+    def _behind(self, home: CodeBlock | None, together: bool) -> int:
+        if home is None or home.owner is not self:
+            return 0  # it is filled before this builder's code begins
+        return home.place + (0 if together else 1)

@@ -1,0 +1,261 @@
+"""Header and source of a control loop in C99, generated from the steps that the tests cover."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from importlib.resources import files
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from slipid.exports.c99.builder import Names
+from slipid.exports.c99.function import Argument, Function, function, traced
+from slipid.exports.c99.text import TYPES, WIDTH, folded, table
+from slipid.exports.description import header
+from slipid.exports.fields import Struct
+from slipid.exports.text import identifiers, listed, wrapped
+from slipid.robot.closed_loop import ControlLoop
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.filter.hypotheses import hypotheses_of
+from slipid.robot.interface import Measurement, Readings
+from slipid.robot.trajectory import Path
+
+TYPE = {**TYPES, "real": "slipid_real"}
+
+
+class Code:
+    """The C code of a control loop, and of a path if it follows one.
+
+    Attributes:
+        robot: robot with the record of its numbers.
+        loop: estimator and controller.
+        path: path placed for a robot that starts at 0.
+        estimator: struct of the estimator's state.
+        controller: struct of the controller's state.
+        reading: struct of the inputs.
+        estimate: struct of the outputs.
+        functions: all generated functions.
+    """
+
+    def __init__(
+        self, robot: DeployedRobot, loop: ControlLoop[eqx.Module], path: Path | None = None
+    ):
+        """Trace and lower all functions.
+
+        Raises:
+            UnsupportedError: a step uses a primitive without a form in C.
+        """
+        self.robot, self.loop, self.path = robot, loop, path
+        self._names = Names()
+        begin, nothing = loop.init(), Readings.nothing(robot.wheels)
+        zero = jnp.zeros(())
+        estimate = loop.estimator.step(begin.estimator, nothing, zero)[1]
+        self.estimator = Struct.of("slipid_estimator", "What the estimator keeps.", begin.estimator)
+        self.controller = Struct.of(
+            "slipid_controller", "What the controller keeps.", begin.controller
+        )
+        self.reading = Struct.of(
+            "slipid_reading",
+            "What the sensors give; NaN where there is none.",
+            nothing,
+            Measurement,
+        )
+        self.estimate = Struct.of("slipid_estimate", "What is believed.", estimate)
+        self.functions = list(self._functions(begin.estimator, begin.controller, nothing, estimate))
+
+    def _functions(
+        self,
+        estimator: eqx.Module,
+        controller: eqx.Module,
+        nothing: Readings,
+        estimate: eqx.Module,
+    ) -> Iterator[Function]:
+        loop, one = self.loop, jnp.zeros(())
+        wheels = loop.controller.robot.wheels
+        pose, dt = Argument.plain("pose", (3,)), Argument.plain("dt", ())
+        fresh = (
+            Argument.of("estimator", self.estimator, False, True),
+            Argument.of("controller", self.controller, False, True),
+        )
+        yield function(
+            self._names,
+            "slipid_begin",
+            "Start estimator and controller of a robot that stands at a pose: x, y [m], heading "
+            "[rad].",
+            (*fresh, pose),
+            traced(lambda p: (loop.init(p).estimator, loop.init(p).controller), jnp.zeros(3)),
+        )
+        yield function(
+            self._names,
+            "slipid_nothing",
+            "Make a reading one of no sensor at all; fill in what there is.",
+            (Argument.of("reading", self.reading, False, True),),
+            traced(lambda: Readings.nothing(wheels)),
+        )
+        yield function(
+            self._names,
+            "slipid_observe",
+            "Take in what the sensors give dt after the last call [s]: the estimator's step.",
+            (
+                Argument.of("estimator", self.estimator, True, True),
+                Argument.of("reading", self.reading),
+                dt,
+                Argument.of("estimate", self.estimate, False, True),
+            ),
+            traced(loop.estimator.step, estimator, nothing, one),
+        )
+        yield function(
+            self._names,
+            "slipid_command",
+            "Wheel speeds to command [rad/s] for a reference, x, y [m], heading [rad] and their "
+            "rates in the world [m/s, m/s, rad/s]: the controller's step.",
+            (
+                Argument.of("controller", self.controller, True, True),
+                Argument.plain("reference", (6,)),
+                Argument.of("estimate", self.estimate),
+                dt,
+                Argument.plain("command", (wheels,), False, True),
+            ),
+            traced(loop.controller.step, controller, jnp.zeros(6), estimate, one),
+        )
+        if self.path is not None:
+            yield self._follow(self.path)
+
+    def _follow(self, path: Path) -> Function:
+        preview = self.loop.controller.gains.preview
+        begin = ", ".join(f"{float(x):g}" for x in path.rows[0, :3])
+
+        def follow(time: jnp.ndarray, pose: jnp.ndarray, dt: jnp.ndarray) -> object:
+            here = jnp.where(jnp.isfinite(pose), pose, 1e3)
+            return path.follow(time, here, dt, preview)
+
+        return function(
+            self._names,
+            "slipid_follow",
+            "Own time of the path [s], from 0, and the reference there, for a robot at a pose. "
+            f"The path begins at {begin} [m, m, rad] and lasts {path.duration:g} s; it waits for a "
+            "robot that lags.",
+            (
+                Argument.plain("time", (), True, True),
+                Argument.plain("pose", (3,)),
+                Argument.plain("dt", ()),
+                Argument.plain("reference", (6,), False, True),
+            ),
+            traced(follow, jnp.zeros(()), jnp.zeros(3), jnp.zeros(())),
+        )
+
+    @property
+    def structs(self) -> tuple[Struct, ...]:
+        """All generated structs."""
+        return self.estimator, self.controller, self.reading, self.estimate
+
+    @property
+    def kept(self) -> int:
+        """Count of the numbers in a state."""
+        return sum(f.size for s in (self.estimator, self.controller) for f in s.fields) + 1
+
+    @property
+    def scratch(self) -> int:
+        """Count of the numbers in arrays that a step has on the stack."""
+        return max(f.scratch for f in self.functions)
+
+    def header(self) -> str:
+        """Return the text of slipid.h."""
+        robot = self.robot
+        names = identifiers(robot.labels, "floor")
+        floors = [f"SLIPID_FLOOR_{name.upper()} {k}" for k, name in enumerate(names)]
+        sizes = [f"SLIPID_WHEELS {robot.wheels}", f"SLIPID_FLOORS {len(robot.labels)}"]
+        defines = [f"#define {d}" for d in (*sizes, *floors, *self._duration())]
+        single = [f"#define {name} {name}_float" for name in self._names_of_functions]
+        declared = [
+            line
+            for f in self.functions
+            for line in (*_comment(f.about), *folded(f"{f.head};", ""), "")
+        ]
+        values = {
+            "HEAD": "\n".join(_comment(*header(robot))),
+            "ROBOT": robot.record.numbers,
+            "DEFINES": "\n".join(defines),
+            "ABOUT": "\n".join(line for part in about(self.loop) for line in _comment(part)),
+            "SINGLE": "\n".join(single),
+            "STRUCTS": "\n".join(line for s in self.structs for line in _struct(s)),
+            "FUNCTIONS": "\n".join(declared),
+        }
+        return filled("slipid.h", values)
+
+    @property
+    def _names_of_functions(self) -> list[str]:
+        return ["slipid_init", "slipid_step", *(f.name for f in self.functions)]
+
+    def _duration(self) -> list[str]:
+        return [] if self.path is None else [f"SLIPID_PATH_SECONDS {self.path.duration!r}"]
+
+    def source(self) -> str:
+        """Return the text of slipid.c."""
+        reads = frozenset[str]().union(*(f.reads for f in self.functions))
+        tables = [m for m in self._names.tables.values() if m.name in reads]
+        values = {
+            "HEAD": "\n".join(_comment(*header(self.robot))),
+            "PRELUDE": template("prelude.c"),
+            "TABLES": "\n".join(line for m in tables for line in table(m)),
+            "FUNCTIONS": "\n".join(line for f in self.functions for line in f.text),
+        }
+        return filled("slipid.c", values)
+
+
+def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
+    """Yield sentences on axes, wheels, sensors and floors for readers of the header."""
+    robot = loop.controller.robot
+    yield (
+        "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: those in "
+        "which the start pose is given. A twist is in the body's axes."
+    )
+    rows = zip(robot.places.tolist(), robot.forward.tolist(), strict=True)
+    for k, ((x, y), row) in enumerate(rows):
+        drives = math.degrees(math.atan2(row[1], row[0]))
+        yield (
+            f"Wheel {k} stands at x = {x:.4f} m, y = {y:.4f} m; turning at a positive speed it "
+            f"pushes the body towards {drives:.1f} deg."
+        )
+    settings = loop.estimator.settings
+    signs = "with their signs" if settings.current_is_signed else "without a sign (a sign is lost)"
+    yield f"Currents are taken {signs}. A wheel unheard for {float(settings.stale_s):g} s is stale."
+    yield "Floors, as columns count them: " + listed([*robot.labels, "none of them"]) + "."
+    rows = hypotheses_of(robot).under.tolist()
+    each = "; ".join(f"{k}: {' '.join(map(str, row))}" for k, row in enumerate(rows))
+    yield f"Hypotheses of the floors, as rows count them, with the floor under each wheel: {each}."
+
+
+def template(name: str) -> str:
+    """Return the text of a file in this folder's templates."""
+    return (files(__package__) / "templates" / name).read_text()
+
+
+def filled(name: str, values: dict[str, str]) -> str:
+    """Return a template with values for every @NAME@."""
+    return re.sub(r"@([A-Z]+)@", lambda match: values[match.group(1)], template(name))
+
+
+def _comment(*parts: str) -> list[str]:
+    """Return a comment of C."""
+    lines = [line.replace("*/", "* /") for part in parts for line in wrapped(part)]
+    return (
+        [f"/* {lines[0]}", *(f"   {line}" for line in lines[1:-1]), f"   {lines[-1]} */"]
+        if len(lines) > 1
+        else [f"/* {lines[0]} */"]
+    )
+
+
+def _struct(struct: Struct) -> Sequence[str]:
+    lines = [*_comment(struct.about), "typedef struct {"]
+    for field in struct.fields:
+        size = f"[{field.size}]" if field.shape else ""
+        shape = "" if len(field.shape) < 2 else f", {' x '.join(map(str, field.shape))} by rows"
+        declared, comment = f"  {TYPE[field.kind]} {field.name}{size};", f"{field.comment}{shape}"
+        if len(declared) + len(comment) + 7 <= WIDTH:
+            lines.append(f"{declared} /* {comment} */")
+        else:
+            lines += [*(f"  {line}" for line in _comment(comment)), declared]
+    return [*lines, f"}} {struct.name};", ""]

@@ -1,0 +1,172 @@
+"""Files of a C folder: the code, its test with reference steps, an example, and build files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from slipid.exports.c99.code import Code, filled, template
+from slipid.exports.c99.text import wrapped
+from slipid.exports.description import facts, made_with, warned
+from slipid.exports.fields import Struct
+from slipid.exports.golden import golden
+from slipid.robot.closed_loop import ControlLoop
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.trajectory import Path
+
+
+def golden_header(code: Code) -> str:
+    """Return the text of golden.h: the steps as tables, and code that fills and reads structs."""
+    steps = golden(code.loop)
+    names = [f.name for f in code.estimate.fields for _ in range(f.size)]
+    scale = np.maximum(np.abs(steps.said).max(axis=0), 1e-3)
+    rows = [
+        "#include <math.h>",
+        "",
+        f"#define GOLDEN_STEPS {len(steps.given)}",
+        f"#define GOLDEN_GIVEN {steps.given.shape[1]}",
+        f"#define GOLDEN_SAID {steps.said.shape[1]}",
+        "",
+        *_table("golden_given[GOLDEN_STEPS][GOLDEN_GIVEN]", steps.given),
+        *_table("golden_said[GOLDEN_STEPS][GOLDEN_SAID]", steps.said),
+        *_table("golden_command[GOLDEN_STEPS][SLIPID_WHEELS]", steps.command),
+        *_table("golden_scale[GOLDEN_SAID]", scale),
+        "static const char *const golden_names[GOLDEN_SAID] = {",
+        *wrapped((f'"{name}"' for name in names), "  "),
+        "};",
+        "",
+        *_filling(code.reading),
+        *_reading_out(code.estimate),
+    ]
+    return "\n".join(rows) + "\n"
+
+
+def _table(declared: str, values: np.ndarray) -> list[str]:
+    def word(value: float) -> str:
+        return "NAN" if np.isnan(value) else repr(float(value))
+
+    if values.ndim == 1:
+        lines = wrapped(map(word, values), "  ")
+    else:
+        lines = [x for row in values for x in ("  {", *wrapped(map(word, row), "    "), "  },")]
+    return [f"static const double {declared} = {{", *lines, "};", ""]
+
+
+def _filling(struct: Struct) -> list[str]:
+    names = [f"{f.name}[{k}]" if f.shape else f.name for f in struct.fields for k in range(f.size)]
+    return [
+        f"static void golden_reading({struct.name} *reading, const double *row) {{",
+        *(f"  reading->{name} = (slipid_real)row[{k}];" for k, name in enumerate(names)),
+        "}",
+        "",
+    ]
+
+
+def _reading_out(struct: Struct) -> list[str]:
+    lines = [f"static void golden_said_of(const {struct.name} *estimate, double *out) {{"]
+    place = 0
+    for field in filter(lambda field: field.size, struct.fields):
+        member = f"estimate->{field.name}{'[k]' if field.shape else ''}"
+        value = f"{member} ? 1.0 : 0.0" if field.kind == "bool" else f"(double){member}"
+        loop = f"for (int k = 0; k < {field.size}; ++k) out[{place} + k]"
+        lines.append(f"  {loop if field.shape else f'out[{place}]'} = {value};")
+        place += field.size
+    return [*lines, "}", ""]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A run of a path that the library has driven, one row per period.
+
+    Attributes:
+        plant: description of the plant.
+        start: pose at which it began [m, m, rad].
+        given: dt [s] and the leaves of the reading.
+        command: wheel speeds [rad/s].
+        time: time of the path [s].
+    """
+
+    plant: str
+    start: tuple[float, float, float]
+    given: Float[np.ndarray, "step given"]
+    command: Float[np.ndarray, "step wheel"]
+    time: Float[np.ndarray, " step"]
+
+    @property
+    def readings(self) -> str:
+        """Text of readings.txt, which the example reads."""
+        rows = [" ".join(repr(float(x)) for x in row) for row in self.given]
+        return "\n".join([" ".join(map(repr, self.start)), *rows]) + "\n"
+
+    @property
+    def commands(self) -> str:
+        """Text of commands.txt, as the example prints it."""
+        rows = zip(self.command, self.time, strict=True)
+        return "".join(f"{' '.join(f'{x:.9f}' for x in c)} {t:.9f}\n" for c, t in rows)
+
+
+def _path(path: Path) -> str:
+    """Return a description of a path for people."""
+    corners = [f"({x:.2f}, {y:.2f})" for x, y in np.asarray(path.corners).tolist()]
+    x, y, heading = np.asarray(path.rows)[0, :3].tolist()
+    return (
+        f"from ({x:.2f}, {y:.2f}), heading {heading:.2f} rad, over {', '.join(corners)} [m] in "
+        f"{path.duration:g} s"
+    )
+
+
+def _kib(numbers: int) -> str:
+    """Return the size of this count of numbers in `double`."""
+    return f"{numbers * 8 / 1024:.1f} KiB"
+
+
+def c_files(
+    robot: DeployedRobot,
+    loop: ControlLoop[eqx.Module],
+    path: Path,
+    recording: Recording | None = None,
+) -> dict[str, str]:
+    """Return the text of the files by their paths in the folder.
+
+    Args:
+        robot: robot with the record of its numbers.
+        loop: estimator and controller.
+        path: path that the example follows.
+        recording: a run of it, as a test of the example.
+
+    Raises:
+        UnsupportedError: a step uses a primitive that has no form in C.
+    """
+    code = Code(robot, loop, path)
+    release = {"VERSION": made_with()}
+    files = {
+        "src/slipid.h": code.header(),
+        "src/slipid.c": code.source(),
+        "test/golden.h": golden_header(code),
+        "test/check.c": template("check.c"),
+        "examples/drive/drive.c": template("drive.c"),
+        "examples/Slipid/Slipid.ino": filled("Slipid.ino", {"STACK": _kib(code.scratch)}),
+        "CMakeLists.txt": template("CMakeLists.txt"),
+        "library.json": filled("library.json", release),
+        "library.properties": filled("library.properties", release),
+    }
+    example = ""
+    if recording is not None:
+        files["examples/drive/readings.txt"] = recording.readings
+        files["examples/drive/commands.txt"] = recording.commands
+        example = filled("recording.md", {"PLANT": recording.plant})
+    values = {
+        "WARNINGS": "\n".join(warned(robot)),
+        "HEAD": "\n".join(facts(robot)),
+        "RECORDING": example,
+        "FLOORS": ", ".join(f"`{name}` ({k})" for k, name in enumerate(robot.labels)),
+        "WHEELS": str(robot.wheels),
+        "STATE": _kib(code.kept),
+        "STACK": _kib(code.scratch),
+        "PATH": _path(path),
+    }
+    files["README.md"] = filled("README.md", values)
+    return files

@@ -1,0 +1,169 @@
+"""A traced function as a function of C: its arguments, its body, and the memory that it reads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax
+
+from slipid.exports.c99.builder import Builder, Names
+from slipid.exports.c99.ir import Array, Memory, Value, in_memory
+from slipid.exports.c99.jaxpr import Traced
+from slipid.exports.c99.lower import apart, lowered, store
+from slipid.exports.c99.text import FunctionBody, folded
+from slipid.exports.fields import Field, Struct
+
+
+@dataclass(frozen=True)
+class Argument:
+    """An argument of a function of C.
+
+    Attributes:
+        name: name of the argument.
+        type: struct that the pointer points to, empty for plain numbers.
+        fields: fields of the struct; a single one for plain numbers.
+        read: whether the function reads it.
+        written: whether the function fills it.
+    """
+
+    name: str
+    type: str
+    fields: tuple[Field, ...]
+    read: bool
+    written: bool
+
+    @classmethod
+    def plain(
+        cls, name: str, shape: tuple[int, ...], read: bool = True, written: bool = False
+    ) -> Argument:
+        """Return a number or a row of numbers as an argument."""
+        return cls(name, "", (Field(name, "real", shape, ""),), read, written)
+
+    @classmethod
+    def of(cls, name: str, struct: Struct, read: bool = True, written: bool = False) -> Argument:
+        """Return a pointer to a struct as an argument."""
+        return cls(name, struct.name, struct.fields, read, written)
+
+    @property
+    def memories(self) -> list[Memory]:
+        """Memory of each of its fields."""
+        if self.type:
+            return [
+                Memory(f"{self.name}->{f.name}", f.kind, f.size, scalar=not f.shape)
+                for f in self.fields
+            ]
+        field = self.fields[0]
+        name = f"(*{self.name})" if self.written and not field.shape else self.name
+        return [Memory(name, field.kind, field.size, scalar=not field.shape)]
+
+    @property
+    def declared(self) -> str:
+        """Text of its declaration in the function's head."""
+        const = "" if self.written else "const "
+        if self.type:
+            return f"{const}{self.type} *{self.name}"
+        field = self.fields[0]
+        if field.shape:
+            return f"{const}slipid_real {self.name}[{field.size}]"
+        return f"slipid_real *{self.name}" if self.written else f"slipid_real {self.name}"
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function of C.
+
+    Attributes:
+        name: name of the function.
+        about: comment of its declaration.
+        arguments: arguments in order.
+        lines: lines of its body.
+        reads: names of all memory that it reads.
+        scratch: count of the numbers in arrays that it has on the stack.
+    """
+
+    name: str
+    about: str
+    arguments: tuple[Argument, ...]
+    lines: tuple[str, ...]
+    reads: frozenset[str]
+    scratch: int
+
+    @property
+    def head(self) -> str:
+        """Text of the declaration without the semicolon."""
+        return f"void {self.name}({', '.join(a.declared for a in self.arguments)})"
+
+    @property
+    def text(self) -> list[str]:
+        """Lines of the definition."""
+        return [*folded(f"{self.head} {{", ""), *self.lines, "}", ""]
+
+
+def function(
+    names: Names,
+    name: str,
+    about: str,
+    arguments: Sequence[Argument],
+    traced: Traced,
+) -> Function:
+    """Return a traced function as a function of C.
+
+    Args:
+        names: names of the file.
+        name: name of the function.
+        about: comment of its declaration.
+        arguments: arguments in order.
+        traced: function from the fields of all arguments that are read to those of all that are
+            written, both in the order of the arguments.
+
+    Raises:
+        UnsupportedError: it uses a primitive without a rule.
+    """
+    builder = Builder(names)
+    values: list[Value] = [
+        in_memory(memory, field.shape)
+        for argument in arguments
+        if argument.read
+        for memory, field in zip(argument.memories, argument.fields, strict=True)
+    ]
+    results = lowered(builder, traced, values)
+    targets = [memory for a in arguments if a.written for memory in a.memories]
+    overwritten = frozenset(memory.name for memory in targets)
+    changed = [
+        (memory, apart(builder, value, overwritten))
+        for memory, value in zip(targets, results, strict=True)
+        if not _holds(memory, value)
+    ]
+    for memory, value in changed:
+        store(builder, value, memory)
+    body = FunctionBody(builder)
+    unused = _unused(arguments, body.reads)
+    lines = (*unused, *body.lines())
+    return Function(name, about, tuple(arguments), lines, body.reads, body.scratch)
+
+
+def traced(run: Callable[..., object], *like: object) -> Traced:
+    """Return a function of some trees, traced as one from their leaves to those of its result."""
+    structure = jax.tree.structure(like)
+
+    def of(*leaves: jax.Array) -> list[jax.Array]:
+        return jax.tree.leaves(run(*jax.tree.unflatten(structure, leaves)))
+
+    return Traced.of(jax.make_jaxpr(of)(*jax.tree.leaves(like)))
+
+
+def _holds(memory: Memory, value: Value) -> bool:
+    """Return whether memory holds a value already."""
+    if not isinstance(value, Array):
+        return False
+    like = in_memory(memory, value.shape)
+    return value.axis == like.axis and bool((value.cells == like.cells).all())
+
+
+def _unused(arguments: Sequence[Argument], reads: frozenset[str]) -> list[str]:
+    """Return statements that mark arguments as deliberately not read."""
+    idle = [
+        a.name for a in arguments if not a.written and not any(m.name in reads for m in a.memories)
+    ]
+    return [f"  (void){name};" for name in idle]

@@ -1,0 +1,121 @@
+"""Access to functions that JAX has traced, the same for all supported versions of JAX.
+
+No other module knows where a version keeps the parameters of a primitive, the functions that it
+calls, and the lines of Python that ask for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import jax
+from jax.extend.core import Jaxpr, JaxprEqn
+
+from slipid.support.errors import DataError
+
+KNOWN = ">=0.10,<0.13"
+"""Versions of JAX whose traced functions are supported."""
+
+
+class Params(dict[str, Any]):
+    """Parameters of a primitive by their names in JAX.
+
+    Raises:
+        DataError: this version of JAX gives the primitive no parameter of such a name.
+    """
+
+    def __init__(self, equation: JaxprEqn):
+        super().__init__(equation.params)
+        self._primitive = equation.primitive.name
+
+    def __missing__(self, name: str) -> NoReturn:
+        raise unknown(f"'{self._primitive}'")
+
+
+@dataclass(frozen=True)
+class Traced:
+    """A traced function.
+
+    Attributes:
+        jaxpr: its equations, arguments and results.
+        constants: arrays that stand for its first variables, one each.
+    """
+
+    jaxpr: Jaxpr
+    constants: Sequence[object]
+
+    @classmethod
+    def of(cls, written: object) -> Traced:
+        """Return a traced function, which JAX 0.10 keeps in two classes and later versions in one.
+
+        Raises:
+            DataError: it is written in an unsupported way.
+        """
+        jaxpr, constants = getattr(written, "jaxpr", written), getattr(written, "consts", ())
+        if not isinstance(jaxpr, Jaxpr) or len(jaxpr.constvars) != len(constants):
+            raise unknown("functions")
+        return cls(jaxpr, tuple(constants))
+
+
+@dataclass(frozen=True)
+class ScanParameters:
+    """Parameters of a scan, which applies a function to its own results again and again.
+
+    Attributes:
+        body: the function; turns: how often it is applied.
+        constants: number of its first arguments, which are the same in every turn.
+        carried: number of its next arguments, which are results of the turn before.
+    """
+
+    body: Traced
+    turns: int
+    constants: int
+    carried: int
+
+    @classmethod
+    def of(cls, params: Params) -> ScanParameters:
+        """Return the parameters from the numbers of JAX 0.10 or the trees of later versions.
+
+        Raises:
+            DataError: they are written in an unsupported way.
+        """
+        if "num_carry" in params:
+            constants, carried = params["num_consts"], params["num_carry"]
+        else:
+            try:
+                constants, carried, _ = map(len, params["ft_in"].unpack())
+            except (AttributeError, TypeError, ValueError) as error:
+                raise unknown("'scan'") from error
+        return cls(Traced.of(params["jaxpr"]), params["length"], constants, carried)
+
+
+def called(params: Params) -> Traced:
+    """Return the function that a primitive calls."""
+    return Traced.of(params.get("jaxpr", params.get("call_jaxpr")))
+
+
+def branches(params: Params) -> list[Traced]:
+    """Return the functions of a condition, one of which is called."""
+    return [Traced.of(branch) for branch in params["branches"]]
+
+
+def source_line(equation: JaxprEqn) -> str:
+    """Return file and line of the innermost own code that asks for an equation, or ""."""
+    traceback = equation.source_info.traceback
+    for frame in traceback.frames if traceback is not None else ():
+        path = Path(frame.file_name)
+        if "slipid" in path.parts and "exports" not in path.parts:
+            start = len(path.parts) - 1 - path.parts[::-1].index("slipid")
+            return f"{'/'.join(path.parts[start:])}:{frame.line_num}"
+    return ""
+
+
+def unknown(what: str) -> DataError:
+    """Return the error for a version of JAX that writes something in an unsupported way."""
+    return DataError(
+        f"jax {jax.__version__} writes {what} in a way that this version of slipid does not know; "
+        f"expected a version that it knows: pip install 'jax{KNOWN}'"
+    )

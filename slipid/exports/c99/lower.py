@@ -1,0 +1,238 @@
+"""Lowering of traced functions to statements; constants are computed now, the rest on the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import prod
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import JaxprEqn, Var
+from jax.extend.core import Literal as JaxLiteral
+
+from slipid.exports.c99 import elementwise, moves, sums
+from slipid.exports.c99.builder import Builder
+from slipid.exports.c99.elementwise import BINARY, UNARY, Rule, Shaped
+from slipid.exports.c99.ir import (
+    Array,
+    At,
+    Cell,
+    CodeBlock,
+    Memory,
+    Nested,
+    NoFormError,
+    Statement,
+    Value,
+    cells_of,
+    in_memory,
+    kind_of_value,
+    longest,
+    varies,
+)
+from slipid.exports.c99.jaxpr import Params, ScanParameters, Traced, branches, called, source_line
+from slipid.exports.c99.moves import MOVES, SOURCES, moved
+from slipid.exports.c99.sources import along, rearranged
+from slipid.exports.c99.sums import REDUCED
+from slipid.exports.fields import DTYPES
+
+RULES: dict[str, Rule] = {
+    **{name: elementwise.unary(name) for name in UNARY},
+    **{name: elementwise.binary(name) for name in BINARY},
+    **{name: sums.reduced(name) for name in REDUCED},
+    "argmin": sums.argmin,
+    "convert_element_type": elementwise.converted,
+    "dot_general": sums.dot,
+    "dynamic_slice": moves.dynamic_slice,
+    "gather": moves.gather,
+    "integer_pow": elementwise.integer_pow,
+    "scatter": moves.scatter,
+    "scatter-add": moves.scattered("add", 0.0),
+    "scatter-mul": moves.scattered("mul", 1.0),
+    "select_n": elementwise.select,
+}
+"""Rule that turns a primitive into C, by its name.
+
+Primitives that only move numbers need no rule of their own: JAX itself is asked where the numbers
+of their result come from."""
+INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
+"""Primitives that call a function, which is inlined."""
+
+_TYPES = frozenset(map(np.dtype, ("float64", "int64", "int32", "bool")))
+"""Types of numbers that have a counterpart in C."""
+
+
+class UnsupportedError(Exception):
+    """A step that has no form in C, with the primitive and the line of Python that asks for it."""
+
+
+def lowered(builder: Builder, traced: Traced, values: Sequence[Value]) -> list[Value]:
+    """Return the results of a traced function of these values.
+
+    Raises:
+        UnsupportedError: it uses a primitive without a rule.
+        DataError: this version of JAX writes it in an unsupported way.
+    """
+    return _Lowering(builder).run(traced, values)
+
+
+class _Lowering:
+    def __init__(self, builder: Builder):
+        self._builder = builder
+
+    def run(self, traced: Traced, values: Sequence[Value]) -> list[Value]:
+        """Return the results of a function."""
+        jaxpr, known = traced.jaxpr, dict[Var, Value]()
+        known.update(zip(jaxpr.constvars, map(np.asarray, traced.constants), strict=True))
+        known.update(zip(jaxpr.invars, values, strict=True))
+
+        def of(atom: Var | JaxLiteral) -> Value:
+            return np.asarray(atom.val) if isinstance(atom, JaxLiteral) else known[atom]
+
+        for equation in jaxpr.eqns:
+            results = self._equation(equation, [_filled(of(atom)) for atom in equation.invars])
+            known.update(zip(equation.outvars, results, strict=True))
+        return [of(atom) for atom in jaxpr.outvars]
+
+    def _equation(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        name = equation.primitive.name
+        constant = not any(isinstance(v, Array) for v in values)
+        if name in INLINED:
+            return self.run(called(Params(equation)), values)
+        if constant:
+            return _evaluated(equation, values)
+        self._builder.source = source_line(equation) or self._builder.source
+        try:
+            return self._ruled(equation, values)
+        except NoFormError as error:
+            known = sorted({*RULES, *MOVES, *INLINED, "cond", "scan"})
+            raise UnsupportedError(
+                f"{self._builder.source}: '{name}' has no form in C ({error}); "
+                f"those that have one: {', '.join(known)}"
+            ) from error
+
+    def _ruled(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+        primitive, params, name = equation.primitive, Params(equation), equation.primitive.name
+        if name == "cond":
+            return self._cond(params, values)
+        if name == "scan":
+            return self._scan(params, values)
+        out: Any = equation.outvars[0].aval  # jax's type hides its attributes
+        shaped = Shaped(out.shape, out.dtype)
+        if out.dtype not in _TYPES:
+            raise NoFormError(f"numbers of type {out.dtype}")
+        where = [v for v in values[1:] if isinstance(v, Array)]
+        if name in ("split", "unstack"):
+            return self._several(equation, values[0])
+        if name in MOVES and not (name in SOURCES and where):
+            return [moved(primitive, SOURCES.get(name, 0))(self._builder, values, params, shaped)]
+        if name not in RULES:
+            raise NoFormError("no rule for it")
+        return [RULES[name](self._builder, values, params, shaped)]
+
+    def _several(self, equation: JaxprEqn, value: Value) -> list[Value]:
+        """Return the results of a primitive that takes an array apart."""
+        places = np.arange(prod(value.shape)).reshape(value.shape)
+        parts = equation.primitive.bind(places, **equation.params)
+        return [rearranged(self._builder, [value], np.asarray(part)) for part in parts]
+
+    def _cond(self, params: Params, values: list[Value]) -> list[Value]:
+        """Return the results of one of two functions."""
+        builder, which, choices = self._builder, values[0], branches(params)
+        if len(choices) != 2:
+            raise NoFormError("more than two branches")
+        if not isinstance(which, Array):
+            return lowered(builder, choices[int(np.clip(which, 0, 1))], values[1:])
+        bodies = [Builder(builder.names, builder) for _ in range(2)]
+        results = [
+            lowered(body, branch, values[1:]) for body, branch in zip(bodies, choices, strict=True)
+        ]
+        when = builder.compute("bool", "{0} != 0", (along(builder, which, (), None).item(),))
+        block = builder.append(nested=Nested(when, 1, bodies[::-1]))
+        out = []
+        for pair in zip(*results, strict=True):
+            memory = self._memory(pair[0], block)
+            for body, value in zip(bodies, pair, strict=True):
+                store(body, value, memory)
+            out.append(in_memory(memory, pair[0].shape))
+        return list(out)
+
+    def _memory(self, like: Value, block: CodeBlock) -> Memory:
+        number = self._builder.names.number()
+        return Memory(f"m{number}", kind_of_value(like), prod(like.shape), block)
+
+    def _scan(self, params: Params, values: list[Value]) -> list[Value]:
+        """Return the results of a function applied to its own result a fixed number of times."""
+        scan = ScanParameters.of(params)
+        carried, consts = scan.carried, scan.constants
+        if len(values) != carried + consts or len(scan.body.jaxpr.outvars) != carried:
+            raise NoFormError("a loop that goes through an array")
+        builder = self._builder
+        body = Builder(builder.names, builder)
+        body.turns = CodeBlock(builder, 0, nested=Nested(None, scan.turns, [body]))
+        begun = values[consts:]
+        memories = [self._memory(value, body.turns) for value in begun]
+        for value, memory in zip(begun, memories, strict=True):
+            store(builder, value, memory)
+        carry = [in_memory(m, v.shape) for m, v in zip(memories, begun, strict=True)]
+        results = lowered(body, scan.body, [*values[:consts], *carry])
+        names = frozenset(memory.name for memory in memories)
+        results = [apart(body, value, names) for value in results]
+        for value, memory in zip(results, memories, strict=True):
+            store(body, value, memory)
+        builder.put(body.turns)
+        return list(carry)
+
+
+def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
+    """Return a result without cells of memory that is about to be overwritten, by its names."""
+    if not isinstance(value, Array):
+        return value
+    lanes = 0 if value.axis is None else value.shape[value.axis]
+
+    def own(cell: Cell) -> Cell:
+        if not isinstance(cell, At) or cell.memory.name not in overwritten:
+            return cell
+        return builder.compute(cell.kind, "{0}", (cell,), lanes if varies(cell) else 0)
+
+    cells = [own(cell) for cell in value.cells.reshape(-1)]
+    return Array(value.shape, value.kind, value.axis, cells_of(value.cells.shape, cells))
+
+
+def store(builder: Builder, value: Value, memory: Memory) -> None:
+    """Write an array, in row-major order, into memory at the end of a builder's code."""
+    shape = value.shape
+    axis = value.axis if isinstance(value, Array) else longest(shape)
+    cells = along(builder, value, shape, axis)
+    places = np.arange(prod(shape)).reshape(shape)
+    lanes = 0 if axis is None else shape[axis]
+    rows = places.reshape(-1, 1) if axis is None else np.moveaxis(places, axis, -1)
+    end = builder.append(lanes)
+    for row, cell in zip(rows.reshape(-1, max(lanes, 1)), cells.reshape(-1), strict=True):
+        stride = int(row[1] - row[0]) if lanes > 1 else 0
+        text = f"{_place(memory, int(row[0]), stride)} = {{0}};"
+        end.statements.append(Statement(None, text, (cell,), memory, always=True))
+
+
+def _place(memory: Memory, offset: int, stride: int) -> str:
+    if memory.scalar:
+        return "{memory}"
+    if not stride:
+        return f"{{memory}}[{offset}]"
+    step = "l" if stride == 1 else f"{stride} * l"
+    return f"{{memory}}[{offset} + {step}]" if offset else f"{{memory}}[{step}]"
+
+
+def _filled(value: Value) -> Value:
+    """Return the value itself, or a constant if it has no numbers at all."""
+    return value if prod(value.shape) else np.zeros(value.shape, DTYPES[kind_of_value(value)])
+
+
+def _evaluated(equation: JaxprEqn, values: list[Value]) -> list[Value]:
+    """Return results that depend on constants alone."""
+    avals: list[Any] = [atom.aval for atom in equation.invars]
+    inputs = [jax.numpy.asarray(v, a.dtype) for v, a in zip(values, avals, strict=True)]
+    with jax.ensure_compile_time_eval():
+        result = equation.primitive.bind(*inputs, **equation.params)
+    many = equation.primitive.multiple_results
+    return [np.asarray(x) for x in (result if many else [result])]

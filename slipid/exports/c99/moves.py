@@ -1,0 +1,161 @@
+"""Rules of primitives that take arrays apart and join them, at constant or variable places."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import prod
+
+import numpy as np
+from jax import lax
+from jax.extend.core import Primitive
+
+from slipid.exports.c99.builder import Builder
+from slipid.exports.c99.elementwise import Rule, Shaped, binary
+from slipid.exports.c99.ir import (
+    Array,
+    At,
+    Cell,
+    Constant,
+    NoFormError,
+    Value,
+    Variable,
+    cells_of,
+    longest,
+    varies,
+)
+from slipid.exports.c99.jaxpr import Params
+from slipid.exports.c99.sources import along, contiguous, rearranged
+
+MOVES = frozenset(
+    {
+        *("broadcast_in_dim", "concatenate", "dynamic_slice", "expand_dims", "gather", "pad"),
+        *("reshape", "rev", "slice", "split", "squeeze", "stack", "transpose", "unstack"),
+    }
+)
+"""Primitives that only move numbers, if their places are constant."""
+SOURCES = {"gather": 1, "dynamic_slice": 1}
+"""Number of first arguments that a primitive moves, the others being places; all by default."""
+
+
+def moved(primitive: Primitive, sources: int) -> Rule:
+    """Return the rule of a primitive that moves numbers of its first arguments.
+
+    The other arguments must be constant.
+    """
+
+    def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
+        taken = values[:sources] if sources else values
+        starts = np.cumsum([0, *(prod(v.shape) for v in taken)])
+        places = [
+            start + np.arange(prod(v.shape)).reshape(v.shape)
+            for start, v in zip(starts, taken, strict=False)
+        ]
+        moved_places = primitive.bind(*places, *values[len(taken) :], **params)
+        return rearranged(builder, taken, np.asarray(moved_places))
+
+    return rule
+
+
+def scatter(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
+    """Return an array with some numbers replaced at constant places."""
+    old, where, new = values
+    fresh = old_size = prod(old.shape)
+    places = _scattered(np.arange(old_size).reshape(old.shape), where, new.shape, params, fresh)
+    return rearranged(builder, [old, new], places)
+
+
+def scattered(name: str, neutral: float) -> Rule:
+    """Return the rule of a primitive that adds to or multiplies numbers at constant places.
+
+    Each place may occur once.
+    """
+
+    def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
+        old, where, new = values
+        size = prod(new.shape)
+        places = _scattered(np.full(old.shape, size), where, new.shape, params, 0)
+        others = rearranged(builder, [new, np.asarray([neutral])], places)
+        return binary(name)(builder, [old, others], params, out)
+
+    return rule
+
+
+def _scattered(
+    old: np.ndarray, where: Value, shape: tuple[int, ...], params: Params, fresh: int
+) -> np.ndarray:
+    """Return where every number comes from: `old`, or new ones numbered from `fresh`."""
+    if isinstance(where, Array):
+        raise NoFormError("places that are not known before the robot runs")
+    kept = {k: params[k] for k in ("dimension_numbers", "indices_are_sorted", "mode")}
+    new = fresh + np.arange(prod(shape)).reshape(shape)
+    options = {**kept, "unique_indices": False}
+    times = lax.scatter_add(np.zeros(old.shape, int), where, np.ones(shape, int), **options)
+    if np.max(times, initial=0) > 1:
+        raise NoFormError("a place that is written twice")
+    return np.asarray(lax.scatter(old, where, new, **options))
+
+
+def dynamic_slice(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
+    """Return a part of an array from a place that is known at run time."""
+    whole, starts, sizes = values[0], values[1:], params["slice_sizes"]
+    memory = contiguous(builder, whole)
+    base = _offset(builder, [along(builder, s, (), None).item() for s in starts], whole, sizes)
+    inner = np.arange(prod(whole.shape)).reshape(whole.shape)
+    places = inner[tuple(slice(0, n) for n in sizes)]
+    axis = longest(places.shape)
+    if axis is None:
+        cells: list[Cell] = [At(memory, int(k), index=base) for k in places.reshape(-1)]
+        return Array(places.shape, memory.kind, None, cells_of(places.shape, cells))
+    rows = np.moveaxis(places, axis, -1)
+    flat = rows.reshape(-1, rows.shape[-1])
+    cells = [At(memory, int(r[0]), int(r[1] - r[0]), index=base) for r in flat]
+    return Array(places.shape, memory.kind, axis, cells_of(rows.shape[:-1], cells))
+
+
+def _offset(
+    builder: Builder, starts: Sequence[Cell], whole: Value, sizes: Sequence[int], lanes: int = 0
+) -> Variable:
+    """Return the position of the first number of a part of an array, limited to its bounds.
+
+    There is one for every lane if any start differs from lane to lane.
+    """
+    terms, cells = [], []
+    for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
+        most, stride = whole.shape[axis] - size, prod(whole.shape[axis + 1 :])
+        if most:
+            terms.append(f"i_min(i_max({{{len(cells)}}}, 0), {most}) * {stride}")
+            cells.append(start)
+    count = lanes if any(map(varies, cells)) else 0
+    return builder.compute("int", " + ".join(terms) or "0", tuple(cells), count)
+
+
+def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
+    """Return parts of an array from places that are known at run time, limited to its bounds."""
+    whole, where = values
+    numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
+    if numbers.operand_batching_dims or numbers.start_indices_batching_dims:
+        raise NoFormError("batches of places")
+    if params["mode"] == lax.GatherScatterMode.FILL_OR_DROP:
+        raise NoFormError("places out of range that are filled")
+    memory = contiguous(builder, whole)
+    batch = [d for d in range(len(out.shape)) if d not in numbers.offset_dims]
+    kept = [d for d in range(len(whole.shape)) if d not in numbers.collapsed_slice_dims]
+    own = where.axis if isinstance(where, Array) else None
+    axis = None if own is None else batch[own]
+    lanes = 0 if own is None else where.shape[own]
+    places = along(builder, where, where.shape, own)
+    strides = [prod(whole.shape[d + 1 :]) for d in range(len(whole.shape))]
+    shape = tuple(n for d, n in enumerate(out.shape) if d != axis)
+    rest = [d for d in range(len(out.shape)) if d != axis]
+    cells: list[Cell] = []
+    for at in np.ndindex(*shape):
+        place = dict(zip(rest, at, strict=True))
+        row = places[tuple(place[d] for d in batch if d != axis)]
+        starts: list[Cell] = [Constant(0, "int")] * len(whole.shape)
+        for k, d in enumerate(numbers.start_index_map):
+            starts[d] = row[k]
+        base = _offset(builder, starts, whole, sizes, lanes)
+        inner = sum(place[o] * strides[d] for o, d in zip(numbers.offset_dims, kept, strict=True))
+        read = At(memory, inner, index=base)
+        cells.append(builder.compute(memory.kind, "{0}", (read,), base.lanes))
+    return Array(out.shape, memory.kind, axis, cells_of(shape, cells))

@@ -1,0 +1,289 @@
+"""Arrays of cells: taken apart, rearranged, and brought to the same lanes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import prod
+
+import numpy as np
+
+from slipid.exports.c99.builder import Builder
+from slipid.exports.c99.ir import (
+    LANES,
+    Array,
+    At,
+    Cell,
+    Cells,
+    Constant,
+    Memory,
+    Value,
+    Variable,
+    cells_of,
+    in_memory,
+    kind_of_value,
+    longest,
+    varies,
+)
+from slipid.exports.fields import kind_of
+
+UNROLLED = 64
+"""Largest count of numbers for which an array without lanes stays unrolled."""
+
+
+class Sources:
+    """Numbers of some arrays, one after the other.
+
+    Attributes:
+        constant: whether all are constants.
+        numbers: the constants, if all are.
+        kind: kind of the numbers.
+    """
+
+    def __init__(self, builder: Builder, sources: Sequence[Value]):
+        self._builder, self._sources = builder, sources
+        sizes = [prod(s.shape) for s in sources]
+        self._starts = np.concatenate([[0], np.cumsum(sizes)])
+        self.constant = not any(isinstance(s, Array) for s in sources)
+        self.kind = kind_of_value(sources[0])
+        flat = [np.asarray(s).reshape(-1) for s in sources if not isinstance(s, Array)]
+        self.numbers = np.concatenate(flat) if self.constant else np.zeros(0)
+        self._ones: dict[int, Cell] = {}
+
+    def _source(self, place: int) -> tuple[Value, int]:
+        k = int(np.searchsorted(self._starts, place, side="right")) - 1
+        return self._sources[k], place - int(self._starts[k])
+
+    def best_axis(self, places: np.ndarray) -> int | None:
+        """Return the axis along which most rows are lanes of a source already; None if none is."""
+        free = {axis: self._free(places, axis) for axis in range(places.ndim)}
+        axis = max(free, key=lambda a: (free[a], places.shape[a], a), default=None)
+        if axis is not None and 2 * free[axis] * places.shape[axis] >= places.size > 0:
+            return axis
+        return longest(places.shape) if self._laned(places) else None
+
+    def _laned(self, places: np.ndarray) -> bool:
+        """Return whether the result has lanes, being long and not one number repeated."""
+        return len(np.unique(places)) > UNROLLED or max(places.shape, default=0) >= 2 * LANES
+
+    def _free(self, places: np.ndarray, axis: int) -> int:
+        rows = np.moveaxis(places, axis, -1)
+        if rows.shape[-1] < 2:
+            return 0
+        flat = rows.reshape(-1, rows.shape[-1])
+        return sum(self._lanes(row) is not None for row in flat)
+
+    def _lanes(self, row: np.ndarray) -> Cell | None:
+        """Return the cell of a source whose lanes are exactly this row, or None."""
+        source, first = self._source(int(row[0]))
+        if not isinstance(source, Array) or source.axis is None:
+            return None
+        if source.shape[source.axis] != len(row):
+            return None
+        at = np.unravel_index(first, source.shape)
+        if at[source.axis] != 0:
+            return None
+        stride = prod(source.shape[source.axis + 1 :])
+        if not np.array_equal(row, row[0] + stride * np.arange(len(row))):
+            return None
+        cell: Cell = source.cells[tuple(a for k, a in enumerate(at) if k != source.axis)]
+        return cell
+
+    def one(self, place: int) -> Cell:
+        """Return the number at a place."""
+        if place not in self._ones:
+            self._ones[place] = self._one(place)
+        return self._ones[place]
+
+    def _one(self, place: int) -> Cell:
+        source, inner = self._source(place)
+        if not isinstance(source, Array):
+            return Constant(source.reshape(-1)[inner].item(), kind_of(source.dtype))
+        at = np.unravel_index(inner, source.shape)
+        cell: Cell = source.cells[tuple(a for k, a in enumerate(at) if k != source.axis)]
+        if not varies(cell):
+            return cell
+        assert source.axis is not None
+        lane = int(at[source.axis])
+        if isinstance(cell, Variable):
+            return At(cell.memory, lane)
+        assert isinstance(cell, At)
+        if cell.table is not None:
+            return At(cell.memory, int(_values(cell.table)[lane]))
+        return At(cell.memory, cell.offset + cell.stride * lane, index=cell.index)
+
+    def row(self, row: np.ndarray) -> Cell:
+        """Return the cell whose lanes are the numbers at these places."""
+        lanes = self._lanes(row)
+        if lanes is not None:
+            return lanes
+        cells = [self.one(int(place)) for place in row]
+        if all(cell == cells[0] for cell in cells):
+            return cells[0]
+        if all(isinstance(cell, Constant) for cell in cells):
+            values = np.array([cell.value for cell in cells if isinstance(cell, Constant)])
+            return At(self._builder.names.table(values, self.kind), 0, 1)
+        places = _places(cells)
+        if places is None and self._laned_source(row):
+            source, _ = self._source(int(row[0]))
+            moved = contiguous(self._builder, source)
+            cells = [At(moved, self._source(int(place))[1]) for place in row]
+            places = _places(cells)
+        if places is None:
+            return At(self.copied(row), 0, 1)
+        first = cells[0]
+        assert isinstance(first, At)
+        stride = int(places[1] - places[0])
+        if np.array_equal(places, places[0] + stride * np.arange(len(places))):
+            return At(first.memory, int(places[0]), stride, first.index)
+        if first.index is not None:
+            return At(self.copied(row), 0, 1)
+        return At(first.memory, 0, table=self._builder.names.table(places, "int"))
+
+    def _laned_source(self, row: np.ndarray) -> bool:
+        """Return whether all of a row comes from one array that has lanes."""
+        source, _ = self._source(int(row[0]))
+        same = all(self._source(int(place))[0] is source for place in row)
+        return same and isinstance(source, Array) and source.axis is not None
+
+    def copied(self, places: np.ndarray) -> Memory:
+        """Return memory that holds these numbers side by side, without a copy where it exists."""
+        cells = [self.one(int(place)) for place in places]
+        offsets = _places(cells)
+        first = cells[0]
+        if offsets is not None and isinstance(first, At) and first.index is None:
+            whole = first.memory.size == len(cells)
+            if whole and np.array_equal(offsets, np.arange(len(cells))):
+                return first.memory
+        memory = self._builder.array(self.kind, len(cells), tuple(dict.fromkeys(cells)))
+        start = 0
+        for group in _runs(cells):
+            self._copy(memory, start, group)
+            start += len(group)
+        return memory
+
+    def _copy(self, memory: Memory, start: int, group: list[Cell]) -> None:
+        """Fill memory from a place with evenly spaced numbers, or with one."""
+        first = group[0]
+        if len(group) == 1:
+            self._builder.fill(memory, f"{{memory}}[{start}] = {{0}};", first)
+            return
+        assert isinstance(first, At)
+        second = group[1]
+        assert isinstance(second, At)
+        many = At(first.memory, first.offset, second.offset - first.offset, first.index)
+        self._builder.fill(memory, f"{{memory}}[{start} + l] = {{0}};", many, len(group))
+
+
+def contiguous(builder: Builder, value: Value) -> Memory:
+    """Return memory that holds an array in row-major order."""
+    if not isinstance(value, Array):
+        return builder.names.table(value, kind_of(value.dtype))
+    key = id(value.cells)
+    if key not in builder.contiguous:
+        builder.contiguous[key] = value, _contiguous(builder, value)
+    return builder.contiguous[key][1]
+
+
+def _contiguous(builder: Builder, value: Array) -> Memory:
+    places = np.arange(prod(value.shape))
+    flat = value.cells.reshape(-1)
+    stored = in_memory(flat[0].memory, value.shape) if isinstance(flat[0], At) else None
+    if (
+        stored is not None
+        and stored.axis == value.axis
+        and bool((stored.cells == value.cells).all())
+    ):
+        return flat[0].memory
+    if value.axis is None:
+        return Sources(builder, [value]).copied(places)
+    lanes = value.shape[value.axis]
+    stride = prod(value.shape[value.axis + 1 :])
+    starts = np.take(places.reshape(value.shape), 0, value.axis).reshape(-1)
+    cells = tuple(flat)
+    memory = builder.array(value.kind, len(places), cells, lanes)
+    for start, cell in zip(starts, cells, strict=True):
+        builder.fill(memory, f"{{memory}}[{start} + {stride} * l] = {{0}};", cell)
+    return memory
+
+
+def _values(table: Memory) -> np.ndarray:
+    return np.frombuffer(table.values, dtype=np.int64)
+
+
+def _places(cells: Sequence[Cell]) -> np.ndarray | None:
+    """Return offsets of cells that are all in one memory; None if they are not."""
+    first = cells[0]
+    for cell in cells:
+        if not isinstance(cell, At) or not isinstance(first, At):
+            return None
+        if cell.memory != first.memory or cell.index is not first.index:
+            return None
+    return np.array([cell.offset for cell in cells if isinstance(cell, At)])
+
+
+def _runs(cells: Sequence[Cell]) -> list[list[Cell]]:
+    """Return cells in their order, grouped where three or more are evenly spaced in one memory."""
+    runs: list[list[Cell]] = []
+    for cell in cells:
+        if runs and _goes_on(runs[-1], cell):
+            runs[-1].append(cell)
+        else:
+            runs.append([cell])
+    return [part for run in runs for part in ([run] if len(run) > 2 else [[c] for c in run])]
+
+
+def _goes_on(run: list[Cell], cell: Cell) -> bool:
+    places = _places([*run[-2:], cell])
+    if places is None:
+        return False
+    return len(places) < 3 or bool(places[2] - places[1] == places[1] - places[0])
+
+
+def rearranged(
+    builder: Builder, sources: Sequence[Value], places: np.ndarray, axis: int | None = -1
+) -> Value:
+    """Return the array whose numbers are at these places of all sources, flat and joined.
+
+    Args:
+        builder: builder of the code.
+        sources: arrays.
+        places: place of every number of the result.
+        axis: axis of the result's lanes, None for none; by default the cheapest one.
+    """
+    known = Sources(builder, sources)
+    if known.constant:
+        return known.numbers[places]
+    if axis == -1:
+        axis = known.best_axis(places)
+    if axis is None:
+        cells = [known.one(int(k)) for k in places.reshape(-1)]
+        return Array(places.shape, known.kind, None, cells_of(places.shape, cells))
+    rows = np.moveaxis(places, axis, -1)
+    cells = [known.row(row) for row in rows.reshape(-1, rows.shape[-1])]
+    return Array(places.shape, known.kind, axis, cells_of(rows.shape[:-1], cells))
+
+
+def along(builder: Builder, value: Value, shape: tuple[int, ...], axis: int | None) -> Cells:
+    """Return the cells of a value broadcast to a shape, with lanes along an axis."""
+    if not isinstance(value, Array):
+        value = np.broadcast_to(value, shape)
+        if axis is None:
+            flat = [Constant(x, kind_of(value.dtype)) for x in value.reshape(-1).tolist()]
+            return cells_of(shape, flat)
+        rows = np.moveaxis(value, axis, -1)
+        cells = [_table(builder, row) for row in rows.reshape(-1, rows.shape[-1])]
+        return cells_of(rows.shape[:-1], cells)
+    if value.axis == axis and value.shape == shape:
+        return value.cells
+    places = np.arange(prod(value.shape)).reshape(value.shape)
+    moved = rearranged(builder, [value], np.broadcast_to(places, shape), axis)
+    assert isinstance(moved, Array)
+    return moved.cells
+
+
+def _table(builder: Builder, row: np.ndarray) -> Cell:
+    """Return a row of constants as a cell."""
+    kind = kind_of(row.dtype)
+    if row.tobytes() == len(row) * row[:1].tobytes():
+        return Constant(row[0].item(), kind)
+    return At(builder.names.table(row, kind), 0, 1)

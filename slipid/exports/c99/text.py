@@ -1,0 +1,298 @@
+"""Statements as text of C99: which of them are used, and which arrays can share memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from slipid.exports.c99.builder import Builder
+from slipid.exports.c99.ir import At, Cell, CodeBlock, Constant, Memory, Nested, Statement, Variable
+from slipid.exports.fields import DTYPES, Kind
+
+
+class Usage:
+    """Use of the statements and arrays of a builder.
+
+    It is determined backwards from the end, since a statement is needed if a later one uses its
+    result; steps are numbered downwards, so that earlier ones have smaller numbers.
+
+    Attributes:
+        live: identities of the statements that are needed.
+        read: names of all memory that is read.
+        shared: kind and name of the array on the stack for each memory, by the memory's name.
+        sizes: sizes of all arrays on the stack, by kind and name.
+    """
+
+    def __init__(self, builder: Builder):
+        self.live: set[int] = set()
+        self.read: set[str] = set()
+        self._used: set[Variable] = set()
+        self._lives: dict[str, _Life] = {}
+        self._step = 0
+        self._scan(builder)
+        self.shared = _shared(list(self._lives.values()))
+        self.sizes: dict[tuple[Kind, str], int] = {}
+        for name, array in self.shared.items():
+            self.sizes[array] = self._lives[name].memory.size
+
+    def _scan(self, builder: Builder) -> None:
+        """Mark what is used, from the end to the beginning."""
+        for block in reversed(builder.blocks):
+            self._step -= 1
+            if block.nested is not None:
+                self._inside(block.nested)
+                if block.nested.when is not None:
+                    self._uses(block.nested.when, block)
+            for statement in reversed(block.statements):
+                if self._needed(statement):
+                    self._mark(statement, block)
+
+    def _mark(self, statement: Statement, block: CodeBlock) -> None:
+        """Mark a statement as needed, with everything that it uses."""
+        self.live.add(id(statement))
+        writes, target = statement.writes, statement.target
+        if writes is not None and writes.home is not None:
+            self._use_array(writes)
+        if target is not None and target.lanes and target.memory.name in self._lives:
+            self._use_array(target.memory)
+        for cell in statement.cells:
+            self._uses(cell, block)
+
+    def _inside(self, nested: Nested) -> None:
+        """Mark what bodies use; memory from before a repetition is live until its end."""
+        end = self._step
+        for body in nested.bodies:
+            self._scan(body)
+        for life in self._lives.values():
+            if life.first < end and not _within(life.memory, nested):
+                life.last = max(life.last, end)
+        self._step -= 1
+
+    def _needed(self, statement: Statement) -> bool:
+        if statement.target is None:
+            written = statement.writes
+            return statement.always or (written is not None and written.name in self.read)
+        return statement.target in self._used or statement.target.memory.name in self.read
+
+    def _uses(self, cell: Cell, block: CodeBlock) -> None:
+        if isinstance(cell, Variable):
+            self._used.add(cell)
+            if cell.lanes and cell.home is not block:
+                self._keep(cell.memory)
+        elif isinstance(cell, At):
+            self._keep(cell.memory)
+            if cell.table is not None:
+                self.read.add(cell.table.name)
+            if cell.index is not None:
+                self._uses(cell.index, block)
+
+    def _keep(self, memory: Memory) -> None:
+        self.read.add(memory.name)
+        if memory.home is not None:
+            self._use_array(memory)
+
+    def _use_array(self, memory: Memory) -> None:
+        """Mark an array as used in this step."""
+        life = self._lives.setdefault(memory.name, _Life(memory, self._step, self._step))
+        life.first = min(life.first, self._step)
+
+
+@dataclass
+class _Life:
+    """First and last step of the program that use an array."""
+
+    memory: Memory
+    first: int
+    last: int
+
+
+def _within(memory: Memory, nested: Nested) -> bool:
+    """Return whether memory is filled within the bodies of a condition or repetition."""
+    owner = None if memory.home is None else memory.home.owner
+    while owner is not None and owner not in nested.bodies:
+        owner = owner.parent
+    return owner is not None
+
+
+def _shared(arrays: list[_Life]) -> dict[str, tuple[Kind, str]]:
+    """Return kind and name of an array for each; those used one after another share one."""
+    slots: dict[tuple[Kind, int], list[_Life]] = {}
+    names: dict[str, tuple[Kind, str]] = {}
+    for life in sorted(arrays, key=lambda life: life.first):
+        memory = life.memory
+        kind: Kind = "real" if memory.lanes and memory.kind == "bool" else memory.kind
+        taken = slots.setdefault((kind, memory.size), [])
+        free = next((k for k, other in enumerate(taken) if other.last < life.first), len(taken))
+        taken[free : free + 1] = [life]
+        names[memory.name] = kind, f"{kind[0]}{memory.size}_{free}"
+    return names
+
+
+TYPES: dict[Kind, str] = {"real": "real_t", "int": "int32_t", "bool": "bool"}
+"""Types of numbers in C."""
+WIDTH = 100
+FLOAT_MAX = float(np.finfo(np.float32).max)
+
+
+def number(value: float | int | bool, kind: Kind) -> str:
+    """Return a constant as text."""
+    if kind == "bool":
+        return "true" if value else "false"
+    if kind == "int":
+        return str(int(value)) if value >= 0 else f"({int(value)})"
+    if math.isnan(value):
+        return "R_NAN"
+    if math.isinf(value):
+        return "R_INFINITY" if value > 0 else "(-R_INFINITY)"
+    if abs(value) > FLOAT_MAX:
+        return f"R_WIDE({float(value)!r})"
+    return f"R({float(value)!r})"
+
+
+def table(memory: Memory) -> list[str]:
+    """Return the definition of a table of constants."""
+    values = np.frombuffer(memory.values, dtype=DTYPES[memory.kind]).tolist()
+    small = memory.kind == "int" and min(values) >= 0 and max(values) < 2**15
+    kind = "int16_t" if small else TYPES[memory.kind]
+    lines = wrapped((number(value, memory.kind) for value in values), "  ")
+    return [f"static const {kind} {memory.name}[{memory.size}] = {{", *lines, "};"]
+
+
+def wrapped(words: Iterable[str], indent: str) -> list[str]:
+    """Return words with commas between them in lines."""
+    lines, line = [], indent
+    for word in words:
+        if len(line) + len(word) + 2 > WIDTH and line.strip():
+            lines.append(line.rstrip())
+            line = indent
+        line += f"{word}, "
+    return [*lines, line.rstrip().rstrip(",")]
+
+
+class FunctionBody:
+    """Text of the code of a builder, without unused statements.
+
+    Attributes:
+        reads: names of all memory that is read.
+        scratch: count of the numbers in arrays on the stack.
+    """
+
+    def __init__(self, builder: Builder):
+        self._usage = Usage(builder)
+        self._source = ""
+        self._lines = self._text(builder, "  ")
+        self.reads = frozenset(self._usage.read)
+        self.scratch = sum(self._usage.sizes.values())
+
+    def lines(self) -> list[str]:
+        """Return declarations and statements."""
+        sizes = self._usage.sizes
+        arrays = [f"  {TYPES[kind]} {name}[{size}];" for (kind, name), size in sizes.items()]
+        return [*arrays, *self._lines]
+
+    def _text(self, builder: Builder, indent: str) -> list[str]:
+        lines: list[str] = []
+        for block in builder.blocks:
+            lines += self._nested(block, indent) if block.nested else self._block(block, indent)
+        return lines
+
+    def _nested(self, block: CodeBlock, indent: str) -> list[str]:
+        nested = block.nested
+        assert nested is not None
+        bodies = [self._text(body, indent + "  ") for body in nested.bodies]
+        if nested.when is not None:
+            yes, no = bodies
+            head = f"{indent}if ({self._cell(nested.when, block)}) {{"
+            return [head, *yes, f"{indent}}} else {{", *no, f"{indent}}}"]
+        head = f"{indent}for (int32_t turn = 0; turn < {nested.times}; ++turn) {{"
+        return [head, *bodies[0], f"{indent}}}"]
+
+    def _block(self, block: CodeBlock, indent: str) -> list[str]:
+        live = [s for s in block.statements if id(s) in self._usage.live]
+        if not block.lanes:
+            return [line for s in live for line in self._statement(s, block, indent)]
+        if not live:
+            return []
+        sums = [s for s in live if s.start]
+        begun = [
+            f"{indent}{TYPES[s.target.kind]} t{s.target.number} = {s.start};"
+            for s in sums
+            if s.target is not None
+        ]
+        inner = indent + "  "
+        body = [line for s in live for line in self._statement(s, block, inner)]
+        head = f"{indent}for (int32_t l = 0; l < {block.lanes}; ++l) {{"
+        return [*begun, head, *body, f"{indent}}}"]
+
+    def _statement(self, statement: Statement, block: CodeBlock, indent: str) -> list[str]:
+        cells = [self._cell(cell, block) for cell in statement.cells]
+        target = statement.target
+        if target is None:
+            return self._write(statement, cells, indent)
+        name = f"t{target.number}"
+        text = statement.template.format(*cells, acc=name)
+        declared = "" if statement.start else f"const {TYPES[target.kind]} "
+        lines = [*self._where(statement, indent), *folded(f"{declared}{name} = {text};", indent)]
+        if target.lanes and target.memory.name in self._usage.read:
+            kept = f"{name} ? R(1.0) : R(0.0)" if target.kind == "bool" else name
+            lines.append(f"{indent}{self._name(target.memory)}[l] = {kept};")
+        return lines
+
+    def _write(self, statement: Statement, cells: list[str], indent: str) -> list[str]:
+        """Return a statement that fills memory, in a loop if it fills several numbers."""
+        assert statement.writes is not None
+        text = statement.template.format(*cells, memory=self._name(statement.writes))
+        if statement.times:
+            head = f"for (int32_t l = 0; l < {statement.times}; ++l) {{"
+            return [f"{indent}{head} {text} }}"]
+        return [f"{indent}{text}"]
+
+    def _where(self, statement: Statement, indent: str) -> list[str]:
+        """Return a comment with the line of Python of a statement, where it changes."""
+        if statement.source == self._source:
+            return []
+        self._source = statement.source
+        return [f"{indent}/* {statement.source} */"] if statement.source else []
+
+    def _cell(self, cell: Cell, block: CodeBlock) -> str:
+        if isinstance(cell, Constant):
+            return number(cell.value, cell.kind)
+        if isinstance(cell, Variable):
+            away = cell.lanes and cell.home is not block
+            return self._number(cell.memory, "l") if away else f"t{cell.number}"
+        if cell.memory.scalar:
+            return cell.memory.name
+        if cell.table is not None:
+            return self._number(cell.memory, f"{cell.table.name}[l]")
+        terms = [str(cell.offset)] if cell.offset or not (cell.stride or cell.index) else []
+        if cell.stride:
+            terms.append("l" if cell.stride == 1 else f"{cell.stride} * l")
+        if cell.index is not None:
+            terms.append(self._cell(cell.index, block))
+        return self._number(cell.memory, " + ".join(terms))
+
+    def _number(self, memory: Memory, place: str) -> str:
+        """Return the text of a number in memory."""
+        text = f"{self._name(memory)}[{place}]"
+        return f"({text} != R(0.0))" if memory.lanes and memory.kind == "bool" else text
+
+    def _name(self, memory: Memory) -> str:
+        """Return the name in C: that of the shared array on the stack, or its own."""
+        shared = self._usage.shared.get(memory.name)
+        return memory.name if shared is None else shared[1]
+
+
+def folded(text: str, indent: str) -> list[str]:
+    """Return a long statement over several lines."""
+    if len(indent) + len(text) <= WIDTH:
+        return [indent + text]
+    lines, line = [], indent
+    for word in text.split(" "):
+        if len(line) + len(word) > WIDTH:
+            lines.append(line.rstrip())
+            line = indent + "    "
+        line += word + " "
+    return [*lines, line.rstrip()]

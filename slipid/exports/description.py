@@ -1,0 +1,207 @@
+"""Texts that all exported files share: numbers of a robot, their origin, warnings, README."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+
+import numpy as np
+
+from slipid.exports.text import listed, one_line, wrapped
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.record import Pair, Provenance, Source, Verdict
+from slipid.robot.robot_file import declared_numbers
+
+VERDICTS: Mapping[Verdict, str] = {
+    "identified": "the logs decide it; use it",
+    "weak": "the logs narrow it, yet what was assumed before still counts: mind its interval",
+    "disputed": "floors disagree about it: use it where it was seen, and not beyond",
+    "not_identified": "the logs say next to nothing of it: the value is what was assumed before, "
+    "no measurement. Do not build on it without measuring it otherwise",
+    "at_bound": "the logs push it to an end of what is possible: the value is that end. The model, "
+    "or a number that was held fixed, may be wrong",
+    "fixed": "it was given and not fitted: as good as who gave it",
+}
+PROVENANCES: Mapping[Provenance, str] = {
+    "measured": "the logs decide",
+    "borrowed": "what was assumed before decides: a default, a data sheet, a prior",
+    "override": "it was held at a chosen value",
+}
+WARNED_VERDICTS: tuple[Verdict, ...] = ("not_identified", "at_bound", "disputed")
+"""Verdicts about which a user must be warned."""
+
+
+@dataclass(frozen=True)
+class NumberRow:
+    """One number of a robot, as a row of a table.
+
+    Attributes:
+        group: key of its table.
+        name: name of the number, which is its path if it is in robot.json.
+        entry: "wheel 2" for example, empty for a number of the whole robot.
+        symbol: symbol in equations.
+        value: value [unit].
+        unit: unit of the value.
+        interval90: 90 % interval [unit]; None where there is none.
+        verdict: how certain it is, as people read it.
+        provenance: its origin, as people read it.
+        about: meaning in words.
+    """
+
+    group: str
+    name: str
+    entry: str
+    symbol: str
+    value: float
+    unit: str
+    interval90: Pair | None
+    verdict: str
+    provenance: str
+    about: str
+
+    @property
+    def verdict_markdown(self) -> str:
+        """The verdict for Markdown, in bold where users must be warned."""
+        warned = self.verdict in map(verdict_text, WARNED_VERDICTS)
+        return f"**{self.verdict}**" if warned else self.verdict
+
+
+def verdict_text(verdict: Verdict) -> str:
+    """Return a verdict as people read it, in capitals where they must be warned."""
+    words = verdict.replace("_", " ")
+    return words.upper() if verdict in WARNED_VERDICTS else words
+
+
+def number_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
+    """Yield every number of a robot, those per wheel one by one."""
+    for e in declared_numbers(robot.record):
+        number, d, group = robot.record.parameters[e.path], e.declaration, e.path.partition(".")[0]
+        ends = np.reshape([] if number.interval90 is None else number.interval90, (-1, 2)).tolist()
+        for k, value in enumerate(np.ravel(number.value).tolist()):
+            entry = f"wheel {k + 1}" if isinstance(number.value, tuple) else ""
+            about = (d.symbol, value, d.unit, (ends[k][0], ends[k][1]) if ends else None)
+            sure = (verdict_text(number.verdict), number.provenance, d.doc)
+            yield NumberRow(group, e.path, entry, *about, *sure)
+
+
+def paths_with_verdict(robot: DeployedRobot, verdict: Verdict) -> tuple[str, ...]:
+    """Return the paths of the numbers with a verdict."""
+    known, numbers = robot.record.parameters, declared_numbers(robot.record)
+    return tuple(e.path for e in numbers if known[e.path].verdict == verdict)
+
+
+LIMITS: Mapping[str, tuple[str, str]] = {
+    "wheel_speed": ("rad/s", "largest speed of a wheel"),
+    "acceleration": ("rad/s^2", "largest change of a wheel's speed"),
+    "voltage": ("V", "of the supply"),
+    "twist": ("m/s", "largest speed asked of the body"),
+}
+"""Unit and meaning of every field of `slipid.robot.controller.Limits`."""
+
+
+def gains_origin(robot: DeployedRobot) -> str:
+    """Return sentences on the origin of a robot's gains, and that limits were not identified."""
+    limits = "Limits are the defaults of slipid: put in those of your motors and supply."
+    tuned = robot.record.gains
+    if tuned is None:
+        return f"Gains set by hand. {limits}"
+    if tuned.load != robot.load_setup:
+        load = one_line(tuned.load)
+        return f"Gains set by hand; those tuned are for the load set-up {load}. {limits}"
+    if not tuned.is_better:
+        return f"Gains set by hand; those tuned are {tuned.verdict}. {limits}"
+    loss = f"loss {tuned.loss.tuned:.1f} mm, by hand {tuned.loss.hand:.1f} mm"
+    gyro = "with a gyro" if tuned.gyro else "without a gyro"
+    return f"Gains tuned on the twin {gyro}: better than by hand in rehearsals ({loss}). {limits}"
+
+
+SOURCES: Mapping[Source, str] = {
+    "laplace": "a fit to logs (Laplace approximation)",
+    "posterior": "the posterior of a fit to logs",
+    "given": "given values, no logs",
+}
+WARNINGS: Mapping[Verdict, str] = {
+    "not_identified": "NOT IDENTIFIED, their values are assumed and no measurement",
+    "at_bound": "AT A BOUND, the model or a number that was held fixed may be wrong",
+    "disputed": "DISPUTED, floors disagree about them",
+}
+
+
+def header(robot: DeployedRobot) -> list[str]:
+    """Return lines of a comment without its sign: origin, floors, loads, verdicts and warnings.
+
+    Each is plain printable text, of 96 characters at most where no word is longer.
+    """
+    sentences = (*_sentences(robot), *(f"WARNING: {text}" for text in warnings(robot)))
+    return [line for sentence in sentences for line in wrapped(sentence)]
+
+
+def in_markdown(robot: DeployedRobot) -> list[str]:
+    """Return the head as Markdown, warnings first, with the messages of the fit."""
+    return [*warned(robot), *facts(robot)]
+
+
+def warned(robot: DeployedRobot) -> list[str]:
+    """Return the warnings as Markdown."""
+    return [line for text in warnings(robot) for line in (f"> **WARNING.** {text}", "")]
+
+
+def facts(robot: DeployedRobot) -> list[str]:
+    """Return origin, floors, loads, verdicts and messages of the fit as a list in Markdown."""
+    notes = (f"Note of the fit: {message}" for message in robot.record.messages)
+    return [*(f"- {one_line(part)}" for part in (*_sentences(robot), *notes)), ""]
+
+
+def warnings(robot: DeployedRobot) -> tuple[str, ...]:
+    """Return a warning for each verdict that some number has and that a user must know of."""
+    by_verdict = {verdict: paths_with_verdict(robot, verdict) for verdict in WARNED_VERDICTS}
+    return tuple(f"{WARNINGS[v]}: {listed(paths)}." for v, paths in by_verdict.items() if paths)
+
+
+def _sentences(robot: DeployedRobot) -> Iterator[str]:
+    """Yield sentences on origin, floors, loads and verdicts."""
+    record = robot.record
+    yield f"Made by slipid {made_with()} from robot.json; make it anew rather than change it."
+    yield f"Numbers: {record.numbers} (`numbers` of robot.json)."
+    yield f"They come from {SOURCES[record.source]}."
+    loads = listed([load.name for load in record.loads])
+    yield f"Load set-up: {one_line(robot.load_setup)}, of those known: {loads}."
+    yield f"Floors: {listed(robot.labels)}."
+    counts = Counter(record.parameters[e.path].verdict for e in declared_numbers(record))
+    listing = ", ".join(f"{n} {v.replace('_', ' ')}" for v, n in counts.most_common())
+    yield f"Verdicts: {listing}."
+
+
+def made_with() -> str:
+    """Return the version of slipid."""
+    try:
+        return version("slipid")
+    except PackageNotFoundError:
+        return "(not installed as a package)"
+
+
+ABOUT: Mapping[str, str] = {
+    "c": "estimator and controller in C99, with a test of themselves and an example; also a "
+    "library for PlatformIO and the Arduino IDE",
+    "ros2": "parameters for drive controllers of ros2_controllers, for robot_localization, and of "
+    "a node of your own with their declaration",
+    "stablehlo": "the same step for programs in JAX: `jax.export.deserialize`, or "
+    "`slipid.exports.stablehlo.load_program`, which compares it first",
+    "table": "gains, limits and matrices for a person who types them in",
+}
+
+
+def readme(robot: DeployedRobot, forms: Sequence[str], controller: str) -> str:
+    """Return the text of README.md."""
+    lines = [
+        "# One identified robot, ready to be taken along",
+        "",
+        *in_markdown(robot),
+        f"Everything here is made of `robot.json`, for the controller `{controller}`.",
+        "",
+        *(f"- `{form}/`: {ABOUT[form]}." for form in forms),
+        "",
+        "`sha256sum -c SHA256SUMS` tells whether a byte was changed; with slipid, "
+        "`slipid export --check` and this folder.",
+    ]
+    return "\n".join(lines) + "\n"

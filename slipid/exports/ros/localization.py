@@ -1,0 +1,201 @@
+"""Errors of odometry on each floor as variances for ROS messages, and filter parameters.
+
+Over a path length d [m] an error grows by a part that stays the same (effect e [per m]) and one
+that is drawn anew (process q [per sqrt(m)]), so that its variance is (e d)^2 + q^2 d. Odometry that
+ignores slip also has the slip of its wheels as an error: its e^2 is effect^2 + slip^2, slip being
+the root mean square over directions of travel of the contact model's slip. A constant covariance
+does not know the direction of travel, so x and y both get the larger of along and across. A wrong
+heading carries the robot sideways: with e_w and q_w of the yaw, by (e_w d^2 / 2)^2 + q_w^2 d^3 / 3.
+
+ROS drive controllers put one constant diagonal into every message, which is not a true covariance
+of odometry; it is taken at `DISTANCE_M`, and for twists at the highest speed of the fitted runs.
+
+The filter is robot_localization's extended Kalman filter for the odometry of a robot. Its state is
+x, y, z, roll, pitch, yaw, their rates in the body frame, and accelerations ahead, sideways and up;
+it adds process noise times the elapsed time.
+
+Source: github.com/cra-ros-pkg/robot_localization, params/ekf.yaml, `Ekf::predict`.
+"""
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.exports.ros.yaml_text import Parameter
+from slipid.exports.text import short
+from slipid.model import contact
+from slipid.model.contact_law import ContactSurface
+from slipid.robot.controller import Limits
+from slipid.robot.deployed import DeployedRobot, RobotArrays
+from slipid.robot.record import Axes, axes_of
+
+DISTANCE_M = 1.0
+"""Path length since the last correction of the pose for which constant variances hold [m]."""
+PERIOD_S = 0.02
+"""Time between two messages of odometry for which they hold [s]."""
+UNKNOWN = 1e6
+"""Variance of height, roll and pitch, which wheels do not measure."""
+DIRECTIONS = 24
+"""Number of directions of travel over which slip is averaged."""
+
+
+@dataclass(frozen=True)
+class OdometryErrors:
+    """Errors of odometry on a floor, along, across and in yaw.
+
+    Attributes:
+        floor: name of the floor.
+        process: std of random errors [m/sqrt(m)], [m/sqrt(m)], [rad/sqrt(m)].
+        effect: std of the contact model's effects [m/m], [m/m], [rad/m].
+        slip: slip of the wheels, which encoders do not measure [m/m], [m/m], [rad/m].
+    """
+
+    floor: str
+    process: Axes
+    effect: Axes
+    slip: Axes
+
+    @property
+    def stays(self) -> Axes:
+        """Error per metre that stays the same, of odometry that ignores slip."""
+        return axes_of(np.hypot(self.effect, self.slip))
+
+    def without_slip(self) -> "OdometryErrors":
+        """Return the errors of odometry that estimates slip: those of the contact model."""
+        return replace(self, slip=(0.0, 0.0, 0.0))
+
+    def pose(self, distance: float) -> Axes:
+        """Return the variance of x, y and heading after a path length [m^2, m^2, rad^2]."""
+        e, q = np.asarray(self.stays), np.asarray(self.process)
+        along, across, yaw = (e * distance) ** 2 + q**2 * distance
+        across += (e[2] * distance**2 / 2) ** 2 + q[2] ** 2 * distance**3 / 3
+        place = max(along, across)
+        return axes_of(np.array([place, place, yaw]))
+
+    def twist(self, speed: float, period: float) -> Axes:
+        """Return the variance of the velocity over one period, (e v)^2 + q^2 v / period."""
+        e, q = np.asarray(self.stays), np.asarray(self.process)
+        return _level((e * speed) ** 2 + q**2 * speed / period)
+
+    def walk(self, speed: float, distance: float) -> Axes:
+        """Return the variance per second of a random walk that errs by e d after d: e^2 d v."""
+        return _level(np.asarray(self.stays) ** 2 * distance * speed)
+
+
+def odometry_errors(robot: DeployedRobot) -> tuple[OdometryErrors, ...]:
+    """Return the errors of odometry on each floor, in the robot's order."""
+    slip = np.asarray(_slip(robot.arrays, jnp.asarray(top_speed(robot))))
+    process, effect = np.asarray(robot.process), np.asarray(robot.effect)
+    return tuple(
+        OdometryErrors(name, axes_of(process[k]), axes_of(effect[k]), axes_of(slip[k]))
+        for k, name in enumerate(robot.labels)
+    )
+
+
+def worst(errs: tuple[OdometryErrors, ...]) -> OdometryErrors:
+    """Return the errors on the floor with the largest position error after `DISTANCE_M`."""
+    return max(errs, key=lambda e: e.pose(DISTANCE_M)[0])
+
+
+def top_speed(robot: DeployedRobot) -> float:
+    """Return the highest rim speed of the fitted runs [m/s]."""
+    return float(robot.highest[0] * robot.frame.radius)
+
+
+def diagonal(planar: Axes) -> tuple[float, ...]:
+    """Return the variances of x, y, z, roll, pitch and yaw."""
+    x, y, yaw = planar
+    return (x, y, UNKNOWN, UNKNOWN, UNKNOWN, yaw)
+
+
+@eqx.filter_jit
+def _slip(robot: RobotArrays, speed: Float[Array, ""]) -> Float[Array, "floor 3"]:
+    """Return the root mean square slip per metre, along, across and in yaw."""
+    angle = jnp.linspace(0.0, 2 * jnp.pi, DIRECTIONS, endpoint=False)
+    twist = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(DIRECTIONS)], axis=-1)
+    rim = speed * twist @ robot.forward.T
+
+    def one(floor: ContactSurface) -> Array:
+        return jax.vmap(lambda r: contact.equilibrium(r, robot.frame, floor, robot.rest))(rim)
+
+    slip = twist - jax.vmap(one)(robot.floors) / speed
+    along = jnp.sum(slip * twist, axis=-1)
+    across = slip[..., 1] * twist[:, 0] - slip[..., 0] * twist[:, 1]
+    return jnp.sqrt(jnp.mean(jnp.stack([along, across, slip[..., 2]], axis=-1) ** 2, axis=1))
+
+
+def _level(row: Float[np.ndarray, "3"]) -> Axes:
+    """Return the same errors with the larger of along and across for both."""
+    return axes_of(np.array([row[:2].max(), row[:2].max(), row[2]]))
+
+
+NODE = "ekf_filter_node"
+_POSE = ("x", "y", "z", "roll", "pitch", "yaw")
+STATE = (*_POSE, *(f"v{name}" for name in _POSE), "ax", "ay", "az")
+FUSED = ("vx", "vy", "vyaw")
+"""States that the filter takes from odometry, whose pose is the sum of the same velocities."""
+HELD = 1e-6
+"""Process noise of the states that `two_d_mode` keeps at zero."""
+ACCELERATION = 0.01
+"""Process noise of accelerations, which nothing measures here: the package's own default."""
+
+
+def filter_parameters(
+    robot: DeployedRobot, errs: OdometryErrors, odometry: str, whose: str
+) -> tuple[Parameter, ...]:
+    """Return all parameters for odometry on a topic, of `whose` kind and with these errors."""
+    about = (
+        f"Odometry of {whose}. Velocities only are fused: its pose is their sum, and would count "
+        "twice. Order: " + ", ".join(STATE) + "."
+    )
+    return (
+        Parameter("frequency", 1 / PERIOD_S, "Assumed rate of the odometry [Hz]."),
+        Parameter("two_d_mode", True, "The robot stays on a plane."),
+        Parameter("publish_tf", True, _TF),
+        Parameter("odom_frame", "odom"),
+        Parameter("base_link_frame", "base_link"),
+        Parameter("world_frame", "odom"),
+        Parameter("odom0", odometry, about),
+        Parameter("odom0_config", tuple(name in FUSED for name in STATE), per_line=3),
+        Parameter("odom0_differential", False),
+        Parameter("odom0_relative", False),
+        Parameter("dynamic_process_noise_covariance", False, _DYNAMIC),
+        process_noise(robot, errs),
+    )
+
+
+def process_noise(robot: DeployedRobot, errs: OdometryErrors) -> Parameter:
+    """Return the process noise on a floor, 15 x 15 as rows."""
+    matrix, most = np.diag(_diagonal(robot, errs)), float(Limits().acceleration)
+    about = (
+        f"On '{errs.floor}'. Pose: errors that stay the same over the path, and so are no noise "
+        f"of single velocities, as a random walk with the same error after {short(DISTANCE_M)} m, "
+        f"at the highest speed of the fitted runs, {short(top_speed(robot))} m/s. Velocity: the "
+        f"change that the limit of wheel acceleration, {short(most)} rad/s^2, allows within "
+        f"{short(PERIOD_S)} s. Accelerations: the package's default. two_d_mode holds the rest."
+    )
+    entries = tuple(float(x) for x in matrix.reshape(-1))
+    return Parameter("process_noise_covariance", entries, about, per_line=len(STATE))
+
+
+def _diagonal(robot: DeployedRobot, errs: OdometryErrors) -> Float[np.ndarray, " state"]:
+    """Return process noise per second: `OdometryErrors.walk`, and (a T)^2 per period T."""
+    pose = errs.walk(top_speed(robot), DISTANCE_M)
+    change = float(Limits().acceleration) * float(robot.frame.radius)
+    speed, turn = change**2 * PERIOD_S, (change / float(robot.frame.base)) ** 2 * PERIOD_S
+    known = dict(zip(("x", "y", "yaw"), pose, strict=True))
+    known |= {"vx": speed, "vy": speed, "vyaw": turn, "ax": ACCELERATION, "ay": ACCELERATION}
+    return np.array([known.get(name, HELD) for name in STATE])
+
+
+_TF = (
+    "Only one node may publish this transform: set enable_odom_tf of the drive controller to false."
+)
+_DYNAMIC = (
+    "False: the pose grows uncertain while the robot stands, too. True would scale it with the "
+    "square of the speed, which ignores slow motion."
+)

@@ -1,0 +1,213 @@
+"""A control loop's step as StableHLO, for programs that run XLA without slipid.
+
+Arrays go in and come out in the order that `step.json` lists, with names, shapes and units.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import export
+from jaxtyping import Array
+
+from slipid.exports.fields import Struct
+from slipid.exports.golden import Golden, golden, loop_step
+from slipid.robot.closed_loop import ControlLoop
+from slipid.robot.interface import Measurement, Readings
+from slipid.robot.robot_file import typed
+from slipid.support.errors import DataError
+
+SCHEMA = "slipid.stablehlo/1"
+CLOSE = 1e-9
+"""Largest difference of a number, relative to its scale, once the program is loaded."""
+PLATFORMS = ("cpu", "cuda", "tpu")
+"""Platforms that the programs run on."""
+FILES = ("step.stablehlo", "step_batch.stablehlo", "step.json", "golden.npz")
+
+
+README = """# The step as StableHLO, for programs in JAX
+
+`step.json` lists the arrays that go in (`state`, then `given`) and come out (`state`, then `said`)
+in their order, all of them of 64 bits. `golden.npz` has the state of a robot at rest at 0, 0, 0 as
+`start0`, `start1` and so on, and steps to compare with.
+
+```python
+import jax, numpy as np
+
+jax.config.update("jax_enable_x64", True)
+step = jax.export.deserialize(bytearray(open("step.stablehlo", "rb").read()))
+kept = np.load("golden.npz")
+state = [kept[f"start{k}"] for k in range(sum(name.startswith("start") for name in kept))]
+found = step.call(*state, *given)  # given: reading, reference and dt, as step.json lists them
+state, said = found[: len(state)], found[len(state) :]
+```
+
+`step_batch.stablehlo` does the same for many robots, with an axis for them in front of every array.
+"""
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """An input or output array; `numbers` is `real`, `int` or `bool`."""
+
+    name: str
+    numbers: str
+    shape: tuple[int, ...]
+    about: str
+
+
+@dataclass(frozen=True)
+class Signature:
+    """Arrays of a step in their order, as step.json lists them.
+
+    Attributes:
+        state: arrays of the state, which go in and come out.
+        given: further inputs.
+        said: further outputs.
+    """
+
+    state: tuple[Leaf, ...]
+    given: tuple[Leaf, ...]
+    said: tuple[Leaf, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """A step that was read back.
+
+    Attributes:
+        signature: names and shapes of its arrays.
+        start: state of a robot at rest at 0, 0, 0.
+        step: step of one robot.
+        batch: step of many robots, with a leading axis on every array.
+    """
+
+    signature: Signature
+    start: tuple[Array, ...]
+    step: export.Exported
+    batch: export.Exported
+
+
+def stablehlo_files(loop: ControlLoop[eqx.Module]) -> dict[str, bytes]:
+    """Return the files' content by name: the step of one robot and of many, and its inputs."""
+    begin = loop.init()
+    state = begin.estimator, begin.controller
+    nothing, zero = Readings.nothing(loop.controller.robot.wheels), jnp.zeros(())
+    like = (state, nothing, jnp.zeros(6), zero)
+    structure = jax.tree.structure(like)
+
+    def step(*flat: Array) -> list[Array]:
+        return jax.tree.leaves(loop_step(loop, *jax.tree.unflatten(structure, flat)))
+
+    flat = [jnp.asarray(x) for x in jax.tree.leaves(like)]
+    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in flat]
+    (count,) = export.symbolic_shape("robot")
+    many = [jax.ShapeDtypeStruct((count, *x.shape), x.dtype) for x in flat]
+    one = export.export(jax.jit(step), platforms=PLATFORMS)(*shapes)
+    batch = export.export(jax.jit(jax.vmap(step)), platforms=PLATFORMS)(*many)
+    start = {f"start{k}": np.asarray(x) for k, x in enumerate(jax.tree.leaves(state))}
+    arrays: dict[str, Any] = start | vars(golden(loop))
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    about = {"schema": SCHEMA, **asdict(_signature(loop))}
+    return {
+        "step.stablehlo": bytes(one.serialize()),
+        "step_batch.stablehlo": bytes(batch.serialize()),
+        "step.json": (json.dumps(about, indent=1) + "\n").encode(),
+        "golden.npz": buffer.getvalue(),
+        "README.md": README.encode(),
+    }
+
+
+def _signature(loop: ControlLoop[eqx.Module]) -> Signature:
+    begin = loop.init()
+    wheels = loop.controller.robot.wheels
+    nothing = Readings.nothing(wheels)
+    estimate = loop.estimator.step(begin.estimator, nothing, 0.0)[1]
+    others = (
+        Leaf("reference", "real", (6,), "pose and rates in the world [m, m, rad and per s]"),
+        Leaf("dt", "real", (), "since the last step [s]"),
+    )
+    command = Leaf("command", "real", (wheels,), "wheel speeds [rad/s]")
+    return Signature(
+        (*_leaves("estimator", begin.estimator), *_leaves("controller", begin.controller)),
+        (*_leaves("reading", nothing, Measurement), *others),
+        (*_leaves("estimate", estimate), command),
+    )
+
+
+def _leaves(name: str, tree: object, documented: type | None = None) -> list[Leaf]:
+    fields = Struct.of(name, "", tree, documented).fields
+    return [Leaf(f"{name}.{f.name}", f.kind, f.shape, f.comment) for f in fields]
+
+
+def load_program(folder: Path | str) -> Program:
+    """Return the step of a folder, once it has repeated the library's results.
+
+    Raises:
+        DataError: a file is absent, damaged or of a newer version, or numbers differ.
+    """
+    place = Path(folder)
+    content = {}
+    for name in FILES:
+        try:
+            content[name] = (place / name).read_bytes()
+        except OSError as error:
+            raise DataError(f"{place / name}: {error.strerror}; export the robot again") from error
+    try:
+        about = json.loads(content["step.json"])
+        schema = about.pop("schema")
+    except (ValueError, KeyError, AttributeError) as error:
+        raise DataError(f"{place / 'step.json'}: damaged; export the robot again") from error
+    if schema != SCHEMA:
+        raise DataError(
+            f"{place / 'step.json'}: written as {schema}, this slipid reads {SCHEMA}; update "
+            "slipid, or export the robot again"
+        )
+    try:
+        arrays = np.load(io.BytesIO(content["golden.npz"]), allow_pickle=False)
+        signature = typed(Signature, about)
+        start = [jnp.asarray(arrays[f"start{k}"]) for k in range(len(signature.state))]
+        programs = [export.deserialize(bytearray(content[name])) for name in FILES[:2]]
+        steps = Golden(arrays["given"], arrays["said"], arrays["command"])
+    except Exception as error:  # the parsers of three formats raise many kinds of errors
+        raise DataError(f"{place}: damaged ({error}); export the robot again") from error
+    program = Program(signature, tuple(start), *programs)
+    _repeated(program, steps, place)
+    return program
+
+
+def _repeated(program: Program, steps: Golden, place: Path) -> None:
+    """Refuse a program whose results differ, for one robot or for two at once."""
+    one, two = list(program.start), [jnp.stack([x, x]) for x in program.start]
+    count = len(one)
+    scale = np.maximum(np.abs(steps.said).max(axis=0), 1e-3)
+    for row, estimate, command in zip(steps.given, steps.said, steps.command, strict=True):
+        inputs = _split(row, program.signature.given)
+        single = program.step.call(*one, *inputs)
+        both = program.batch.call(*two, *(jnp.stack([x, x]) for x in inputs))
+        one, two = list(single[:count]), list(both[:count])
+        for outputs in (single[count:], [x[1] for x in both[count:]]):
+            numbers = np.concatenate([np.asarray(x, float).reshape(-1) for x in outputs])
+            gap = np.abs(numbers - np.concatenate([estimate, command]))
+            if not (gap <= CLOSE * np.concatenate([scale, np.ones(len(command))])).all():
+                raise DataError(
+                    f"{place}: the program does not repeat what was computed when it was made "
+                    f"(off by {gap.max():.1e}); export the robot again"
+                )
+
+
+def _split(row: np.ndarray, leaves: Sequence[Leaf]) -> list[Array]:
+    sizes = [int(np.prod(leaf.shape)) for leaf in leaves]
+    parts = np.split(row, np.cumsum(sizes)[:-1])
+    pairs = zip(parts, leaves, strict=True)
+    return [jnp.asarray(part.reshape(leaf.shape)) for part, leaf in pairs]

@@ -1,0 +1,349 @@
+"""Variances of shared effects and of the differences of floors, by restricted likelihood.
+
+The effects that remain in the runs on a floor, one axis at a time,
+
+    a_i = (E_i^T W_i E_i)^-1 E_i^T W_i r_i
+
+(E_i moves the residuals r_i by an effect, W_i weighs them without the run effects) have the
+covariance
+
+    N + v_own D + v_near K + v_session M + T C T^T
+
+N of camera and process noise, D of the Student-t weights, K the kernel over conditions, M 1 within
+a session, T the derivative by the model's numbers and C their covariance before the floor's own
+runs were used.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy.optimize import brentq
+from scipy.stats import f as fisher
+
+from slipid.fitting.session_effects import remaining_effects
+from slipid.fitting.shared_effects import AXES, SharedEffects
+from slipid.fitting.variances import DEGREES, VARIANCE_SPREAD, Objective, Search, Square, Variances
+
+_STEPS, _SETTLED = 20, 1e-5
+"""Largest number of scoring steps per round, and the log-variance step that counts as rest."""
+_SECTORS = 6
+"""Number of sectors of directions, each of which is held out in turn."""
+LEAST_RUNS = 30
+"""Number of runs below which a tenth of them says too little about the tail."""
+_MOST_GROWTH = 10.0
+"""Largest accepted factor of the variances."""
+_GRID = np.geomspace(0.1, 4.0, 60)
+"""Stds of the load biases on the grid, over the typical one."""
+
+
+class _AxisEffects(NamedTuple):
+    """The effects of the runs on a floor along one axis.
+
+    Attributes:
+        number: number of the axis.
+        segments: numbers of the segments.
+        left: remaining effects.
+        fixed: their covariance without the variances to be estimated.
+        noise: diagonal of camera and process noise in it.
+        numbers: numbers of the variances to be estimated.
+        bases: derivative of the covariance by each of these variances.
+    """
+
+    number: int
+    segments: Int[np.ndarray, " run"]
+    left: Float[np.ndarray, " run"]
+    fixed: Float[np.ndarray, "run run"]
+    noise: Float[np.ndarray, " run"]
+    numbers: list[int]
+    bases: list[np.ndarray]
+
+
+def effect_variances(
+    objective: Objective,
+    motion: tuple[Array, Array],
+    weight: Array,
+    covariance: Square,
+    log_v: Variances,
+) -> Variances:
+    """Return the log variances after scoring steps of those of the run effects.
+
+    Args:
+        motion: residuals and their derivative, all segments.
+        weight: Student-t weight of every segment, 0 for one that does not count.
+        covariance: covariance of the search vector.
+    """
+    out = np.array(log_v)
+    for axis in _axes(objective, motion, weight, covariance, log_v):
+        typical = np.asarray(objective.typical)[axis.numbers]
+        out[axis.numbers] = _scoring_steps(axis, out[axis.numbers], typical)
+    return out
+
+
+def effect_information(
+    objective: Objective,
+    motion: tuple[Array, Array],
+    weight: Array,
+    covariance: Square,
+    log_v: Variances,
+) -> Float[np.ndarray, "variance variance"]:
+    """Return the expected information of the same log variances, zero for the others."""
+    out = np.zeros((len(log_v), len(log_v)))
+    for axis in _axes(objective, motion, weight, covariance, log_v):
+        v = np.exp(log_v)[axis.numbers]
+        inverse = np.linalg.inv(_covariance(axis, v))
+        grown = [k * (inverse @ b) for k, b in zip(v, axis.bases, strict=True)]
+        out[np.ix_(axis.numbers, axis.numbers)] += _information(grown)
+    return out
+
+
+class TravelDirections(NamedTuple):
+    """Direction of travel, distance and load set-up of every segment.
+
+    Attributes:
+        direction: direction of travel [rad], nan on the spot.
+        distance: distance driven [m].
+        setup: floor and load set-up.
+    """
+
+    direction: Float[np.ndarray, " segment"]
+    distance: Float[np.ndarray, " segment"]
+    setup: Sequence[str]
+
+
+def extrapolation(
+    objective: Objective,
+    motion: tuple[Array, Array],
+    keep: Float[np.ndarray, " segment"],
+    covariance: Square,
+    log_v: Variances,
+    travel: TravelDirections,
+) -> dict[str, float]:
+    """Return the factors by which variances are too small far from fitted runs, by set-up.
+
+    Every sector of directions is predicted from the others, with the numbers of the floor estimated
+    anew (to first order). The variances of shared effects and of the numbers are multiplied by the
+    factor that puts 90 % of the end points into their 90 % regions; the run's own effects and
+    noise, which neighbours do not predict, are kept. It is 1 where enough end points lie there
+    already, and where there are fewer than three sectors or `LEAST_RUNS` runs. A likelihood finds
+    the variances that are best between the runs it has, which are too small where the model is
+    wrong on a larger scale, and down-weights outliers that a forecast meets again.
+
+    Sources: Sundararajan and Keerthi 2001, Neural Computation 13(5), eq. for leaving out; Bachoc
+    2013, Computational Statistics and Data Analysis 66, on wrong models.
+    """
+    axes = _axes(objective, motion, jnp.asarray(keep), covariance, log_v)
+    held_out = _held_out_effects(axes, log_v, travel.direction)
+    names = np.asarray(travel.setup)
+    return {
+        name: _variance_growth(held_out, travel.distance, names == name)
+        for name in dict.fromkeys(names)
+    }
+
+
+class _HeldOutEffects(NamedTuple):
+    """Effects of segments on three axes as other sectors predict them; nan where none do.
+
+    Attributes:
+        gap: effect less its prediction.
+        spread: variance of the gap.
+        own: part of the variance that other runs cannot predict.
+    """
+
+    gap: Float[np.ndarray, "segment 3"]
+    spread: Float[np.ndarray, "segment 3"]
+    own: Float[np.ndarray, "segment 3"]
+
+
+def _held_out_effects(
+    axes: Iterable[_AxisEffects], log_v: Variances, direction: Float[np.ndarray, " segment"]
+) -> _HeldOutEffects:
+    """Return the effects of every sector as predicted from the other sectors."""
+    found = _HeldOutEffects(*(np.full((len(direction), len(AXES)), np.nan) for _ in range(3)))
+    for axis in axes:
+        v = np.exp(log_v)[axis.numbers]
+        inverse, groups = np.linalg.inv(_covariance(axis, v)), _sectors(direction[axis.segments])
+        if len(groups) < 3:
+            continue
+        white = inverse @ axis.left
+        own = axis.noise + v[0] * np.diag(axis.bases[0])
+        for mine in groups:
+            spread = np.linalg.inv(inverse[np.ix_(mine, mine)])
+            at = axis.segments[mine], axis.number
+            found.gap[at], found.spread[at] = spread @ white[mine], np.diag(spread)
+            found.own[at] = np.minimum(own[mine], np.diag(spread))
+    return found
+
+
+def _variance_growth(
+    held_out: _HeldOutEffects,
+    distance: Float[np.ndarray, " segment"],
+    mine: Bool[np.ndarray, " segment"],
+) -> float:
+    """Return the factor of a set-up's predictable variances that gives 90 % coverage."""
+    mine = mine & np.isfinite(held_out.gap).all(axis=1)
+    if mine.sum() < LEAST_RUNS:
+        return 1.0
+    d = distance[mine]
+    gap, spread, own = (x[mine] for x in held_out)
+    # a yaw that grows linearly along the run moves its end across by half of it times the distance
+    along, across = gap[:, 0], gap[:, 1] + 0.5 * d * gap[:, 2]
+
+    def excess(log_growth: float) -> float:
+        v = own + np.exp(log_growth) * (spread - own)
+        square = along**2 / v[:, 0] + across**2 / (v[:, 1] + 0.25 * d**2 * v[:, 2])
+        return float(np.quantile(square, 0.9) - 2 * fisher.ppf(0.9, 2, DEGREES))
+
+    most = np.log(_MOST_GROWTH)
+    if excess(0.0) <= 0:
+        return 1.0
+    return _MOST_GROWTH if excess(most) >= 0 else float(np.exp(brentq(excess, 0.0, most)))
+
+
+def _sectors(direction: Float[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]]:
+    """Return the runs whose directions lie in each sector; sectors without runs are omitted.
+
+    The edges separate the fewest runs from others in nearly the same direction: they are in the
+    middle of the widest gap between directions, taken modulo a sector.
+    """
+    moves = np.flatnonzero(np.isfinite(direction))
+    if not len(moves):
+        return []
+    width = 2 * np.pi / _SECTORS
+    along = np.sort(direction[moves] % width)
+    gap = np.diff(along, append=along[0] + width)
+    edge = along[gap.argmax()] + 0.5 * gap.max()
+    sector = np.floor((direction[moves] - edge) % (2 * np.pi) / width).astype(int) % _SECTORS
+    return [moves[sector == k] for k in np.unique(sector)]
+
+
+def _axes(
+    objective: Objective,
+    motion: tuple[Array, Array],
+    weight: Array,
+    covariance: Square,
+    log_v: Variances,
+) -> Iterator[_AxisEffects]:
+    """Yield the remaining effects of every floor and axis."""
+    space = objective.space
+    of_floor = space.where(lambda e: e.surface is not None)
+    wide = np.where(of_floor[:, None] | of_floor, 0.0, covariance)
+    wide[of_floor, of_floor] = np.asarray(objective.prior_std(log_v))[of_floor] ** 2
+    scale = np.asarray(objective.blocks["motion"].covariance(jnp.asarray(log_v)))
+    gap, slope, counted = np.asarray(motion[0]), np.asarray(motion[1]), np.asarray(weight)
+    for floor in objective.shared:
+        kept = counted[np.asarray(floor.segments)] > 0
+        mine = np.asarray(floor.segments)[kept]
+        if len(mine) < 2:
+            continue
+        effect = np.asarray(floor.effect)[kept]
+        run = np.broadcast_to(np.exp(log_v)[np.asarray(floor.numbers)[0]], (len(mine), len(AXES)))
+        left, noise, by = remaining_effects(gap[mine], slope[mine], scale[mine], effect, run)
+        for k in range(len(AXES)):
+            alone = noise[:, k] / counted[mine]
+            fixed = np.diag(alone) + by[:, k] @ wide @ by[:, k].T
+            variances = _variance_bases(floor, k, kept, counted[mine])
+            numbers, bases = [n for n, _ in variances], [c for _, c in variances]
+            yield _AxisEffects(k, mine, left[:, k], fixed, alone, numbers, bases)
+
+
+def _variance_bases(
+    floor: SharedEffects, axis: int, kept: Bool[np.ndarray, " run"], weight: np.ndarray
+) -> list[tuple[int, np.ndarray]]:
+    """Return variance numbers and the covariance of the effects along an axis per unit of each."""
+    own, near, session = np.asarray(floor.numbers)[:, axis].tolist()
+    root, member = np.asarray(floor.near)[axis, kept], np.asarray(floor.session)[kept]
+    found = [(own, np.diag(1 / weight)), (near, root @ root.T), (session, member @ member.T)]
+    return [(number, matrix) for number, matrix in found if number >= 0]
+
+
+def _covariance(axis: _AxisEffects, v: np.ndarray) -> Float[np.ndarray, "run run"]:
+    """Return the covariance of the effects at given variances."""
+    return np.asarray(axis.fixed + sum(k * b for k, b in zip(v, axis.bases, strict=True)))
+
+
+def _information(grown: list[np.ndarray]) -> np.ndarray:
+    """Return the expected information of the log variances."""
+    return np.array([[0.5 * np.sum(a * b.T) for b in grown] for a in grown])
+
+
+def _scoring_steps(axis: _AxisEffects, log_v: np.ndarray, typical: np.ndarray) -> np.ndarray:
+    """Return the log variances after Fisher scoring steps of the restricted likelihood.
+
+    A step that decreases the likelihood is halved.
+    """
+
+    def loss(at: np.ndarray) -> float:
+        root = np.linalg.cholesky(_covariance(axis, np.exp(at)))
+        white = np.linalg.solve(root, axis.left)
+        deviation = (at - typical) / VARIANCE_SPREAD
+        return float(
+            np.log(np.diag(root)).sum() + 0.5 * white @ white + 0.5 * deviation @ deviation
+        )
+
+    before = loss(log_v)
+    for _ in range(_STEPS):
+        v = np.exp(log_v)
+        inverse = np.linalg.inv(_covariance(axis, v))
+        white = inverse @ axis.left
+        grown = [k * (inverse @ b) for k, b in zip(v, axis.bases, strict=True)]
+        quadratic = [k * white @ b @ white for k, b in zip(v, axis.bases, strict=True)]
+        score = 0.5 * (np.array(quadratic) - [np.trace(g) for g in grown])
+        score -= (log_v - typical) / VARIANCE_SPREAD**2
+        info = _information(grown) + np.eye(len(v)) / VARIANCE_SPREAD**2
+        step = np.clip(np.linalg.solve(info, score), -1.5, 1.5)
+        while (after := loss(log_v + step)) > before and np.abs(step).max() > _SETTLED:
+            step = step / 2
+        if after > before:
+            break
+        log_v, before = log_v + step, after
+        if np.abs(step).max() < _SETTLED:
+            break
+    return log_v
+
+
+def pooled(precision: Square, z: Search, objective: Objective, log_v: Variances) -> float:
+    """Return the log mean variance of the load biases of floors; arguments as in `pooled_stds`."""
+    found = pooled_stds(precision, z, objective, log_v)
+    return float(np.log(found.weight @ found.std**2))
+
+
+class PooledStds(NamedTuple):
+    """Candidate stds of the load biases of floors and their probabilities, which sum to one."""
+
+    std: Float[np.ndarray, " grid"]
+    weight: Float[np.ndarray, " grid"]
+
+
+def pooled_stds(precision: Square, z: Search, objective: Objective, log_v: Variances) -> PooledStds:
+    """Return the posterior of the std of the load biases with a half-normal prior, on a grid.
+
+    The fit is a Gaussian of that precision around z; its evidence for every std is known.
+
+    Source: Gelman 2006, Bayesian Analysis 1(3), on half-normal priors of group stds.
+    """
+    at = np.flatnonzero(objective.space.pooled)
+    now = np.exp(-log_v[objective.pooled])
+    of_data = np.asarray(precision).copy()
+    offset = np.zeros(len(of_data))
+    offset[at] = (z - objective.space.prior_mean)[at]
+    shifted = of_data @ offset
+    of_data[at, at] -= now
+    typical = np.exp(0.5 * float(objective.typical[objective.pooled]))
+    log = []
+    for part in _GRID:
+        with_prior = of_data.copy()
+        with_prior[at, at] += 1 / (part * typical) ** 2
+        root = np.linalg.cholesky(with_prior)
+        half = np.linalg.solve(root, shifted)
+        log.append(
+            0.5 * half @ half
+            - np.log(np.diag(root)).sum()
+            - len(at) * np.log(part * typical)
+            - 0.5 * part**2
+            + np.log(part)  # grid steps grow with the std
+        )
+    weight = np.exp(np.array(log) - max(log))
+    return PooledStds(_GRID * typical, weight / weight.sum())

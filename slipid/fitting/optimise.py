@@ -1,0 +1,315 @@
+"""Maximum a posteriori fit: weights, numbers and variances alternate until all are at rest."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from slipid.fitting import likelihood as lk
+from slipid.fitting.hierarchy import effect_variances, pooled
+from slipid.fitting.multi_floor import MULTI_FLOOR_MOTION
+from slipid.fitting.noise import SHARED
+from slipid.fitting.problem import (
+    CREEPS,
+    FitState,
+    Problem,
+    effects_given,
+    linear,
+    log_jacobian,
+    without_effects,
+)
+from slipid.fitting.shared_effects import Posteriors, marginal_residuals
+from slipid.fitting.variances import (
+    Blocks,
+    Objective,
+    Search,
+    Square,
+    fitted_covariance,
+    scoring_step,
+)
+
+_REFUSED = 12
+"""Number of steps that the solver may refuse in a round."""
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """End of a fit.
+
+    Attributes:
+        state: state at the end.
+        covariance: Laplace covariance of the search vector.
+        converged: whether the fit settled.
+        reason: why it stopped, for people.
+        history: loss of every round.
+    """
+
+    state: FitState
+    covariance: Square
+    converged: bool
+    reason: str
+    history: tuple[float, ...]
+
+
+def optimise(
+    problem: Problem,
+    keep: np.ndarray | None = None,
+    start: FitState | None = None,
+    most_rounds: int = 30,
+    tolerance: float = 0.02,
+    tell: Callable[[FitState], None] = lambda state: None,
+    free: np.ndarray | None = None,
+    variances: bool = True,
+) -> Optimum:
+    """Return the maximum a posteriori, from a staged start or continued from a state.
+
+    Args:
+        keep: weight of each segment, 1 or 0, in the order of `Problem.full_weight`; all 1 by
+            default. Folds of a cross-validation differ in this only, so they share one compiled
+            function.
+        start: state to continue from instead of the staged start.
+        most_rounds: largest number of rounds.
+        tolerance: the fit stops when no number moves more posterior stds than this in a round.
+        tell: function called after every round, for progress and checkpoints.
+        free: 1 for coordinates that may move from the start, 0 for fixed ones (free,).
+        variances: whether the variances of the noise are fitted, too.
+    """
+    keep = problem.full_weight if keep is None else np.asarray(keep, float)
+    state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")
+    mask = np.ones(problem.space.size) if free is None else np.asarray(free, float)
+    history: list[float] = []
+    while state.round < most_rounds:
+        early = state.round < 3
+        scoring = (2 if early else 4) if variances else 0
+        state = one_round(problem, state, keep, mask, steps=8 if early else 4, scoring=scoring)
+        history.append(state.loss)
+        tell(state)
+        if state.moved < tolerance:
+            break
+    covariance = problem.laplace(state.z, state.log_variance, keep)
+    reason = f"{most_rounds} rounds without settling"
+    if settled := state.moved < tolerance:
+        reason = f"no number changed by {100 * tolerance:g} % of its std in round {state.round}"
+    return Optimum(state, covariance, settled, reason, tuple(history))
+
+
+def one_round(
+    problem: Problem,
+    state: FitState,
+    keep: Float[np.ndarray, " segment"],
+    mask: Search,
+    steps: int,
+    scoring: int,
+) -> FitState:
+    """Return the state after one round: weights, then numbers, then variances.
+
+    Args:
+        mask: 1 for coordinates that may move, 0 for fixed ones.
+        steps: largest number of solver steps of the numbers.
+        scoring: number of scoring steps of the variances.
+    """
+    objective, log_v = problem.objective, jnp.asarray(state.log_variance)
+    electric = problem.electric(state.z, log_v)
+    residual, _, motor_force = linear(objective, jnp.asarray(state.z), electric)
+    before = state.shared(len(problem.windows))
+    weighed = problem.weighed(residual, log_v, keep, before)
+    root = weighed.whitening.root
+    fixed = RoundInputs(
+        objective=objective,
+        z=jnp.asarray(state.z),
+        mask=jnp.asarray(mask),
+        root=root,
+        effects=weighed.effects,
+        prior_std=objective.prior_std(log_v),
+        electric=electric,
+        motor_force=motor_force,
+        slope=log_jacobian(objective, state.z, electric, keep)[1],
+    )
+    z = np.asarray(levenberg(fixed, LimitedLevenberg(steps)))
+    electric = problem.electric(z, log_v)
+    whole, jacobian, motor_force = linear(objective, jnp.asarray(z), electric)
+    effect = effects_given(weighed.effects, root["motion"], whole["motion"])
+    # weights and effects depend on each other: half a step, or they can oscillate for ever
+    effect = 0.5 * (effect + before) if state.round else effect
+    residual = without_effects(objective, whole, effect)
+    voltage = problem.voltage_information(z, log_v, motor_force)
+    if scoring:
+        spread = fitted_covariance(objective, jacobian, log_v, jnp.asarray(keep))
+    for _ in range(scoring):
+        log_v = scoring_step(objective, residual, spread, log_v, jnp.asarray(keep), voltage)
+        last, voltage = voltage, problem.voltage_information(z, log_v, motor_force)
+        if last is not None and voltage is not None:  # rescale to the new noise
+            scale = jnp.sqrt(voltage.share / last.share)
+            residual = residual | {"voltage": voltage.residual}
+            both = scale[:, :, None] * scale[:, None, :]
+            spread = spread | {"voltage": spread["voltage"] * both}
+    if voltage is not None and scoring:  # the Jacobian by R changes beyond its scale
+        electric = problem.electric(z, log_v)
+        whole, jacobian = problem.linear(z, electric)
+    information = np.asarray(problem.precision(jacobian, log_v, keep))
+    covariance = np.linalg.inv(information)
+    if scoring:
+        weight, motion = weighed.whitening.weight["motion"], (whole["motion"], jacobian["motion"])
+        found = effect_variances(objective, motion, weight, covariance, np.asarray(log_v))
+        found[objective.pooled] = pooled(information, z, objective, np.asarray(log_v))
+        log_v = jnp.asarray(found)
+    std = np.sqrt(np.diag(covariance))
+    moved = float(np.max(np.abs(z - state.z) / std, initial=0.0))
+    moved = max(moved, float(np.max(np.abs(np.asarray(log_v) - state.log_variance)) / 3))
+    return FitState(
+        z=z,
+        log_variance=np.asarray(log_v),
+        round=state.round + 1,
+        loss=problem.loss(z, log_v, keep, problem.weighed(whole, log_v, keep, effect), electric),
+        moved=moved,
+        stage=state.stage,
+        effect=np.asarray(effect),
+    )
+
+
+def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], None]) -> FitState:
+    """Return a start: motor by regression, then every floor by itself, the best of several starts.
+
+    Floors share nothing while the shared numbers are fixed, so one masked fit of all floors is a
+    fit of each by itself.
+    """
+    space, labels = problem.space, problem.robot.surfaces.labels
+    mask = space.where(lambda e: e.surface is not None).astype(float)
+    creep = space.where(lambda e: e.quantity == "surface.creep")
+    # far from the optimum every run is an outlier: start with wide variances
+    usual = {"camera": 1.0, "pooled": 1.0} | dict.fromkeys(SHARED, 0.1)
+    wide = [usual.get(c.kind, 3.0) for c in problem.noise.components]
+    log_v = 2 * np.log(problem.noise.typical) + 2 * np.log(wide)
+    first = _motor_start(problem, keep)
+    independent = problem.without_shared_effects()
+    best, z = np.full(len(labels), np.inf), first.copy()
+    floors = np.asarray(problem.batch.surface)
+    of_floor = np.repeat([e.surface or "" for e in space.free], [e.coordinates for e in space.free])
+    for attempt, value in enumerate(CREEPS):
+        stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
+        start = np.where(creep, np.log(value), first)
+        state = FitState(start, log_v, 0, np.inf, np.inf, stage)
+        for steps in (15, 6, 6):  # the damping must grow from 1 to the problem's scale first
+            state = one_round(independent, state, keep, mask, steps=steps, scoring=0)
+            tell(state)
+        residual, _ = independent.linear(state.z, problem.electric(state.z, state.log_variance))
+        found = problem.whitening(residual, state.log_variance, problem.full_weight)
+        cost = -np.log(np.asarray(found.weight["motion"]))  # the loss up to a factor and a constant
+        for number, label in enumerate(labels):
+            mine = float(np.sum(cost[(floors == number) & (keep[: len(floors)] > 0)]))
+            if mine < best[number]:
+                best[number] = mine
+                z = np.where(of_floor == label, state.z, z)
+    return FitState(z, log_v, 0, np.inf, np.inf, "joint")
+
+
+def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
+    """Return the search vector with R and C_e from a regression of logged voltages."""
+    z = problem.space.start.copy()
+    w = problem.windows.segments(np.flatnonzero(keep > 0))
+    if not (w.has_voltage and w.has_current):
+        return z
+    speed = (w.turn / w.dt[..., None]).ravel()
+    amps = w.current.ravel() if w.current_is_signed else (w.current.ravel() * np.sign(speed))
+    wm = speed * float(problem.robot.motor.gear_ratio)
+    a, *_ = np.linalg.lstsq(np.stack([amps, wm], -1), w.voltage.ravel(), rcond=None)
+    slices = problem.space.slices
+    for path, value in (("motor.resistance", a[0]), ("motor.back_emf", a[1])):
+        if path in slices and value > 0:
+            z[slices[path]] = np.log(value)
+    return z
+
+
+class RoundInputs(eqx.Module):
+    """Quantities that stay fixed while the solver moves the numbers from z.
+
+    Attributes:
+        objective: the objective of the fit.
+        z: search vector at the start.
+        mask: 1 for coordinates that may move.
+        root: whitening roots of the residuals.
+        effects: posterior of the shared effects given these roots.
+        prior_std: prior std of every coordinate.
+        electric: noise that voltages are predicted with.
+        motor_force: forces of the motors at z, from which currents and voltages are predicted.
+        slope: derivative of log |d residuals / d data| by the search vector.
+    """
+
+    objective: Objective
+    z: Float[Array, " free"]
+    mask: Float[Array, " free"]
+    root: Blocks
+    effects: Posteriors
+    prior_std: Float[Array, " free"]
+    electric: lk.ElectricNoise
+    motor_force: lk.MotorForce
+    slope: Float[Array, " free"]
+
+
+class LimitedLevenberg(optx.LevenbergMarquardt):
+    """Levenberg-Marquardt that ends after a given number of accepted steps.
+
+    A refused step shrinks the next one, and stopping among refused steps would look like
+    convergence. The solver counts its evaluation of the start as an accepted step.
+    """
+
+    most: Array
+
+    def __init__(self, most: int):
+        super().__init__(rtol=1e-6, atol=1e-8, linear_solver=lx.Normal(lx.Cholesky()))
+        self.most = jnp.asarray(most)
+
+    def terminate(
+        self,
+        fn: Any,
+        y: Array,
+        args: RoundInputs,
+        options: Any,
+        state: Any,
+        tags: frozenset[object],
+    ) -> tuple[Array, optx.RESULTS]:
+        done, result = super().terminate(fn, y, args, options, state, tags)
+        taken = state.num_accepted_steps - 1 >= self.most
+        return done | taken | (state.num_steps >= self.most + _REFUSED), result
+
+
+@eqx.filter_jit
+def levenberg(fixed: RoundInputs, solver: LimitedLevenberg) -> Float[Array, " free"]:
+    """Return the search vector after the solver's steps with fixed whitening."""
+    start = jnp.zeros_like(fixed.z)
+    found = optx.least_squares(_stacked, solver, start, fixed, max_steps=None, throw=False)
+    return _at(fixed, found.value)
+
+
+def _at(fixed: RoundInputs, y: Array) -> Array:
+    """Return the search vector of a step in prior stds."""
+    return fixed.z + fixed.mask * fixed.prior_std * y
+
+
+def _stacked(y: Array, fixed: RoundInputs) -> Array:
+    """Return the whitened residuals of all blocks and of the prior."""
+    objective, space = fixed.objective, fixed.objective.space
+    z = _at(fixed, y)
+    robot, given = space.tree(z), space.tree(jnp.where(space.electric, z, fixed.z))
+    motion = lk.motion_residual(robot, objective.batch, lk.predict(robot, objective.batch))
+    # currents and voltages given the motion of the round's start
+    electric = lk.electric_residuals(given, objective.batch, fixed.motor_force, fixed.electric)
+    blocks = {"motion": motion} | electric
+    if (of := objective.multi_floor) is not None:
+        # here, too, currents move electric numbers only; friction is one of them, and it moves the
+        # equilibrium that currents come from
+        blocks |= of.residuals(given, lk.predict(given, of.batch))
+        of_robot = of.residuals(robot, lk.predict(robot, of.batch))
+        blocks[MULTI_FLOOR_MOTION] = of_robot[MULTI_FLOOR_MOTION]
+    white = {k: jnp.einsum("nij,nj->ni", fixed.root[k], r) for k, r in blocks.items()}
+    rest = [w.ravel() for k, w in white.items() if k != "motion"]
+    parts = [marginal_residuals(fixed.effects, white["motion"]), *rest]
+    # the slope of the log Jacobian adds slope . z to the log posterior
+    mean = space.prior_mean + fixed.prior_std**2 * fixed.slope
+    return jnp.concatenate([*parts, (z - mean) / fixed.prior_std])

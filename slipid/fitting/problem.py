@@ -1,0 +1,320 @@
+"""Posterior of a robot given windows of its runs, compiled once for all windows of equal shapes."""
+
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from glob import escape
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from slipid.data.runs import Runs
+from slipid.data.windows import Windows
+from slipid.fitting import likelihood as lk
+from slipid.fitting import variances
+from slipid.fitting.multi_floor import MULTI_FLOOR_CURRENT, MultiFloorBatch, MultiFloorRuns
+from slipid.fitting.noise import POOLED, SHARED, electric_noise, noise
+from slipid.fitting.shared_effects import (
+    Posteriors,
+    effect_posteriors,
+    effects_by_floor,
+    marginal_residuals,
+    mean_effects,
+)
+from slipid.fitting.variances import (
+    VARIANCE_SPREAD,
+    Blocks,
+    Objective,
+    Search,
+    Vector,
+    VoltageInformation,
+    Whitening,
+    voltage_information,
+)
+from slipid.model.robot import Robot
+from slipid.search_space import Choice, Space
+
+CREEPS = (0.05, 0.4, 1.0)
+"""Start values of the creep of every floor; other starts end in poor minima."""
+FEW = 200
+"""Number of pieces up to which effects of no size cost less time than compiling a fit without."""
+
+
+@dataclass(frozen=True)
+class FitState:
+    """State of a fit, sufficient to continue it.
+
+    Attributes:
+        z: search vector.
+        log_variance: log variances of the noise.
+        round: number of finished rounds.
+        loss: minus log posterior up to a constant.
+        moved: largest step of the last round in posterior stds.
+        stage: current activity, for progress.
+        effect: mean shared effects along, across and in yaw.
+    """
+
+    z: Search
+    log_variance: Float[np.ndarray, " variance"]
+    round: int
+    loss: float
+    moved: float
+    stage: str
+    effect: Float[np.ndarray, "segment 3"] | None = None
+
+    def shared(self, segments: int) -> Float[np.ndarray, "segment 3"]:
+        """Return the shared effects of that many segments, zero before any were estimated."""
+        return np.zeros((segments, 3)) if self.effect is None else self.effect
+
+    @property
+    def arrays(self) -> dict[str, Any]:
+        """Values that a checkpoint stores, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    @classmethod
+    def of(cls, kept: Mapping[str, np.ndarray]) -> "FitState":
+        """Return the state whose `arrays` a checkpoint has stored."""
+        plain: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in kept.items()}
+        return cls(**plain)
+
+
+class Problem:
+    """Likelihood of a set of windows as functions of the search vector.
+
+    Currents and voltages do not move the numbers of the motion ("cut"): the torque scale is
+    estimated from currents given the motion, whose errors are propagated. A friction model good to
+    5 % in current would otherwise outvote forces that motion determines to 1 %.
+
+    The argument `keep` of the methods weighs segments with 1 or 0. `compiled` holds functions that
+    other modules compiled for windows of these shapes, under their own keys.
+    """
+
+    def __init__(self, windows: Windows, robot: Robot, choices: Sequence[Choice]):
+        self.space = Space(robot, choices)
+        self.robot: Robot = self.space.template
+        self.compiled: dict[Any, Any] = {}
+        self._read(windows, None)
+
+    def of(self, windows: Windows) -> "Problem":
+        """Return the same problem for other windows; equal shapes share compiled functions."""
+        other = copy.copy(self)
+        other._read(windows, self.multi_floor)
+        return other
+
+    def with_multi_floor(self, multi_floor: MultiFloorRuns) -> "Problem":
+        """Return the same problem with runs over several floors."""
+        other = copy.copy(self)
+        other.compiled = {}
+        other._read(self.windows, multi_floor)
+        return other
+
+    def _read(self, windows: Windows, multi_floor: MultiFloorRuns | None) -> None:
+        self.windows, self.multi_floor = windows, multi_floor
+        self.noise = noise(windows, self.robot, multi_floor)
+        shared, self.speeds_and_loads = effects_by_floor(windows, self.robot, self.noise)
+        kinds = np.array([c.kind for c in self.noise.components])
+        batch = None if multi_floor is None else MultiFloorBatch.of(multi_floor, self.robot)
+        self.objective = Objective(
+            space=self.space,
+            batch=lk.batch(windows, self.robot),
+            multi_floor=batch,
+            blocks=self.noise.blocks,
+            shared=shared,
+            typical=jnp.asarray(2 * np.log(self.noise.typical)),
+            scored=~np.isin(kinds, ("run", "pooled", *SHARED)),
+            pooled=self.noise.names.index(POOLED),
+            joint=not windows.has_current and MULTI_FLOOR_CURRENT not in self.noise.blocks,
+        )
+
+    @property
+    def full_weight(self) -> Float[np.ndarray, " segment"]:
+        """Weight 1 for every segment, those of runs over several floors last."""
+        more = () if self.multi_floor is None else self.multi_floor.counts
+        return np.ones(len(self.windows) + len(more))
+
+    def carried_over(self, state: FitState, of: "Problem") -> FitState:
+        """Return the state of another problem with the same numbers as a state of this problem."""
+        known = dict(zip(of.noise.names, state.log_variance, strict=True))
+        log_v = [known.get(c.name, 2 * np.log(c.typical)) for c in self.noise.components]
+        return replace(state, log_variance=np.array(log_v), moved=np.inf)
+
+    def without_shared_effects(self) -> "Problem":
+        """Return the same problem as if runs shared no effects.
+
+        Effects of few runs are kept at no size, so that one compiled fit serves both problems.
+        """
+        other, shared = copy.copy(self), self.objective.shared
+        none = tuple(replace(of, numbers=jnp.full_like(of.numbers, -1)) for of in shared)
+        other.objective = replace(self.objective, shared=none if len(self.windows) <= FEW else ())
+        return other
+
+    @property
+    def batch(self) -> lk.Batch:
+        return self.objective.batch
+
+    def linear(self, z: Vector, electric: lk.ElectricNoise) -> tuple[Blocks, Blocks]:
+        """Return residual blocks (segment, m) and their Jacobians (segment, m, free)."""
+        return linear(self.objective, z, electric)[:2]
+
+    def covariance(self, block: str, log_v: Vector) -> Array:
+        """Return the covariance of the residuals of a block (segment, m, m)."""
+        return self.noise.blocks[block].covariance(log_v)
+
+    def whitening(self, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
+        return variances.whitening(self.noise.blocks, residual, log_v, keep)
+
+    def precision(self, jacobian: Blocks, log_v: Vector, keep: Vector) -> Array:
+        return variances.precision(self.objective, jacobian, log_v, keep)
+
+    def laplace(
+        self, z: Vector, log_v: Vector, keep: Vector, alone: bool = False
+    ) -> Float[np.ndarray, "free free"]:
+        """Return the covariance of the search vector: inverse information, prior included."""
+        jacobian = self.linear(z, self.electric(z, log_v))[1]
+        information = variances.precision(self.objective, jacobian, log_v, keep, alone)
+        return np.linalg.inv(np.asarray(information))
+
+    def weighed(
+        self, residual: Blocks, log_v: Vector, keep: Vector, effect: Vector
+    ) -> "WeighedResiduals":
+        """Return weighed residuals; outliers are judged without the effects they share.
+
+        `effect` are the shared effects found so far (segment, 3).
+        """
+        where = jnp.asarray(log_v), jnp.asarray(keep), jnp.asarray(effect)
+        return _weighed(self.objective, residual, *where)
+
+    def loss(
+        self, z: Vector, log_v: Vector, keep: Vector, at: "WeighedResiduals", e: lk.ElectricNoise
+    ) -> float:
+        """Return minus the log posterior of numbers and variances, less constants."""
+        nll = float(at.loss) - float(log_jacobian(self.objective, z, e, keep)[0])
+        prior_std = np.asarray(self.objective.prior_std(log_v))
+        deviation = (np.asarray(z) - self.space.prior_mean) / prior_std
+        nll += float(np.log(prior_std).sum())
+        spread = (np.asarray(log_v) - np.asarray(self.objective.typical)) / VARIANCE_SPREAD
+        return nll + 0.5 * float(np.sum(deviation**2)) + 0.5 * float(np.sum(spread**2))
+
+    def electric(self, z: Vector, log_v: Vector) -> lk.ElectricNoise:
+        """Return the noise that voltages are predicted with at these numbers and variances."""
+        return _electric(self.objective, z, log_v)
+
+    def voltage_information(
+        self, z: Vector, log_v: Vector, motor_force: Array
+    ) -> VoltageInformation | None:
+        """Return the information of voltages about variances, None where none are logged."""
+        if "voltage" not in self.noise.blocks:
+            return None
+        return voltage_information(self.objective, z, log_v, motor_force)
+
+
+class WeighedResiduals(NamedTuple):
+    """Residuals of a problem at given variances, and the effects that runs share.
+
+    Attributes:
+        whitening: weights and roots of residuals less the shared effects.
+        effects: posterior of the shared effects given residuals whitened by these roots.
+        loss: minus log posterior of the residuals, less constants.
+    """
+
+    whitening: Whitening
+    effects: Posteriors
+    loss: Array
+
+
+@eqx.filter_jit
+def _weighed(
+    objective: Objective, residual: Blocks, log_v: Array, keep: Array, effect: Array
+) -> WeighedResiduals:
+    own, motion = without_effects(objective, residual, effect), residual["motion"]
+    found = variances.whitening(objective.blocks, own, log_v, keep)
+    root = found.root["motion"]
+    posteriors = effect_posteriors(objective.shared, log_v, root)
+    rows = marginal_residuals(posteriors, jnp.einsum("nij,nj->ni", root, motion))
+    coefs = rows[motion.size :]
+    log_det = sum(jnp.sum(jnp.log(jnp.diagonal(p.factor))) for p in posteriors)
+    return WeighedResiduals(found, posteriors, found.loss + 0.5 * jnp.sum(coefs**2) + log_det)
+
+
+@eqx.filter_jit
+def without_effects(objective: Objective, residual: Blocks, effect: Array) -> Blocks:
+    """Return residual blocks less shared effects (segment, 3)."""
+    motion = residual["motion"]
+    for of in objective.shared:
+        off = jnp.einsum("nma,na->nm", of.effect, effect[of.segments])
+        motion = motion.at[of.segments].add(-off)
+    return residual | {"motion": motion}
+
+
+@eqx.filter_jit
+def effects_given(posteriors: Posteriors, root: Array, motion: Array) -> Array:
+    """Return the conditional mean of the shared effects (segment, 3) given motion residuals."""
+    return mean_effects(posteriors, jnp.einsum("nij,nj->ni", root, motion))
+
+
+@eqx.filter_jit
+def linear(
+    objective: Objective, z: Vector, electric: lk.ElectricNoise
+) -> tuple[Blocks, Blocks, Array]:
+    """Return residual blocks, their Jacobians, and the forces of every motor."""
+
+    def blocks(x: Array) -> tuple[Blocks, tuple[Blocks, Array]]:
+        robot = objective.space.tree(x)
+        p = lk.predict(robot, objective.batch)
+        motion = {"motion": lk.motion_residual(robot, objective.batch, p)}
+        out = motion | lk.electric_residuals(robot, objective.batch, p.motor_force, electric)
+        if (of := objective.multi_floor) is not None:
+            out |= of.residuals(robot, lk.predict(robot, of.batch))
+        return out, (out, p.motor_force)
+
+    jacobian, (out, motor_force) = jax.jacfwd(blocks, has_aux=True)(z)
+    return out, jacobian, motor_force
+
+
+@eqx.filter_jit
+def _electric(objective: Objective, z: Vector, log_v: Vector) -> lk.ElectricNoise:
+    return electric_noise(objective.blocks, log_v, objective.space.tree(z).motor.resistance)
+
+
+@eqx.filter_jit
+def log_jacobian(
+    objective: Objective, z: Vector, electric: lk.ElectricNoise, keep: Vector
+) -> tuple[Array, Array]:
+    """Return log |d residuals / d data| of all segments, and its gradient by the search vector."""
+
+    def total(x: Array) -> Array:
+        robot = objective.space.tree(x)
+        each = sum(lk.log_jacobians(robot, objective.batch, electric))
+        if objective.multi_floor is not None:
+            each = jnp.concatenate([each, objective.multi_floor.log_jacobian(robot)])
+        return jnp.asarray(keep) @ each
+
+    return jax.value_and_grad(total)(z)
+
+
+@eqx.filter_jit
+def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
+    """Return every window's body twist (segment, window, 3) and its derivative by z (.., free)."""
+    return lk.with_slope(lambda x: lk.predict(space.tree(x), batch).twist, z)
+
+
+def fixed_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:
+    """Return choices that fix viscous terms near zero on floors driven at one speed only.
+
+    With one speed they cannot be distinguished from creep, and a wrong split of the two is wrong at
+    every other speed.
+    """
+    driven: dict[str, list[float]] = {}
+    for k in range(len(data)) if runs is None else runs:
+        driven.setdefault(data.logs[k].surface or "unknown", []).append(float(data.speed[k]))
+    out = []
+    for floor, speeds in driven.items():
+        known = np.asarray(speeds)[np.isfinite(speeds)]
+        if len(known) == len(speeds) and known.max() < 1.3 * max(known.min(), 1e-3):
+            names = (f"surface.{floor}.{name}" for name in ("slide_viscosity", "roller_viscosity"))
+            out += [Choice(escape(path), fixed=1e-4) for path in names]
+    return out

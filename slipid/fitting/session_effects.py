@@ -1,0 +1,159 @@
+"""Effects that the runs of one session share beyond the model, and the information they cost.
+
+Runs driven on one floor at one time slip a little more or less than the model says, all of them
+together: a slip model of the comparison is fitted as if they were independent. After its fit the
+remaining effects of its runs,
+
+    a_i = (E_i^T W_i E_i)^-1 E_i^T W_i r_i     along, across, yaw
+
+have a part that is common to the session (E_i moves the residuals by an effect, W_i weighs without
+the run effects). Its variance v is estimated per floor and axis by restricted likelihood, at fixed
+variances of the run effects, in turn with the Student-t weights of the runs, which are outliers
+only for effects that their session does not share; the covariance C of the fitted numbers grows to
+
+    C + C (sum_s v u_s u_s^T) C,    u_s = sum_{i in s} J_i^T V_i^-1 E_i
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize_scalar
+
+from slipid.data.windows import Windows
+from slipid.fitting.shared_effects import AXES
+from slipid.fitting.variances import DEGREES
+
+SPREAD = 3.0
+"""Std of the prior of a log variance around the log variance of the run effects."""
+TURNS = 4
+"""Number of alternations between weights and variances."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """A fitted model linearised at its fit, on all segments of a problem.
+
+    Attributes:
+        gap: predicted less measured increments.
+        slope: derivative of the increments by the numbers.
+        covariance: covariance of the numbers.
+        wide: covariance of the numbers before the floor's own runs were used.
+        scale: noise covariance, the run's own effect included.
+        effect: change of the increments per unit of an effect along, across and in yaw.
+        run: variance of the run's own effects.
+    """
+
+    gap: Float[np.ndarray, "segment m"]
+    slope: Float[np.ndarray, "segment m number"]
+    covariance: Float[np.ndarray, "number number"]
+    wide: Float[np.ndarray, "number number"]
+    scale: Float[np.ndarray, "segment m m"]
+    effect: Float[np.ndarray, "segment m 3"]
+    run: Float[np.ndarray, "segment 3"]
+
+
+def with_session_effects(
+    model: LinearModel, w: Windows, keep: Float[np.ndarray, " segment"]
+) -> tuple[dict[str, float], Float[np.ndarray, "number number"]]:
+    """Return variances `session.<floor>.<axis>`, and the numbers' covariance that includes them.
+
+    A floor driven in only one session has none: shared effects are then part of the floor's
+    numbers.
+    """
+    variance: dict[str, float] = {}
+    for _ in range(TURNS):
+        variance = _variances(model, w, keep, _weights(model, by_axis(variance, "session", w)))
+    weighted = np.swapaxes(model.effect, 1, 2) @ np.linalg.solve(model.scale, model.slope)
+    scores = weighted * (_weights(model, np.zeros_like(model.run)) * keep)[:, None, None]
+    of_session = by_axis(variance, "session", w)
+    meat = np.zeros_like(model.covariance)
+    of_segment = floors_and_sessions(w)
+    for pair in dict.fromkeys(of_segment):
+        mine = np.array([other == pair for other in of_segment]) & (keep > 0)
+        if mine.any():
+            u = scores[mine].sum(axis=0)
+            meat += u.T @ (of_session[mine][0][:, None] * u)
+    return variance, model.covariance + model.covariance @ meat @ model.covariance
+
+
+def floors_and_sessions(w: Windows) -> list[tuple[str, str]]:
+    """Return the floor and session of every segment; segments of equal pairs share effects."""
+    return list(zip(w.surface, w.session, strict=True))
+
+
+def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.ndarray, "segment 3"]:
+    """Return the variances of an effect of every segment, zero where there is none."""
+    return np.array([[variance.get(f"{kind}.{f}.{axis}", 0.0) for axis in AXES] for f in w.surface])
+
+
+def _variances(
+    model: LinearModel, w: Windows, keep: np.ndarray, weight: np.ndarray
+) -> dict[str, float]:
+    """Return the variances of session effects by name, at given weights of the segments."""
+    session, floor = np.asarray(w.session), np.asarray(w.surface)
+    left, noise, slope = remaining_effects(
+        model.gap, model.slope, model.scale, model.effect, model.run
+    )
+    variance: dict[str, float] = {}
+    for name in dict.fromkeys(floor[keep > 0].tolist()):
+        mine = (floor == name) & (keep > 0)
+        if len(set(session[mine].tolist())) < 2:
+            continue
+        member = (session[mine][:, None] == np.unique(session[mine])).astype(float)
+        for k, axis in enumerate(AXES):
+            run = model.run[mine, k]
+            own = np.diag((noise[mine, k] + run) / weight[mine])
+            own += slope[mine, k] @ model.wide @ slope[mine, k].T
+            found = _variance(left[mine, k], own, member, float(np.log(run.mean())))
+            variance[f"session.{name}.{axis}"] = found
+    return variance
+
+
+def _weights(model: LinearModel, more: np.ndarray) -> np.ndarray:
+    """Return the Student-t weight of every segment, given additional variances of effects."""
+    e = model.effect
+    scale = model.scale + np.einsum("nma,na,nla->nml", e, more, e)
+    white = np.linalg.solve(scale, model.gap[..., None])[..., 0]
+    q, m = np.sum(model.gap * white, axis=1), model.gap.shape[1]
+    return np.asarray((DEGREES + m) / (DEGREES + q))
+
+
+def remaining_effects(
+    gap: np.ndarray, slope: np.ndarray, scale: np.ndarray, effect: np.ndarray, run: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return remaining effects of each run (run, 3), their noise variance and their derivative.
+
+    Arguments are those of `LinearModel`.
+    """
+    plain = scale - np.einsum("nma,na,nla->nml", effect, run, effect)
+    by_noise = np.linalg.solve(plain, effect)
+    cov = np.linalg.inv(np.swapaxes(effect, 1, 2) @ by_noise)
+    take = cov @ np.swapaxes(by_noise, 1, 2)
+    left = np.einsum("nam,nm->na", take, gap)
+    return left, np.diagonal(cov, axis1=1, axis2=2), take @ slope
+
+
+def _variance(left: np.ndarray, own: np.ndarray, member: np.ndarray, centre: float) -> float:
+    """Return the most likely variance of effects shared by the members of each session.
+
+    Args:
+        left: remaining effects of the runs.
+        own: their covariance without shared effects.
+        member: 1 where a run belongs to a session, else 0 (run, session).
+        centre: centre of the prior of the log variance.
+    """
+    root = np.linalg.cholesky(own)
+    white = np.linalg.solve(root, np.concatenate([left[:, None], member], axis=1))
+    scale, turn = np.linalg.eigh(white[:, 1:].T @ white[:, 1:])
+    along = turn.T @ (white[:, 1:].T @ white[:, 0])
+
+    def loss(log_v: float) -> float:
+        grown = 1.0 + np.exp(log_v) * scale
+        explained = np.exp(log_v) * np.sum(along**2 / grown)
+        deviation = (log_v - centre) / SPREAD
+        return float(0.5 * (np.log(grown).sum() - explained + deviation**2))
+
+    span = (centre - 4 * SPREAD, centre + 4 * SPREAD)
+    return float(np.exp(minimize_scalar(loss, bounds=span, method="bounded").x))

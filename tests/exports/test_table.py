@@ -1,0 +1,102 @@
+"""gains.md and gains.csv: every number of the robot, to the last bit, with how sure it is."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+import numpy as np
+import pytest
+
+from slipid.exports.table import HEAD, table_files
+from slipid.robot.controller import Gains, Limits
+from slipid.robot.deployed import DeployedRobot
+from slipid.robot.robot_file import declared_numbers
+from tests.helpers.exported import LOADS, doubtful, mecanum_robot
+from tests.helpers.known_robot import USED
+
+
+def table(robot: DeployedRobot) -> list[dict[str, str]]:
+    """Rows of gains.csv, by columns."""
+    rows = list(csv.reader(io.StringIO(table_files(robot)["gains.csv"])))
+    assert rows[0][0].startswith("# Made by slipid")
+    plain = [row for row in rows if not row[0].startswith("#")]
+    assert tuple(plain[0]) == HEAD
+    assert {len(row) for row in plain} == {len(HEAD)}
+    return [dict(zip(HEAD, row, strict=True)) for row in plain[1:]]
+
+
+def values(rows: list[dict[str, str]], group: str) -> list[float]:
+    return [float(row["value"]) for row in rows if row["group"] == group]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("made", [doubtful, mecanum_robot])
+def test_every_number_reads_back_to_the_last_bit(made):
+    robot = made()
+    rows = table(robot)
+    assert values(rows, "forward") == np.ravel(robot.forward).tolist()
+    assert values(rows, "inverse") == np.ravel(robot.inverse).tolist()
+    assert values(rows, "wheel_curve") == np.ravel(robot.wheel_curve).tolist()
+    gains, limits = Gains.of(robot), Limits()
+    assert values(rows, "gains") == [float(x) for x in vars(gains).values()]
+    assert values(rows, "limits") == list(vars(limits).values())
+    assert values(rows, "motor")[0] == robot.record.wheels.gear_ratio
+    for e in declared_numbers(robot.record):
+        number = robot.record.parameters[e.path]
+        found = [row for row in rows if row["name"] == e.path]
+        assert [float(row["value"]) for row in found] == np.ravel(number.value).tolist()
+        ends = [(row["low90"], row["high90"]) for row in found]
+        if number.interval90 is None:
+            assert set(ends) == {("", "")}
+        else:
+            np.testing.assert_array_equal(
+                np.asarray(ends, float), np.reshape(number.interval90, (-1, 2))
+            )
+
+
+def test_names_are_those_of_the_robot_and_stand_once(robot):
+    rows = table(robot)
+    names = [(row["name"], row["entry"]) for row in rows]
+    assert len(set(names)) == len(names)
+    assert {e.path for e in declared_numbers(robot.record)} < {name for name, _ in names}
+
+
+def test_rows_of_a_matrix_say_which_wheel_and_part_of_the_twist(robot):
+    by_name = {(row["name"], row["entry"]): float(row["value"]) for row in table(robot)}
+    assert by_name["forward[2]", "vy"] == float(robot.forward[1, 1])
+    assert by_name["inverse[W]", "wheel 3"] == float(robot.inverse[2, 2])
+
+
+@pytest.mark.slow
+def test_verdicts_warn(robot):
+    sure = {row["name"]: row["verdict"] for row in table(robot)}
+    assert sure["motor.resistance"] == "NOT IDENTIFIED"
+    assert sure["motor.back_emf"] == "AT BOUND"
+    assert sure["robot.load_share@moved"] == "DISPUTED"
+    assert sure["robot.mass"] == "weak"
+    text = table_files(robot)["gains.md"]
+    assert "> **WARNING.** NOT IDENTIFIED" in text
+    line = next(x for x in text.splitlines() if x.startswith("| `motor.resistance` |"))
+    assert "**NOT IDENTIFIED**" in line
+    assert "WARNING" not in table_files(mecanum_robot())["gains.md"]
+
+
+def test_gains_are_those_the_controller_takes(robot):
+    moved = DeployedRobot.of(robot.record, LOADS[1])
+    by_hand, tuned = table(robot), table(moved)
+    assert by_hand[0]["verdict"] == "by hand"
+    assert tuned[0]["verdict"] == "tuned, better than by hand"
+    assert values(tuned, "gains") == USED
+    assert "those tuned are for the load set-up moved" in table_files(robot)["gains.md"]
+
+
+def test_tables_for_reading_hold_whatever_a_name_is(robot):
+    text = table_files(robot)["gains.md"]
+    columns = {
+        len(line.replace("\\|", "").split("|")) for line in text.splitlines() if line[:1] == "|"
+    }
+    assert columns == {12}
+    assert "\x07" not in text
+    for row in table(robot):
+        assert f" {float(row['value'])!r} |" in text, row
