@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 import threading
 
@@ -148,6 +149,7 @@ def test_threads_do_not_take_each_others_functions(made):
     assert found == {k: {k + 1.0} for k in range(4)}
 
 
+@pytest.mark.skipif(os.environ.get("SLIPID_CHECK_TYPES") == "0", reason="types are not checked")
 def test_slipid_is_checked():
     with pytest.raises(jaxtyping.TypeCheckError, match="robotino2022_csv"):
         robotino2022_csv("no log", 16.0, 2000)
