@@ -158,7 +158,8 @@ def read_vector_map(path: Path) -> VectorMap:
         )
     surfaces = {f.properties.surface for f in given.features} | {about.base}
     if missing := sorted(surfaces - set(about.colours)):
-        raise DataError(f"{path}: no colour of {', '.join(missing)}; expected it in slipid.colours")
+        where = "the key 'colours' of its object 'slipid'"
+        raise DataError(f"{path}: no colour of {', '.join(missing)}; expected it in {where}")
     patches = tuple(
         Patch(
             feature.properties.surface,

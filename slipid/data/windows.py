@@ -259,11 +259,11 @@ def _mean(
 def _between(
     time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], read: Bool[np.ndarray, " row"]
 ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " row"]]:
-    """Return readings interpolated linearly, and the variance rate of a jump between two readings.
+    """Return the signal, linear between readings, and the variance rate of a missed jump.
 
-    The latter is step^2 seconds / 12 in rows from a reading to the next: summed over their time,
-    the variance of the integral over what the meter missed. It is zero where neighbouring rows
-    were read.
+    In the rows between two readings that differ by d and lie T apart, the rate is d^2 T / 12, and 0
+    where neighbouring rows were read. Its integral over T is the variance of the signal's integral,
+    had the signal jumped once at an unknown time.
     """
     if not read.any():
         return x, np.zeros_like(x)

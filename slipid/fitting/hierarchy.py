@@ -160,7 +160,7 @@ class _HeldOutEffects(NamedTuple):
 def _held_out_effects(
     axes: Iterable[_AxisEffects], log_v: Variances, direction: Float[np.ndarray, " segment"]
 ) -> _HeldOutEffects:
-    """Return the effects of every sector as predicted from the other sectors."""
+    """Return every effect less its prediction from the other sectors, with that gap's variance."""
     found = _HeldOutEffects(*(np.full((len(direction), len(AXES)), np.nan) for _ in range(3)))
     for axis in axes:
         v = np.exp(log_v)[axis.numbers]

@@ -164,7 +164,7 @@ class MultiFloorBatch(eqx.Module):
 
     Attributes:
         batch: the windows.
-        counts: 1 for windows that count, else 0.
+        counts: 1 for windows in the likelihood (steady, one floor per wheel), else 0.
     """
 
     batch: lk.Batch

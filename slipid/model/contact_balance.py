@@ -125,8 +125,9 @@ class Balance(eqx.Module):
     def chord(self, xi: Planar) -> Planar:
         """Return the twist that balances the forces when each is replaced by its chord.
 
-        The chord goes from zero speed to xi. tanh(x) / x falls with |x|, so that no step overshoots
-        where Newton's does; near the root it is slow (Weiszfeld's iteration).
+        Each force is replaced by the line through zero speed and its value at xi (Weiszfeld's
+        iteration). Since tanh(x) / x falls with |x|, no step overshoots where Newton's does; near
+        the root it is slow.
         """
         on, f, w = self.on, self.on.frame, self.wheels(*self._speeds(xi))
         # the chord of a lifted wheel would have the wrong sign

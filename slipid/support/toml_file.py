@@ -100,7 +100,7 @@ def _steps(mapping: object, loc: Sequence[Step]) -> list[Step]:
 
 
 def _spelled(steps: Sequence[Step]) -> str:
-    """Return a location as text, such as `a.b[2]`."""
+    """Return a location as text, such as `a.b[2]`; items of lists count from 1."""
     out = ""
     for step in steps:
         if isinstance(step, int):

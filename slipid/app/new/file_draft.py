@@ -74,7 +74,7 @@ def _units_row(one: FileStudy) -> int:
 
 
 def _row_lines(one: FileStudy, main: bool) -> list[ConfigLine]:
-    """Return keys about rows: several runs in one file, repeated rows, gaps, or no time at all."""
+    """Return the layout's keys about rows: start of a run, repeated times, gaps, or the period."""
     if one.clock is None:
         ask = "no column of time: how long is a row [s]?"
         return [layout_line("row_period", 0.05, ask)]

@@ -173,9 +173,9 @@ def _parameters(config: "c.Config | None") -> str:
     head = f"""\
 ## Parameters
 
-Of {whose}. `FLOOR` and `SESSION` stand for names that the logs
-tell. In `[parameters]` a pattern such as `"surface.*.creep"` says what is wanted of all that match
-it."""
+Of {whose}. `FLOOR` and `SESSION` stand for names in the
+logs. In `[parameters]` a pattern such as `"surface.*.creep"` holds for every parameter that it
+matches."""
     columns: list[str] = [
         "parameter",
         "numbers",

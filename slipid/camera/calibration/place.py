@@ -72,7 +72,7 @@ def fit_place(source: str, lens: Lens, points: FloorPoints) -> FloorFit:
     """Return the place of the camera by all points.
 
     Raises:
-        DataError: no camera above the floor sees the points so.
+        DataError: no place of a camera above the floor explains the points.
     """
     fit = _fitted(lens, points)
     if fit is None:

@@ -104,7 +104,7 @@ def _simplified(
     Each part between two junctions is simplified alone, hence alike for the patches on both sides.
     """
     ends = np.flatnonzero(fixed[ring[:, 1], ring[:, 0]])
-    if not len(ends):  # both sides begin at the same corner
+    if not len(ends):  # no junction: begin at the lowest corner, which both patches find
         ends = np.array([np.lexsort((ring[:, 1], ring[:, 0]))[0]])
     turned = np.roll(ring, -ends[0], axis=0)
     closed = np.concatenate([turned, turned[:1]]).astype(float)

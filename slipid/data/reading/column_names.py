@@ -59,7 +59,7 @@ _TABLE: dict[str, str] = {
         "log sensor drive shaft nsec sec secs ros"
     ),
 }
-"""Roles and their words: the dictionary of all names."""
+"""Words in column names, by their role and its value: `side l` is the role `side`, value `l`."""
 _ROLES: dict[str, tuple[str, str]] = {
     word: (role.partition(" ")[0], role.partition(" ")[2])
     for role, words in _TABLE.items()

@@ -76,7 +76,7 @@ def _worst(fit: MotorFit, equation: Equation) -> Misfit | None:
         ("current", (w.odd.current, w.even.current), "A"),
         ("time", (w.time, w.time), "s"),
     ):
-        # bins depend on the rows that a residual is not computed from, or noise would sort them
+        # residuals of even rows are binned by odd rows and vice versa, or noise would choose bins
         bins = [np.array_split(used[np.argsort(v[used], kind="stable")], BINS) for v in (odd, even)]
         for one, other in zip(*bins, strict=True):
             off, sure = _mean(fit, equation, one, other)

@@ -16,7 +16,9 @@ MOST_SPEEDS = 4
 
 @dataclass(frozen=True)
 class DesignOptions:
-    """Options of the command line; the fit's driven ranges replace those that are absent.
+    """Options of `slipid design`; one that is not given takes the range that fitted runs cover.
+
+    A goal is a number, or a prediction, whose std the new runs are to reduce.
 
     Attributes:
         parameters: patterns of the names of goals.

@@ -156,7 +156,7 @@ def tracking_error(wanted: PlaneVector, pose: PlaneVector) -> PlaneVector:
 
 
 def lyapunov(e: PlaneVector) -> Numbers:
-    """Return the function V of errors; squared metres and radians are added as they are."""
+    """Return the Lyapunov function V of the errors; terms in m^2 and rad have no weights."""
     return 0.5 * (e.x * e.x + e.y * e.y) + 1.0 - e.yaw.__array_namespace__().cos(e.yaw)
 
 

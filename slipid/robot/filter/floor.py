@@ -1,10 +1,11 @@
 """A floor map for jitted functions, and the evidence that it gives on floors and pose.
 
 With a map, the estimated pose and its covariance determine which floors are likely under the
-wheels. Poses x_s drawn from the belief, at fixed places in its own axes, make it a prior of every
-hypothesis c, one floor under each wheel:
+wheels. Poses x_s are drawn from the belief, at fixed places in its own axes. The map gives each of
+them the probability W_sc of every hypothesis c (one floor under each wheel); their mean is c's
+prior. [...] is 1 where it is true, else 0:
 
-    W_sc ~ prod_wheel [(1 - leak) (map at the wheel of x_s is c's) + leak / floors],  sum_c W_sc = 1
+    W_sc ~ prod_wheel ((1 - leak) [map at the wheel of x_s is c's] + leak / floors),  sum_c W_sc = 1
     prior_c = mean_s W_sc
 
 The evidence of a step's currents and gyro on the hypotheses, p_c before and p_c' after it, shows in

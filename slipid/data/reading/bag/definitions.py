@@ -25,7 +25,7 @@ _SEPARATOR = "=" * 80 + "\n"
 
 @dataclass(frozen=True)
 class NumberType:
-    """A number; its numpy type has no byte order, such as `f8`."""
+    """A number; `dtype` is its numpy type without byte order, such as `f8`."""
 
     dtype: str
 

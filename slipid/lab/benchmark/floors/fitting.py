@@ -41,7 +41,7 @@ FITTED = ("friction", "creep", "rolling_resistance")
 START = np.log([0.6, 0.15, 0.08])
 """Prior means of the logarithms; their prior std is one."""
 CURRENT_A, YAW_RATE = 1.0, 0.2
-"""Units of the residuals of currents and turning [A], [rad/s]."""
+"""Scales by which residuals of currents and of the yaw rate are divided [A], [rad/s]."""
 ALIKE, LONG = 20.0, 300.0
 """Rows at the same speeds, and rows of a run, above which more rows add little information."""
 CELLS = 512

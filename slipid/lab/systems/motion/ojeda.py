@@ -64,7 +64,7 @@ Line = Float[np.ndarray, "2"]
 Tuning = Literal["continuous", "sporadic", "gyro"]
 FORGETTING = 0.995
 SIGMAS = 3.0
-"""Excess of the mean current over the hard floor's mean from which slip is flagged."""
+"""Excess of the mean current over the hard floor's mean from which slip is flagged [std there]."""
 MOVING = 0.02
 """Mean rim speed above which the robot moves [m/s]."""
 PRIOR = 1e6

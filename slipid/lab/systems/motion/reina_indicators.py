@@ -44,7 +44,7 @@ class Sugeno:
 
     @classmethod
     def logical_or(cls, inputs: int, sets: int) -> "Sugeno":
-        """Return rules whose output is the peak of the highest set among their inputs."""
+        """Return rules that compute OR: the output is the largest peak of the inputs' sets."""
         peak = np.linspace(0.0, 1.0, sets)
         grid = np.stack(np.meshgrid(*[peak] * inputs, indexing="ij"), axis=-1)
         return cls(sets, grid.max(axis=-1).ravel())
