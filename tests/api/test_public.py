@@ -60,8 +60,8 @@ def world(tmp_path_factory) -> dict:
 @pytest.mark.slow
 def test_the_example_of_the_readme_runs(world, capsys):
     assert (world["folder"] / "robot.json").is_file()
-    assert np.shape(world["seen"].pose) == (3,)
-    assert set(world["seen"].surface) <= {"gray", "unknown"}
+    assert np.shape(world["estimate"].pose) == (3,)
+    assert set(world["estimate"].surface) <= {"gray", "unknown"}
     assert "surface.gray.creep" in str(world["fit"])
     assert world["fit"]["robot.load_share@as_built"].verdict
     assert "not converged" in str(world["posterior"]).lower()
