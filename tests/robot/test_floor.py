@@ -71,19 +71,25 @@ def met(after, before):
 
     Beliefs are by the floor under all wheels, `{floor: probability}`.
     """
-    robot = deployed()
-    hypotheses = hypotheses_of(robot).under
-    by_pose, by_floor = PoseFilter(robot, SETTINGS), FloorFilter(robot, SETTINGS)
-    state = by_pose.init(jnp.zeros(3), (0.2, 0.1))
-    none, still = jnp.zeros(3), TimeStep(jnp.asarray(0.05), jnp.zeros((), bool), jnp.zeros(()))
-    currents = MotorCurrents(none, jnp.zeros(3, int), jnp.ones(3))
-    _, motion = by_floor.step(by_floor.init(), none, currents, jnp.asarray(jnp.nan), still)
+    hypotheses = hypotheses_of(deployed()).under
 
     def of(belief):
         alike = [(hypotheses == k).all(axis=1) * p for k, p in belief.items()]
         return jnp.asarray(np.sum(alike, axis=0, dtype=float))
 
-    motion = replace(motion, known=of(after), before=of(before))
+    return believed(PoseFilter(deployed(), SETTINGS), of(after), of(before))
+
+
+@eqx.filter_jit
+def believed(by_pose, after, before):
+    """The same by the probability of every hypothesis."""
+    robot = by_pose.robot
+    by_floor, hypotheses = FloorFilter(robot, SETTINGS), hypotheses_of(robot).under
+    state = by_pose.init(jnp.zeros(3), (0.2, 0.1))
+    none, still = jnp.zeros(3), TimeStep(jnp.asarray(0.05), jnp.zeros((), bool), jnp.zeros(()))
+    currents = MotorCurrents(none, jnp.zeros(3, int), jnp.ones(3))
+    _, motion = by_floor.step(by_floor.init(), none, currents, jnp.asarray(jnp.nan), still)
+    motion = replace(motion, known=after, before=before)
     root, supports = by_pose.mapped(state, HALVES, hypotheses)
     return state, *apply_map(state, root, supports, motion)
 
