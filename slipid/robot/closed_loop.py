@@ -24,7 +24,7 @@ from slipid.robot.trajectory import Path
 PERIOD = 0.05
 """Time between two commands [s]."""
 LONGEST = 2.0
-"""A run is stopped after this multiple of the path's own duration, plus 10 s."""
+"""A run is stopped after this multiple of the path's duration plus 10 s [1]."""
 
 
 class ControlLoopState(eqx.Module, Generic[State]):
@@ -33,7 +33,7 @@ class ControlLoopState(eqx.Module, Generic[State]):
     Attributes:
         estimator: state of the estimator.
         controller: state of the controller.
-        time: time of the path [s].
+        time: time of the path, which runs slower than real time while the robot lags [s].
     """
 
     estimator: State
@@ -75,7 +75,7 @@ class ControlLoop(eqx.Module, Generic[State]):
         measurement: Measurement | Readings,
         dt: Float[Numbers, ""] | float,
     ) -> tuple[ControlLoopState[State], ControlLoopOutput]:
-        """Return the next state, and the command with the estimate that it follows from."""
+        """Return the next state, and the output: the command and the estimate it is based on."""
         dt = jnp.asarray(dt, dtype=float)
         estimator, estimate = self.estimator.step(state.estimator, measurement, dt)
         here = jnp.where(jnp.isfinite(estimate.pose), estimate.pose, 1e3)
@@ -113,7 +113,7 @@ class ClosedLoopRun:
         path_time: time of the path at each row [s].
         pose: true pose [m, m, rad].
         command: commanded wheel speeds [rad/s].
-        estimate: everything that was estimated; every array has a leading axis of steps.
+        estimate: outputs of the estimator; every array has a leading axis of steps.
         energy: energy used by the motors so far [J]; NaN where the plant does not know it.
     """
 
@@ -132,7 +132,7 @@ class ClosedLoopRun:
 
 
 _step = eqx.filter_jit(ControlLoop.step)
-"""Compiled step with all numbers as arguments, so that all loops of one structure share it."""
+"""Compiled step whose numbers are all arguments, so that loops of equal structure share it."""
 
 
 def run_closed_loop(
@@ -142,7 +142,7 @@ def run_closed_loop(
 
     Args:
         loop: estimator and controller.
-        path: path, already placed for a robot at `start`.
+        path: path in world coordinates that begins at `start`.
         plant: robot that is driven.
         start: pose at which the estimator starts [m, m, rad].
     """
@@ -189,9 +189,9 @@ class PathMetrics:
     """Errors of a closed-loop run along its path, computed from true poses.
 
     Attributes:
-        along_track_mm: distance travelled less distance wanted, at the end of every side or quarter
-            of a curve [mm].
-        sides_mm: straight distance wanted from one of these ends to the next [mm].
+        along_track_mm: error along the direction of travel, positive where the robot went too far,
+            at the end of every side or quarter of a curve [mm].
+        sides_mm: straight distance in the path from each of these ends to the next [mm].
         closure_mm: distance from the last pose to the end of the path, plus the path length that
             remained where the controller gave up [mm].
         cross_track_rmse_mm: root mean square over time of the distance from the path [mm].

@@ -8,11 +8,14 @@ the terms that they add to the pose loop
 
 or in a law that replaces it.
 
+with the pose p [m] and heading [rad], their references p_ref and heading_ref, the demanded velocity
+v [m/s] in the body frame and yaw rate W [rad/s], and R, the rotation from world to body axes.
+
 A robot whose wheels turn while its body stands still enters recovery: it alternates between turning
-on the spot and driving, with growing effort. Such rests exist far from the path, where the demands
-to drive and to turn cancel at the wheels that have grip and only a wheel without grip spins. The
-controller returns to normal operation once the robot has moved for a while. Otherwise it stops for
-good and reports that it gave up.
+on the spot and driving, with growing effort. A robot far from its path can get stuck like this
+where the demands to drive and to turn cancel at the wheels that have grip and only a wheel without
+grip spins. The controller returns to normal operation once the robot has moved for a while.
+Otherwise it stops for good and reports that it gave up.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,19 +35,22 @@ Correction = Literal["none", "torque", "paper_print", "paper_code"]
 Law = Callable[[Float[Array, "6"], Float[Array, "3"]], Float[Array, "3"]]
 """Function from a reference (see `Path.at`) and a pose to a body twist [m/s, m/s, rad/s]."""
 PAPER_GAIN = {"x": (3000.0, 500.0, 3000.0), "y": (2000.0, 2000.0, 2000.0)}
-"""Gains of the 2021 paper's torque correction by leg [motor rpm per N m at the motor shaft]."""
+"""Gain of the 2021 paper's torque correction for each of the robot's three wheels, by the body axis
+along which the robot mainly drives [motor rpm per N m at the motor shaft]."""
 OBSERVE_S = 0.4
 """Time constant of the disturbance observer [s]."""
 LONGEST_I = 0.06
-"""Largest velocity that the integral term may add [m/s]."""
+"""Largest velocity that the integral term may add to each component [m/s]."""
 STUCK_S = 0.5
-"""Time without the demanded motion until a robot is stuck, and with it until it is free [s]."""
+"""Time without the demanded motion after which a robot counts as stuck, and time with the demanded
+motion after which it counts as free again [s]."""
 STUCK_SHARE, STUCK_FROM = 0.2, 0.1
-"""A robot is blocked below this share of the demanded speed, for demands above this speed [m/s]."""
+"""A robot counts as blocked if its speed is below this share of the demanded speed [1], provided
+that the demanded speed exceeds the second number [m/s]."""
 TURN_S, GO_S = 0.6, 1.2
-"""Durations for which a stuck robot alternately turns on the spot and drives [s]."""
+"""Durations of the alternating stages of a recovery: turning on the spot, then driving [s]."""
 RECOVERY_GROWTH = 0.6
-"""Relative growth of the demand per second of recovery [1/s]."""
+"""Relative growth of the demanded twist per second of recovery [1/s]."""
 GIVES_UP_S = 15.0
 """Duration of a recovery after which the robot stops for good [s]."""
 
@@ -80,7 +86,7 @@ class Gains(eqx.Module):
 
     @classmethod
     def at(cls, values: Sequence[Float[Array, ""] | float] | Float[Numbers, " gain"]) -> "Gains":
-        """Return the gains of a vector, in the order in which they are declared."""
+        """Return gains from a vector that lists them in the order of their declaration."""
         return cls(*(jnp.asarray(value, dtype=float) for value in values))
 
 
@@ -107,10 +113,11 @@ class ControllerState(eqx.Module):
         command: last command [rad/s].
         integral: velocity of the integral term [m/s].
         wanted: twist demanded in the last step [m/s, m/s, rad/s].
-        miss: smoothed difference of the estimated twist and the demanded one [m/s, m/s, rad/s].
-        still: time for which the body has not moved as demanded; it counts down while it moves [s].
+        miss: smoothed difference, estimated twist less demanded twist [m/s, m/s, rad/s].
+        still: time for which the body has not moved as demanded; it counts down while the body
+            moves as demanded [s].
         tried: time since the current recovery began; 0 while there is none [s].
-        begun: whether anything was commanded yet.
+        begun: whether a command has been computed yet.
     """
 
     command: Float[Array, " wheel"]
@@ -137,13 +144,16 @@ def limit_command(
 ) -> Float[Array, " wheel"]:
     """Return wheel speeds within all limits, scaled together so that the robot keeps its direction.
 
-    Speed and voltage scale the command, U = R |I| + n C_e |w| being at most the supply's voltage;
-    acceleration scales the change from the last command. The result is never NaN.
+    The limits of wheel speed and voltage scale the whole command. The voltage at each motor,
+    U = R |I| + n C_e |w|, must not exceed that of the supply; R is the resistance [Ohm], I the
+    current [A], n the gear ratio, C_e the back-EMF constant [V s/rad] and w the wheel speed
+    [rad/s]. The limit of acceleration scales the change from the last command. The result is never
+    NaN.
 
     Args:
         wanted: demanded wheel speeds [rad/s].
         before: last command [rad/s].
-        current: motor currents, which determine how much voltage remains for speed [A].
+        current: motor currents, whose voltage drop reduces the largest wheel speed [A].
         robot: robot with the constants of its motor.
         limits: limits of the command.
         dt: time since the last command [s].
@@ -176,15 +186,17 @@ def _recovery_factors(tried: Float[Array, ""]) -> Float[Array, "3"]:
 
 
 class Controller(eqx.Module):
-    """Pose loop with optional correction terms, or with another law in its place.
+    """Pose loop with optional correction terms, or another law that replaces it.
 
     Attributes:
-        gains: gains; by default those tuned for the robot where they are better than those by hand.
+        robot: identified robot.
+        gains: gains; by default those tuned for the robot if they are better than those set by
+            hand.
         limits: limits of the command.
-        correction: torque correction of the 2021 paper, as the paper prints it, as its authors ran
-            it, or corrected.
-        law: law that replaces the pose loop and its integral; as a module, its numbers are
-            arguments of the compiled code.
+        correction: torque correction of the 2021 paper: "paper_print" as the paper prints it,
+            "paper_code" as its authors ran it, "torque" with the errors removed, or "none".
+        law: law that replaces the pose loop and its integral; if it is an equinox module, its
+            numbers are arguments of the compiled code.
     """
 
     robot: RobotArrays
@@ -220,8 +232,8 @@ class Controller(eqx.Module):
         """Return the next state and the wheel speeds to command [rad/s].
 
         The robot stops, at the allowed deceleration, while the estimate is stale or any input is
-        not finite, and for good once the controller has given up. It starts from the measured wheel
-        speeds.
+        not finite, and for good once the controller has given up. The first command is limited
+        relative to the measured wheel speeds.
 
         Args:
             state: state from `init` or the last step.
@@ -239,7 +251,7 @@ class Controller(eqx.Module):
         safe &= ~old.gave_up
         still, tried = self._recovery(old, e, jnp.where(safe, dt, 0.0))
         wanted = self._wanted(old, ref, pose, gap)
-        # motion of the robot by the estimator, less the motion that was demanded
+        # disturbance: estimated twist of the robot, less the twist demanded in the last step
         twist = jnp.where(safe, e.twist, 0.0)
         a = 1 - jnp.exp(-dt / OBSERVE_S)
         miss = old.miss + a * (twist - old.wanted - old.miss)
@@ -249,7 +261,7 @@ class Controller(eqx.Module):
         wheels = jnp.where(safe, wheels, 0.0)
         since = jnp.where(safe, dt, jnp.maximum(dt, UNTIMED_S))
         command = limit_command(wheels, before, e.current, self.robot, self.limits, since)
-        free = safe & (jnp.max(jnp.abs(command - wheels)) < 0.05)  # the integral rests at a limit
+        free = safe & (jnp.max(jnp.abs(command - wheels)) < 0.05)  # no integration at a limit
         summed = jnp.clip(old.integral + k.integral * gap * dt, -LONGEST_I, LONGEST_I)
         new = ControllerState(
             command=command,
@@ -263,10 +275,10 @@ class Controller(eqx.Module):
         return new, command
 
     def _recovery(self, old: ControllerState, e: StateEstimate, dt: Array) -> tuple[Array, Array]:
-        """Return the times without the demanded motion and since recovery began [s].
+        """Return the time without the demanded motion, and the time since recovery began [s].
 
-        While the robot turns on the spot no translation is demanded, so the first time stands still
-        at that stage.
+        While the robot turns on the spot no translation is demanded, so the first time does not
+        change during that stage.
         """
         demand = jnp.sqrt(old.wanted[:2] @ old.wanted[:2] + 1e-12)
         speed = jnp.sqrt(e.twist[:2] @ e.twist[:2] + 1e-12)
@@ -278,7 +290,10 @@ class Controller(eqx.Module):
         return still, jnp.where(tries, old.tried + dt, 0.0)
 
     def _wanted(self, old: ControllerState, ref: Array, pose: Array, gap: Array) -> Array:
-        """Return the speed-limited twist of the pose loop or the law [m/s, m/s, rad/s]."""
+        """Return the twist that the pose loop or the law demands, within the speed limit.
+
+        Units are [m/s, m/s, rad/s].
+        """
         wanted = self._pose_loop(old, ref, pose, gap) if self.law is None else self.law(ref, pose)
         wanted = wanted * _recovery_factors(old.tried)
         fast = jnp.sqrt(wanted[:2] @ wanted[:2] + 1e-12) / self.limits.twist
@@ -310,7 +325,7 @@ class Controller(eqx.Module):
             off = force.at[:2].add(-(force[:2] @ u) * u).at[2].multiply(straight)
         if self.correction == "torque":
             moment = f.frame.radius * f.inverse.T @ off
-        else:  # as printed: divided by the lever, not multiplied
+        else:  # as the paper prints it: divided by the lever arm instead of multiplied
             printed = f.forward.at[:, 2].divide(f.frame.base**2)
             moment = f.frame.radius * printed @ off
         moves = jnp.max(jnp.abs(e.wheel_speed)) > 0.5

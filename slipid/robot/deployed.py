@@ -1,4 +1,4 @@
-"""Arrays of an identified robot that estimators and controllers use, and their robot.json."""
+"""Arrays of an identified robot that estimators and controllers use; they come from robot.json."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -24,14 +24,14 @@ from slipid.support.errors import DataError
 class RobotArrays(eqx.Module):
     """Arrays of an identified robot with one load set-up, as estimators and controllers hold them.
 
-    Compiled code depends on the static fields, which are the robot's structure, and on no number:
-    robots of one structure share it. A drive is a motor with its encoder and ammeter. There is one
-    for every wheel unless a motor drives several wheels.
+    Compiled code depends only on the static fields, which describe the robot's structure, so robots
+    of equal structure share it whatever their numbers. A drive is a motor with its encoder and
+    ammeter. There is one for every wheel unless a motor drives several wheels.
 
     Attributes:
-        frame: directions and size of the wheels.
+        frame: directions and radii of the wheels.
         places: wheel centres in the body frame [m].
-        forward: J, rim speeds per body twist (drive, 3).
+        forward: matrix J (drive, 3), rim speeds [m/s] = J body twist [m/s, m/s, rad/s].
         inverse: pseudo-inverse of J (3, drive).
         motor: constants of the motor, which all drives share.
         floors: contact parameters, one row per floor in the order of `labels`.
@@ -39,19 +39,19 @@ class RobotArrays(eqx.Module):
         mass: mass of the robot [kg].
         process: std of the model's random errors, which grow with the root of the path length,
             along and across [m/sqrt(m)] and in yaw [rad/sqrt(m)].
-        effect: std of the effects, which stay the same over the path, [m/m], [m/m], [rad/m]; the
-            posterior spread of the fitted numbers is included.
+        effect: std of the effects, errors that stay the same over the path, along and across [m/m]
+            and in yaw [rad/m]; it includes the posterior spread of the fitted numbers.
         effect_table: estimates of the effects from the fitted runs, by direction and speed.
         friction_covariance: posterior covariance of the log frictions.
-        current_std: std of measured currents about the model's, without the ammeters' noise [A].
+        current_std: std of measured less modelled currents, without the ammeters' noise [A].
         current_trend: a and b of a + b v, by which measured currents exceed the model's at speed v
             [A, A s/m].
-        highest: highest wheel speed of the fitted runs [rad/s], and the model's largest current up
-            to 0.8 of it [A].
+        highest: highest wheel speed of the fitted runs [rad/s], and the largest current that the
+            model predicts up to 0.8 of that speed [A].
         wheel_curve: a and b of a + b |I|, the slip ratio of each drive over all floors (drive, 2).
         drive_of: drive of each wheel, see `slipid.model.geometry.Geometry`.
         around: order of the wheels around the body, see `slipid.model.geometry.Geometry`.
-        unseen: for each floor, whether no run drove on it.
+        unseen: for each floor, True if no run drove on it.
     """
 
     frame: WheelFrame
@@ -91,7 +91,7 @@ class RobotArrays(eqx.Module):
 
     @property
     def by_wheels(self) -> Float[Array, "3 wheel"]:
-        """Body twist per rim speed of every wheel, where all wheels of a drive have one speed."""
+        """Matrix from rim speeds to body twist, where wheels of a drive share their speed."""
         if not self.drive_of:
             return self.inverse
         return self.inverse @ self.on_average(jnp.eye(self.wheels)).T
@@ -151,7 +151,7 @@ class DeployedRobot(RobotArrays):
     def load(cls, path: Path | str, load: str | None = None) -> "DeployedRobot":
         """Return the robot of a file that `slipid identify`, `slipid sample` or `save` wrote.
 
-        `load` names its load set-up, the first one by default.
+        `load` is the name of the load set-up, by default the first one in the file.
 
         Raises:
             DataError: the file is absent, damaged, changed or of a newer version, or has no such
@@ -171,7 +171,8 @@ class DeployedRobot(RobotArrays):
         """Write robot.json, with all load set-ups.
 
         Raises:
-            ValueError: arrays were changed after the robot was made, which the file could not hold.
+            ValueError: arrays differ from those of the record, since they were changed later; the
+                file can hold only the record.
             DataError: the file cannot be written.
         """
         same = DeployedRobot.of(self.record, self.load_setup)
@@ -186,8 +187,8 @@ class DeployedRobot(RobotArrays):
         """Return the robot for a site that is known to have these floors only.
 
         Raises:
-            ValueError: no floor is given, one is given twice or is not identified; names those that
-                are.
+            ValueError: no floor is given, one is given twice or is not identified; the message
+                lists the identified floors.
         """
         known = ", ".join(self.labels)
         for name in floors:
@@ -199,20 +200,20 @@ class DeployedRobot(RobotArrays):
         return DeployedRobot.of(self.record.on(rows), self.load_setup)
 
     def with_unseen(self) -> "DeployedRobot":
-        """Return the robot for a site that may have floors without a run, `unseen_1` and on.
+        """Return the robot with additional floors `unseen_1`, `unseen_2`, ... that no run drove on.
 
-        Its estimator then assigns an unfamiliar floor to whichever of them fits the currents best,
-        with their large uncertainty; without them it assigns it to a known floor. See
+        On an unfamiliar floor its estimator then selects the one of them that fits the currents
+        best, with a large uncertainty of the motion; without them it selects a known floor. See
         `slipid.robot.unseen`.
         """
         return DeployedRobot.of(with_unseen(self.record), self.load_setup)
 
 
 def with_record(robot: RobotArrays) -> DeployedRobot:
-    """Return the same robot once it is certain that it has its record.
+    """Return the same robot, checked to include its record.
 
     Raises:
-        ValueError: it consists of arrays alone.
+        ValueError: the robot consists of arrays alone.
     """
     if not isinstance(robot, DeployedRobot):
         raise ValueError(
@@ -223,11 +224,11 @@ def with_record(robot: RobotArrays) -> DeployedRobot:
 
 
 def posterior_robots(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
-    """Return the robots of some posterior draws, stacked along a leading axis.
+    """Return the robots of the posterior draws number `picked`, stacked along a leading axis.
 
-    Differences between runs stay in `DeployedRobot.effect`; the spread of the numbers is in the
-    draws. Effect tables belong to the robot's own numbers, with the same share of the std
-    unexplained. `highest` and `wheel_curve` are those of the robot.
+    `DeployedRobot.effect` then holds only the differences between runs, since the draws themselves
+    show the spread of the numbers. The means of the effect tables, the remaining shares of their
+    std, `highest` and `wheel_curve` are those of `robot`.
     """
     record, one = robot.record, []
     plain = {path: n.value for path, n in record.parameters.items()}
@@ -240,9 +241,9 @@ def posterior_robots(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedR
 def _arrays(
     record: RobotRecord, load: str | None, values: Mapping[str, Numbers], spread: bool = True
 ) -> DeployedRobot:
-    """Return the arrays of a record at some values of its numbers, by path.
+    """Return the arrays of a record for `values` of its numbers by path.
 
-    With `spread` the posterior uncertainty of the numbers counts as an effect.
+    With `spread` the std of effects includes the posterior uncertainty of the numbers.
     """
     place = record.load_index(load)
     chosen, wheels, floors = record.loads[place], record.wheels, record.floors
@@ -289,7 +290,10 @@ def _array(value: Numbers | Sequence[object]) -> Array:
 
 
 def _effect_table(load: LoadRecord, whole: Array) -> EffectLookup:
-    """Return the effect table of a load set-up, its stds relative to the whole std of a floor."""
+    """Return the effect table of a load set-up, its remaining stds as shares of `whole`.
+
+    `whole` (floor, 3) is the std of each floor's effects without a table [m/m, m/m, rad/m].
+    """
     if load.told is None:
         return EffectLookup.empty(len(whole))
     mean, left = _array(load.told.mean), _array(load.told.left)
@@ -298,7 +302,7 @@ def _effect_table(load: LoadRecord, whole: Array) -> EffectLookup:
 
 
 def _friction_covariance(record: RobotRecord) -> Array:
-    """Return the posterior covariance of the floors' log frictions, which is 0 for fixed ones."""
+    """Return the posterior covariance of the floors' log frictions; fixed frictions have 0."""
     still = (1.0,) * max(record.drawn, 1)
     paths = [f"surface.{name}.friction" for name in record.labels]
     logs = np.log(np.array([record.draws.get(path, still) for path in paths], dtype=float))

@@ -1,9 +1,12 @@
 """Estimators of slip, floor and pose from wheel speeds and currents, and odometry without contact.
 
-In `Estimator` wheel readings go through a filter over the floors under the wheels (`floor_filter`),
-which yields the body's motion, and that goes through a filter of the pose (`pose_filter`):
+In `Estimator` a filter over the floors under the wheels (`floor_filter`) turns the wheel readings
+into a body motion, from which a second filter computes the pose (`pose_filter`):
 
     xi = sum_c p_c xi_c,   pose <- pose * exp(xi dt) * (late corrections from the floors)
+
+with p_c the probability of hypothesis c, one floor under each wheel, and xi_c the body twist
+[m/s, m/s, rad/s] if that hypothesis is true.
 """
 
 from dataclasses import replace
@@ -30,7 +33,7 @@ from slipid.robot.interface import (
 )
 
 CURRENT_FROM = 0.4
-"""Current above which the 2021 paper's deployed estimator subtracts slip [A]."""
+"""Motor current above which the 2021 paper's deployed estimator subtracts slip [A]."""
 
 
 class EstimatorState(eqx.Module):
@@ -57,7 +60,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
     Attributes:
         robot: identified robot; its `labels` name the floors in the order of
             `StateEstimate.surface_probability`.
-        settings: settings; by default those that fit the robot's logs.
+        settings: settings; by default those for the sensors and floors of the robot's logs.
         floor: map of the site, its surfaces numbered as in the robot's `labels`; None without a
             map.
     """
@@ -133,7 +136,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
         )
 
     def _slip(self, w: Array, twist: Array) -> Array:
-        """Return the slip ratio of each drive, which is 0 while it stands."""
+        """Return the slip ratio of each drive [1]; it is 0 while the drive stands."""
         f, turns = self.robot, jnp.abs(w) > 1e-3
         rim = f.frame.radius * jnp.where(turns, w, 1.0)
         return jnp.where(turns, jnp.clip(1 - f.forward @ twist / rim, -2.0, 2.0), 0.0)
@@ -141,7 +144,8 @@ class Estimator(AbstractEstimator[EstimatorState]):
     def _stuck(self, before: Array, w: Array, twist: Array, tick: TimeStep) -> Array:
         """Return the time since the body stopped moving while its wheels turn [s].
 
-        Source: Ward and Iagnemma 2008, below a fifth of the wheels' speed.
+        The body counts as stopped below a fifth of the speed of wheels that do not slip. Source:
+        Ward and Iagnemma 2008.
         """
         f = self.robot
         speed = length((f.inverse @ (f.frame.radius * w))[:2])
@@ -149,14 +153,21 @@ class Estimator(AbstractEstimator[EstimatorState]):
         return jnp.where(blocked, jnp.minimum(before + tick.dt, 1e3), 0.0)
 
     def _beyond(self, w: Array, amps: Array, unknown: Array) -> Bool[Array, ""]:
-        """Return whether speed or currents exceed the fitted runs', or no floor explains them."""
+        """Return whether speed or currents exceed those of the fitted runs, or no floor fits."""
         highest = self.robot.highest
         fast = jnp.max(jnp.abs(w)) > 1.3 * highest[0]
         return fast | (jnp.max(jnp.abs(amps)) > 1.3 * highest[1]) | (unknown > 0.5)
 
 
 def _corrected(floors: FloorState, left: Array, place: PoseState, expected: Array) -> FloorState:
-    """Return the belief after a map corrected the pose, with `left` in the world's axes."""
+    """Return the belief after a map corrected the pose.
+
+    Args:
+        floors: belief before the correction.
+        left: share of the distances between poses that the correction leaves, in world axes (3, 3).
+        place: corrected pose.
+        expected: probability of each hypothesis by the map at the corrected pose.
+    """
     world = axes_rotation(place.pose[2])
     return replace(floors, apart=floors.apart @ (world.T @ left @ world).T, expected=expected)
 
@@ -176,14 +187,13 @@ class OdometryState(eqx.Module):
 
 
 class Odometry(AbstractEstimator[OdometryState]):
-    """Wheel-by-wheel odometry, w_eff = w (1 - s).
+    """Wheel-by-wheel odometry: a wheel with speed w and slip ratio s rolls at w_eff = w (1 - s).
 
     Attributes:
         robot: identified robot.
-        settings: settings; by default those that fit the robot's logs.
-        curve: whether slip follows `DeployedRobot.wheel_curve`, a + b |I| where the smoothed
-            current exceeds `CURRENT_FROM`, as on the 2021 paper's robot; else encoders count as
-            free of slip.
+        settings: settings; by default those for the sensors and floors of the robot's logs.
+        curve: True for a slip ratio by `DeployedRobot.wheel_curve`, a + b |I| where the smoothed
+            current I [A] exceeds `CURRENT_FROM`, as on the 2021 paper's robot; False for no slip.
     """
 
     robot: RobotArrays
@@ -211,7 +221,7 @@ class Odometry(AbstractEstimator[OdometryState]):
         wheels = read_wheels(f, s, old.wheels, z, dt)
         w = wheels.speed
         known = jnp.isfinite(z.current) & (jnp.abs(z.current) < 10.0 * f.highest[1])
-        a = 1 - jnp.exp(-dt / 0.6)  # exponential with 0.97 a row, as on the paper's robot
+        a = 1 - jnp.exp(-dt / 0.6)  # 0.6 s: the paper's robot kept 0.97 of the value per row
         smoothed = old.current + a * (jnp.abs(z.current) - old.current)
         amps = jnp.where(known, smoothed, old.current)
         slip = jnp.zeros_like(w)

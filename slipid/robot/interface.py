@@ -18,32 +18,34 @@ Pose = Float[Numbers, "3"] | tuple[float, float, float]
 """Pose as x, y [m] and heading [rad]."""
 Given = Numbers | Sequence[float] | float | None
 NO_FLOOR = "unknown"
-"""Name of the floor under a wheel where no identified floor explains the measurements."""
+"""Name used for the floor under a wheel if no identified floor explains the measurements."""
 MIXED_FLOORS_PENALTY = 1.0
-"""`Settings.further_floor_penalty` of a robot that is known to drive across edges of floors."""
+"""Value of `Settings.further_floor_penalty` for a robot that is known to drive across edges between
+floors: drop in log probability for each further floor [1]."""
 UNTIMED_S = 0.01
-"""Time that counts for a step without a valid time, for staleness and while stopping [s]."""
+"""Duration assumed for a step without a valid time step, to age readings and to stop [s]."""
 State = TypeVar("State", bound=eqx.Module)
 Some = TypeVar("Some", bound=eqx.Module)
 Scalar = Float[Array, ""] | float
 
 
 def as_arrays(given: Some) -> Some:
-    """Return the module with arrays for numbers, so that compiled code accepts any values."""
+    """Return the module with its numbers as arrays, so that compiled code accepts any values."""
     return jax.tree.map(partial(jnp.asarray, dtype=float), given)
 
 
 class Settings(eqx.Module):
-    """Settings of an estimator, none of which is identified.
+    """Settings of an estimator; they are chosen, not identified.
 
     Attributes:
         current_is_signed: whether the ammeters measure the sign of a current.
-        forget_s: time within which currents repeat the same evidence [s].
+        forget_s: time over which measurements count as one independent piece of evidence on the
+            floors [s].
         filter_s: time constant of the filter of currents [s].
-        patch_m: distance over which the floor under a wheel changes [m].
+        patch_m: mean path length between changes of the floor under a wheel [m].
         doubt_m: distance over which an error of the belief about floors persists [m].
-        further_floor_penalty: drop in log probability for each further floor under the robot.
-        unknown_std: residual at which a hypothesis loses to "unknown", in stds of a current.
+        further_floor_penalty: drop in log probability for each further floor under the robot [1].
+        unknown_std: weighted residual above which "unknown" is more likely than a hypothesis [1].
         ammeter_std_a: noise of an ammeter [A].
         voltmeter_std_v: noise of a voltmeter [V].
         gyro_std: noise of a gyro's reading [rad/s].
@@ -72,7 +74,7 @@ class Settings(eqx.Module):
 
     @classmethod
     def of(cls, robot: RobotArrays) -> "Settings":
-        """Return the settings for a robot by the sensors and floors of its own logs.
+        """Return the settings for a robot that has the sensors and floors of its own logs.
 
         Raises:
             ValueError: the robot comes without its record.
@@ -86,7 +88,7 @@ class Settings(eqx.Module):
 class Readings(eqx.Module):
     """A measurement with NaN for everything that is absent; attributes as in `Measurement`.
 
-    All robots with the same number of drives share one structure, whatever they measure.
+    All robots with the same number of drives share one structure, whichever sensors they have.
     """
 
     wheel_angle: Float[Array, "*batch drive"]
@@ -115,9 +117,9 @@ class Measurement(eqx.Module):
     `Measurement(wheel_angle=angle, current=amps)` is a robot that measures these two.
 
     Attributes:
-        wheel_angle: cumulative angle of every encoder, as the wheel turns [rad]; it takes
+        wheel_angle: cumulative angle of every encoder, scaled to turns of the wheel [rad]; it takes
             precedence over `wheel_speed`.
-        wheel_speed: rate of the same angle [rad/s].
+        wheel_speed: rate of change of that angle [rad/s].
         current: current of every motor [A], signed or unsigned as the estimator's settings say.
         voltage: voltage of every motor [V].
         gyro: yaw rate [rad/s].
@@ -140,7 +142,7 @@ class Measurement(eqx.Module):
         """Return the same readings with NaN for everything that is absent.
 
         Raises:
-            ValueError: a field has another shape than a robot with this number of drives gives.
+            ValueError: a field does not have the shape for this number of drives.
         """
         given = vars(Readings.nothing(drives))
         for name, value in vars(self).items():
@@ -164,7 +166,7 @@ class StateEstimate(eqx.Module):
         current: signed, filtered current of each motor [A].
         surface_probability: probability of each floor under each wheel, in the order of `labels`,
             and of none of them in the last column [1].
-        covariance: covariance of the pose in the world frame [m, m, rad, each times each].
+        covariance: covariance of the pose in the world frame, in products of [m, m, rad].
         stale: whether readings of a wheel are missing for too long.
         immobilised: whether the wheels turn while the body stands still.
         out_of_range: whether speed or currents exceed those of the fitted runs, or the floor is
@@ -186,7 +188,7 @@ class StateEstimate(eqx.Module):
 
     @property
     def surface(self) -> np.ndarray:
-        """Name of the most probable floor under each wheel; `NO_FLOOR` where none of them is."""
+        """Name of the most probable floor under each wheel, or `NO_FLOOR` if none fits."""
         names = np.array([*self.labels, NO_FLOOR])
         return np.asarray(names[np.argmax(np.asarray(self.surface_probability), axis=-1)])
 
@@ -211,16 +213,17 @@ class AbstractEstimator(eqx.Module, Generic[State]):
     def advance(
         self, state: State, z: Readings, dt: Float[Array, ""]
     ) -> tuple[State, StateEstimate]:
-        """Return state and estimate as `step` does, from complete readings."""
+        """Return what `step` returns, from readings that have every field; `dt` is in [s]."""
 
     def step(
         self, state: State, measurement: Measurement | Readings, dt: Float[Numbers, ""] | float
     ) -> tuple[State, StateEstimate]:
         """Return state and estimate one time step later.
 
-        It is compiled at its first call; within a function that JAX transforms it becomes part of
-        that function. Readings that are None, not finite, or beyond what a sensor of this robot
-        could measure count as not measured; a `dt` [s] that is not a positive number counts as 0.
+        The step is compiled at its first call; inside a function that JAX transforms it becomes
+        part of that function. Readings that are None, not finite, or beyond what a sensor of this
+        robot could measure count as not measured; a `dt` [s] that is not a positive number counts
+        as 0.
         """
         z, dt = measurement.filled(self.robot.drives), jnp.asarray(dt, dtype=float)
         given = jax.tree.leaves((self, state, z, dt))

@@ -1,7 +1,7 @@
 """An identified robot as plain values: every number with its uncertainty and its origin.
 
-Field names are the keys of robot.json. Units are those of `UNITS`; numbers of the robot carry
-their own.
+Field names are the keys of robot.json. Units of fields are listed in `UNITS`; each number in
+`RobotRecord.parameters` has its own field `unit`.
 """
 
 from collections.abc import Iterable, Mapping
@@ -15,7 +15,7 @@ from slipid.model.robot import Validity
 from slipid.support.files import checksum
 
 Numbers = float | tuple[float, ...]
-"""A number, or one per wheel or drive."""
+"""A single number, or one number per wheel or drive."""
 Pair = tuple[float, float]
 Axes = tuple[float, float, float]
 """Values along, across and in yaw."""
@@ -61,7 +61,8 @@ class RecordedNumber:
         std: posterior std [unit]; None where the number was fixed.
         interval90: equal-tailed 90 % interval [unit]; None where the number was fixed.
         verdict: how well the logs determine it.
-        provenance: whether the logs, a prior or an explicit choice determine the value.
+        provenance: what determines the value: the logs ("measured"), a prior ("borrowed") or an
+            explicit choice ("override").
         source: method that std and interval come from.
     """
 
@@ -77,12 +78,12 @@ class RecordedNumber:
     def without_std(
         cls, value: Numbers, unit: str, verdict: Verdict, provenance: Provenance
     ) -> "RecordedNumber":
-        """Return a number that no run was fitted to."""
+        """Return a number that was given, not fitted: std and interval are None."""
         return cls(value, unit, None, None, verdict, provenance, "given")
 
 
 def plain(value: np.ndarray) -> Numbers:
-    """Return a float, or a tuple of floats."""
+    """Return an array as a float if it has one element, else as a tuple of floats."""
     return float(value.reshape(())) if value.size == 1 else tuple(float(v) for v in value)
 
 
@@ -105,7 +106,7 @@ class Wheels:
 
     @property
     def drives(self) -> int:
-        """Number of drives, computed without arrays as `Geometry.drives` is with them."""
+        """Number of drives, equal to `Geometry.drives` but computed without arrays."""
         return len(set(self.drive_of)) or len(self.place)
 
 
@@ -116,10 +117,11 @@ class FloorRecord:
     Attributes:
         name: name of the floor.
         process: std of errors that grow with the root of the path length.
-        effect: std of effects, which stay the same over the path.
-        current_std: std of measured currents about the model's, without the ammeters' noise.
-        seen: range of the fitted runs; None where the numbers were given, not fitted.
-        unseen: whether no run drove on it, see `slipid.robot.unseen`.
+        effect: std of effects, errors that stay the same over the path.
+        current_std: std of measured less modelled currents, without the ammeters' noise.
+        seen: ranges of speed, torque and so on that the fitted runs cover; None where the numbers
+            were given, not fitted.
+        unseen: True for a floor that no run drove on, see `slipid.robot.unseen`.
     """
 
     name: str
@@ -134,13 +136,13 @@ class FloorRecord:
 class EffectRecord:
     """Effect table of a load set-up: effects estimated from the fitted runs.
 
-    It has rows for floors, speeds and directions of travel. Directions are those of the motion
-    relative to the body, evenly spaced from straight ahead counter-clockwise.
+    Its arrays are indexed by floor, speed and direction of travel. Directions are those of the
+    motion relative to the body, evenly spaced counter-clockwise from straight ahead.
 
     Attributes:
         speeds: speeds of the rows, rising.
         mean: estimated effect, to be added to the motion that the model predicts.
-        left: remaining std of effects and of the numbers' uncertainty together.
+        left: remaining std, which includes the uncertainty of the robot's numbers.
     """
 
     speeds: tuple[float, ...]
@@ -154,9 +156,10 @@ class LoadRecord:
 
     Attributes:
         name: name of the load set-up.
-        spread: std of the motion per metre from the numbers' uncertainty, on every floor.
-        told: effect table; None where no runs are known.
-        highest_current: largest current of the model up to 0.8 of the highest wheel speed.
+        spread: std of the motion per metre on every floor due to the uncertainty of the numbers.
+        told: effect table; None if the robot was not fitted to runs.
+        highest_current: largest current that the model predicts up to 0.8 of the highest wheel
+            speed.
         wheel_curve: a and b of a + b |I|, the slip ratio of each drive over all floors.
     """
 
@@ -167,7 +170,7 @@ class LoadRecord:
     wheel_curve: tuple[Pair, ...]
 
     def on(self, rows: tuple[int, ...]) -> "LoadRecord":
-        """Return the record with these floors only, given by their numbers."""
+        """Return the record with only the floors number `rows`."""
         spread = tuple(self.spread[k] for k in rows)
         if self.told is None:
             return replace(self, spread=spread)
@@ -186,7 +189,7 @@ class LogSensors:
 
 @dataclass(frozen=True)
 class GainRecord:
-    """One gain [unit], and its std over the end of the search."""
+    """Value of a gain [unit], and its std among the last candidates of the search [unit]."""
 
     value: float
     unit: str
@@ -195,15 +198,15 @@ class GainRecord:
 
 @dataclass(frozen=True)
 class GainValues:
-    """All gains of `slipid.robot.controller.Gains`, and one that is no longer used.
+    """All gains of `slipid.robot.controller.Gains`, and `ahead`, which is no longer used.
 
     Attributes:
         place: gain of the position loop.
         yaw: gain of the heading loop.
         integral: gain of the integral of the position error.
-        ahead: share of wheel speeds by the contact model, which controllers once had.
+        ahead: share of the wheel speeds that earlier controllers took from the contact model.
         observer: gain of the disturbance observer.
-        preview: time by which rates are previewed.
+        preview: time by which reference rates are taken ahead of the reference pose.
     """
 
     place: GainRecord
@@ -216,9 +219,9 @@ class GainValues:
 
 @dataclass(frozen=True)
 class Losses:
-    """Losses of gains by hand and of tuned ones, on cases that were not tuned on.
+    """Losses of the gains set by hand and of the tuned gains, on cases not used for tuning.
 
-    A loss is the mean plus the worst tenth.
+    A loss is the mean over the cases plus the mean over the worst tenth of them.
     """
 
     hand: float
@@ -234,10 +237,10 @@ class GainsRecord:
         load: load set-up they were tuned for.
         gyro: whether the robot had a gyro.
         method: method of the search.
-        loss: losses by hand and tuned.
+        loss: losses of the gains set by hand and of the tuned gains.
         better_than_hand: share of the cases in which the tuned gains win.
-        stability_margin: 1 less the largest spectral radius of a loop.
-        verdict: comparison of the losses; "better" where they differ by more than chance.
+        stability_margin: 1 less the largest spectral radius of the linearized loops.
+        verdict: comparison of the losses; "better" or "worse" if they differ by more than chance.
     """
 
     values: GainValues
@@ -251,7 +254,7 @@ class GainsRecord:
 
     @property
     def is_better(self) -> bool:
-        """Whether they are preferred to those set by hand."""
+        """Whether the tuned gains are used instead of those set by hand."""
         return self.verdict == "better than by hand"
 
 
@@ -262,10 +265,10 @@ class RobotRecord:
     Attributes:
         source: method that the numbers come from.
         wheels: shape of the robot.
-        parameters: numbers by path.
+        parameters: numbers of the robot by path, such as `robot.mass`.
         floors: floors in the order of the arrays.
         loads: load set-ups in the order of the arrays.
-        current_trend: a and b of a + b v, by which measured currents exceed the model's.
+        current_trend: a and b of a + b v, by which measured currents exceed the model's at speed v.
         highest_speed: highest wheel speed of the fitted runs.
         sensors: sensors of the logs.
         alike: drop in log probability for each further floor under the robot; lower where the fit
@@ -294,7 +297,7 @@ class RobotRecord:
 
     @cached_property
     def numbers(self) -> str:
-        """Hash of the robot's numbers, whatever gains it has."""
+        """Hash of the robot's numbers; it does not depend on gains, versions and messages."""
         return checksum(asdict(replace(self, gains=None, versions={}, messages=())))
 
     @cached_property
@@ -321,7 +324,7 @@ class RobotRecord:
         """Return the position of a load set-up, the first by default.
 
         Raises:
-            ValueError: there is none of this name; names those that exist.
+            ValueError: there is no load set-up of this name; the message lists those that exist.
         """
         names = [load.name for load in self.loads]
         if name not in (None, *names):
@@ -329,7 +332,7 @@ class RobotRecord:
         return 0 if name is None else names.index(name)
 
     def on(self, rows: tuple[int, ...]) -> "RobotRecord":
-        """Return the record with these floors only, given by their numbers."""
+        """Return the record with only the floors number `rows`."""
         floors = tuple(self.floors[k] for k in rows)
         kept = tuple(f"surface.{floor.name}." for floor in floors)
 

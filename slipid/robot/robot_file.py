@@ -1,4 +1,4 @@
-"""robot.json: written whole or not at all, and read with one clear message for any error.
+"""Reading and writing of robot.json: a write is complete or changes nothing, errors are explained.
 
 `typed` turns JSON values into dataclasses. `robot.schema.json` beside this package describes the
 file for other programs.
@@ -32,16 +32,17 @@ _PLAIN = {bool: "true or false", str: "text", int: "a whole number", NoneType: "
 
 
 def typed(kind: type[Kind], value: object, where: str = "") -> Kind:
-    """Return a JSON value as a dataclass: every number finite, no key missing and none unknown.
+    """Return a JSON value as a dataclass; numbers must be finite and keys complete and known.
 
     Args:
         kind: a dataclass of bool, int, float, str, None, `Literal`, tuples, mappings by str, unions
             and dataclasses.
         value: value as `json.loads` returns it.
-        where: its place in the file, for messages.
+        where: position of the value in the file, such as `floors[0].name`, for messages.
 
     Raises:
-        ValueError: something is missing, unknown or of another type; the message says where.
+        ValueError: something is missing, unknown or of another type; the message gives its
+            position.
     """
     return _as(kind, value, where)
 
@@ -131,7 +132,7 @@ def robot_bytes(record: RobotRecord) -> bytes:
 
 
 def read_robot(path: Path) -> RobotRecord:
-    """Read a robot's file; it raises what `DeployedRobot.load` raises."""
+    """Return the record in a robot's file; raise the same errors as `DeployedRobot.load`."""
     content = _content(path)
     written, computed = content.pop("checksum", None), checksum(content)
     content.pop("schema")
@@ -152,7 +153,7 @@ def read_robot(path: Path) -> RobotRecord:
 
 
 def _content(path: Path) -> dict[str, object]:
-    """Return the content of a file whose version can be read."""
+    """Return the JSON object in a robot's file; raise `DataError` if its schema is not `SCHEMA`."""
     try:
         content = json.loads(
             path.read_bytes().decode("utf-8"), parse_constant=_refused, object_pairs_hook=_once
@@ -189,7 +190,7 @@ def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def _text(value: object, indent: str = "") -> str:
-    """Return JSON with objects over several lines and everything without objects on one."""
+    """Return JSON text with one line per key of an object, and lists without objects on a line."""
     inner = indent + " "
     if isinstance(value, dict) and value:
         rows = [f"{inner}{json.dumps(k)}: {_text(v, inner)}" for k, v in value.items()]
@@ -200,13 +201,16 @@ def _text(value: object, indent: str = "") -> str:
 
 
 def check_record(record: RobotRecord) -> None:
-    """Raise `ValueError` with the field and what is expected where parts of a record do not fit."""
+    """Raise `ValueError` if parts of a record do not fit together.
+
+    The message names the field and what is expected.
+    """
     wheels = len(record.wheels.place)
     if not wheels:
         raise ValueError("wheels.place: no entries; expected one for every wheel")
     for name in ("drive_angle", "roller_angle", "grips"):
         _counted(f"wheels.{name}", getattr(record.wheels, name), wheels)
-    geometry_of(record)  # refuses wheels that cannot drive and drives without wheels
+    geometry_of(record)  # raises for wheels that cannot drive and for drives without wheels
     for kind, names in (("floors", record.labels), ("loads", [x.name for x in record.loads])):
         if not names or len(set(names)) < len(names):
             raise ValueError(f"{kind} {list(names)}; expected one or more, each once")
@@ -219,7 +223,7 @@ def check_record(record: RobotRecord) -> None:
 
 
 def geometry_of(record: RobotRecord) -> Geometry:
-    """Return the geometry with every number at its start value."""
+    """Return the geometry of a record's wheels, with fitted numbers at their start values."""
     plain = Geometry(**vars(record.wheels))
     return replace(
         plain, drive_offset=jnp.zeros(plain.wheels), radius_deviation=jnp.zeros(plain.drives)
@@ -243,7 +247,7 @@ def _check_effects(where: str, table: EffectRecord, floors: int) -> None:
 
 
 def declared_numbers(record: RobotRecord) -> tuple[Entry, ...]:
-    """Return every number that a robot of this shape has, in order, without those of the camera."""
+    """Return the declarations of all numbers of a robot of this shape, without the camera's."""
     robot = build(geometry_of(record), record.labels, [load.name for load in record.loads])
     return tuple(e for e in entries(robot) if e.part != "camera")
 
@@ -284,7 +288,7 @@ def _sized(where: str, value: Numbers, size: int) -> None:
 
 
 def _inside(where: str, value: Numbers, declaration: Declaration, size: int) -> None:
-    """Raise `ValueError` for a value of another size, or one out of its declared bounds."""
+    """Raise `ValueError` for a value of another size, or one outside its declared bounds."""
     _sized(where, value, size)
     x = np.asarray(value)
     if declaration.shares:

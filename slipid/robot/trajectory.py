@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 STEP = 0.02
 """Time between two rows of a path [s]."""
 FULL_SPEED_M, WAIT_M = 0.02, 0.12
-"""Distances of the robot up to which a path keeps its speed, and from which it waits [m]."""
+"""Distance of the robot from its reference up to which a path keeps its speed, and distance from
+which it waits; in between it slows down linearly [m]."""
 LONGEST = 0.5
 """Largest time step by which a path advances [s]."""
 
@@ -21,7 +22,7 @@ class Path(eqx.Module):
 
     Attributes:
         rows: x, y [m], heading [rad] and their rates [m/s, m/s, rad/s], one row every `STEP`.
-        marks: times at which a side (its settling time included) or a quarter of a curve ends [s].
+        marks: times at which a side, with the rest at its end, or a quarter of a curve ends [s].
         corners: reference positions at these times (mark, 2) [m].
     """
 
@@ -35,7 +36,7 @@ class Path(eqx.Module):
         return (len(self.rows) - 1) * STEP
 
     def at(self, time: Float[Array, ""] | float) -> Float[Array, "6"]:
-        """Return pose and rates at a time of the path; beyond its ends it rests there."""
+        """Return pose and rates at a time of the path [s]; beyond an end they are those at it."""
         place = jnp.clip(jnp.asarray(time) / STEP, 0.0, len(self.rows) - 1.000001)
         low = jnp.floor(place).astype(jnp.int32)
         high, part = jnp.minimum(low + 1, len(self.rows) - 1), place - low
@@ -54,13 +55,13 @@ class Path(eqx.Module):
         dt: Float[Array, ""] | float,
         preview: Float[Array, ""] | float = 0.0,
     ) -> tuple[Float[Array, ""], Float[Array, "6"]]:
-        """Return the time of the path one step later and the reference there, for a robot's pose.
+        """Return the time of the path one step later, and the reference at that time.
 
-        The reference's pose is that of this time, its rates are those `preview` later [s].
+        The reference consists of the pose at that time and the rates `preview` [s] later.
 
-        The path slows down, and its rates with it, while the estimated pose lags behind it or is
-        off to the side; it does not wait for a robot that is ahead. A `dt` that is not a positive
-        number counts as 0; the time advances by `LONGEST` at most.
+        The path slows down, and its rates with it, while the robot's estimated `pose` lags behind
+        it or is off to the side; it does not wait for a robot that is ahead. A `dt` [s] that is not
+        a positive number counts as 0; the time advances by at most `LONGEST`.
         """
         dt = jnp.asarray(dt, dtype=float)
         dt = jnp.where(jnp.isfinite(dt) & (dt > 0), jnp.minimum(dt, LONGEST), 0.0)
@@ -89,7 +90,7 @@ class Path(eqx.Module):
         return Path(jnp.asarray(rows), self.marks, jnp.asarray(corners))
 
     def after_rest(self, seconds: float) -> "Path":
-        """Return the path after a rest of this duration at its start."""
+        """Return the path preceded by a rest of this duration at its start."""
         count = round(seconds / STEP)
         still = jnp.broadcast_to(self.rows[0].at[3:].set(0.0), (count, 6))
         return Path(jnp.concatenate([still, self.rows]), self.marks + count * STEP, self.corners)
@@ -102,7 +103,7 @@ def waypoints(
     pause: float = 0.6,
     turn: float = 0.0,
 ) -> Path:
-    """Return straight lines between way-points with a stop at each.
+    """Return a path of straight lines between way-points, with a stop at each.
 
     Args:
         places: way-points x, y [m]; the first one is the start.
@@ -112,8 +113,8 @@ def waypoints(
         turn: change of heading on each line [rad].
 
     Raises:
-        ValueError: there are fewer than two way-points, two neighbours are the same, or a speed or
-            acceleration is not positive.
+        ValueError: there are fewer than two way-points, two consecutive ones are equal, or a speed
+            or acceleration is not positive.
     """
     _positive(speed, acceleration)
     p = np.asarray(places, float)
@@ -139,8 +140,8 @@ def rectangle(
     """Return the path of the 2021 paper's trial (figure 7): ahead, to the right, back, to the left.
 
     Args:
-        length: sides ahead and back [m].
-        width: sides to the right and to the left [m].
+        length: length of the sides driven ahead and back [m].
+        width: length of the sides driven to the right and to the left [m].
         speed: speed on each side [m/s].
         turn: change of heading on each side [rad].
     """
@@ -157,13 +158,13 @@ def curve(
     """Return a smooth path driven without turning and without stops, at rest in the end.
 
     Args:
-        places: points x, y [m], dense enough for straight lines between them to be the curve.
+        places: points x, y on the curve, connected by straight lines and therefore dense [m].
         speed: speed along it [m/s].
         acceleration: acceleration at its ends [m/s^2].
         pause: rest at its end [s].
 
     Raises:
-        ValueError: there are fewer than two points, two neighbours are the same, or a speed or
+        ValueError: there are fewer than two points, two consecutive ones are equal, or a speed or
             acceleration is not positive.
     """
     _positive(speed, acceleration)
@@ -183,12 +184,12 @@ def curve(
 
 
 def circle(radius: float = 0.35, speed: float = 0.2) -> Path:
-    """Return one full circle to the right, driven without turning [m], [m/s]."""
+    """Return a full circle to the right, driven without turning; units are [m], [m/s]."""
     return curve(_round(radius), speed)
 
 
 def eight(radius: float = 0.25, speed: float = 0.2) -> Path:
-    """Return a circle to the right and one to the left, driven without turning [m], [m/s]."""
+    """Return a circle to the right, then one to the left, driven without turning [m], [m/s]."""
     right = _round(radius)
     return curve(np.concatenate([right, right[1:] * [1.0, -1.0]]), speed)
 
@@ -204,11 +205,11 @@ PATHS: Mapping[str, Callable[[float], Path]] = {
     "eight": lambda speed: eight(speed=speed),
     "turning": turning,
 }
-"""Paths of a trial by name, each a function of its speed [m/s]."""
+"""Paths of a trial by name; each function takes a speed [m/s] and returns the path."""
 
 
 def _round(radius: float) -> Float[np.ndarray, "place 2"]:
-    """Return the points of a circle to the right that begins straight ahead [m]."""
+    """Return points of a circle to the right that begins at the origin, straight ahead [m]."""
     angle = np.linspace(0.0, 2 * np.pi, 721)
     return radius * np.stack([np.sin(angle), np.cos(angle) - 1.0], axis=1)
 
@@ -222,7 +223,10 @@ def _positive(speed: float, acceleration: float) -> None:
 def _trapezoid(
     length: float, speed: float, acceleration: float, pause: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return distance and speed every `STEP` on a straight line with a rest at its end."""
+    """Return distance [m] and speed [m/s] every `STEP` on a straight line with a rest at its end.
+
+    The speed ramps up, stays level and ramps down (trapezoidal profile).
+    """
     top = min(speed, float(np.sqrt(length * acceleration)))
     ramp = top / acceleration
     whole = length / top + ramp

@@ -8,11 +8,12 @@ body by the contact model, and the model's errors are drawn anew for every run, 
     xi = equilibrium(r w; floor under each wheel)
     pose <- pose * exp(xi h + s h (estimated + remaining effect) + sqrt(s h) process)
 
-with s the speed at which the wheels would take the body without slip.
+with h the substep [s], `set` the set speeds and w the wheel speeds [rad/s], r the wheel radius [m],
+xi the body twist [m/s, m/s, rad/s] and s the speed of the body if no wheel slipped [m/s].
 
-Everything is differentiable except for which floor a wheel is on; derivatives pass through the
-ticks of encoders. Differentiate forwards (`jax.jvp`, `jax.jacfwd`), since NaN readings would spoil
-reverse mode.
+Everything is differentiable except for the choice of the floor under a wheel; derivatives ignore
+the quantization of encoders. Use forward mode (`jax.jvp`, `jax.jacfwd`), since NaN readings would
+make the derivatives of reverse mode NaN.
 """
 
 from dataclasses import dataclass, replace
@@ -33,7 +34,7 @@ from slipid.robot.filter.floor import Floor
 from slipid.robot.interface import Measurement, Pose, Readings
 
 RING = 6
-"""Number of commands that are kept; a delay may be up to `RING` - 1 periods."""
+"""Number of past commands that are kept; the delay is at most `RING` - 1 periods."""
 
 
 @dataclass(frozen=True)
@@ -41,20 +42,20 @@ class ActuatorModel:
     """Response of the wheels to commands and noise of the sensors, which no fit determines.
 
     Attributes:
-        delay_s: time from a command to the wheels [s].
+        delay_s: time until a command reaches the wheels [s].
         slew: largest acceleration of the wheels [rad/s^2].
-        lag_s: time constant of their speed control [s].
+        lag_s: time constant of the wheels' speed control [s].
         ticks: ticks of an encoder per turn of the wheel.
-        ammeter_a: noise of a current [A].
-        drift_s: correlation time of the currents' errors [s].
-        voltmeter_v: noise of a voltage [V].
+        ammeter_a: std of the noise of a measured current [A].
+        drift_s: correlation time of the errors of modelled currents [s].
+        voltmeter_v: std of the noise of a measured voltage [V].
         voltage: whether voltages are measured.
-        gyro_noise: noise of a yaw rate [rad/s].
-        gyro_bias: std of the bias of a yaw rate [rad/s].
+        gyro_noise: std of the noise of a measured yaw rate [rad/s].
+        gyro_bias: std of the bias of a measured yaw rate [rad/s].
         gyro: whether yaw rates are measured.
-        signed: whether currents have signs.
-        substeps: steps of wheels and body in a control period.
-        smooth: whether encoders have no ticks.
+        signed: whether measured currents have signs.
+        substeps: number of simulation steps of wheels and body in a control period.
+        smooth: True for encoders without ticks, which measure angles exactly.
     """
 
     delay_s: float = 0.12
@@ -79,21 +80,21 @@ class ActuatorModel:
 
     @property
     def lag_gain(self) -> float:
-        """Share of the difference from its set speed that a wheel makes up in a substep."""
+        """Share of the difference between set speed and wheel speed that a substep removes [1]."""
         return 1 - float(np.exp(-self.substep / max(self.lag_s, 1e-6)))
 
     def command_shares(self) -> Float[np.ndarray, "substep command"]:
-        """Return the weights of the last commands, the newest first, in every substep's mean.
+        """Return the weights of the last commands, newest first, in the mean command of a substep.
 
-        Commands hold for a period and arrive after the delay. The weights are exact, and linear in
-        the delay.
+        A command holds for a period and arrives after the delay. The weights are exact, and
+        piecewise linear in the delay.
         """
         h = self.substep
         begin = np.arange(self.substeps)[:, None] * h - self.delay_s
         since = -np.arange(RING)[None, :] * PERIOD
         both = np.minimum(begin + h, since + PERIOD) - np.maximum(begin, since)
         share = np.clip(both, 0.0, None) / h
-        share[:, -1] += 1.0 - share.sum(axis=1)  # older commands count as the oldest
+        share[:, -1] += 1.0 - share.sum(axis=1)  # the oldest one stands for all older commands
         return share
 
 
@@ -103,15 +104,15 @@ class TwinState(eqx.Module):
     Attributes:
         pose: x, y [m], heading [rad].
         twist: velocity of the body in its own axes [m/s, m/s, rad/s].
-        wanted: set speeds of the wheels' control [rad/s].
+        wanted: set speeds of the wheels' speed control [rad/s].
         speed: wheel speeds [rad/s].
         angle: wheel angles [rad].
-        effect: present effect of every floor beyond its estimate, in remaining stds.
+        effect: present effect of every floor beyond its estimate, in units of its remaining std.
         toward: settled direction of travel, see `slipid.robot.filter.effects`.
         offset: constant error of the currents in this run [A].
         drift: correlated error of the currents [A].
         bias: bias of the gyro [rad/s].
-        ring: commands on their way, the newest first [rad/s].
+        ring: last commands, some of which have not arrived yet, the newest first [rad/s].
     """
 
     pose: Float[Array, "3"]
@@ -128,11 +129,11 @@ class TwinState(eqx.Module):
 
 
 class Twin(eqx.Module):
-    """A robot on a floor map, as a plant.
+    """A robot on a floor map, simulated by its own identified model.
 
     Attributes:
         robot: robot with its true numbers.
-        floor: map of the surfaces, by number in `robot.labels`.
+        floor: map of the surfaces, numbered as in `robot.labels`.
         actuators: response of the wheels and noise of the sensors.
     """
 
@@ -141,13 +142,13 @@ class Twin(eqx.Module):
     actuators: ActuatorModel = eqx.field(static=True, default=ActuatorModel())
 
     def __check_init__(self) -> None:
-        """Raise `ValueError` for a delay longer than the commands that are kept."""
+        """Raise `ValueError` for a delay longer than the kept commands span."""
         most = (RING - 1) * PERIOD
         if not 0 <= self.actuators.delay_s <= most:
             raise ValueError(f"delay_s = {self.actuators.delay_s}; expected 0 to {most:g}")
 
     def noise(self, key: Array, number: Array | int) -> Float[Array, " noise"]:
-        """Return the standard normal numbers of a step; step 0 is the reading at rest."""
+        """Return the standard normal random numbers of step `number`; 0 is the reading at rest."""
         count = 3 * (self.robot.wheels + self.actuators.substeps + len(self.robot.labels)) + 1
         return jax.random.normal(jax.random.fold_in(key, number), (count,))
 
@@ -201,7 +202,7 @@ class Twin(eqx.Module):
     def _roll(
         self, pose: Array, w: Array, effect: Array, push: Array, h: float
     ) -> tuple[Array, Array]:
-        """Return pose and twist one substep later."""
+        """Return the pose one substep later, and the twist by contact equilibrium."""
         f = self.robot
         under = self.floor.under(pose, f.places)
         rim = f.frame.radius * w
@@ -260,7 +261,7 @@ class Twin(eqx.Module):
 
 
 class TwinPlant:
-    """A twin as a `slipid.robot.closed_loop.Plant`; a key gives the same run every time."""
+    """A twin as a `slipid.robot.closed_loop.Plant`; equal random keys give equal runs."""
 
     def __init__(self, twin: Twin, start: Pose, key: Array):
         self.twin, self.start, self.key = twin, start, key

@@ -1,11 +1,12 @@
-"""Floors without a run, which a robot may meet beside the floors it was identified on.
+"""Floors without a run, which a robot may meet in addition to the floors it was identified on.
 
-Floors differ most by how soft they are. Over the floors in the public logs of 2022 and on the
-virtual test site, the logarithms of creep and of roller drag rise together, with a slope of 0.8. So
-a floor without a run is assumed to be the middle of the known floors, made softer or harder, with
-more friction or less. Currents, and a gyro, show which of these an unfamiliar floor resembles;
-without either they count for little, being rare. Their numbers are not identified, and the motion
-on them is uncertain by a tenth of the path length and 0.3 rad per metre.
+Floors differ mainly in softness. Over the floors in the public logs of 2022 and on the virtual test
+site, the logarithm of roller drag rises with the logarithm of creep at a slope of 0.8. So a floor
+without a run is assumed to be the geometric mean of the known floors, made softer or harder, with
+more friction or less. Currents and a gyro show which of these an unfamiliar floor resembles;
+without both sensors these floors have little influence, since their prior probability is low. Their
+numbers are not identified, and the motion on them is uncertain by a tenth of the path length and
+0.3 rad per metre.
 """
 
 from dataclasses import replace
@@ -25,21 +26,21 @@ from slipid.robot.record import (
 )
 
 SOFTNESS = (-2.0, -1.0, 0.0, 1.0, 2.0)
-"""Log of the creep relative to the middle floor; its declared spread over floors is 1.5."""
+"""Logs of creep relative to the middle floor [1]; the declared prior std over floors is 1.5."""
 DRAG = 0.8
-"""Power of the creep with which roller drag grows from floor to floor."""
+"""Exponent d of roller drag ~ creep^d over floors [1]."""
 GRIP = (-0.4, 0.4)
-"""Log of the friction relative to the middle floor; its declared spread over floors is 0.5."""
+"""Logs of friction relative to the middle floor [1]; the declared prior std over floors is 0.5."""
 EFFECT: Axes = (0.1, 0.1, 0.3)
 """Std of the effects on such a floor [m/m, m/m, rad/m]."""
 CURRENT_FACTOR = 1.5
-"""Std of the currents on such a floor, relative to that of the known floors."""
+"""Std of the currents' errors on such a floor, relative to the mean of the known floors [1]."""
 _SIGNED = ("lead", "load_bias")
 _NAME = "unseen_{}"
 
 
 def with_unseen(record: RobotRecord) -> RobotRecord:
-    """Return the robot with floors without a run, `unseen_1` and on, after its own floors.
+    """Return the robot with floors without a run, `unseen_1`, `unseen_2`, ..., added at the end.
 
     A robot that has them already is returned unchanged.
 
@@ -74,7 +75,10 @@ def with_unseen(record: RobotRecord) -> RobotRecord:
 
 
 def _middle(record: RobotRecord) -> dict[str, RecordedNumber]:
-    """Return the numbers of the middle of the known floors, a geometric mean where positive."""
+    """Return the numbers of the middle floor by name.
+
+    They are geometric means over the known floors, and arithmetic means of numbers with a sign.
+    """
     first = f"surface.{record.labels[0]}."
     middle_floor: dict[str, RecordedNumber] = {}
     for path, number in record.parameters.items():

@@ -1,21 +1,22 @@
 """Effects of floors: their estimates from the fitted runs, and their correlation over a path.
 
-An effect is what the model misses all the way on a floor: a motion along, across and in yaw per
-metre that the wheels would roll without slip. It belongs to a floor and to a direction of travel u,
-the unit vector of the twist without slip, yaw as rim speed. Its estimates from the fitted runs, a
-mean and a remaining std, are a table over directions and speeds (`EffectLookup`). An effect e is
-counted in remaining stds; it decorrelates as the direction changes, and once the robot has left the
-floor:
+An effect is a constant error of the model on a floor: motion along, across and in yaw that the
+model misses, per metre that the wheels would roll without slip [m/m, m/m, rad/m]. It belongs to a
+floor and to a direction of travel u, the unit vector of the twist without slip, its yaw rate
+multiplied by the base radius. Its estimates from the fitted runs, a mean and a remaining std, are a
+table over directions and speeds (`EffectLookup`). An effect e, in units of its remaining std,
+decorrelates as the direction changes, and once the robot has left the floor:
 
     k = exp(-(1 - a^2) |u - v|^2 / (2 TURN^2) - left far / AWAY),   a = exp(-far / SETTLES)
     e <- k e + sqrt(1 - k^2) noise,   v <- u + a (v - u)
 
-with `far` the path length of the step, v the settled direction and `left` whether no wheel is on
-the floor. For a direction that changes at once from v to u this makes exp(-|u - v|^2 / (2 TURN^2)),
-in however many steps it is computed, and trembling directions make nearly no change; on a drive
-back the effect is a new one. Along an arc on which the direction turns by an angle at a curvature c
-it fades more slowly, by about exp(-angle c SETTLES / TURN^2): over a quarter turn on a radius of a
-metre a fifth remains.
+with `far` the path length of the step [m], v the settled direction, a low-pass filtered u, and
+`left` 1 if no wheel is on the floor, else 0. If the direction changes at once from v to u, the
+correlation becomes exp(-|u - v|^2 / (2 TURN^2)), in however many steps it is computed; jitter of
+the direction hardly changes it, and on a drive back the effect is independent of the earlier one.
+Along an arc of curvature c [1/m] on which the direction turns by an angle [rad] the correlation
+falls more slowly, to about exp(-angle c SETTLES / TURN^2): after a quarter turn on a radius of one
+metre it is a fifth.
 """
 
 import equinox as eqx
@@ -23,22 +24,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 TURN = 0.17
-"""Change of direction over which an effect becomes another one [rad]; on real logs 10 degrees."""
+"""Change of direction, as a std, over which an effect decorrelates [rad]; 10 deg on real logs."""
 SETTLES = 0.03
-"""Path length over which a direction of travel settles [m]."""
+"""Path length constant of the low-pass filter of the direction of travel [m]."""
 AWAY = 0.1
-"""Path length off a floor after which its effect is drawn anew [m]."""
+"""Path length off a floor over which its effect decorrelates by a factor of e [m]."""
 FORGETS = 0.5
-"""Difference of log speeds over which the estimates fade beyond the table, as in the fit."""
+"""Difference of log speeds [1], as a std, over which estimates fade to 0 outside the speeds of the
+table; the fit uses the same number."""
 TRAVELS = 0.2
-"""Share of the rim speed above which a turning robot travels in a direction, as in the fit."""
+"""Translation's share of the robot's speed (see `RolledMotion.speed`) above which it counts as
+travelling in a direction, not as turning on the spot [1]; the fit uses the same number."""
 
 
 class RolledMotion(eqx.Module):
-    """Motion of the body if no wheel slipped, along which effects count.
+    """Motion of the body if no wheel slipped; effects are relative to its speed and direction.
 
     Attributes:
-        speed: speed of the body plus that of its turn as rim speed [m/s].
+        speed: speed of the body plus base radius times its absolute yaw rate [m/s].
         axes: directions along, across and in yaw, as columns in the body frame.
         straight: speed of the body without its turn [m/s].
         angle: direction of travel in the body frame [rad].
@@ -71,7 +74,8 @@ class EffectLookup(eqx.Module):
 
     Attributes:
         log_speed: rising logarithms of the table's speeds [m/s].
-        table: mean along, across and in yaw, then the remaining share of the whole std in each.
+        table: mean effect along, across [m/m] and in yaw [rad/m], then for each of the three the
+            remaining std as a share of the whole std [1].
     """
 
     log_speed: Float[Array, " speed"]
@@ -79,7 +83,7 @@ class EffectLookup(eqx.Module):
 
     @classmethod
     def empty(cls, floors: int) -> "EffectLookup":
-        """Return the table of unknown effects."""
+        """Return the table of effects without estimates: mean 0 and the whole std remaining."""
         row = jnp.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
         return cls(jnp.zeros(1), jnp.broadcast_to(row, (floors, 1, 1, 6)))
 
@@ -101,7 +105,10 @@ class EffectLookup(eqx.Module):
         return fade * row[:, :3], jnp.sqrt(1 - fade**2 * (1 - row[:, 3:] ** 2))
 
     def _speeds(self, log_speed: Array) -> tuple[Array, Array, Array]:
-        """Return two rows of the table, their weights, and how far a log speed lies beyond all."""
+        """Return the table's rows next to a log speed, their weights, and the excess.
+
+        The excess is the signed distance of the log speed from the table's range, 0 inside.
+        """
         rows = self.log_speed
         within = jnp.clip(log_speed, rows[0], rows[-1])
         if len(rows) == 1:
@@ -112,7 +119,10 @@ class EffectLookup(eqx.Module):
 
 
 def travel_direction(rolling: Float[Array, "3"], base: Float[Array, ""]) -> Float[Array, "3"]:
-    """Return the direction of travel of a twist without slip, for a base radius [m]."""
+    """Return the direction of travel of a twist without slip as a unit vector.
+
+    The yaw rate is multiplied by the base radius `base` [m] first.
+    """
     rim = rolling.at[2].multiply(base)
     return rim / jnp.sqrt(rim @ rim + 1e-12)
 
@@ -123,12 +133,12 @@ def effect_correlation(
     left: Float[Array, " floor"],
     far: Float[Array, ""],
 ) -> tuple[Float[Array, "3"], Float[Array, " floor"]]:
-    """Return the settled direction after a step, and each floor's correlation of effects over it.
+    """Return the settled direction after a step, and the effects' correlation over it by floor.
 
     Args:
         before: settled direction before the step, zeros at the start.
         now: direction of the step.
-        left: whether no wheel is on the floor, 0 to 1.
+        left: probability that no wheel is on the floor [1].
         far: path length of the step [m].
     """
     a = jnp.exp(-far / SETTLES)

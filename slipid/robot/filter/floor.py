@@ -1,20 +1,20 @@
 """A floor map for jitted functions, and the evidence that it gives on floors and pose.
 
 With a map, the estimated pose and its covariance determine which floors are likely under the
-wheels. Poses x_s are drawn from the belief, at fixed places in its own axes. The map gives each of
-them the probability W_sc of every hypothesis c (one floor under each wheel); their mean is c's
-prior. [...] is 1 where it is true, else 0:
+wheels. Poses x_s are a fixed set of samples, scaled by the root of the covariance. The map gives
+the probability W_sc of every hypothesis c (one floor under each wheel) at each pose x_s; the mean
+over poses is the prior of c. [...] is 1 where it is true, else 0:
 
     W_sc ~ prod_wheel ((1 - leak) [map at the wheel of x_s is c's] + leak / floors),  sum_c W_sc = 1
     prior_c = mean_s W_sc
 
-The evidence of a step's currents and gyro on the hypotheses, p_c before and p_c' after it, shows in
-turn how likely each pose is (`slipid.robot.filter.pose_fix.apply_map`):
+Currents and gyro of a step change the probability of a hypothesis from p_c to p_c'. This in turn
+changes the probability of each pose (`slipid.robot.filter.pose_fix.apply_map`):
 
     P(x_s) ~ (sum_c p_c' W_sc / prior_c  /  sum_c p_c W_sc / prior_c)^(1/4)
 
-so that crossing an edge at an unexpected place corrects the pose. Evidence counts in the step in
-which it comes; without evidence no pose moves.
+so that crossing an edge at an unexpected place corrects the pose. Evidence corrects the pose only
+in the step in which it arrives; without evidence the map does not move the pose.
 """
 
 from collections.abc import Sequence
@@ -32,13 +32,13 @@ from slipid.support.errors import DataError
 from slipid.support.files import write_arrays
 
 LEAK = 0.1
-"""Probability that a map is wrong under a wheel."""
+"""Probability that the map shows the wrong floor under a wheel [1]."""
 HALF = 16
-"""Number of pairs of opposite poses drawn from a belief."""
+"""Number of pairs of opposite pose samples."""
 
 
 def _spread() -> Float[np.ndarray, "sample 3"]:
-    """Return poses in a belief's own axes, with mean 0 and covariance 1 exactly."""
+    """Return pose samples whose mean is exactly 0 and whose covariance is exactly the identity."""
     draws = np.random.default_rng(0).normal(size=(HALF, 3))
     draws = draws @ np.linalg.inv(np.linalg.cholesky(draws.T @ draws / HALF)).T
     return np.concatenate([draws, -draws])
@@ -102,9 +102,13 @@ class Floor(eqx.Module):
     def under(
         self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
     ) -> Int[Array, " wheel"]:
-        """Return the surface under wheels at these places in the frame of a body at a pose [m].
+        """Return the number of the surface under each wheel of a robot at a pose.
 
-        Beyond the edge it is that of the nearest cell.
+        Beyond the edge of the map it is that of the nearest cell.
+
+        Args:
+            pose: x, y [m] and heading [rad].
+            wheels: places of the wheels in the body frame [m].
         """
         (row, column), (rows, columns) = self.steps_to(pose, wheels), self.cells.shape
         return self.cells[row.clip(0, rows - 1), column.clip(0, columns - 1)]
@@ -112,7 +116,7 @@ class Floor(eqx.Module):
     def steps_to(
         self, pose: Float[Array, "3"], wheels: Float[Array, "wheel 2"]
     ) -> tuple[Int[Array, " wheel"], Int[Array, " wheel"]]:
-        """Return rows and columns from the corner to each wheel, also where there is no cell."""
+        """Return row and column of each wheel; they may lie outside the map's cells."""
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
         turned = jnp.stack(
             [c * wheels[:, 0] - s * wheels[:, 1], s * wheels[:, 0] + c * wheels[:, 1]], axis=-1
@@ -128,7 +132,7 @@ class Floor(eqx.Module):
         hypotheses: Int[np.ndarray, "hypothesis wheel"],
         floors: int,
     ) -> Float[Array, "sample hypothesis"]:
-        """Return the probability W of every hypothesis by the map, at every pose drawn.
+        """Return W, the probability that the map gives each hypothesis at each pose sample.
 
         Args:
             pose: estimated pose.

@@ -9,6 +9,9 @@ wheel (`hypotheses`), and one more is "unknown":
     g_c <- g_c * exp(xi_c dt)                             pose if c is true, averaged over changes
     g = sum_c p_c g_c
 
+with p_c the probability of c, xi_c its body twist [m/s, m/s, rad/s], I the measured and I_c the
+predicted currents [A], and tau the time within which evidence repeats (`Settings.forget_s`) [s].
+
 A wheel's current shows its share of the whole drag, not the drag beneath it; only all currents
 together distinguish the floors. Evidence that comes late corrects the pose by the distance between
 the hypotheses' poses (interacting multiple models; Blom and Bar-Shalom 1988).
@@ -33,14 +36,15 @@ from slipid.robot.filter.wheels import MotorCurrents
 from slipid.robot.interface import Settings
 
 INERTIA_ACCELERATION = 30.0
-"""Wheel acceleration above which inertia, absent from the equilibrium, hides floors [rad/s^2]."""
+"""Wheel acceleration at which evidence on floors weighs half, since the equilibrium lacks inertia
+[rad/s^2]."""
 
 
 class TimeStep(eqx.Module):
-    """One time step, as `slipid.robot.filter.wheels.time_step` counts it.
+    """One time step.
 
     Attributes:
-        dt: duration [s].
+        dt: duration as `slipid.robot.filter.wheels.time_step` returns it [s].
         moves: whether a wheel turns.
         acceleration: acceleration of the fastest changing wheel [rad/s^2].
     """
@@ -55,9 +59,11 @@ class FloorState(eqx.Module):
 
     Attributes:
         belief: probability of each hypothesis, and of "unknown" in the last place.
-        expected: probability of each hypothesis without measurements, where the robot is.
-        twist: twist by contact alone if the hypothesis were true [m/s, m/s, rad/s].
-        apart: pose if the hypothesis were true, relative to the estimated one [m, m, rad].
+        expected: probability of each hypothesis at the robot's pose before any measurement, by the
+            map or else by the prior.
+        twist: twist by contact equilibrium, without effects, if the hypothesis were true
+            [m/s, m/s, rad/s].
+        apart: pose if the hypothesis were true, relative to the estimated pose [m, m, rad].
     """
 
     belief: Float[Array, " hypothesis_or_none"]
@@ -67,18 +73,18 @@ class FloorState(eqx.Module):
 
 
 class BodyMotion(eqx.Module):
-    """Motion of the body by all hypotheses together.
+    """Motion of the body, averaged over all hypotheses.
 
     Attributes:
         twist: mean twist [m/s, m/s, rad/s].
         scatter: covariance of the twist over hypotheses.
-        rolling: twist of wheels that do not slip [m/s, m/s, rad/s].
-        rolled: the same as direction and speed.
-        left: remaining std of every floor's effects in this direction.
+        rolling: twist of the body if no wheel slipped [m/s, m/s, rad/s].
+        rolled: direction and speed of `rolling`.
+        left: remaining std of every floor's effects in this direction [m/m, m/m, rad/m].
         by_friction: derivative of the mean twist by the log friction of each floor [m/s, m/s,
             rad/s].
         known: probability of every hypothesis after this step, given that one of them is true.
-        before: the same without the evidence of this step.
+        before: the same probability without the evidence of this step.
         under: probability of each floor under each wheel, given that one hypothesis is true.
         jump: change of pose beyond the mean twist, from late evidence [m, m, rad].
         correction: change of the mean twist by the evidence of this step [m/s, m/s, rad/s].
@@ -116,12 +122,12 @@ class FloorFilter(eqx.Module):
     def prior(self) -> Float[Array, " hypothesis"]:
         """Return the probability of every hypothesis before any measurement.
 
-        All floors without a run together are as rare as one further floor under the robot.
+        All floors without a run together are as improbable as one further floor under the robot.
         """
         under = hypotheses_of(self.robot).under
         kinds = np.array([len(set(row)) for row in under.tolist()])
         unseen = np.array(self.robot.unseen)[under[:, 0]]
-        further = kinds - 1 + unseen  # floors beside the one that is certainly under the robot
+        further = kinds - 1 + unseen  # floors beyond the first one under the robot
         weight = jnp.exp(-self.settings.further_floor_penalty * further) / np.where(
             unseen, unseen.sum(), 1
         )
@@ -144,7 +150,7 @@ class FloorFilter(eqx.Module):
             currents: motor currents.
             turn: yaw rate by the gyro without its bias, NaN without a gyro [rad/s].
             tick: the time step.
-            mapped: probability of every hypothesis by a floor map where the robot is now.
+            mapped: probability of every hypothesis by a floor map at the robot's pose.
         """
         settled, predicted = self.solve(old.twist, w)
         f = self.robot
@@ -182,9 +188,10 @@ class FloorFilter(eqx.Module):
         return FloorState(belief, expected, twist=settled, apart=apart), motion
 
     def _left(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
-        """Return the remaining share of the std of every floor's effects.
+        """Return the remaining std of every floor's effects as a share of the whole std [1].
 
-        With wheels on several floors, the whole std remains.
+        With wheels on several floors the whole std remains, since the estimates hold for all wheels
+        on one floor.
         """
         alone = known[hypotheses_of(self.robot).uniform]
         share = alone / jnp.maximum(self.robot.rest @ under, 1e-12)
@@ -195,7 +202,7 @@ class FloorFilter(eqx.Module):
     ) -> tuple[Float[Array, "hypothesis 3"], Float[Array, "hypothesis drive"]]:
         """Return twist [m/s, m/s, rad/s] and currents [A] of every hypothesis.
 
-        The iteration starts from `near`, the twists of a moment ago.
+        The iteration starts from `near`, the twists of the last step.
         """
         f = self.robot
         on = stand(f.frame, f.floors.at(hypotheses_of(f).under.T), f.rest)
@@ -212,7 +219,7 @@ class FloorFilter(eqx.Module):
     def _by_friction(self, twist: Array, w: Array, under: Array) -> Float[Array, "3 floor"]:
         """Return the derivative of a twist by the log friction of each floor under the wheels.
 
-        It follows from the balance of forces. It is limited to the speed itself, since
+        It follows from the balance of forces. Its magnitude is limited to the body's speed, since
         linearization fails where all wheels slide.
         """
         f = self.robot
@@ -235,10 +242,10 @@ class FloorFilter(eqx.Module):
     def _evidence(
         self, xi: Array, predicted: Array, currents: MotorCurrents, w: Array, turn: Array
     ) -> tuple[Array, Array]:
-        """Return the log likelihood of the measurements under every hypothesis, and "unknown".
+        """Return the log likelihoods of the measurements under every hypothesis and "unknown".
 
-        Variances are divided by their means: that adds the same constant to all hypotheses and
-        keeps the product within the range of single precision.
+        Variances are divided by their mean over hypotheses: that adds the same constant to the log
+        likelihood of every hypothesis and keeps the product within the range of single precision.
         """
         f, s = self.robot, self.settings
         amps, measured = currents.filtered, currents.measured
@@ -258,9 +265,10 @@ class FloorFilter(eqx.Module):
         return -0.5 * (score + jnp.log(spread)), -0.5 * s.unknown_std**2 * jnp.sum(counts)
 
     def _of_friction(self, amps: Float[Array, "hypothesis drive"]) -> Array:
-        """Return the variance of currents from uncertain frictions of several floors [A^2].
+        """Return the variance of currents that uncertain frictions of several floors cause [A^2].
 
-        A wheel carries a share of the whole drag in proportion to its friction over the mean.
+        A wheel carries a share of the whole drag in proportion to its floor's friction divided by
+        the mean friction.
         """
         on = hypotheses_of(self.robot).on.astype(float)
         over = (on - on.mean(axis=1, keepdims=True)).reshape(-1, on.shape[2])
@@ -268,14 +276,17 @@ class FloorFilter(eqx.Module):
         return amps**2 * self.robot.on_average(var.reshape(on.shape[:2]))
 
     def _stiction(self, w: Array) -> Array:
-        """Return the variance of a standing wheel's current, between friction's bounds [A^2]."""
+        """Return the variance of the current of a standing wheel [A^2]; it is 0 for a turning one.
+
+        Static friction lets the current lie anywhere between two bounds, taken as uniform.
+        """
         motor = self.robot.motor
         return (1 - jnp.tanh(w / 0.2) ** 2) * (motor.coulomb_friction / motor.gain) ** 2 / 3
 
     def _mixed(
         self, old: FloorState, xi: Array, tick: TimeStep, mapped: Array | None
     ) -> tuple[Array, Array]:
-        """Return probabilities and poses once wheels may have changed floors."""
+        """Return probabilities and relative poses after wheels may have changed floors."""
         known, unknown = jnp.maximum(old.belief[:-1], 1e-12), old.belief[-1]
         sure = jnp.sum(known)
         speed = length((known @ xi)[:2] / sure)
@@ -287,13 +298,17 @@ class FloorFilter(eqx.Module):
             fresh, whole = mapped, _followed(whole, old.expected, mapped, change)
         stayed = whole[:, 0] * (1 - 0.05 * change)
         of_known = stayed + 0.2 * change * unknown * fresh
-        # belief that returns from "unknown" has moved as the mean
+        # the probability that returns from "unknown" has the mean pose, relative pose 0
         apart = whole[:, 1:] * ((1 - 0.05 * change) / of_known)[:, None]
         of_none = unknown * (1 - 0.2 * change) + 0.05 * change * sure
         return jnp.append(of_known, of_none), apart
 
     def _changed(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
-        """Return the belief after wheels may have changed floors, by the prior given the others."""
+        """Return the belief after each wheel in turn may have changed its floor.
+
+        The new floor has its prior probability, given the floors under the other wheels. Columns of
+        `p` are the probability, and its products with the relative pose.
+        """
         prior, none = self.prior(), jnp.zeros((1, p.shape[1]))
         for beside in hypotheses_of(self.robot).beside:
             given = prior / jnp.sum(jnp.append(prior, 0.0)[beside], axis=1)
@@ -302,9 +317,9 @@ class FloorFilter(eqx.Module):
         return self._estranged(p, change)
 
     def _estranged(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
-        """Return the belief after the whole robot may have come to or from a floor without a run.
+        """Return the belief after the whole robot may have moved to or from a floor without a run.
 
-        Such a change is as rare as a floor that none of the hypotheses knows.
+        Such a change is as improbable as one to the "unknown" floor.
         """
         unseen = np.array(self.robot.unseen)
         if not unseen.any():
@@ -320,10 +335,11 @@ class FloorFilter(eqx.Module):
     def _moved(
         self, apart: Array, known: Array, xi: Array, turn: Array, tick: TimeStep
     ) -> tuple[Array, Array]:
-        """Return poses of the hypotheses relative to their mean, and the mean's late jump.
+        """Return poses of the hypotheses relative to their mean, and the jump of the mean pose.
 
-        The jump is what the mean pose moves beyond the mean twist. Each hypothesis continues from
-        its own pose by its own twist, all with the yaw rate of a gyro.
+        The jump is the change of the mean pose beyond the mean twist; late evidence on the floors
+        causes it. Each hypothesis continues from its own pose with its own twist; the yaw rate of a
+        gyro, if there is one, replaces that of all twists.
         """
         xi = xi.at[:, 2].set(jnp.where(jnp.isfinite(turn), turn, xi[:, 2]))
         poses = jax.vmap(compose)(apart, jax.vmap(advance, (0, None))(xi, tick.dt))
@@ -349,10 +365,11 @@ def effects_by_hypothesis(
 def _followed(
     p: Float[Array, "hypothesis column"], before: Array, now: Array, change: Array
 ) -> Float[Array, "hypothesis column"]:
-    """Return the belief transferred between hypotheses as a map predicts where the robot goes.
+    """Return the belief after a step of a robot whose map predicts the floors at its new pose.
 
-    Hypotheses that the map expects less than before lose that share to those that it expects more.
-    Beyond that, a wheel may have come to a floor that the map does not show.
+    Hypotheses whose probability by the map fell lose the same share of their belief to hypotheses
+    whose probability rose. In addition, a share `change` of the belief returns to the map's
+    probabilities, in case the map is wrong.
     """
     gone = jnp.clip(1 - now / jnp.maximum(before, 1e-12), 0.0, 1.0)[:, None]
     more = jnp.maximum(now - before, 0.0)
@@ -362,5 +379,5 @@ def _followed(
 
 
 def length(v: Float[Array, "*batch axis"]) -> Float[Array, "*batch"]:
-    """Return the length of a vector, with a derivative at zero."""
+    """Return the length of a vector; unlike the norm it has a derivative at zero."""
     return jnp.sqrt(jnp.sum(v * v, axis=-1) + 1e-24)

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Int
 from slipid.robot.deployed import RobotArrays
 
 CHANGES = 2
-"""Largest number of changes of floor around the robot, from wheel to wheel."""
+"""Largest number of pairs of neighbouring wheels around the robot that stand on two floors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +27,9 @@ class Hypotheses:
 
     Attributes:
         under: number of the floor under each wheel.
-        beside: for each wheel and floor, the hypothesis that has this floor under this wheel and
-            the others unchanged; the number of hypotheses where there is none.
+        beside: for each wheel, hypothesis and floor, index of the hypothesis that has this floor
+            under this wheel and the other wheels unchanged; where there is none, the number of
+            hypotheses.
         uniform: for each floor, the hypothesis that has it under all wheels.
         on: whether the floor is under the wheel.
     """
@@ -73,5 +74,5 @@ def _hypotheses(around: tuple[int, ...], unseen: tuple[bool, ...], changes: int)
 
 
 def _changes(row: tuple[int, ...], around: tuple[int, ...]) -> int:
-    """Return the number of changes of floor around the robot."""
+    """Return the number of neighbouring wheels around the robot that stand on different floors."""
     return sum(row[a] != row[b] for a, b in zip(around, around[1:] + around[:1], strict=True))

@@ -1,14 +1,15 @@
 """Filter of the pose and its covariance, with the errors of the model as further states.
 
-Process noise and effects grow the covariance. The effects, the floors' friction and a gyro's bias
-are unknowns that pose fixes and rests correct. Friction counts where wheels stand on several
-floors; on one floor it moves no robot, so runs on one floor each leave it undetermined. Uncertainty
-about the floors is the scatter of the hypotheses, and an error of the belief persists for a while:
+Process noise and effects increase the covariance. The effects, the floors' friction and a gyro's
+bias are unknowns that pose fixes and rests correct. Friction affects the motion only where wheels
+stand on several floors, so runs on a single floor each leave it undetermined. Uncertainty about the
+floors is the scatter S of the hypotheses' twists xi_c about their mean xi, with probabilities p_c.
+An error d of the belief persists for a while:
 
     S = sum_c p_c (xi_c - xi) (xi_c - xi)^T = L L^T,   xi_true = xi + L d,   d ~ N(0, 1)
     d <- k d + sqrt(1 - k^2) noise,   k = exp(-far / doubt_m)
 
-with `far` the path length of the step.
+with `far` the path length of the step [m] and `doubt_m` its decay length, a setting [m].
 """
 
 from dataclasses import replace
@@ -35,18 +36,19 @@ from slipid.robot.filter.pose_fix import (
 from slipid.robot.interface import Readings, Settings
 
 CREEP_SPEED = 0.05
-"""Speed below which no fitted run shows how a robot turns [m/s]."""
+"""Speed below which the gyro does not correct the contact model, since no fitted run is as slow
+[m/s]."""
 
 
 class _StepMotion(eqx.Module):
     """Motion of the body in a step with its derivatives.
 
     Attributes:
-        speed: speed of wheels without slip, by which effects of floors count [m/s].
+        speed: `RolledMotion.speed`; effects are relative to it [m/s].
         axes: directions along, across and in yaw, as columns in the body frame.
         slope: derivative of the twist by the nuisance states without the gyro's bias.
-        share: share of the load on each floor.
-        by_gyro: whether yaw is measured.
+        share: expected share of the load on each floor [1].
+        by_gyro: whether a gyro measures the yaw rate.
     """
 
     speed: Float[Array, ""]
@@ -87,17 +89,18 @@ class PoseFilter(eqx.Module):
     def mapped(
         self, now: PoseState, floor: Floor, hypotheses: Int[np.ndarray, "hypothesis wheel"]
     ) -> tuple[Float[Array, "3 3"], Float[Array, "sample hypothesis"]]:
-        """Return the root of the pose's covariance, and a map's support at poses drawn from it."""
+        """Return the pose covariance's root, and `Floor.supports` at pose samples drawn with it."""
         root, floors = cholesky_root(now.covariance[:3, :3]), len(self.robot.labels)
         return root, floor.supports(now.pose, root, self.robot.places, hypotheses, floors)
 
     def step(
         self, old: PoseState, motion: BodyMotion, gyro: Array, z: Readings, tick: TimeStep
     ) -> tuple[PoseState, Float[Array, "3"], Float[Array, "3 3"]]:
-        """Return the pose one time step later, the twist that led there, and a factor on distances.
+        """Return the state one time step later, the twist of the step, and a factor on distances.
 
-        The factor is the share of another pose's distance that a pose fix leaves, in the body's
-        axes.
+        A pose fix also corrects the poses of the hypotheses: the factor (3, 3), in body axes, is
+        the share of their distances from the estimated pose that remains. It is the identity
+        without a fix.
 
         Args:
             old: state before the step.
@@ -109,7 +112,7 @@ class PoseFilter(eqx.Module):
         dt = tick.dt
         body = self._step_motion(motion, gyro)
         old = self._forgotten(old, motion, tick)
-        free = motion.twist + body.slope @ old.nuisance[:-1]  # also for slow creep, which adds up
+        free = motion.twist + body.slope @ old.nuisance[:-1]  # at any speed: slow creep adds up
         old = replace(old, history=old.history.at[:, 0].add(dt))
         twist = free.at[2].set(self._turned(old, free[2], gyro))
         pose = compose(old.pose, advance(twist, dt) + motion.jump)
@@ -129,7 +132,7 @@ class PoseFilter(eqx.Module):
         speed, axes = motion.rolled.speed, motion.rolled.axes
         std = speed * share[:, None] * motion.left
         by_effect = (std[:, :, None] * axes.T).reshape(-1, 3).T
-        # per metre, so that a robot at rest has none
+        # covariance per metre, so that a robot at rest has no doubt about its motion
         per_metre = motion.scatter / jnp.maximum(speed**2, 1e-12)
         doubt = speed * axes @ cholesky_root(axes.T @ per_metre @ axes)
         return _StepMotion(
@@ -141,10 +144,13 @@ class PoseFilter(eqx.Module):
         )
 
     def _forgotten(self, old: PoseState, motion: BodyMotion, tick: TimeStep) -> PoseState:
-        """Return the state with effects decorrelated over the step, their variance unchanged."""
+        """Return the state with effects and belief errors decorrelated over the step.
+
+        Their variances return towards their stationary values.
+        """
         f = self.robot
         speed = length(motion.twist[:2]) + f.frame.base * jnp.abs(motion.twist[2])
-        far = speed * tick.dt  # true path length of the step
+        far = speed * tick.dt  # path length with slip
         left = jnp.prod(1 - motion.under, axis=0)
         now = travel_direction(motion.rolling, f.frame.base)
         toward, keep = effect_correlation(old.toward, now, left, far)
@@ -162,10 +168,11 @@ class PoseFilter(eqx.Module):
         return replace(old, nuisance=kept * old.nuisance, covariance=covariance, toward=toward)
 
     def _turned(self, old: PoseState, free: Array, gyro: Array) -> Array:
-        """Return the yaw rate by the gyro less its bias, brought forward by the contact model.
+        """Return the present yaw rate: the gyro's reading less its bias, extrapolated [rad/s].
 
-        Over the gyro's delay the contact model's change of yaw rate is added. `free` is the contact
-        model's yaw rate [rad/s]; ages in the history are those after the step.
+        A gyro's reading is delayed, so the contact model's change of yaw rate over that delay is
+        added. `free` is the contact model's yaw rate [rad/s], which is returned without a gyro;
+        ages in the history are those after the step.
         """
         then = self._then(old, free)
         return jnp.where(jnp.isfinite(gyro), free + gyro - old.nuisance[-1] - then, free)
@@ -180,17 +187,18 @@ class PoseFilter(eqx.Module):
     def _turns(
         self, now: PoseState, body: _StepMotion, gyro: Array, free: Array, tick: TimeStep
     ) -> PoseState:
-        """Return the state after a gyro's comparison with the contact model of a moving robot.
+        """Return the state corrected by comparing a moving robot's gyro with the contact model.
 
-        The gyro reads the model's yaw rate, its errors, and its own bias, so that it informs about
-        both, and about sideways errors that are correlated with them:
+        The gyro's reading is the model's yaw rate plus the model's errors and the gyro's own bias,
+        so that it informs about both, and about sideways errors that are correlated with them:
 
             gyro = (twist + slope nuisance)_yaw + bias + noise
 
-        The noise is that of the gyro and of the model per root of the distance. A reading far from
-        the expected value counts less, as do all while wheels accelerate, since the equilibrium
-        lacks inertia. Only heading and bias are updated: the model's errors are considered and keep
-        their values (Schmidt 1966), since the same gyro already informs the belief about floors.
+        The noise is that of the gyro, plus the model's process noise, whose std grows with the root
+        of the path length. A reading far from the expected value has less weight, and so has every
+        reading while wheels accelerate, since the equilibrium lacks inertia. Only heading and bias
+        are updated; the model's errors enter the variance but keep their values (Schmidt 1966),
+        since the same gyro already informs the belief about floors.
         """
         dt, cov = jnp.maximum(tick.dt, 1e-3), now.covariance
         look = jnp.concatenate([jnp.zeros(3), body.slope[2], jnp.ones(1)])
@@ -219,11 +227,11 @@ class PoseFilter(eqx.Module):
         return _scalar_update(now, look, jnp.where(rests, gap, 0.0), var, learns.astype(float))
 
     def _grow(self, old: PoseState, pose: Array, body: _StepMotion, tick: TimeStep) -> PoseState:
-        """Return the state at the pose after the step, with its grown covariance."""
+        """Return the state at the pose after the step, with the covariance propagated to it."""
         f, s, dt = self.robot, self.settings, tick.dt
         world = axes_rotation(old.pose[2] + 0.5 * (pose[2] - old.pose[2]))
         gone = pose[:2] - old.pose[:2]
-        # yaw comes from the gyro, not from the floor
+        # with a gyro, effects and process noise of the floor do not affect the yaw
         keep = jnp.where(body.by_gyro, jnp.array([1.0, 1.0, 0.0]), jnp.ones(3))
         far = body.speed * dt
         push = world @ (keep[:, None] * body.slope)
@@ -234,7 +242,7 @@ class PoseFilter(eqx.Module):
         floor_axes = world @ (keep[:, None] * body.axes)
         noise = (floor_axes * grown) @ floor_axes.T
         noise = noise.at[2, 2].add(jnp.where(body.by_gyro, (s.gyro_std * dt) ** 2, 0.0))
-        rows = by @ old.covariance  # rows of the pose; the others stay
+        rows = by @ old.covariance  # rows of the pose; the others do not change
         pose_rows = jnp.concatenate([rows @ by.T + noise, rows[:, 3:]], axis=1)
         rest = jnp.concatenate([rows[:, 3:].T, old.covariance[3:, 3:]], axis=1)
         return replace(
@@ -250,16 +258,16 @@ class PoseFilter(eqx.Module):
 def _scalar_update(
     now: PoseState, look: Array, gap: Array, var: Array, learns: Float[Array, " unknown"]
 ) -> PoseState:
-    """Return the state corrected by one reading.
+    """Return the state corrected by one scalar reading.
 
-    Unknowns that are not updated keep their values, and their covariance with the others stays
-    right (Joseph's form).
+    Unknowns that are not updated keep their values; Joseph's form of the update keeps the
+    covariance consistent with that.
 
     Args:
         now: state before the reading.
         look: derivative of the reading by pose and nuisance.
-        gap: measured less predicted reading.
-        var: variance of the gap.
+        gap: measured less predicted reading, its unit being that of the reading.
+        var: variance of the gap, in that unit squared.
         learns: 1 for each unknown that is updated, else 0.
     """
     by = now.covariance @ look
@@ -275,7 +283,7 @@ def _scalar_update(
 
 
 def axes_rotation(heading: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Return the matrix that turns a body's motion from its axes to the world's."""
+    """Return the matrix that rotates a motion (x, y, yaw) from body axes to world axes."""
     c, s = jnp.cos(heading), jnp.sin(heading)
     return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -283,7 +291,7 @@ def axes_rotation(heading: Float[Array, ""]) -> Float[Array, "3 3"]:
 def cholesky_root(m: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """Return the lower triangular root of a covariance of poses, or of motions per metre.
 
-    It is computed with 0.1 mm/m, or 0.1 mm and 0.1 mrad, added, so that it always exists.
+    A std of 0.1 mm and 0.1 mrad (or the same per metre) is added first, so that the root exists.
     """
     a = jnp.sqrt(m[0, 0] + 1e-8)
     b, d = m[1, 0] / a, m[2, 0] / a

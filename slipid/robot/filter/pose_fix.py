@@ -12,9 +12,10 @@ from slipid.robot.filter.floor_filter import BodyMotion
 from slipid.robot.interface import Readings
 
 HISTORY = 48
-"""Number of steps that a delayed measurement may reach back."""
+"""Number of past steps that are kept, which limits the age of a delayed measurement."""
 TRUST = 0.25
-"""Power of the floors' evidence on the pose: one wrong map affects many steps."""
+"""Exponent on the floors' likelihood of a pose [1]. It is below 1 because an error of the map
+affects many steps, whose evidence is therefore not independent."""
 
 
 class PoseState(eqx.Module):
@@ -25,15 +26,16 @@ class PoseState(eqx.Module):
         nuisance: effects of every floor along, across and in yaw beyond their estimates, in
             remaining stds, errors of their log frictions, belief errors d [1], then the gyro's bias
             [rad/s].
-        covariance: covariance of pose and nuisance [units of both].
+        covariance: covariance of pose and nuisance [products of their units].
         toward: settled direction of travel, see `slipid.robot.filter.effects`.
-        still: time for which the robot has stood [s].
-        noise: covariance added to the pose over the history [m, m, rad, each times each].
+        still: time for which the robot has stood still [s].
+        noise: covariance that process noise added to the pose over the history, in products of
+            [m, m, rad].
         far: path length over the history [m].
         push: derivative of the pose by the nuisance per metre of the last motion, without the
             gyro's bias [m/m, m/m, rad/m].
-        history: last steps, the newest first: age [s], pose [m, m, rad], yaw rate of the contact
-            model [rad/s], noise and path length until then.
+        history: last steps, the newest first. Columns: age [s], pose [m, m, rad], yaw rate of the
+            contact model [rad/s], `noise` in row-major order and `far` [m] after that step.
     """
 
     pose: Float[Array, "3"]
@@ -50,7 +52,8 @@ class PoseState(eqx.Module):
 def apply_fix(now: PoseState, z: Readings) -> tuple[PoseState, Float[Array, "3 3"]]:
     """Return the state corrected by a pose fix, if there is one, and the factor on distances.
 
-    The factor is the share of another pose's distance that the fix leaves.
+    The factor (3, 3), in world axes, is the share of a hypothesis's distance from the estimated
+    pose that remains after the fix; it is the identity without a fix.
     """
     age = jnp.where(jnp.isfinite(z.fix_age) & (z.fix_age >= 0), z.fix_age, 0.0)
     has = (
@@ -74,10 +77,11 @@ def _corrected(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return pose, nuisance, covariance, history and the factor on distances after a pose fix.
 
-    The fix is of the pose `age` ago [s]. Since then nuisance is assumed to act as on the last
-    motion. The fix does not include the noise added since then, a covariance of the pose, so it is
-    set aside. The part of it that the pose no longer contains, because a later fix removed it,
-    counts as noise of this fix.
+    The fix is of the pose `age` [s] ago. From then on, nuisance states are assumed to act on the
+    pose as they did in the last motion. The fix contains no information on process noise added
+    since then, so the covariance of that noise is subtracted from the pose's before the update and
+    added again after it. The part of it that the pose no longer contains, because a later fix
+    removed it, counts as noise of this fix.
     """
     pose, cov, history = now.pose, now.covariance, now.history
     then = nearest(history, age)
@@ -94,7 +98,7 @@ def _corrected(
     noise = jnp.diag(jnp.stack([std[0], std[0], std[1]]) ** 2) + since - held
     rows = look @ cov
     total = rows @ look.T + noise
-    # a fix far from the expected pose counts less, but still counts
+    # a fix beyond 3 stds of the expected pose has less weight, but is not rejected
     far = gap @ _inverse(total) @ gap
     total = total + noise * jnp.maximum(far / 9.0 - 1.0, 0.0)
     gain = rows.T @ _inverse(total)
@@ -112,14 +116,15 @@ def apply_map(
     supports: Float[Array, "sample hypothesis"],
     motion: BodyMotion,
 ) -> tuple[PoseState, Float[Array, "3 3"]]:
-    """Return the state corrected by the belief about floors, where a map has them elsewhere.
+    """Return the state after comparing the belief about floors with a map, and a factor.
 
-    The second result is the share of another pose's distance that it leaves, in the world's axes.
+    The factor (3, 3), in world axes, is the share of a hypothesis's distance from the estimated
+    pose that remains.
 
     Args:
         now: pose and covariance.
-        root: root of the pose's covariance with which poses were drawn.
-        supports: probability of every hypothesis at every pose drawn, see `Floor.supports`.
+        root: root of the pose's covariance, with which the pose samples were drawn.
+        supports: probability of every hypothesis at every pose sample, see `Floor.supports`.
         motion: belief over the hypotheses before this step's evidence and after it.
     """
     share = supports / jnp.maximum(jnp.mean(supports, axis=0), 1e-12)
@@ -148,13 +153,14 @@ def history_after_jump(
 ) -> Float[Array, "entry 15"]:
     """Return the history after late evidence on the floors moved the pose.
 
-    The poses of the old and the new belief diverged until now, at the rate at which the two differ
-    now. So of a jump J a part was already true a path length s ago,
+    The old and the new belief predict twists that differ; their poses are assumed to have diverged
+    at the present rate until now. So of the jump J between them, a path length s [m] ago, the share
 
-        1 - s (j . J) / |J|^2,   j their divergence per metre
+        1 - s (j . J) / |J|^2,   j the divergence per metre
 
-    limited to between none and all of it, yaw as rim speed. Otherwise a fix of an earlier time
-    would move the pose by the jump once more.
+    was already there, limited to 0 ... 1, with yaw multiplied by the base radius. Past poses are
+    shifted by that share of the jump. Otherwise a fix of an earlier time would move the pose by the
+    jump once more.
     """
     scale = jnp.stack([jnp.ones(()), jnp.ones(()), base])
     jump, apart = scale * motion.jump, scale * motion.correction
@@ -170,17 +176,20 @@ def history_after_jump(
 def shifted(
     history: Float[Array, "entry 15"], pose: Float[Array, "3"], change: Float[Array, "entry 3"]
 ) -> Float[Array, "entry 15"]:
-    """Return the history of a pose that was off by these changes, turning about the pose now."""
+    """Return the history with past poses corrected by `change`, one row per entry.
+
+    The correction of heading rotates past positions about the present `pose`.
+    """
     back = history[:, 1:3] - pose[:2]
     moved = change[:, :2] + change[:, 2:] * jnp.stack([-back[:, 1], back[:, 0]], axis=-1)
     return history.at[:, 1:3].add(moved).at[:, 3].add(change[:, 2])
 
 
 def _given(cov: Float[Array, "unknown unknown"]) -> Float[Array, "3 3"]:
-    """Return the covariance of the pose if everything else were known.
+    """Return the covariance of the pose given all other unknowns.
 
-    No more than that can be set aside from the pose alone: its remainder is correlated with the
-    other unknowns, and with more taken off, the whole would not be a covariance.
+    This is the most that can be subtracted from the pose's covariance alone: the rest is correlated
+    with the other unknowns, and subtracting more would leave an indefinite matrix.
     """
 
     def known(k: Int[Array, ""], c: Array) -> Array:
@@ -192,10 +201,10 @@ def _given(cov: Float[Array, "unknown unknown"]) -> Float[Array, "3 3"]:
 
 
 def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Return the largest multiple, at most 1, of a covariance that another one contains.
+    """Return the covariance `part`, scaled down if needed so that it does not exceed `whole`.
 
-    The largest eigenvalue of their quotient is at most the eighth root of the trace of its eighth
-    power, and at least 1 / 1.15 of that.
+    The bound on the largest eigenvalue of whole^-1 part is the eighth root of the trace of its
+    eighth power, which exceeds that eigenvalue by a factor of at most 1.15.
     """
     m = _inverse(whole) @ part
     for _ in range(3):
@@ -207,8 +216,8 @@ def _within(part: Float[Array, "3 3"], whole: Float[Array, "3 3"]) -> Float[Arra
 def rebased(now: PoseState) -> PoseState:
     """Return the state with noise and path length counted from the oldest entry of the history.
 
-    They, and ages instead of times, stay small however long a robot drives, so that 32 bits
-    suffice.
+    They stay small however long a robot drives, and so do ages (kept instead of times), so that
+    32-bit numbers suffice.
     """
     first = now.history[-1, 5:]
     history = now.history.at[:, 5:].add(-first)
@@ -218,7 +227,7 @@ def rebased(now: PoseState) -> PoseState:
 
 
 def nearest(history: Array, age: Array | float) -> Array:
-    """Return the entry nearest to an age: age, pose, model's yaw rate, noise and path length."""
+    """Return the entry of `PoseState.history` whose age is nearest to `age` [s]."""
     return history[jnp.argmin(jnp.abs(history[:, 0] - age))]
 
 

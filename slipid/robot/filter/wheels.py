@@ -14,7 +14,8 @@ class WheelState(eqx.Module):
     Attributes:
         speed: speed of the wheels of each drive [rad/s].
         age: age of its last reading [s].
-        angle: angle up to which motion is counted [rad]; NaN before the first reading.
+        angle: encoder angle up to which motion has been counted [rad]; NaN before the first
+            reading.
     """
 
     speed: Float[Array, " drive"]
@@ -36,8 +37,9 @@ class MotorCurrents(eqx.Module):
     """Motor currents after one step.
 
     Attributes:
-        filtered: filtered current [A]; without a sign where `measured` is 1.
-        measured: 0 where nothing was measured, 1 for the magnitude alone, 2 with the sign.
+        filtered: filtered current [A]; its magnitude where `measured` is 1.
+        measured: 0 where nothing was measured, 1 where only the magnitude was, 2 where the sign
+            was, too.
         variance: variance of the sensors [A^2].
     """
 
@@ -47,7 +49,7 @@ class MotorCurrents(eqx.Module):
 
 
 def time_step(dt: Float[Array, ""] | float, settings: Settings) -> Float[Array, ""]:
-    """Return a time step [s] as it counts: 0 unless it is positive, `longest_s` at most."""
+    """Return a time step limited to `longest_s`, or 0 unless it is a positive number [s]."""
     dt = jnp.asarray(dt, dtype=float)
     passed = jnp.isfinite(dt) & (dt > 0)
     return jnp.where(passed, jnp.clip(dt, 1e-4, settings.longest_s), 0.0)
@@ -56,10 +58,10 @@ def time_step(dt: Float[Array, ""] | float, settings: Settings) -> Float[Array, 
 def read_wheels(
     robot: RobotArrays, settings: Settings, old: WheelState, z: Readings, dt: Array
 ) -> WheelState:
-    """Return wheel speeds, angles up to which motion is counted, and ages of the readings.
+    """Return wheel speeds, angles up to which motion has been counted, and ages of the readings.
 
-    A wheel without readings keeps its speed until it is stale, then it counts as standing. Once its
-    readings return, the motion that was missed is made up for.
+    A wheel without readings keeps its speed until it is stale, then it counts as standing. When its
+    encoder returns, the next step includes the motion missed in between.
     """
     most = 4.0 * robot.highest[0]
     turned = (z.wheel_angle - old.angle) / jnp.maximum(dt, 1e-3)
