@@ -229,14 +229,14 @@ def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
 
 
 def curve_points(log: Log, recipe: Recipe) -> np.ndarray:
-    """Return current [A] and slip [-] of all wheels within the paper's limits, shape (sample, 2)."""
+    """Return current [A] and slip [-] of all wheels within the paper's limits, (sample, 2)."""
     current, slip = wheel_windows(log, recipe)
     keep = (slip > 0.0) & (slip <= 1.0) & (current > recipe.min_current)
     return np.stack([current[keep], slip[keep]], axis=1)
 
 
 def leave_one_surface_out(logs: Iterable[Log]) -> Transfer:
-    """Return errors of curves fitted to all surfaces but one, or to one, in predicting its slip.
+    """Return how well curves fitted to other surfaces, or to a surface itself, predict its slip.
 
     Poses are used as the camera logged them, without correction of its scale and lag.
 

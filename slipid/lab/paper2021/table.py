@@ -136,7 +136,7 @@ def surface_tables(folder: Path) -> dict[int, MotorTable]:
 
 
 def field_table(folder: Path) -> MotorTable:
-    """Return the table of figure 2: motor 1 over the whole site, with refitted and stored models."""
+    """Return the table of figure 2: motor 1 over the whole site, with refitted and stored model."""
     path = folder / "experimental_data_on_whole_field.csv"
     table = read_columns(path, "robotino2021_field", needed(FIGURE_2))
     samples = slip_samples(table, 1, FIGURE_2)

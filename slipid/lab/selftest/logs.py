@@ -93,9 +93,9 @@ def heading_grid(
     speeds: Sequence[float] = (0.1, 0.2),
     turns: int = 2,
 ) -> tuple[PlannedRun, ...]:
-    """Return straight runs in all headings, and `turns` curves, at each speed on each (floor, load).
+    """Return straight runs and curves at each speed on each (floor, load).
 
-    Speeds are in m/s.
+    At each speed [m/s] there are straight runs in `headings` directions, and `turns` curves.
     """
     drives = []
     for surface, load in setups:
@@ -332,7 +332,7 @@ class _LogSimulator:
 
 @jax.jit
 def _twists(robot: Robot, speed: Array, floor: Array, load: Array) -> tuple[Array, Array]:
-    """Return body twist [m/s, m/s, rad/s] and signed motor currents [A] of each step of each run."""
+    """Return body twists [m/s, m/s, rad/s] and signed motor currents [A] by run and step."""
     frame = robot.geometry.frame()
 
     def one(w: Array, f: Array, s: Array) -> tuple[Array, Array]:

@@ -69,7 +69,7 @@ class FloorSignals:
 
     @property
     def moving(self) -> Bool[np.ndarray, " row"]:
-        """True in rows in which a wheel turns; signals at rest carry no evidence about the floor."""
+        """True in rows in which a wheel turns; at rest there is no evidence about the floor."""
         return np.asarray(np.abs(self.speed).max(axis=1) > STILL)
 
     def rows(self, first: int, last: int) -> "FloorSignals":
@@ -85,7 +85,7 @@ class FloorSignals:
         )
 
     def segment_start(self, seconds: float) -> Int[np.ndarray, " row"]:
-        """Return the index of the first row of each row's segment, for segments of `seconds` [s]."""
+        """Return the index of the first row of each row's segment; segments last `seconds` [s]."""
         start = np.cumsum(self.dt) - self.dt
         number = np.floor(start / seconds + 1e-6)
         return np.searchsorted(number, number)
@@ -248,7 +248,7 @@ class TrailingWindow:
         seconds: float,
         start: Int[np.ndarray, " row"] | None = None,
     ) -> "TrailingWindow":
-        """Return windows of `seconds` [s] for rows at these times [s], with no row before `start`."""
+        """Return windows of `seconds` [s] for rows at times `time` [s], no row before `start`."""
         first = np.searchsorted(time, time - seconds + 1e-6)
         return cls(first if start is None else np.maximum(first, start))
 
