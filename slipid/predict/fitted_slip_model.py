@@ -1,5 +1,6 @@
 """Slip models with noise variances of their own, which forecast distributions as the force balance
-does."""
+does.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
