@@ -1,6 +1,4 @@
-"""Slip models with noise variances of their own, which forecast distributions as the force balance
-does.
-"""
+"""Slip models with noise variances of their own, so that they forecast distributions of runs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
