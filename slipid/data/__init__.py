@@ -1,1 +1,1 @@
-"""Runs: readers of logs, signals, windows and floor maps."""
+"""Runs and floors as data: readers of log files, signals of runs, windows and floor maps."""

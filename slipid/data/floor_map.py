@@ -1,4 +1,7 @@
-"""Floor maps: the surface at every place, from polygons, a picture or a file, or random."""
+"""Floor maps, which give the surface at every place of a floor.
+
+A map is made from polygons, from a picture, from a map file or at random.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,11 +27,11 @@ MOST_CELLS = 16_000_000
 
 @dataclass(frozen=True, eq=False)
 class FloorMap:
-    """A floor of square cells with one surface each.
+    """A rectangular floor of square cells, each of which has one surface.
 
     Attributes:
         surfaces: names of the surfaces; `cells` numbers them from 0.
-        cells: surface of each cell, the first row at the lowest y.
+        cells: number of each cell's surface; the first row has the lowest y.
         corner: x, y of the corner with the lowest coordinates [m].
         cell: edge length of a cell [m].
     """
@@ -46,7 +49,10 @@ class FloorMap:
         return x, y, x + columns * self.cell, y + rows * self.cell
 
     def at(self, xy: Float[np.ndarray, "*batch 2"]) -> Int[np.ndarray, "*batch"]:
-        """Return the number of the surface at places [m]; outside the map that of its edge."""
+        """Return the number of the surface at places x, y [m].
+
+        A place outside the map has the surface of the nearest cell at the map's edge.
+        """
         steps = np.floor((np.asarray(xy) - self.corner) / self.cell).astype(np.intp)
         rows, columns = self.cells.shape
         row, column = steps[..., 1].clip(0, rows - 1), steps[..., 0].clip(0, columns - 1)
@@ -54,7 +60,7 @@ class FloorMap:
 
 
 def uniform(surface: str, half: float = 2.0) -> FloorMap:
-    """Return a map with one surface everywhere."""
+    """Return a map with one surface everywhere, a square with edges of `2 * half` [m]."""
     return FloorMap((surface,), np.zeros((1, 1), np.intp), (-half, -half), 2 * half)
 
 
@@ -67,7 +73,8 @@ def from_polygons(
     """Return the map of patches on a base surface, later patches on top of earlier ones.
 
     Args:
-        patches: surface and corners (x, y) [m] of each.
+        base: surface where there is no patch.
+        patches: name of the surface and corners (x, y) [m] of each patch.
         extent: lowest x, lowest y, highest x, highest y [m].
         cell: edge length of a cell [m].
 
@@ -93,9 +100,10 @@ def patchwork(
 ) -> FloorMap:
     """Return a random floor whose patches are cells of a jittered grid.
 
-    By default the patches are smaller than a Robotino.
+    By default the patches are smaller than a Robotino, so that its wheels stand on several.
 
     Args:
+        surfaces: surfaces, one of which is drawn for each patch.
         seed: seed of the jitter and of the choice of surfaces.
         patch: mean distance between neighbouring patches [m].
         half: half of the floor's edge length [m].
@@ -122,12 +130,14 @@ def patchwork(
 
 
 def four_zones(surfaces: Sequence[str], middle: tuple[float, float] = (0.45, -0.2)) -> FloorMap:
-    """Return four surfaces that meet in a point, by default the centre of the paper's rectangle.
+    """Return the map of four surfaces that meet in a point.
+
+    The point is by default the centre of the rectangle that the robot drives in the paper.
 
     Args:
         surfaces: surfaces of the quarters with low x and high y, high x and high y, high x and low
             y, and low x and low y.
-        middle: the point x, y [m]; every zone reaches 1.2 m from there.
+        middle: x, y of the point where they meet [m]; every zone is a square of 1.2 m.
     """
     reach, cell = 1.2, 0.005
     names = tuple(dict.fromkeys(surfaces))
@@ -144,16 +154,16 @@ def _few(cells: int) -> None:
 
 
 class PatchTable(Section):
-    """Table of a map file: one surface on top of the base."""
+    """One `[[patch]]` table of a map file: a polygon of one surface on top of the base."""
 
     surface: str
     polygon: list[Point] = Field(min_length=3)
 
 
 class PatchedFile(Section):
-    """Map file of patches on a base, later ones on top.
+    """Map file of patches on a base surface, later patches on top of earlier ones.
 
-    `extent_m` is lowest x, lowest y, highest x, highest y.
+    `extent_m` is the lowest x, lowest y, highest x and highest y [m].
     """
 
     schema_: Literal["slipid.map/1"] = Field(alias="schema")
@@ -164,7 +174,7 @@ class PatchedFile(Section):
 
 
 class PicturedFile(Section):
-    """Map file with a picture seen from above, whose lower left corner is at `corner_m`."""
+    """Map file with a picture of the floor from above, whose lower left corner is at `corner_m`."""
 
     schema_: Literal["slipid.map/1"] = Field(alias="schema")
     picture: str
@@ -176,10 +186,10 @@ class PicturedFile(Section):
 def read_map(path: Path) -> FloorMap:
     """Return the map in a file: TOML or, with the suffix `.geojson`, a map written by `slipid map`.
 
-    TOML has `base`, `extent_m` and `[[patch]]`, or `picture` and `[colours]`.
+    A TOML file has either `base`, `extent_m` and `[[patch]]`, or `picture` and `[colours]`.
 
     Raises:
-        DataError: unreadable, unknown or missing keys, wrong values.
+        DataError: the file is unreadable, has unknown or missing keys, or wrong values.
     """
     if path.suffix.lower() == ".geojson":
         from slipid.data.geojson_map import in_cells, read_vector_map
@@ -204,7 +214,7 @@ def read_map(path: Path) -> FloorMap:
 
 
 def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
-    """Write a map as a TOML file and a picture with the same stem beside it.
+    """Write a map as a TOML file, and its picture as a PNG file of the same name beside it.
 
     `colours` has a different colour `#rrggbb` for each surface.
     """
@@ -230,7 +240,7 @@ def write_map(path: Path, floor: FloorMap, colours: Mapping[str, str]) -> None:
 
 
 def _pictured(path: Path, given: PicturedFile) -> FloorMap:
-    """Return the map of a picture: each pixel has the surface of the nearest colour."""
+    """Return the map in a picture: each pixel is a cell with the surface of the nearest colour."""
     from matplotlib.colors import to_rgb
     from matplotlib.image import imread
 

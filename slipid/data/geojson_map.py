@@ -1,6 +1,6 @@
-"""Floor maps as polygons in a GeoJSON file, in metres of the floor instead of degrees.
+"""Floor maps as polygons in a GeoJSON file, with coordinates in metres instead of degrees.
 
-Cells in no polygon are unknown; when read as a floor map they get the nearest surface.
+Parts of the floor in no polygon are unknown; read as a floor map they get the nearest surface.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from slipid.support.toml_file import Section, checked
 SCHEMA = "slipid.map/2"
 WHAT = "a floor map (slipid.map/2) that `slipid map` wrote"
 DIGITS = 5
-"""Decimal places of coordinates: a hundredth of a millimetre."""
+"""Decimal places of the written coordinates [m]: they are rounded to 0.01 mm."""
 Place = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
 Ring = Annotated[list[Place], Field(min_length=4)]
 
@@ -30,12 +30,12 @@ class Patch:
     """A connected patch of one surface.
 
     Attributes:
-        surface: name of its surface.
-        rings: corners [m], the outer ring first, then rings around holes; the last corner does not
-            repeat the first.
-        area: area without holes [m^2].
-        confidence: distance of the next best surface in the look of the patch, in spreads of the
-            looks of one surface; None where there is no other surface.
+        surface: name of the patch's surface.
+        rings: corners x, y [m], the outer ring first, then rings around holes; the last corner does
+            not repeat the first.
+        area: area of the patch without its holes [m^2].
+        confidence: distance from the patch's appearance to that of the second-best surface, in
+            multiples of the spread within one surface [1]; None where there is only one surface.
     """
 
     surface: str
@@ -54,9 +54,9 @@ class VectorMap:
         low_x, low_y, high_x, high_y: bounds of the region [m].
         cell: edge length of the cells in which patches were detected [m].
         base: the surface that covers most of the floor.
-        picture_sha256: hash of the file with the picture.
-        unknown: share of the region that no patch covers.
-        notes: remarks for the reader.
+        picture_sha256: SHA-256 hash of the picture file in which the patches were detected.
+        unknown: share of the region that no patch covers [1].
+        notes: remarks for the reader of the file, one sentence each.
     """
 
     patches: tuple[Patch, ...]
@@ -72,11 +72,11 @@ class VectorMap:
     notes: tuple[str, ...]
 
     def save(self, path: Path) -> None:
-        """Write the map; raise `DataError` where the file cannot be written."""
+        """Write the map as a GeoJSON file; raise `DataError` where it cannot be written."""
         write_json(path, self.to_json())
 
     def to_json(self) -> Content:
-        """Return a FeatureCollection, with all other data under the key `slipid`."""
+        """Return a GeoJSON FeatureCollection of the patches, all else under the key `slipid`."""
         about = {
             "schema": SCHEMA,
             "extent_m": [
@@ -136,7 +136,7 @@ class _About(Section):
 
 
 class _GeojsonFile(Section):
-    """A GeoJSON map file."""
+    """Content of a GeoJSON map file, as it is checked when read."""
 
     type: Literal["FeatureCollection"]
     slipid: _About
@@ -144,10 +144,10 @@ class _GeojsonFile(Section):
 
 
 def read_vector_map(path: Path) -> VectorMap:
-    """Return the polygons of a GeoJSON file.
+    """Return the map of polygons in a GeoJSON file.
 
     Raises:
-        DataError: the file is absent, is no such map, or has wrong values.
+        DataError: the file is absent, is not a map that `slipid map` wrote, or has wrong values.
     """
     given = checked(path, read_json(path, WHAT), _GeojsonFile)
     about = given.slipid
@@ -182,10 +182,13 @@ def read_vector_map(path: Path) -> VectorMap:
 
 
 def in_cells(path: Path, vector_map: VectorMap) -> FloorMap:
-    """Return the map in cells; unknown cells have the nearest surface.
+    """Return a map of polygons as a map of cells; unknown cells get the nearest surface.
+
+    Args:
+        path: file of the map, which errors name.
 
     Raises:
-        DataError: too many cells, or patches that cover none of them.
+        DataError: the map has too many cells, or no patch covers any cell.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -210,9 +213,10 @@ def in_cells(path: Path, vector_map: VectorMap) -> FloorMap:
 def covered(
     rings: list[Float[np.ndarray, "_ 2"]], rows: int, columns: int
 ) -> Bool[np.ndarray, "row column"]:
-    """Return cells whose centre lies within an odd number of rings, in units of columns and rows.
+    """Return whether the centre of each cell lies within an odd number of rings.
 
-    In each row every edge flips the cells to its right between outside and inside.
+    Coordinates of the rings count cells: x in columns, y in rows. In each row, every edge of a ring
+    flips all cells to its right between outside and inside.
     """
     turns = np.zeros((rows, columns + 1), np.intp)
     for ring in rings:
@@ -225,7 +229,7 @@ def covered(
 
 
 def _rows_between(y: float, y2: float, rows: int) -> Int[np.ndarray, " row"]:
-    """Return the rows whose centre lies between two heights, the lower one included."""
+    """Return the rows whose centre lies at or above the lower and below the higher of two y."""
     low, high = sorted((y, y2))
     first, last = np.clip([np.ceil(low - 0.5), np.ceil(high - 0.5)], 0, rows)
     return np.arange(int(first), int(last))

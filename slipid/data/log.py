@@ -1,4 +1,4 @@
-"""A log: one recorded run as a frozen value with SI units, REP-103 axes and named arrays."""
+"""Class `Log`: one recorded run, frozen, with named arrays in SI units and axes as in REP 103."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,37 +11,37 @@ from slipid.data.align.clock import Clock
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Log:
-    """One run, with every array at the times `time` at which some sensor was read.
+    """One run; all its arrays have a row for each time at which some sensor was read.
 
-    A wheel stands for a drive where several wheels share a motor.
+    Where several wheels share a motor, a "wheel" stands for that motor with all its wheels.
 
     Attributes:
         name: path relative to the data root, with forward slashes; `#03` follows where one file
             holds several runs.
-        path: the file.
-        sha256: hash of the file's bytes.
-        time: time [s], strictly increasing; relative to the first row where a clock counts from
-            1970.
-        wheel_angle: angle of each wheel [rad], cumulative from the first row and linear between two
-            readings; no columns where a log has only poses.
+        path: path of the file.
+        sha256: SHA-256 hash of the file's bytes.
+        time: time [s], strictly increasing; it starts at 0 if the logged clock counts from 1970.
+        wheel_angle: angle of each wheel [rad], cumulative from the first row, interpolated linearly
+            between readings; without columns if the log has only poses.
         wheel_speed: reported speed of each wheel [rad/s], or None.
         wheel_speed_command: commanded speed of each wheel [rad/s], or None.
         twist_command: commanded x [m/s], y [m/s] and yaw rate [rad/s], or None.
         current: current of each motor [A], or None.
-        current_fresh: False where a current repeats the last reading; None where it was read in
-            every row.
-        current_is_signed: False where the log has magnitudes only.
+        current_fresh: False where a current repeats the last reading; None if every row has a new
+            one.
+        current_is_signed: False if the log has only magnitudes of currents.
         voltage: voltage across each motor [V], or None.
-        voltage_fresh: False where a voltage repeats the last reading; None where it was read in
-            every row.
+        voltage_fresh: False where a voltage repeats the last reading; None if every row has a new
+            one.
         duty: duty cycle of each motor's bridge [1], or None.
         bus_voltage: supply voltage [V], or None.
         gyro: yaw rate [rad/s], or None.
-        pose: x [m], y [m], heading [rad] without wrap-around, in the scale of the camera's log, or
-            None.
+        pose: x [m], y [m], heading [rad] without wrap-around, in the scale of the camera's log (not
+            corrected for a wrong camera scale), or None.
         pose_fresh: False where the row repeats the last pose.
-        pose_clock: clock of poses with times of their own, estimated from the motion, or None.
-        surface: name of the floor, None where it is unknown.
+        pose_clock: clock offset and drift, estimated from the motion, of poses that have times of
+            their own; else None.
+        surface: name of the surface, or None if it is unknown.
         load: name of the load set-up.
         notes: repairs made by the reader, one sentence each.
     """
@@ -76,7 +76,7 @@ class Log:
 
     @property
     def wheels(self) -> int:
-        """Return the number of wheels, 0 where only poses were logged."""
+        """Return the number of wheels, 0 if only poses were logged."""
         return self.wheel_angle.shape[1]
 
     @property
@@ -85,7 +85,7 @@ class Log:
         return float(self.time[-1] - self.time[0])
 
     def __repr__(self) -> str:
-        """Return name, size and measured channels on one line."""
+        """Return one line with the name, size and logged channels."""
         names = ("wheel_speed", "current", "voltage", "duty", "bus_voltage", "gyro", "pose")
         has = [name for name in names if getattr(self, name) is not None]
         return (

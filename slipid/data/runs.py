@@ -1,4 +1,4 @@
-"""Runs of different lengths as one set of flat arrays."""
+"""Class `Runs`: a set of runs of different lengths in one set of flat arrays."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -20,27 +20,27 @@ from slipid.support.errors import DataError
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Runs laid end to end: one copy of the samples, each run a view.
+    """Runs laid end to end: each array holds the samples of all runs, one run after another.
 
     Attributes:
-        logs: the runs; their arrays are views of the flat ones below, except for raw wheel angles
-            where a stall was bridged.
-        offset: index of the first sample of each run, and the end of the last.
+        logs: the runs; their arrays are views of the flat ones below, except for the raw wheel
+            angles of runs in which a stall was bridged.
+        offset: index of the first sample of each run, and finally the number of samples.
         time: time within the run [s] (sample,).
-        wheel_angle: angle of each wheel [rad] (sample, wheel), stalls of the telemetry bridged.
+        wheel_angle: angle of each wheel [rad] (sample, wheel), linear across telemetry stalls.
         pose: x [m], y [m], heading [rad], in the scale of the log.
         fresh: False where the row repeats the last camera frame.
-        live: False in the rows of a stall, whose currents are stale.
+        live: False in the rows of a telemetry stall, whose currents are stale.
         current: motor currents [A], or None.
         voltage: motor voltages [V], or None.
         current_fresh: False where a current repeats the last reading (sample, wheel), or None.
         voltage_fresh: False where a voltage repeats the last reading (sample, wheel), or None.
-        current_is_signed: False where some log has magnitudes only.
+        current_is_signed: False if some log has only magnitudes of currents.
         session: name of each run's session, in which the marker stayed in place.
         heading: commanded direction of travel of each run [rad]; nan where it turns on the spot.
         speed: commanded speed of each run [m/s]; nan where no command was logged.
         turn: commanded yaw rate of each run [rad/s]; nan where no command was logged.
-        aside: a line for every run that is left out because its pose jumps.
+        aside: one line about each run that was left out because its pose jumps.
     """
 
     logs: tuple[Log, ...]
@@ -65,16 +65,20 @@ class Runs:
         return len(self.logs)
 
     def rows(self, run: int) -> slice:
-        """Return the samples of one run in the flat arrays."""
+        """Return the slice of the flat arrays that holds one run."""
         return slice(int(self.offset[run]), int(self.offset[run + 1]))
 
     def subset(self, keep: Iterable[int] | np.ndarray) -> "Runs":
-        """Return some of the runs, in the order given."""
+        """Return the runs with the given indices, in the given order."""
         index = [int(k) for k in keep]
         return collect([self.logs[i] for i in index], [self.session[i] for i in index])
 
     def __add__(self, other: "Runs") -> "Runs":
-        """Return the runs of both sets; raise `DataError` where they overlap or do not match."""
+        """Return the runs of both sets.
+
+        Raises:
+            DataError: a run is in both sets, or the numbers of wheels differ.
+        """
         if both := {log.name for log in self.logs} & {log.name for log in other.logs}:
             raise DataError(f"{min(both)}: in both sets of runs; expected it once")
         aside = [*self.aside, *other.aside]
@@ -84,15 +88,17 @@ class Runs:
 def collect(
     logs: Sequence[Log], session: Sequence[str] | None = None, aside: Sequence[str] = ()
 ) -> Runs:
-    """Return one set of runs that all have wheels and poses.
+    """Return runs, all of which have wheels and poses, as one set.
 
     Args:
-        session: session of each run, in which the marker stayed in place; by default surface, load
-            set-up and commanded speed, which is how test grids are driven.
-        aside: a line for every run that is left out because its pose jumps.
+        logs: the runs.
+        session: session of each run, in which the marker stayed in place on the robot; by default
+            the runs with the same surface, load set-up and commanded speed are one session, since
+            test grids are driven in that order.
+        aside: one line about each run that was left out because its pose jumps.
 
     Raises:
-        DataError: no run, different wheel counts, a run without pose.
+        DataError: there is no run, the numbers of wheels differ, or a run has no poses.
     """
     if not logs:
         raise DataError("no runs; expected at least one log")
@@ -147,7 +153,7 @@ def collect(
 
 
 def _fresh(logs: Sequence[Log], channel: str) -> Bool[np.ndarray, "sample wheel"] | None:
-    """Return whether a channel was read anew in each row of all runs; None where it always was."""
+    """Return whether each row of all runs has a new reading of a channel; None if every row has."""
     each = [getattr(log, f"{channel}_fresh") for log in logs]
     if all(fresh is None for fresh in each):
         return None
@@ -160,9 +166,10 @@ def _fresh(logs: Sequence[Log], channel: str) -> Bool[np.ndarray, "sample wheel"
 def counted_once(logs: Sequence[Log]) -> list[Log]:
     """Return the logs with `current_fresh` False where a current only repeats the last reading.
 
-    The refresh period of an ammeter is estimated from all runs together: one that is read once a
-    second changes six times in six seconds. Voltages are not checked: those that a bench or a
-    program sets stay constant until the next step.
+    The refresh period of each ammeter is estimated from all runs together, because a short run has
+    too few changes: an ammeter read once a second changes only six times in six seconds. Voltages
+    are not checked: a voltage that a test bench or a program sets stays constant between its steps,
+    although it is read in every row.
     """
     have = [k for k, log in enumerate(logs) if log.current is not None]
     wheels = max((logs[k].wheels for k in have), default=0)
@@ -187,28 +194,31 @@ def counted_once(logs: Sequence[Log]) -> list[Log]:
 
 
 def _rows_read(log: Log, wheel: int) -> Int[np.ndarray, " read"]:
-    """Return the rows in which one ammeter was read."""
+    """Return the rows of a run in which the ammeter of one wheel was read."""
     fresh = log.current_fresh
     return np.arange(log.samples) if fresh is None else np.flatnonzero(fresh[:, wheel])
 
 
 def _readings(log: Log, rows: np.ndarray, wheel: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [s] and currents [A] of one ammeter in some rows."""
+    """Return times [s] and currents [A] of the ammeter of one wheel in the given rows."""
     assert log.current is not None
     return log.time[rows], log.current[rows, wheel]
 
 
 def default_session(log: Log) -> str:
-    """Return `surface/load/speed`, the speed to 0.01 m/s and absent if nothing was commanded."""
+    """Return the session name `surface/load/speed` of a run.
+
+    The commanded speed is rounded to 0.01 m/s, and absent if no command was logged.
+    """
     _, speed, _ = _command(log)
     parts = [log.surface or "unknown", log.load] + ([f"{speed:.2f}"] if np.isfinite(speed) else [])
     return "/".join(parts)
 
 
 def _command(log: Log) -> tuple[float, float, float]:
-    """Return heading [rad], speed [m/s] and yaw rate [rad/s] of the median command; nan if unknown.
+    """Return the direction of travel [rad], speed [m/s] and yaw rate [rad/s] of the median command.
 
-    The heading is nan where the robot turns on the spot.
+    All are nan if no command was logged; the direction is nan if the robot turns on the spot.
     """
     if log.twist_command is None:
         return np.nan, np.nan, np.nan
@@ -218,7 +228,11 @@ def _command(log: Log) -> tuple[float, float, float]:
 
 
 def first_row(data: Runs, run: int, wheel_radius: float) -> int:
-    """Return the row in which the fastest rim has moved `MOVED`; raise `DataError` if none has."""
+    """Return the first row of a run by which the rim of some wheel has moved `MOVED`.
+
+    Raises:
+        DataError: no rim moves that far in the run.
+    """
     first = first_moved(data.wheel_angle[data.rows(run)], wheel_radius)
     if first is None:
         raise DataError(

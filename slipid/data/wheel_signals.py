@@ -1,4 +1,8 @@
-"""Signals of one run: increments of motion, telemetry stalls, first motion, swapped wheels."""
+"""Functions on the signals of one run.
+
+They compute increments of motion, find the rows in which a slow sensor was read, bridge telemetry
+stalls, and find the first motion and wheels in the wrong order.
+"""
 
 from collections.abc import Iterable
 from itertools import permutations
@@ -7,18 +11,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 MOVED = 0.010
-"""A run starts where the fastest wheel's rim has moved this distance [m]."""
+"""Motion starts in the row by which the fastest wheel's rim has moved this distance [m]."""
 STALLED = 3
-"""Least number of steps without change in a stall."""
+"""Least number of steps (from row to row) without change of any wheel angle in a stall."""
 DOUBT = 0.05
-"""Relative misfit of the declared order above which other orders are tried; errors of speed loops
-stay below it."""
+"""Misfit of the declared order of wheels (see `swapped_order`) above which other orders are tried
+[1]; speed control errors alone cause less."""
 LEAST_CHANGES = 8
-"""Least number of changes of a value from which its sensor's refresh period is estimated."""
+"""Least number of changes of a sensor's value that suffices to estimate its refresh period."""
 LEAST_IN_A_RUN = 3
-"""Least mean number of changes in a run."""
+"""Least number of changes per run, on average, that suffices to estimate a refresh period."""
 BETTER = 0.25
-"""Another order must have less than this share of the declared one's misfit."""
+"""Another order of wheels is reported if its misfit is below this share of the declared order's
+misfit [1]."""
 
 
 def interpolate(
@@ -26,7 +31,7 @@ def interpolate(
     values: Float[np.ndarray, "time column"],
     at: Float[np.ndarray, " at"],
 ) -> Float[np.ndarray, "at column"]:
-    """Return columns at other times [s], linear in between and constant beyond both ends.
+    """Return columns at other times [s], interpolated linearly and constant beyond both ends.
 
     Angles must be without wrap-around.
     """
@@ -36,7 +41,7 @@ def interpolate(
 def integral(
     time: Float[np.ndarray, " time"], rate: Float[np.ndarray, "time column"]
 ) -> Float[np.ndarray, "time column"]:
-    """Return the integral of each column from the first row on by trapezoids; it starts at 0."""
+    """Return the integral of each column over time by the trapezoidal rule, 0 in the first row."""
     areas = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None]
     return np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(areas, axis=0)])
 
@@ -44,9 +49,10 @@ def integral(
 def readings(
     time: Float[np.ndarray, " time"], values: Float[np.ndarray, " time"]
 ) -> Bool[np.ndarray, " time"]:
-    """Return whether a sensor that may be slower than the rows was read anew, for each row.
+    """Return whether each row has a new reading of a sensor that may be slower than the rows.
 
-    It is True everywhere where the value changes in neighbouring rows, or hardly ever.
+    All rows count as new if the value often changes from row to row, or changes too rarely to
+    estimate a refresh period.
     """
     period = refresh_period([(time, values)])
     return np.ones(len(time), bool) if period is None else read_anew(time, values, period)
@@ -55,11 +61,12 @@ def readings(
 def refresh_period(
     runs: Iterable[tuple[Float[np.ndarray, " time"], Float[np.ndarray, " time"]]],
 ) -> float | None:
-    """Return the refresh period of a sensor slower than its rows [s], or None of one that is not.
+    """Return the refresh period of a sensor that is read less often than rows are logged [s].
 
-    The value of a slow sensor never changes in two neighbouring rows, except one time in twenty; a
-    sensor that is read in every row and happens to repeat itself changes in neighbouring rows, too.
-    It changes several times in a run: a single change is a step of the measured quantity.
+    The result is None if the sensor is not that slow. At most one in twenty changes of a slow
+    sensor follows another in the very next row, whereas a sensor that is read in every row and
+    sometimes repeats a value often changes in two successive rows. A slow sensor must change
+    several times in a run, because a single change may be a step of the measured quantity.
     """
     rows: list[np.ndarray] = []
     seconds: list[np.ndarray] = []
@@ -79,9 +86,9 @@ def refresh_period(
 def read_anew(
     time: Float[np.ndarray, " time"], values: Float[np.ndarray, " time"], period: float
 ) -> Bool[np.ndarray, " time"]:
-    """Return the rows in which a sensor of this period was read: at changes, or after a period.
+    """Return whether a sensor with a refresh period [s] was read in each row.
 
-    A value that stays constant for several periods was read several times.
+    It was read where its value changes, and once every period while the value stays constant.
     """
     out = np.zeros(len(time), dtype=bool)
     out[0] = True
@@ -101,9 +108,9 @@ def read_anew(
 def body_increments(
     before: Float[np.ndarray, "step 3"], after: Float[np.ndarray, "step 3"]
 ) -> Float[np.ndarray, "step 3"]:
-    """Return increments ahead [m], left [m] and of the heading [rad] between poses.
+    """Return the increments ahead [m], to the left [m] and of the heading [rad] between poses.
 
-    They are in the body's axes at the middle of each step, rotated by the mean heading.
+    Ahead and left are the body's axes at the mean heading of each step.
     """
     middle = 0.5 * (after[:, 2] + before[:, 2])
     dx, dy, turn = (after - before).T
@@ -113,23 +120,23 @@ def body_increments(
 
 
 def body_steps(pose: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "step 3"]:
-    """Return the `body_increments` from each row of a pose to the next."""
+    """Return the `body_increments` between successive rows of poses."""
     return body_increments(pose[:-1], pose[1:])
 
 
 def stretches(mask: Bool[np.ndarray, " row"]) -> Int[np.ndarray, "stretch 2"]:
-    """Return the first row of every stretch of True, and the row after its last."""
+    """Return, for every stretch of consecutive True, its first row and the row after its last."""
     return np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]]))).reshape(-1, 2)
 
 
 def bridge_stalls(
     time: Float[np.ndarray, " time"], wheel_angle: Float[np.ndarray, "time wheel"]
 ) -> tuple[Float[np.ndarray, "time wheel"], Bool[np.ndarray, " time"]]:
-    """Return the wheel angle with stalls of the telemetry bridged, and whether each row is stalled.
+    """Return the wheel angle with telemetry stalls bridged, and whether each row is in a stall.
 
-    A stall is a stretch in which no wheel's angle changes and that ends in one step as large as the
-    missed motion: the radio froze, not the wheels. The angle is made linear across it; speeds and
-    currents reported in the stalled rows are as stale as the angle was.
+    In a stall no wheel's angle changes for some rows, and then all change in one step by about the
+    missed motion: the radio link froze, not the wheels. The angle is made linear across the stall.
+    Speeds and currents reported in its rows are as outdated as the angle was.
     """
     stalled = np.zeros(len(time), dtype=bool)
     step = np.abs(np.diff(wheel_angle, axis=0)).max(axis=1, initial=0.0)
@@ -138,7 +145,7 @@ def bridge_stalls(
     usual = float(np.median(step[step > 0]))
     bridged = wheel_angle
     for start, end in stretches(step == 0):
-        # Rows start..end hold the same angle; row end + 1 is the burst.
+        # Rows start to end have the same angle; row end + 1 has the jump by the missed motion.
         if end - start < STALLED or end == len(step) or start == 0:
             continue
         if step[end] < 0.5 * (end - start + 1) * min(usual, step[start - 1]):
@@ -153,7 +160,10 @@ def bridge_stalls(
 
 
 def first_moved(wheel_angle: Float[np.ndarray, "time wheel"], radius: float) -> int | None:
-    """Return the first row by which some wheel's rim has moved `MOVED`; None where none does."""
+    """Return the first row by which some wheel's rim has moved `MOVED`, or None if none does.
+
+    `radius` is the radius of the wheels [m].
+    """
     rim = radius * np.abs(wheel_angle - wheel_angle[:1]).max(axis=1, initial=0.0)
     moved = np.flatnonzero(rim >= MOVED)
     return int(moved[0]) if len(moved) else None
@@ -162,15 +172,16 @@ def first_moved(wheel_angle: Float[np.ndarray, "time wheel"], radius: float) -> 
 def swapped_order(
     measured: Float[np.ndarray, "time wheel"], reference: Float[np.ndarray, "time wheel"]
 ) -> tuple[int, ...] | None:
-    """Return the column of each wheel, such as (3, -1, 2); None where the order is right.
+    """Return the measured column of each wheel, such as (3, -1, 2), or None if the order is right.
 
-    Wheels are counted from 1, and negative where they count backwards. It is the order in which the
-    measured steps come closest to the reference:
+    Columns are counted from 1; a negative number is a column that counts backwards. The result is
+    the order and signs in which the measured steps are closest to the reference:
 
         misfit = sum_i |m_order(i) sign_i - ref_i|^2 / sum_i |ref_i|^2
 
-    Only the products of every pair enter, so that all orders of six wheels take no time. Steps are
-    in any measure of wheel motion, such as the angle turned.
+    Only the sums of products of every pair of columns enter, so that trying all orders of six
+    wheels is fast. Steps may be any measure of wheel motion, such as the angle turned [rad], the
+    same in both arrays.
     """
     products = measured.T @ reference
     norm, reference_norm = float(np.sum(measured**2)), float(np.sum(reference**2))

@@ -1,4 +1,4 @@
-"""Runs cut into segments of windows, over which a likelihood sums."""
+"""Runs cut into segments of several windows each; the likelihood is a sum over segments."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -10,33 +10,35 @@ from slipid.data.wheel_signals import interpolate
 from slipid.support.errors import DataError
 
 NORMAL_STD = 0.6827
-"""Probability of a normal variable to be within one std."""
+"""Probability that a normally distributed variable is within one std of its mean [1]."""
 UNREAD = 1e6
-"""Variance of a mean without any reading, so large that it carries no information [A^2, V^2]."""
+"""Variance assigned to the mean of a window without any reading [A^2] or [V^2]; it is so large that
+the mean carries no information."""
 PerWindow = Float[np.ndarray, "window wheel"]
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Segments of K neighbouring windows; a short run is one segment, a long one is cut.
+    """Segments of K successive windows; a short run is one segment, a long run has several.
 
     Attributes:
         run: index of the run of each segment (segment,).
-        surface, load, session: their names for each segment.
+        surface, load, session: name of the surface, load set-up and session of each segment.
         start: time in its run at which each segment starts [s] (segment,).
         dt: length of each window [s] (segment, window).
-        turn: rotation of each wheel in the window [rad] (segment, window, wheel), at lag `lag`.
-        speed_change: wheel speed at its end less that at its start [rad/s], so that
+        turn: rotation of each wheel in the window [rad] (segment, window, wheel) if the camera lags
+            by `lag`.
+        speed_change: wheel speed at the window's end less that at its start [rad/s], so that
             d turn / d lag = -speed_change.
         pose: pose at the edges of the windows (segment, window + 1, 3), as logged.
-        current: mean of the signed current or of its magnitude [A]; zeros where not logged.
-        voltage: mean voltage [V]; zeros where not logged.
+        current: mean of the signed current or of its magnitude [A]; zeros if not logged.
+        voltage: mean voltage [V]; zeros if not logged.
         current_var: variance of the mean current due to the ammeter's noise [A^2]; `UNREAD` where
             no current was read in the window.
         voltage_var: variance of the mean voltage due to missing readings [V^2]; `UNREAD` where no
             voltage was read in the window.
-        has_current, has_voltage: whether they were logged.
-        current_is_signed: False where `current` is a mean of magnitudes.
+        has_current, has_voltage: whether all runs have logged currents, or voltages.
+        current_is_signed: False if `current` is a mean of magnitudes.
         lag: assumed lag of the camera behind the encoders [s].
     """
 
@@ -62,7 +64,7 @@ class Windows:
         return len(self.run)
 
     def segments(self, index: Int[np.ndarray, " some"]) -> "Windows":
-        """Return some segments, in the order given."""
+        """Return the segments with the given indices, in the given order."""
         kept = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -73,22 +75,24 @@ class Windows:
         return replace(self, **kept)
 
     def at_lag(self, lag: float) -> "Windows":
-        """Return the same windows at another lag of the camera [s], to first order."""
+        """Return the same windows for another lag of the camera [s], to first order in the lag."""
         return replace(self, turn=self.turn - (lag - self.lag) * self.speed_change, lag=lag)
 
 
 def windows(
     data: Runs, wheel_radius: float, lag: float = 0.0, per_segment: int = 4, longest: float = 6.0
 ) -> Windows:
-    """Cut every run from where it has moved `MOVED` into segments of `per_segment` windows.
+    """Return every run cut into segments of `per_segment` windows, from its first motion on.
 
     Args:
+        data: the runs.
         wheel_radius: radius of the wheels [m]; it only determines where motion starts.
         lag: lag of the camera behind the encoders [s].
-        longest: longest window [s]; a longer run has more segments.
+        per_segment: number of windows in each segment.
+        longest: largest length of a window [s]; longer runs have more segments.
 
     Raises:
-        DataError: a run whose wheels never move `MOVED`, or too short for its windows.
+        DataError: a run has no wheel that moves `MOVED`, or has too few poses for its windows.
     """
     each = [_edges(data, k, wheel_radius, lag, per_segment, longest) for k in range(len(data))]
     run = [k for k, segments in enumerate(each) for _ in segments]
@@ -115,14 +119,14 @@ def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
     """Return the variance of a single reading of each ammeter in each run [A^2].
 
     It uses second differences d_t = x_(t-1) - 2 x_t + x_(t+1), which have six times the variance of
-    white noise and suppress smooth signals: of a ripple with a period of n readings only
-    (2 - 2 cos(2 pi / n))^2 / 6 remains, 6 % at n = 8. The quantile of |d| that is the std of a
-    normal distribution gives jumps little weight.
+    white noise and suppress smooth signals: of the variance of a ripple with a period of n readings
+    only the share (2 - 2 cos(2 pi / n))^2 / 6 remains, 6 % at n = 8. The std of d is taken from the
+    quantile of |d| at 68 %, so that jumps have little weight.
 
-    Limits: ripple that is faster than that, or aliased by slow sampling, looks like noise; repeated
-    readings, or noise smoothed by a driver, make the noise look small; readings in steps coarser
-    than the noise give the noise of a few steps, and never less than that of rounding; magnitudes
-    of currents near zero have less noise than signed ones.
+    Limits: ripple with a shorter period, or aliased by slow sampling, counts as noise; repeated
+    readings, or smoothing in the motor driver, make the estimate too small; readings with a
+    resolution coarser than the noise give an estimate of a few of its steps, and never less than
+    the rounding noise; magnitudes of currents near zero have less noise than signed currents.
     """
     out = np.zeros((len(data), data.wheel_angle.shape[1]))
     if data.current is None:
@@ -139,7 +143,10 @@ def ammeter_variance(data: Runs) -> Float[np.ndarray, "run wheel"]:
 
 
 def _ammeter(amps: Float[np.ndarray, " reading"], live: Bool[np.ndarray, " reading"]) -> float:
-    """Return the variance of a reading of one ammeter in one run [A^2]."""
+    """Return the variance of a single reading of one ammeter in one run [A^2].
+
+    The variance is at least that of rounding to the smallest step between readings, step^2 / 12.
+    """
     curvature = np.abs(np.diff(amps, 2))[live[:-2] & live[1:-1] & live[2:]]
     if not len(curvature):
         return 0.0
@@ -152,9 +159,10 @@ def _ammeter(amps: Float[np.ndarray, " reading"], live: Bool[np.ndarray, " readi
 def _edges(
     data: Runs, run: int, radius: float, lag: float, per_segment: int, longest: float
 ) -> list[np.ndarray]:
-    """Return the rows at the window edges of each segment of a run.
+    """Return, for each segment of a run, the rows at the edges of its windows.
 
-    They are rows with a new pose that shows a time at which the wheels were measured.
+    These rows have a new pose, and the pose's true time, earlier by the lag, lies in the record of
+    the wheels.
     """
     first, time = first_row(data, run, radius), data.time[data.rows(run)]
     fresh = np.flatnonzero(data.fresh[data.rows(run)])
@@ -181,14 +189,20 @@ def _edges(
 def _cut(
     data: Runs, run: int, edges: np.ndarray, lag: float, noise: Float[np.ndarray, " wheel"]
 ) -> dict[str, np.ndarray]:
-    """Return the arrays of `Windows` for one segment by name.
+    """Return the arrays of `Windows` for one segment, by the attribute's name.
 
-    The noise is the variance of a single reading of each ammeter.
+    Args:
+        data: the runs.
+        run: index of the segment's run.
+        edges: rows of the run at the edges of the windows.
+        lag: lag of the camera behind the encoders [s].
+        noise: variance of a single reading of each ammeter [A^2].
     """
     rows = data.rows(run)
     t, angle = data.time[rows], data.wheel_angle[rows]
     at = t[edges] - lag
-    half = 0.08  # a speed over 0.16 s: shorter shows the encoder's uneven updates
+    # Speeds are means over 0.16 s: shorter means would show the encoder's uneven updates.
+    half = 0.08
     turned, ahead, behind = (interpolate(t, angle, when) for when in (at, at + half, at - half))
     span = np.clip(at + half, t[0], t[-1]) - np.clip(at - half, t[0], t[-1])
     speed = (ahead - behind) / np.maximum(span, 1e-3)[:, None]
@@ -225,14 +239,21 @@ def _mean(
     fresh: Bool[np.ndarray, "row wheel"] | None,
     at: Float[np.ndarray, " edge"],
 ) -> tuple[PerWindow, PerWindow, PerWindow]:
-    """Return time averages between edges, their counts of readings, and variances by missed ones.
+    """Return each window's time average, number of readings, and variance by missing readings.
 
-    A row stands for the time from halfway to the row before it to halfway to the next. A mean
-    over the rows in a window would be as late as its first row lies behind the edge: while a robot
-    speeds up, voltages would read high. Between the readings of a slower meter the signal counts as
-    linear; had it jumped from one reading's value to the next one's at any time in between, the
-    mean over that time would be off by their difference over sqrt(12). Rows that are not live are
-    left out, except in windows that have no others.
+    A row stands for the time from halfway to the previous row to halfway to the next. (A plain mean
+    over the rows in a window would be biased, because its first row comes after the edge: while a
+    robot speeds up, voltages would come out too high.) Between the readings of a slow meter the
+    signal is taken as linear; had it jumped from one reading to the next at an unknown time in
+    between, the mean over that time would have an error with a std of their difference over
+    sqrt(12). Rows of telemetry stalls are left out, except in windows that have no other rows.
+
+    Args:
+        time: times of the rows [s].
+        x: current [A] or voltage [V] of each wheel's motor.
+        live: False in the rows of a telemetry stall.
+        fresh: whether each value was read in its row; None if all were.
+        at: times of the window edges on the clock of the rows [s].
     """
     bounds = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), time[-1:]])
     cell = np.diff(bounds)[:, None]
@@ -259,11 +280,11 @@ def _mean(
 def _between(
     time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], read: Bool[np.ndarray, " row"]
 ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " row"]]:
-    """Return the signal, linear between readings, and the variance rate of a missed jump.
+    """Return a signal made linear between its readings, and the variance rate of a missed jump.
 
-    In the rows between two readings that differ by d and lie T apart, the rate is d^2 T / 12, and 0
-    where neighbouring rows were read. Its integral over T is the variance of the signal's integral,
-    had the signal jumped once at an unknown time.
+    In the rows between two readings that differ by d and are a time T [s] apart, the rate is
+    d^2 T / 12; it is 0 between readings in successive rows. Its integral over T is the variance of
+    the signal's integral if the signal jumped once between the readings, at an unknown time.
     """
     if not read.any():
         return x, np.zeros_like(x)

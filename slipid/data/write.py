@@ -1,4 +1,4 @@
-"""Logs as files: with slipid's own columns, and with those of the published Robotino logs."""
+"""Texts of log files: with slipid's own columns, and with those of the published Robotino logs."""
 
 from collections.abc import Sequence
 from io import StringIO
@@ -16,12 +16,15 @@ OPTIONAL = {
     "bus_voltage": ("V", "%.2f"),
     "gyro": ("rad/s", "%.5f"),
 }
-"""Channels that not every log has, with their unit and number format."""
+"""Unit and number format of the channels that not every log has."""
 _IMAGE = (1920, 1080)
 
 
 def own_columns(wheels: int, more: Sequence[str]) -> Content:
-    """Return the columns of `own_csv` as a config declares them, with the channels in `more`."""
+    """Return the columns of the file that `own_csv` writes, as a config declares them.
+
+    `more` has the names of the `OPTIONAL` channels in the file.
+    """
     columns: Content = {
         "time": {"column": "time", "unit": "s"},
         "twist_command_x": {"column": "command_x", "unit": "m/s"},
@@ -42,7 +45,10 @@ def own_columns(wheels: int, more: Sequence[str]) -> Content:
 
 
 def own_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> str:
-    """Return the text of a log with commands, currents and poses in slipid's own columns."""
+    """Return the text of a CSV file, in slipid's own columns, of a run.
+
+    The run has commands, currents and poses; `ticks_per_revolution` are those of the motor.
+    """
     assert log.twist_command is not None
     assert log.current is not None
     assert log.pose is not None
@@ -79,10 +85,11 @@ _NAMES_2022 = (
 
 
 def robotino2022_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> str:
-    """Return the text of a log in the layout of the 2022 Robotino logs, preset `robotino2022`.
+    """Return the text of a run's file in the layout of the 2022 Robotino logs.
 
-    It has three wheels, commands, speeds, currents and poses. The pose's origin is the centre of
-    the image. Projected currents and steps are zeros.
+    The preset `robotino2022` reads it. The run has three wheels, commands, speeds, currents and
+    poses. The origin of the poses is the centre of the image. The columns of projected currents and
+    of steps, which the published logs have, are zeros.
     """
     assert log.twist_command is not None
     assert log.wheel_speed is not None
@@ -113,7 +120,7 @@ def robotino2022_csv(log: Log, gear_ratio: float, ticks_per_revolution: int) -> 
 
 
 def _csv(header: str, columns: Sequence[tuple[np.ndarray, str]], delimiter: str, end: str) -> str:
-    """Return the text of columns, each with its number format."""
+    """Return the text of a CSV file: a header, then columns, each with its number format."""
     forms = [form for values, form in columns for _ in range(values.shape[1])]
     table = np.concatenate([values for values, _ in columns], axis=1)
     text = StringIO()

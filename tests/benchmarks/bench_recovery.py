@@ -53,7 +53,7 @@ def summary(found):
         print(
             f"curve of {floor}: largest error {max(gaps):.4f} in slip, median {np.median(gaps):.4f}"
         )
-    sensors = recovery.Sensors()
+    sensors = recovery.SimulatedSensors()
     for name in found[0].noise:
         if name.startswith(("camera", "process", "run")):
             got = np.array([f.noise[name] for f in found])

@@ -22,6 +22,7 @@ def test_other_starts_on_other_maps(fit_folder, robot, tmp_path):
     from slipid.data.floor_map import patchwork, write_map
     from slipid.lab.trial.summary import best_controllers, summaries
     from slipid.lab.trial.trial import TrialOptions, trial
+    from slipid.support.executor import Processes
     from slipid.support.progress import Reporter
 
     labels = robot.labels
@@ -30,8 +31,9 @@ def test_other_starts_on_other_maps(fit_folder, robot, tmp_path):
     for seed in MAPS:
         there = tmp_path / f"map{seed}.toml"
         write_map(there, patchwork(labels, seed, patch=0.35, half=2.0), colours)
-        wish = TrialOptions(map=there, controllers=ROWS, starts=STARTS, jobs=os.cpu_count() or 1)
-        runs += trial(fit_folder, wish, Reporter(quiet=True)).runs
+        wish = TrialOptions(map=there, controllers=ROWS, starts=STARTS)
+        with Processes(os.cpu_count() or 1) as executor:
+            runs += trial(fit_folder, wish, executor, Reporter(quiet=True)).runs
     table = summaries(runs)
     base = table["encoder"].median
     print(

@@ -146,7 +146,7 @@ def test_the_program_drives_the_test_site_to_the_last_printed_digit(tmp_path):
     found = np.array(rows)
     found[:, 2] = np.unwrap(found[:, 2])
     np.testing.assert_allclose(found[:, 3:6], wanted.command, atol=1e-6)
-    same = replace(wanted, pose=found[:, :3], own=found[:, 6], command=found[:, 3:6])
+    same = replace(wanted, pose=found[:, :3], path_time=found[:, 6], command=found[:, 3:6])
     assert printed(same) == printed(wanted)
 
 

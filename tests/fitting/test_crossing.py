@@ -480,7 +480,7 @@ def deployed(out):
     """The fit drives its twin; what is done is not done again."""
     fit = load(out)
     robot = read_robot(out)
-    assert Settings.of(robot).alike == MIXED_FLOORS_PENALTY
+    assert Settings.of(robot).further_floor_penalty == MIXED_FLOORS_PENALTY
     assert fit.current_trend != (0.0, 0.0)
     np.testing.assert_array_equal(robot.current_trend, fit.current_trend)
     wish = ("trial", out, "--plant", "twin", "--starts", 2, "--jobs", 1)

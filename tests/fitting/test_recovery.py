@@ -90,7 +90,7 @@ def test_another_start_ends_at_the_same_place():
 def test_noise_is_recovered(name, scatter):
     found = np.mean([recovered(seed).noise[name] for seed in SEEDS])
     sure = 4 * scatter / np.sqrt(len(SEEDS))
-    assert found == pytest.approx(recovery.Sensors().of(name), rel=sure)
+    assert found == pytest.approx(recovery.SimulatedSensors().of(name), rel=sure)
 
 
 @functools.cache

@@ -100,7 +100,7 @@ class Recovered:
     names: list[str]
     z: np.ndarray
     std: np.ndarray
-    true_robot: np.ndarray
+    truth: np.ndarray
     identified: np.ndarray
     curve_gap: dict[str, float]
     noise: dict[str, float]

@@ -1,1 +1,1 @@
-"""Alignment: lag, clock offset and drift between poses and a robot's own sensors."""
+"""Alignment in time of poses with a robot's own sensors: lag, clock offset and drift."""

@@ -1,13 +1,13 @@
 """Clock offset and drift between a run's poses and its robot, estimated from the motion itself.
 
-A camera and a robot that were started by hand have clocks of their own. The motion of the body is
-regressed on what turned (`regression`) at
+A camera and a robot that were started by hand have clocks of their own. The increments of the pose
+are regressed on the turns of the wheels, or of the gyro (see `regression`), at the time
 
     s = t + offset + drift (t - middle)
 
 where t is the time of a pose on its own clock and s the time on the robot's clock. The noise
-variances are estimated from the residuals, the interval from the disagreement between blocks of
-the run.
+variances are estimated from the residuals, the stds of offset and drift from the disagreement
+between blocks of the run.
 """
 
 from collections.abc import Iterable
@@ -29,38 +29,40 @@ from slipid.data.align.regression import (
 )
 
 COARSE, SEARCHED = 0.05, 0.1
-"""Step of the search for the offset, and shortest increment that the search compares [s]."""
+"""Grid spacing of the first search for the offset, and shortest duration of the pose increments
+that it compares [s]."""
 FINE, REACH = 0.01, 0.2
-"""Step and half width of the second search, with a noise model, around the first one's offset
-[s]."""
+"""Grid spacing and half width of the second search, which has a noise model, around the offset that
+the first search found [s]."""
 LEAST_SHARED = 1.0
-"""Least overlap of the two clocks that an offset must leave [s]."""
+"""Least time that both records must have in common at a searched offset [s]."""
 DRIFT_STD, OTHER_RATE = 1e-4, 1e-2
-"""Prior stds of the drift [1]: the first is above the error of any quartz; the second replaces it
-where the motion contradicts the first, for example because the frame rate is wrong."""
+"""Prior stds of the drift [1]: the first is larger than the error of any quartz clock; the second
+replaces it if the motion contradicts it, for example because the declared frame rate is wrong."""
 BLOCKS = 10
-"""Number of blocks of a run whose disagreement gives the interval."""
+"""Number of blocks of a run whose disagreement gives the stds of offset and drift."""
 ROUNDS, SETTLED = 20, 6
-"""Most Gauss-Newton rounds, and the number of first rounds that estimate the noise anew."""
+"""Largest number of Gauss-Newton iterations, and number of the first ones that re-estimate the
+noise."""
 MOST_LEFT = 0.5
-"""Largest part of the motion that the best offset may leave unexplained [1]."""
+"""Largest share of the motion that the regression at the best offset may leave unexplained [1]."""
 GOOD_STD = 0.03
-"""Largest std of an offset that is used at all [s]."""
+"""Std above which an offset is discarded [s]."""
 SURE_STD = 0.005
-"""Std of an offset below which no other motion pair of the run is evaluated [s]."""
+"""Std below which an offset is accepted without evaluating further motion pairs of the run [s]."""
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Clock of a run's poses, with robot's time = t + offset + drift (t - middle).
+    """Clock of a run's poses: the robot's time is t + offset + drift (t - middle).
 
     Attributes:
         offset: the robot's clock minus the poses' clock at `middle` [s].
-        offset_std: its std [s].
+        offset_std: std of the offset [s].
         drift: rate of the robot's clock relative to the poses' clock, less one [1].
-        drift_std: its std [1].
+        drift_std: std of the drift [1].
         middle: time on the poses' clock at which the offset holds [s].
-        unexplained: part of the motion that the regression leaves unexplained [1].
+        unexplained: share of the motion that the regression leaves unexplained [1].
         source: sensor that the poses were compared with.
     """
 
@@ -84,10 +86,10 @@ class Clock:
 
 
 def best_clock(pairs: Iterable[MotionPair]) -> Clock | None:
-    """Return the first certain clock from several motion pairs of a run, else the most certain one.
+    """Return the clock of a run's poses from the first motion pair whose offset std is `SURE_STD`.
 
-    The result is None where no pair determines a clock. Pairs after the first certain one are not
-    evaluated.
+    Later pairs are not evaluated. If no pair reaches that std, the clock with the smallest std is
+    returned, or None if no pair determines a clock.
     """
     found = []
     for pair in pairs:
@@ -99,7 +101,7 @@ def best_clock(pairs: Iterable[MotionPair]) -> Clock | None:
 
 
 def clock_of_poses(pair: MotionPair) -> Clock | None:
-    """Return the clock of a run's poses, or None where the motion does not determine it."""
+    """Return the clock of a run's poses, or None if the motion does not determine it."""
     if len(pair.pose_time) < LEAST_STEPS or len(pair.time) < LEAST_STEPS:
         return None
     steps = pair.increments(pair.step)
@@ -122,11 +124,15 @@ def _searched(pair: MotionPair) -> float | None:
 
 
 def _refined(pair: MotionPair, steps: PoseIncrements, offset: float) -> Clock | None:
-    """Return the clock after Gauss-Newton steps in offset and drift, with B profiled out."""
+    """Return the clock from Gauss-Newton iterations in offset and drift.
+
+    The regression matrix B is profiled out. The result is None if the iterations do not converge,
+    or leave the searched range around the given offset [s].
+    """
     middle = 0.5 * float(steps.first[0] + steps.last[-1])
     grid = offset + np.arange(-REACH, REACH + FINE, FINE)
     at, noise = np.array([offset, 0.0]), tuple(StepNoise(0.0, 1.0) for _ in pair.components)
-    for _ in range(2):  # the second round has the noise of the first
+    for _ in range(2):  # the second search whitens with the noise estimated in the first
         every = [linearised(pair, steps, np.array([o, 0.0]), middle, noise) for o in grid]
         fits = [(near.squares, k, near.noise) for k, near in enumerate(every) if near is not None]
         if not fits:
@@ -161,7 +167,7 @@ def _clock(
     inverse: Float[np.ndarray, "2 2"],
     middle: float,
 ) -> Clock | None:
-    """Return the clock at an optimum, or None where its offset is too uncertain to be used."""
+    """Return the clock at an optimum, or None if the std of its offset is above `GOOD_STD`."""
     std = _spread(near, inverse)
     std[0] = np.hypot(std[0], pair.body_std)
     if not std[0] < GOOD_STD:
@@ -178,7 +184,10 @@ def _clock(
 
 
 def _spread(near: Linearised, inverse: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2"]:
-    """Return the stds of offset and drift from block scores, at least those of the model."""
+    """Return the stds of offset and drift from the scores of blocks, by the sandwich formula.
+
+    They are at least the model-based stds, from the inverse of the normal matrix.
+    """
     blocks = np.array_split(np.arange(len(near.residual)), BLOCKS)
     scores = np.stack([np.einsum("kci,kc->i", near.slope[b], near.residual[b]) for b in blocks])
     sandwich = inverse @ (scores.T @ scores) @ inverse * BLOCKS / (BLOCKS - 1)

@@ -1,4 +1,4 @@
-"""Lag of the poses of a set of runs behind their wheels, estimated from the motion itself."""
+"""Lag of the poses of a set of runs behind their encoders, estimated from the motion itself."""
 
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
@@ -9,16 +9,17 @@ from slipid.data.align.regression import MotionPair, clear_best, unexplained
 from slipid.data.runs import Runs
 
 LONGEST, SHARED = 8.0, 0.3
-"""Largest lag of either sign that is searched [s], and part of a median run that must overlap."""
+"""Largest searched lag of either sign [s], and share of a median run in which poses and encoders
+must still overlap [1]."""
 COARSE, FINE = 0.1, 0.01
-"""Steps of the two searches [s]."""
+"""Grid spacings of the first and of the second search [s]."""
 STEP = 0.2
-"""Shortest increment that is compared [s]."""
+"""Shortest duration of the compared pose increments [s]."""
 MOST_RUNS = 40
-"""Most runs that are compared; they are picked evenly from all runs."""
+"""Largest number of compared runs, which are picked evenly from all runs."""
 GAIN, DROP = 0.75, 0.02
-"""A lag is decisive where it leaves less than `GAIN` times what no lag leaves unexplained, and the
-difference is more than `DROP` of the motion."""
+"""A lag is decisive if the share of the motion that it leaves unexplained is below `GAIN` times the
+share at zero lag, and lower than that by more than `DROP` [1]."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +27,9 @@ class PoseLag:
     """Lag of the poses behind the encoders.
 
     Attributes:
-        seconds: the lag, positive where poses are late [s].
-        unexplained: part of the motion that stays unexplained at this lag [1].
-        unexplained_at_zero: the same without a lag [1].
+        seconds: the lag [s], positive if poses are late.
+        unexplained: share of the motion that stays unexplained at this lag [1].
+        unexplained_at_zero: share of the motion that stays unexplained at zero lag [1].
     """
 
     seconds: float
@@ -46,9 +47,9 @@ _FOUND: WeakKeyDictionary[Runs, PoseLag | None] = WeakKeyDictionary()
 
 
 def pose_lag(data: Runs) -> PoseLag | None:
-    """Return the lag of the poses of some runs, or None where no lag is clearly the best.
+    """Return the lag of the poses of some runs, or None if no lag is clearly the best.
 
-    The search is done once for each set of runs: a fit starts from the lag, and `check` reports it.
+    The result is kept for each set of runs, because both the check and the start of a fit use it.
     """
     if data not in _FOUND:
         _FOUND[data] = _searched(data)
@@ -75,7 +76,7 @@ def _searched(data: Runs) -> PoseLag | None:
 
 
 def _pair(data: Runs, run: int) -> MotionPair:
-    """Return wheels and poses of one run; a log may begin and end while the robot moves."""
+    """Return the wheel angles and poses of one run, whose record may begin and end in motion."""
     rows = data.rows(run)
     time, fresh = data.time[rows], data.fresh[rows]
     return MotionPair(

@@ -2,10 +2,13 @@
 
     moved_k = B (turned(last_k + offset) - turned(first_k + offset)) + e_k
 
-It needs no sizes, signs or order of the wheels, but changes of speed: steady motion looks the same
-at any offset. A search compares offsets by the unexplained part of the motion; near the best one
-`linearised` gives the derivatives by offset and drift under a noise model, in which e is the sum of
-pose noise, which neighbouring steps share, and slip, which is independent in each step.
+where moved_k is the pose increment over step k, from first_k to last_k [s], turned are the angles
+of the wheels or of the gyro, B is the fitted matrix and e_k the noise. Sizes, signs and order of
+the wheels need not be known, since B absorbs them. The motion must change its speed, because steady
+motion looks the same at any offset. A search compares offsets by the unexplained share of the
+motion; near the best offset, `linearised` gives the derivatives by offset and drift under a noise
+model, in which e is the sum of pose noise, which successive steps share, and of slip, which is
+independent in each step.
 """
 
 from collections.abc import Sequence
@@ -23,11 +26,11 @@ from slipid.data.wheel_signals import body_steps, integral
 
 @dataclass(frozen=True, eq=False)
 class PoseIncrements:
-    """Increments of the pose over steps.
+    """Increments of the pose over time steps.
 
     Attributes:
         first, last: begin and end of each step on the clock of the poses [s].
-        moved: increments of the components of the pair: ahead [m], left [m], yaw [rad].
+        moved: increments of the pair's `components` of ahead [m], left [m] and heading [rad].
     """
 
     first: Float[np.ndarray, " step"]
@@ -45,12 +48,13 @@ class MotionPair:
         pose_time: times of the poses on their own clock [s].
         pose: x, y [m], heading [rad] without wrap-around.
         source: sensor that measured `turned`.
-        step: shortest increment that is compared [s].
-        collinear: singular values of `turned` below this share of the largest are dropped: on a
-            straight path all wheels turn alike.
-        body_std: std of the delay between what turned and the body [s].
-        components: components of the pose increments that are compared.
-        goes_on: True where the motion continues beyond the record as at its ends, else it stops.
+        step: shortest duration of the compared pose increments [s].
+        collinear: relative threshold below which singular values of the turns are dropped [1], as
+            on a straight path, where the turns of all wheels are proportional.
+        body_std: std of the delay between the body and `turned` [s].
+        components: indices of the compared components: 0 ahead, 1 left, 2 heading.
+        goes_on: True if the motion is extrapolated beyond the record at the rates at its ends, else
+            it stops there.
     """
 
     time: Float[np.ndarray, " row"]
@@ -72,11 +76,12 @@ class MotionPair:
         pose_time: Float[np.ndarray, " pose"],
         pose: Float[np.ndarray, "pose 3"],
     ) -> "MotionPair":
-        """Return the pair of wheels and poses.
+        """Return the motion pair of wheels and poses.
 
-        Steps are longer than a roller takes to pass under a wheel. While a robot accelerates its
-        wheels slip more, and a soft floor gives way; the data cannot distinguish this from a body
-        that comes late, by some 10 ms where the floor is firm and more on carpets.
+        Steps are longer than the time in which a roller passes under an omni wheel. While a robot
+        accelerates, its wheels slip more and a soft floor gives way, which the data cannot
+        distinguish from a delay of the body: some 10 ms on firm floors, more on carpets. Therefore
+        `body_std` is 15 ms.
         """
         robot = time, angle, pose_time, pose
         return cls(*robot, "wheels", step=0.1, collinear=0.1, body_std=0.015)
@@ -89,12 +94,18 @@ class MotionPair:
         pose_time: Float[np.ndarray, " pose"],
         pose: Float[np.ndarray, "pose 3"],
     ) -> "MotionPair":
-        """Return the pair of headings and a gyro [rad/s] with a scale and a bias of its own."""
+        """Return the motion pair of headings and a gyro [rad/s].
+
+        Scale and bias of the gyro are fitted, so time itself is the second column of `turned`.
+        """
         turned = np.column_stack([integral(time, gyro[:, None]), time])
         return cls(time, turned, pose_time, pose, "gyro", step=0.02, collinear=0.0, components=(2,))
 
     def increments(self, least: float) -> PoseIncrements:
-        """Return increments over steps of at least `least` [s], none across a gap in the poses."""
+        """Return the pose increments over steps of at least `least` [s].
+
+        Steps across a gap in the poses are left out.
+        """
         t = self.pose_time
         usual = max(float(np.median(np.diff(t))), 1e-6)
         stride = max(1, int(np.ceil(least / usual - 1e-6)))
@@ -105,7 +116,7 @@ class MotionPair:
         return PoseIncrements(first[whole], last[whole], moved[whole])
 
     def turned_at(self, at: Float[np.ndarray, " at"]) -> Float[np.ndarray, "at column"]:
-        """Interpolate `turned` at times on the robot's clock."""
+        """Return `turned` interpolated at times on the robot's clock [s]."""
         inside = np.clip(at, self.time[0], self.time[-1])
         turned = np.asarray(self._spline(inside))
         if self.goes_on:
@@ -114,7 +125,7 @@ class MotionPair:
         return turned
 
     def rate_at(self, at: Float[np.ndarray, " at"]) -> Float[np.ndarray, "at column"]:
-        """Return the mean rate of `turned` over one step around each time."""
+        """Return the mean rate of `turned` over one step centred at each time [s]."""
         half = 0.5 * self.step
         return (self.turned_at(at + half) - self.turned_at(at - half)) / self.step
 
@@ -124,29 +135,36 @@ class MotionPair:
 
     @cached_property
     def _end_rates(self) -> Float[np.ndarray, "2 column"]:
-        """Return the mean rates in the first and in the last step of the record."""
+        """Return the mean rates of `turned` in the first and in the last step of the record."""
         ends = self.time[[0, -1]]
         within = np.clip(ends + self.step * np.array([1.0, -1.0]), *ends)
         return np.asarray((self._spline(within) - self._spline(ends)) / (within - ends)[:, None])
 
 
 LEAST_STEPS = 20
-"""Least number of steps that offset and drift are fitted to."""
+"""Least number of steps for a fit of offset and drift."""
 LEAST_PER_COLUMN = 3
-"""Least number of steps of a search for every column of `turned`."""
+"""Least number of steps per column of `turned` for the regression at a searched offset."""
 ELSEWHERE, BETTER = 0.5, 0.02
-"""Offsets further than `ELSEWHERE` [s] from the best one must leave at least `BETTER` more of the
-motion unexplained [1]: steady or periodic motion determines no offset."""
+"""The best offset is clear if the unexplained share of the motion at every offset further than
+`ELSEWHERE` [s] from it is larger by at least `BETTER` [1]; steady or periodic motion has no clear
+best offset."""
 
 
 def unexplained(
     pairs: Sequence[MotionPair], offsets: Float[np.ndarray, " offset"], step: float
 ) -> Float[np.ndarray, " offset"]:
-    """Return the part of the motion of all pairs that one common B cannot explain, for each offset.
+    """Return, for each offset [s], the share of the motion that one B for all pairs cannot explain.
 
-    It is the geometric mean of the parts of each component: the profile likelihood, where each
-    component has noise of its own size. So units do not matter, and a component that nothing
-    explains, such as the sideways motion of two wheels, hides no other.
+    It is the geometric mean of the unexplained shares of the components, which ranks offsets as the
+    profile likelihood does if each component has a noise variance of its own. Therefore units do
+    not matter, and a component that nothing explains, such as the sideways motion of a robot with
+    two wheels, does not hide the others.
+
+    Args:
+        pairs: motion pairs.
+        offsets: offsets to compare [s].
+        step: shortest duration of the pose increments [s].
     """
     steps = [pair.increments(step) for pair in pairs]
     moved = np.concatenate([one.moved for one in steps])
@@ -172,7 +190,10 @@ def unexplained(
 def clear_best(
     offsets: Float[np.ndarray, " offset"], rest: Float[np.ndarray, " offset"]
 ) -> int | None:
-    """Return the index of the best offset, or None where a distant one is about as good."""
+    """Return the index of the best offset, or None if a distant offset is about as good.
+
+    `rest` is the unexplained share of the motion at each offset [1].
+    """
     best = int(np.argmin(rest))
     others = rest[np.abs(offsets - offsets[best]) > ELSEWHERE]
     return best if others.min(initial=np.inf) > rest[best] + BETTER else None
@@ -180,11 +201,11 @@ def clear_best(
 
 @dataclass(frozen=True, eq=False)
 class StepNoise:
-    """Noise in the increments of one component.
+    """Noise of the pose increments in one component.
 
     Attributes:
-        shared: variance of a pose, which two neighbouring increments share.
-        separate: variance that is independent in each increment, such as slip.
+        shared: variance of a single pose, whose error two successive increments share.
+        separate: variance of the errors that are independent in each increment, such as slip.
     """
 
     shared: float
@@ -192,7 +213,10 @@ class StepNoise:
 
     @classmethod
     def of(cls, rest: Float[np.ndarray, " step"], joined: Bool[np.ndarray, " step"]) -> "StepNoise":
-        """Estimate the noise from residuals; `joined` steps begin where the previous one ended."""
+        """Return the noise estimated from residuals.
+
+        `joined` is True for a step that begins where the previous one ended.
+        """
         whole = max(float((rest**2).mean()), 1e-12)
         neighbours = (rest[1:] * rest[:-1])[joined[1:]]
         shared = float(np.clip(-neighbours.mean(), 0.0, 0.499 * whole)) if len(neighbours) else 0.0
@@ -201,9 +225,9 @@ class StepNoise:
     def whitened(
         self, rows: Float[np.ndarray, "step column"], joined: Bool[np.ndarray, " step"]
     ) -> Float[np.ndarray, "step column"]:
-        """Return columns times the inverse root of the covariance.
+        """Return the columns multiplied by the inverse Cholesky factor of the noise covariance.
 
-        The covariance is 2 shared + separate on the diagonal and -shared beside it.
+        The covariance is 2 shared + separate on the diagonal, and -shared between joined steps.
         """
         beside = np.where(joined[1:], -self.shared, 0.0)
         band = np.stack(
@@ -218,8 +242,8 @@ class Linearised:
 
     Attributes:
         residual: weighted residuals.
-        slope: their derivatives by offset and drift, with B profiled out.
-        share: part of the motion that is unexplained.
+        slope: derivatives of the residuals by offset and drift, with B profiled out.
+        share: share of the motion that is unexplained [1].
         noise: noise of each component, estimated from the residuals.
     """
 
@@ -241,11 +265,16 @@ def linearised(
     middle: float,
     noise: Sequence[StepNoise],
 ) -> Linearised | None:
-    """Return the regression at an offset and a drift, or None where too few steps overlap.
+    """Return the regression linearised at an offset and a drift.
+
+    The result is None if fewer than `LEAST_STEPS` steps lie in the robot's record.
 
     Args:
+        pair: motion pair.
+        steps: pose increments of the pair.
         at: offset at `middle` [s] and drift [1].
-        noise: noise model that whitens each component.
+        middle: time on the poses' clock at which the offset holds [s].
+        noise: noise model of each component, by which the regression is whitened.
     """
     first, last = (t + at[0] + at[1] * (t - middle) for t in (steps.first, steps.last))
     inside = (first > pair.time[0] + pair.step) & (last < pair.time[-1] - pair.step)

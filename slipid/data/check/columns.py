@@ -1,10 +1,11 @@
 """Findings about the columns of the wheels' channels: wheel speeds, currents and voltages.
 
-Columns of commanded or reported speeds may be in another order than those of the encoders; one run
-is enough to find that. The columns of commanded and reported speeds may be exchanged: a command
-comes before the motion and is constant in between, so the channel that is called the command then
-changes later than the one that is called the measured speed, and in more rows. The sign and order
-of currents and voltages follow from the work that they do, their units from what robots draw.
+The columns of commanded or reported speeds may be in another order than those of the encoders; one
+run is enough to find that. The channels of commanded and of reported speeds may be exchanged: a
+command precedes the motion and is constant between its changes. If they are exchanged, the channel
+declared as the command changes later than the one declared as the measured speed, and in more rows.
+The sign and order of currents and voltages are found from the work of the motors, their units from
+the currents, voltages and power that are plausible for a robot.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,28 +22,33 @@ from slipid.data.wheel_signals import integral, interpolate, swapped_order
 from slipid.support.errors import DataError
 
 SAME = ("wheel_sign", "wheel_order", "command_sign", "command_order")
-"""Findings from the poses of all runs that make a finding about wheel columns redundant."""
+"""Kinds of findings, from the poses of all runs, that make a `wheel_columns` finding redundant."""
 BROUGHT = ("wheel_scale", "wheel_speed_unit")
-"""Findings that a wrong order of columns may cause; they come back if they remain in the right
-order."""
+"""Kinds of findings that a wrong order of columns may cause. They are left out where there is a
+`wheel_columns` finding; a check after its remedy reports them if they were real."""
 STEP_S = 0.5
-"""Length of a compared step [s]; delays and jitter are small beside it."""
+"""Duration of the steps in which channels are compared with encoders [s]; delays and jitter are
+small compared with it."""
 CHANNELS = ("wheel_speed_command", "wheel_speed")
-"""Channels that are compared with the encoders."""
+"""Channels whose order of columns is compared with the encoders'."""
 LONGEST_S = 1.0
-"""Largest lag of either sign between command and motion that is searched [s]."""
+"""Largest searched lag of either sign between command and measured speed [s]."""
 MOST_SHIFTS = 50
-"""Largest lag in rows, which limits the search where time is in a wrong unit."""
+"""Largest searched lag in rows; it limits the search where time is in a wrong unit."""
 MOST_ROWS = 20_000
-"""Most rows that are compared."""
+"""Largest number of rows in which command and measured speed are compared."""
 ALIKE = 0.3
-"""Least correlation for which a lag is used."""
+"""Least correlation of command and measured speed, at the best lag, for a finding [1]."""
 BUSIER = 1.5
-"""Least ratio between the numbers of rows in which the two speeds change."""
+"""Least ratio, for a finding, of the number of rows in which the declared command changes to that
+in which the declared measured speed changes [1]."""
 
 
 def misordered(logs: Sequence[Log]) -> Iterator[Finding]:
-    """Yield a finding for every channel whose columns fit the encoders only in another order."""
+    """Yield a finding for every channel and order in which its columns fit the encoders.
+
+    Only orders other than the declared one are findings.
+    """
     found: dict[tuple[str, tuple[int, ...]], list[str]] = {}
     for log in logs:
         for name, order in _orders(log):
@@ -60,13 +66,16 @@ def misordered(logs: Sequence[Log]) -> Iterator[Finding]:
 
 
 def refuse_misordered(logs: Sequence[Log]) -> None:
-    """Raise `DataError` with all findings, for commands that check for no other mistakes."""
+    """Raise `DataError` with all findings of `misordered`.
+
+    It is for commands that do not run the whole check.
+    """
     if listed := "\n".join(f"not used: {finding}" for finding in misordered(logs)):
         raise DataError(listed)
 
 
 def _orders(log: Log) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Yield the channels of a run that fit the encoders only in another order, with that order."""
+    """Yield each channel of a run that fits the encoders only in another order, with that order."""
     edges = np.linspace(log.time[0], log.time[-1], max(2, int(log.duration / STEP_S) + 1))
     measured: Float[np.ndarray, "step wheel"] | None = None
     for name in CHANNELS:
@@ -114,14 +123,24 @@ def _changes(
     row: float,
     inside: Bool[np.ndarray, " at"],
 ) -> Float[np.ndarray, "change wheel"]:
-    """Return the change of a speed from row to row [rad/s], zero across the ends of runs."""
+    """Return the change of a wheel speed from row to row [rad/s], zero across the ends of runs.
+
+    Args:
+        channel: integral of the wheel speed [rad].
+        when: times of the rows [s].
+        row: time between rows [s].
+        inside: whether the time from each row to the next lies within one run.
+    """
     speed = (channel.at(when + row) - channel.at(when)) / row
     speed[~inside] = np.nan
     return np.nan_to_num(np.diff(speed, axis=0))
 
 
 def _correlation(command: np.ndarray, speed: np.ndarray, shift: int) -> float:
-    """Return the correlation of a command with the speed `shift` rows later."""
+    """Return the correlation of the changes of a command with those of the speed `shift` later.
+
+    `shift` is a number of rows of either sign.
+    """
     n = len(command) - abs(shift)
     first, second = (command[:n], speed[-n:]) if shift >= 0 else (command[-n:], speed[:n])
     size = np.sqrt((first**2).sum() * (second**2).sum())
@@ -129,40 +148,44 @@ def _correlation(command: np.ndarray, speed: np.ndarray, shift: int) -> float:
 
 
 BACKWARDS = -0.25
-"""A sign is wrong where work over the sum of its magnitudes is below this [1]."""
+"""Share of work (see `_share`) below which the sign of a current or voltage is wrong [1]."""
 ORDERED = 0.4
-"""Another order of the columns must give every wheel a larger share of work than this, and a sum
-that exceeds the best sum with other signs by as much [1]."""
+"""Another order of the columns is a finding if every wheel's share of work exceeds this, and their
+sum exceeds that of the declared order with the best signs by as much [1]."""
 MOST_ORDERED = 6
-"""Most wheels for which every order is tried."""
+"""Largest number of wheels for which every order is tried."""
 SIDED = 0.1
-"""A current has the sign of the power where its share of work exceeds this forwards and is below
-its negative backwards [1]."""
+"""A current has the sign of the power, not of the torque, if its share of work is above this while
+wheels turn forwards and below its negative while they turn backwards [1]."""
 MOST_A_PER_KG = 2.5
-"""Continuous current of one motor per mass of the robot, which no wheeled robot draws [A/kg]."""
+"""Slope of the largest plausible current of one motor, `MOST_A + MOST_A_PER_KG * mass` [A/kg]; no
+wheeled robot draws that much continuously."""
 MOST_A = 8.0
-"""Current that is plausible in addition, whatever the mass [A]."""
+"""Constant part of the largest plausible current of one motor [A]."""
 MOST_UNWEIGHED_A = 200.0
-"""Implausible current where the mass is not known [A]."""
+"""Largest plausible current of one motor if the robot's mass is unknown [A]."""
 LEAST_A = 0.005
-"""Current of a driving motor below which the unit is wrong [A]."""
+"""Current of a driving motor below which its unit must be wrong [A]."""
 MOST_V, LEAST_V = 200.0, 0.2
 """Largest and smallest plausible voltages of the motors of such robots [V]."""
 POWER = (0.003, 60.0)
-"""Range of electrical power over mass, gravity and speed of any robot that rolls or climbs [1]."""
+"""Plausible range of the electrical power over weight times speed, P / (m g v) [1]; every robot
+that rolls or climbs lies in it."""
 GRAVITY = 9.81
+"""Acceleration of gravity [m/s^2]."""
 
 
 def electric(
     data: JoinedRuns, meant: Interpretation, radius: float, mass_kg: float | None, by_power: bool
 ) -> Iterator[Finding]:
-    """Yield findings about currents and voltages.
+    """Yield findings about the signs, order and units of currents and voltages.
 
     Args:
+        data: channels of all runs.
         meant: the right order and signs of the wheels.
         radius: radius of the wheels [m].
-        mass_kg: mass of the robot, or None where it is not known.
-        by_power: whether the speeds are right, so that the power can be compared with them.
+        mass_kg: mass of the robot [kg], or None if it is unknown.
+        by_power: whether no scale is wrong, so that the power can be compared with the speed.
     """
     declared = _speeds(data)
     speed = declared @ columns(meant, data.wheels).T
@@ -194,7 +217,7 @@ def electric(
 
 
 def _speeds(data: JoinedRuns) -> Float[np.ndarray, "row wheel"]:
-    """Return the speed of each column's wheel [rad/s], zero between runs."""
+    """Return the wheel speed in each encoder column as declared [rad/s], zero between runs."""
     step = np.diff(data.angle.time)
     speed = np.diff(data.angle.value, axis=0) / step[:, None]
     run = data.runs_of(data.angle.time)
@@ -208,11 +231,14 @@ def _sign_findings(
     declared: Float[np.ndarray, "row wheel"],
     name: str,
 ) -> Iterator[Finding]:
-    """Yield findings about signs and order: motors must do positive work, so sum value x speed > 0.
+    """Yield findings about the signs and order of currents or voltages.
+
+    Over a drive a motor does positive work on its wheel, so the sum of value x speed is positive.
 
     Args:
-        speed: wheel speeds in the right order and with the right signs.
-        declared: wheel speeds as declared.
+        values: currents [A] or voltages [V].
+        speed: wheel speeds in the right order and with the right signs [rad/s].
+        declared: wheel speeds as declared [rad/s].
         name: name of the channel.
     """
     work = np.nan_to_num(values * speed)
@@ -264,9 +290,10 @@ def _other_order(
     speed: Float[np.ndarray, "row wheel"],
     declared: Float[np.ndarray, "row wheel"],
 ) -> tuple[int, ...] | None:
-    """Return the column of each wheel, where another order explains more than other signs do.
+    """Return the column of each wheel if another order explains more than other signs, else None.
 
-    Columns in the declared order of the encoders are right, even where that is not the wheels'.
+    An order of the columns that matches the encoders' as declared is no finding: if that order is
+    wrong, the finding is about the encoders.
     """
     wheels = range(speed.shape[1])
     if len(wheels) > MOST_ORDERED:
@@ -281,12 +308,15 @@ def _other_order(
 def _shares(
     values: Float[np.ndarray, "row wheel"], speed: Float[np.ndarray, "row wheel"]
 ) -> Float[np.ndarray, "wheel wheel"]:
-    """Return the `_share` of every column with every wheel's speed."""
+    """Return the share of work of every column (rows) with every wheel's speed (columns)."""
     return np.array([[_share(np.nan_to_num(v * w)) for w in speed.T] for v in values.T])
 
 
 def _share(work: np.ndarray) -> float:
-    """Return the work over the sum of its magnitudes, 0 where there is none."""
+    """Return the share of work: the sum of all values over the sum of their magnitudes [1].
+
+    It is 1 if all values are positive, -1 if all are negative, and 0 if all are zero.
+    """
     total = float(np.abs(work).sum())
     return float(work.sum()) / total if total > 0 else 0.0
 
@@ -294,7 +324,16 @@ def _share(work: np.ndarray) -> float:
 def _size(
     values: np.ndarray | None, name: str, unit: str, low: float, high: float, channel: str
 ) -> Iterator[Finding]:
-    """Yield a finding where currents or voltages are implausible while the motors drive."""
+    """Yield a finding if currents or voltages of driving motors are implausible.
+
+    Args:
+        values: magnitudes, or None if not logged.
+        name: name of the quantity.
+        unit: unit of the values.
+        low: smallest plausible value.
+        high: largest plausible value.
+        channel: channel that the remedy names.
+    """
     if values is None or not np.nanmax(values, initial=0.0) > 0:
         return
     usual = float(np.nanquantile(values, 0.95))

@@ -1,4 +1,7 @@
-"""Findings of the check: what is wrong or could not be checked, and which config key to change."""
+"""Findings of the check, and their texts.
+
+A finding says what is wrong or could not be checked, and which key of the config to change.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,11 +14,11 @@ from slipid.data.check.ratios import ScaleCause, ScaleRatios
 from slipid.support.content import Content
 
 Severity = Literal["wrong", "suspicious", "note"]
-"""`wrong` must be corrected before a fit, `suspicious` needs a look, `note` could not be
-checked."""
+"""Severity of a finding: `wrong` must be corrected before a fit, `suspicious` may be right but
+should be looked at, `note` is about what could not be checked."""
 ORDER: tuple[Severity, ...] = ("wrong", "suspicious", "note")
 NAMED = 4
-"""Most runs that a sentence names; the others are counted."""
+"""Largest number of runs that a sentence names; the others are only counted."""
 
 
 @dataclass(frozen=True)
@@ -23,11 +26,11 @@ class Finding:
     """One thing that the check found in the runs.
 
     Attributes:
-        kind: name of the finding, such as `wheel_sign`; `sanity` lists all of them.
-        found: what is wrong, with numbers.
-        remedy: which key to change, and to what; or None.
-        severity: how bad it is.
-        runs: names of the runs concerned; empty where all are.
+        kind: name of the kind of finding, such as `wheel_sign`; module `sanity` lists all kinds.
+        found: text that says what is wrong, with numbers.
+        remedy: text that says which key to change, and to what; or None.
+        severity: severity of the finding.
+        runs: names of the runs concerned; empty if all are.
     """
 
     kind: str
@@ -41,12 +44,17 @@ class Finding:
         return self.found + where + (f"; {self.remedy}" if self.remedy else "")
 
     def explained(self, how: str, others: Iterable["Finding"] = ()) -> "Finding":
-        """Return the finding with its evidence and the remedies of equally good ones."""
+        """Return the finding with further text.
+
+        Args:
+            how: evidence, which follows the text of the finding.
+            others: findings that explain the logs as well, whose remedies are added.
+        """
         more = "".join(f"; or, which explains these logs as well: {o.remedy}" for o in others)
         return replace(self, found=f"{self.found}: {how}", remedy=f"{self.remedy}{more}")
 
     def to_json(self) -> Content:
-        """Return the finding as check.json has it."""
+        """Return the finding in the form in which `check.json` has it."""
         return {
             "kind": self.kind,
             "severity": self.severity,
@@ -57,7 +65,7 @@ class Finding:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return the first few names, and how many more there are."""
+    """Return the first `NAMED` names, and the number of the others."""
     more = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
@@ -96,11 +104,11 @@ _CAUSES = {
     "command_twist": ("command_unit", "the channel twist_command_x and twist_command_y"),
     "command_yaw": ("command_unit", "the channel twist_command_yaw"),
 }
-"""Kind of the finding about each wrong factor, and the scaled quantity."""
+"""Kind of finding, and name of the scaled quantity in its text, for the name of each cause."""
 
 
 def mistake_finding(mistake: Mistake) -> Finding:
-    """Return the finding about a mistake in order, signs or axes."""
+    """Return the finding about a mistake in order, signs or axes, with at most two alternatives."""
     how = (
         f"with this correction {mistake.after:.2f} of the motion is unexplained, "
         f"as declared {mistake.before:.2f}"
@@ -111,7 +119,7 @@ def mistake_finding(mistake: Mistake) -> Finding:
 
 
 def _candidate_finding(candidate: Candidate) -> Finding:
-    """Return the finding about one interpretation that differs in order, signs or axes."""
+    """Return the finding about one candidate, which differs in order, signs or axes."""
     kind, meant = candidate.kind, candidate.meant
     if kind == "wheel_sign":
         return _sign_finding(kind, meant.sign, "")
@@ -141,7 +149,10 @@ def _candidate_finding(candidate: Candidate) -> Finding:
 
 
 def _sign_finding(kind: str, sign: Sequence[int], commanded: str) -> Finding:
-    """Return the finding about wheels whose turns or commands have the wrong sign."""
+    """Return the finding about wheels whose turns or commanded turns have the wrong sign.
+
+    `commanded` is a word before "turns": "commanded ", or an empty text.
+    """
     turned = [str(k + 1) for k, s in enumerate(sign) if s < 0]
     wheels = f"wheel{'s' if len(turned) > 1 else ''} {' and '.join(turned)}"
     column = "their columns" if len(turned) > 1 else "its column"
@@ -156,7 +167,7 @@ def _sign_finding(kind: str, sign: Sequence[int], commanded: str) -> Finding:
 
 
 def _order_finding(kind: str, order: Sequence[int], columns: str) -> Finding:
-    """Return the finding about columns in another order."""
+    """Return the finding about columns, which `columns` names, in another order than the wheels."""
     listed = ", ".join(str(k + 1) for k in order)
     return Finding(
         kind,
@@ -166,7 +177,7 @@ def _order_finding(kind: str, order: Sequence[int], columns: str) -> Finding:
 
 
 def _convention_finding(kind: str, convention: PoseConvention) -> Finding:
-    """Return the finding about the convention of the poses."""
+    """Return the finding about poses that follow another convention than declared."""
     turn = convention.offset
     offset = f" and add {turn} deg to its offset" if turn else ""
     if kind == "heading_offset":
@@ -192,11 +203,14 @@ def _convention_finding(kind: str, convention: PoseConvention) -> Finding:
 def cause_findings(
     fitting: Sequence[ScaleCause], single: bool, why: str, gear_ratio: float
 ) -> tuple[Finding, ...]:
-    """Return findings about wrong factors: the likeliest with alternatives, or both of a pair.
+    """Return findings about wrong factors.
+
+    If causes fit alone, the likeliest one is the finding and others are alternatives in its text;
+    if two causes fit only together, both are findings.
 
     Args:
         fitting: causes that fit, the likeliest first.
-        single: whether each of them fits alone.
+        single: whether each of these causes fits alone.
         why: sentence about the ratios that are out of range.
         gear_ratio: gear ratio of the declared robot.
     """
@@ -214,7 +228,7 @@ def cause_findings(
 
 
 def ratio_sentence(scales: ScaleRatios) -> str:
-    """Return a sentence about the ratios that are out of range."""
+    """Return a sentence with the value of every ratio that is outside its range."""
     sentences = {
         "travel": "the body's path length is {:.3g} times that of the wheels",
         "turning": "the body turns {:.3g} times as much as the wheels",
@@ -229,7 +243,7 @@ def ratio_sentence(scales: ScaleRatios) -> str:
 
 
 def _factor_finding(cause: ScaleCause, gear_ratio: float) -> Finding:
-    """Return the finding about a factor by which a channel is too large."""
+    """Return the finding about a quantity that is too large or too small by a factor."""
     factor, (kind, channel) = cause.factor, _CAUSES[cause.name]
     ratio = f"{max(factor, 1 / factor):.3g}"
     size = f"{ratio} times too {'large' if factor > 1 else 'small'}"
@@ -266,7 +280,7 @@ def _factor_finding(cause: ScaleCause, gear_ratio: float) -> Finding:
 
 
 def _turns(factor: float, gear_ratio: float) -> str:
-    """Return the remedy for wheel turns that are too large by a factor."""
+    """Return the remedy for turns of the wheels that are too large by a factor."""
     remedies = [f"multiply ticks_per_revolution or the layout's gear_ratio by {factor:.3g}"]
     if gear_ratio > 1.5 and isclose(1 / factor, gear_ratio, rel_tol=0.02):
         remedies = [
@@ -280,7 +294,7 @@ def _turns(factor: float, gear_ratio: float) -> str:
 
 
 def _unit_of_rate(factor: float) -> str:
-    """Return which units were confused if a factor is their ratio, else an empty text."""
+    """Return a text that names two confused units if a factor is their ratio, else no text."""
     names = {
         30 / pi: ": 'rpm' was taken for 'rad/s'",
         pi / 30: ": 'rad/s' was taken for 'rpm'",
@@ -294,5 +308,5 @@ def _unit_of_rate(factor: float) -> str:
 
 
 def _unit_name(factor: float, names: Mapping[float, str]) -> str:
-    """Return the name that belongs to a factor, else an empty text."""
+    """Return the name of a factor that occurs in `names` to 0.1 %, else an empty text."""
     return next((name for f, name in names.items() if isclose(f, factor, rel_tol=1e-3)), "")

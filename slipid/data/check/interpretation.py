@@ -1,13 +1,14 @@
-"""Interpretations of the logs: which column is which wheel, with which sign, and how axes lie.
+"""Interpretations of the logs: order and signs of the wheels' columns, and the axes of the poses.
 
-The declared interpretation has no mistake; each candidate differs from it by one. The misfit of an
-interpretation is a sum of unexplained shares, each from 0 to 1 and each independent of lengths, so
-that slip does not count against the true one:
+The declared interpretation is compared with candidates, which differ from it by single mistakes.
+The misfit of an interpretation is a sum of unexplained shares, each from 0 to 1. They do not depend
+on lengths, so that slip, which shortens the motion, does not count against the true interpretation:
 
-    pose, and commanded twist   increments of the body along each axis, by those that wheels predict
+    pose, and commanded twist   body increments along each axis that those predicted from the wheels
+                                do not explain
     wheels                      turns that no motion of a rigid body makes (beyond three wheels)
-    commanded wheel speeds      turns, by the commanded ones
-    gyro                        increments of the heading, by those of the gyro
+    commanded wheel speeds      turns that the commanded turns do not explain
+    gyro                        heading increments that those of the gyro do not explain
 """
 
 from collections.abc import Mapping
@@ -30,22 +31,22 @@ from slipid.data.check.joined import (
 from slipid.model.geometry import Geometry
 
 STILL = 1e-3
-"""Share of the predicted motion along an axis below which the axis is not compared."""
+"""Share of the predicted motion below which an axis is not compared [1]."""
 
 
 @dataclass(frozen=True)
 class Interpretation:
-    """One interpretation of the columns.
+    """One interpretation of the columns, relative to the declared one.
 
     Attributes:
         order: column of each wheel, counted from 0; empty for the declared order.
-        sign: sign of each wheel's column; empty where all are as declared.
+        sign: sign of each wheel, relative to the declared sign; empty if all are as declared.
         azimuth: correction to the declared directions of all wheels [deg].
         convention: convention of the poses.
-        command_order: `order` for the commanded wheel speeds.
-        command_sign: `sign` for the commanded wheel speeds.
-        twist_sign: signs of the commanded x, y and yaw rate.
-        gyro_sign: sign of the gyro.
+        command_order: the same as `order`, for the commanded wheel speeds.
+        command_sign: the same as `sign`, for the commanded wheel speeds.
+        twist_sign: signs of the commanded x, y and yaw rate, relative to the declared signs.
+        gyro_sign: sign of the gyro, relative to the declared sign.
     """
 
     order: tuple[int, ...] = ()
@@ -60,11 +61,11 @@ class Interpretation:
 
 @dataclass(frozen=True, eq=False)
 class Commanded:
-    """Products of measured and commanded turns.
+    """Sums over steps of products of the wheels' measured and commanded turns.
 
     Attributes:
-        across: sums of products of turns and commanded turns (wheel, wheel) [rad^2].
-        turns: sum of squared turns [rad^2].
+        across: sums of measured times commanded turns (wheel, wheel) [rad^2].
+        turns: sum of squared measured turns [rad^2].
         commanded: sum of squared commanded turns [rad^2].
     """
 
@@ -73,7 +74,7 @@ class Commanded:
     commanded: float
 
     def product(self, meant: Interpretation) -> float:
-        """Return the sum of turns times commanded turns under an interpretation [rad^2]."""
+        """Return the sum of measured times commanded turns under an interpretation [rad^2]."""
         wheels = len(self.across)
         turned, command = (
             columns(meant, wheels),
@@ -84,16 +85,18 @@ class Commanded:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Products from which the misfit of every interpretation is computed.
+    """Sums of products from which the misfit of every interpretation is computed.
 
     Attributes:
-        rolling: J / r, turns of each wheel per increment of the body (wheel, 3) [rad/m]; the
-            heading counts in metres at the base radius.
+        rolling: J / r, turns of each wheel per body increment without slip (wheel, 3) [rad/m]; the
+            heading increment is an arc in metres at the base radius.
         base: base radius [m].
-        pose: products of the declared turns with the body's increments, for each bare convention.
-        twist: the same with the commanded twist, or None.
-        command: products of the declared turns with the commanded ones, or None.
-        gyro: correlation of gyro and heading for each bare convention, or None where neither turns.
+        pose: products of the turns as declared with the body increments from the poses, for each
+            convention without offset.
+        twist: products of the turns as declared with the commanded body increments, or None.
+        command: products of the turns as declared with the commanded turns, or None.
+        gyro: correlation of gyro and heading for each convention without offset; None if no run
+            turns or there is no gyro.
     """
 
     rolling: Float[np.ndarray, "wheel 3"]
@@ -115,7 +118,7 @@ class Evidence:
 
 
 def gather(geometry: Geometry, at: StepEdges, moved: ChannelIncrements) -> Evidence:
-    """Return the products of all channels, for a robot of the declared geometry."""
+    """Return the evidence from the channels of all runs, for the declared geometry of the robot."""
     base = float(geometry.base_radius)
     rolling = np.asarray(geometry.forward()) / float(geometry.wheel_radius) / [1.0, 1.0, base]
     pose: dict[PoseConvention, Products] = {}
@@ -136,7 +139,7 @@ def gather(geometry: Geometry, at: StepEdges, moved: ChannelIncrements) -> Evide
 
 
 def _correlation_with_gyro(gyro: np.ndarray, body: np.ndarray, found: Products) -> float:
-    """Return the correlation of gyro and heading, 0 where one of them never turns."""
+    """Return the correlation of the turns by gyro and by heading, 0 if one of them never turns."""
     turned = np.stack([gyro[found.known, 0], body[found.known, 2]])
     (gyro_square, both), (_, pose_square) = (turned * found.weight) @ turned.T
     size = np.sqrt(gyro_square * pose_square)
@@ -144,7 +147,7 @@ def _correlation_with_gyro(gyro: np.ndarray, body: np.ndarray, found: Products) 
 
 
 def _commanded(moved: ChannelIncrements) -> Commanded | None:
-    """Return the products of turns and commanded turns, or None where none were commanded."""
+    """Return the products of measured and commanded turns, or None if no turns were commanded."""
     if moved.commanded is None:
         return None
     known = usable(moved.wheels, moved.commanded)
@@ -189,7 +192,10 @@ def columns(meant: Interpretation, wheels: int) -> Float[np.ndarray, "wheel whee
 
 
 def to_body(evidence: Evidence, meant: Interpretation) -> Float[np.ndarray, "3 wheel"]:
-    """Return the map from declared columns to increments of the body, for wheels without slip."""
+    """Return the matrix from turns, in the declared columns, to body increments without slip.
+
+    Increments are ahead [m], left [m] and of the heading, as an arc at the base radius [m].
+    """
     inverse = np.linalg.pinv(evidence.rolling, rcond=1e-6)
     turned = rotation(meant.azimuth) @ inverse
     return np.asarray(turned @ columns(meant, evidence.wheels))
@@ -201,11 +207,18 @@ def _unexplained(
     axes: Float[np.ndarray, "3 3"],
     free: bool,
 ) -> float:
-    """Return the share of the body's motion that the prediction, with a factor per axis, leaves.
+    """Return the share of the body's motion that the prediction does not explain.
 
-    Sideways and turning motion count by the mean of their shares in the prediction and in the
-    poses: lengths in a wrong unit must not hide either. Wheels that do not determine the twist
-    (not `free`) determine one direction, which has one factor.
+    The prediction has a fitted factor for each axis. Translation and rotation are weighted by the
+    mean of their shares in the prediction and in the poses, so that lengths in a wrong unit hide
+    neither of them. Wheels that do not determine the twist (`free` is False) determine only one
+    direction of translation, which has a single factor.
+
+    Args:
+        sums: products of turns and body increments.
+        predict: matrix from turns to body increments.
+        axes: matrix from the axes of the measured body increments to the true ones.
+        free: whether the wheels determine all three components of the twist.
     """
     predicted, both = sums.predicted(predict), sums.matched(predict, axes)
     measured = np.diag(axes @ sums.body @ axes.T)
@@ -214,7 +227,7 @@ def _unexplained(
         return 1.0
     moves = predicted > STILL * total
     explained = np.where(moves, both.clip(0) ** 2 / np.where(moves, predicted, 1.0), 0.0)
-    if not free and moves[:2].any():  # wheels that roll in one direction only: no factor per axis
+    if not free and moves[:2].any():  # all wheels roll in one direction: a factor for both axes
         explained[:2] = 0.5 * max(both[:2].sum(), 0.0) ** 2 / predicted[:2].sum()
     along = 1.0 - explained[:2].sum() / max(measured[:2].sum(), 1e-300)
     about = 1.0 - explained[2] / max(measured[2], 1e-300)
@@ -225,7 +238,7 @@ def _unexplained(
 def _beyond_rigid(
     sums: Products, rolling: Float[np.ndarray, "wheel 3"], wheels: Float[np.ndarray, "wheel wheel"]
 ) -> float:
-    """Return the share of the turns that no motion of a rigid body makes without slip."""
+    """Return the share of the wheels' turns that no motion of a rigid body without slip makes."""
     basis, values, _ = np.linalg.svd(rolling, full_matrices=False)
     basis = basis[:, values > 1e-6 * values[0]]
     turns = wheels @ sums.turns @ wheels.T
@@ -234,7 +247,7 @@ def _beyond_rigid(
 
 
 def _uncommanded(commanded: Commanded, meant: Interpretation) -> float:
-    """Return the share of the turns that the commanded ones, times one factor, do not explain."""
+    """Return the share of the turns that the commanded turns, times one factor, do not explain."""
     return 1.0 - max(commanded.product(meant), 0.0) ** 2 / max(
         commanded.turns * commanded.commanded, 1e-300
     )

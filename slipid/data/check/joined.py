@@ -1,14 +1,15 @@
-"""Channels of all runs on one clock, and their increments over the same steps.
+"""Channels of all runs on one clock, and their increments over common time steps.
 
-It also has the conventions by which a logged pose may be meant, with the body's increments under
-each, and the products of increments from which interpretations are compared.
+The module also defines the conventions that logged poses may follow, with the body increments under
+each, and the sums of products of increments by which interpretations are compared.
 
-A robust fit of the body's increments on the wheels' turns finds outliers, whatever wheels and axes
-mean:
+Steps with outliers get a low weight by a robust linear regression of the body increments on the
+wheels' turns:
 
     body = K turn,    weight = (1 + (|residual| / s)^2)^-2,    s = 2 median |residual|
 
-since a linear map of turns absorbs order, signs, radius, azimuths and heading offset alike.
+It works for any interpretation, since the fitted matrix K absorbs order, signs, radius, azimuths
+and heading offset.
 """
 
 from dataclasses import dataclass, replace
@@ -21,9 +22,11 @@ from slipid.data.runs import Runs
 from slipid.data.wheel_signals import body_increments, integral, interpolate
 
 STEP_S = 0.4
-"""Length of a step [s]: long beside jitter and rounding, short beside a turn of the robot."""
+"""Duration of a step [s]: so long that jitter and rounding matter little, and short compared with
+the time in which a robot turns round."""
 MOST_STEPS = 20_000
-"""Most steps; where there are more, as with time in a wrong unit, steps are longer."""
+"""Largest number of steps; if there were more, for example with time in a wrong unit, steps are
+made longer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,28 +35,28 @@ class JoinedChannel:
 
     Attributes:
         time: times of the rows, increasing [s].
-        value: one column per wheel or axis; nan in runs that lack the channel.
+        value: values, one column per wheel or axis; nan in runs without the channel.
     """
 
     time: Float[np.ndarray, " row"]
     value: Float[np.ndarray, "row column"]
 
     def at(self, when: Float[np.ndarray, " at"]) -> Float[np.ndarray, "at column"]:
-        """Return values at other times of the clock [s], linear in between."""
+        """Return the values at other times on the clock [s], interpolated linearly."""
         return interpolate(self.time, self.value, when)
 
 
 @dataclass(frozen=True, eq=False)
 class JoinedRuns:
-    """Channels of all runs, run after run on one clock with pauses in between.
+    """Channels of all runs, one run after another on a common clock, with pauses in between.
 
     Attributes:
         names: names of the runs.
-        begin: time at which each run's poses and encoders begin (run,) [s].
-        end: time at which they end (run,) [s].
+        begin: time at which each run begins (run,) [s].
+        end: time at which each run ends (run,) [s].
         row: median time between rows of each run (run,) [s].
         angle: angle of each wheel [rad].
-        pose: x [m], y [m], heading [rad] where it is fresh.
+        pose: x [m], y [m], heading [rad], only rows with a new pose.
         reported: integral of the reported wheel speeds [rad], or None.
         commanded: integral of the commanded wheel speeds [rad], or None.
         twist: integral of the commanded twist in the body's axes [m, m, rad], or None.
@@ -61,7 +64,7 @@ class JoinedRuns:
         current: current of each motor [A], or None.
         voltage: voltage of each motor [V], or None.
         bus: voltage of the battery [V], or None.
-        current_is_signed: False where some run has magnitudes only.
+        current_is_signed: False if some run has only magnitudes of currents.
     """
 
     names: tuple[str, ...]
@@ -85,13 +88,13 @@ class JoinedRuns:
         return self.angle.value.shape[1]
 
     def runs_of(self, when: Float[np.ndarray, " at"]) -> Int[np.ndarray, " at"]:
-        """Return the index of the run at each time of the clock."""
+        """Return the index of the run at each time on the clock [s]."""
         return np.searchsorted(self.begin, when + 1e-9, side="right") - 1
 
 
 @dataclass(frozen=True, eq=False)
 class StepEdges:
-    """Steps over which motion is compared, with the poses at their ends.
+    """Time steps over which motion is compared, with the poses at their begin and end.
 
     Attributes:
         before: begin of each step on the clock of `JoinedRuns` (step,) [s].
@@ -110,10 +113,10 @@ class StepEdges:
 
 @dataclass(frozen=True, eq=False)
 class ChannelIncrements:
-    """Increments of the robot's own channels over the same steps.
+    """Increments of the robot's own channels over the steps, shifted by the lag of the poses.
 
     Attributes:
-        wheels: rotation of each wheel [rad]; nan where it was not logged for the whole step.
+        wheels: rotation of each wheel [rad]; nan if it was not logged for the whole step.
         commanded: commanded rotation of each wheel [rad], or None.
         twist: commanded increment of the body in its axes [m, m, rad], or None.
         gyro: rotation measured by the gyro [rad], or None.
@@ -126,17 +129,18 @@ class ChannelIncrements:
 
 
 def joined(data: Runs) -> JoinedRuns:
-    """Return the channels of runs on one clock, with a second between runs."""
+    """Return the channels of all runs on a common clock, with a pause of 1 s between runs."""
     first = np.array([log.time[0] for log in data.logs])
     length = np.array([log.duration for log in data.logs])
     starts = np.concatenate([[0.0], np.cumsum(length + 1.0)])[:-1]
     time = data.time + np.repeat(starts - first, np.diff(data.offset))
-    # a pose holds to both ends of its run, so that none is interpolated between runs
+    # The first and last row of a run count as new poses, so that no pose is interpolated between
+    # two runs.
     fresh = data.fresh.copy()
     fresh[data.offset[:-1]] = fresh[data.offset[1:] - 1] = True
 
     def channel(name: str, summed: bool = True) -> JoinedChannel | None:
-        """Return a channel, or its integral; nan where a run lacks it, None where all do."""
+        """Return a channel, or its integral; nan in runs without it, None if no run has it."""
         logged = [getattr(log, name) for log in data.logs]
         columns = [values.size // len(values) for values in logged if values is not None]
         if not columns:
@@ -169,7 +173,10 @@ def joined(data: Runs) -> JoinedRuns:
 
 
 def edges(data: JoinedRuns) -> StepEdges:
-    """Return steps of about `STEP_S` of every run, from its first pose to its last."""
+    """Return every run cut into steps of equal duration, of about `STEP_S`.
+
+    Steps are shorter in short runs, so that a median run has eight, but never shorter than a row.
+    """
     length = data.end - data.begin
     step = max(min(STEP_S, float(np.median(length)) / 8), float(np.median(data.row)))
     step = max(step, float(length.sum()) / MOST_STEPS)
@@ -183,7 +190,10 @@ def edges(data: JoinedRuns) -> StepEdges:
 
 
 def increments(data: JoinedRuns, at: StepEdges, lag: float) -> ChannelIncrements:
-    """Return increments of the robot's channels, `lag` [s] before the steps of the poses."""
+    """Return the increments of the robot's channels over the steps, each moved back by `lag` [s].
+
+    `lag` is the lag of the poses. Increments are nan where a moved step leaves its run.
+    """
     slack, before, after = data.row[at.run], at.before - lag, at.after - lag
     outside = (before < data.begin[at.run] - slack) | (after > data.end[at.run] + slack)
 
@@ -199,18 +209,19 @@ def increments(data: JoinedRuns, at: StepEdges, lag: float) -> ChannelIncrements
 
 
 Heading = Literal["as_logged", "turned_round", "degrees", "radians", "half_sine"]
-"""Meaning of the logged heading: the heading [rad]; its negative; degrees that were read as
-radians; radians that were read as degrees; sin(heading / 2), the z of a quaternion."""
+"""Meaning of a logged heading, in the order of the names: the heading [rad]; its negative; degrees
+that were read as radians; radians that were read as degrees; sin(heading / 2), the z of a
+quaternion."""
 
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """Convention by which a logged pose is meant.
+    """Convention that the logged poses follow, relative to the declared one.
 
     Attributes:
         heading: meaning of the logged heading.
         y_down: whether y has the opposite sign.
-        offset: correction to the heading in whole degrees [deg].
+        offset: whole degrees to add to the heading [deg].
     """
 
     heading: Heading = "as_logged"
@@ -219,39 +230,41 @@ class PoseConvention:
 
     @property
     def bare(self) -> "PoseConvention":
-        """Return the convention without its offset."""
+        """Return the same convention with an offset of 0."""
         return replace(self, offset=0)
 
 
 CONVENTIONS = tuple(
     PoseConvention(heading, down) for heading in get_args(Heading) for down in (False, True)
 )
-"""Every convention whose body increments differ by more than a rotation."""
+"""All conventions without offset; an offset only rotates the body increments."""
 
 
 def rotation(degrees: int) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation matrix of a body increment about the vertical."""
+    """Return the matrix that rotates a body increment about the vertical by an angle [deg]."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, "step 3"]:
-    """Return increments ahead [m], left [m] and of the heading [rad] under a bare convention.
+    """Return increments ahead [m], left [m] and of the heading [rad], for a convention.
 
-    They are nan where a heading is impossible under the convention.
+    The offset of the convention is not applied. Increments are nan where the logged heading is
+    impossible under the convention.
     """
     flip = [1.0, -1.0 if convention.y_down else 1.0, 1.0]
     before, after = at.pose_before * flip, at.pose_after * flip
     before[:, 2] = _heading(before[:, 2], convention.heading)
     turned = _heading(after[:, 2], convention.heading) - before[:, 2]
-    if convention.heading in ("radians", "half_sine"):  # the reader did not know the wrap
+    # The reader unwrapped headings as declared; under these conventions the wrap is elsewhere.
+    if convention.heading in ("radians", "half_sine"):
         turned = np.mod(turned + np.pi, 2 * np.pi) - np.pi
     after[:, 2] = before[:, 2] + turned
     return body_increments(before, after)
 
 
 def _heading(logged: Float[np.ndarray, " step"], meaning: Heading) -> Float[np.ndarray, " step"]:
-    """Return the heading [rad] that a logged value means."""
+    """Return the true heading [rad] for logged values with a given meaning."""
     if meaning == "turned_round":
         return -logged
     if meaning == "degrees":
@@ -259,27 +272,29 @@ def _heading(logged: Float[np.ndarray, " step"], meaning: Heading) -> Float[np.n
     if meaning == "radians":
         return np.degrees(logged)
     if meaning == "half_sine":
-        # values beyond 1 are no sine
+        # A value above 1 in magnitude, but for rounding, cannot be a sine.
         return 2 * np.arcsin(np.where(np.abs(logged) <= 1.0 + 1e-3, logged.clip(-1, 1), np.nan))
     return logged
 
 
 ROUNDS = 8
-"""Number of rounds of reweighting."""
+"""Number of iterations of the reweighted regression."""
 RIDGE = 1e-4
-"""Ridge over the mean squared turn: wheels of one side turn alike."""
+"""Ridge of the regression, relative to the mean squared turn [1]; it is needed because the wheels
+on one side of a robot may turn by equal angles."""
 
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """Weighted sums of products over steps.
+    """Weighted sums over steps of products of the wheels' turns and the body increments.
+
+    The heading increment is an arc in metres at the base radius.
 
     Attributes:
         turns: products of turns with turns (wheel, wheel) [rad^2].
-        across: products of turns with body increments (wheel, 3) [rad m]; the heading counts in
-            metres at the base radius.
+        across: products of turns with body increments (wheel, 3) [rad m].
         body: products of body increments with each other (3, 3) [m^2].
-        known: whether wheels and body are known in each step (every,).
+        known: whether both turns and body increment are known, for every step (every,).
         weight: weight of each known step (step,).
     """
 
@@ -290,18 +305,25 @@ class Products:
     weight: Float[np.ndarray, " step"]
 
     def predicted(self, predict: Float[np.ndarray, "3 wheel"]) -> Float[np.ndarray, "3"]:
-        """Return the sum of squares of the predicted body increments along each axis [m^2]."""
+        """Return the sum of squared predicted body increments along each axis [m^2].
+
+        `predict` is the matrix from turns to body increments.
+        """
         return np.einsum("aw,wv,av->a", predict, self.turns, predict)
 
     def matched(
         self, predict: Float[np.ndarray, "3 wheel"], axes: Float[np.ndarray, "3 3"]
     ) -> Float[np.ndarray, "3"]:
-        """Return the sum of products of predicted and measured increments along each axis [m^2]."""
+        """Return the sum of predicted times measured body increments along each axis [m^2].
+
+        `predict` is the matrix from turns to body increments; `axes` maps the axes of the measured
+        increments to the true ones.
+        """
         return np.einsum("aw,wa->a", predict, self.across @ axes.T)
 
 
 def usable(*parts: Float[np.ndarray, "step _"]) -> Bool[np.ndarray, " step"]:
-    """Return whether all parts are known, for each step."""
+    """Return whether all given arrays are finite, for each step."""
     return np.all([np.isfinite(part).all(axis=1) for part in parts], axis=0)
 
 
@@ -311,11 +333,15 @@ def products(
     base: float,
     rounds: int = ROUNDS,
 ) -> Products | None:
-    """Return products over known steps, or None where these are fewer than twice the wheels.
+    """Return the weighted sums of products over the known steps.
+
+    The result is None if there are fewer known steps than twice the number of wheels.
 
     Args:
-        base: base radius, at which headings become metres [m].
-        rounds: rounds of reweighting; 0 for commands, which have no outliers.
+        turns: rotation of each wheel [rad].
+        body: body increments ahead [m], left [m] and of the heading [rad].
+        base: base radius, by which heading increments become arcs [m].
+        rounds: iterations of the reweighted regression; 0 for commands, which have no outliers.
     """
     known = usable(turns, body)
     if known.sum() < 2 * turns.shape[1]:
@@ -331,7 +357,7 @@ def products(
 
 
 def _linear(turns: np.ndarray, body: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the map from turns to body increments (wheel, 3) by least squares with a ridge."""
+    """Return the matrix (wheel, 3) from turns to body increments, by weighted ridge regression."""
     weighted = turns * weight[:, None]
     gram = weighted.T @ turns
     ridge = RIDGE * np.trace(gram) / len(gram) + 1e-300

@@ -1,4 +1,7 @@
-"""Single mistakes in order, signs and axes that explain logs far better than what is declared."""
+"""Search for single mistakes in order, signs and axes.
+
+A mistake is found if the logs fit far better with its correction than as declared.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -10,30 +13,31 @@ from slipid.data.check.interpretation import Evidence, Interpretation, misfit, m
 from slipid.data.check.joined import PoseConvention
 
 MISTAKES = 3
-"""Most mistakes that are found, one after the other."""
+"""Largest number of mistakes, which are found one after another."""
 GAIN = 0.05
-"""A mistake is accepted where its interpretation reduces the misfit by `GAIN` plus `SHARE` times
-the remaining misfit."""
+"""Constant part of the least reduction of the misfit for which a mistake is accepted, `GAIN` plus
+`SHARE` times the remaining misfit [1]."""
 SHARE = 0.3
-"""Relative part of that reduction; no real log without a mistake comes near it."""
+"""Relative part of that least reduction [1]; no real log without a mistake comes near it."""
 EXPLAINED = 0.4
-"""Part of the poses' motion that another convention may leave unexplained."""
+"""Largest share of the poses' motion that an accepted pose convention leaves unexplained [1]."""
 ALIKE = 0.02
-"""Interpretations whose misfits differ by less are named as alternatives."""
+"""Difference of misfits below which another kind of mistake is named as an alternative [1]."""
 TURN_DEG = 15
-"""Grid of the searched rotations of axes and azimuths [deg]."""
+"""Grid spacing of the searched heading offsets and azimuths [deg]."""
 MANY = 6
-"""Wheels above which only exchanges of two columns are tried, not all orders."""
+"""Number of wheels above which only exchanges of two columns are tried, not all orders."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """An interpretation with one mistake more.
+    """A candidate interpretation, which corrects one mistake more than the current one.
 
     Attributes:
-        kind: name of the mistake.
+        kind: name of the kind of mistake.
         meant: the interpretation.
-        cost: small number; of candidates that fit alike the one with the least cost is accepted.
+        cost: small number added to the misfit when candidates are ranked, so that of those with
+            about the same misfit the simplest mistake is accepted [1].
     """
 
     kind: str
@@ -43,13 +47,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Mistake:
-    """A mistake that explains the logs.
+    """A mistake in the declaration, whose correction explains the logs decisively better.
 
     Attributes:
-        found: the right interpretation.
-        before: misfit without it.
-        after: misfit with it.
-        others: other kinds of mistake that explain the logs as well.
+        found: the candidate interpretation that corrects the mistake.
+        before: misfit without the correction.
+        after: misfit with the correction.
+        others: corrections of other kinds of mistake that explain the logs about as well.
     """
 
     found: Candidate
@@ -59,7 +63,7 @@ class Mistake:
 
 
 def mistakes(evidence: Evidence) -> tuple[Interpretation, tuple[Mistake, ...]]:
-    """Return the right interpretation and the single mistakes that lead to it."""
+    """Return the right interpretation, and the mistakes in the declared one that it corrects."""
     meant, found = Interpretation(), []
     for _ in range(MISTAKES):
         one = _next_mistake(evidence, meant)
@@ -74,7 +78,7 @@ def _next_mistake(evidence: Evidence, current: Interpretation) -> Mistake | None
     """Return the simplest mistake that explains the logs decisively better, or None."""
     before = misfit(evidence, current)
     tried = [(misfit(evidence, c.meant), c) for c in candidates(evidence, current)]
-    # poses of another convention must then follow the wheels
+    # Another convention of the poses counts only if the poses then follow the wheels.
     tried = [
         (left, c)
         for left, c in tried
@@ -92,7 +96,7 @@ def _next_mistake(evidence: Evidence, current: Interpretation) -> Mistake | None
 
 
 def candidates(evidence: Evidence, current: Interpretation) -> Iterator[Candidate]:
-    """Yield the interpretations that are one mistake away."""
+    """Yield the interpretations that differ from the current one by one mistake."""
     wheels = evidence.wheels
     for sign, cost in _signs(wheels, evidence.rolling):
         yield Candidate("wheel_sign", replace(current, sign=sign), cost)
@@ -119,7 +123,7 @@ def candidates(evidence: Evidence, current: Interpretation) -> Iterator[Candidat
 
 
 def _conventions(current: Interpretation) -> Iterator[Candidate]:
-    """Yield candidates with other conventions of the pose."""
+    """Yield candidates with other conventions of the poses."""
     found: list[tuple[str, float, PoseConvention]] = []
     for quarter in (0, 90, 180, -90):
         more = 0.0 if quarter == 0 else 0.02
@@ -144,7 +148,10 @@ def _conventions(current: Interpretation) -> Iterator[Candidate]:
 
 
 def _signs(wheels: int, rolling: np.ndarray) -> Iterator[tuple[tuple[int, ...], float]]:
-    """Yield signs of wheels and their costs: one wheel, all, one side, then any."""
+    """Yield every choice of reversed wheels, as signs, with its cost.
+
+    A single wheel, all wheels, or the wheels of one side cost nothing; any other choice costs 0.02.
+    """
     sides = {tuple(np.flatnonzero(side)) for side in (rolling[:, 2] > 0, rolling[:, 2] < 0)}
     for count in range(1, wheels + 1):
         for turned in combinations(range(wheels), count):
@@ -154,7 +161,10 @@ def _signs(wheels: int, rolling: np.ndarray) -> Iterator[tuple[tuple[int, ...], 
 
 
 def _orders(wheels: int) -> Iterator[tuple[tuple[int, ...], float]]:
-    """Yield other orders of the wheels' columns and their costs, least for an exchange of two."""
+    """Yield other orders of the wheels' columns, each with its cost.
+
+    The cost grows with the number of columns that are not in their declared place.
+    """
     declared = tuple(range(wheels))
     for order in permutations(declared) if wheels <= MANY else _exchanges(declared):
         moved = sum(k != at for at, k in enumerate(order))
@@ -163,6 +173,6 @@ def _orders(wheels: int) -> Iterator[tuple[tuple[int, ...], float]]:
 
 
 def _exchanges(declared: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
-    """Yield orders in which two columns are exchanged."""
+    """Yield all orders in which two columns are exchanged."""
     for a, b in combinations(declared, 2):
         yield tuple({a: b, b: a}.get(k, k) for k in declared)

@@ -1,21 +1,21 @@
-"""Ratios of the motion in different channels, their natural ranges, and wrong factors behind them.
+"""Ratios between the motion in different channels, their natural ranges, and wrong factors.
 
-travel      body over wheels, along        pose / (r / J turns): less than 1 where wheels slip
-turning     body over wheels, heading      the same in heading
-drive       commanded over wheels, along
-steer       commanded over wheels, heading
-command     commanded over measured wheel speeds
-report      reported speeds over encoders
-gyro        gyro over heading of the poses
+travel      translation of the body by poses over that by wheels; below 1 if wheels slip
+turning     rotation of the body by poses over that by wheels
+drive       commanded translation over that by wheels
+steer       commanded rotation over that by wheels
+command     commanded wheel speeds over measured ones
+report      reported wheel speeds over those of the encoders
+gyro        rotation by the gyro over that of the poses
 
-A cause, such as a wrong unit, multiplies each ratio by a power of its factor. With the logarithms
-of ratios and of the ends of their ranges, a cause fits where one factor brings all of them into
-their ranges:
+A cause, such as a wrong unit, multiplies ratio i by its factor to a power e_i. The cause fits if
+one factor explains all ratios, that is, if ratio_i / factor^e_i lies in the range from low_i to
+high_i for every i:
 
     max_i  log(ratio_i / high_i) / e_i   <=   log factor   <=   min_i  log(ratio_i / low_i) / e_i
 
-(ends exchanged where e_i < 0). Of the causes that fit, one with a common error is preferred: 1000,
-2 pi, 57.3, the gear ratio.
+(with low and high exchanged where e_i < 0). Of the causes that fit, those whose factor is a common
+error, such as 1000, 2 pi, 57.3 or the gear ratio, are preferred.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,20 +37,21 @@ from slipid.data.check.joined import (
 )
 
 TURNS = 0.01
-"""Least share of turning in the predicted motion for which headings are compared."""
+"""Least share of rotation in the predicted motion for which rotations are compared [1]."""
 FORWARD = 0.02
-"""Least share of translation for which lengths are compared."""
+"""Least share of translation in the predicted motion for which translations are compared [1]."""
 RIGID = 1e-6
-"""Relative difference of angle and integrated speed below which one was computed from the other."""
+"""Relative difference between the wheels' angle and their integrated speed below which the angle
+was computed from the speed [1]."""
 
 _Range = tuple[float, float, float]
-"""Least, usual and largest value of a ratio."""
+"""Least, usual and largest natural value of a ratio [1]."""
 _WIDE: Mapping[str, _Range] = {
-    # A carpet may hold a robot in place, so the lower end is low where commands confirm wheels;
-    # a camera's scale may be off by an eighth.
+    # A carpet may hold a robot in place, hence the small lower end (used if commands confirm the
+    # motion of the wheels). The scale of a camera may be wrong by an eighth.
     "travel": (0.012, 0.8, 1.35),
     "turning": (0.35, 0.8, 1.35),
-    # Commands precede the motion, and exceed it where brakes or limits act.
+    # Commands precede the motion, and are larger than it where brakes or limits act.
     "drive": (0.65, 1.1, 1.75),
     "steer": (0.65, 1.1, 1.75),
     "command": (0.7, 1.1, 1.75),
@@ -58,15 +59,15 @@ _WIDE: Mapping[str, _Range] = {
     "gyro": (0.75, 1.0, 1.33),
 }
 _UNVOUCHED: _Range = (0.3, 0.8, 1.35)
-"""Range of `travel` where no command was logged."""
+"""Natural range of `travel` if no command was logged that could confirm the wheels' motion."""
 _SCRUBBING: Mapping[str, _Range] = {"turning": (0.25, 0.55, 1.15), "steer": (0.4, 1.3, 3.2)}
-"""Ranges of robots whose wheels cannot roll sideways: they turn less than their track says, and
-command more."""
+"""Natural ranges for robots whose wheels cannot roll sideways: they turn less than their wheel
+speeds and track predict, and their drivers command more rotation to make up for it."""
 
 
 @dataclass(frozen=True)
 class ScaleRatio:
-    """One ratio with the range in which it is natural, and its usual value."""
+    """One ratio [1], with its natural range from `low` to `high` and its usual value."""
 
     value: float
     low: float
@@ -81,11 +82,12 @@ class ScaleRatio:
 
 @dataclass(frozen=True)
 class ScaleRatios:
-    """Ratios of a set of runs.
+    """Ratios between the channels of a set of runs.
 
     Attributes:
-        known: ratios by name.
-        speed_is_angle: whether the wheels' angle is the integral of the reported speeds.
+        known: ratios that could be computed, by name.
+        speed_is_angle: whether the wheels' angle is the integral of the reported speeds, so that
+            the ratio `report` means nothing.
     """
 
     known: Mapping[str, ScaleRatio]
@@ -99,7 +101,7 @@ def ratios(
     evidence: Evidence,
     meant: Interpretation,
 ) -> ScaleRatios:
-    """Return the ratios under an interpretation in which order, signs and axes are right."""
+    """Return the ratios under an interpretation whose order, signs and axes are right."""
     values: dict[str, float | None] = {}
     predict = to_body(evidence, meant)
     pose = evidence.pose.get(meant.convention.bare)
@@ -130,14 +132,17 @@ def ratios(
 def _along(
     sums: Products, predict: Float[np.ndarray, "3 wheel"], offset: int
 ) -> tuple[float | None, float | None]:
-    """Return least-squares ratios of the body's to the predicted motion, along and in heading."""
+    """Return least-squares ratios of measured to predicted motion, for translation and rotation.
+
+    A ratio is None if there is too little motion to compute it.
+    """
     predicted, both = sums.predicted(predict), sums.matched(predict, rotation(-offset))
     total = predicted.sum()
     if not total > 0:
         return None, None
     ahead, about = predicted[:2].sum(), predicted[2]
     along = float(both[:2].sum() / ahead) if ahead > FORWARD * total else None
-    # small predicted turns are hidden by the turns that slip causes
+    # Rotations that are predicted to be small are hidden by the rotations that slip causes.
     turns = about > TURNS * total and both[2] ** 2 > 0.25 * about * sums.body[2, 2]
     return along, float(both[2] / about) if turns else None
 
@@ -145,7 +150,10 @@ def _along(
 def _gyro(
     at: StepEdges, moved: ChannelIncrements, pose: Products, meant: Interpretation
 ) -> float | None:
-    """Return the turn of the gyro over that of the heading, or None where they do not correlate."""
+    """Return the ratio of rotation by the gyro to that of the poses.
+
+    It is None if there is no gyro, or if their correlation is below 0.5.
+    """
     if moved.gyro is None:
         return None
     body = body_motion(at, meant.convention.bare)[pose.known, 2]
@@ -161,7 +169,10 @@ def _gyro(
 
 
 def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
-    """Return the ratio of reported speeds to encoders, and whether they are the same data."""
+    """Return the ratio of reported to encoder wheel speeds, and whether they are the same data.
+
+    The ratio is None if no speeds were reported or no wheel turns.
+    """
     if data.reported is None:
         return None, False
     edges = [data.begin, 0.5 * (data.begin + data.end), data.end]
@@ -180,9 +191,10 @@ def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
 
 
 NEAR = 0.02
-"""Tolerance of a range about a common factor (in the logarithm)."""
+"""Margin by which a common factor may lie outside the range of a fitting cause, in its logarithm
+[1]."""
 ROWS_S = (0.001, 1.5)
-"""Plausible times between rows [s]."""
+"""Range of the time between rows in which the unit of time is not suspected [s]."""
 
 _COMMON = {
     "time": (1000.0, 1e6, 1e9, 60.0),
@@ -200,17 +212,17 @@ _COMMON = {
 }
 _BY_GEAR = ("wheel_gear", "wheel_turns", "command_wheels", "report")
 _OF_RATES = (30 / pi, 180 / pi, 2 * pi, 1000.0, 60.0)
-"""Common errors of turns that are integrated from speeds."""
+"""Common factors of the wheels' turns if these are integrated from speeds."""
 
 
 @dataclass(frozen=True)
 class ScaleCause:
-    """A wrong factor that explains the ratios.
+    """A cause, that is, a quantity that is wrong by a factor, which explains the ratios.
 
     Attributes:
         name: name of the cause.
-        factor: divisor of the declared number, or factor of the values of its channels.
-        common: whether people often make this error.
+        factor: factor by which the quantity, or the values of its channels, are too large [1].
+        common: whether the factor is a common error, such as 1000.
     """
 
     name: str
@@ -219,9 +231,10 @@ class ScaleCause:
 
 
 def causes(speed_is_angle: bool) -> Mapping[str, Mapping[str, float]]:
-    """Return the power of each cause's factor in every ratio that it changes, the likeliest first.
+    """Return the power of each cause's factor in every ratio that it changes.
 
-    A factor above 1 means that channels are too large: turns, lengths, angles, time.
+    The likeliest causes come first. A factor above 1 means that the channel's values are too large.
+    `speed_is_angle` says whether the wheels' angle was integrated from their speeds.
     """
     rates = {"drive": 1.0, "steer": 1.0, "command": 1.0, "gyro": 1.0, "report": 1.0}
     integrated = {"travel": -1.0, "turning": -1.0, "gyro": 1.0}
@@ -245,10 +258,15 @@ def causes(speed_is_angle: bool) -> Mapping[str, Mapping[str, float]]:
 def single_causes(
     scales: ScaleRatios, row_s: float, gear_ratio: float
 ) -> tuple[tuple[ScaleCause, ...], bool]:
-    """Return the causes that fit, the likeliest first, and whether single ones do.
+    """Return the causes that fit, the likeliest first, and whether each of them fits alone.
 
-    Where no single cause fits, the first pair that does is returned. The result is empty where
+    If no single cause fits, the first pair that fits together is returned. The result is empty if
     every ratio is natural, or no pair of causes fits.
+
+    Args:
+        scales: ratios.
+        row_s: median time between rows [s].
+        gear_ratio: declared gear ratio.
     """
     if all(r.natural for r in scales.known.values()):
         return (), True
@@ -277,7 +295,13 @@ def _singles(
     possible: Mapping[str, Mapping[str, float]],
     common: Mapping[str, Sequence[float]],
 ) -> list[ScaleCause]:
-    """Return the causes that fit alone."""
+    """Return the causes that fit alone, each with its likeliest factor.
+
+    Args:
+        known: ratios by name.
+        possible: powers of each cause's factor in the ratios.
+        common: common factors of each cause.
+    """
     found = []
     for name, power in possible.items():
         low, high = _range(known, power)
@@ -291,7 +315,10 @@ def _singles(
 
 
 def _range(known: Mapping[str, ScaleRatio], powers: Mapping[str, float]) -> tuple[float, float]:
-    """Return log factors that bring every ratio into its range; they are empty where none does."""
+    """Return the least and largest log factor that bring every ratio into its range.
+
+    The least is above the largest if no factor does.
+    """
     low, high = -inf, inf
     for name, ratio in known.items():
         power = powers.get(name, 0.0)
@@ -305,7 +332,10 @@ def _range(known: Mapping[str, ScaleRatio], powers: Mapping[str, float]) -> tupl
 
 
 def _middle(known: Mapping[str, ScaleRatio], powers: Mapping[str, float]) -> float:
-    """Return the log factor that brings ratios to their usual values; narrow ranges count most."""
+    """Return the log factor that brings the ratios closest to their usual values.
+
+    Each ratio has the weight 1 / (log width of its range)^2.
+    """
     total = weights = 0.0
     for name, ratio in known.items():
         if power := powers.get(name, 0.0):
@@ -316,7 +346,7 @@ def _middle(known: Mapping[str, ScaleRatio], powers: Mapping[str, float]) -> flo
 
 
 def _common(gear_ratio: float, speed_is_angle: bool) -> Mapping[str, Sequence[float]]:
-    """Return common errors by name of the cause, with their inverses."""
+    """Return the common factors, and their inverses, of each cause by its name."""
     named = dict(_COMMON)
     if speed_is_angle:
         named["wheel_gear"] = _OF_RATES

@@ -1,4 +1,7 @@
-"""The check before a fit: whether encoders, commands, gyro and poses are of the declared robot.
+"""The sanity check of runs before a fit.
+
+It checks whether encoders, commands, gyro, currents and poses agree with each other and with the
+declared robot.
 
 Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_speed_unit`,
 `heading_sign`, `heading_unit`, `heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`,
@@ -41,31 +44,34 @@ from slipid.data.runs import Runs
 from slipid.model.geometry import Geometry
 
 FEW = 20
-"""Least number of steps for a comparison."""
+"""Least number of steps in which poses and wheels can be compared."""
 FOREIGN = 0.4
-"""Unexplained share of the poses' motion, in the best interpretation, that is a finding."""
+"""Share of the poses' motion left unexplained, in the best interpretation, above which poses and
+wheels do not belong together [1]."""
 LATE_S = 1.0
-"""Lag of the poses that is a finding [s]."""
+"""Magnitude of the lag of the poses from which there is a finding [s]."""
 TOO_LATE_S = 1.9
-"""Lag beyond which a fit would not start near enough [s]."""
+"""Magnitude of the lag above which the finding is `wrong`, since a fit would start too far off
+[s]."""
 SLOW_M_S, SLOW_ROW_S = 0.01, 2.0
-"""Rim speeds below it and times between rows above it mean that time is in a smaller unit than
-declared."""
+"""Rim speed [m/s] and time between rows [s]: if the speed is below and the time above these, the
+unit of time is smaller than declared."""
 FAST_M_S, FAST_ROW_S = 50.0, 1e-3
-"""Rim speeds above it and times between rows below it mean the reverse."""
+"""Rim speed [m/s] and time between rows [s]: if the speed is above and the time below these, the
+unit of time is larger than declared."""
 SHORT = 0.62
-"""Path length of the body over the wheels' below which there is a finding, where no command
-confirms the wheels."""
+"""Ratio of the body's path length to that of the wheels below which there is a finding if no
+command confirms the wheels [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """Comparison of poses and wheels.
+    """Result of the comparison of poses with wheels.
 
     Attributes:
         findings: findings about lag, order, signs, axes and single runs.
-        moved: increments of the robot's channels at the lag of the poses.
-        evidence: products of these.
+        moved: increments of the robot's channels, shifted by the lag of the poses.
+        evidence: sums of products of these increments and those of the body.
         meant: the right interpretation.
         poses: whether the poses are usable for further comparisons.
     """
@@ -82,8 +88,8 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
 
     Args:
         data: runs.
-        geometry: declared geometry.
-        mass_kg: mass of the robot, or None where it is not known.
+        geometry: declared geometry of the robot.
+        mass_kg: mass of the robot [kg], or None if it is unknown.
     """
     channels = joined(data)
     found = tuple(_all(channels, edges(channels), geometry, mass_kg, pose_lag(data)))
@@ -100,7 +106,7 @@ def _all(
     mass_kg: float | None,
     lag: PoseLag | None,
 ) -> Iterator[Finding]:
-    """Yield all findings in no order."""
+    """Yield all findings but `wheel_columns`, in no particular order."""
     found = _compared(data, at, geometry, lag)
     if found is None:
         yield _not_checked(f"the runs are too short: {len(at.run)} steps, {FEW} are needed")
@@ -123,7 +129,7 @@ def _all(
 def _compared(
     data: JoinedRuns, at: StepEdges, geometry: Geometry, lag: PoseLag | None
 ) -> _Compared | None:
-    """Return the comparison of poses and wheels, or None where there are too few steps."""
+    """Return the comparison of poses with wheels, or None if there are too few steps."""
     lag = lag if lag is not None and lag.decisive else PoseLag(0.0, 1.0, 1.0)
     moved = increments(data, at, lag.seconds)
     if usable(moved.wheels).sum() < FEW:
@@ -136,7 +142,8 @@ def _compared(
     left = misfits(evidence, meant)["pose"]
     if left > FOREIGN:
         return _Compared((_foreign(left),), moved, evidence)
-    # a half sine turns back at half a turn, which puts single runs out of step
+    # sin(heading / 2) does not determine the heading beyond half a turn, so that single runs may
+    # seem to disagree.
     half_sine = meant.convention.heading == "half_sine"
     agreeing = agreement(data, at, moved, evidence, meant)
     alone = () if half_sine else tuple(single_runs(data, agreeing))
@@ -160,7 +167,10 @@ def _of_lag(lag: PoseLag) -> Iterator[Finding]:
 
 
 def _foreign(left: float) -> Finding:
-    """Return the finding that poses and wheels do not belong together."""
+    """Return the finding that poses and wheels do not belong together.
+
+    `left` is the share of the poses' motion that stays unexplained [1].
+    """
     return Finding(
         "pose_unexplained",
         f"the poses do not follow the wheels: {left:.2f} of their motion is left unexplained, in "
@@ -171,7 +181,7 @@ def _foreign(left: float) -> Finding:
 
 
 def _factors(scales: ScaleRatios, row_s: float, gear_ratio: float) -> Iterator[Finding]:
-    """Yield findings about wrong units and sizes."""
+    """Yield findings about wrong units and sizes, from ratios outside their ranges."""
     fitting, single = single_causes(scales, row_s, gear_ratio)
     yield from cause_findings(fitting, single, ratio_sentence(scales), gear_ratio)
     if not fitting and not all(r.natural for r in scales.known.values()):
@@ -186,7 +196,10 @@ def _factors(scales: ScaleRatios, row_s: float, gear_ratio: float) -> Iterator[F
 def _of_time(
     data: JoinedRuns, moved: ChannelIncrements, at: StepEdges, radius: float
 ) -> Iterator[Finding]:
-    """Yield the finding about time in another unit, where only its size shows it."""
+    """Yield the finding that time is in another unit than declared.
+
+    It uses implausible rim speeds and times between rows, for logs whose ratios do not show it.
+    """
     row = float(np.median(data.row))
     speed = np.abs(moved.wheels) / (at.after - at.before)[:, None] * radius
     top = float(np.nanquantile(speed, 0.95))
@@ -200,7 +213,7 @@ def _of_time(
 
 
 def _suspicious(scales: ScaleRatios) -> Iterator[Finding]:
-    """Yield the finding about wheels that go much further than body and commands show."""
+    """Yield the finding that the wheels travel much further than the body, without any command."""
     travel = scales.known.get("travel")
     if travel is None or "drive" in scales.known or "command" in scales.known:
         return
@@ -234,7 +247,7 @@ def _not_checked(what: str) -> Finding:
 
 
 def _unmoved(evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
-    """Yield notes about directions in which no run moves."""
+    """Yield notes about directions in which no run moves, so that they are unchecked."""
     pose = next(iter(evidence.pose.values()), None)
     if pose is None:
         return
@@ -249,5 +262,5 @@ def _unmoved(evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
 
 
 def _constant(channel: JoinedChannel | None) -> bool:
-    """Return whether a channel never changes."""
+    """Return whether a channel was logged and never changes."""
     return channel is not None and not np.nanmax(np.abs(np.diff(channel.value, axis=0))) > 0

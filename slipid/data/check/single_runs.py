@@ -1,4 +1,4 @@
-"""Runs whose poses do not belong to them: poses of another run, and poses that do not move."""
+"""Search for single runs with wrong poses: poses of another run, or poses that never change."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,28 +18,32 @@ from slipid.data.check.joined import (
 )
 
 MOVED_M = 0.2
-"""Path length of the wheels from which the poses must move as well [m]."""
+"""Path length by the wheels above which a run is judged, since its poses must move as well [m]."""
 STILL_M = 1e-6
-"""Path length of poses that do not change but for rounding [m]."""
+"""Path length below which poses do not change, except for rounding [m]."""
 ROWS = 20
-"""Least number of rows of a run that is judged alone."""
+"""Least number of rows of a run that is judged."""
 ODD, TIMES, USUAL = 0.3, 10.0, 0.9
-"""A run is odd where its disagreement, 1 - cosine, exceeds `ODD` and `TIMES` that of the median
-run; the cosine of that one must be at least `USUAL`."""
+"""A run has poses of another run if its disagreement, 1 - cosine, exceeds both `ODD` and `TIMES`
+times that of the median run. No run is judged if the median run's cosine is below `USUAL`."""
 CLIPPED = 4.0
-"""Increments of the body above this multiple of the median one are shortened to it."""
+"""Multiple of the median length of the body increments to which longer increments are
+shortened [1]."""
 ALL = 0.5
-"""Share of the runs from which a finding concerns all of them."""
+"""Share of runs with constant poses from which the finding is about all runs [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunAgreement:
-    """Agreement of poses and wheels in each run.
+    """Agreement of poses with wheels in each run.
+
+    Path lengths include rotation, as an arc at the base radius.
 
     Attributes:
-        wheels_m: path length by the wheels (run,) [m].
-        poses_m: path length of the poses, with headings at the base radius (run,) [m].
-        cosine: cosine between the increments of the poses and those predicted by wheels (run,).
+        wheels_m: path length of the body predicted from the wheels (run,) [m].
+        poses_m: path length of the poses (run,) [m].
+        cosine: normalised scalar product of the body increments from the poses and from the wheels
+            (run,) [1].
     """
 
     wheels_m: Float[np.ndarray, " run"]
@@ -54,7 +58,7 @@ def agreement(
     evidence: Evidence,
     meant: Interpretation,
 ) -> RunAgreement:
-    """Return the agreement of every run under an interpretation, from wheels and poses alone."""
+    """Return the agreement of poses with wheels in every run, under an interpretation."""
     convention = meant.convention
     body = body_motion(at, convention.bare) * [1.0, 1.0, evidence.base]
     body = body @ rotation(-convention.offset).T
@@ -64,7 +68,7 @@ def agreement(
     length = np.linalg.norm(body, axis=1)
     most = CLIPPED * float(np.median(length[length > 0])) if (length > 0).any() else 1.0
     body = body * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
-    # slip shortens each axis by its own factor
+    # Slip shortens the motion along each axis by a different factor.
     squares = (predicted**2).sum(axis=0)
     factor = (predicted * body).sum(axis=0) / np.where(squares > 0, squares, 1.0)
     scaled = predicted * np.where(factor > 0, factor, 0.0)
@@ -82,12 +86,12 @@ def agreement(
 
 
 def standing(data: JoinedRuns, compared: RunAgreement) -> Bool[np.ndarray, " run"]:
-    """Return whether the poses of each run do not change while its wheels turn."""
+    """Return, for each run, whether its poses do not change although its wheels turn."""
     return (compared.poses_m < STILL_M) & (compared.wheels_m > MOVED_M) & (_rows(data) >= ROWS)
 
 
 def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
-    """Yield findings about runs that do not agree with the others."""
+    """Yield findings about runs with constant poses, and about runs with poses of another run."""
     still = standing(data, compared)
     if still.any():
         every = bool(still.mean() >= ALL)
@@ -100,7 +104,7 @@ def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
             else "leave these runs out of the globs of [[logs]]",
             runs=() if every else _names(data, still),
         )
-    # a robot that is held in place by the floor is not like another run
+    # Runs in which the floor holds the robot in place disagree for a reason, and are not judged.
     moves = ~still & (_rows(data) >= ROWS) & (compared.wheels_m > MOVED_M)
     if moves.any():
         moves &= (
