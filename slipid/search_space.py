@@ -1,4 +1,7 @@
-"""The user's choices for declared numbers, and the free numbers as one vector without bounds."""
+"""Search space of a fit: its free parameters as one vector without bounds, and the user's choices.
+
+A "number" of a tree is one declared parameter (`slipid.parameter`), a scalar or a small vector.
+"""
 
 import fnmatch
 from collections.abc import Callable, Mapping, Sequence
@@ -20,12 +23,12 @@ class Choice:
 
     Attributes:
         pattern: path, with `*` and `?` as wildcards: `surface.*.creep`.
-        start: start value [SI]; a number that is fixed keeps this value.
+        start: start value [SI], which is also the value of a number that is not fitted.
         fixed: value at which the number is fixed [SI]; None leaves it free.
         free: True or False to free or fix the number without giving a value.
         prior_mean: centre of the prior [SI].
-        prior_std: std of the prior, in SI around its centre, which without `prior_mean` is the
-            declared start.
+        prior_std: std of the prior [SI]; without `prior_mean`, the prior is centred on the declared
+            start value.
     """
 
     pattern: str
@@ -39,11 +42,11 @@ class Choice:
 class Space(eqx.Module):
     """The free numbers of a tree as one vector without bounds, with their Gaussian prior.
 
-    A space is passed to compiled functions as an argument: spaces of the same parameters share
-    them.
+    A space is passed to compiled functions as an argument, so that spaces with the same parameters
+    share these functions.
 
     Attributes:
-        template: tree that holds the values of the fixed numbers.
+        template: tree with the values of the fixed numbers and the start values of the free ones.
         start, prior_mean, prior_std: start vector, and mean and std of the prior, in the search
             space.
         pooled: coordinates of deviations whose prior std is estimated from the data because the
@@ -92,7 +95,7 @@ class Space(eqx.Module):
         self.pooled = np.concatenate([np.zeros(0, bool), *pooled])
 
     def with_pooled(self, std: float) -> "Space":
-        """Return the same space with an estimated prior std for the pooled deviations."""
+        """Return the same space with prior std `std` for the pooled coordinates."""
         prior_std = np.where(self.pooled, std, self.prior_std)
         return eqx.tree_at(lambda space: space.prior_std, self, prior_std)
 
@@ -109,7 +112,7 @@ class Space(eqx.Module):
 
     @property
     def electric(self) -> Bool[np.ndarray, " free"]:
-        """Mask of the coordinates estimated from currents and voltages given the motion."""
+        """Mask of the coordinates that currents and voltages determine, given the motion."""
         return self.where(lambda e: e.declaration.electric)
 
     @property
@@ -119,7 +122,7 @@ class Space(eqx.Module):
 
     @property
     def names(self) -> list[str]:
-        """One name per coordinate: the path, numbered where it takes several."""
+        """One name per coordinate: the path of its number, with an index if it has several."""
         return [
             e.path if e.coordinates == 1 else f"{e.path}[{k + 1}]"
             for e in self.free
@@ -127,7 +130,7 @@ class Space(eqx.Module):
         ]
 
     def tree(self, z: Float[Array, " free"] | Float[np.ndarray, " free"]) -> Any:
-        """Return the tree of SI values at a search-space vector; can be compiled."""
+        """Return the tree of SI values at a search-space vector; `z` may be traced."""
         z, slices = z if isinstance(z, jax.core.Tracer) else np.asarray(z, float), self.slices
         return with_values(
             self.template, {e: e.declaration.to_si(z[slices[e.path]]) for e in self.free}
@@ -140,7 +143,10 @@ class Space(eqx.Module):
 
 
 def with_values(tree: Any, values: Mapping[Entry, Any]) -> Any:
-    """Return the tree with new values [SI] at some entries; nothing is compiled without tracing."""
+    """Return the tree with new values [SI] at some entries.
+
+    Values that are not traced are handled with NumPy, so that JAX compiles nothing for them.
+    """
     changed: dict[tuple[str, ...], tuple[Entry, Any]] = {}
     for entry, value in values.items():
         whole = changed[entry.leaf][1] if entry.leaf in changed else entry.whole(tree)
@@ -168,7 +174,10 @@ def _replaced(whole: Any, index: int | None, value: Any) -> Any:
 
 
 def _resolved(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any, Any, bool]:
-    """Return the value, prior mean and std in the search space, and whether it is free."""
+    """Return the value [SI] of an entry, its prior mean and std, and whether it is free.
+
+    Prior mean and std are in the search space. `picked` are the choices that match the entry.
+    """
     d = entry.declaration
     usual = np.full(entry.size, 1 / entry.size if d.shares else d.start)
     is_free, mean_si, std_si = d.free, None, None
@@ -202,7 +211,7 @@ def _resolved(entry: Entry, value: Any, picked: list[Choice]) -> tuple[Any, Any,
 
 
 def _checked_std(entry: Entry, std: Any) -> np.ndarray | None:
-    """Return a valid std of a prior, None where only its centre was given."""
+    """Return the prior std of an entry as an array, None if not given; `ValueError` if invalid."""
     if std is None:
         return None
     x = np.asarray(std, float).ravel()
@@ -212,7 +221,7 @@ def _checked_std(entry: Entry, std: Any) -> np.ndarray | None:
 
 
 def _checked_value(entry: Entry, value: Any) -> np.ndarray:
-    """Return a valid value as an array; one number stands for all entries of a vector."""
+    """Return a value as an array; `ValueError` if invalid. A scalar applies to all elements."""
     x, d = np.asarray(value, float), entry.declaration
     if x.size not in (1, entry.size):
         raise ValueError(f"{entry.path} takes {entry.size} numbers, got {x.size}")

@@ -75,7 +75,7 @@ def export(
         options = ExportOptions(_names(to), controller, path, speed, map)
         done = run(robot, out, options, report, ROWS)
     content = {
-        "schema": "slipid.exports/1",
+        "schema": "slipid.export/1",
         "folder": str(done.folder),
         "robot": done.robot,
         "forms": list(done.forms),

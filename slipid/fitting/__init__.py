@@ -1,1 +1,1 @@
-"""Likelihood of windows and its maximum."""
+"""Fit of a robot model: likelihood of windows, its noise variances, and search for its maximum."""

@@ -1,17 +1,19 @@
-"""Variances of shared effects and of the differences of floors, by restricted likelihood.
+"""Variances of run, shared and session effects, and of load biases, by restricted likelihood.
 
-The effects that remain in the runs on a floor, one axis at a time,
+After a fit, every run on a floor has a remaining effect along, across and in yaw. On one axis, the
+remaining effects of these runs,
 
     a_i = (E_i^T W_i E_i)^-1 E_i^T W_i r_i
 
-(E_i moves the residuals r_i by an effect, W_i weighs them without the run effects) have the
-covariance
+have the covariance given below. E_i is the change of the residuals r_i of run i per unit of an
+effect; W_i is the inverse of their covariance without the run effects.
 
     N + v_own D + v_near K + v_session M + T C T^T
 
-N of camera and process noise, D of the Student-t weights, K the kernel over conditions, M 1 within
-a session, T the derivative by the model's numbers and C their covariance before the floor's own
-runs were used.
+N is the variance from camera and process noise, D the diagonal of inverse Student-t weights, K the
+kernel over driving conditions, and M is 1 for two runs of the same session and 0 otherwise. T is
+the derivative of the effects by the model's fitted numbers, and C the covariance of these numbers
+before the floor's own runs were used.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -28,28 +30,32 @@ from slipid.fitting.shared_effects import AXES, SharedEffects
 from slipid.fitting.variances import DEGREES, VARIANCE_SPREAD, Objective, Search, Square, Variances
 
 _STEPS, _SETTLED = 20, 1e-5
-"""Largest number of scoring steps per round, and the log-variance step that counts as rest."""
+"""Largest number of scoring steps per round, and the change of every log variance below which the
+steps stop."""
 _SECTORS = 6
-"""Number of sectors of directions, each of which is held out in turn."""
+"""Number of equal sectors of travel directions; each is held out in turn."""
 LEAST_RUNS = 30
-"""Number of runs below which a tenth of them says too little about the tail."""
+"""Smallest number of runs from which the 90 % coverage of end points is estimated.
+
+With fewer runs, less than three are expected outside the 90 % region.
+"""
 _MOST_GROWTH = 10.0
-"""Largest accepted factor of the variances."""
+"""Largest factor by which `extrapolation` multiplies variances."""
 _GRID = np.geomspace(0.1, 4.0, 60)
-"""Stds of the load biases on the grid, over the typical one."""
+"""Candidate stds of the load biases, divided by the typical std."""
 
 
 class _AxisEffects(NamedTuple):
     """The effects of the runs on a floor along one axis.
 
     Attributes:
-        number: number of the axis.
-        segments: numbers of the segments.
-        left: remaining effects.
-        fixed: their covariance without the variances to be estimated.
-        noise: diagonal of camera and process noise in it.
-        numbers: numbers of the variances to be estimated.
-        bases: derivative of the covariance by each of these variances.
+        number: index of the axis in `AXES`.
+        segments: indices of the segments.
+        left: remaining effect of each segment.
+        fixed: part of the covariance of `left` that does not depend on the estimated variances.
+        noise: part of the diagonal of `fixed` that comes from camera and process noise.
+        numbers: indices of the estimated variances among all variances.
+        bases: derivative of the covariance of `left` by each estimated variance.
     """
 
     number: int
@@ -68,11 +74,11 @@ def effect_variances(
     covariance: Square,
     log_v: Variances,
 ) -> Variances:
-    """Return the log variances after scoring steps of those of the run effects.
+    """Return all log variances after scoring steps for those of run, shared and session effects.
 
     Args:
-        motion: residuals and their derivative, all segments.
-        weight: Student-t weight of every segment, 0 for one that does not count.
+        motion: motion residuals of all segments and their derivative by the search vector.
+        weight: Student-t weight of every segment, 0 for a segment that is left out of the fit.
         covariance: covariance of the search vector.
     """
     out = np.array(log_v)
@@ -89,7 +95,10 @@ def effect_information(
     covariance: Square,
     log_v: Variances,
 ) -> Float[np.ndarray, "variance variance"]:
-    """Return the expected information of the same log variances, zero for the others."""
+    """Return the expected information of the log variances that `effect_variances` estimates.
+
+    Rows and columns of all other variances are zero. Arguments are those of `effect_variances`.
+    """
     out = np.zeros((len(log_v), len(log_v)))
     for axis in _axes(objective, motion, weight, covariance, log_v):
         v = np.exp(log_v)[axis.numbers]
@@ -103,9 +112,9 @@ class TravelDirections(NamedTuple):
     """Direction of travel, distance and load set-up of every segment.
 
     Attributes:
-        direction: direction of travel [rad], nan on the spot.
+        direction: direction of travel relative to the body [rad], nan for turns on the spot.
         distance: distance driven [m].
-        setup: floor and load set-up.
+        setup: name that stands for the floor and the load set-up of the segment.
     """
 
     direction: Float[np.ndarray, " segment"]
@@ -121,15 +130,17 @@ def extrapolation(
     log_v: Variances,
     travel: TravelDirections,
 ) -> dict[str, float]:
-    """Return the factors by which variances are too small far from fitted runs, by set-up.
+    """Return the factors that correct too small variances in unfitted directions, by set-up.
 
     Every sector of directions is predicted from the others, with the numbers of the floor estimated
     anew (to first order). The variances of shared effects and of the numbers are multiplied by the
-    factor that puts 90 % of the end points into their 90 % regions; the run's own effects and
-    noise, which neighbours do not predict, are kept. It is 1 where enough end points lie there
-    already, and where there are fewer than three sectors or `LEAST_RUNS` runs. A likelihood finds
-    the variances that are best between the runs it has, which are too small where the model is
-    wrong on a larger scale, and down-weights outliers that a forecast meets again.
+    factor that puts 90 % of the end points into their 90 % regions; the variances of the run's own
+    effects and of the noise, which neighbours do not predict, are kept. The factor is 1 where at
+    least 90 % of the end points already lie in their regions, and where there are fewer than three
+    sectors or fewer than `LEAST_RUNS` runs. The factor is needed for two reasons: maximum
+    likelihood fits the variances to distances between neighbouring runs, so that they are too small
+    where the model is wrong on a larger scale; and it down-weights outliers, which occur in
+    forecast runs as well.
 
     Sources: Sundararajan and Keerthi 2001, Neural Computation 13(5), eq. for leaving out; Bachoc
     2013, Computational Statistics and Data Analysis 66, on wrong models.
@@ -144,12 +155,12 @@ def extrapolation(
 
 
 class _HeldOutEffects(NamedTuple):
-    """Effects of segments on three axes as other sectors predict them; nan where none do.
+    """Prediction errors of each segment's effects from the other sectors; nan without a prediction.
 
     Attributes:
-        gap: effect less its prediction.
-        spread: variance of the gap.
-        own: part of the variance that other runs cannot predict.
+        gap: effect less its prediction, on each axis.
+        spread: variance of `gap`.
+        own: part of `spread` from the run's own effect and noise, which other runs do not predict.
     """
 
     gap: Float[np.ndarray, "segment 3"]
@@ -160,7 +171,7 @@ class _HeldOutEffects(NamedTuple):
 def _held_out_effects(
     axes: Iterable[_AxisEffects], log_v: Variances, direction: Float[np.ndarray, " segment"]
 ) -> _HeldOutEffects:
-    """Return every effect less its prediction from the other sectors, with that gap's variance."""
+    """Return every effect less its prediction from the other sectors, and the error's variance."""
     found = _HeldOutEffects(*(np.full((len(direction), len(AXES)), np.nan) for _ in range(3)))
     for axis in axes:
         v = np.exp(log_v)[axis.numbers]
@@ -182,13 +193,16 @@ def _variance_growth(
     distance: Float[np.ndarray, " segment"],
     mine: Bool[np.ndarray, " segment"],
 ) -> float:
-    """Return the factor of a set-up's predictable variances that gives 90 % coverage."""
+    """Return the factor of one set-up's variances at which 90 % of end points are in 90 % regions.
+
+    `mine` marks the segments of the set-up. The run's own effects and noise are not multiplied.
+    """
     mine = mine & np.isfinite(held_out.gap).all(axis=1)
     if mine.sum() < LEAST_RUNS:
         return 1.0
     d = distance[mine]
     gap, spread, own = (x[mine] for x in held_out)
-    # a yaw that grows linearly along the run moves its end across by half of it times the distance
+    # yaw grows linearly along the run: the end point moves across by half the yaw times distance
     along, across = gap[:, 0], gap[:, 1] + 0.5 * d * gap[:, 2]
 
     def excess(log_growth: float) -> float:
@@ -203,10 +217,10 @@ def _variance_growth(
 
 
 def _sectors(direction: Float[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]]:
-    """Return the runs whose directions lie in each sector; sectors without runs are omitted.
+    """Return the indices of the runs in each sector of directions, without empty sectors.
 
-    The edges separate the fewest runs from others in nearly the same direction: they are in the
-    middle of the widest gap between directions, taken modulo a sector.
+    The sector edges lie in the middle of the widest gap between directions, taken modulo the width
+    of a sector, so that few runs in nearly the same direction are separated.
     """
     moves = np.flatnonzero(np.isfinite(direction))
     if not len(moves):
@@ -252,7 +266,11 @@ def _axes(
 def _variance_bases(
     floor: SharedEffects, axis: int, kept: Bool[np.ndarray, " run"], weight: np.ndarray
 ) -> list[tuple[int, np.ndarray]]:
-    """Return variance numbers and the covariance of the effects along an axis per unit of each."""
+    """Return pairs of a variance's index and its derivative matrix, for the effects on one axis.
+
+    The matrix is the covariance of the effects per unit of the variance. The pairs are those of
+    own, neighbours' and session effects, as far as the floor has them.
+    """
     own, near, session = np.asarray(floor.numbers)[:, axis].tolist()
     root, member = np.asarray(floor.near)[axis, kept], np.asarray(floor.session)[kept]
     found = [(own, np.diag(1 / weight)), (near, root @ root.T), (session, member @ member.T)]
@@ -260,12 +278,15 @@ def _variance_bases(
 
 
 def _covariance(axis: _AxisEffects, v: np.ndarray) -> Float[np.ndarray, "run run"]:
-    """Return the covariance of the effects at given variances."""
+    """Return the covariance of the effects on an axis at given values of the variances."""
     return np.asarray(axis.fixed + sum(k * b for k, b in zip(v, axis.bases, strict=True)))
 
 
 def _information(grown: list[np.ndarray]) -> np.ndarray:
-    """Return the expected information of the log variances."""
+    """Return the expected information of the log variances.
+
+    `grown` holds, for each variance v, the matrix v V^-1 dV/dv of the covariance V.
+    """
     return np.array([[0.5 * np.sum(a * b.T) for b in grown] for a in grown])
 
 
@@ -305,7 +326,10 @@ def _scoring_steps(axis: _AxisEffects, log_v: np.ndarray, typical: np.ndarray) -
 
 
 def pooled(precision: Square, z: Search, objective: Objective, log_v: Variances) -> float:
-    """Return the log mean variance of the load biases of floors; arguments as in `pooled_stds`."""
+    """Return the log of the posterior mean variance of the load biases of floors.
+
+    Arguments are those of `pooled_stds`.
+    """
     found = pooled_stds(precision, z, objective, log_v)
     return float(np.log(found.weight @ found.std**2))
 
@@ -320,7 +344,8 @@ class PooledStds(NamedTuple):
 def pooled_stds(precision: Square, z: Search, objective: Objective, log_v: Variances) -> PooledStds:
     """Return the posterior of the std of the load biases with a half-normal prior, on a grid.
 
-    The fit is a Gaussian of that precision around z; its evidence for every std is known.
+    The posterior of the search vector is taken as a Gaussian with mean z and the given precision,
+    so that the evidence for every candidate std has a closed form.
 
     Source: Gelman 2006, Bayesian Analysis 1(3), on half-normal priors of group stds.
     """

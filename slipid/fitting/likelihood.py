@@ -21,29 +21,33 @@ Marker = Float[Array, "segment window 3"]
 """Increments of the marker [m, m, rad], or body twists [m/s, m/s, rad/s], of every window."""
 PerDrive = Float[Array, "segment window drive"]
 MotorForce = Float[Array, "segment window drive 2"]
-"""Forces of `model.robot.motor_forces`, summed over the wheels of every drive."""
+"""Forces of `model.robot.motor_forces` [mu m g], summed over the wheels of every drive."""
 PerChannel = Float[Array, "segment m"]
-"""Values of every segment in one row, window by window and drive by drive, as residuals are."""
+"""One value per window and drive, in one row per segment: window by window, then drive by drive."""
 Std = Float[Array, ""] | float
 SMOOTH = 0.03
-"""Magnitude below which the mean of an unsigned current levels off [A]."""
+"""Current magnitude below which the prediction of an unsigned current levels off [A]."""
 FLOOR = {"motion": 1e-9, "current": 1e-6, "voltage": 1e-6}
-"""Variance added to every residual for the rounding of the logs [m^2, A^2, V^2]."""
+"""Variance added to every residual of a kind for the rounding of the logs.
+
+`motion` [m^2] or [rad^2], `current` [A^2], `voltage` [V^2].
+"""
 
 _AS_THEY_ARE = ("dt", "turn", "speed_change", "pose", "current", "voltage", "current_var", "lag")
 
 
 def with_slope(of: Callable[[Array], Array], z: Array | np.ndarray) -> tuple[Array, Array]:
-    """Return a function's value at a vector and its derivative by the vector, from one pass."""
+    """Return the value of function `of` at vector z and its derivative by z, evaluated together."""
     slope, value = jax.jacfwd(lambda x: (of(x),) * 2, has_aux=True)(z)
     return value, slope
 
 
 class Batch(eqx.Module):
-    """Windows as arrays for a compiled function, with indices of the robot's stacks as names.
+    """Windows as arrays for compiled functions; names of floors, loads and sessions are indices.
 
-    The surface is the one under the robot (segment,), or under each of its wheels in every window
-    (segment, window, wheel).
+    The indices are those of the robot's stacked numbers. `surface` holds the floor under the whole
+    robot (segment,), or under each of its wheels in every window (segment, window, wheel). The
+    other fields are those of `slipid.data.windows.Windows`.
     """
 
     surface: Int[Array, "segment *window_wheel"]
@@ -65,7 +69,7 @@ class Batch(eqx.Module):
 def batch(
     windows: Windows, robot: Robot, floor: Int[np.ndarray, "segment window wheel"] | None = None
 ) -> Batch:
-    """Return the batch for a robot that knows the floors, loads and sessions of the windows.
+    """Return the windows as a batch, for a robot that has their floors, loads and sessions.
 
     `floor` is the surface under each wheel in every window, for windows on several floors.
     """
@@ -86,12 +90,12 @@ class ElectricNoise(eqx.Module):
     """Noise that the prediction of voltages depends on.
 
     Attributes:
-        voltage_std: std of the voltmeter [V].
-        scatter: variance of the true current of every window around the predicted one [A^2],
+        voltage_std: std of the voltmeter noise [V].
+        scatter: variance of the true current of every window around the predicted current [A^2],
             without the ammeter's noise.
-        resistance: winding resistance [ohm], which converts unknown current to voltage. It is fixed
-            during every round of a fit, as the variances are: these are fitted to the size of the
-            residuals, which then contains no information about R.
+        resistance: winding resistance R [ohm], which converts the uncertainty of the true current
+            to a voltage. It is fixed during every round of a fit, as the variances are: these are
+            fitted to the size of the residuals, so that the size has no information left about R.
     """
 
     voltage_std: Std
@@ -104,8 +108,8 @@ class Predicted(eqx.Module):
 
     Attributes:
         increment: increments of the marker (x, y [m], yaw [rad]).
-        twist: body twists.
-        motor_force: forces each motor works against, in units of mu m g.
+        twist: body twists (vx, vy [m/s], yaw rate [rad/s]).
+        motor_force: forces each motor works against [mu m g].
     """
 
     increment: Marker
@@ -119,7 +123,10 @@ def wheel_speed(robot: Robot, b: Batch) -> PerDrive:
 
 
 def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
-    """Return the contact equilibrium of every window; `near` is as in `model.robot.twist`."""
+    """Return the motion and motor forces of every window at its contact equilibrium.
+
+    `near` holds twists close to the equilibria, as in `model.robot.twist`.
+    """
     shape, frame = robot.geometry, robot.geometry.frame()
 
     def window(w: Array, near: Array | None, surface: Array, load: Array) -> tuple[Array, Array]:
@@ -132,9 +139,11 @@ def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
 
 
 def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | None = None) -> Any:
-    """Apply a function to every window: wheel speeds, a nearby twist, surface and load.
+    """Return the results of function `of` for every window, with axes (segment, window, ...).
 
-    All windows are one axis meanwhile: two nested ones take JAX half as long again to trace.
+    `of` takes the wheel speeds of a window [rad/s], a nearby twist or None, and the indices of its
+    surface and load. It is mapped over one flat axis of all windows: tracing two nested axes takes
+    JAX half as long again.
     """
     segments, windows = b.dt.shape
 
@@ -164,8 +173,8 @@ def marker_increments(
 
 
 def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDrive:
-    """Return the motor current of every window [A], its magnitude if logs are unsigned."""
-    friction = robot.surfaces.friction[b.surface]  # mean over wheels, as for forces
+    """Return the predicted motor current of every window [A]; its magnitude for unsigned logs."""
+    friction = robot.surfaces.friction[b.surface]  # forces are relative to its mean over wheels
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
     weight = friction * robot.body.mass * model.GRAVITY
     torque = (
@@ -197,10 +206,11 @@ def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "segme
 def electric_residuals(
     robot: Robot, b: Batch, motor_force: MotorForce, noise: ElectricNoise
 ) -> dict[str, Array]:
-    """Return predicted less measured `current` [A] and `voltage` [V], as far as they are logged.
+    """Return predicted less measured `current` [A] and `voltage`, as far as they are logged.
 
-    Voltages are predicted from the expected true current given the measured and the predicted one:
-    predicted from the measured current alone, its noise would bias R towards small values.
+    The voltage residual [V] is divided by `voltage_spread`. Voltages are predicted from the
+    expected true current, given the measured and the predicted current. If the measured current
+    were used alone, its noise would bias R towards small values.
     """
     if not b.has_current:
         return {}
@@ -219,16 +229,20 @@ def _flat(x: PerDrive) -> PerChannel:
 
 
 def _direction(b: Batch) -> PerDrive:
-    """Return the factor from a logged current to the wheel's direction, 1 if it is signed."""
+    """Return the factor that gives a logged current the sign of the wheel speed; 1 if signed.
+
+    The factor of an unsigned current passes smoothly from -1 to 1 around standstill.
+    """
     return jnp.ones_like(b.turn) if b.signed else jnp.tanh(b.turn / b.dt[..., None] / 0.2)
 
 
 def _true_current_share(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDrive]:
-    """Return the share k of measured less predicted current that is true, and the variance left.
+    """Return the regression factor k from measured to true current, and the variance that remains.
 
-    The true current is N(predicted, s^2) before it is measured with the noise sigma^2. Afterwards
-    it is N(predicted + k (measured - predicted), k sigma^2) with k = s^2 / (s^2 + sigma^2). Source:
-    Kelly 2007, ApJ 665(2), whose population of true values is here the model's prediction.
+    The true current is N(predicted, s^2) before it is measured with noise of variance sigma^2.
+    After the measurement it is N(predicted + k (measured - predicted), k sigma^2) with
+    k = s^2 / (s^2 + sigma^2); k sigma^2 [A^2] is the second result. Source: Kelly 2007, ApJ 665(2);
+    his distribution of true values is here the one around the model's prediction.
     """
     scatter = noise.scatter.reshape(b.current.shape)
     share = scatter / (scatter + b.current_var)
@@ -236,10 +250,11 @@ def _true_current_share(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDr
 
 
 def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, Array]:
-    """Return log |d residuals / d data| of the motion and of the voltage of every segment.
+    """Return log |d residuals / d data| of motion and of voltages, one value per segment each.
 
-    The camera corrects measured positions and the voltage residual is scaled by its own spread:
-    without these terms a smaller scale would fit better only because it shrinks the residuals.
+    Both depend on fitted numbers: measured positions are corrected by the camera model, and voltage
+    residuals are divided by `voltage_spread`. Without these terms of the likelihood, numbers that
+    shrink the residuals would seem to fit better.
     """
     camera = camera_log_jacobian(robot, b.pose)
     if not (b.has_current and b.has_voltage):
@@ -250,22 +265,22 @@ def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, 
 def camera_log_jacobian(
     robot: Robot, pose: Float[Array, "segment edge 3"]
 ) -> Float[Array, " segment"]:
-    """Return log |d motion residuals / d logged poses| of every segment, given its first pose."""
+    """Return log |d motion residuals / d logged poses| of every segment, its first pose fixed."""
     return jnp.sum(jax.vmap(jax.vmap(robot.camera.log_jacobian))(pose[:, 1:]), axis=1)
 
 
 def voltage_spread(b: Batch, noise: ElectricNoise) -> PerChannel:
-    """Return the std of the voltage residual over that of the voltage noise.
+    """Return the factor by which the std of the voltage residual exceeds that of the voltmeter.
 
-    The remainder comes from the true current that ammeter and model leave unknown, times R.
+    The excess comes from the uncertainty of the true current after its measurement, times R.
     """
     unknown = (noise.resistance * _direction(b)) ** 2 * _true_current_share(b, noise)[1]
     return _flat(jnp.sqrt(1.0 + unknown / noise.voltage_std**2))
 
 
 def voltage_std(log_variance: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the std of the voltage noise, rounding included, from the log of its variance [V].
+    """Return the std of the voltage noise [V], rounding included, from the log of its variance.
 
-    The voltage residual is in units of it: without the floor it would vanish with the noise.
+    The rounding `FLOOR` keeps it above zero, since `voltage_spread` divides by it.
     """
     return jnp.sqrt(jnp.exp(log_variance) + FLOOR["voltage"])

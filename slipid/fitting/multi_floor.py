@@ -1,11 +1,12 @@
 """Runs over several floors: short windows in a row, with the floor under each wheel in each window.
 
-The friction of a floor cannot be seen where all wheels stand on it: the forces balance in any unit.
+The friction coefficient of a floor has no influence on motion where all wheels stand on that floor,
+because all forces of the balance are in proportion to it.
 Where wheels stand on different floors, the ratio of their frictions turns the robot. A run is one
 segment of many short windows, so that its camera noise, its process noise and the constant errors
 of its motion and its currents are in the covariance of the segment, as they are for runs on one
-floor. Windows in which a wheel changes floors, in which wheels turn unevenly, or beyond the end of
-a run do not count: their residuals are zero.
+floor. Windows do not count in the likelihood, and their residuals are set to zero, where a wheel
+changes floors, where wheel speeds are not steady, or beyond the end of a run.
 """
 
 from collections.abc import Sequence
@@ -27,15 +28,16 @@ from slipid.search_space import Space
 from slipid.support.errors import DataError
 
 SHORTEST, LONGEST = 0.25, 0.5
-"""Shortest and longest window [s], short compared with the time a wheel stays on a patch."""
+"""Shortest and longest window [s], short compared with the time a wheel stays on one floor."""
 LEAST_SPEED = 0.04
-"""Speed of the fastest rim below which a window does not count [m/s]."""
+"""Rim speed that the fastest wheel must reach for a window to count [m/s]."""
 MOST_ACCELERATION = 0.6
-"""Acceleration of a rim above which the forces are not those of steady motion [m/s^2]."""
+"""Largest rim acceleration of a window that counts [m/s^2]; above it motion is not steady."""
 MOST_WINDOWS = 40
-"""Largest number of windows in a segment, for which windows are made longer.
+"""Largest number of windows in a segment.
 
-A run with still more windows makes several segments, as if it were several runs.
+The windows of a long run are lengthened up to `LONGEST` to keep to this number. A run with still
+more windows is split into several segments, as if it were several runs.
 """
 MULTI_FLOOR_MOTION = "crossing.motion"
 """Name of the block of motion residuals of runs over several floors."""
@@ -49,8 +51,8 @@ class MultiFloorRuns:
 
     Attributes:
         windows: windows of every segment.
-        floor: floor under each wheel in the middle of each window, by number in the robot's stack.
-        counts: whether a window counts in the likelihood.
+        floor: index of the floor under each wheel in the middle of each window.
+        counts: True for windows that count in the likelihood.
         runs: (name, sha256) of every run.
     """
 
@@ -63,8 +65,8 @@ class MultiFloorRuns:
 def multi_floor_runs(sets: Sequence[tuple[Runs, FloorMap]], robot: Robot) -> MultiFloorRuns:
     """Return the segments of runs whose poses are in the frame of a map, for several maps.
 
-    The wheel positions come from the camera of the fitted robot, which knows every surface of the
-    maps and every load of the runs.
+    The wheel positions are computed with the camera model of the fitted robot, which must have
+    every surface of the maps and every load set-up of the runs.
 
     Raises:
         DataError: no window of a map's runs counts, or only some runs log currents.
@@ -127,7 +129,7 @@ def _short(data: Runs, radius: float, lag: float) -> Windows:
 
 
 def _joined(each: Sequence[Windows], run: Int[np.ndarray, " segment"]) -> Windows:
-    """Return several sets of windows as one, with new run numbers."""
+    """Return several sets of windows as one; `run` is the new run index of every segment."""
     whole: dict[str, Any] = {"run": run}
     for name in (f.name for f in fields(Windows) if f.name != "run"):
         values = [getattr(w, name) for w in each]
@@ -152,7 +154,7 @@ def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "segment time wh
 
 
 def _steady(w: Windows, radius: float) -> Bool[np.ndarray, " segment"]:
-    """Return a mask of windows in which wheels turn evenly and no camera frames are missing."""
+    """Return a mask of windows with moving wheels at steady speeds and without missing poses."""
     rim, jump = radius * w.turn[:, 0] / w.dt, radius * w.speed_change[:, 0] / w.dt
     moves = np.abs(rim).max(axis=1) >= LEAST_SPEED
     even = np.abs(jump).max(axis=1) <= MOST_ACCELERATION
@@ -163,8 +165,8 @@ class MultiFloorBatch(eqx.Module):
     """Runs over several floors as arrays for compiled functions.
 
     Attributes:
-        batch: the windows.
-        counts: 1 for windows in the likelihood (steady, one floor per wheel), else 0.
+        batch: windows, with the floor under each wheel.
+        counts: 1 for windows that count in the likelihood, else 0.
     """
 
     batch: lk.Batch
@@ -222,7 +224,12 @@ def window_errors(
     multi_floor: MultiFloorBatch,
     judged: Sequence[tuple[dict[str, Array], Float[np.ndarray, " segment"]]],
 ) -> WindowErrors:
-    """Return the errors of residuals by block, each set with the weight 1 or 0 of every segment."""
+    """Return root mean square errors over all windows that count.
+
+    Args:
+        judged: sets of residuals by block, each with weight 1 for the segments that are taken from
+            this set and 0 for the others.
+    """
     counts, dt = np.asarray(multi_floor.counts), np.asarray(multi_floor.batch.dt)
     motion, current, total = np.zeros(3), 0.0, 0.0
     for residual, weight in judged:

@@ -1,7 +1,7 @@
 """Fit of runs over several floors together with the runs that each keep to one floor.
 
-They are further segments of the same likelihood. The quality of their prediction is judged on
-held-out runs: each half of them is predicted by a fit to the other half.
+The runs over several floors are further segments of the same likelihood. Their predictions are
+judged on held-out runs: each half of them is predicted by a fit to the other half.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,7 +22,7 @@ from slipid.fitting.optimise import Optimum, optimise
 from slipid.fitting.problem import FitState, Problem
 
 _ROUNDS = 6
-"""Largest number of rounds of the fits to half of the runs, which serve for judgement only."""
+"""Largest number of rounds of each fit to half of the runs, which only serves to judge errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +32,12 @@ class MultiFloorFit:
     Attributes:
         problem: problem of all runs.
         optimum: optimum of all runs.
-        before: errors of the runs over several floors by a fit without any of them.
-        after: errors of each half by a fit to the other half, None where there is only one run.
-        learnt: errors by the fit to all of them.
-        as_if: errors as if all wheels had always stood on one floor, by floor; a correct map
-            predicts better than that.
+        before: errors on the runs over several floors, predicted by the fit without any of them.
+        after: errors where each half of them is predicted by a fit to the other half, None where
+            there is only one run.
+        learnt: errors on the same runs, predicted by the fit to all runs.
+        as_if: errors, by floor, of predictions as if all wheels had always stood on this floor; a
+            correct map predicts better.
     """
 
     problem: Problem
@@ -55,9 +56,10 @@ def fit_multi_floor(
     most_rounds: int = 30,
     tolerance: float = 0.02,
 ) -> MultiFloorFit:
-    """Continue from the optimum of a problem with runs over several floors.
+    """Return the fit to all runs, continued from the optimum of the runs on one floor each.
 
-    `tell` is called after every round of the fit to all runs; the limits are those of `optimise`.
+    `tell` is called after every round of the fit to all runs; `most_rounds` and `tolerance` are
+    those of `optimise`.
     """
     whole = problem.with_multi_floor(multi_floor)
     start = replace(whole.carried_over(optimum.state, problem), round=0)
@@ -69,7 +71,7 @@ def fit_multi_floor(
     def errors(
         of: MultiFloorBatch, *judged: tuple[FitState, Float[np.ndarray, " run"]]
     ) -> WindowErrors:
-        """Return the errors of runs, each by the state that judges it with weight 1."""
+        """Return the errors of runs; each state predicts the runs for which its weight is 1."""
         found = [(residuals_at(objective.space, of, jnp.asarray(s.z)), w) for s, w in judged]
         return window_errors(of, found)
 

@@ -1,15 +1,16 @@
-"""Variance components of the residuals of a segment, and the covariance they make.
+"""Variance components of the residuals of a segment, and the covariance that they add up to.
 
 The residuals of a segment have the covariance
 
-    V = sum_c v_c B_c,   B from: camera position and heading noise, shared by neighbouring windows;
+    V = sum_c v_c B_c,   c over: camera position and heading noise, shared by neighbouring windows;
                          process noise along, across and in yaw, growing with distance, per floor;
                          the run's own effect along, across and in yaw, per floor
 
-so the run effects are marginalised. Runs over several floors have variances of their own, as if
-they were driven on one more floor. Effects that runs share (`slipid.fitting.shared_effects`) and
-the deviations of floors from their common values have variances, too, beside these blocks. Known
-variances, such as the ammeter's noise, are added.
+with variances v_c and matrices B_c, so that the run effects are marginalised. Runs over several
+floors have variances of their own, as if they were driven on one more floor. Two kinds of variances
+are listed with these but are not part of V: those of effects that runs share
+(`slipid.fitting.shared_effects`), and that of the load biases of floors. Known variances, such as
+the ammeter's noise, are added.
 """
 
 from dataclasses import dataclass
@@ -30,10 +31,10 @@ class Components(eqx.Module):
 
     Attributes:
         base: covariance B_c of every segment and component at unit variance.
-        which: number of the variance of every segment and component.
+        which: index of the variance v_c of every segment and component.
         known: known variances of single residuals: rounding, and the ammeter's noise.
-        segments: numbers of its segments among all segments of a problem.
-        count: number of informative residuals of each segment.
+        segments: indices of the block's segments among all segments of a problem.
+        count: number of residuals of each segment that count in the likelihood.
     """
 
     base: Float[Array, "segment component m m"]
@@ -45,23 +46,23 @@ class Components(eqx.Module):
     def covariance(
         self, log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"]
     ) -> Float[Array, "segment m m"]:
-        """Return V of every segment."""
+        """Return the covariance V of every segment's residuals, known variances included."""
         v, m = jnp.exp(log_variance)[self.which], self.base.shape[-1]
         return jnp.einsum("nc,ncij->nij", v, self.base) + self.known[..., None] * jnp.eye(m)
 
     @property
     def single(self) -> Float[Array, "segment component m"]:
-        """Growth of the variance of every single residual with each component."""
+        """Derivative of the variance of every single residual by the variance of each component."""
         return jnp.diagonal(self.base, axis1=-2, axis2=-1)
 
 
 @dataclass(frozen=True)
 class Component:
-    """One source of noise: `process` `along`, `camera` `place`, `current` `window` and so on.
+    """One variance component: `process` `along`, `camera` `place`, `current` `window` and so on.
 
     Attributes:
-        kind: source of the noise.
-        what: direction or channel of the source.
+        kind: source of the noise, such as `process`.
+        what: direction or channel, such as `along`.
         floor: floor it belongs to, None for all floors.
         unit: unit of its std.
         typical: typical std, the centre of its weak log-normal prior.
@@ -81,7 +82,12 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """Every variance component, and the matrices of each block of residuals."""
+    """All variance components of a problem.
+
+    Attributes:
+        components: descriptions of the components, in the order of the vector of variances.
+        blocks: covariance terms of each block of residuals, by the name of the block.
+    """
 
     components: tuple[Component, ...]
     blocks: dict[str, Components]
@@ -110,15 +116,15 @@ _MULTI_FLOOR = (
     ("run.yaw", "rad/m", 0.06),
 )
 SHARED = {"neighbours": 0.5, "session": 0.3}
-"""Kinds of effects that runs share, and their typical std over that of the run's own effect."""
+"""Kinds of effects that runs share, with the ratio of their typical std to that of run effects."""
 POOLED = "pooled.load_bias"
-"""Name of the variance of the load biases of floors."""
+"""Name of the prior variance that the load biases of all floors have in common."""
 
 
 def noise(windows: Windows, robot: Robot, multi_floor: MultiFloorRuns | None = None) -> NoiseModel:
-    """Return the noise model of these windows; distances and directions are the encoders'.
+    """Return the noise model of these windows; distances and directions come from the encoders.
 
-    Segments of runs over several floors are numbered after those of the windows.
+    The segments of runs over several floors follow those of the windows in the order of segments.
     """
     floors = robot.surfaces.labels
     table = [
@@ -162,7 +168,7 @@ def electric_noise(
     log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"],
     resistance: Array,
 ) -> ElectricNoise:
-    """Return the noise that voltages are predicted with; a placeholder where none are logged."""
+    """Return the noise that predictions of voltages depend on; a placeholder without voltages."""
     if "voltage" not in blocks:
         return ElectricNoise(jnp.ones(()), jnp.ones((1, 1)), resistance)
     current, log_v = blocks["current"], jnp.asarray(log_variance)
@@ -177,9 +183,9 @@ def _multi_floor_components(
     start: int,
     blocks: dict[str, Components],
 ) -> list[Component]:
-    """Return the variances of runs over several floors and put their covariances into the blocks.
+    """Return the components of runs over several floors, and add their blocks to `blocks`.
 
-    `segments` segments and `start` variances come before theirs.
+    `segments` and `start` are the indices of their first segment and of their first variance.
     """
     w, none = multi_floor.windows, np.zeros((len(multi_floor.windows), 1), int)
     table = [
@@ -198,7 +204,12 @@ def _multi_floor_components(
 
 
 def _counted(of: Components, live: Bool[np.ndarray, "segment m"], first: int) -> Components:
-    """Return covariances in which uninformative residuals, which are zero, have the variance 1."""
+    """Return covariances in which residuals that do not count have variance 1 and no correlation.
+
+    Args:
+        live: True for residuals that count; the others are set to zero elsewhere.
+        first: index of the first segment among all segments of the problem.
+    """
     both = live[:, None, :, None] & live[:, None, None, :]
     return Components(
         base=jnp.where(both, of.base, 0.0),
@@ -212,7 +223,13 @@ def _counted(of: Components, live: Bool[np.ndarray, "segment m"], first: int) ->
 def _components(
     block: str, base: np.ndarray, which: np.ndarray, more: np.ndarray | float = 0.0
 ) -> Components:
-    """Return components with the rounding of the logs, and with known variances (segment, m)."""
+    """Return components whose known variances are the rounding of the logs plus `more`.
+
+    Args:
+        block: name of the block in `FLOOR`.
+        base, which: as in `Components`.
+        more: further known variances (segment, m).
+    """
     n, m = base.shape[0], base.shape[-1]
     return Components(
         base=jnp.asarray(base),
@@ -226,7 +243,7 @@ def _components(
 def encoder_increments(
     windows: Windows | Batch, robot: Robot
 ) -> Float[np.ndarray, "segment window 3"]:
-    """Return the body's motion in each window by the encoders, in its own frame [m, m, rad]."""
+    """Return the body-frame pose increment of each window without slip, by encoders [m, m, rad]."""
     j = np.asarray(robot.geometry.pseudo_inverse())
     return np.asarray(windows.turn) * float(robot.geometry.wheel_radius) @ j.T
 
@@ -234,7 +251,8 @@ def encoder_increments(
 def travel(windows: Windows | Batch, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance of each window by the encoders (segment, window) [m], and its direction.
 
-    Turning counts with the distance the wheels travel. The direction is a unit vector.
+    The distance includes the turn in radians times the base radius. The direction is a unit vector
+    in the body frame (segment, window, 2), ahead where the robot turns on the spot.
     """
     step = encoder_increments(windows, robot)
     distance = np.linalg.norm(step[..., :2], axis=-1)
@@ -246,7 +264,10 @@ def travel(windows: Windows | Batch, robot: Robot) -> tuple[np.ndarray, np.ndarr
 def _motion_components(
     windows: Windows, robot: Robot, first: Int[np.ndarray, "segment 1"]
 ) -> Components:
-    """Return the components of the motion; `first` numbers each floor's first variance."""
+    """Return the components of motion residuals.
+
+    `first` is the index of the first of the six process and run variances of each segment's floor.
+    """
     distance, u = travel(windows, robot)
     n, k = distance.shape
     scale = float(robot.camera.scale)
@@ -269,12 +290,15 @@ def _motion_components(
 
 
 def _floors(windows: Windows, robot: Robot) -> Int[np.ndarray, "segment 1"]:
-    """Return the number of each segment's floor."""
+    """Return the index of each segment's floor."""
     return np.array([[robot.surface_index(s)] for s in windows.surface])
 
 
 def axes(u: np.ndarray) -> np.ndarray:
-    """Return directions along, across and in yaw per window (axis, segment, 3 window, window)."""
+    """Return unit residuals along, across and in yaw per window (axis, segment, 3 window, window).
+
+    `u` is the unit direction of travel in each window, as `travel` returns it.
+    """
     n, k, _ = u.shape
     out = np.zeros((3, n, 3 * k, k))
     for j in range(k):
@@ -291,7 +315,10 @@ def effects(windows: Windows, robot: Robot) -> Float[np.ndarray, "segment m 3"]:
 
 
 def _current_components(windows: Windows, first: Int[np.ndarray, "segment 1"]) -> Components:
-    """Return the components of the currents; `first` numbers each floor's first variance."""
+    """Return the components of current residuals: of single windows, and common to a run.
+
+    `first` is the index of the first of the two current variances of each segment's floor.
+    """
     n, k, w = windows.turn.shape
     same = np.kron(np.ones((k, k)), np.eye(w))
     base = np.broadcast_to(np.stack([np.eye(k * w), same]), (n, 2, k * w, k * w)).copy()

@@ -1,4 +1,4 @@
-"""Maximum a posteriori fit: weights, numbers and variances alternate until all are at rest."""
+"""Maximum a posteriori fit by turns: Student-t weights, fitted numbers, and noise variances."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -35,19 +35,19 @@ from slipid.fitting.variances import (
 )
 
 _REFUSED = 12
-"""Number of steps that the solver may refuse in a round."""
+"""Largest number of steps that the solver may refuse in a round."""
 
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """End of a fit.
+    """Result of a fit: its last state, the covariance there, and whether it converged.
 
     Attributes:
-        state: state at the end.
+        state: state after the last round.
         covariance: Laplace covariance of the search vector.
-        converged: whether the fit settled.
-        reason: why it stopped, for people.
-        history: loss of every round.
+        converged: True if the last round changed less than the tolerance.
+        reason: reason why the fit stopped, as text for people.
+        history: loss after every round, minus log posterior up to a constant.
     """
 
     state: FitState
@@ -70,12 +70,13 @@ def optimise(
     """Return the maximum a posteriori, from a staged start or continued from a state.
 
     Args:
-        keep: weight of each segment, 1 or 0, in the order of `Problem.full_weight`; all 1 by
-            default. Folds of a cross-validation differ in this only, so they share one compiled
-            function.
+        keep: 1 for segments that are fitted, 0 for held-out ones, in the order of
+            `Problem.full_weight`; all 1 by default. Folds of a cross-validation differ in this
+            argument only, so that they share compiled functions.
         start: state to continue from instead of the staged start.
         most_rounds: largest number of rounds.
-        tolerance: the fit stops when no number moves more posterior stds than this in a round.
+        tolerance: the fit stops after a round in which every fitted number changed by less than
+            this many posterior stds, and every log variance by less than three times as much.
         tell: function called after every round, for progress and checkpoints.
         free: 1 for coordinates that may move from the start, 0 for fixed ones (free,).
         variances: whether the variances of the noise are fitted, too.
@@ -135,7 +136,7 @@ def one_round(
     electric = problem.electric(z, log_v)
     whole, jacobian, motor_force = linear(objective, jnp.asarray(z), electric)
     effect = effects_given(weighed.effects, root["motion"], whole["motion"])
-    # weights and effects depend on each other: half a step, or they can oscillate for ever
+    # weights and effects depend on each other: a full step of both can oscillate for ever
     effect = 0.5 * (effect + before) if state.round else effect
     residual = without_effects(objective, whole, effect)
     voltage = problem.voltage_information(z, log_v, motor_force)
@@ -144,12 +145,12 @@ def one_round(
     for _ in range(scoring):
         log_v = scoring_step(objective, residual, spread, log_v, jnp.asarray(keep), voltage)
         last, voltage = voltage, problem.voltage_information(z, log_v, motor_force)
-        if last is not None and voltage is not None:  # rescale to the new noise
+        if last is not None and voltage is not None:  # voltage residuals are scaled by their noise
             scale = jnp.sqrt(voltage.share / last.share)
             residual = residual | {"voltage": voltage.residual}
             both = scale[:, :, None] * scale[:, None, :]
             spread = spread | {"voltage": spread["voltage"] * both}
-    if voltage is not None and scoring:  # the Jacobian by R changes beyond its scale
+    if voltage is not None and scoring:  # a new noise does not merely rescale the derivative by R
         electric = problem.electric(z, log_v)
         whole, jacobian = problem.linear(z, electric)
     information = np.asarray(problem.precision(jacobian, log_v, keep))
@@ -174,10 +175,11 @@ def one_round(
 
 
 def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], None]) -> FitState:
-    """Return a start: motor by regression, then every floor by itself, the best of several starts.
+    """Return a start for the joint fit: motor by regression, then each floor from several starts.
 
-    Floors share nothing while the shared numbers are fixed, so one masked fit of all floors is a
-    fit of each by itself.
+    While all other numbers are fixed, floors have no number in common, so that one fit in which
+    only the floors' numbers may move fits each floor independently. The start with the least loss
+    is chosen floor by floor.
     """
     space, labels = problem.space, problem.robot.surfaces.labels
     mask = space.where(lambda e: e.surface is not None).astype(float)
@@ -195,12 +197,12 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
         stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
         start = np.where(creep, np.log(value), first)
         state = FitState(start, log_v, 0, np.inf, np.inf, stage)
-        for steps in (15, 6, 6):  # the damping must grow from 1 to the problem's scale first
+        for steps in (15, 6, 6):  # the solver's damping starts at 1, far below the problem's scale
             state = one_round(independent, state, keep, mask, steps=steps, scoring=0)
             tell(state)
         residual, _ = independent.linear(state.z, problem.electric(state.z, state.log_variance))
         found = problem.whitening(residual, state.log_variance, problem.full_weight)
-        cost = -np.log(np.asarray(found.weight["motion"]))  # the loss up to a factor and a constant
+        cost = -np.log(np.asarray(found.weight["motion"]))  # loss per segment, up to scale, offset
         for number, label in enumerate(labels):
             mine = float(np.sum(cost[(floors == number) & (keep[: len(floors)] > 0)]))
             if mine < best[number]:
@@ -210,7 +212,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
 
 
 def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
-    """Return the search vector with R and C_e from a regression of logged voltages."""
+    """Return the start vector with resistance R and back-EMF C_e regressed from logged voltages."""
     z = problem.space.start.copy()
     w = problem.windows.segments(np.flatnonzero(keep > 0))
     if not (w.has_voltage and w.has_current):
@@ -227,7 +229,7 @@ def _motor_start(problem: Problem, keep: np.ndarray) -> np.ndarray:
 
 
 class RoundInputs(eqx.Module):
-    """Quantities that stay fixed while the solver moves the numbers from z.
+    """Quantities that stay fixed during a round while the solver changes the search vector from z.
 
     Attributes:
         objective: the objective of the fit.
@@ -236,8 +238,8 @@ class RoundInputs(eqx.Module):
         root: whitening roots of the residuals.
         effects: posterior of the shared effects given these roots.
         prior_std: prior std of every coordinate.
-        electric: noise that voltages are predicted with.
-        motor_force: forces of the motors at z, from which currents and voltages are predicted.
+        electric: noise that predictions of voltages depend on.
+        motor_force: motor forces at z [mu m g], from which currents and voltages are predicted.
         slope: derivative of log |d residuals / d data| by the search vector.
     """
 
@@ -253,10 +255,11 @@ class RoundInputs(eqx.Module):
 
 
 class LimitedLevenberg(optx.LevenbergMarquardt):
-    """Levenberg-Marquardt that ends after a given number of accepted steps.
+    """Levenberg-Marquardt solver that stops after `most` accepted steps.
 
-    A refused step shrinks the next one, and stopping among refused steps would look like
-    convergence. The solver counts its evaluation of the start as an accepted step.
+    Refused steps do not count: each makes the next step smaller, so that a round that stopped after
+    refused steps would look like convergence. The solver counts its evaluation of the start as an
+    accepted step.
     """
 
     most: Array
@@ -288,7 +291,7 @@ def levenberg(fixed: RoundInputs, solver: LimitedLevenberg) -> Float[Array, " fr
 
 
 def _at(fixed: RoundInputs, y: Array) -> Array:
-    """Return the search vector of a step in prior stds."""
+    """Return the search vector after a step `y`, which is in units of the prior stds."""
     return fixed.z + fixed.mask * fixed.prior_std * y
 
 
@@ -298,18 +301,18 @@ def _stacked(y: Array, fixed: RoundInputs) -> Array:
     z = _at(fixed, y)
     robot, given = space.tree(z), space.tree(jnp.where(space.electric, z, fixed.z))
     motion = lk.motion_residual(robot, objective.batch, lk.predict(robot, objective.batch))
-    # currents and voltages given the motion of the round's start
+    # currents and voltages are predicted with the motion at the start of the round
     electric = lk.electric_residuals(given, objective.batch, fixed.motor_force, fixed.electric)
     blocks = {"motion": motion} | electric
     if (of := objective.multi_floor) is not None:
-        # here, too, currents move electric numbers only; friction is one of them, and it moves the
-        # equilibrium that currents come from
+        # here, too, currents change electric numbers only. Friction is one of them and changes the
+        # motion, so that currents need a prediction of their own, with the other numbers at z
         blocks |= of.residuals(given, lk.predict(given, of.batch))
         of_robot = of.residuals(robot, lk.predict(robot, of.batch))
         blocks[MULTI_FLOOR_MOTION] = of_robot[MULTI_FLOOR_MOTION]
     white = {k: jnp.einsum("nij,nj->ni", fixed.root[k], r) for k, r in blocks.items()}
     rest = [w.ravel() for k, w in white.items() if k != "motion"]
     parts = [marginal_residuals(fixed.effects, white["motion"]), *rest]
-    # the slope of the log Jacobian adds slope . z to the log posterior
+    # the log Jacobian adds slope . z to the log posterior: to first order it shifts the prior mean
     mean = space.prior_mean + fixed.prior_std**2 * fixed.slope
     return jnp.concatenate([*parts, (z - mean) / fixed.prior_std])

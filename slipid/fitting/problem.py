@@ -1,4 +1,4 @@
-"""Posterior of a robot given windows of its runs, compiled once for all windows of equal shapes."""
+"""Posterior of a robot's numbers given windows of its runs, compiled once per shape of windows."""
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
@@ -39,9 +39,15 @@ from slipid.model.robot import Robot
 from slipid.search_space import Choice, Space
 
 CREEPS = (0.05, 0.4, 1.0)
-"""Start values of the creep of every floor; other starts end in poor minima."""
+"""Start values of the creep (slip ratio of full traction) of every floor.
+
+From other values, fits have ended in poor local minima.
+"""
 FEW = 200
-"""Number of pieces up to which effects of no size cost less time than compiling a fit without."""
+"""Largest number of segments for which `without_shared_effects` keeps the effects at zero size.
+
+Up to this number the extra arithmetic costs less time than compiling a fit without effects.
+"""
 
 
 @dataclass(frozen=True)
@@ -53,9 +59,11 @@ class FitState:
         log_variance: log variances of the noise.
         round: number of finished rounds.
         loss: minus log posterior up to a constant.
-        moved: largest step of the last round in posterior stds.
-        stage: current activity, for progress.
-        effect: mean shared effects along, across and in yaw.
+        moved: largest change in the last round: of a number in posterior stds, or a third of the
+            change of a log variance.
+        stage: current stage of the fit, as text for progress reports.
+        effect: mean shared effects along, across [m/m] and in yaw [rad/m]; None before the first
+            estimate.
     """
 
     z: Search
@@ -85,12 +93,13 @@ class FitState:
 class Problem:
     """Likelihood of a set of windows as functions of the search vector.
 
-    Currents and voltages do not move the numbers of the motion ("cut"): the torque scale is
-    estimated from currents given the motion, whose errors are propagated. A friction model good to
-    5 % in current would otherwise outvote forces that motion determines to 1 %.
+    Currents and voltages do not change the numbers that motion determines (a "cut" posterior): the
+    torque scale is estimated from currents given the motion, and the errors of the motion are
+    propagated. Otherwise a motor friction model that is accurate to 5 % of the current would
+    overrule forces that motion determines to 1 %.
 
-    The argument `keep` of the methods weighs segments with 1 or 0. `compiled` holds functions that
-    other modules compiled for windows of these shapes, under their own keys.
+    The argument `keep` of the methods is 1 for segments that count and 0 for others. `compiled`
+    holds functions that other modules compiled for windows of these shapes, under their own keys.
     """
 
     def __init__(self, windows: Windows, robot: Robot, choices: Sequence[Choice]):
@@ -132,12 +141,16 @@ class Problem:
 
     @property
     def full_weight(self) -> Float[np.ndarray, " segment"]:
-        """Weight 1 for every segment, those of runs over several floors last."""
+        """Array of weight 1 for every segment; segments of runs over several floors come last."""
         more = () if self.multi_floor is None else self.multi_floor.counts
         return np.ones(len(self.windows) + len(more))
 
     def carried_over(self, state: FitState, of: "Problem") -> FitState:
-        """Return the state of another problem with the same numbers as a state of this problem."""
+        """Return a state of another problem as a state of this one.
+
+        Both problems have the same fitted numbers. Variances are matched by name; those that the
+        other problem does not have start at their typical values.
+        """
         known = dict(zip(of.noise.names, state.log_variance, strict=True))
         log_v = [known.get(c.name, 2 * np.log(c.typical)) for c in self.noise.components]
         return replace(state, log_variance=np.array(log_v), moved=np.inf)
@@ -145,7 +158,8 @@ class Problem:
     def without_shared_effects(self) -> "Problem":
         """Return the same problem as if runs shared no effects.
 
-        Effects of few runs are kept at no size, so that one compiled fit serves both problems.
+        Up to `FEW` segments, the effects stay in the problem with variance zero, so that the same
+        compiled fit serves both problems.
         """
         other, shared = copy.copy(self), self.objective.shared
         none = tuple(replace(of, numbers=jnp.full_like(of.numbers, -1)) for of in shared)
@@ -157,7 +171,7 @@ class Problem:
         return self.objective.batch
 
     def linear(self, z: Vector, electric: lk.ElectricNoise) -> tuple[Blocks, Blocks]:
-        """Return residual blocks (segment, m) and their Jacobians (segment, m, free)."""
+        """Return residual blocks (segment, m) and their Jacobians (segment, m, free) at z."""
         return linear(self.objective, z, electric)[:2]
 
     def covariance(self, block: str, log_v: Vector) -> Array:
@@ -173,7 +187,10 @@ class Problem:
     def laplace(
         self, z: Vector, log_v: Vector, keep: Vector, alone: bool = False
     ) -> Float[np.ndarray, "free free"]:
-        """Return the covariance of the search vector: inverse information, prior included."""
+        """Return the covariance of the search vector: inverse information, prior included.
+
+        With `alone` every run counts as if it shared no effects with others.
+        """
         jacobian = self.linear(z, self.electric(z, log_v))[1]
         information = variances.precision(self.objective, jacobian, log_v, keep, alone)
         return np.linalg.inv(np.asarray(information))
@@ -181,9 +198,9 @@ class Problem:
     def weighed(
         self, residual: Blocks, log_v: Vector, keep: Vector, effect: Vector
     ) -> "WeighedResiduals":
-        """Return weighed residuals; outliers are judged without the effects they share.
+        """Return weighted residuals; the weights come from residuals less the shared effects.
 
-        `effect` are the shared effects found so far (segment, 3).
+        `effect` holds the latest estimate of the shared effects (segment, 3).
         """
         where = jnp.asarray(log_v), jnp.asarray(keep), jnp.asarray(effect)
         return _weighed(self.objective, residual, *where)
@@ -191,7 +208,12 @@ class Problem:
     def loss(
         self, z: Vector, log_v: Vector, keep: Vector, at: "WeighedResiduals", e: lk.ElectricNoise
     ) -> float:
-        """Return minus the log posterior of numbers and variances, less constants."""
+        """Return minus the log posterior of numbers and variances, up to a constant.
+
+        Args:
+            at: weighted residuals at z and log_v.
+            e: noise that predictions of voltages depend on.
+        """
         nll = float(at.loss) - float(log_jacobian(self.objective, z, e, keep)[0])
         prior_std = np.asarray(self.objective.prior_std(log_v))
         deviation = (np.asarray(z) - self.space.prior_mean) / prior_std
@@ -200,7 +222,7 @@ class Problem:
         return nll + 0.5 * float(np.sum(deviation**2)) + 0.5 * float(np.sum(spread**2))
 
     def electric(self, z: Vector, log_v: Vector) -> lk.ElectricNoise:
-        """Return the noise that voltages are predicted with at these numbers and variances."""
+        """Return the noise that predictions of voltages depend on, at given numbers, variances."""
         return _electric(self.objective, z, log_v)
 
     def voltage_information(
@@ -213,12 +235,12 @@ class Problem:
 
 
 class WeighedResiduals(NamedTuple):
-    """Residuals of a problem at given variances, and the effects that runs share.
+    """Weights of residuals at given variances, and the posterior of the effects that runs share.
 
     Attributes:
-        whitening: weights and roots of residuals less the shared effects.
-        effects: posterior of the shared effects given residuals whitened by these roots.
-        loss: minus log posterior of the residuals, less constants.
+        whitening: weights and whitening roots, from residuals less the shared effects.
+        effects: posterior of the shared effects, given residuals whitened by these roots.
+        loss: minus log likelihood of the residuals, shared effects marginalised, up to a constant.
     """
 
     whitening: Whitening
@@ -303,10 +325,10 @@ def twists(space: Space, batch: lk.Batch, z: Vector) -> tuple[Array, Array]:
 
 
 def fixed_viscosities(data: Runs, runs: Iterable[int] | np.ndarray | None = None) -> list[Choice]:
-    """Return choices that fix viscous terms near zero on floors driven at one speed only.
+    """Return choices that fix the viscous terms near zero on floors driven at one speed only.
 
-    With one speed they cannot be distinguished from creep, and a wrong split of the two is wrong at
-    every other speed.
+    At one speed they cannot be distinguished from creep, and a wrong division between the two makes
+    wrong predictions at every other speed.
     """
     driven: dict[str, list[float]] = {}
     for k in range(len(data)) if runs is None else runs:

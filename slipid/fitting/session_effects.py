@@ -1,15 +1,16 @@
-"""Effects that the runs of one session share beyond the model, and the information they cost.
+"""Effects that the runs of one session share beyond the model, and how they widen its covariance.
 
-Runs driven on one floor at one time slip a little more or less than the model says, all of them
-together: a slip model of the comparison is fitted as if they were independent. After its fit the
-remaining effects of its runs,
+Runs driven on one floor in one session slip a little more or less than the model predicts, all of
+them in the same sense. The slip models of the comparison are fitted as if runs were independent.
+After such a fit the remaining effects of its runs,
 
     a_i = (E_i^T W_i E_i)^-1 E_i^T W_i r_i     along, across, yaw
 
-have a part that is common to the session (E_i moves the residuals by an effect, W_i weighs without
-the run effects). Its variance v is estimated per floor and axis by restricted likelihood, at fixed
-variances of the run effects, in turn with the Student-t weights of the runs, which are outliers
-only for effects that their session does not share; the covariance C of the fitted numbers grows to
+have a part that is common to the session. E_i is the change of the residuals r_i per unit of an
+effect; W_i is the inverse of their covariance without the run effects. The variance v of the common
+part is estimated per floor and axis by restricted likelihood, at fixed variances of the run
+effects. It alternates with the Student-t weights of the runs, so that a run is not down-weighted
+for an effect that its whole session shares. The covariance C of the fitted numbers grows to
 
     C + C (sum_s v u_s u_s^T) C,    u_s = sum_{i in s} J_i^T V_i^-1 E_i
 """
@@ -26,7 +27,7 @@ from slipid.fitting.shared_effects import AXES
 from slipid.fitting.variances import DEGREES
 
 SPREAD = 3.0
-"""Std of the prior of a log variance around the log variance of the run effects."""
+"""Std of the prior of a session effect's log variance, centred on that of the run effects."""
 TURNS = 4
 """Number of alternations between weights and variances."""
 
@@ -37,12 +38,12 @@ class LinearModel:
 
     Attributes:
         gap: predicted less measured increments.
-        slope: derivative of the increments by the numbers.
-        covariance: covariance of the numbers.
-        wide: covariance of the numbers before the floor's own runs were used.
-        scale: noise covariance, the run's own effect included.
+        slope: derivative of the increments by the fitted numbers.
+        covariance: covariance of the fitted numbers.
+        wide: covariance of the fitted numbers before the floor's own runs were used.
+        scale: noise covariance of `gap`, the run's own effect included.
         effect: change of the increments per unit of an effect along, across and in yaw.
-        run: variance of the run's own effects.
+        run: variance of the run's own effects along, across and in yaw.
     """
 
     gap: Float[np.ndarray, "segment m"]
@@ -59,8 +60,8 @@ def with_session_effects(
 ) -> tuple[dict[str, float], Float[np.ndarray, "number number"]]:
     """Return variances `session.<floor>.<axis>`, and the numbers' covariance that includes them.
 
-    A floor driven in only one session has none: shared effects are then part of the floor's
-    numbers.
+    A floor driven in only one session has no such variances: what its runs have in common is then
+    part of the floor's fitted numbers.
     """
     variance: dict[str, float] = {}
     for _ in range(TURNS):
@@ -84,7 +85,10 @@ def floors_and_sessions(w: Windows) -> list[tuple[str, str]]:
 
 
 def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.ndarray, "segment 3"]:
-    """Return the variances of an effect of every segment, zero where there is none."""
+    """Return the variances of one kind of effect along, across and in yaw, for every segment.
+
+    They are zero where `variance` has no entry `<kind>.<floor>.<axis>`.
+    """
     return np.array([[variance.get(f"{kind}.{f}.{axis}", 0.0) for axis in AXES] for f in w.surface])
 
 
@@ -112,7 +116,10 @@ def _variances(
 
 
 def _weights(model: LinearModel, more: np.ndarray) -> np.ndarray:
-    """Return the Student-t weight of every segment, given additional variances of effects."""
+    """Return the Student-t weight of every segment.
+
+    `more` holds variances of effects (segment, 3) that are added to the noise covariance.
+    """
     e = model.effect
     scale = model.scale + np.einsum("nma,na,nla->nml", e, more, e)
     white = np.linalg.solve(scale, model.gap[..., None])[..., 0]
@@ -123,9 +130,9 @@ def _weights(model: LinearModel, more: np.ndarray) -> np.ndarray:
 def remaining_effects(
     gap: np.ndarray, slope: np.ndarray, scale: np.ndarray, effect: np.ndarray, run: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return remaining effects of each run (run, 3), their noise variance and their derivative.
+    """Return remaining effects of each run (run, 3), their noise variances, and their derivative.
 
-    Arguments are those of `LinearModel`.
+    The derivative is by the fitted numbers (run, 3, number). Arguments are those of `LinearModel`.
     """
     plain = scale - np.einsum("nma,na,nla->nml", effect, run, effect)
     by_noise = np.linalg.solve(plain, effect)

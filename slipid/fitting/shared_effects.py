@@ -6,17 +6,18 @@ session. The effect of a run along, across and in yaw is
     e = d(direction, speed, load) + s(session) + own
 
 d is a Gaussian process per floor and axis, with a kernel that is periodic in the direction of
-travel relative to the body, and s one number per floor, axis and session; `own` is in the noise of
-the run. A robot whose wheels are their own mirror image has mirrored errors to either side: equal
-along its direction of travel, opposite across it and in yaw: k(a, b) = k0(a - b) +- h k0(a + b),
-with angles from the axis of the mirror.
+travel relative to the body; s is one number per floor, axis and session; `own` is part of the noise
+of the run. A robot whose wheels are symmetric about an axis has symmetric errors in directions that
+mirror each other: of the same sign along the direction of travel, of opposite sign across it and in
+yaw. The kernel is therefore k(a, b) = k0(a - b) +- h k0(a + b), with angles from the mirror axis.
 
 With r the residuals of a floor's runs, whitened by roots W of their own noise, and coefficients u
 of unit variance, e = S u, the effects are marginalised:
 
     min over u of |W (r - E S u)|^2 + |u|^2,    u^ = C^-1 (W E S)^T W r,    C = 1 + (W E S)^T W E S
 
-(E moves residuals by an effect). Source: Rasmussen and Williams 2006, section 2.7.
+where E is the change of the residuals per unit of an effect. Source: Rasmussen and Williams 2006,
+section 2.7.
 """
 
 from collections.abc import Mapping
@@ -40,20 +41,25 @@ AXES = ("along", "across", "yaw")
 LENGTH = np.radians(10.0)
 """Length scale of the kernel over directions [rad]."""
 SPEED_LENGTH = 0.5
-"""Length scale of the kernel over logarithms of speed."""
+"""Length scale of the kernel over the natural logarithm of speed."""
 OTHER_LOAD = 0.5
 """Correlation of effects with different load set-ups."""
 OTHER_SIDE = 0.7
 """Correlation of effects in mirrored directions, h."""
 _HARMONICS = 15
-"""Number of harmonics of the kernel over directions; those beyond hold 1 % of its variance."""
+"""Number of harmonics of the kernel over directions; higher ones hold 1 % of its variance."""
 _SPEED = 0.25
-"""Step to which logarithms of speed are rounded."""
+"""Step to which natural logarithms of speed are rounded."""
 
 
 @dataclass(frozen=True)
 class SpeedAndLoad:
-    """A speed, as the rounded logarithm of m/s, and a load set-up that were driven on a floor."""
+    """A speed and a load set-up that were driven on a floor.
+
+    Attributes:
+        log_speed: natural logarithm of the speed in m/s, rounded to `_SPEED`.
+        load: load set-up.
+    """
 
     log_speed: float
     load: str
@@ -81,7 +87,7 @@ class TravelConditions:
 
     @staticmethod
     def of(w: Windows, robot: Robot) -> "TravelConditions":
-        """Return the conditions of windows according to the encoders."""
+        """Return the conditions of windows, with directions and speeds from the encoders."""
         displacement = encoder_increments(w, robot)[..., :2].sum(axis=1)
         chord = np.hypot(*displacement.T)
         moves = chord > 0.2 * travel(w, robot)[0].sum(axis=1)
@@ -100,7 +106,10 @@ class TravelConditions:
         )
 
     def around(self) -> Float[np.ndarray, "3 segment harmonic"]:
-        """Return the root of the kernel over directions for the three axes; zero on the spot."""
+        """Return a root of the kernel over directions for each axis: root root^T is the kernel.
+
+        Rows are zero where the robot turns on the spot.
+        """
         mirrored = 0.0 if self.mirror is None else OTHER_SIDE
         wave = 1 / LENGTH**2
         k = np.arange(1, _HARMONICS + 1)
@@ -116,10 +125,10 @@ class TravelConditions:
         return np.stack(root) * np.isfinite(self.direction)[:, None]
 
     def basis(self, known: tuple[SpeedAndLoad, ...]) -> Float[np.ndarray, "3 segment coef"]:
-        """Return the root of the kernel: effects of unit coefficients, from known speeds and loads.
+        """Return a root of the whole kernel: effects per unit coefficient, for fitted conditions.
 
-        Its rows have the norm of those of `around`, less where speed and load differ from the known
-        ones.
+        `known` are the speeds and loads for which there are coefficients. A row has the same norm
+        as that of `around` where its speed and load are among them, and a smaller norm elsewhere.
         """
         if not known:
             return np.zeros((len(AXES), len(self.speed_and_load), 0))
@@ -139,11 +148,11 @@ class SharedEffects(eqx.Module):
     """The effects that the runs on a floor share, as arrays.
 
     Attributes:
-        segments: numbers of the floor's segments.
+        segments: indices of the floor's segments.
         effect: change of their residuals per unit of an effect along, across and in yaw.
-        near: root of the neighbours' kernel by axis and segment.
-        session: 1 for the session of each segment.
-        numbers: numbers of the variances of own, neighbours' and session's effects, -1 for none.
+        near: root of the kernel over driving conditions, by axis and segment.
+        session: 1 in the column of each segment's session, else 0.
+        numbers: indices of the variances (own, neighbours', session; axis), -1 where there is none.
     """
 
     segments: Int[Array, " run"]
@@ -153,14 +162,14 @@ class SharedEffects(eqx.Module):
     numbers: Int[Array, "3 3"]
 
     def root(self, log_v: Float[Array, " variance"]) -> Float[Array, "3 run coef"]:
-        """Return S, by which unit coefficients make effects along, across and in yaw."""
+        """Return S: effects along, across and in yaw per unit coefficient, e = S u."""
         std = jnp.where(self.numbers < 0, 0.0, jnp.exp(0.5 * log_v)[self.numbers])
         parts = [std[k, :, None, None] * x for k, x in ((1, self.near), (2, self.session[None]))]
         return jnp.concatenate(parts, axis=-1)
 
 
 SpeedsAndLoads = dict[str, tuple[SpeedAndLoad, ...]]
-"""Speeds and loads that each floor was driven with."""
+"""Speeds and loads that each floor was driven with, by floor."""
 
 
 def effects_by_floor(
@@ -196,10 +205,10 @@ class EffectPosterior(eqx.Module):
     """Posterior of a floor's shared effects given whitened residuals of its runs.
 
     Attributes:
-        segments: numbers of its segments.
+        segments: indices of the floor's segments.
         span: W E, change of the whitened residuals per unit of an effect.
-        root: S.
-        factor: Cholesky factor of C.
+        root: S, effects per unit coefficient.
+        factor: lower Cholesky factor of C, the precision of the coefficients.
     """
 
     segments: Int[Array, " run"]
@@ -244,9 +253,9 @@ def effect_posteriors(
 def marginal_residuals(
     posteriors: Posteriors, white: Float[Array, "segment m"]
 ) -> Float[Array, " rows"]:
-    """Return whitened residuals less the mean shared effects, followed by the coefficients.
+    """Return whitened residuals less the mean shared effects, followed by the mean coefficients.
 
-    Their square is the quadratic form of the marginal likelihood.
+    The sum of their squares is the quadratic form of the marginal likelihood.
     """
     coefs = [p.coefs(white) for p in posteriors]
     for p, u in zip(posteriors, coefs, strict=True):
@@ -285,12 +294,12 @@ mean_effect_slopes = jax.vmap(mean_effects, in_axes=(None, -1), out_axes=-1)
 
 
 class EffectForecast(NamedTuple):
-    """Shared effects expected in segments.
+    """Shared effects along, across and in yaw that are expected in segments.
 
     Attributes:
         mean: mean effects.
         slope: derivative of the mean by the search vector.
-        covariance: covariance of the effects.
+        covariance: covariance of the effects, given the fitted numbers.
     """
 
     mean: Float[np.ndarray, "segment 3"]
@@ -300,14 +309,14 @@ class EffectForecast(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FittedEffects:
-    """Effects that neighbouring runs on a floor were found to share.
+    """Fitted effects that neighbouring runs on a floor share (the Gaussian process d).
 
     Attributes:
         speeds_and_loads: speeds and loads of these runs.
         std: std of the process along, across and in yaw.
-        coefs: mean of its unit coefficients at the fit.
+        coefs: mean of its coefficients, which have prior variance 1, at the fit.
         by_number: derivative of the coefficients by the search vector.
-        covariance: covariance of the coefficients given the numbers.
+        covariance: covariance of the coefficients given the fitted numbers.
     """
 
     speeds_and_loads: tuple[SpeedAndLoad, ...]
@@ -333,7 +342,10 @@ class FittedEffects:
 def forecast_effects(
     found: Mapping[str, FittedEffects], w: Windows, robot: Robot, free: int
 ) -> EffectForecast:
-    """Return the effects expected in runs on any floor; zero where a floor has no table."""
+    """Return the effects expected in runs on any floor; zero on floors without fitted effects.
+
+    `free` is the length of the search vector.
+    """
     n, axes = len(w), len(AXES)
     out = EffectForecast(np.zeros((n, axes)), np.zeros((n, axes, free)), np.zeros((n, axes, axes)))
     if not found:

@@ -1,8 +1,8 @@
-"""Weights of residuals given their variances, and the variances by Fisher scoring.
+"""Student-t weights of residuals at given variances, and variances estimated by Fisher scoring.
 
-Residuals of a segment are a multivariate Student t with the scale matrix V of `noise`. The
-restricted likelihood of the variances accounts for the numbers having been fitted to the same
-residuals (Patterson and Thompson 1971, Biometrika 58(3)).
+The residuals of a segment have a multivariate Student-t distribution with the scale matrix V of
+`noise`. The restricted likelihood of the variances accounts for the fact that the model's numbers
+were fitted to the same residuals (Patterson and Thompson 1971, Biometrika 58(3)).
 """
 
 from typing import Any, NamedTuple
@@ -29,21 +29,21 @@ from slipid.search_space import Space
 Vector = Array | np.ndarray
 """One-dimensional array of jax or numpy."""
 Search = Float[np.ndarray, " free"]
-"""A search vector, or one number for each of its coordinates."""
+"""A search vector, or one value for each of its coordinates."""
 Variances = Float[np.ndarray, " variance"]
-"""One number for each variance."""
+"""One value for each variance component, usually its log variance."""
 Square = Float[np.ndarray, "free free"]
 """Covariance or information of the search vector."""
 Blocks = dict[str, Array]
-"""An array for every block of residuals: `motion`, `current`, `voltage`, `crossing.*`."""
+"""An array for every block of residuals, by name: `motion`, `current`, `voltage`, `crossing.*`."""
 Noises = dict[str, Components]
 """Covariance components of every block."""
 MOTION_BLOCKS = ("motion", MULTI_FLOOR_MOTION)
-"""Blocks of residuals of the motion; the others are conditional on it."""
+"""Blocks of motion residuals; those of currents and voltages are conditional on the motion."""
 DEGREES = 8.0
-"""Degrees of freedom of the Student-t weight of a run."""
+"""Degrees of freedom of the Student-t distribution of a segment's residuals."""
 VARIANCE_SPREAD = 3.0
-"""Std of the prior of every log variance."""
+"""Std of the prior of every log variance around its typical value."""
 
 
 class Objective(eqx.Module):
@@ -56,9 +56,10 @@ class Objective(eqx.Module):
         blocks: covariance components of every block.
         shared: effects that the runs on each floor share.
         typical: centre of the prior of the log variances.
-        scored: variances that are estimated from the residuals of each segment alone.
-        pooled: number of the prior variance of the space's pooled coordinates.
-        joint: whether there are no currents, so that all numbers are estimated from motion.
+        scored: True for variances that `scoring_step` estimates; run, shared and session effects
+            and load biases have estimators of their own (`slipid.fitting.hierarchy`).
+        pooled: index of the variance that is the prior variance of the space's pooled coordinates.
+        joint: True where no currents are logged, so that all numbers are estimated from motion.
     """
 
     space: Space
@@ -92,15 +93,15 @@ class Whitening(NamedTuple):
 
 
 class VoltageInformation(NamedTuple):
-    """Information of voltages about variances, each (segment, m).
+    """Information of voltages about variances; every array is (segment, m).
 
     Attributes:
-        residual: residual of the voltages in units of their own noise.
-        share: share of this noise in the variance of every residual.
+        residual: voltage residual, divided by `likelihood.voltage_spread` [V].
+        share: ratio of the voltmeter's variance to the whole variance of the undivided residual.
         slope: derivative of the log likelihood by the scatter of the true current.
         information: expected information about that scatter.
-        steeper: curvature of the loss beyond its expectation in the log of the voltage noise, where
-            other variances explain the residuals.
+        steeper: excess of the loss's curvature by the log of the voltage noise over its expected
+            value; it is large where other variances explain the residuals.
     """
 
     residual: Array
@@ -122,7 +123,7 @@ def voltage_information(
         at = lk.ElectricNoise(noise.voltage_std, scatter, noise.resistance)
         return lk.electric_residuals(robot, b, motor_force, at)["voltage"], lk.voltage_spread(b, at)
 
-    # every residual depends on its own scatter only: one product gives all derivatives
+    # a residual depends on the scatter of its own window only: one jvp gives all derivatives
     (r, spread), (more, wider) = jax.jvp(scaled, (noise.scatter,), (jnp.ones_like(noise.scatter),))
     variance, m, wider = noise.voltage_std**2, r.shape[1], wider / spread
     weight = (DEGREES + m) / (DEGREES + jnp.sum(r**2, axis=1, keepdims=True) / variance)
@@ -135,7 +136,7 @@ def voltage_information(
 
 @eqx.filter_jit
 def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> Whitening:
-    """Return the weights of residuals; `keep` is 1 for segments that count."""
+    """Return weights and whitening roots of residuals; `keep` is 1 for segments that count."""
     roots, weights, loss = {}, {}, jnp.zeros(())
     for k, r in residual.items():
         inverse = inverse_root(noises[k].covariance(log_v))
@@ -150,7 +151,7 @@ def whitening(noises: Noises, residual: Blocks, log_v: Vector, keep: Vector) -> 
 
 @eqx.filter_jit
 def whitened(noises: Noises, jacobian: Blocks, log_v: Vector, keep: Vector) -> Blocks:
-    """Return Jacobians H (segment, m, free) such that H^T H is a segment's expected information."""
+    """Return whitened Jacobians H (segment, m, free); H^T H is a segment's expected information."""
     out = {}
     for k, jac in jacobian.items():
         factor = jnp.asarray(keep)[noises[k].segments] * expected(noises[k].count)
@@ -165,7 +166,7 @@ def precision(
 ) -> Array:
     """Return the expected information of the search vector, prior included (free, free).
 
-    Shared effects are marginalised; with `alone` every run counts as if it shared none.
+    Shared effects are marginalised; with `alone` every run counts as if it shared no effects.
     """
     prior = jnp.diag(1 / objective.prior_std(log_v) ** 2)
     total, of_motion = prior, prior
@@ -189,16 +190,20 @@ def expected_posteriors(objective: Objective, log_v: Vector, keep: Vector) -> Po
 
 
 def expected(m: Array | float | int) -> Any:
-    """Return the Fisher information of an m-dimensional Student-t location over the Gaussian's."""
+    """Return the ratio of a Student t's Fisher information about its location to a Gaussian's.
+
+    The distribution has m dimensions, and the Gaussian has the same scale matrix.
+    """
     return (DEGREES + m) / (DEGREES + m + 2)
 
 
 def _cut(total: Array, of_motion: Array, e: Array) -> Array:
     """Return the information of p(motion | motion data) p(electric | motion, all data).
 
-    Where wheels stand on several floors, motion depends on their friction, which is electric: it is
-    marginalised in the first factor as if currents contained no information about it. The estimate
-    of the motion does follow the friction from currents: its interval is rather too wide there.
+    Where wheels stand on several floors, motion depends on their friction, which is one of the
+    electric numbers `e`. The first factor marginalises friction as if currents contained no
+    information about it, although the estimated motion does use the friction from currents. The
+    intervals of the motion numbers are therefore somewhat too wide there.
     """
     first = of_motion - _schur_term(of_motion, e)
     motion = ~e[:, None] & ~e[None, :]
@@ -216,7 +221,8 @@ def _schur_term(information: Array, e: Array) -> Array:
 def fitted_covariance(objective: Objective, jacobian: Blocks, log_v: Array, keep: Array) -> Blocks:
     """Return the residuals' covariance due to fitted numbers and shared effects (segment, m, m).
 
-    The Jacobian is that of the structural numbers; the shared effects follow them.
+    The Jacobian is by the search vector, at fixed shared effects; their dependence on the search
+    vector is added here.
     """
     cov = jnp.linalg.inv(precision(objective, jacobian, log_v, keep))
     posteriors = expected_posteriors(objective, log_v, keep)
@@ -246,9 +252,9 @@ def scoring_step(
 ) -> Array:
     """Return the log variances after one Fisher-scoring step of the restricted likelihood.
 
-    Residuals are those of any model, less shared effects. `spread` is their covariance due to what
-    was fitted to them (segment, m, m); the degrees of freedom spent there are not available to the
-    variances.
+    `residual` are those of any model, less shared effects. `spread` is their covariance due to the
+    numbers and effects that were fitted to them (segment, m, m); it corrects the variances for the
+    degrees of freedom that the fit has used.
     """
     _, weights, _ = whitening(objective.blocks, residual, log_v, keep)
     score, steeper = jnp.zeros(log_v.shape[0]), jnp.zeros(log_v.shape[0])
@@ -271,7 +277,7 @@ def scoring_step(
             steeper = steeper.at[which].add((kept * jnp.sum(voltage.steeper, axis=1))[:, None])
         others = () if voltage is None else ("current",)
         if k in (MULTI_FLOOR_MOTION, MULTI_FLOOR_CURRENT, *others):
-            # the curvature grows where a log variance falls: the slope is in proportion to it
+            # where a log variance falls, the loss curves more than expected, by the size of slope
             steeper = steeper.at[which].add(-slope)
     score -= (log_v - objective.typical) / VARIANCE_SPREAD**2
     info = information(objective.blocks, log_v, keep, voltage)
@@ -297,7 +303,7 @@ def information(
         info = info.at[which[:, :, None], which[:, None, :]].add(kept * cross)
     if voltage is None:
         return info
-    # voltages also depend on the scatter of the currents
+    # the variance of voltage residuals also depends on the scatter of the true currents
     noise = noises["current"]
     grown = jnp.exp(log_v)[noise.which][..., None] * noise.single
     kept = jnp.asarray(keep)[noise.segments]
@@ -307,7 +313,10 @@ def information(
 
 
 def _scaled_base(noise: Components, block: str, voltage: VoltageInformation | None) -> Array:
-    """Return a block's covariance components, scaled by their noise's share in its residuals."""
+    """Return a block's covariance components; those of voltages times `VoltageInformation.share`.
+
+    Voltage residuals have been divided by their spread, and so must be their components.
+    """
     if voltage is None or block != "voltage":
         return noise.base
     root = jnp.sqrt(voltage.share)
@@ -317,7 +326,7 @@ def _scaled_base(noise: Components, block: str, voltage: VoltageInformation | No
 def inverse_root(v: Float[Array, "segment m m"]) -> Float[Array, "segment m m"]:
     """Return L^-1 of V = L L^T for many small matrices at once, column by column.
 
-    Written out because batched LAPACK calls that run beside each other inside one compiled function
+    It is written out because batched LAPACK calls that run in parallel inside one compiled function
     can deadlock on a computer with two cores (jax 0.10).
     """
     a = jnp.moveaxis(v, 0, -1)

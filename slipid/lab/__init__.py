@@ -1,1 +1,1 @@
-"""What judges: test site, self test, trial, benchmark, published systems, the 2021 paper."""
+"""Evaluation of slipid: test site, self test, trial, benchmark, published systems, 2021 paper."""

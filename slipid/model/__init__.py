@@ -1,1 +1,1 @@
-"""Physics of one instant: geometry, motor, slip, contact."""
+"""Physics of a robot in steady motion: geometry, motors, slip, contact forces, and the camera."""

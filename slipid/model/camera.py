@@ -10,9 +10,9 @@ from jaxtyping import Array, Float, Int
 from slipid.parameter import parameter
 
 known = partial(parameter, free=False)
-"""A number that stays fixed unless the user frees it."""
+"""Declaration of a number that stays fixed unless the user frees it."""
 plane = partial(known, of="axis")
-"""A fixed vector in the plane, x and y."""
+"""Declaration of a vector (x, y) in the plane that stays fixed unless the user frees it."""
 
 
 class Camera(eqx.Module):
@@ -44,9 +44,9 @@ class Camera(eqx.Module):
     sessions: tuple[str, ...] = eqx.field(static=True, default=())
 
     def corrected(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Return a logged pose in true metres, its heading turned as the map turns it.
+        """Return a logged pose in true metres, the heading rotated as the map rotates directions.
 
-        The marker yaw stays in the heading.
+        The heading is still that of the marker: the marker yaw is not subtracted.
         """
         u = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
         place, turned = jax.jvp(self._ground, (pose[:2],), (u,))
@@ -56,8 +56,8 @@ class Camera(eqx.Module):
     def logged(self, pose: Float[Array, "3"]) -> Float[Array, "3"]:
         """Return the logged pose of a true pose: the inverse of `corrected`, by iteration.
 
-        Every iteration shrinks the error by the nonlinearity of the map, a few percent across a
-        picture.
+        Every iteration reduces the error to the fraction by which the map is not linear, a few
+        percent across an image.
         """
         step = jnp.stack([self.scale, self.scale, jnp.ones(())])
         q = (pose / step).at[:2].add(jnp.asarray(self.centre))
@@ -84,7 +84,10 @@ class Camera(eqx.Module):
         return self.scale * bent / (1 + self.tilt @ q)
 
     def yaw(self, session: Int[Array, ""] | int) -> Float[Array, ""]:
-        """Return the marker's heading less the body's in a session; -1 is an unknown one."""
+        """Return the marker's heading less the body's [rad] in a session.
+
+        Session -1, which was not fitted, has the heading without a session's deviation.
+        """
         if not self.sessions:
             return self.marker_yaw
         own = jnp.where(session >= 0, self.session_yaw[session], 0.0)

@@ -19,16 +19,23 @@ from slipid.model.geometry import WheelFrame
 from slipid.model.se2 import Columns, Planar, solve3
 
 _CHORD_STEPS = 30
+"""Number of chord steps of `_solve`."""
 _NEWTON_STEPS = 8
+"""Number of damped Newton steps of `_solve`, after the chord steps."""
 _DAMPING = (1.0, 0.3, 0.05)
+"""Factors of Newton's step that are tried in each damped step."""
 _ROUNDING = 1e-20
+"""Squared residual force [(mu m g)^2] below which no better step exists because of rounding."""
 _NEAR = 1e-6
+"""Largest component of the last step with which `_solve_near` has converged [m/s], [rad/s]."""
 _MOST_NEAR = 12
+"""Largest number of Newton steps of `_solve_near`."""
 CHORD, NEWTON = 4, 2
-"""Number of steps of each kind that `settle` takes from the twist of the previous time step.
+"""Numbers of chord and of Newton steps that `settle` takes from the previous time step's twist.
 
 With wheel speeds that change by up to 1.25 rad/s per time step and three floors, 99 % of all twists
-are then within 3 mm/s (20 mm/s with 2 and 3 steps), half of them within rounding.
+are then within 3 mm/s of the equilibrium (20 mm/s with 2 and 3 steps), and half of them within
+rounding errors.
 """
 
 
@@ -65,7 +72,7 @@ def _damped(balance: Balance, xi: Planar) -> Planar:
     damping = jnp.asarray(_DAMPING)
     tried = jax.vmap(merit)(damping)
     best = jnp.argmin(tried)
-    # where all wheels slide, the balance is nearly flat and Newton's step leads far away
+    # where all wheels slide, forces hardly depend on the twist and Newton's step leads far away
     stuck = (tried[best] >= before) & (before > _ROUNDING)
     return jax.tree.map(partial(jnp.where, stuck), balance.chord(xi), less(damping[best]))
 
@@ -110,7 +117,7 @@ OneProblem = tuple[ContactProblem]
 def _implicit_derivative(
     root: Callable[[ContactProblem], Array],
 ) -> Callable[[OneProblem, OneProblem], tuple[Array, Array]]:
-    """Return the derivative rule of a root of the balance by its inputs."""
+    """Return the JAX derivative rule of a root finder, by the implicit function theorem."""
 
     def rule(primals: OneProblem, tangents: OneProblem) -> tuple[Array, Array]:
         xi = root(*primals)
@@ -151,8 +158,8 @@ def equilibrium(
         surface: one floor, or one under each wheel.
         rest: load shares at rest, sum 1.
         near: a twist so close to the root that plain Newton steps converge, which is about ten
-            times cheaper; the result is NaN where they do not. The last step is below 1e-6, so the
-            remaining error is about its square.
+            times cheaper; the result is NaN where they do not. The last step is below 1e-6 m/s or
+            rad/s, so that the remaining error is of the order of its square.
 
     Source: the balance at the head of `slipid.model.contact_law`.
     """
@@ -168,7 +175,7 @@ def traction(
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
 ) -> Float[Array, " wheel"]:
-    """Return the traction along the drive of each wheel that its motor works against [mu m g]."""
+    """Return the traction of each wheel that its motor works against, along the drive [mu m g]."""
     return Balance(rim, stand(frame, surface, rest)).motor_force(Planar(*xi))
 
 
@@ -179,9 +186,10 @@ def rolling_drag(
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
 ) -> Float[Array, " wheel"]:
-    """Return the drag of each wheel along its drive if it equals that of its rollers [mu m g].
+    """Return the rolling drag of each wheel along its drive, for `Motor.rolling_drag` 1 [mu m g].
 
-    It counts in units of `Motor.rolling_drag`; the motor works against it, the body does not.
+    At that value a wheel that rolls along its drive has as much drag as its rollers have. The motor
+    works against this drag; it exerts no force on the body.
     """
     return Balance(rim, stand(frame, surface, rest)).rolling_drag(Planar(*xi))
 
@@ -191,15 +199,16 @@ def settle(
 ) -> tuple[Float[Array, "3 floors"], Float[Array, "wheel floors"]]:
     """Return the equilibria on many floors at once, and the tractions, from recent twists.
 
-    It takes a few chord steps, then Newton steps where these reduce the residual: made for a
-    robot's computer. Where a number is not finite, the twist is that without slip. What remains
-    after a jump of the wheel speeds is settled by the next call.
+    A few chord steps are followed by Newton steps, which are kept where they reduce the residual
+    force; the fixed small number of steps suits a robot's own computer. Where the result is not
+    finite, the twist is that without slip. The error that remains after a jump of the wheel speeds
+    is removed in the following calls.
 
     Args:
         start: twists [m/s, m/s, rad/s].
-        rim: rim speeds of one robot (wheel,), or of one for every column (wheel, floors) [m/s].
+        rim: rim speeds, the same on all floors (wheel,) or by column (wheel, floors) [m/s].
         on: how the robot stands on each combination of floors, arrays (wheel, floors).
-        plain: twist per rim speed without slip, J^+.
+        plain: J^+, body twist without slip per rim speed.
 
     Returns:
         Twists, and tractions [m g mean(mu)].

@@ -1,8 +1,8 @@
-"""Balance of the contact forces of one robot, of many at once, or of one on many floors.
+"""Balance of the contact forces of one robot, of many robots at once, or of one on many floors.
 
-Wheels are the first axis of every array and the batch, if there is one, the others; sums over
-wheels and over x, y, yaw are written out. Nothing is a matrix product then, so that XLA makes few
-loops over contiguous numbers of it; every loop costs it at least 0.2 us.
+Wheels are the first axis of every array; the batch, if there is one, follows. Sums over wheels and
+over x, y, yaw are written out instead of matrix products, so that XLA compiles them to few loops
+over contiguous numbers: each loop costs at least 0.2 us.
 """
 
 from dataclasses import replace
@@ -18,6 +18,7 @@ from slipid.model.geometry import WheelFrame
 from slipid.model.se2 import Columns, Planar, dot, solve3
 
 _LEAST_LOAD = 1e-3
+"""Smallest load share in a chord step; a lifted wheel has a negative share."""
 
 
 class Stance(eqx.Module):
@@ -25,12 +26,13 @@ class Stance(eqx.Module):
 
     Attributes:
         frame, rest: wheel directions and apparent load shares at rest, with an axis for the batch.
-        hold, roll, shift: rows of the frame by the components of a twist, each (wheel, *one).
-        floor: numbers under each wheel or under all; friction is relative to its mean, scrub and
-            lead are means over the loads, and the roller numbers are those of `law.sideways`.
+        hold, roll, shift: matrices of `frame`, split by component of the twist, each (wheel, *one).
+        floor: floor parameters under each wheel or under all; friction is relative to its mean,
+            scrub and lead are means over the loads, and the roller parameters are those of
+            `law.sideways`.
         drag_onset: roller speed below which drag is viscous [m/s].
-        friction: mean over the wheels; forces are in units of it times m g.
-        roller_scale: roller drag of each wheel under an even load.
+        friction: mean friction coefficient of the wheels; forces are in units of friction m g.
+        roller_scale: roller drag of each wheel if all wheels carry the same load.
     """
 
     frame: WheelFrame
@@ -45,7 +47,10 @@ class Stance(eqx.Module):
 
 
 def stand(frame: WheelFrame, surface: ContactSurface, rest: Float[Array, " wheel"]) -> Stance:
-    """Return a robot's stance on one floor (leaves are numbers) or one per wheel (wheel, batch)."""
+    """Return a robot's stance on one floor, or on one floor per wheel.
+
+    The leaves of `surface` are single numbers for one floor, else arrays (wheel, *batch).
+    """
     floor, friction = replace(surface, friction=jnp.ones(())), surface.friction
     if jnp.ndim(friction) > 0:
         ones = (1,) * (jnp.ndim(friction) - 1)
@@ -99,7 +104,7 @@ class Balance(eqx.Module):
         by_along = -w.traction.by_speed() - w.resistance.by_speed()
         across = (w.traction.by_activity() - w.resistance.by_activity()) * by_roll
         rolls = -w.drag.by_speed() - w.drag.by_activity() * by_roll
-        turned: Array | float = 0.0  # drag along the rollers by the speed along the drive
+        turned: Array | float = 0.0  # derivative of the drag along rollers by the speed along drive
         if rows.frame.ordinary:
             across = across + rows.frame.grip * w.traction.by_beside()
             turned = load * rows.frame.grip * w.drag.by_beside()
@@ -119,18 +124,18 @@ class Balance(eqx.Module):
         return Columns(x, y, yaw._replace(yaw=yaw.yaw - scrub))
 
     def newton(self, xi: Planar) -> Planar:
-        """Return Newton's step, to be subtracted from the twist."""
+        """Return Newton's step, which is to be subtracted from the twist."""
         return solve3(self.jacobian(xi), self.force(xi))
 
     def chord(self, xi: Planar) -> Planar:
         """Return the twist that balances the forces when each is replaced by its chord.
 
-        Each force is replaced by the line through zero speed and its value at xi (Weiszfeld's
-        iteration). Since tanh(x) / x falls with |x|, no step overshoots where Newton's does; near
-        the root it is slow.
+        A chord is the line through zero at zero speed and through the force at xi (Weiszfeld's
+        iteration). Since tanh(x) / x falls with |x|, chord steps do not overshoot as Newton's do;
+        near the root they converge slowly.
         """
         on, f, w = self.on, self.on.frame, self.wheels(*self._speeds(xi))
-        # the chord of a lifted wheel would have the wrong sign
+        # a lifted wheel's load share is negative, which would give its chords the wrong sign
         load = law.load_force(jnp.maximum(self.share(xi), _LEAST_LOAD), on.floor)
         pulls, rolls = load * w.traction.chord(), load * w.drag.chord()
         both = pulls + load * w.resistance.chord()
@@ -147,16 +152,16 @@ class Balance(eqx.Module):
         return solve3(m, drive)
 
     def motor_force(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Return the traction that each motor works against."""
+        """Return the traction that each motor works against [mean(mu) m g]."""
         f = self.on.frame
         return self.load(xi) * self.wheels(*self._speeds(xi)).motor_force(
             f.drive_share, f.roller_share
         )
 
     def rolling_drag(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Return the drag of rolling along the drive, if it equals that of the rollers.
+        """Return the rolling drag of each wheel along its drive, for `Motor.rolling_drag` 1.
 
-        Only the motors work against it.
+        Only the motors work against it; it exerts no force on the body.
         """
         _, roll = self._speeds(xi)
         return self.on.roller_scale * law.rolling_fraction(
@@ -164,7 +169,7 @@ class Balance(eqx.Module):
         )
 
     def size(self, force: Planar) -> Float[Array, "*batch"]:
-        """Return the squared size of a force, its moment taken over the base radius."""
+        """Return the squared size of a force, with its moment divided by the base radius."""
         return force.x**2 + force.y**2 + (force.yaw / self.on.frame.base) ** 2
 
     def share(self, xi: Planar) -> Float[Array, "wheel *batch"]:
@@ -172,7 +177,7 @@ class Balance(eqx.Module):
         return law.load_shift(xi, self.on.rest, self.on.shift, self.on.floor.lead)
 
     def load(self, xi: Planar) -> Float[Array, "wheel *batch"]:
-        """Return friction times load of every wheel, relative to mean(mu) m g."""
+        """Return friction coefficient times load of every wheel, divided by mean(mu) m g."""
         return law.load_force(self.share(xi), self.on.floor)
 
     def wheels(self, along: Array, roll: Array) -> WheelForces:

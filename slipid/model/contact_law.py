@@ -16,21 +16,21 @@ load share, v^ the direction of motion, and forces in units of mu m g:
     0     = sum J_i^T T_i + K_i^T D_i + (0, 0, -cz tanh(W / W0))
 
 These equations are for omni wheels. Where rollers stand at an angle g to the drive, vs_i is r w_i
-sin g less the speed along the direction in which the rollers do not give way, and r w_i cos g is
-subtracted from q_i. Ordinary wheels grip sideways as they do ahead, and friction acts against their
-total sliding: with m_i = sqrt(vs_i^2 + q_i^2) the first terms of T_i and D_i are
+sin g less the speed along the direction in which the rollers do not roll, and r w_i cos g is
+subtracted from q_i. Ordinary wheels have the same friction sideways as ahead, and it acts against
+their total sliding: with m_i = sqrt(vs_i^2 + q_i^2) the first terms of T_i and D_i are
 
     N_i tanh(m_i / (v0 + s0 c_i)) vs_i / m_i,     -N_i tanh(m_i / (v0 + s0 c_i)) q_i / m_i
 
 Wheels may stand on different floors. Forces are then in units of mean(mu) m g, each wheel's
 weighted by mu_i / mean(mu), and b and cz are means over the loads. Creep and rolling resistance are
-rate-independent (s0 is a slip *ratio*): with a resistance that sets in at 20 mm/s instead, runs
-faster than the fitted ones are predicted worse.
+rate-independent (s0 is a slip *ratio*): with a resistance that sets in at a fixed speed of 20 mm/s
+instead, runs faster than the fitted ones are predicted worse.
 
 Friction grows linearly with the load and drag faster: with N^(4/3) where bodies deform elastically
-(Hertz), up to N^2 where wheels sink in (Bekker). This is how motion distinguishes a load from a
-drag. Errors of the law bend the loads that a single floor would suggest; delta, per floor, absorbs
-them.
+(Hertz), up to N^2 where wheels sink in (Bekker). This difference lets motion distinguish a larger
+load on a wheel from a larger drag. Errors of the law would bias the load shares that are fitted on
+a single floor; the load bias delta of each floor absorbs them.
 
 Every function here is elementwise: it takes arrays of any shapes that broadcast.
 """
@@ -48,7 +48,7 @@ from slipid.model.se2 import Planar
 from slipid.parameter import parameter
 
 _LIFTED = 0.03
-"""Load relative to an even one below which drag falls no faster than the load."""
+"""Load over the mean wheel load below which drag is in proportion to the load (p has no effect)."""
 V0 = 0.002
 """Sliding speed below which traction is viscous [m/s]."""
 VR = 0.001
@@ -60,9 +60,9 @@ W0 = 0.05
 
 
 _STILL = 1e-6
-"""Sliding speed that is treated as zero [m/s]."""
+"""Sliding speed added in quadrature, so that its magnitude is smooth at standstill [m/s]."""
 positive = partial(parameter, lower=0.0)
-"""A number above zero."""
+"""Declaration of a number above zero."""
 
 
 class ContactSurface(eqx.Module):
@@ -105,9 +105,10 @@ class ContactSurface(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True, default=())
 
     def at(self, index: Int[Array | np.ndarray, "..."] | int) -> "ContactSurface":
-        """Return surface number `index` of the stack (may be traced), or the one under each wheel.
+        """Return the surface at `index` of the stack, or the surface under each wheel.
 
-        An index per wheel has the wheels first. The load bias of each wheel is then its own.
+        `index` may be traced. With an index per wheel, wheels are the first axis, and each wheel
+        has the load bias that the floor under it declares for this wheel.
         """
         bias = self.load_bias[index]
         if jnp.ndim(index):
@@ -115,7 +116,7 @@ class ContactSurface(eqx.Module):
         return replace(jax.tree.map(lambda leaf: leaf[index], self), load_bias=bias)
 
     def mixed(self, share: Float[Array, "wheel floor"]) -> "ContactSurface":
-        """Return the mean floor under each wheel, for the shares of the floors there."""
+        """Return the floor under each wheel as a mean of all floors, weighted by `share`."""
         bias = jnp.sum(share * self.load_bias.T, axis=1)
         return replace(jax.tree.map(lambda leaf: share @ leaf, self), load_bias=bias)
 
@@ -128,12 +129,13 @@ class Friction(eqx.Module):
 
     Attributes:
         speed: sliding or rolling speed [m/s].
-        onset: speed at which the force is nearly saturated [m/s], linear in the wheel's activity.
+        onset: speed at which the force reaches tanh(1) = 76 % of `top` [m/s]; it is linear in the
+            wheel's activity.
         ratio: derivative of the onset by the activity.
         top: saturated force.
         viscosity: force per speed.
-        beside: component of the sliding at right angles [m/s]; None where components are
-            independent.
+        beside: component of the sliding at right angles to `speed` [m/s]; None where friction in
+            one direction does not depend on sliding in the other.
     """
 
     speed: Array
@@ -163,7 +165,7 @@ class Friction(eqx.Module):
         return self.top * (self._slope() + self._bent() * self.speed**2) + self.viscosity
 
     def by_beside(self) -> Array | float:
-        """Return the derivative by the sliding at right angles."""
+        """Return the derivative of the force by the sliding at right angles, `beside`."""
         if self.beside is None:
             return 0.0
         return self.top * self._bent() * self.speed * self.beside
@@ -173,7 +175,7 @@ class Friction(eqx.Module):
         return -(self._steep() / self.onset) * (self.speed / self.onset) * self.ratio
 
     def _steep(self) -> Array:
-        """Return top (1 - tanh^2), the slope of the saturating term in units of the onset."""
+        """Return top (1 - tanh^2(m / onset)), the slope of the saturating term times the onset."""
         return self.top * (1 - jnp.tanh(self._size() / self.onset) ** 2)
 
     def _size(self) -> Array:
@@ -198,8 +200,9 @@ class WheelForces(eqx.Module):
 
     Attributes:
         active: c, rim and roller speed combined [m/s].
-        traction, resistance: forces ahead and back along the drive.
-        drag: force back along the rollers.
+        traction: force on the body ahead along the drive.
+        resistance: rolling resistance, backward along the drive.
+        drag: drag against the speed along the rollers.
     """
 
     active: Array
@@ -212,11 +215,11 @@ class WheelForces(eqx.Module):
         return self.traction.force() - self.resistance.force()
 
     def motor_force(self, drive_share: Array, roller_share: Array) -> Array:
-        """Return the force on the motor, for the wheel's two shares of the frame.
+        """Return the force that the motor works against; arguments are those of `WheelFrame`.
 
-        Rolling resistance counts as a force on the body only; the part that the motor bears is in
-        its own friction. Rollers at an angle (mecanum) transmit a part of the force that holds the
-        wheel and a part of their drag.
+        Rolling resistance acts on the body only; the part that acts on the motor is included in the
+        motor's own friction. Rollers at an angle (mecanum) transmit a part of the traction and a
+        part of their drag to the motor.
         """
         return self.traction.force() * drive_share - self.drag.force() * roller_share
 
@@ -224,15 +227,18 @@ class WheelForces(eqx.Module):
 def wheel_traction(
     slide: Array, active: Array, floor: ContactSurface, beside: Array | None = None
 ) -> Friction:
-    """Return the traction at a sliding speed; `beside` is that across, without rollers."""
+    """Return the traction at a sliding speed along the drive.
+
+    `beside` is the sliding speed across, for wheels without rollers.
+    """
     onset = V0 + floor.creep * active
     return Friction(slide, onset, floor.creep, 1.0, floor.slide_viscosity, beside)
 
 
 def rolling_fraction(rim: Array, roll: Array, drive_share: Array) -> Array:
-    """Return (r w / c) |r w / c|, the signed fraction of a wheel's motion along its drive.
+    """Return (r w / c) |r w / c|, to which rolling drag along the drive is in proportion.
 
-    Rolling drag along the drive is in proportion to it.
+    It is the signed square of the rim speed over the wheel activity c.
     """
     along = rim * drive_share * jax.lax.rsqrt(rim**2 + roll**2 + 1e-12)
     return along * jnp.abs(along)
@@ -244,7 +250,7 @@ def scrub_moment(yaw_rate: Array, scrub: Array) -> Friction:
 
 
 def at_load(floor: ContactSurface, relative: Array) -> ContactSurface:
-    """Return the floor for a wheel at rest with a given load relative to an even one."""
+    """Return the floor with the drags of a wheel that carries `relative` times the mean load."""
     grown = jnp.maximum(relative, _LIFTED) ** (floor.drag_exponent - 1)
     return replace(
         floor,
@@ -254,15 +260,16 @@ def at_load(floor: ContactSurface, relative: Array) -> ContactSurface:
 
 
 def apparent_load(rest: Float[Array, "wheel *one"], bias: Array) -> Float[Array, "wheel *batch"]:
-    """Return apparent load shares at rest, for a floor's load biases (wheel, *batch) or 0."""
+    """Return load shares at rest with a floor's load biases (wheel, *batch), or 0 for none."""
     seen = rest * jnp.exp(bias)
     return seen / sum(seen[1:], start=seen[0])
 
 
 def sideways(floor: ContactSurface, grip: Array) -> tuple[ContactSurface, Array]:
-    """Return the floor for a wheel without rollers (grip 1) or with (0), and its drag onset [m/s].
+    """Return the floor with the sideways friction of each wheel, and its drag onset [m/s].
 
-    An ordinary wheel grips sideways as it does ahead.
+    `grip` is 1 for a wheel without rollers, whose friction sideways is the same as ahead, and 0 for
+    a wheel with rollers.
     """
     free = 1 - grip
     out = replace(
@@ -289,8 +296,8 @@ def wheel_forces(
         along, roll, rim: J xi, q and r w of the module docstring.
         drive_share: `WheelFrame.drive_share`.
         at_rest, floor: results of `sideways`.
-        grip: `WheelFrame.grip` of a robot with wheels without rollers, where friction acts against
-            the total sliding; None for a robot without such wheels.
+        grip: `WheelFrame.grip` of a robot that has wheels without rollers, whose friction acts
+            against the total sliding; None for a robot with rollers on all wheels.
     """
     active = jnp.sqrt(rim**2 + roll**2 + 1e-12)
     onset, slide = at_rest + floor.roller_creep * active, rim * drive_share - along
@@ -310,6 +317,6 @@ def load_force(load: Array, floor: ContactSurface) -> Array:
 
 
 def load_shift(xi: Planar, rest: Array, shift: Float[Array, "2 wheel *one"], lead: Array) -> Array:
-    """Return load shares in motion, shifted by contacts that lead along the motion [m]."""
+    """Return load shares in motion, where contacts lead the wheel centres by `lead` [m]."""
     inv = jax.lax.rsqrt(xi.x**2 + xi.y**2 + 1e-8)
     return rest - lead * (shift[0] * (xi.x * inv) + shift[1] * (xi.y * inv))

@@ -1,4 +1,7 @@
-"""Wheel positions and drive directions (Indiveri 2009, IEEE T-RO 25(1))."""
+"""Geometry of a robot's wheels: positions, drive and roller directions, and drives.
+
+Source: Indiveri 2009, IEEE T-RO 25(1).
+"""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +16,10 @@ from jaxtyping import Array, Float
 from slipid.parameter import parameter
 
 _MIRRORED = 0.01
-"""Largest distance of a wheel from its mirror image: base radii, or twice the radians of a line."""
+"""Largest difference of a wheel from a mirror image, for `Geometry.mirror`.
+
+It limits distances, in base radii, and twice the angle between lines [rad].
+"""
 
 
 class Geometry(eqx.Module):
@@ -82,7 +88,7 @@ class Geometry(eqx.Module):
 
     @property
     def drives(self) -> int:
-        """Number of drives: as many angles, currents and voltages are logged."""
+        """Number of drives, which is also the number of logged angles, currents and voltages."""
         return len(set(self.drive_of)) if self.drive_of else self.wheels
 
     @property
@@ -91,15 +97,15 @@ class Geometry(eqx.Module):
         return int(np.linalg.matrix_rank(np.asarray(self.forward()), tol=1e-6)) == 3
 
     def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """Return the value of every wheel's drive, such as its speed."""
+        """Return the values of drives at their wheels, such as the speed of every wheel."""
         return at_wheels(self.drive_of, of_drives)
 
     def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
-        """Return the sum over every drive's wheels, such as their torque."""
+        """Return the sums of wheels' values by drive, such as the torque of every drive."""
         return at_drives(self.drive_of, of_wheels)
 
     def frame(self) -> "WheelFrame":
-        """Return the wheels as rows of matrices, at the current radius, base and offsets."""
+        """Return the wheels as rows of matrices, for the current radii and drive offsets."""
         return _wheel_frame(
             jnp.asarray(self.place) * self.base_radius,
             jnp.asarray(self.drive_angle) + self.drive_offset,
@@ -127,9 +133,9 @@ class Geometry(eqx.Module):
     def mirror(self) -> float | None:
         """Return the axis about which the wheels are their own mirror image [rad], or None.
 
-        The axis ahead is tried before the sideways one. Wheels are compared by their positions and
-        by the lines of their drives and rollers, with a tolerance for a config that was measured by
-        hand.
+        The longitudinal axis (0) is tried before the lateral one (pi / 2). Wheels are compared by
+        their positions and by the lines of their drives and rollers, with the tolerance `_MIRRORED`
+        for positions that were measured by hand.
         """
         drive = np.asarray(self.drive_angle)
         free = np.where(self.grips, drive, drive - np.asarray(self.roller_angle))
@@ -144,9 +150,9 @@ class Geometry(eqx.Module):
         return None
 
     def forward(self) -> Float[Array, "drive 3"]:
-        """Return J: rim speed r w of each drive without slip [m/s] from the body twist.
+        """Return J, which gives the rim speed r w of each drive [m/s] from a twist without slip.
 
-        The value of a drive with several wheels is their mean.
+        The row of a drive with several wheels is the mean over its wheels.
         """
         frame = self.frame()
         of_wheels = frame.hold / frame.drive_share[:, None]
@@ -156,9 +162,9 @@ class Geometry(eqx.Module):
         return jnp.asarray((share / share.sum(axis=0)).T) @ of_wheels
 
     def pseudo_inverse(self) -> Float[Array, "3 drive"]:
-        """Return J^+: the smallest body twist that comes nearest to the drives' rim speeds [m/s].
+        """Return J^+, which gives the least-squares body twist from the drives' rim speeds [m/s].
 
-        Wheels that all point ahead do not determine motion sideways: it is then zero.
+        Wheels that all point ahead do not determine motion sideways; J^+ gives zero for it.
         """
         return jnp.asarray(np.linalg.pinv(np.asarray(self.forward()), rcond=1e-6))
 
@@ -166,14 +172,14 @@ class Geometry(eqx.Module):
 def at_wheels(
     drive_of: tuple[int, ...], of_drives: Float[Array, "*batch drive"]
 ) -> Float[Array, "*batch wheel"]:
-    """Return the value of every wheel's drive; `drive_of` as in `Geometry`."""
+    """Return the values of drives at their wheels; `drive_of` as in `Geometry`."""
     return of_drives[..., jnp.asarray(drive_of)] if drive_of else of_drives
 
 
 def at_drives(
     drive_of: tuple[int, ...], of_wheels: Float[Array, "*batch wheel"]
 ) -> Float[Array, "*batch drive"]:
-    """Return the sum over every drive's wheels; `drive_of` as in `Geometry`."""
+    """Return the sums of wheels' values by drive; `drive_of` as in `Geometry`."""
     if not drive_of:
         return of_wheels
     return of_wheels @ jnp.asarray(np.eye(len(set(drive_of)))[list(drive_of)])
@@ -183,17 +189,19 @@ class WheelFrame(eqx.Module):
     """Wheel directions and levers as the force balance uses them.
 
     Attributes:
-        hold: row of the speed along the direction in which the rollers do not give way (wheel, 3);
-            for an omni wheel this is the drive direction.
-        roll: row of the speed along the free rolling direction (wheel, 3).
-        drive_share: share of the rim speed r w along `hold`, sin(roller angle), times the wheel's
-            radius over r; wheel activity counts with r itself.
-        roller_share: share of the rim speed along `roll`, cos(roller angle), times the same ratio.
-        grip: 1 where the wheel has no rollers.
-        shift: change of load shares per contact displacement (wheel, 2) [1/m].
-        radius: wheel radius [m].
-        base: base radius [m], which scales the moment.
-        ordinary: whether some wheel has no rollers.
+        hold: rows that give, from the body twist, the speed of each wheel centre along the
+            direction in which its rollers do not roll (wheel, 3); for an omni wheel this is the
+            drive direction.
+        roll: rows that give the speed along the free rolling direction (wheel, 3).
+        drive_share: component of the rim speed r w along `hold`: sin(roller angle), times the
+            wheel's radius over r. Wheel activity is computed with r itself.
+        roller_share: component of the rim speed along `roll`: cos(roller angle), times the same
+            ratio of radii.
+        grip: 1 for a wheel without rollers, else 0.
+        shift: change of load shares per displacement of the contact patches (wheel, 2) [1/m].
+        radius: wheel radius r [m].
+        base: base radius [m], by which moments are divided to compare them with forces.
+        ordinary: True if some wheel has no rollers.
     """
 
     hold: Float[Array, "wheel 3"]
@@ -247,7 +255,10 @@ def omni(
     roller_deg: float = 90.0,
     drive_of: Sequence[int] = (),
 ) -> Geometry:
-    """Return an omni robot with any number of wheels, each driving 90 deg ahead of its azimuth."""
+    """Return an omni robot with any number of wheels, each of which drives tangentially.
+
+    The drive direction is the wheel's azimuth plus 90 deg.
+    """
     d = np.radians(np.asarray(azimuth_deg, float))
     place, ways = np.stack([np.cos(d), np.sin(d)], -1) * base_radius, np.degrees(d) + 90.0
     return general(place, ways, [roller_deg] * len(d), wheel_radius, gear_ratio, drive_of)
@@ -260,7 +271,10 @@ def mecanum(
     gear_ratio: float = 1.0,
     drive_of: Sequence[int] = (),
 ) -> Geometry:
-    """Return a robot with four mecanum wheels in X: front left and right, rear left and right."""
+    """Return a robot with four mecanum wheels whose rollers form an X seen from above.
+
+    The order is front left, front right, rear left, rear right.
+    """
     corners = _corners(half_length, half_width)
     rollers = [135.0, 45.0, 45.0, 135.0]
     return general(corners, [0.0] * 4, rollers, wheel_radius, gear_ratio, drive_of)
@@ -275,8 +289,8 @@ def skid_steer(
 ) -> Geometry:
     """Return a robot with four ordinary wheels that point ahead: two at the front, two at the rear.
 
-    The order is front left, front right, rear left, rear right. With `drive_of` (0, 1, 0, 1) a
-    drive turns both wheels of a side.
+    The order is front left, front right, rear left, rear right. With `drive_of` (0, 1, 0, 1) each
+    drive turns both wheels of one side.
     """
     corners = _corners(half_length, half_width)
     return general(corners, [0.0] * 4, [None] * 4, wheel_radius, gear_ratio, drive_of)
@@ -300,9 +314,16 @@ def general(
     gear_ratio: float = 1.0,
     drive_of: Sequence[int] = (),
 ) -> Geometry:
-    """Return any wheels: centres [m], drive directions and roller angles [deg] (None: no rollers).
+    """Return a robot with any wheels.
 
-    `drive_of` is the number of the drive that turns each wheel, from 0, where wheels share drives.
+    Args:
+        place: wheel centres (wheel, 2) [m].
+        drive_deg: drive direction of each wheel [deg].
+        roller_deg: angle from the rollers' free direction to the drive [deg], None without rollers.
+        wheel_radius: radius of the wheels [m].
+        gear_ratio: motor speed over wheel speed.
+        drive_of: index of the drive that turns each wheel, from 0; empty where every wheel has a
+            drive of its own.
     """
     p = np.asarray(place, float)
     base = float(np.sqrt((p**2).sum(axis=1).mean()))

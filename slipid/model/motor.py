@@ -1,4 +1,4 @@
-"""Brushed DC motor: U = R I + C_e wm + L_a dI/dt + brush drop."""
+"""Brushed DC motor: U = R I + C_e wm + L_a dI/dt + brush drop, wm the motor speed [rad/s]."""
 
 from functools import partial
 
@@ -12,12 +12,14 @@ from slipid.parameter import parameter
 electric = partial(parameter, electric=True)
 
 REST = 2.5
-"""Motor speed below which its sign is not trusted, about one quantum of the speed signal [rad/s].
+"""Motor speed w0 below which the sign of the speed is unreliable [rad/s].
+
+It is about the resolution of the speed signal.
 """
 
 
 held = partial(electric, free=False)
-"""An electric number that is fixed unless the user frees it."""
+"""Declaration of an electric number that is fixed unless the user frees it."""
 
 
 class Motor(eqx.Module):
@@ -74,9 +76,10 @@ class Motor(eqx.Module):
         )
 
     def opposing_force(self, motor_force: Float[Array, "*w 2"]) -> Float[Array, " *w"]:
-        """Return the force a motor works against: traction, and drag along the drive.
+        """Return the force that a motor works against: traction plus drag along the drive.
 
-        `motor_force` holds both, as `slipid.model.robot.motor_forces` returns them.
+        `motor_force` holds the two, as `slipid.model.robot.motor_forces` returns them, and the
+        result has the same unit.
         """
         return motor_force[..., 0] + self.rolling_drag * motor_force[..., 1]
 
@@ -100,7 +103,7 @@ class Motor(eqx.Module):
     def characteristic(
         self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
     ) -> Float[Array, " *w"]:
-        """Return M = U I / wm = C_e I + R I^2 wm / (wm^2 + w0^2) [N m], regular at standstill.
+        """Return M = U I / wm = C_e I + R I^2 wm / (wm^2 + w0^2) [N m], finite at standstill.
 
         Source: the paper's "torque characterising variable" (Belyaev, Brylev, Ivanov 2021).
         """

@@ -1,4 +1,4 @@
-"""The whole robot as one tree of declared numbers: wheels, motors, floors, loads, camera."""
+"""The whole robot as one tree of declared parameters: wheels, motors, floors, loads, camera."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -121,10 +121,11 @@ class Validity:
         torque_nm: smallest and largest torque [N m].
         slip: smallest and largest slip.
         yaw_rate: smallest and largest yaw rate by the encoders [rad/s].
-        headings_deg: headings of the body that were driven [deg]; this and the next two are read
-            from the encoders, roughly, where no steady command was logged.
+        headings_deg: directions of travel in the body frame that were driven [deg]. Headings,
+            speeds and turn rates are commanded values, or approximate values from the encoders
+            where no steady command was logged.
         speeds: speeds of the body that were driven [m/s].
-        turn_rates: turn rates of the body that were driven [rad/s].
+        turn_rates: yaw rates of the body that were driven [rad/s].
         distance: mean distance of a run [m].
     """
 
@@ -151,7 +152,7 @@ def build(
     sessions: Sequence[str] = (),
     centre: tuple[float, float] = (0.0, 0.0),
 ) -> Robot:
-    """Return a robot with every number at its declared start."""
+    """Return a robot with every parameter at its declared start value; surfaces are sorted."""
     names = sorted(surfaces)
     single = ContactSurface()
     stack = {e.path: jnp.full((len(names),), e.get(single)) for e in entries(single)}
@@ -181,9 +182,10 @@ def twist(
     load: Array,
     near: Float[Array, "3"] | None = None,
 ) -> Float[Array, "3"]:
-    """Return the body twist on floor `surface` with load set-up `load` (indices), by wheel speeds.
+    """Return the body twist at given wheel speeds [rad/s] (vx, vy [m/s], yaw rate [rad/s]).
 
-    `surface` may have one index per wheel, here and below; `near` is as in `contact.equilibrium`.
+    `surface` and `load` are indices of the floor and the load set-up. `surface` may have one index
+    per wheel, here and in the functions below; `near` is as in `contact.equilibrium`.
     """
     floor, rest = robot.surfaces.at(surface), robot.body.load_share[load]
     return contact.equilibrium(frame.radius * wheel_speed, frame, floor, rest, near)
@@ -197,9 +199,9 @@ def motor_forces(
     surface: Array,
     load: Array,
 ) -> Float[Array, "wheel 2"]:
-    """Return the forces each motor works against at a twist, in units of mean(mu) m g.
+    """Return the forces that each motor works against at a twist, in units of mean(mu) m g.
 
-    They are the traction, and the drag along the drive if it equals that of the rollers
+    They are the traction, and the drag along the drive for `Motor.rolling_drag` 1
     (`contact.rolling_drag`).
     """
     rim, floor = frame.radius * wheel_speed, robot.surfaces.at(surface)
@@ -228,9 +230,9 @@ def motor_current(
     surface: Array,
     load: Array,
 ) -> Float[Array, " drive"]:
-    """Return the signed current of each motor [A]: force of its wheels, and its own friction.
+    """Return the signed current of each motor [A], for the forces of its wheels and its friction.
 
-    `speed` is the speed of the wheels of each drive [rad/s].
+    `speed` is the wheel speed of each drive [rad/s].
     """
     shape = robot.geometry
     force = jnp.mean(robot.surfaces.friction[surface]) * robot.body.mass * GRAVITY

@@ -1,4 +1,4 @@
-"""Plane motion and forces: exact SE(2) poses, and small linear algebra without LAPACK."""
+"""Planar motion and forces: exact SE(2) poses, and 3x3 linear algebra without LAPACK."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ class Columns(NamedTuple):
 
 
 def dot(a: Planar, b: Planar) -> Array:
-    """Return the scalar product, written out: to XLA a matrix product is a loop of its own."""
+    """Return the scalar product, written out because XLA makes a loop of every matrix product."""
     return a.x * b.x + a.y * b.y + a.yaw * b.yaw
 
 
@@ -35,7 +35,7 @@ def cross(a: Planar, b: Planar) -> Planar:
 
 
 def solve3(m: Columns, b: Planar) -> Planar:
-    """Return m^-1 b by Cramer's rule: no LAPACK call per row of a batch, and it exports to C."""
+    """Return m^-1 b by Cramer's rule, which needs no LAPACK call per matrix and exports to C."""
     first = cross(m.y, m.yaw)
     det = dot(m.x, first)
     scale = 1 / jnp.where(jnp.abs(det) < 1e-30, 1e-30, det)

@@ -87,7 +87,7 @@ def sane(kind, state, said, before, dt):
     f, order = p.controller.robot, Flat(state)
     last, now = before.controller, state.controller
     # an angle that was never read is NaN
-    angle, numbers = order.place("seen.wheels.angle"), order.ravel(state)
+    angle, numbers = order.place("estimator.wheels.angle"), order.ravel(state)
     rest = jnp.concatenate([numbers[: angle.start], numbers[angle.stop :]])
     finite = jnp.all(jnp.isfinite(rest)) & jnp.all(jnp.isfinite(Flat(said).ravel(said)))
     finite &= ~jnp.any(jnp.isinf(numbers[angle]))

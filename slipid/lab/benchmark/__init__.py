@@ -1,1 +1,1 @@
-"""Every published system on the same logs: what `slipid benchmark` does."""
+"""Implementation of `slipid benchmark`: slipid and every published system on the same logs."""

@@ -1,4 +1,4 @@
-"""`slipid benchmark`: every published system on the same logs, beside slipid itself."""
+"""The command `slipid benchmark`: slipid and every published system on the same logs."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -25,13 +25,13 @@ from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
-SCHEMA = "slipid.lab.benchmark/1"
+SCHEMA = "slipid.benchmark/1"
 Tables = dict[str, dict[str, dict[str, RowSummary]]]
-"""Summaries by data set, protocol and row."""
+"""Row summaries, by name of the data set, then of the protocol, then of the row."""
 
 
 class BenchmarkTask(Protocol):
-    """A part of the benchmark's work that keeps its results."""
+    """A part of the benchmark's work that saves its results in a checkpoint."""
 
     @property
     def name(self) -> str:
@@ -39,14 +39,15 @@ class BenchmarkTask(Protocol):
         ...
 
     def run(self) -> str:
-        """Compute the results that are not kept yet, and return the task's name."""
+        """Compute the results that the checkpoint lacks, and return the task's name."""
         ...
 
 
 def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -> Content:
     """Run every row on every available data set, and write benchmark.json.
 
-    Kept results are not computed again; a row that fails is reported, and the others go on.
+    Results in checkpoints are not computed again. A row that fails is reported as absent with its
+    error, and the other rows are still computed.
 
     Raises:
         DataError: the data folder or a row does not exist.
@@ -65,7 +66,7 @@ def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -
     for source in sources:
         try:
             each.append(tasks_of(options, source.name))
-        except Exception as error:  # other data sets are used all the same
+        except Exception as error:  # a data set that cannot be read does not stop the others
             unread[source.name] = FoldScore.of_error(error).absent
             report.line(f"skipped: {source.name}: {unread[source.name]}")
     folds = alternating(each)
@@ -73,7 +74,7 @@ def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -
         task for task in (HuskyFloorTask(options), RobotinoFloorTask(options)) if task.is_requested
     ]
     rectangle = RectangleTask(options)
-    # the Robotino's floors come last: they reuse the fits of its headings
+    # the Robotino's floor table comes last: it reuses slipid's fits to its folds by heading
     tasks: list[BenchmarkTask] = [*folds, *floors]
     if not options.quick and set(CONTROLLERS) & set(options.only or CONTROLLERS):
         tasks.insert(0, rectangle)
@@ -100,7 +101,7 @@ def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -
 
 
 def tasks_of(options: BenchmarkOptions, name: str) -> list[FoldTask]:
-    """Return the tasks of all folds of a source."""
+    """Return one task for each fold of each kind of split of a source."""
     data = data_of(options, name)
     found = []
     for kind in data.source.kinds:
@@ -112,9 +113,10 @@ def tasks_of(options: BenchmarkOptions, name: str) -> list[FoldTask]:
 
 
 def alternating(each: Sequence[Sequence[FoldTask]]) -> list[FoldTask]:
-    """Return the tasks of all sources in turn.
+    """Return the tasks interleaved: the first of every source, then the second of every source.
 
-    Functions compiled for a source are then in the cache when another process needs them.
+    Parallel processes then start on different sources, and a function that one of them compiled
+    for a source is in the compilation cache when another process needs it.
     """
     return [task for row in zip_longest(*each) for task in row if task is not None]
 
@@ -140,7 +142,7 @@ def _check(options: BenchmarkOptions) -> None:
 
 
 def tables_of(tasks: Sequence[FoldTask]) -> Tables:
-    """Return summaries of the kept scores of all tasks."""
+    """Return summaries of all scores that the tasks saved in their checkpoints."""
     folds: dict[tuple[str, str], dict[str, list[FoldScore]]] = {}
     for task in tasks:
         for (protocol, name), score in task.rows().items():
@@ -158,7 +160,7 @@ def tables_of(tasks: Sequence[FoldTask]) -> Tables:
 def _set(
     options: BenchmarkOptions, name: str, protocols: Mapping[str, Mapping[str, RowSummary]]
 ) -> Content:
-    """Return the content of a data set in benchmark.json."""
+    """Return the part of benchmark.json about one data set."""
     data = data_of(options, name)
     return {
         "about": data.source.about,

@@ -1,4 +1,4 @@
-"""End-point errors of every row, protocol by protocol."""
+"""Plots of the end-point errors of every row of the benchmark, one panel per protocol."""
 
 from collections.abc import Mapping, Sequence
 
@@ -16,17 +16,19 @@ OWN = "slipid"
 
 
 def benchmark_pictures(found: Content) -> dict[str, bytes]:
-    """Return the bytes of a PNG file for every data set of benchmark.json, by its name."""
+    """Return a PNG file as bytes for every data set of benchmark.json, by the data set's name."""
     made = {n: benchmark_figure(one, found["protocols"], n) for n, one in found["sets"].items()}
     return {name: drawing.png(figure) for name, figure in made.items() if figure is not None}
 
 
 def benchmark_figure(one: Content, about: Content, name: str) -> Figure | None:
-    """Return a panel per protocol of one data set: mean end-point error with its 90 % interval.
+    """Return a figure of one data set: mean end-point errors with 90 % intervals, by protocol.
+
+    The figure is None if no row has an end-point error.
 
     Args:
         one: content of a data set in benchmark.json.
-        about: descriptions of the protocols.
+        about: descriptions of the protocols, by name.
         name: name of the data set.
     """
     protocols = {

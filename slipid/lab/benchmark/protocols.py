@@ -1,4 +1,4 @@
-"""Protocols of the benchmark: held-out runs, and the information that methods are given."""
+"""Protocols of the benchmark: which runs are held out, and what methods are given about floors."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,15 +14,15 @@ from slipid.predict.folds import FoldKey, speeds
 from slipid.predict.slip_model import Run
 
 FOLDS = 2
-"""Number of parts of headings and sectors; every other sector is held out together."""
+"""Number of folds by headings and by sectors; one fold holds every other sector."""
 SPEEDS = 2
-"""Number of parts of speeds, where there are many."""
+"""Largest number of folds by speeds; if there are more speeds, several share a fold."""
 INNER = 1
-"""Number of parts of the training runs that are held back in turn to pick settings."""
+"""Number of folds of the training runs that are held out in turn to pick settings."""
 LEAST_TRAINING, LEAST_HELD_OUT = 8, 3
 """Smallest numbers of training runs and of held-out runs of a split."""
 ALL = -1
-"""Fold of the split without held-out runs."""
+"""Index of the only fold of the split "all", whose runs are all training runs."""
 Labels = Int[np.ndarray, " run"]
 
 
@@ -30,11 +30,11 @@ class BenchmarkProtocol(NamedTuple):
     """Protocol of the benchmark.
 
     Attributes:
-        split: kind of split of the runs.
-        floor_known: the floor of each run is given to methods.
+        split: kind of split of the runs, a key of `KINDS` or "all".
+        floor_known: True if methods are given the floor of each held-out run.
         about: description in words.
-        unseen_floors: slipid's estimator is given that there may be floors without training runs;
-            other rows have no such option.
+        unseen_floors: True if slipid's estimator is set up for floors without training runs; other
+            rows have no such option.
     """
 
     split: str
@@ -61,7 +61,7 @@ class Split:
 
     Attributes:
         kind: kind of split.
-        fold: index of the held-out part.
+        fold: index of the fold that is held out.
         training: indices of the training runs.
         held_out: indices of the held-out runs.
     """
@@ -83,7 +83,11 @@ def base_of(floor: str) -> str:
 
 
 def facts_of(data: Runs, base_radius: float) -> list[FoldKey]:
-    """Return the facts of all runs; the direction of a skid steer is that of (speed, turning)."""
+    """Return floor, heading and speed of all runs, by which they are split.
+
+    For a robot with two drives, heading and speed are the direction and the norm of the vector
+    (commanded forward speed, base radius times turn rate) [m/s].
+    """
     out = compared.fold_keys(data)
     for k, log in enumerate(data.logs):
         if log.wheels == 2 and np.isfinite(data.speed[k]) and log.twist_command is not None:
@@ -95,14 +99,14 @@ def facts_of(data: Runs, base_radius: float) -> list[FoldKey]:
 
 
 def facts_of_run(run: Run) -> FoldKey:
-    """Return the facts of a run."""
+    """Return floor, heading and speed of a run, by which runs are split."""
     return FoldKey(run.floor, float(np.degrees(run.heading)), run.speed)
 
 
 def headings(facts: Sequence[FoldKey]) -> Labels:
-    """Return random parts by heading, with one heading in the same part on every floor.
+    """Return random folds by heading: runs of one heading are in the same fold on every floor.
 
-    Runs without a heading are assigned one by one.
+    Headings are rounded to 5 deg. Runs without a heading are assigned to folds one by one.
     """
     heading = np.array([f.heading_deg for f in facts])
     known = np.isfinite(heading)
@@ -113,13 +117,13 @@ def headings(facts: Sequence[FoldKey]) -> Labels:
 
 
 def sectors(facts: Sequence[FoldKey]) -> Labels:
-    """Return parts of every other sector of directions; -1 for runs without a direction."""
+    """Return folds by sector of the heading, every other sector in one; -1 without a heading."""
     sector = compared.sectors(facts)
     return np.where(sector < 0, sector, sector % FOLDS)
 
 
 def floors(facts: Sequence[FoldKey]) -> Labels:
-    """Return parts of one floor each."""
+    """Return folds of one floor each, with any load set-up."""
     return np.unique([base_of(f.floor) for f in facts], return_inverse=True)[1]
 
 
@@ -134,8 +138,8 @@ KINDS: dict[str, Callable[[Sequence[FoldKey]], Labels]] = {
 def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
     """Return the folds of a kind, without those that have too few training or held-out runs.
 
-    Runs of part -1 are training runs in all folds. Runs on floors without training runs are not
-    held out, unless the split is by floors.
+    Runs whose fold is -1 are training runs in all folds. A run on a floor without training runs is
+    not held out, unless the split is by floors.
     """
     everybody = np.arange(len(facts))
     if kind == "all":
@@ -153,13 +157,14 @@ def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
 
 
 def inner(runs: Sequence[Run], kind: str) -> Labels:
-    """Return the part of every training run for picking settings, by the protocol's kind of split.
+    """Return the inner fold of every training run, for the cross-validation that picks settings.
 
-    The `INNER` largest parts of the training runs are held back in turn and numbered from 0; all
-    other runs have -1, or `INNER` after a random assignment, and stay. The parts are by headings
-    if the training runs have fewer than two parts of the kind, and so always for sectors: every
-    other one is missing already, and with one more missing the gap would be three times as wide as
-    that of the protocol.
+    The training runs are divided by the protocol's kind of split. The `INNER` largest parts are
+    held out in turn and numbered from 0. All other runs are -1, or `INNER` where runs are assigned
+    at random, and always remain training runs. If the training runs have fewer than two parts of
+    the kind, they are divided by headings. This is always so for sectors: every other sector is
+    missing from the training runs already, and without one more the gap would be three times as
+    wide as that of the protocol.
     """
     facts = [facts_of_run(run) for run in runs]
     for name in dict.fromkeys((kind if kind in KINDS else "headings", "headings")):

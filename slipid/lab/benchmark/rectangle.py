@@ -1,4 +1,4 @@
-"""The rectangle of the 2021 paper, driven by the published controllers and slipid's."""
+"""Closed-loop runs on the rectangle of the 2021 paper, with published controllers and slipid's."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 SOURCE = "testsite"
-"""Data set of the robot."""
+"""Name of the data set from which the robot is identified."""
 CONTROLLERS = (
     "encoder",
     "goswami_padhy",
@@ -48,7 +48,7 @@ class RectangleTask:
 
     @property
     def folder(self) -> Path:
-        """Folder of the robot and its trial."""
+        """Folder of robot.json and of the trial's results."""
         return self.options.out / self.name
 
     def run(self) -> str:
@@ -57,13 +57,13 @@ class RectangleTask:
         self._failure.unlink(missing_ok=True)
         try:
             self._identify()
-        except Exception as error:  # other tasks are done all the same
+        except Exception as error:  # a task that fails does not stop the others
             write_json(self._failure, {"failed": FoldScore.of_error(error).absent})
         return self.name
 
     @property
     def _failure(self) -> Path:
-        """File with the reason why there is no robot."""
+        """Path of the file that records why the robot could not be identified."""
         return self.folder / "failed.json"
 
     def _identify(self) -> None:
@@ -83,7 +83,7 @@ class RectangleTask:
         """Run all controllers on the virtual test site, or on the twin if MuJoCo is missing.
 
         Returns:
-            Content that `slipid trial` writes, or the reason why there is none.
+            Content that `slipid trial` writes, or the reason for a failure under the key `failed`.
         """
         if self._failure.is_file():
             return read_json(self._failure, "why there is no robot")
@@ -93,5 +93,5 @@ class RectangleTask:
         try:
             wish = trial.TrialOptions(plant, controllers=tuple(controllers), starts=STARTS)
             return trial.trial(self.folder, wish, executor, report).content
-        except Exception as error:  # the rest is written all the same
+        except Exception as error:  # a failed trial does not stop the rest of the benchmark
             return {"failed": FoldScore.of_error(error).absent}

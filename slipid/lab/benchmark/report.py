@@ -23,11 +23,11 @@ COLUMNS: Mapping[str, tuple[str, float, int]] = {
     "floor_accuracy": ("floor, %", 100.0, 0),
     "energy_error": ("energy, %", 100.0, 0),
 }
-"""Heading, factor and decimal places of each number of a row."""
+"""Column heading, factor to the displayed unit and decimal places, by field of `RowSummary`."""
 ENDS = ("endpoint_error", "behind")
-"""Numbers with a 90 % interval."""
+"""Fields that are shown with their 90 % intervals."""
 ON_THE_PAGE = ("length_error", "twist_error")
-"""Numbers on the page only, as a terminal is too narrow for them."""
+"""Fields that are shown only on the HTML page, as a terminal is too narrow for them."""
 
 
 def show_benchmark(page: Page, found: Content) -> None:
@@ -62,23 +62,23 @@ COSTS = ("numbers", "fit, s", "step, us")
 
 
 def ranked(rows: Content) -> list[tuple[str, Content]]:
-    """Return the rows with results, the least end-point error first."""
+    """Return the rows that have results, sorted by end-point error, the smallest first."""
     there = [(name, one) for name, one in rows.items() if one["endpoint_error"] is not None]
     return sorted(there, key=lambda item: item[1]["endpoint_error"][0])
 
 
 def shown(rows: Content) -> list[str]:
-    """Return the names of numbers that some row has."""
+    """Return the fields of `COLUMNS` that at least one row has a value for."""
     return [name for name in COLUMNS if any(row[name] is not None for row in rows.values())]
 
 
 def cells(row: Content, numbers: Sequence[str]) -> list[str]:
-    """Return the formatted numbers of a row."""
+    """Return the formatted values of the named fields of a row."""
     return [in_words(name, row[name]) for name in numbers]
 
 
 def in_words(name: str, value: Sequence[float] | None) -> str:
-    """Return a formatted number, with its interval if it is one of `ENDS`, or an empty string."""
+    """Return a field's value as text, with its interval for fields in `ENDS`; empty for None."""
     if value is None:
         return ""
     _, factor, places = COLUMNS[name]
@@ -88,14 +88,14 @@ def in_words(name: str, value: Sequence[float] | None) -> str:
 
 
 def costs(row: Content) -> list[str]:
-    """Return number of parameters, seconds to fit, and microseconds per step."""
+    """Return a row's number of parameters, time to fit [s] and time per step [us], as text."""
     fit, step = row["fit_s"], row["step_us"]
     seconds = "< 0.1" if fit < 0.1 else f"{fit:.1f}" if fit < 10 else f"{fit:.0f}"
     return [str(row["numbers"]), seconds, f"{step:.1f}" if step < 10 else f"{step:.0f}"]
 
 
 def absent(rows: Content) -> list[str]:
-    """Return the reasons why rows are absent or did not converge, rows of one reason together."""
+    """Return one line for each reason why rows are absent or did not converge, with the rows."""
     why: dict[str, list[str]] = {}
     for name, row in rows.items():
         if row["unconverged"]:
@@ -106,7 +106,7 @@ def absent(rows: Content) -> list[str]:
 
 
 class ExtraTable(NamedTuple):
-    """A part of benchmark.json that is one table.
+    """A table of benchmark.json that does not belong to a data set.
 
     Attributes:
         title: title of the table.
@@ -122,7 +122,7 @@ class ExtraTable(NamedTuple):
 
 
 def others(found: Content) -> list[tuple[str, ExtraTable]]:
-    """Return the tables besides those of the data sets, by their names."""
+    """Return name and content of each table that does not belong to a data set."""
     parts: list[tuple[str, Content, Callable[[Content], ExtraTable]]]
     parts = [(name, one, classifiers) for name, one in found["floors"].items()]
     if found["rectangle"] is not None:
@@ -134,7 +134,7 @@ def others(found: Content) -> list[tuple[str, ExtraTable]]:
 
 
 def rectangle(trial: Content) -> ExtraTable:
-    """Return the table of the trial's controllers, the least closure error first."""
+    """Return the table of the trial's controllers, sorted by closure error, the smallest first."""
     plant = {"testsite": "the virtual test site", "twin": "the identified model itself"}
     runs = min(row["runs"] for row in trial["summary"].values())
     title = f"rectangle on {plant[trial['plant']]}, {runs} starts, medians with 90 % intervals"
@@ -154,7 +154,10 @@ def rectangle(trial: Content) -> ExtraTable:
 
 
 def classifiers(found: Content) -> ExtraTable:
-    """Return the table of classifiers' accuracies by seconds, the best after the last first."""
+    """Return the table of classifiers' accuracies after each time.
+
+    Rows are sorted by their accuracy after the longest time, the best first.
+    """
     chance = f"always naming the commonest floor is right in {100 * found['chance']:.0f} %"
     title = f"{found['about']}; {found['runs']} runs; {chance}"
     if lost := [f"{row['name']}: {row['absent']}" for row in found["rows"] if row["absent"]]:
@@ -174,7 +177,7 @@ def classifiers(found: Content) -> ExtraTable:
 
 
 def settings_lines(rows: Content) -> list[str]:
-    """Return the settings picked by cross-validation in each fold, for rows that have some."""
+    """Return a line for each row that has settings: those picked by cross-validation by fold."""
     return [
         f"{name}: {'; '.join(dict.fromkeys(row['settings']))}"
         for name, row in rows.items()
@@ -207,7 +210,7 @@ tr.own { background: #fdeee3; font-weight: 600 } .note { color: #666; font-size:
 
 
 def write_page(found: Content, pictures: Mapping[str, bytes], out: Path) -> Path:
-    """Write the page of a benchmark's content below a folder and return its path."""
+    """Write the HTML page of a benchmark's content to a folder and return the page's path."""
     path = out / PAGE
     write_bytes(path, page(found, pictures).encode())
     return path
@@ -267,7 +270,7 @@ def _set(found: Content, name: str, one: Content, drawn: bytes | None) -> list[s
 
 
 def html_table(head: tuple[str, ...], body: list[tuple[str, ...]]) -> str:
-    """Return a table whose first column names the row, with slipid's own rows highlighted."""
+    """Return an HTML table with row names in the first column; slipid's rows are highlighted."""
     lines = [
         "<div class='wide'><table><tr>",
         *(f"<th>{escape(cell)}</th>" for cell in head),

@@ -1,4 +1,4 @@
-"""Rows of the benchmark's tables: every published system, roughly by its year."""
+"""Rows of the benchmark's tables: every published system, roughly in order of its year."""
 
 from slipid.lab.paper2021.deployed_form import paper_rows
 from slipid.lab.systems.motion.gmdh import GmdhClass, GmdhOne
@@ -12,11 +12,14 @@ from slipid.predict.slip_model import RobotSpec, SlipModel
 from slipid.predict.slip_models import ByFloor
 
 KINEMATIC = ("effective_track", "instantaneous_centres")
-"""Names of the rows for wheels that do not determine the twist."""
+"""Names of the rows that are only for robots whose wheels do not determine the twist."""
 
 
 def _every() -> list[SlipModel]:
-    """Return all methods, unfitted, fitted floor by floor unless they handle floors themselves."""
+    """Return all methods, unfitted.
+
+    Methods that do not handle floors themselves are wrapped so as to be fitted floor by floor.
+    """
     of_one_floor: list[SlipModel] = [
         *(Corrected(name) for name in KINEMATIC),
         ReinaDeterministic(),
@@ -39,7 +42,7 @@ ROWS = tuple(method.name for method in _every())
 
 
 def rows(spec: RobotSpec) -> list[SlipModel]:
-    """Return the methods for a robot, unfitted, including those whose channels are missing."""
+    """Return the unfitted methods for a robot, even those that need channels it may not log."""
     every = _every()
     if spec.determines_twist:
         every = [method for method in every if method.name not in KINEMATIC]

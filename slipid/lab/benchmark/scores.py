@@ -22,9 +22,10 @@ from slipid.predict.slip_model import (
 from slipid.support.content import Content
 
 SLIPS = 0.2
-"""Smallest relative difference between the twists of body and wheels that counts as slip."""
+"""Difference of the body's twist from that of the rolling wheels, relative to the latter, above
+which a window counts as slipping."""
 STANDS = 0.02
-"""Rim speed below which a window is not used for slip detection [m/s]."""
+"""Norm of the rolling wheels' twist [m/s] up to which a window is not used for slip detection."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +35,16 @@ class RunScore:
     Attributes:
         name: name of the run.
         floor: floor of the run, with the load set-up.
-        cluster: cluster of runs with correlated errors.
-        endpoint_error: distance of predicted and true end over the chord, or over the path length.
+        cluster: index of the cluster of runs with correlated errors, which are resampled together.
+        endpoint_error: distance between predicted and true end, divided by the true chord or by the
+            true path length.
         length_error: relative error of the chord, or of the path length.
-        heading_error_deg: heading error at the end, at most 180 [deg].
-        twist_error: rms of the windows' twist errors, a yaw rate times the base radius [m/s].
-        covered90: the true end lies in the 90 % region; None without a region.
-        scores: slip score of each window.
-        slips: true slip of each window.
+        heading_error_deg: magnitude of the heading error at the end, at most 180 [deg].
+        twist_error: rms error of the twist over windows, with yaw rates multiplied by the base
+            radius [m/s].
+        covered90: True if the true end lies in the predicted 90 % region; None without a region.
+        scores: slip score of each moving window; higher if the method predicts more slip.
+        slips: True for each moving window in which the robot slips.
         floor_right: share of the time in which the most probable floor is the true one; None for
             methods without floor probabilities.
         energy_error: relative error of the run's electric energy; None if it is not predicted.
@@ -62,7 +65,7 @@ class RunScore:
 
 
 def scored(run: Run, predicted: PredictedRun, spec: RobotSpec, over: Over) -> RunScore:
-    """Return the score of a prediction of a run."""
+    """Return the errors of a prediction of a run; `over` is the denominator of end-point errors."""
     true = relative_to_start(run.pose)
     cov = None if predicted.end_covariance is None else predicted.end_covariance[None]
     (end,) = scores(predicted.path[None], true[None], cov, predicted.freedom)
@@ -85,14 +88,17 @@ def scored(run: Run, predicted: PredictedRun, spec: RobotSpec, over: Over) -> Ru
 
 
 def _length(path: Float[np.ndarray, "edge 3"], over: Over) -> float:
-    """Return the chord, or the path length [m]."""
+    """Return the chord or the path length of a path, as `over` says [m]."""
     return (chords if over == "chord" else lengths)(path[None])[0]
 
 
 def _windows(
     run: Run, predicted: PredictedRun, spec: RobotSpec, first: np.ndarray
 ) -> tuple[float, Float[np.ndarray, " window"], Bool[np.ndarray, " window"]]:
-    """Return the rms twist error [m/s], and slip score and true slip of the moving windows."""
+    """Return the rms twist error [m/s], and slip scores and true slips of the moving windows.
+
+    `first` has the index of the first step of each window.
+    """
     edges = np.append(first, len(run.signals))
     dt = np.diff(np.concatenate([[0.0], np.cumsum(run.signals.dt)])[edges])[:, None]
     true = body_increments(run.pose[edges]) / dt * spec.size
@@ -137,15 +143,16 @@ class FoldScore:
 
     Attributes:
         runs: scores of the held-out runs.
-        absent: reason why there are none: a channel that these logs lack, or an error.
-        failed: the reason is an error.
+        absent: reason why there are no scores: a channel that these logs lack, or an error; empty
+            if there are scores.
+        failed: True if that reason is an error.
         settings: settings picked by cross-validation, in words.
         tried: number of settings that were compared.
         numbers: number of fitted parameters.
         tune_s: time to pick the settings [s].
         fit_s: time of one fit [s].
         step_us: time to predict one step of one run [microseconds].
-        converged: the fit converged.
+        converged: True if the fit converged.
     """
 
     runs: tuple[RunScore, ...] = ()
@@ -161,17 +168,17 @@ class FoldScore:
 
     @classmethod
     def of_json(cls, content: Content) -> "FoldScore":
-        """Return the score whose fields were written as JSON."""
+        """Return the scores read back from JSON content."""
         return cls(**{**content, "runs": tuple(RunScore(**run) for run in content["runs"])})
 
     @classmethod
     def lacking(cls, channels: Iterable[str]) -> "FoldScore":
-        """Return the result of a method whose channels were not logged."""
+        """Return the empty result of a method that needs these channels, which were not logged."""
         words = {"twist": "wheels that drive sideways", "command": "a commanded twist"}
         named = [words.get(name, f"a {name}") for name in sorted(channels)]
         return cls(absent=f"needs {' and '.join(named)}")
 
     @classmethod
     def of_error(cls, error: Exception) -> "FoldScore":
-        """Return the result of a method that raised an error."""
+        """Return the empty result of a method that raised this error."""
         return cls(absent=f"{type(error).__name__}: {error}".splitlines()[0][:300], failed=True)

@@ -1,4 +1,4 @@
-"""Logs of the benchmark: public data sets below a folder, and recorded runs of the package."""
+"""Logs of the benchmark: public data sets in a folder, and recorded runs in the package itself."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -33,13 +33,15 @@ class LogSource:
         name: name of the set.
         about: description of the set.
         folder: folder below the data folder; empty for the recorded runs of the package.
-        config: name of the packaged config.
+        config: file name of the packaged config.
         kinds: kinds of splits, see `slipid.lab.benchmark.protocols`.
         over: denominator of end-point errors.
-        poses_per_step: see `slipid.lab.benchmark.steps.run_batches`.
-        currents: columns of currents that the config leaves out of the fit, for other methods.
-        current_is_signed: these currents have a sign.
-        crossing: glob of the runs from one floor to another, and the file of their map.
+        poses_per_step: minimum number of poses in a step, see
+            `slipid.lab.benchmark.steps.run_batches`.
+        currents: columns of currents that published methods use but slipid's fit does not, since
+            the config does not read them.
+        current_is_signed: True if these currents have a sign.
+        crossing: glob of the runs from one floor to another, and file name of the map of floors.
     """
 
     name: str
@@ -103,15 +105,15 @@ SOURCES = (
 
 @dataclass(frozen=True, eq=False)
 class DataSet:
-    """The runs of a source.
+    """The runs of a source, with what slipid's fit and the splits need.
 
     Attributes:
         source: source of the logs.
         job: task of slipid's fit to the runs.
-        logged: the same runs with all logged channels.
-        facts: facts of each run for splits.
-        crossing: runs over several floors, or None.
-        map: map of these floors, or None.
+        logged: the same runs with all logged channels, also those that slipid's fit does not use.
+        facts: floor, heading and speed of each run, by which runs are split.
+        crossing: runs from one floor to another, or None.
+        map: map of the floors of these runs, or None.
     """
 
     source: LogSource
@@ -123,11 +125,11 @@ class DataSet:
 
     @property
     def spec(self) -> RobotSpec:
-        """The robot by its config."""
+        """Specification of the robot as its config describes it, before any fit."""
         return RobotSpec.of(Space(self.job.robot, self.job.choices).template)
 
     def thinned(self, most: int) -> "DataSet":
-        """Return at most so many runs, evenly taken from every floor and speed."""
+        """Return a data set of at most `most` runs, evenly taken from every floor and speed."""
         count = len(self.logged)
         if count <= most:
             return self
@@ -143,7 +145,7 @@ class DataSet:
 
     @property
     def crossing_hash(self) -> str:
-        """Hash of the runs over several floors and of their map."""
+        """Hash of the runs from one floor to another and of their map."""
         logs = [] if self.crossing is None else [(x.name, x.sha256) for x in self.crossing.logs]
         return hash_of([*logs, ("map", repr(self.map))])
 

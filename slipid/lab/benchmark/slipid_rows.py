@@ -1,4 +1,4 @@
-"""slipid's own rows: the force balance on known floors, and its estimator on unknown ones."""
+"""The rows of slipid: its force balance on known floors, and its estimator on unknown floors."""
 
 import time
 from collections.abc import Sequence
@@ -34,13 +34,17 @@ from slipid.support.checkpoint import Checkpoint
 
 NAME = "slipid"
 TOLERANCE = 0.1
-"""Largest change of a parameter in a converged fit, in its std: runs scatter far more."""
+"""A fit has converged when no parameter changes by more than this multiple of its std.
+
+Errors of predictions scatter far more from run to run.
+"""
 STEPS = 16
-"""Divisor of the number of steps of an estimator, so that few shapes are compiled."""
+"""The steps of a replay are padded to a multiple of this number, so that few shapes are compiled.
+"""
 TOGETHER = 32
-"""Number of runs in one call of an estimator."""
+"""Number of runs in one call of an estimator; fewer are padded, so that one shape is compiled."""
 LONGEST_S = 0.25
-"""Longest step of an estimator [s]; longer ones are split, as it rejects those of half a second."""
+"""Longest step of an estimator [s]; longer steps are split, since it rejects those of 0.5 s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +52,11 @@ class SlipidFit:
     """slipid fitted to some runs of a data set.
 
     Attributes:
-        contact: force balance with its forecasts.
+        contact: fitted force balance, which predicts runs.
         job: fit task of all runs of the data set.
         floors: indices of the fitted floors.
         highest_speed: highest wheel speed in these runs [rad/s].
-        trend: trend of their currents, see `slipid.infer.slip_curves.current_trend`.
+        trend: trend of current residuals, see `slipid.infer.slip_curves.current_trend`.
         seconds: duration of the fit [s].
         converged: True if the fit converged.
     """
@@ -82,9 +86,13 @@ class SlipidFit:
 def fit_slipid(
     job: ConfigFitTask, problem: Problem, training: np.ndarray, kept: Checkpoint
 ) -> SlipidFit:
-    """Return the force balance fitted to some runs of a fit task, or the kept result.
+    """Return slipid fitted to some runs of a fit task, or the fit that was saved before.
 
-    Fits of one `job.problem()` share its compiled functions.
+    Args:
+        job: fit task of all runs of the data set.
+        problem: `job.problem()`; fits that are given the same problem share compiled functions.
+        training: indices of the runs that are fitted.
+        kept: checkpoint from which the fit is loaded, or to which it is saved.
     """
     problem = problem_of_runs(problem, job.choices, job.dataset, training)
     keep = np.isin(problem.windows.run, training).astype(float)
@@ -134,7 +142,7 @@ def forecast(fit: SlipidFit, batch: RunBatch, spec: RobotSpec) -> list[Predicted
 
 
 def _power(fit: SlipidFit, w: Any, spec: RobotSpec) -> np.ndarray:
-    """Return the electric power of all motors by the predicted currents [W]."""
+    """Return the total electric power of the motors in each step, from predicted currents [W]."""
     robot = fit.contact.robot
     b = lk.batch(w, robot)
     amps = np.abs(np.asarray(_currents(robot, b)))
@@ -149,12 +157,12 @@ def _currents(robot: Any, b: lk.Batch) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class FloorKnowledge:
-    """Knowledge of an estimator about the floors of its runs.
+    """Information that an estimator is given about the floors of its runs.
 
     Attributes:
-        floor_known: the floor of each run is given; it is then the estimator's only floor.
-        unseen_floors: there may be floors without training runs.
-        map: map of the floors; the estimator then starts at the first pose of the body in it.
+        floor_known: True if the floor of each run is given; it is then the estimator's only floor.
+        unseen_floors: True if the estimator also considers floors without training runs.
+        map: map of the floors, or None; with a map, the estimator starts at the first true pose.
     """
 
     floor_known: bool = False
@@ -165,9 +173,15 @@ class FloorKnowledge:
 def estimator_runs(
     fit: SlipidFit, batches: Sequence[RunBatch], data: Runs, floors: FloorKnowledge
 ) -> list[PredictedRun]:
-    """Return the estimator's predictions of runs of some data, in the order of the batches.
+    """Return the estimator's predictions of runs, in the order of the batches.
 
-    It uses currents only if it was fitted to currents.
+    The estimator uses currents only if slipid was fitted to currents.
+
+    Args:
+        fit: slipid's fit.
+        batches: the runs.
+        data: logs that the numbers of the batches index.
+        floors: information about the floors.
     """
     runs = [run for batch in batches for run in batch.runs]
     logs = [data.logs[k] for batch in batches for k in batch.numbers]
@@ -189,7 +203,15 @@ def estimator_runs(
 def _estimator(
     fit: SlipidFit, load: str, only: str | None, floors: FloorKnowledge, several: bool
 ) -> Estimator:
-    """Return the estimator of a fit for all fitted floors, or for only one."""
+    """Return the estimator of a fit for one load set-up.
+
+    Args:
+        fit: slipid's fit.
+        load: name of the load set-up.
+        only: the estimator's only floor; None for all fitted floors.
+        floors: information about the floors.
+        several: True if a run may cross several floors.
+    """
     whole = fit.deployed
     # floors without training runs have no parameters
     rows = fit.floors if only is None else (whole.labels.index(only),)
@@ -204,7 +226,14 @@ def _estimator(
 
 
 class _ReplayRows(eqx.Module):
-    """Inputs of an estimator, row by row of every run; NaN where a channel has no value."""
+    """Inputs of an estimator in each row of several runs; NaN where a channel has no value.
+
+    Attributes:
+        angle: angle of each wheel since the start [rad].
+        current: current of each motor [A].
+        gyro: yaw rate [rad/s].
+        dt: duration of the row [s]; 0 in the first row and in rows of padding.
+    """
 
     angle: Float[Array, "run row drive"]
     current: Float[Array, "run row drive"]
@@ -216,7 +245,11 @@ class _ReplayRows(eqx.Module):
 def _replayed(
     estimator: Estimator, start: Float[Array, "run 3"], rows: _ReplayRows
 ) -> tuple[Array, Array, Array]:
-    """Return poses, covariances of the place and floor probabilities under the robot, by row."""
+    """Return estimates after each row of each run.
+
+    The estimates are the pose [m, m, rad], the covariance of the position [m^2], and the
+    probability of each floor, averaged over the wheels.
+    """
     nothing = Readings.nothing(estimator.robot.drives)
 
     def step(state: Any, row: _ReplayRows) -> Any:
@@ -234,10 +267,15 @@ def _replayed(
 def replay(
     estimator: Estimator, runs: Sequence[RunSignals], start: np.ndarray
 ) -> list[PredictedRun]:
-    """Return the estimates of runs from their signals, from start poses (run, 3).
+    """Return the estimator's predictions of runs from their signals.
 
-    The first row is the wheels' first angle, with no time before it. Steps longer than `LONGEST_S`
-    are split into equal parts.
+    The estimator's first row has zero duration and gives the wheels' first angles. Steps longer
+    than `LONGEST_S` are split into equal parts.
+
+    Args:
+        estimator: the estimator.
+        runs: signals of the runs.
+        start: start pose of each run, shape (run, 3) [m, m, rad].
     """
     parts = [np.ceil(run.dt / LONGEST_S - 1e-9).astype(int).clip(1) for run in runs]
     longest = max(int(part.sum()) for part in parts)
@@ -276,6 +314,6 @@ def replay(
 
 
 def turned_covariance(cov: Float[np.ndarray, "2 2"], angle: float) -> Float[np.ndarray, "2 2"]:
-    """Return the covariance of a plane vector after a turn by an angle [rad]."""
+    """Return the covariance of a plane vector that is rotated by an angle [rad]."""
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return turn @ cov @ turn.T

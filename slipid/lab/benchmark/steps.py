@@ -1,4 +1,4 @@
-"""Runs in short steps with true body poses, the input of every method of the benchmark."""
+"""Runs divided into short steps, with true body poses: the input of all benchmark methods."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,10 @@ from slipid.predict import open_loop
 from slipid.predict.slip_model import Run, RunSignals, turned
 
 POSES_PER_STEP = 3
-"""Poses in each step, if there are enough: the noise of two poses is nearly as long as a step."""
+"""Minimum number of logged poses in each step, if a run has enough poses.
+
+Between two successive poses, the noise of the poses is nearly as large as the motion.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +28,8 @@ class RunBatch:
 
     Attributes:
         numbers: index of each run in its data set.
-        runs: the runs, with floors unknown to methods.
-        windows: windows of the same runs; the last segments may be repeated.
+        runs: the runs; their signals, which methods are given, do not tell the floor.
+        windows: windows of the same runs; the last segments may be repeated as padding.
     """
 
     numbers: tuple[int, ...]
@@ -35,10 +38,10 @@ class RunBatch:
 
 
 def run_batches(data: Runs, robot: Robot, poses_per_step: int = POSES_PER_STEP) -> list[RunBatch]:
-    """Return all runs in steps, from one centimetre of wheel motion to the last pose.
+    """Return all runs divided into steps, from one centimetre of wheel motion to the last pose.
 
-    The robot's camera model turns logged poses into true ones, and has their lag. Nearly all runs
-    have the same number of steps, a power of two, so that few shapes are compiled.
+    Logged poses are corrected in scale and lag by the robot's camera model. Nearly all runs get the
+    same number of steps, a power of two, so that few shapes are compiled.
     """
     poses = [int(data.fresh[data.rows(k)].sum()) for k in range(len(data))]
     usual = _step_count(float(np.quantile(poses, 0.1)), poses_per_step)
@@ -53,7 +56,7 @@ def in_order(batches: Sequence[RunBatch]) -> list[Run]:
 
 
 def _step_count(poses: float, poses_per_step: int) -> int:
-    """Return the number of steps that so many poses allow."""
+    """Return the number of steps of a run with so many logged poses, a power of two."""
     return 2 ** max(1, int(np.floor(np.log2(max(0.8 * poses / poses_per_step, 2.0)))))
 
 
@@ -89,7 +92,7 @@ def _batch(data: Runs, robot: Robot, w: Windows) -> RunBatch:
 def _mean(
     log: Log, x: Float[np.ndarray, "row column"], edges: Float[np.ndarray, " edge"]
 ) -> Float[np.ndarray, "step column"]:
-    """Return the mean over time between edges [s]."""
+    """Return the time average of a logged signal between successive edges [s]."""
     inside = np.clip(edges, log.time[0], log.time[-1])
     total = np.diff(interpolate(log.time, integral(log.time, x), inside), axis=0)
     return np.asarray(total / np.maximum(np.diff(inside), 1e-9)[:, None])
@@ -98,7 +101,7 @@ def _mean(
 def body_poses(
     robot: Robot, w: Windows, marker: Float[np.ndarray, "segment edge 3"]
 ) -> Float[np.ndarray, "segment edge 3"]:
-    """Return poses of the body from those of its marker in true metres."""
+    """Return poses of the body from those of its marker, both in true metres and radians."""
     yaws = {s: float(robot.camera.yaw(robot.session_index(s))) for s in set(w.session)}
     out = marker.copy()
     out[..., 2] -= np.array([yaws[s] for s in w.session])[:, None]

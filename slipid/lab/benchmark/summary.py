@@ -1,6 +1,6 @@
-"""Summaries of all folds: means over runs, intervals by resampling, differences run by run.
+"""Summaries over all folds: means over runs, bootstrap intervals and differences run by run.
 
-`reading` says in sentences where slipid is ahead, where it is not, and by how much.
+`reading` compares slipid's end-point errors with those of the other rows in sentences.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,10 +14,11 @@ from slipid.lab.benchmark.scores import FoldScore, RunScore
 from slipid.lab.benchmark.slipid_rows import NAME
 
 NAMED = 4
-"""Largest number of rows that a sentence names."""
+"""Largest number of tied rows that a sentence names."""
 DRAWS = 1000
 """Number of draws of the bootstrap."""
 INTERVAL = (0.05, 0.95)
+"""Quantiles of the draws at the ends of a 90 % interval."""
 FEW = 2
 """Number of clusters on a floor below which its runs are resampled one by one."""
 Weights = Float[np.ndarray, "draw run"]
@@ -35,15 +36,16 @@ class MeanInterval(NamedTuple):
 class RowSummary:
     """Row of a method in one protocol of one data set.
 
-    Attributes that are not listed are means of those of `RunScore`, over the runs of each floor and
-    then over floors; None if the method does not predict them.
+    Attributes that are not listed are means of the attribute of `RunScore` with the same name
+    (`coverage90` of `covered90`, `floor_accuracy` of `floor_right`), first over the runs of each
+    floor and then over floors; None if the method does not predict them.
 
     Attributes:
         floors: mean end-point error of each floor, with its load set-up.
         behind: end-point error less that of slipid on the same resampled runs; None for slipid
-            itself, and without slipid.
+            itself, and if slipid has no row.
         slip_auc: area under the receiver operating characteristic of slip detection, by windows;
-            None if all windows slip, or none.
+            None if all windows slip, or if no window does.
         runs: number of runs.
         numbers: number of fitted parameters, median over folds.
         tune_s: time to pick the settings, median over folds [s].
@@ -52,7 +54,7 @@ class RowSummary:
         settings: settings picked in each fold.
         unconverged: number of folds whose fit did not converge.
         absent: reason why there are no runs, see `FoldScore`.
-        failed: the reason is an error.
+        failed: True if the reason is an error.
     """
 
     endpoint_error: MeanInterval | None = None
@@ -77,9 +79,10 @@ class RowSummary:
 
 
 def summary(folds: Mapping[str, Sequence[FoldScore]], reference: str) -> dict[str, RowSummary]:
-    """Return the summary of every row by its folds, compared with the reference row.
+    """Return the summary of every row over its folds, compared with the row named `reference`.
 
-    A row that is absent in some fold is absent altogether: its runs would differ.
+    A row that is absent in some fold is absent altogether, since it would be averaged over other
+    runs than the rest.
     """
     present = {
         name: each for name, each in folds.items() if each and not any(r.absent for r in each)
@@ -103,12 +106,14 @@ def summary(folds: Mapping[str, Sequence[FoldScore]], reference: str) -> dict[st
 
 @dataclass(frozen=True, eq=False)
 class Bootstrap:
-    """Runs resampled with replacement, in whole clusters of a floor if there are enough.
+    """Bootstrap draws of runs: on each floor, clusters of runs are resampled with replacement.
+
+    On a floor with fewer than `FEW` clusters, single runs are resampled.
 
     Attributes:
         floor: index of the floor of each run.
         names: names of the floors.
-        draws: weight of each run in each draw; the first draw is the runs as they are.
+        draws: weight of each run in each draw; in the first draw every run has weight 1.
     """
 
     floor: Int[np.ndarray, " run"]
@@ -117,14 +122,14 @@ class Bootstrap:
 
     @classmethod
     def of(cls, runs: Sequence[RunScore]) -> "Bootstrap":
-        """Return draws of runs by clusters; a run with a negative cluster is its own cluster."""
+        """Return draws of scored runs; a run with a negative cluster is a cluster of its own."""
         sector = np.array([run.cluster for run in runs])
         alone = -1 - np.arange(len(runs))
         return cls.by([run.floor for run in runs], np.where(sector < 0, alone, sector))
 
     @classmethod
     def by(cls, floors: Sequence[str], cluster: np.ndarray) -> "Bootstrap":
-        """Return draws of items on these floors and in these clusters."""
+        """Return draws of items, given the floor and the cluster of each item."""
         names = tuple(dict.fromkeys(floors))
         floor = np.array([names.index(name) for name in floors])
         rng = np.random.default_rng(0)
@@ -139,11 +144,11 @@ class Bootstrap:
         return cls(floor, names, draws)
 
     def mean(self, x: Float[np.ndarray, " run"]) -> Float[np.ndarray, " draw"]:
-        """Return the mean over floors of means over runs, in every draw, without NaN."""
+        """Return the mean over floors of means over runs, in every draw; NaN values are ignored."""
         return np.nanmean([self.on(x, k) for k in range(len(self.names))], axis=0)
 
     def over_all(self, x: Float[np.ndarray, " run"]) -> Float[np.ndarray, " draw"]:
-        """Return the mean over all runs, whatever their floor, in every draw."""
+        """Return the mean over all runs with equal weights of runs, in every draw."""
         return np.asarray(self.draws @ x / np.maximum(self.draws.sum(axis=1), 1e-12))
 
     def on(self, x: Float[np.ndarray, " run"], floor: int) -> Float[np.ndarray, " draw"]:
@@ -155,7 +160,7 @@ class Bootstrap:
 
 
 def mean_interval(draws: Float[np.ndarray, " draw"]) -> MeanInterval:
-    """Return the first draw with the interval of the others."""
+    """Return the value of the first draw, with the 90 % interval of the other draws."""
     low, high = np.nanquantile(draws[1:], INTERVAL)
     return MeanInterval(float(draws[0]), float(low), float(high))
 
@@ -200,7 +205,10 @@ def _summary(
 
 
 def _auc(runs: Sequence[RunScore], by: Bootstrap) -> MeanInterval | None:
-    """Return the area under the curve of slip detection over all windows, in some of the draws."""
+    """Return the area under the slip detection curve over all windows; None if it is undefined.
+
+    Its interval uses a fifth of the draws.
+    """
     score = np.concatenate([run.scores for run in runs])
     slips = np.concatenate([np.asarray(run.slips, bool) for run in runs])
     if slips.all() or not slips.any():
@@ -215,7 +223,10 @@ def area(
     positive: Bool[np.ndarray, " window"],
     weight: Float[np.ndarray, " window"],
 ) -> float:
-    """Return the weighted probability of a higher score of positives; ties count half."""
+    """Return the weighted probability that a positive scores higher than a negative window.
+
+    It equals the area under the receiver operating characteristic; ties count half.
+    """
     values, at = np.unique(score, return_inverse=True)
     up = np.bincount(at, weight * positive, len(values))
     down = np.bincount(at, weight * ~positive, len(values))
@@ -225,7 +236,7 @@ def area(
 
 
 def reading(tables: Mapping[str, Mapping[str, Mapping[str, RowSummary]]]) -> list[str]:
-    """Return a sentence for each protocol of each data set."""
+    """Return a sentence for each protocol of each data set that compares slipid with the rest."""
     return [
         sentence(name, protocol, found)
         for name, protocols in tables.items()
@@ -234,7 +245,7 @@ def reading(tables: Mapping[str, Mapping[str, Mapping[str, RowSummary]]]) -> lis
 
 
 def sentence(name: str, protocol: str, found: Mapping[str, RowSummary]) -> str:
-    """Return the comparison of slipid's end-point error with the others' in one table."""
+    """Return a sentence that compares slipid's end-point error with the other rows of a table."""
     head = f"{name}, {protocol.replace('_', ' ')}: "
     slipid = found.get(NAME)
     if slipid is None or slipid.endpoint_error is None:
@@ -271,5 +282,5 @@ def _percent(x: MeanInterval) -> str:
 
 
 def _points(x: MeanInterval) -> str:
-    """Return a difference in points of percent, with its interval."""
+    """Return a difference in percentage points with its interval, as text."""
     return f"{100 * x.value:+.1f} points [{100 * x.low:+.1f}, {100 * x.high:+.1f}]"

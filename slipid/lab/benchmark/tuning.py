@@ -1,4 +1,4 @@
-"""Settings of every method, picked in the same way: by held-back training runs."""
+"""Tuning of the settings of every method in the same way: on held-out training runs."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from slipid.predict.slip_model import TRIES, RobotSpec, Run, SlipModel
 from slipid.predict.slip_models import ByFloor
 
 WORST = 2.0
-"""Relative error above which all errors of a setting count the same."""
+"""Upper limit of the relative error of a run in the loss; larger errors count as this."""
 Method = TypeVar("Method")
 
 
@@ -24,7 +24,7 @@ class Tuned(Generic[Method]):
         method: the method.
         settings: its settings in words.
         tried: number of settings that were compared.
-        loss: loss of the method; NaN where there was nothing to compare.
+        loss: loss of the method; NaN if there was only one candidate.
     """
 
     method: Method
@@ -34,7 +34,7 @@ class Tuned(Generic[Method]):
 
 
 def best_candidate(candidates: Sequence[Method], loss: Callable[[Method], float]) -> Tuned[Method]:
-    """Return the candidate with the least loss; the first of equally good ones."""
+    """Return the candidate with the smallest loss; the first of equally good ones."""
     if len(candidates) == 1:
         return Tuned(candidates[0])
     losses = [loss(candidate) for candidate in candidates]
@@ -45,12 +45,13 @@ def best_candidate(candidates: Sequence[Method], loss: Callable[[Method], float]
 def tuned(method: SlipModel, runs: Sequence[Run], spec: RobotSpec, kind: str) -> Tuned[SlipModel]:
     """Return the method with the best of its settings, unfitted.
 
-    Each setting is fitted without a part of the runs, split like the protocol's runs as far as the
-    training runs allow it, and scored on that part by its mean error, of the end over the path or
-    of the energy (`SlipModel.aim`), with equal weights of floors. A setting with which the method
+    With each setting, the method is fitted without a part of the runs and scored on that part. The
+    part is chosen by the protocol's kind of split where the training runs allow it. The score is
+    the mean error, averaged with equal weights of floors: that of the end point relative to the
+    path length, or that of the energy, as `SlipModel.aim` says. A setting with which the method
     cannot be fitted has the worst score. All training runs are used, since settings that are best
-    for fewer are too cautious. A method that is fitted floor by floor may also do better with one
-    fit to all runs: both are tried with the best settings.
+    for fewer runs are too cautious. For a method that is fitted floor by floor, one fit to all runs
+    together is also tried, with the best settings, and used if it has the smaller loss.
     """
     part = inner(runs, kind)
 
@@ -70,7 +71,11 @@ def tuned(method: SlipModel, runs: Sequence[Run], spec: RobotSpec, kind: str) ->
 
 
 def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, spec: RobotSpec) -> float:
-    """Return the mean error over parts held back in turn, over runs and then over floors."""
+    """Return the mean error on parts of the runs that are held out in turn.
+
+    Errors are averaged over the runs of each floor and then over floors. The loss is infinite if
+    the method cannot be fitted, and 0 if no part can be held out.
+    """
     errors: dict[str, list[float]] = {}
     for k in range(INNER):
         training = [run for run, p in zip(runs, part, strict=True) if p != k]
@@ -94,7 +99,10 @@ def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, spec: RobotS
 
 
 def settings_of(best: object, candidates: Sequence[object]) -> str:
-    """Return the settings in which candidates differ, of the best one, such as `ridge = 0.01`."""
+    """Return the best candidate's values of the fields in which candidates differ, as text.
+
+    An example is `ridge = 0.01`.
+    """
     inside = [vars(c.method if isinstance(c, ByFloor) else c) for c in (best, *candidates)]
     names = [name for name in inside[0] if len({repr(one[name]) for one in inside}) > 1]
     return ", ".join(f"{name} = {inside[0][name]!r}" for name in names)

@@ -1,4 +1,4 @@
-"""Tasks of the benchmark: slipid and every row fitted and scored in one fold of one data set."""
+"""Tasks of the benchmark: each fits and scores slipid and every row in one fold of a data set."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -26,16 +26,16 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 OWN_MAP = "slipid_map"
-"""Row of slipid's estimator with the map of the floors."""
+"""Name of the row of slipid's estimator that is given the map of the floors."""
 
 
 OF_FITS = (
     *("parameter", "search_space", "model", "data", "fitting", "predict", "infer", "app"),
     "lab/benchmark/slipid_rows",
 )
-"""Packages and modules that slipid's fits depend on."""
+"""Packages and modules that slipid's fits depend on; saved fits are void when one changes."""
 OF_ROWS = ("lab/systems", "lab/paper2021", "lab/benchmark", "robot", "deploy")
-"""Packages that all rows depend on besides these."""
+"""Packages that the scores of all rows depend on in addition to `OF_FITS`."""
 QUICK_RUNS = 60
 """Number of runs of each data set in a quick benchmark."""
 QUICK_KIND = "headings"
@@ -50,7 +50,7 @@ class BenchmarkOptions:
         data: folder of the data sets.
         out: folder to write to.
         only: names of the requested rows; all if empty.
-        quick: some of the runs, one fold of headings, and known floors only.
+        quick: True for a short benchmark: some of the runs, one fold by headings, known floors.
     """
 
     data: Path
@@ -61,7 +61,7 @@ class BenchmarkOptions:
 
 @dataclass(frozen=True)
 class FoldTask:
-    """One fold of one data set.
+    """Task that fits and scores all rows in one fold of one data set.
 
     Attributes:
         options: options of the benchmark.
@@ -80,14 +80,14 @@ class FoldTask:
         return f"{self.source}/{self.kind}_{self.fold}"
 
     def run(self) -> str:
-        """Fit and score all rows that are not kept yet, and return the task's name."""
+        """Fit and score all rows that the checkpoint lacks, and return the task's name."""
         setup_jax(quiet=True)
         kept = checkpoint_of(self, fit=False)
         missing = [key for key in keys_of(self) if not _is_done(kept.load_json("_".join(key)))]
         if missing:
             try:
                 data: FoldData | FoldScore = _fold_data(self)
-            except Exception as error:  # other tasks are done all the same
+            except Exception as error:  # a task that fails does not stop the others
                 data = FoldScore.of_error(error)
             for protocol, name in missing:
                 score = data if isinstance(data, FoldScore) else _score(data, protocol, name)
@@ -95,14 +95,14 @@ class FoldTask:
         return self.name
 
     def rows(self) -> dict[tuple[str, str], FoldScore]:
-        """Return the kept scores by protocol and row."""
+        """Return the scores in the checkpoint, by protocol and row."""
         kept = checkpoint_of(self, fit=False)
         found = {key: kept.load_json("_".join(key)) for key in keys_of(self)}
         return {key: FoldScore.of_json(one) for key, one in found.items() if one is not None}
 
 
 def _is_done(content: Content | None) -> bool:
-    """Return True if a row is kept; a failed one is tried again."""
+    """Return True if a row's score was saved and is no failure; failed rows are tried again."""
     return content is not None and not content["failed"]
 
 
@@ -113,14 +113,14 @@ def source_of(name: str) -> LogSource:
 
 @lru_cache(maxsize=8)
 def data_of(options: BenchmarkOptions, source: str) -> DataSet:
-    """Return the runs of a source, read once in every process."""
+    """Return the data set of a source; it is read once in every process."""
     found = read_set(source_of(source), options.data, options.out, Reporter(quiet=True))
     return found.thinned(QUICK_RUNS) if options.quick else found
 
 
 @lru_cache(maxsize=8)
 def problem_of(options: BenchmarkOptions, source: str) -> Problem:
-    """Return the fitting problem of all runs of a source, made once in every process."""
+    """Return slipid's fitting problem of all runs of a source; it is made once in every process."""
     return data_of(options, source).job.problem()
 
 
@@ -131,13 +131,13 @@ def split_of(task: FoldTask) -> Split:
 
 
 def checkpoint_of(task: FoldTask, fit: bool) -> Checkpoint:
-    """Return the checkpoint of slipid's fit in a task, or of its scores."""
+    """Return the checkpoint of slipid's fit in a task if `fit`, else that of the task's scores."""
     data = data_of(task.options, task.source)
     more = () if fit else (data.crossing_hash, source_hash(*OF_ROWS))
     split = split_of(task)
     marks = data.job.config.hash, data.job.data_hash, source_hash(*OF_FITS)
     key = key_of(*marks, split.training, split.held_out, *more)
-    # the folder depends on the key, so that results of other settings stay
+    # the folder name contains the key, so that results of other options are not overwritten
     return Checkpoint(task.options.out / "kept" / task.name / key[:12], key)
 
 
@@ -161,9 +161,9 @@ class FoldData:
 
     Attributes:
         data: the data set.
-        fit: slipid's fit, or the reason why there is none.
-        training: training runs, with known floors.
-        batches: held-out runs.
+        fit: slipid's fit, or an empty score with the reason why there is none.
+        training: training runs, whose signals tell the floor.
+        batches: held-out runs, in batches with equal numbers of steps.
         held_out: logs of the held-out runs.
     """
 
@@ -180,9 +180,10 @@ class FoldData:
 
 
 def _fold_data(task: FoldTask) -> FoldData:
-    """Return the runs in true metres of the camera model that slipid fitted to training runs.
+    """Return the runs and slipid's fit of a fold.
 
-    If slipid cannot be fitted, the camera model is that of the config.
+    Poses are corrected by the camera model that slipid fitted to the training runs, or by that of
+    the config if slipid cannot be fitted.
     """
     data, split = data_of(task.options, task.source), split_of(task)
     fit: slipid_rows.SlipidFit | FoldScore
@@ -191,7 +192,7 @@ def _fold_data(task: FoldTask) -> FoldData:
         problem = problem_of(task.options, task.source)
         fit = slipid_rows.fit_slipid(data.job, problem, split.training, kept)
         robot = fit.contact.robot
-    except Exception as error:  # other rows are scored all the same
+    except Exception as error:  # without slipid's fit, the other rows can still be scored
         fit = FoldScore.of_error(error)
         robot = Space(data.job.robot, data.job.choices).template
 
@@ -209,7 +210,10 @@ def _fold_data(task: FoldTask) -> FoldData:
 
 
 def _with_facts(batch: RunBatch, data: DataSet, numbers: np.ndarray) -> RunBatch:
-    """Return the batch with the facts of splits: floors with loads, commanded motion."""
+    """Return the batch with floors, headings and speeds of its runs as the splits use them.
+
+    Floors include the load set-up; heading and speed follow from the commanded motion.
+    """
     facts = [data.facts[numbers[k]] for k in batch.numbers]
     runs = [
         replace(run, floor=f.floor, heading=float(np.radians(f.heading_deg)), speed=f.speed)
@@ -229,12 +233,12 @@ def _score(data: FoldData, protocol: str, name: str) -> FoldScore:
         if lacks := method.needs - channels_of(runs, data.data.spec):
             return FoldScore.lacking(lacks)
         return _published(data, rules, runs, method)
-    except Exception as error:  # other rows are scored all the same
+    except Exception as error:  # a row that fails does not stop the others
         return FoldScore.of_error(error)
 
 
 def channels_of(runs: Sequence[Run], spec: RobotSpec) -> frozenset[Channel]:
-    """Return the channels besides encoders that all runs have."""
+    """Return the channels that all runs have, other than encoders."""
     twist: frozenset[Channel] = frozenset({"twist"} if spec.determines_twist else ())
     return common(runs) | twist
 
@@ -262,7 +266,11 @@ def _published(
 
 
 def _slipid(data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], name: str) -> FoldScore:
-    """Return the score of slipid: its estimator on unknown floors or with a gyro, else its fit."""
+    """Return the score of slipid in a protocol.
+
+    Runs are predicted by its estimator if floors are unknown or the runs have a gyro, and
+    otherwise by its fitted force balance.
+    """
     fit, known = data.fit, protocol.floor_known
     if isinstance(fit, FoldScore):
         return fit
@@ -278,7 +286,7 @@ def _slipid(data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], name: 
         forecasts = [slipid_rows.forecast(fit, b, data.data.spec) for b in data.batches]
         return [run for of_batch in forecasts for run in of_batch]
 
-    predict()  # compiles
+    predict()  # compiles the functions, so that the timed call measures execution only
     score = _timed(data, runs, predict)
     return replace(score, numbers=fit.numbers, fit_s=fit.seconds, converged=fit.converged)
 
@@ -286,7 +294,7 @@ def _slipid(data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], name: 
 def _timed(
     data: FoldData, runs: Sequence[Run], predict: Callable[[], list[PredictedRun]]
 ) -> FoldScore:
-    """Return the scores of predictions, and the time for one step."""
+    """Return the scores of the predictions, with the time that one step of one run took."""
     began = time.perf_counter()
     predicted = predict()
     took = time.perf_counter() - began

@@ -1,4 +1,4 @@
-"""The 2021 paper's system: slip of each wheel by the torque or current of its own motor.
+"""The 2021 paper's system: the slip of each wheel from the torque or current of its own motor.
 
     xi = back r (w_i (1 - s_i))
 
@@ -9,27 +9,31 @@
     paper_linear_svr      s = c0 + c1 M, by epsilon-insensitive regression, clipped to [0, 1]
     paper_quadratic_svr   s = c0 + c1 M + c2 M^2, likewise
 
-M is the torque characterising variable at the motor's shaft [N m], I~ the current [A] smoothed with
-a factor of 0.97 from each sample of 31 ms to the next. The first two are the authors' own numbers
-and are never fitted. The refits are least squares in the displacement of half-second windows. The
-last two follow the authors' recipe: s = 1 - w_eff / w of each wheel and window, w_eff by the pose;
-only 0 < s <= 1 and I > 0.25 A are kept, which cuts the response that is fitted.
+xi is the twist of the body, `back` the matrix from wheel rim speeds to the twist, r the wheel
+radius [m], w_i the speed [rad/s] and s_i the slip of wheel i. M is the torque characterising
+variable at the motor's shaft [N m], I~ the current [A] after exponential smoothing, which keeps
+0.97 of its value from one sample of 31 ms to the next. The first two rows have the authors' own
+numbers and are never fitted. The refits are least squares in the displacement of half-second
+windows. The last two rows follow the authors' recipe: s = 1 - w_eff / w of each wheel and window,
+with w_eff from the pose; only samples with 0 < s <= 1 and I > 0.25 A are kept, which truncates the
+response that is fitted.
 
 Tuned: C and epsilon of the support vector regressions.
 
 Liberties:
-    - M is regular at rest (`RunSignals.torque`); the authors divide by the shaft's speed. Their own
-      numbers take R and C_e of their scripts, the refits those of the robot's config.
-    - `paper_code` starts its smoothing at a run's first current. Robots that do not have three
-      drives get the mean of the three motors' slips.
+    - M is regular at rest (`RunSignals.torque`); the authors divide by the shaft's speed.
+      `paper_print` uses the winding resistance R and back-EMF constant C_e of the authors'
+      scripts, the refits those of the robot's config.
+    - `paper_code` starts its smoothing at a run's first current. On robots that do not have three
+      drives, each wheel has the mean of the slips by the three motors' lines.
     - The refits are clipped to [-1, 1] instead: the slip of a dragged wheel is negative.
     - The recipe's M is not cut at 0.5 N m, and all motors are pooled, as the printed curve is used
       for all; at most 3000 samples are used.
-    - C and epsilon are not printed. With ours, epsilon a tenth of a robust std, figure 2's line
-      comes back from the authors' samples (0.115 + 0.570 I for 0.120 + 0.566 I); the curve of
-      figure 4 does not, from what they published.
-    - The quadratic regression is linear in M and M^2, standardised, where the authors may have had
-      a polynomial kernel: the same curves under another penalty.
+    - C and epsilon are not printed. With our values, epsilon a tenth of a robust std, the line of
+      figure 2 is reproduced from the authors' samples (0.115 + 0.570 I for 0.120 + 0.566 I); the
+      curve of figure 4 is not reproduced from what they published.
+    - The quadratic regression is linear in M and M^2, standardised. The authors may have used a
+      polynomial kernel, which gives the same curves under another penalty.
 
 Source: Belyaev, Brylev, Ivanov 2021, IFAC-PapersOnLine 54(13), section 3, figures 2 to 4, and the
 code that its authors published, BrOleg5/Slippage-compensation.
@@ -70,7 +74,7 @@ class _AsPublished(WheelSlip, abc.ABC):
 @final
 @dataclass(frozen=True)
 class PaperPrint(_AsPublished):
-    """The printed curve over torque, with the motor's constants of the authors' scripts."""
+    """The printed curve of slip over torque, with the motor constants of the authors' scripts."""
 
     name: str = "paper_print"
 
@@ -84,7 +88,7 @@ class PaperPrint(_AsPublished):
 @final
 @dataclass(frozen=True)
 class PaperCode(_AsPublished):
-    """The lines over smoothed current that ran on the authors' robot."""
+    """The lines of slip over smoothed current, one per motor, that ran on the authors' robot."""
 
     name: str = "paper_code"
 
@@ -97,7 +101,10 @@ class PaperCode(_AsPublished):
 
 
 def recipe_samples(w: TrainingWindows, spec: RobotSpec) -> SlipSamples:
-    """Return the wheels and windows within the authors' cuts, at most `MOST` drawn at random."""
+    """Return samples of single wheels and windows within the authors' limits of slip and current.
+
+    If there are more than `MOST`, so many are drawn at random.
+    """
     signals = w.signals
     rim = signals.speed * spec.wheel_radius
     real = w.twist @ spec.forward.T
@@ -119,9 +126,9 @@ def insensitive_curve(
 ) -> Float[np.ndarray, " power"]:
     """Return coefficients of 1, x, ..., x^degree by epsilon-insensitive regression.
 
-    The support vector regression is linear in standardised powers with a centred slip, to which
-    its penalty applies. C weighs the loss of each sample; epsilon is the tube times a robust std of
-    the slip.
+    The support vector regression is linear in standardised powers of x, with a centred slip; its
+    penalty applies to the coefficients of the standardised powers. C weights the loss of each
+    sample; epsilon is `tube` times a robust std of the slip.
     """
     from sklearn.svm import LinearSVR
 
@@ -169,7 +176,7 @@ class PaperSvr(WheelSlip):
 
 
 def refits() -> list[CurveModel]:
-    """Return the printed and the deployed form, unfitted, clipped to [-1, 1]."""
+    """Return curves of the printed and of the deployed form, unfitted, clipped to [-1, 1]."""
     deployed = above(tables.DEPLOYED_THRESHOLD)
     return [
         CurveModel("paper_print_refit", powers(0, 1, 2), RunSignals.torque, most=1.0, needs=NEEDS),

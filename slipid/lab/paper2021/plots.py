@@ -1,4 +1,4 @@
-"""The 2021 paper regenerated: its numbers as JSON, its figures 2, 3, 4 and 7 redrawn from data."""
+"""Reproduction of the 2021 paper: its numbers as JSON, its figures 2, 3, 4 and 7 from the data."""
 
 from pathlib import Path
 
@@ -43,7 +43,7 @@ def run(data_dir: Path, out: Path) -> list[Path]:
 
 
 def runs_2022(folder: Path) -> tuple[Log, ...] | None:
-    """Return the 2022 runs on one surface each, or None without any."""
+    """Return the 2022 runs, each on one surface; None if the folder has none."""
     pattern = "one_surface/*/*.csv"
     return read_runs(folder, pattern, "robotino2022").logs if any(folder.glob(pattern)) else None
 
@@ -170,7 +170,10 @@ def _draw_track(axes: Axes, track: SquareTrack) -> None:
 
 
 def _floor(track: SquareTrack) -> np.ndarray:
-    """Return positions from the start in right-handed axes [mm]; the image has y down."""
+    """Return positions relative to the start in right-handed axes on the floor [mm].
+
+    In the image, y points down.
+    """
     step = track.position - track.position[0]
     return np.stack([-step[:, 0], step[:, 1]], axis=1)
 
@@ -178,7 +181,7 @@ def _floor(track: SquareTrack) -> np.ndarray:
 def _medians(
     axes: Axes, x: np.ndarray, slip: np.ndarray, colour: str, marker: str, label: str, width: float
 ) -> None:
-    """Draw running medians of bins with enough points."""
+    """Draw the median slip of each bin of x that has at least 8 points; `width` is a bin's."""
     bins = np.floor(x / width).astype(int)
     filled = [b for b in np.unique(bins) if np.count_nonzero(bins == b) >= 8]
     centre = [np.median(x[bins == b]) for b in filled]

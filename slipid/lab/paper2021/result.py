@@ -1,4 +1,4 @@
-"""The paper regenerated: tables, the camera tracks of figure 7, and transfer between surfaces."""
+"""Results of the 2021 paper: tables, camera tracks of figure 7, transfer between surfaces."""
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -19,8 +19,8 @@ class TrackFile:
 
     Attributes:
         name: key in results.
-        label: controller of the robot.
-        square: its part of the file name `square_<square>_camera.csv` in the folder figure7.
+        label: controller that the robot ran.
+        square: <square> in the file name `square_<square>_camera.csv` in the folder figure7.
         authors_frames: camera frames of the first side, by the authors' own index.
         side_frames: camera frames of the first side in this file, up to the robot's turn.
         printed_path_length: length of the first side as the paper prints it [mm].
@@ -34,8 +34,9 @@ class TrackFile:
     printed_path_length: float
 
 
-# Encoders: by the authors' index the first side has 216 frames, but this track turns off at frame
-# 181. Their length script reads a variable of another name, most likely a repeat of the run.
+# For "encoders", the authors' index gives 216 frames of the first side, but the track in the file
+# turns at frame 181. The authors' script of path lengths reads a variable of another name, most
+# likely from a repetition of the run.
 TRACK_FILES = (
     TrackFile("encoders", "encoders only", "without_controller", 216, 181, 760.0),
     TrackFile("slip_model", "slip model", "without_controller_with_compensation", 324, 324, 940.0),
@@ -49,7 +50,7 @@ COMMANDED_SIDES = (900.0, 400.0)
 
 @dataclass(frozen=True, eq=False)
 class SquareTrack:
-    """One camera track, with the numbers of figure 7.
+    """One camera track of figure 7, with the numbers that the figure shows.
 
     Attributes:
         file: file of the track.
@@ -87,7 +88,7 @@ class SquareTrack:
         return float(np.hypot(*(self.position[-1] - self.position[0])))
 
     def as_dict(self) -> dict[str, float | str | int]:
-        """Return the numbers by name, with units in the names."""
+        """Return the numbers of the track; their names end in their units."""
         return {
             "label": self.file.label,
             "side_frames": self.file.side_frames,
@@ -102,7 +103,11 @@ class SquareTrack:
 
 
 def read_track(folder: Path, file: TrackFile) -> SquareTrack:
-    """Read one track of figure 7; DataError if the file is broken or ends within its first side."""
+    """Return one track of figure 7 from its file.
+
+    Raises:
+        DataError: the file cannot be read, or ends within the first side of the rectangle.
+    """
     path = folder / "figure7" / f"square_{file.square}_camera.csv"
     table = read_columns(path, "robotino2021_camera")
     frames = len(table["time_s"])
@@ -122,13 +127,13 @@ SCHEMA = "slipid.paper2021/1"
 
 @dataclass(frozen=True, eq=False)
 class PaperResult:
-    """The paper regenerated.
+    """Numbers of the paper, computed from its data.
 
     Attributes:
-        field: figure 2, motor 1 over the whole site.
-        motors: figures 3 and 4 and their table, by motor.
-        tracks: figure 7.
-        transfer: transfer of a current curve between surfaces of the 2022 runs; None without them.
+        field: samples and models of figure 2: motor 1 over the whole site.
+        motors: samples and models of figures 3 and 4 and their table, by motor number.
+        tracks: camera tracks of figure 7.
+        transfer: transfer of slip curves between surfaces of the 2022 runs; None without these.
     """
 
     field: MotorTable
@@ -154,7 +159,11 @@ class PaperResult:
 
 
 def find_folder(data: Path) -> Path:
-    """Return the folder of the 2021 data set, below a data root or itself; DataError if absent."""
+    """Return the folder of the 2021 data set: `data` itself or the folder robotino2021 in it.
+
+    Raises:
+        DataError: neither contains the data set.
+    """
     for folder in (data / "robotino2021", data):
         if (folder / "experimental_data_gray.csv").is_file():
             return folder
@@ -168,7 +177,9 @@ def regenerate(folder: Path, logs: Iterable[Log] | None = None) -> PaperResult:
     """Compute the paper's numbers from its own data.
 
     Args:
-        logs: the 2022 runs on one surface each, for the transfer between surfaces; None without.
+        folder: folder of the 2021 data set.
+        logs: the 2022 runs on one surface each, for the transfer between surfaces; None if the
+            transfer is not wanted.
     """
     return PaperResult(
         field=field_table(folder),

@@ -1,7 +1,7 @@
-"""Slip, current and torque of one motor, from the authors' half-second means, by their recipe.
+"""Samples of slip, current and torque of each motor, computed by the authors' recipe.
 
-`leave_one_surface_out` tests on the 2022 runs whether a curve of slip over current carries over to
-another surface.
+The samples of 2021 come from the authors' half-second means. `leave_one_surface_out` tests on the
+runs of 2022 whether a curve of slip over current that is fitted to some surfaces holds on another.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,10 +28,12 @@ _TO_SI = np.array([1e-3, 1e-3, np.pi / 180.0])
 
 @dataclass(frozen=True)
 class Recipe:
-    """Processing of logged columns into the points of a figure, as chosen by the authors.
+    """Parameters by which the authors turn logged columns into the points of a figure.
 
-    w_eff = n J v / r; s = 1 - w_eff / w; U = C_e w + R I sign(w); M = U I / w, with w and w_eff at
-    the motor shaft.
+    w_eff = n J v / r; s = 1 - w_eff / w; U = C_e w + R I sign(w); M = U I / w. Here w is the
+    measured speed of the motor shaft, w_eff its speed without slip [rad/s], v the measured twist of
+    the body, J the matrix `rim`, s the slip [-], U the voltage [V], I the current [A] and M the
+    torque characterising variable [N m].
 
     Attributes:
         wheel_radius: r [m].
@@ -43,9 +45,10 @@ class Recipe:
         row_period: divisor of each row's pose delta [s]; the rows are about 0.45 s apart.
         delta_columns: pose deltas used, x, y [mm] and heading [deg].
         drop_rotation: leave out rows with a rotation command.
-        speed_limit: rows with any |w_eff| at or above it are taken for camera jumps [rpm, motor].
-        min_current: samples at or below it are taken for idling [A].
-        max_torque: samples above it are left out [N m].
+        speed_limit: rows with any |w_eff| at or above it are left out as camera jumps [rpm of the
+            motor shaft].
+        min_current: samples with a current at or below it are left out as idling [A].
+        max_torque: samples with M above it are left out [N m].
     """
 
     wheel_radius: float = 0.040
@@ -63,14 +66,15 @@ class Recipe:
 
     @property
     def rim(self) -> np.ndarray:
-        """Matrix J of rim speeds [m/s] by the body twist, shape (wheel, 3)."""
+        """Matrix J that maps the body twist to rim speeds [m/s], shape (wheel, 3)."""
         azimuth = np.radians(self.azimuth_deg)
         arm = np.full(len(azimuth), self.base_radius)
         return np.stack([-np.sin(azimuth), np.cos(azimuth), arm], axis=1)
 
 
 FIGURES_3_AND_4 = Recipe()
-# The whole-field figure keeps turning rows and idling wheels and uses the re-calibrated deltas.
+# Figure 2, over the whole field, includes rows with rotation commands and idling wheels, and uses
+# the recalibrated pose deltas.
 FIGURE_2 = Recipe(
     delta_columns=_DELTA_RESCALED,
     drop_rotation=False,
@@ -82,7 +86,13 @@ FIGURE_2 = Recipe(
 
 @dataclass(frozen=True, eq=False)
 class SlipSamples:
-    """Points of one motor: current [A], torque M [N m, motor] and slip [-], all (sample,)."""
+    """Samples of one motor.
+
+    Attributes:
+        current: motor current [A], shape (sample,).
+        torque: torque characterising variable M at the motor shaft [N m], shape (sample,).
+        slip: slip of the wheel [-], shape (sample,).
+    """
 
     current: np.ndarray
     torque: np.ndarray
@@ -93,13 +103,19 @@ class SlipSamples:
 
 
 def pool(parts: Sequence[SlipSamples]) -> SlipSamples:
-    """Return all points of several sets of one motor, in order."""
+    """Return the samples of several sets concatenated."""
     columns = zip(*((p.current, p.torque, p.slip) for p in parts), strict=True)
     return SlipSamples(*map(np.concatenate, columns))
 
 
 def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> SlipSamples:
-    """Return the points of one motor within the recipe's cuts; the table is in file units."""
+    """Return the samples of one motor that the recipe does not leave out.
+
+    Args:
+        table: logged columns by name, in the units of the file.
+        motor: number of the motor, from 1.
+        recipe: the authors' processing.
+    """
     effective = effective_speed(table, recipe)
     rpm = 2.0 * np.pi / 60.0
     keep = np.all(np.abs(effective) < recipe.speed_limit * rpm, axis=1)
@@ -118,12 +134,13 @@ def slip_samples(table: dict[str, np.ndarray], motor: int, recipe: Recipe) -> Sl
 
 
 def effective_speed(table: dict[str, np.ndarray], recipe: Recipe) -> np.ndarray:
-    """Return motor speeds of wheels without slip at the measured body motion, w_eff = n J v / r.
+    """Return the motor speeds that wheels without slip would have at the measured body motion.
 
-    A component of v whose command is 0 is set to 0, as by the authors.
+    w_eff = n J v / r. A component of the body twist v whose command is 0 is set to 0, as by the
+    authors.
 
     Returns:
-        [rad/s, motor shaft], shape (row, motor).
+        Speeds of the motor shafts [rad/s], shape (row, motor).
     """
     command = np.stack([table[c] for c in _COMMAND], axis=1)
     delta = np.stack([table[c] for c in recipe.delta_columns], axis=1)
@@ -158,13 +175,13 @@ def read_columns(path: Path, layout: str, needed: Sequence[str] = ()) -> dict[st
 
 @dataclass(frozen=True)
 class Transfer:
-    """Errors in slip [-] on each surface, by three predictions.
+    """Errors of three predictions of slip on each surface [-].
 
     Attributes:
         samples: number of samples per surface.
         pooled: root mean square error of a curve fitted to the other surfaces.
         constant: root mean square error of the other surfaces' mean slip.
-        own: root mean square error of a curve fitted to the surface itself.
+        own: root mean square error of a curve fitted to the samples of the surface itself.
     """
 
     samples: dict[str, int]
@@ -173,7 +190,7 @@ class Transfer:
     own: dict[str, float]
 
     def mean(self) -> dict[str, float]:
-        """Return each error averaged over surfaces with equal weights."""
+        """Return the error of each prediction, averaged over surfaces with equal weights."""
         rows = {"pooled": self.pooled, "constant": self.constant, "own": self.own}
         return {name: float(np.mean(list(row.values()))) for name, row in rows.items()}
 
@@ -181,17 +198,22 @@ class Transfer:
 def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
     """Return mean current and slip of every wheel in all windows of a log.
 
-    A window is as long as a row of the 2021 files. s = 1 - J v / (r w), v the camera's body
-    velocity over the window, w the encoders' mean speed.
+    A window lasts `recipe.row_period`, about as long as a row of the 2021 files. The slip is
+    s = 1 - J v / (r w), with v the body velocity over the window from camera poses and w the mean
+    wheel speed from encoders.
 
     Returns:
-        |current| [A] and slip [-], both (window, wheel); slip is not finite where a wheel rests.
+        Mean magnitude of the current [A] and slip [-], both of shape (window, wheel). The slip of a
+        wheel at rest is not finite.
+
+    Raises:
+        ValueError: the log has no pose or no current.
     """
     if log.pose is None or log.current is None:
         raise ValueError(f"{log.name}: slip against current needs both pose and current")
     first = first_moved(log.wheel_angle, recipe.wheel_radius)
     start = log.time[-1] if first is None else log.time[first]
-    # unique, since two windows may start at the same row where rows are rare
+    # where rows are sparse, two windows may start at the same row; only one of them is kept
     starts = np.arange(start, log.time[-1], recipe.row_period)
     edges = np.unique(np.searchsorted(log.time, starts))
     if len(edges) < 2:
@@ -199,7 +221,7 @@ def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
     span = np.diff(log.time[edges])[:, None]
     effective = body_steps(log.pose[edges]) / span @ recipe.rim.T
     driven = np.diff(log.wheel_angle[edges], axis=0) / span * recipe.wheel_radius
-    # mean over the rows of each window, since a single 10-bit current is rough
+    # a single 10-bit current reading is coarse, so the current is averaged over each window
     current = np.add.reduceat(np.abs(log.current), edges, axis=0)[:-1] / np.diff(edges)[:, None]
     slip = np.full_like(driven, np.nan)
     np.divide(effective, driven, out=slip, where=driven != 0)
@@ -207,16 +229,16 @@ def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
 
 
 def curve_points(log: Log, recipe: Recipe) -> np.ndarray:
-    """Return current [A] and slip [-] of all wheels within the paper's cuts, (sample, 2)."""
+    """Return current [A] and slip [-] of all wheels within the paper's limits, (sample, 2)."""
     current, slip = wheel_windows(log, recipe)
     keep = (slip > 0.0) & (slip <= 1.0) & (current > recipe.min_current)
     return np.stack([current[keep], slip[keep]], axis=1)
 
 
 def leave_one_surface_out(logs: Iterable[Log]) -> Transfer:
-    """Return errors of predicting the slip of each surface by the others and by itself.
+    """Return how well curves fitted to other surfaces, or to a surface itself, predict its slip.
 
-    Poses are those of the uncorrected camera.
+    Poses are used as the camera logged them, without correction of its scale and lag.
 
     Raises:
         ValueError: if fewer than two surfaces are there, or one has too few samples for a curve.

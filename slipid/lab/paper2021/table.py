@@ -1,4 +1,4 @@
-"""The paper's slip models: as published, as deployed, and each form refitted to its points."""
+"""The paper's slip models: as published, as deployed, and each form refitted to its samples."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,19 +18,25 @@ from slipid.lab.paper2021.samples import (
 )
 
 CURRENT_SVR = (0.120, 0.566)
-"""Figure 2: s = 0.120 + 0.566 I, epsilon-SVR with linear kernel, whole field, motor 1; I in A."""
+"""Coefficients of the line of figure 2, s = 0.120 + 0.566 I, with I in A.
+
+The authors fitted it to motor 1 over the whole field by epsilon-SVR with a linear kernel.
+"""
 
 TORQUE_SVR = (-0.072, 4.888, -5.456)
-"""Figure 4: s = -0.072 + 4.888 M - 5.456 M^2, quadratic SVR, motor 1; M in N m at the motor."""
+"""Coefficients of the curve of figure 4, s = -0.072 + 4.888 M - 5.456 M^2, with M in N m.
+
+The authors fitted it to motor 1 by a quadratic SVR; M is at the motor shaft.
+"""
 
 DEPLOYED_GAIN, DEPLOYED_OFFSET = (-0.639, -0.4559, -0.6294), (0.988, 0.9678, 0.9913)
-"""a [1/A] and b [-] of `deployed_slip`, motors 1, 2, 3."""
+"""Coefficients a [1/A] and b [-] of `deployed_slip` for motors 1, 2, 3."""
 DEPLOYED_THRESHOLD = 0.4
-"""Current below which a wheel counts as not slipping [A]."""
+"""Smoothed current up to which a wheel counts as not slipping [A]."""
 DEPLOYED_MEMORY = 0.97
-"""Factor of the smoothed current from sample to sample [-]."""
+"""Weight of the previous smoothed current in the next one [-]."""
 
-# name: (regressor, powers of it in the design matrix)
+# by name of the form: the regressor, and its powers in the design matrix
 _FORMS = {
     "linear in M": ("torque", (1,)),
     "affine in M": ("torque", (0, 1)),
@@ -41,11 +47,12 @@ _FORMS = {
 
 
 def deployed_slip(current: np.ndarray) -> np.ndarray:
-    """Return slip [-] of each wheel by its own smoothed current [A], both (sample, wheel).
+    """Return the slip [-] of each wheel from its own smoothed current [A], both (sample, wheel).
 
     1 - s_i = a_i I~_i + b_i where the smoothed current I~_i > threshold, else s_i = 0. The paper's
-    robot smoothed from sample to sample, I~_k = memory I~_(k-1) + (1 - memory) I_k. The authors'
-    lines leave [0, 1] beyond 1.55 A, so 1 - s is clipped to it: a wheel is never turned backwards.
+    robot smoothed the current from sample to sample, I~_k = memory I~_(k-1) + (1 - memory) I_k. The
+    authors' lines leave the range [0, 1] above 1.55 A. Here 1 - s is clipped to this range, so that
+    no wheel counts as rolling backwards.
 
     Source: Belyaev et al. 2021, section 3, coefficients as deployed.
     """
@@ -55,13 +62,13 @@ def deployed_slip(current: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class FittedForm:
-    """Polynomial slip model with its coefficients from the power `first_power` on.
+    """Polynomial model of slip, s = sum_k c_k x^(first_power + k).
 
     Attributes:
-        regressor: "torque" [N m] or "current" [A].
-        coefficients: c_k of s = sum c_k x^(first_power + k).
+        regressor: quantity x: "torque" [N m] or "current" [A].
+        coefficients: coefficients c_k.
         first_power: 0, or 1 for a line through the origin.
-        rmse: root mean square error in slip [-] on the given samples.
+        rmse: root mean square error in slip [-] on the samples of its table.
     """
 
     regressor: str
@@ -76,13 +83,14 @@ class FittedForm:
 
 @dataclass(frozen=True, eq=False)
 class MotorTable:
-    """All forms of one motor on the same samples.
+    """Slip models of one motor on the same samples.
 
     Attributes:
-        samples: the points fitted.
-        by_surface: the same points, per surface.
-        forms: the least-squares fits, by name.
-        stored: the paper's stored model for these samples, not refitted; motor 1 only.
+        samples: samples to which the models are fitted.
+        by_surface: the same samples by surface; empty for the whole field.
+        forms: least-squares fits by name of the form.
+        stored: model with the paper's own coefficients for motor 1, not refitted; None for other
+            motors.
     """
 
     samples: SlipSamples
@@ -92,10 +100,10 @@ class MotorTable:
 
 
 def fit_form(samples: SlipSamples, name: str) -> FittedForm:
-    """Return the least-squares fit of one row of the table.
+    """Return the least-squares fit of the named form to the samples.
 
     Raises:
-        ValueError: if there are fewer samples than coefficients.
+        ValueError: there are fewer samples than coefficients.
     """
     regressor, powers = _FORMS[name]
     x = getattr(samples, regressor)
@@ -128,7 +136,7 @@ def surface_tables(folder: Path) -> dict[int, MotorTable]:
 
 
 def field_table(folder: Path) -> MotorTable:
-    """Return the table of figure 2: motor 1 over the whole site, least squares and the SVR."""
+    """Return the table of figure 2: motor 1 over the whole site, with refitted and stored model."""
     path = folder / "experimental_data_on_whole_field.csv"
     table = read_columns(path, "robotino2021_field", needed(FIGURE_2))
     samples = slip_samples(table, 1, FIGURE_2)

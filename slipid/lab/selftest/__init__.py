@@ -1,1 +1,1 @@
-"""Made logs with known truth, and what a fit makes of them."""
+"""Simulated logs with known true parameters, and the comparison of their fits with the truth."""

@@ -1,4 +1,4 @@
-"""Test what an experiment can recover: the work of `slipid selftest`."""
+"""The command `slipid selftest`: which parameters an experiment can recover."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -27,27 +27,35 @@ from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
-SCHEMA = "slipid.lab.selftest/1"
+SCHEMA = "slipid.selftest/1"
 CHANCE = 1e-3
-"""Probability below which large errors, or intervals without the truth, are not taken for chance.
+"""Significance level of the two tests of a parameter's errors over all replicates.
 
-A number whose intervals fail this is wrong, whatever its verdict says.
+The tests ask whether its 90 % intervals contain the truth often enough, and whether its errors are
+as small as its standard deviations say. A parameter that fails one of them was recovered wrongly,
+unless it counts as not recovered anyway.
 """
 LEAST_CONVERGED = 0.75
-"""Least share of the fits that must converge."""
+"""Smallest share of the replicates' fits that must converge for a successful self test."""
 ORDER = ("identified", "weak", "not_identified", "at_bound")
+"""Verdicts of a fit; of equally frequent ones, the last in this order counts."""
 
 
 def selftest(
     config_path: Path, data: Path | None, out: Path, count: int, seed: int, report: Reporter
 ) -> Content:
-    """Return what an experiment can recover, by simulating it with known truth and fitting that.
+    """Simulate an experiment with known true parameters, fit it, and return what was recovered.
+
+    The result is also written to selftest.json.
 
     Args:
-        data: logs of the experiment, whose wheel motion is taken; without them a plan is simulated.
-        out: folder for selftest.json and the replicates, which a later call goes on from.
+        config_path: path of the config of the experiment.
+        data: folder of the logs of the experiment, whose wheel motion the simulation uses; None to
+            simulate the plan in the config's section `[selftest]`.
+        out: folder for selftest.json and the replicates; a later call continues from these.
         count: number of replicates.
-        seed: seed of truths and noise.
+        seed: seed of true parameters and noise.
+        report: receives messages about progress.
     """
     setup_jax(quiet=True)
     config = read_config(config_path)
@@ -75,10 +83,10 @@ def selftest(
 
 
 def planned_task(config: Config, report: Reporter) -> ConfigFitTask:
-    """Return the fit task of an experiment that nobody has driven: the grid of `[selftest]`.
+    """Return the fit task of a planned experiment, whose runs are the grid of `[selftest]`.
 
-    Channels are those that the config's layouts name; every load set-up of the config is driven on
-    every floor.
+    The logs are simulated. They have the channels that the config's layouts name, and runs with
+    every load set-up of the config on every floor.
     """
     wanted, shape = config.content.selftest, shape_of(config)
     sections = single_floor_sections(config.content.logs)
@@ -106,10 +114,13 @@ def planned_task(config: Config, report: Reporter) -> ConfigFitTask:
 
 
 def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
-    """Return paths that must be recovered: the config's, else those the channels should identify.
+    """Return the paths of the parameters and ratios that a successful self test must recover.
+
+    They match the patterns in the config or, without any, patterns of what the logged channels
+    should identify.
 
     Raises:
-        DataError: a pattern of the config matches nothing that is fitted.
+        DataError: a pattern of the config matches no fitted parameter and no ratio.
     """
     w, z = problem.windows, problem.space.start
     ratios = derived(problem.space, z, np.eye(len(z)), w.has_voltage)
@@ -131,11 +142,13 @@ def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
 
 
 def summary(replicates: Sequence[Replicate], wanted: Sequence[str]) -> Content:
-    """Return error, coverage, verdict and recovery of everything that was compared.
+    """Return the comparison of estimates with the truth, summarised over all replicates.
 
     Returns:
-        `parameters` (ratios included), `curves`, `predictions`, `failed` (wanted and not
-        recovered), `recovered`.
+        Content of selftest.json: errors, coverage, verdict and recovery of each of the
+        `parameters` (ratios included); errors of `curves` and `predictions` by floor; `failed`, the
+        wanted parameters that were not recovered; `recovered`, True if there are none of these and
+        enough fits converged.
     """
     first = replicates[0]
     numbers = {
@@ -171,10 +184,11 @@ def summary(replicates: Sequence[Replicate], wanted: Sequence[str]) -> Content:
 
 
 def number_summary(found: Sequence[NumberRecovery]) -> Content:
-    """Return one number over all replicates.
+    """Return the summary of one parameter over all replicates.
 
-    `recovered` is yes where most fits call it identified, roughly where they call it weak, no where
-    they say that they do not know it, and wrong where errors are larger than the fits say.
+    `recovered` follows from the most frequent verdict of the fits: "yes" for identified, "roughly"
+    for weak, and "no" for the others. "yes" and "roughly" become "wrong" if the errors are
+    significantly larger than the fits' intervals and standard deviations allow (`CHANCE`).
     """
     truth, value = np.array([f.truth for f in found]), np.array([f.value for f in found])
     inside, z = np.array([f.inside for f in found]), np.array([f.z for f in found])

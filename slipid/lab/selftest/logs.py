@@ -1,10 +1,10 @@
-"""Simulate logs of a Robotino whose every number is known, for self tests and tests of recovery.
+"""Simulation of logs of a robot whose parameters are all known, for self tests and tests.
 
-Straight and turning runs of a grid like a Robotino's under an overhead camera. The noise is the one
-the likelihood assumes (camera, process growing with distance, run effects, current level per run).
-Added to it are difficulties of real logs that the likelihood does not know: ticks, quantised
-unsigned currents with ripple, quantised voltages, repeated camera frames, uneven rows, a delayed
-and ramped start.
+The runs are a grid of straight and turning runs, such as those of a Robotino under an overhead
+camera. The noise is the one that the likelihood assumes: of the camera, of the motion (growing with
+distance), of each run, and of each run's current level. In addition, the logs have features of real
+logs that the likelihood does not model: encoder ticks, quantised unsigned currents with ripple,
+quantised voltages, repeated camera frames, uneven rows, and a delayed and ramped start.
 """
 
 import hashlib
@@ -29,7 +29,7 @@ from slipid.search_space import Choice, Space
 
 
 def true_numbers(robot: Robot) -> dict[str, float | list[float]]:
-    """Return every number of a robot by its path, as plain values."""
+    """Return the value of every parameter of a robot by its path, as plain numbers."""
     return {e.path: np.asarray(e.get(robot)).tolist() for e in entries(robot)}
 
 
@@ -44,7 +44,7 @@ _FLOORS = {
     "scrub": (0.001, 0.002),
     "lead": (0.0015, 0.0045),
 }
-"""Numbers of the floors firm and soft."""
+"""True surface parameters of the floors "firm" and "soft" in SI units, by name."""
 TRUTH: dict[str, float | tuple[float, ...]] = {
     "robot.mass": 12.0,
     "robot.load_share@as_built": (0.29, 0.42, 0.29),
@@ -61,11 +61,14 @@ TRUTH: dict[str, float | tuple[float, ...]] = {
     **{f"surface.firm.{name}": firm for name, (firm, _) in _FLOORS.items()},
     **{f"surface.soft.{name}": soft for name, (_, soft) in _FLOORS.items()},
 }
-"""Numbers of the default robot [SI], of the size found on real logs; the rest are as declared."""
+"""True parameters of the default robot in SI units, by path.
+
+They are of the magnitude found on real logs. All other parameters have their declared start values.
+"""
 
 
 def nominal_robot(drives: Sequence[PlannedRun]) -> Robot:
-    """Return a Robotino at declared start values with the floors, loads and sessions of a plan."""
+    """Return a Robotino with declared start values and the floors, loads, sessions of a plan."""
     return build(
         omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0),
         sorted({d.surface for d in drives}),
@@ -77,7 +80,7 @@ def nominal_robot(drives: Sequence[PlannedRun]) -> Robot:
 def true_robot(
     drives: Sequence[PlannedRun], values: Mapping[str, float | Sequence[float]] | None = None
 ) -> Robot:
-    """Return a Robotino with the numbers of `TRUTH`, or with others where given."""
+    """Return a Robotino with the parameters `TRUTH`, of which `values` replaces some."""
     robot = nominal_robot(drives)
     known = {e.path for e in entries(robot)}
     values = {**TRUTH, **(values or {})}
@@ -90,7 +93,10 @@ def heading_grid(
     speeds: Sequence[float] = (0.1, 0.2),
     turns: int = 2,
 ) -> tuple[PlannedRun, ...]:
-    """Return runs at every heading and speed on every (floor, load), and `turns` curves of each."""
+    """Return straight runs and curves at each speed on each (floor, load).
+
+    At each speed [m/s] there are straight runs in `headings` directions, and `turns` curves.
+    """
     drives = []
     for surface, load in setups:
         for speed in speeds:
@@ -107,16 +113,17 @@ def heading_grid(
 def turning_grid(
     setups: Sequence[tuple[str, str]], count: int, speeds: Sequence[float], base_radius: float
 ) -> tuple[PlannedRun, ...]:
-    """Return runs of wheels that do not drive sideways, on every (floor, load).
+    """Return runs of a robot that cannot drive sideways, at each speed on each (floor, load).
 
-    Each speed has `count` runs between straight ahead and turning on the spot, evenly around the
-    circle of (ahead, turn times base radius [m]).
+    At each speed [m/s] there are `count` runs, from straight ahead to turning on the spot. Their
+    commands (forward speed, turn rate times base radius) [m/s] are evenly spaced on a circle whose
+    radius is the speed.
     """
     drives = []
     for surface, load in setups:
         for speed in speeds:
             for angle in 2 * np.pi * np.arange(count) / count:
-                # rounded: the cosine of a right angle is not quite zero
+                # rounded, since the computed cosine of a right angle is not exactly zero
                 ahead, turn = (round(speed * float(f(angle)), 9) for f in (np.cos, np.sin))
                 back = 0.0 if ahead >= 0 else np.pi
                 drives.append(PlannedRun(surface, load, back, abs(ahead), turn=turn / base_radius))
@@ -125,21 +132,21 @@ def turning_grid(
 
 @dataclass(frozen=True)
 class SimulatedSensors:
-    """Disturbances of simulated logs, with stds by the names of `slipid.fitting.noise.noise`.
+    """Noise, sampling and quantisation of simulated logs.
 
     Attributes:
-        std: std of every variance component; `floor` in a name stands for every floor without its
-            own.
-        ripple: ripple of the current from row to row [A].
-        voltage_noise: noise of the voltage [V].
-        current_step, voltage_step: steps of the converters [A], [V].
+        std: std of each variance component, by its name in `slipid.fitting.noise.noise`; a name
+            with `floor` in place of a floor's name holds for every floor without an entry.
+        ripple: std of the current's noise from row to row [A].
+        voltage_noise: std of the voltage's noise from row to row [V].
+        current_step, voltage_step: steps of the analogue-to-digital converters [A], [V].
         ticks: encoder ticks per turn of the motor.
         row_period, frame_period: time between rows and between camera frames [s].
         delay, ramp: time from command to motion, and from there to full speed [s].
-        wobble: oscillation of the wheel's angle, as time [s]; a real speed loop is never quite
-            still.
-        has_voltage: whether voltages are logged.
-        signed: whether currents have their sign.
+        wobble: amplitude of an oscillation of the wheel angle, divided by the wheel speed [s]; it
+            imitates speed control, which is never quite steady.
+        has_voltage: True if voltages are logged.
+        signed: True if currents are logged with their sign.
     """
 
     std: Mapping[str, float] = field(
@@ -169,7 +176,7 @@ class SimulatedSensors:
     signed: bool = False
 
     def of(self, name: str) -> float:
-        """Return the std of a variance component; 0 for one that these logs do not have."""
+        """Return the std of a variance component by its name; 0 without an entry in `std`."""
         head, _, last = name.partition(".")
         of_any_floor = f"{head}.floor.{last.split('.')[-1]}"
         return self.std.get(name, self.std.get(of_any_floor, 0.0))
@@ -178,7 +185,7 @@ class SimulatedSensors:
 def simulate_logs(
     robot: Robot, drives: Sequence[PlannedRun], seed: int, sensors: SimulatedSensors | None = None
 ) -> list[Log]:
-    """Return logs of a plan, driven by a robot with the plan's floors, loads and sessions."""
+    """Return simulated logs of planned runs; the robot must have their floors, loads, sessions."""
     return _LogSimulator(
         robot, drives, sensors or SimulatedSensors(), np.random.default_rng(seed)
     ).logs()
@@ -186,7 +193,7 @@ def simulate_logs(
 
 @dataclass(frozen=True, eq=False)
 class _LogSimulator:
-    """Simulates the logs of all runs at once; arrays are (run, row or step, ...)."""
+    """Simulator of the logs of all runs at once; its arrays have shape (run, row or step, ...)."""
 
     robot: Robot
     drives: Sequence[PlannedRun]
@@ -233,7 +240,7 @@ class _LogSimulator:
         return out
 
     def wheels(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return times and true wheel angles."""
+        """Return the times [s] and the true wheel angles [rad] of `rows` rows of every run."""
         s, n, j = self.sensors, len(self.drives), np.asarray(self.robot.geometry.forward())
         radius = float(self.robot.geometry.wheel_radius)
         want = np.stack([d.command for d in self.drives]) @ j.T / radius
@@ -252,7 +259,10 @@ class _LogSimulator:
         speed: Float[np.ndarray, "run step wheel"],
         xi: Float[np.ndarray, "run step 3"],
     ) -> Float[np.ndarray, "run row 3"]:
-        """Return body poses with process noise and run effects, centred on the camera's origin."""
+        """Return true body poses, whose motion includes process noise and run effects.
+
+        Start and end of each run lie opposite each other about the camera's origin.
+        """
         s, shape, rng = self.sensors, self.robot.geometry, self.random
         back = np.asarray(shape.pseudo_inverse())
         step = speed * dt[..., None] * float(shape.wheel_radius) @ back.T
@@ -279,7 +289,7 @@ class _LogSimulator:
     def camera(
         self, time: Float[np.ndarray, "run row"], pose: Float[np.ndarray, "run row 3"]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return logged poses, and whether each row has a new frame."""
+        """Return the logged poses, and for each row True if it has a new camera frame."""
         robot, s, rng = self.robot, self.sensors, self.random
         fresh, marker = np.ones(time.shape, bool), np.empty_like(pose)
         for k, t in enumerate(time):
@@ -287,7 +297,7 @@ class _LogSimulator:
             frames += rng.uniform(0, s.frame_period)
             newest = np.searchsorted(frames, t) - 1
             fresh[k, 1:] = np.diff(newest) > 0
-            at = t - float(robot.camera.lag)  # age of every new frame
+            at = t - float(robot.camera.lag)  # time at which a frame logged at t was taken
             marker[k] = interpolate(t, pose[k], at)
         session = [robot.session_index(d.session) for d in self.drives]
         yaw = np.array([float(robot.camera.yaw(k)) for k in session])
@@ -301,7 +311,10 @@ class _LogSimulator:
     def electric(
         self, speed: Float[np.ndarray, "run step wheel"], amps: Float[np.ndarray, "run step wheel"]
     ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-        """Return logged currents or magnitudes [A], voltages [V] and reported speeds [rad/s]."""
+        """Return logged currents [A], voltages [V] or None, and reported wheel speeds [rad/s].
+
+        Currents are magnitudes unless `sensors.signed`.
+        """
         s, motor, rng = self.sensors, self.robot.motor, self.random
         level = np.array([s.of(f"current.{d.surface}.run") for d in self.drives])[:, None, None]
         amps = amps + level * rng.normal(size=(len(amps), 1, amps.shape[2])) * (speed != 0)
@@ -312,13 +325,14 @@ class _LogSimulator:
         noise = s.voltage_noise * rng.normal(size=true.shape)
         held = np.asarray(motor.voltage(jnp.asarray(true), jnp.asarray(w))) + noise
         voltage = np.round(held / s.voltage_step) * s.voltage_step if s.has_voltage else None
-        quantum = 2.83 / self.robot.geometry.gear_ratio  # as a Robotino reports it, 1.3 % high
+        # a Robotino reports wheel speeds in these steps, and 1.3 % too high
+        quantum = 2.83 / self.robot.geometry.gear_ratio
         return current * s.current_step, voltage, np.round(1.013 * w / quantum) * quantum
 
 
 @jax.jit
 def _twists(robot: Robot, speed: Array, floor: Array, load: Array) -> tuple[Array, Array]:
-    """Return body twists and signed motor currents of every step of every run."""
+    """Return body twists [m/s, m/s, rad/s] and signed motor currents [A] by run and step."""
     frame = robot.geometry.frame()
 
     def one(w: Array, f: Array, s: Array) -> tuple[Array, Array]:
@@ -333,7 +347,7 @@ _paths = jax.jit(jax.vmap(path))
 
 @jax.jit
 def _as_logged(robot: Robot, pose: Array, yaw: Array) -> Array:
-    """Return the camera's poses for true body poses."""
+    """Return the poses that the camera logs, without noise, for true body poses."""
 
     def one(body: Array, psi: Array) -> Array:
         return robot.camera.logged(compose(body, jnp.stack([*robot.camera.marker_place, psi])))
@@ -342,6 +356,6 @@ def _as_logged(robot: Robot, pose: Array, yaw: Array) -> Array:
 
 
 def _row_means(x: Float[np.ndarray, "run step wheel"]) -> Float[np.ndarray, "run row wheel"]:
-    """Return readings at the rows between steps: the mean of the two steps that meet there."""
+    """Return values at rows from values of steps: the mean of the steps before and after a row."""
     ends = np.concatenate([x[:, :1], x, x[:, -1:]], axis=1)
     return 0.5 * (ends[:, 1:] + ends[:, :-1])

@@ -1,12 +1,12 @@
-"""Simulate an experiment with known truth and fit it, again and again, to see what it recovers.
+"""Replicates of an experiment: simulations with known true parameters, and their fits.
 
-A replicate draws true numbers from what is plausible before the logs, fills the windows of the
-experiment with the readings that a robot of these numbers would give, noise included, and fits them
-from the usual start. Wheel motion, floors, loads, sessions and sampling are those of the given
-windows. The noise is the likelihood's own at typical variances: the test shows what the experiment
-can recover if the model is right, and cannot show an error of the model itself.
+A replicate draws true parameters near the centre of their priors, fills the windows of the
+experiment with the measurements that a robot with these parameters would give, including noise, and
+fits them from the usual start values. Wheel motion, floors, loads, sessions and sampling are those
+of the given windows. The noise is that of the likelihood at typical variances. Replicates therefore
+show what the experiment can recover if the model is right; they cannot show an error of the model.
 
-Source: simulation-based calibration in small (Talts et al. 2018, arXiv:1804.06788).
+Source: a small version of simulation-based calibration (Talts et al. 2018, arXiv:1804.06788).
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,15 +44,16 @@ def simulate_windows(
 ) -> Windows:
     """Return the windows with simulated poses, currents and voltages, noise included.
 
-    Every segment starts at the pose it has. The current's scatter is in the current that flows, and
-    voltages follow it; `current_var` comes on top as the ammeter's noise, which no voltage shows.
+    Every segment starts at its first pose in `w`. The random effects of the current components are
+    part of the current that flows, which determines the voltage. The noise of variance
+    `w.current_var` is that of the ammeter: it is added to measured currents only.
 
     Args:
-        truth: robot with the floors, loads and sessions of the windows.
+        truth: robot with the true parameters, and the floors, loads, sessions of the windows.
         w: windows that were driven; channels that they lack are not simulated.
-        rng: random numbers of the noise.
-        std: std of the variance components by name (`fit.noise`); a name without its floor stands
-            for every floor, and missing ones are zero.
+        rng: generator of the random numbers of the noise.
+        std: std of each variance component by its name (`fit.noise`); a name without a floor holds
+            for every floor without an entry, and missing components are zero.
     """
     b = lk.batch(w, truth)
     increment, amps, start = (np.asarray(x) for x in _predicted(truth, b, jnp.asarray(w.pose)))
@@ -90,7 +91,7 @@ def _logged(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Float[Array, 
 
 
 def _component_std(std: Mapping[str, float], w: Windows, kind: str, part: str) -> np.ndarray:
-    """Return the std of a variance component for every segment, by its floor (segment,)."""
+    """Return the std of a variance component on the floor of each segment, shape (segment,)."""
     usual = std.get(f"{kind}.{part}", 0.0)
     return np.array([std.get(f"{kind}.{floor}.{part}", usual) for floor in w.surface])
 
@@ -98,7 +99,7 @@ def _component_std(std: Mapping[str, float], w: Windows, kind: str, part: str) -
 def _process(
     truth: Robot, w: Windows, rng: np.random.Generator, std: Mapping[str, float]
 ) -> Float[np.ndarray, "segment window 3"]:
-    """Return random displacements beyond the model, which grow with distance."""
+    """Return the random part of each window's displacement, whose std grows with distance."""
     distance, u = travel(w, truth)
     total, shared = np.zeros((*distance.shape, 3)), _shared(truth, w, rng, std)
     for k, (axis, name) in enumerate(zip(axes(u), AXES, strict=True)):
@@ -112,7 +113,7 @@ def _process(
 def _shared(
     truth: Robot, w: Windows, rng: np.random.Generator, std: Mapping[str, float]
 ) -> Float[np.ndarray, "segment 3"]:
-    """Return random effects that neighbouring runs, and runs of one session, share."""
+    """Return the sum of shared effects (neighbouring runs) and session effects of each segment."""
     components = noise(w, truth)
     named = [
         std.get(c.name, std.get(f"{c.kind}.{c.what}", 0.0) if c.kind in SHARED else 0.0)
@@ -128,21 +129,24 @@ def _shared(
 
 
 FILE = "replicates"
-"""File of finished replicates, from which a later call continues."""
+"""Name of the checkpoint's file of finished replicates, from which a later call continues."""
 SCATTER, MOST = 0.5, 0.5
-"""True numbers scatter by `SCATTER` times their prior's std, which counts up to `MOST` [search]."""
+"""True parameters are drawn with a std of `SCATTER` times the prior std, the latter at most `MOST`.
+
+Both stds are in the search space.
+"""
 
 
 @dataclass(frozen=True)
 class NumberRecovery:
-    """One number of a replicate, or a short vector: truth against estimate, entry by entry.
+    """True and estimated value of one parameter in a replicate; lists have one item per entry.
 
     Attributes:
         unit, labels: as in `Estimate`.
         truth, value: true and estimated values [unit].
-        inside: whether the 90 % interval holds the truth.
-        z: estimate less truth, in stds of the estimate, in the search space.
-        verdict: verdict of the fit.
+        inside: True if the 90 % interval contains the truth.
+        z: estimate less truth in the search space, divided by the estimate's std there.
+        verdict: verdict of the fit, see `Estimate`.
     """
 
     unit: str
@@ -156,7 +160,12 @@ class NumberRecovery:
 
 @dataclass(frozen=True)
 class CurveRecovery:
-    """Largest gap in slip to the true curve, and the share of that curve in the 90 % band."""
+    """Agreement of a floor's fitted slip curve with the true one.
+
+    Attributes:
+        gap: largest difference in slip between fitted and true curve [-].
+        inside: share of the points of the true curve that lie in the fit's 90 % band.
+    """
 
     gap: float
     inside: float
@@ -167,10 +176,11 @@ class Replicate:
     """One simulated experiment and its fit.
 
     Attributes:
-        parameters: numbers and ratios by path.
+        parameters: parameters and ratios of parameters, by path.
         curves: slip curves by floor.
-        predictions: distance of predicted ends over the true chord, by floor and slip model.
-        converged, reason: how the fit ended.
+        predictions: mean distance between predicted and true end of a run, divided by the true
+            chord, by floor and slip model.
+        converged, reason: True if the fit converged, and why it stopped.
     """
 
     parameters: dict[str, NumberRecovery]
@@ -186,13 +196,14 @@ _FILE = TypeAdapter(list[Replicate])
 def plausible(
     config: Config, choices: Sequence[Choice], problem: Problem
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre and scatter of the true numbers, in the search space.
+    """Return mean and std, in the search space, from which true parameters are drawn.
 
-    The centre is the prior's and the scatter half its std. Numbers in `[selftest.truth]` have
+    The mean is that of the prior; for the std see `SCATTER`. A parameter in `[selftest.truth]` has
     exactly the value given there.
 
     Raises:
-        DataError: a truth for a number that does not exist, is fixed, or cannot have it.
+        DataError: `[selftest.truth]` names a parameter that does not exist or is fixed, or gives
+            a value that the parameter cannot have.
     """
     space, given = problem.space, config.content.selftest.truth
     center = space.prior_mean.copy()
@@ -225,10 +236,14 @@ def replicates(
     """Return `count` replicates; those in the checkpoint are not simulated again.
 
     Args:
+        config: config of the experiment.
         choices: choices of the problem.
-        problem: problem of the experiment; its compiled functions serve every replicate.
-        seed: seed of truth and noise, together with the replicate's number.
+        problem: fitting problem of the experiment; its compiled functions are used for every
+            replicate.
+        count: number of replicates.
+        seed: seed of true parameters and noise, together with the replicate's number.
         kept: checkpoint with the finished replicates, to which every new one is added.
+        report: receives messages about progress.
     """
     center, scatter = plausible(config, choices, problem)
     std = dict(zip(problem.noise.names, problem.noise.typical.tolist(), strict=True))
@@ -256,7 +271,10 @@ def replicates(
 def recovery(
     problem: Problem, choices: Sequence[Choice], true: Float[np.ndarray, " free"], end: Optimum
 ) -> Replicate:
-    """Compare the end of a fit with its truth: numbers, ratios, curves, predictions."""
+    """Return the comparison of a fit with its truth: parameters, ratios, curves, predictions.
+
+    `true` has the true free parameters in the search space, `end` the result of the fit.
+    """
     space, volt = problem.space, problem.windows.has_voltage
     z, covariance = end.state.z, end.covariance
     truth = space.tree(jnp.asarray(true))
@@ -300,7 +318,7 @@ def _number(e: Estimate, truth: np.ndarray, score: np.ndarray) -> NumberRecovery
 def _curves(
     problem: Problem, truth: Robot, z: np.ndarray, covariance: np.ndarray
 ) -> dict[str, CurveRecovery]:
-    """Return how well the slip curve of every floor was recovered."""
+    """Return the agreement of the fitted slip curve with the true one on every floor."""
     found = curves(problem.space, z, draws(z, covariance, 200, 0), problem.batch)
     out = {}
     for floor, curve in found.items():
@@ -311,10 +329,10 @@ def _curves(
 
 
 def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, float]]:
-    """Return the mean distance of predicted ends from the true ones over the true chord, per floor.
+    """Return the mean end-point errors relative to the true chord, by floor and slip model.
 
-    The runs are those of the experiment without any noise, so that only the errors of the numbers
-    count.
+    The runs are those of the experiment, simulated without noise, so that only errors of the fitted
+    parameters count.
     """
     start = jnp.zeros((len(w), 3))
 

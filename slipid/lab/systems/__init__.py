@@ -1,1 +1,4 @@
-"""Published systems to compare with: equations, sources, and every liberty taken."""
+"""Published systems that slipid is compared with: equations, sources, and deviations from them.
+
+Their docstrings list under "Liberties" every deviation from the published form.
+"""

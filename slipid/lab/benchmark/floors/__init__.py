@@ -1,1 +1,1 @@
-"""Floors by wheels, currents and a gyro: slipid's floor filter beside other classifiers."""
+"""Floor classification from wheel speeds, currents and a gyro: slipid's filter and others."""

@@ -1,24 +1,27 @@
-"""ForceBalance parameters of floors from currents and turning alone, at the measured wheel speeds.
+"""Fit of each floor's force balance parameters to currents and yaw rates alone, without a pose.
 
-Rows of one run at the same wheel speeds are one cell: accelerations, which are not modelled, cancel
-in its mean. For every floor
+Rows of one run at the same wheel speeds form one cell: accelerations, which are not modelled,
+cancel in its mean. For every floor, the fit solves
 
     min  sum_cells w_c^2 rho( ((I(w_c) - I_c) / 1 A)^2 + ((W(w_c) - gyro_c) / 0.2 rad/s)^2 ) + prior
 
-over the logarithms of friction, creep and rolling resistance, with I and W of the contact
-equilibrium and of the ammeter (`MeteredMotor`), rho a soft absolute value. Currents are correlated
-for seconds and differ from run to run: a cell of n rows has the weight of n / (1 + n / 20), and a
-run of many rows that of `LONG`.
+over the logarithms of friction, creep and rolling resistance. w_c are the wheel speeds of cell c,
+I_c and gyro_c its mean currents and yaw rate, I(w) and W(w) the ammeter readings (`MeteredMotor`)
+and the yaw rate that the model predicts in equilibrium at the wheel speeds w, w_c^2 the weight of
+the cell and rho a soft absolute value. Currents are correlated for seconds and differ from run to
+run. A cell of n rows therefore has a weight proportional to n / (1 + n / 20), and the weight of a
+whole run saturates above `LONG` rows.
 
 Ammeters. The Husky's ammeters measure the current that a motor takes from the battery. Where the
-ground pushes a wheel, as on the inner side of a turn, the motor brakes and the ammeter reads zero.
+floor pushes a wheel, as on the inner side of a turn, the motor brakes and the ammeter reads zero.
 Within a row the current scatters, so the mean reading is that of a clipped normal variable,
 
     E[max(I + n, 0)] = I Phi(I / s) + s phi(I / s),   n ~ N(0, s^2)
 
-with I the motor's current along its wheel's motion, Phi and phi the normal distribution and its
-density. The motor of one side may be stiffer than that of the other; its excess over the mean
-current of all motors counts as its own friction.
+with I the motor's current, positive when it drives its wheel's motion, s the standard deviation of
+the scatter, and Phi and phi the standard normal distribution function and density. The motor of one
+side may be stiffer than that of the other; its excess over the mean current of all motors counts as
+its own friction.
 """
 
 from collections.abc import Sequence
@@ -37,17 +40,17 @@ from slipid.model.motor import Motor
 from slipid.model.robot import Robot, motor_current, twist
 
 FITTED = ("friction", "creep", "rolling_resistance")
-"""Fitted parameters of every floor, as logarithms."""
+"""Names of the parameters that are fitted for every floor; the fit is in their logarithms."""
 START = np.log([0.6, 0.15, 0.08])
-"""Prior means of the logarithms; their prior std is one."""
+"""Prior means of the logarithms, where the fit also starts; the prior std of each is 1."""
 CURRENT_A, YAW_RATE = 1.0, 0.2
-"""Scales by which residuals of currents and of the yaw rate are divided [A], [rad/s]."""
+"""Scales by which residuals of currents [A] and of the yaw rate [rad/s] are divided."""
 ALIKE, LONG = 20.0, 300.0
-"""Rows at the same speeds, and rows of a run, above which more rows add little information."""
+"""Numbers of rows above which more rows hardly add weight: in one cell, and in one run."""
 CELLS = 512
-"""Largest number of cells of a floor, and their number in the compiled functions."""
+"""Largest number of cells of a floor; fewer are padded to it, so that one shape is compiled."""
 SAME_SPEED = 1e-3
-"""Difference below which wheel speeds are the same [rad/s]."""
+"""Width to which wheel speeds are rounded; rows with equal rounded speeds are one cell [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +61,9 @@ class Cells:
         speed: wheel speed of each drive [rad/s].
         current: current of each motor [A].
         gyro: yaw rate [rad/s], 0 where it is missing.
-        weight: weight of each cell, for currents and for turning.
+        weight: factor of the cell's residuals, of its currents and of its yaw rate.
         std: standard deviation of the currents in the cell [A].
-        rows: number of rows.
+        rows: number of rows in the cell.
     """
 
     speed: Float[np.ndarray, "cell drive"]
@@ -72,7 +75,7 @@ class Cells:
 
     @classmethod
     def of(cls, run: FloorSignals) -> "Cells":
-        """Return the cells of one run, from rows in which it moves."""
+        """Return the cells of one run, made of the rows in which the robot moves."""
         take = run.moving & np.isfinite(run.current).all(axis=1)
         speed, amps = run.speed[take], run.current[take]
         gyro = np.full(len(speed), np.nan) if run.gyro is None else run.gyro[take]
@@ -102,7 +105,7 @@ class Cells:
         return cls(*(np.concatenate([getattr(c, f.name) for c in each]) for f in fields(cls)))
 
     def thinned(self, most: int) -> "Cells":
-        """Return exactly `most` cells: a random sample, or all and cells of zero weight."""
+        """Return exactly `most` cells: a random sample, or all of them padded with zero weight."""
         rng = np.random.default_rng(0)
         take = np.sort(rng.permutation(len(self.rows))[:most])
 
@@ -156,9 +159,9 @@ def currents_off(
     speed: Float[np.ndarray, "row drive"],
     current: Float[np.ndarray, "row drive"],
 ) -> Float[np.ndarray, "row drive"]:
-    """Return the modelled less the measured currents in each row on a floor [A].
+    """Return the modelled less the measured current of each row and drive on a floor [A].
 
-    The rows go through the compiled function of the fit.
+    Rows are evaluated in groups of `CELLS` by the compiled function of the fit.
     """
     logs = np.log([float(getattr(robot.surfaces, name)[number]) for name in FITTED])
     count, drives = speed.shape
@@ -176,7 +179,7 @@ def currents_off(
 
 
 def on_floor(robot: Robot, number: Array, logs: Float[Array, "3"]) -> Robot:
-    """Return the robot with other parameters of a floor, given as logarithms."""
+    """Return the robot with the parameters `FITTED` of floor `number` set to exp(logs)."""
     stacks = {
         name: getattr(robot.surfaces, name).at[number].set(jnp.exp(logs[k]))
         for k, name in enumerate(FITTED)
@@ -187,7 +190,7 @@ def on_floor(robot: Robot, number: Array, logs: Float[Array, "3"]) -> Robot:
 def shown(
     robot: Robot, number: Array, speed: Float[Array, "row drive"]
 ) -> tuple[Float[Array, "row drive"], Float[Array, " row"]]:
-    """Return ammeter readings [A] and yaw rates [rad/s] at wheel speeds on a floor."""
+    """Return the modelled ammeter readings [A] and yaw rates [rad/s] at wheel speeds on a floor."""
     frame, load = robot.geometry.frame(), jnp.zeros((), int)
 
     def one(w: Array) -> tuple[Array, Array]:
@@ -198,7 +201,7 @@ def shown(
 
 
 class _FloorMisfit:
-    """Residuals of currents and turning by the parameters of a floor, with their Jacobian."""
+    """Residuals of currents and yaw rate as functions of a floor's parameters, with Jacobian."""
 
     def __init__(self, robot: Robot, number: int, cells: Cells):
         self.robot, self.number = robot, jnp.asarray(number)
@@ -215,7 +218,7 @@ class _FloorMisfit:
         return self._both(logs)[1]
 
     def _both(self, logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return both, computed together: the solver calls for one after the other."""
+        """Return residuals and Jacobian, computed together: the solver needs both at each point."""
         key = logs.tobytes()
         if key not in self.last:
             slope, off = _with_jacobian(jnp.asarray(logs), self.robot, self.number, *self.cells)
@@ -226,7 +229,10 @@ class _FloorMisfit:
 def _residuals(
     logs: Array, robot: Robot, number: Array, w: Array, amps: Array, gyro: Array, weight: Array
 ) -> tuple[Array, Array]:
-    """Return the residuals of currents, turning and prior, as value and auxiliary output."""
+    """Return the residuals of currents, yaw rate and prior twice: as value and as auxiliary output.
+
+    With the auxiliary output, `jax.jacfwd` returns the residuals beside their Jacobian.
+    """
     modelled, turn = shown(on_floor(robot, number, logs), number, w)
     off = jnp.concatenate(
         [
@@ -242,9 +248,10 @@ _with_jacobian = jax.jit(jax.jacfwd(_residuals, has_aux=True))
 
 
 TURNING = 0.2
-"""Wheel speed above which friction has its full value, as in `slipid.model.motor` [rad/s]."""
+"""Scale of the wheel speed in tanh(speed / TURNING), the smooth sign of motion that friction and
+readings follow, as in `slipid.model.motor` [rad/s]."""
 STEADY_A = 0.1
-"""Scatter of the current of a wheel at rest [A]."""
+"""Standard deviation of the current of a wheel at rest [A]."""
 
 
 class MeteredMotor(Motor):
@@ -252,7 +259,7 @@ class MeteredMotor(Motor):
 
     Attributes:
         stiffness: excess of each drive's current over the mean of all [A].
-        scatter: standard deviation of a current about its mean [A].
+        scatter: standard deviation of a current about its mean at constant wheel speed [A].
     """
 
     stiffness: Float[Array, " drive"] = eqx.field(kw_only=True)
@@ -260,7 +267,7 @@ class MeteredMotor(Motor):
 
     @classmethod
     def of(cls, motor: Motor, stiffness: Array, scatter: Array) -> "MeteredMotor":
-        """Return a motor with its ammeter."""
+        """Return a motor with its ammeter, given the two attributes of this class [A]."""
         same = {f.name: getattr(motor, f.name) for f in fields(Motor)}
         return cls(**same, stiffness=stiffness, scatter=scatter)
 

@@ -1,8 +1,8 @@
-"""The floors of `borealtc`: a Husky on five floors without a pose.
+"""Floor classification on the data set `borealtc`: a Husky on five floors, without a pose.
 
-The robot is the Husky of the public logs with its maker's data and the measured behaviour of its
-motors and ammeters. Without a pose the torque constant is not identified; frictions of floors are
-then in units of the assumed constant, and only their ratios are meaningful.
+The robot is built from its maker's data and the measured behaviour of its motors and ammeters.
+Without a pose the torque constant is not identified: frictions scale with the assumed constant, and
+only ratios of frictions of different floors are meaningful.
 
 Logs have a folder per floor with a CSV file per run.
 """
@@ -34,22 +34,24 @@ RADIUS = 0.165
 MASS = 60.0
 """Mass of the robot [kg]."""
 ZERO_A = 0.59
-"""Reading of the ammeters for wheels at rest [A]; for braking motors they read nothing."""
+"""Reading of the ammeters for wheels at rest, subtracted from all readings [A]."""
 FREE_A, FREE_AS = 0.54, 0.032
-"""Friction of a wheel in the air, and its growth with the wheel's speed [A], [A s/rad]."""
+"""Motor current of a wheel that turns in the air: at low speed [A], and its increase per wheel
+speed [A s/rad]."""
 
 FOLDER = "borealtc"
 ABOUT = (
     "Husky on five floors, no pose: wheel speeds, sizes of currents and a gyro, 6.5 rows a second"
 )
 COLUMNS = ("time", "curL", "curR", "velL", "velR", "gyro_z", "accel_std")
-"""Time [s], currents without a sign [A], rim speeds [m/s], yaw rate [rad/s], and the std of the
-vertical acceleration since the row before [m/s^2]."""
+"""Columns that are read: time [s], magnitudes of the currents of the left and right motors [A], rim
+speeds left and right [m/s], yaw rate [rad/s], and the std of the vertical acceleration since the
+previous row [m/s^2]."""
 LAYOUT = Layout(FOLDER, {name: Channel(columns=(name,), unit="1") for name in COLUMNS})
 NEEDED = COLUMNS[:5]
-"""Columns without missing values."""
+"""Columns in which a missing value is an error: time, currents and rim speeds."""
 LONGEST_S = 0.5
-"""Time between two rows above which a file holds two runs [s]."""
+"""Time between two rows above which a file is split into two runs there [s]."""
 FEWEST = 3
 """Smallest number of rows of a run."""
 
@@ -85,7 +87,7 @@ def read_floor_runs(root: Path, wheel_radius: float) -> list[FloorSignals]:
 
 
 def _runs(path: Path, wheel_radius: float) -> list[FloorSignals]:
-    """Return the runs of one file."""
+    """Return the runs of one file; DataError if a value is missing or times do not increase."""
     table = read_table(path, LAYOUT)
     if len(table.values) < FEWEST:
         raise bad_data(path, f"{len(table.values)} rows", f"at least {FEWEST}")
@@ -123,7 +125,7 @@ def husky_table(data: Path, quick: bool = False, only: tuple[str, ...] = ()) -> 
 
     Args:
         data: folder with the data sets.
-        quick: one fold, short times, default settings.
+        quick: one fold, short times and default settings instead of the full evaluation.
         only: names of rows; all if empty.
 
     Raises:

@@ -1,10 +1,11 @@
-"""Evaluation of floor classifiers on held-out runs, by the seconds of signals.
+"""Evaluation of floor classifiers on held-out runs, after different lengths of signals.
 
 Runs are dealt into folds, floor by floor, so that every run is held out once. A classifier picks
-its settings by a cross-validation of the same kind among its training runs. Held-out runs are cut
-into consecutive stretches of the longest time; in each of them the classifier starts anew, and its
-answer is read after every one of the times. A stretch counts for a time if it is that long and the
-robot moves in at least half of its rows up to it.
+its settings by a cross-validation of the same kind among its training runs. Answers are read after
+several times, such as 0.5 s and 8 s (`SECONDS`). Held-out runs are cut into consecutive stretches
+whose length is the longest of these times. In each stretch the classifier starts anew, and its
+answer is read after each of the times. A stretch counts for a time if it is at least that long and
+the robot moves in at least half of its rows up to that time.
 """
 
 import abc
@@ -34,9 +35,11 @@ from slipid.support.content import Content
 from slipid.support.jax_setup import setup_jax
 
 SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
-"""Times after which answers are read [s]."""
+"""Times from the start of a stretch after which answers are read [s]."""
 QUICK_SECONDS = (0.5, 1.0, 2.0)
+"""These times in a quick evaluation [s]."""
 FOLDS, INNER = 5, 2
+"""Numbers of folds: of the evaluation, and of the inner cross-validation that picks settings."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +47,12 @@ class EvaluationSettings:
     """Settings of the evaluation of classifiers.
 
     Attributes:
-        seconds: times after which answers are read [s].
+        seconds: times from the start of a stretch after which answers are read [s].
         folds: number of folds into which runs are dealt.
-        held_out: number of folds that are held out in turn.
-        inner: number of folds that pick settings; with one, the default settings are used.
-        first_s: length from the start of held-out runs that is used [s].
+        held_out: number of folds that are held out in turn; all, or fewer to save time.
+        inner: number of folds of the inner cross-validation that picks settings; with one fold,
+            the default settings are used.
+        first_s: only this much of each held-out run is used, from its start [s].
     """
 
     seconds: tuple[float, ...] = SECONDS
@@ -59,12 +63,12 @@ class EvaluationSettings:
 
     @classmethod
     def quick(cls) -> "EvaluationSettings":
-        """Return one fold, the first minute of its runs, short times and default settings."""
+        """Return settings for one fold, the first minute of its runs, short times, no tuning."""
         return cls(seconds=QUICK_SECONDS, held_out=1, inner=1, first_s=60.0)
 
 
 def folds_of(runs: Sequence[FloorSignals], count: int) -> Int[np.ndarray, " run"]:
-    """Return the fold of every run; the runs of each floor are dealt to the folds in turn."""
+    """Return the fold index of every run; the runs of each floor are dealt to folds in turn."""
     dealt: dict[str, int] = {}
     fold = []
     for run in runs:
@@ -90,7 +94,16 @@ def answers_of(
 def answers_after(
     stretch: FloorSignals, beliefs: Beliefs, labels: Sequence[str], seconds: Sequence[float]
 ) -> list[Answer]:
-    """Return the answers after each of the times that count, see the top of this file."""
+    """Return the answers in one stretch after each of the times for which the stretch counts.
+
+    The module's docstring defines for which times a stretch counts.
+
+    Args:
+        stretch: signals of the stretch.
+        beliefs: floor probabilities after each of its rows.
+        labels: floor of each column of `beliefs`.
+        seconds: times after which answers are read [s].
+    """
     elapsed, step = np.cumsum(stretch.dt), float(np.median(stretch.dt))
     out = []
     for after in seconds:
@@ -112,7 +125,8 @@ def tuned_classifier(
 ) -> Tuned[FloorClassifier]:
     """Return the candidate with the highest accuracy in an inner cross-validation.
 
-    The accuracy is the mean over all times; the first of equally good candidates is taken.
+    The accuracy is averaged over all times (`settings.seconds`); the first of equally good
+    candidates is taken.
     """
     fold = folds_of(runs, settings.inner)
 
@@ -136,11 +150,11 @@ def _some(runs: Sequence[FloorSignals], take: np.ndarray) -> list[FloorSignals]:
 
 @dataclass(frozen=True)
 class ScoredClassifier:
-    """A classifier in one or several folds.
+    """Result of a classifier in one or several folds.
 
     Attributes:
-        row: its row of the table, without comparisons.
-        answers: its answers.
+        row: row of the table, with costs and settings but without accuracies.
+        answers: answers to all stretches of the held-out runs.
     """
 
     row: ClassifierRow
@@ -154,7 +168,7 @@ def evaluated(
     spec: RobotSpec,
     settings: EvaluationSettings,
 ) -> ScoredClassifier:
-    """Return the result of one fold: settings picked, fitted, and answers on held-out runs."""
+    """Return a classifier's result in one fold: tuned, fitted and applied to the held-out runs."""
     began = time.perf_counter()
     found = tuned_classifier(method, training, spec, settings)
     tuned = time.perf_counter()
@@ -174,7 +188,10 @@ def evaluated(
 
 
 def joined(folds: Sequence[ScoredClassifier]) -> ScoredClassifier:
-    """Return all folds of a classifier as one; its row is empty if it failed in one of them."""
+    """Return the results of all folds of a classifier as one result.
+
+    If the classifier failed in a fold, the result is that of the failed fold, without accuracies.
+    """
     if failed := [fold for fold in folds if fold.row.absent]:
         return failed[0]
 
@@ -193,10 +210,10 @@ def joined(folds: Sequence[ScoredClassifier]) -> ScoredClassifier:
 
 
 def attempted(name: str, work: Callable[[], ScoredClassifier]) -> ScoredClassifier:
-    """Return the result of some work; if it raises, an empty row with the reason."""
+    """Return the result of `work()`; if it raises, an empty row with the reason."""
     try:
         return work()
-    except Exception as error:  # other rows are evaluated all the same
+    except Exception as error:  # a row that fails does not stop the evaluation of others
         return ScoredClassifier(ClassifierRow(name, absent=FoldScore.of_error(error).absent), ())
 
 
@@ -210,7 +227,7 @@ def classifier_table(
 ) -> ClassifierTable:
     """Return the cross-validated table of all classifiers on the same runs.
 
-    The others are compared with the row named `reference`.
+    Every other row is compared with the row named `reference`.
     """
     fold = folds_of(runs, settings.folds)
 
@@ -233,7 +250,11 @@ def table_of(
     settings: EvaluationSettings,
     reference: str,
 ) -> ClassifierTable:
-    """Return the table of all results, compared with the reference."""
+    """Return the table of all results, each compared with the row named `reference`.
+
+    Raises:
+        ValueError: every classifier failed; the message lists the reasons.
+    """
     rival = (done[reference].answers or None) if reference in done else None
     rows = []
     for name, one in done.items():
@@ -254,12 +275,12 @@ def table_of(
 
 @dataclass(frozen=True)
 class FloorTask(abc.ABC):
-    """Task of the benchmark that makes one table of classifiers and keeps it.
+    """Task of the benchmark that makes one table of classifiers and saves it in a checkpoint.
 
     Attributes:
         options: options of the benchmark.
         name: name of the task, and of its table in benchmark.json.
-        folder: folder of its logs, below the data folder.
+        folder: name of the folder of its logs, below the data folder.
     """
 
     options: BenchmarkOptions
@@ -287,24 +308,24 @@ class FloorTask(abc.ABC):
 
     @property
     def checkpoint(self) -> Checkpoint:
-        """Checkpoint that keeps its table."""
+        """Checkpoint in which the table is saved; its key depends on logs, options and code."""
         code = source_hash(*OF_FITS, *OF_ROWS)
         key = key_of(self.log_hash(), self.options.quick, self.options.only, code)
         return Checkpoint(self.options.out / "kept" / self.name / key[:12], key)
 
     def run(self) -> str:
-        """Make the table, unless it is kept without failures, and return the task's name."""
+        """Make and save the table unless a saved one has no failed rows; return the task's name."""
         setup_jax(quiet=True)
         kept = self.checkpoint
         found = kept.load_json(self.name)
         if found is None or "failed" in found or any(row["absent"] for row in found["rows"]):
             try:
                 kept.save_json(self.name, self.make().to_json())
-            except Exception as error:  # other tasks are done all the same
+            except Exception as error:  # a task that fails does not stop the others
                 kept.save_json(self.name, {"failed": FoldScore.of_error(error).absent})
         return self.name
 
     def table(self) -> Content:
-        """Return the kept table as in benchmark.json."""
+        """Return the saved table in the form of benchmark.json."""
         found: Content = self.checkpoint.load_json(self.name) or {"failed": "it was not kept"}
         return found

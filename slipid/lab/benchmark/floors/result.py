@@ -1,4 +1,4 @@
-"""Results of floor classifiers: answers, accuracies by seconds of signals, and tables."""
+"""Results of floor classifiers: answers, accuracies by length of the signals, and tables."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -11,7 +11,7 @@ from slipid.lab.benchmark.summary import Bootstrap, MeanInterval, mean_interval
 
 @dataclass(frozen=True)
 class Answer:
-    """Answer of a classifier after some seconds of a stretch.
+    """Answer of a classifier after the first seconds of a stretch of a held-out run.
 
     Attributes:
         run: name of the run.
@@ -30,17 +30,17 @@ class Answer:
 
 @dataclass(frozen=True)
 class AfterSeconds:
-    """Accuracy of a classifier after some seconds of every stretch.
+    """Accuracy of a classifier after the first seconds of every stretch.
 
     Attributes:
         seconds: length of the signals used [s].
         stretches: number of stretches.
         accuracy: share of the stretches in which the most probable floor is the true one.
-        balanced: mean over floors of the share on each floor.
+        balanced: mean over floors of the accuracy on each floor.
         behind: accuracy less that of slipid on the same resampled runs; None for slipid itself.
-        by_floor: share on each floor.
-        log_score: mean log probability of the true floor; 0 is best, and equal probabilities give
-            the log of one over the number of floors.
+        by_floor: accuracy on each floor.
+        log_score: mean natural logarithm of the probability of the true floor; 0 is best, and equal
+            probabilities of n floors give log(1 / n).
     """
 
     seconds: float
@@ -61,7 +61,8 @@ class ClassifierRow:
         settings: settings picked by cross-validation in each fold, in words.
         numbers: number of fitted parameters, median over folds.
         after: accuracy after each time.
-        said: confusion table after the longest time: how often each floor was named on each [%].
+        said: confusion table after the longest time: `said[true][named]` is the share of the
+            stretches on the true floor in which a floor was named [%].
         fit_s: time of one fit, median over folds [s].
         tune_s: time to pick settings, median over folds [s].
         row_us: time per row of signals, median over folds [microseconds].
@@ -87,7 +88,7 @@ class ClassifierTable:
         about: description of the runs.
         runs: number of runs.
         floors: names of the floors.
-        chance: accuracy of always naming the floor with most stretches.
+        chance: accuracy of a classifier that always names the floor with the most stretches.
         rows: rows of the classifiers, slipid's first.
     """
 
@@ -98,14 +99,17 @@ class ClassifierTable:
     rows: tuple[ClassifierRow, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values."""
+        """Return the fields as plain values for JSON."""
         return asdict(self)
 
 
 def after_seconds(
     answers: Sequence[Answer], rival: Sequence[Answer] | None
 ) -> tuple[AfterSeconds, ...]:
-    """Return accuracies by time, compared with a rival's answers to the same stretches in order."""
+    """Return the accuracy after each time, compared with a rival's if there is one.
+
+    `rival` has the answers of another classifier to the same stretches, in the same order.
+    """
     out = []
     for seconds in sorted({a.seconds for a in answers}):
         take = [k for k, a in enumerate(answers) if a.seconds == seconds]
@@ -115,7 +119,7 @@ def after_seconds(
 
 
 def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> AfterSeconds:
-    """Return the accuracy by answers after the same time."""
+    """Return the accuracy from answers that were all read after the same time."""
     right = np.array([a.named == a.floor for a in answers], dtype=float)
     # whole runs are resampled, floor by floor
     run = np.unique([a.run for a in answers], return_inverse=True)[1]
@@ -137,7 +141,7 @@ def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> AfterSe
 
 
 def confusion(answers: Sequence[Answer], seconds: float) -> dict[str, dict[str, float]]:
-    """Return how often each floor was named on each true floor after some seconds [%]."""
+    """Return the share of answers that name each floor, by true floor, after `seconds` s [%]."""
     mine = [a for a in answers if a.seconds == seconds]
     names = sorted({a.floor for a in mine} | {a.named for a in mine})
     table: dict[str, dict[str, float]] = {}

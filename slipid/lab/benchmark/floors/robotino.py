@@ -1,10 +1,10 @@
-"""The floors of the Robotino runs of 2022, by wheel speeds and magnitudes of currents alone.
+"""Floor classification on the Robotino runs of 2022, from wheel speeds and current magnitudes.
 
 Runs are split by headings, as elsewhere in the benchmark, and start where the wheels have moved a
-centimetre; none of them contains a stop or a second start. slipid is its fit to the training runs
-with their poses, and the estimator as it is deployed, with its own settings. It knows the load
-set-up, as a robot in service does; the other rows use neither poses nor loads, and are fitted to
-runs with all loads together.
+centimetre; none of them contains a stop or a second start. The row of slipid is the deployed
+estimator with its default settings, from a fit to the training runs with their poses. It is given
+the load set-up of a run, as a robot in service is. The other rows use neither poses nor loads, and
+are fitted to runs with all loads together.
 """
 
 import time
@@ -42,12 +42,12 @@ from slipid.predict.slip_model import PredictedRun, Run
 
 SOURCE, KIND = "robotino2022", "headings"
 SECONDS = (0.5, 1.0, 2.0, 4.0)
-"""Times after which answers are read; steps last a third of a second, runs six and more [s]."""
+"""Times after which answers are read [s]; steps last about 0.3 s, runs 6 s or more."""
 ABOUT = "Robotino on four floors, straight runs: wheel speeds and sizes of currents"
 
 
 def robotino_classifiers() -> list[FloorClassifier]:
-    """Return the classifiers besides slipid; without an accelerometer there is no vibration row."""
+    """Return the classifiers other than slipid, without those that need an accelerometer."""
     trees = [row for row in tree_classifiers() if not row.channels.vibration]
     return [CosineEnergyClassifier(), GaussianClassifier(), *trees]
 
@@ -55,7 +55,7 @@ def robotino_classifiers() -> list[FloorClassifier]:
 def robotino_table(options: BenchmarkOptions) -> ClassifierTable:
     """Return the table of all classifiers on the Robotino's runs, or of the requested ones.
 
-    A kept fit of slipid to the same runs is reused.
+    A fit of slipid to the same runs that is saved in a checkpoint is reused.
     """
     data, only = data_of(options, SOURCE), options.only
     inner = 1 if options.quick else 2
@@ -86,10 +86,10 @@ def robotino_table(options: BenchmarkOptions) -> ClassifierTable:
 
 
 def floor_signals(run: Run) -> FloorSignals:
-    """Return the signals of a run for classifiers, without its pose.
+    """Return the signals of a run that floor classifiers use, without its pose.
 
     Raises:
-        ValueError: it has no currents.
+        ValueError: the run has no currents.
     """
     signals = run.signals
     if signals.current is None:
@@ -107,7 +107,7 @@ def floor_signals(run: Run) -> FloorSignals:
 def _slipid(
     fit: SlipidFit, batches: list[RunBatch], data: Runs, runs: list[FloorSignals]
 ) -> ScoredClassifier:
-    """Return the estimator's result on held-out runs."""
+    """Return the result of slipid's estimator on held-out runs."""
     began = time.perf_counter()
     predicted = estimator_runs(fit, batches, data, FloorKnowledge())
     took = time.perf_counter() - began
@@ -121,7 +121,7 @@ def _slipid(
 
 
 def beliefs_of(predicted: PredictedRun) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return the known floors, and their probabilities given that it is one of them."""
+    """Return the known floors and their probabilities, given that the true floor is one of them."""
     assert predicted.floors is not None
     labels = tuple(name for name in predicted.floors if name != "unknown")
     each = np.stack([predicted.floors[name] for name in labels], axis=1)
@@ -129,7 +129,7 @@ def beliefs_of(predicted: PredictedRun) -> tuple[tuple[str, ...], np.ndarray]:
 
 
 class RobotinoFloorTask(FloorTask):
-    """Table of the Robotino on four floors; slipid is its fit to the runs with poses."""
+    """Task that makes the table of the Robotino on four floors."""
 
     name = "robotino_floors"
     folder = SOURCE

@@ -1,20 +1,21 @@
-"""slipid's own row: floors by currents and turning, and the estimator's floor filter.
+"""The row of slipid among the floor classifiers: its estimator's floor filter, fitted without pose.
 
 The filter is the deployed one (`slipid.robot.estimator.Estimator`) with wheels, currents and the
 gyro. Besides the parameters of the floors it is given
 
-- the ammeter readings of braking motors (`slipid.lab.benchmark.floors.fitting`);
+- a model of the ammeters, which read zero for braking motors
+  (`slipid.lab.benchmark.floors.fitting`);
 - the scatter of currents on each floor, separately for straight motion, bends and turning on the
   spot, which follow from the wheel speeds;
-- that all wheels are on one floor, which does not change.
+- settings under which all wheels are on one floor that does not change.
 
-At its first row the wheels are taken to turn as measured, without a start from rest.
+At the first row of a run, the filter starts with the measured wheel speeds, not from rest.
 
 Parameters of floors, motors and scatters come from the training runs. `SETTINGS`, `BENDS`, the
 model of the ammeters and the weights in `slipid.lab.benchmark.floors.fitting` are not picked by an
 inner cross-validation, as settings of other rows are: they were set by hand after about a hundred
-variants were compared by their cross-validated accuracy on `borealtc`. The accuracy there is
-optimistic by as much as that choice fits these very runs.
+variants were compared by their cross-validated accuracy on `borealtc`. The accuracy of slipid on
+`borealtc` is therefore optimistic, to the extent that this choice was tuned to these runs.
 """
 
 from collections.abc import Sequence
@@ -44,14 +45,14 @@ from slipid.robot.interface import Readings, Settings
 from slipid.robot.record import FloorRecord, LoadRecord, RobotRecord, Wheels
 
 HIGHEST_A, HIGHEST_SPEED = 100.0, 20.0
-"""Limits of plausible measurements [A], [rad/s]."""
+"""Limits of plausible measurements in the robot record: motor current [A], wheel speed [rad/s]."""
 
 
 def deployed(robot: Robot) -> DeployedRobot:
     """Return the robot in its deployed form, with its parameters as they are.
 
-    Fields that the floor filter does not use, such as the uncertainty and the ranges of a fit, have
-    values without effect.
+    Fields of the record that the floor filter does not use, such as the uncertainty and the ranges
+    of a fit, are filled with values that have no effect.
     """
     shape = robot.geometry
     none = (0.0, 0.0, 0.0)
@@ -80,13 +81,20 @@ def deployed(robot: Robot) -> DeployedRobot:
 
 
 BENDS = (0.17, 0.45)
-"""Smallest L |W| / (|v| + L |W|) of a bend, and of turning on the spot."""
+"""Smallest ratio L |W| / (|v| + L |W|) that counts as a bend, and as turning on the spot.
+
+v is the velocity [m/s], W the yaw rate [rad/s] of the rolling wheels, and L the base radius [m].
+"""
 TOGETHER = 64
-"""Number of runs in one call of the filter."""
+"""Number of runs in one call of the filter; fewer are padded, so that one shape is compiled."""
 SHARED_ROWS = 20.0
-"""Prior weight of a floor's overall scatter in that of each kind of motion, in rows."""
+"""Weight, in rows, of a floor's mean squared residual in that of each kind of motion on it.
+
+It acts as a prior where a kind of motion has few rows.
+"""
 MOST_ROWS = 150
-"""Largest number of rows of a run for the scatter."""
+"""Target number of rows of a run for the scatter of currents; longer runs are thinned to about it.
+"""
 SETTINGS = Settings(
     current_is_signed=False,
     forget_s=4.0,
@@ -97,8 +105,9 @@ SETTINGS = Settings(
     ammeter_std_a=0.1,
     gyro_std=0.08,
 )
-"""Currents of neighbouring rows are correlated for seconds (`forget_s`), rows are not averaged
-(`filter_s`), and `gyro_std` is about the residual of the yaw rate in the fits."""
+"""Settings of the estimator. Currents of neighbouring rows are correlated for seconds (`forget_s`),
+rows are not averaged (`filter_s`), and `gyro_std` is about the residual of the yaw rate in the
+fits [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,10 +127,10 @@ class FittedFloors:
 
 @dataclass(frozen=True)
 class SlipidFloorClassifier(FloorClassifier):
-    """slipid's floor filter.
+    """slipid's floor filter as a floor classifier.
 
     Attributes:
-        robot: robot by its maker's data, without floors.
+        robot: robot with its maker's data, without floors.
         zero_a: reading of its ammeters for wheels at rest [A].
         settings: settings of the estimator.
         fitted: fitted parameters; None before a fit.
@@ -160,23 +169,26 @@ class SlipidFloorClassifier(FloorClassifier):
 
     @property
     def numbers(self) -> int:
-        """Number of fitted parameters: three of each floor, its scatters, those of the motors."""
+        """Number of fitted parameters: `FITTED` and scatters of each floor, and motor stiffnesses.
+
+        Each floor has one scatter for each kind of motion.
+        """
         if self.fitted is None:
             return 0
         return 3 * len(self.labels) + self.fitted.std.size + len(self.fitted.motor.stiffness)
 
     def _on(self, labels: tuple[str, ...]) -> Robot:
-        """Return the robot on floors that have not been fitted."""
+        """Return the robot on the named floors with parameters that are not yet fitted."""
         if self.robot is None:
             raise ValueError(f"{self.name}: no robot was given")
         robot = self.robot.on(labels)
         none = jnp.zeros(len(labels))
-        # lead and load exponent of the drag are for soft floors under omni wheels
+        # lead and load exponent of the drag describe soft floors under omni wheels: no effect here
         surfaces = replace(robot.surfaces, lead=none, drag_exponent=none + 1.0)
         return replace(robot, surfaces=surfaces)
 
     def _zeroed(self, run: FloorSignals) -> FloorSignals:
-        """Return the run with currents above the zero of the ammeters, at least 0."""
+        """Return the run with the ammeters' zero reading subtracted from currents, at least 0 A."""
         return replace(run, current=np.maximum(np.abs(run.current) - self.zero_a, 0.0))
 
 
@@ -190,7 +202,7 @@ def kinds(run: FloorSignals, spec: RobotSpec) -> Int[np.ndarray, " row"]:
 def _scatter(
     robot: Robot, runs: Sequence[FloorSignals], spec: RobotSpec
 ) -> Float[np.ndarray, "kind floor"]:
-    """Return the std of current residuals on every floor in each kind of motion [A]."""
+    """Return the std of current residuals in each kind of motion on every floor [A]."""
     count = len(BENDS) + 1
     std = np.ones((count, len(robot.surfaces.labels)))
     for k, floor in enumerate(robot.surfaces.labels):
@@ -229,7 +241,7 @@ class _FilterRows(eqx.Module):
 
     @classmethod
     def of(cls, runs: Sequence[FloorSignals], rows: int, spec: RobotSpec) -> "_FilterRows":
-        """Return runs side by side, padded to so many rows and to `TOGETHER` runs."""
+        """Return the inputs of several runs, padded to `rows` rows and to `TOGETHER` runs."""
         drives = runs[0].speed.shape[1]
         speed, current = np.zeros((2, TOGETHER, rows, drives))
         gyro, dt = np.full((TOGETHER, rows), np.nan), np.zeros((TOGETHER, rows))
@@ -237,7 +249,7 @@ class _FilterRows(eqx.Module):
         for k, run in enumerate(runs):
             n = len(run)
             speed[k, :n], current[k, :n] = run.speed, run.current
-            # a robot at rest has no evidence on its floor
+            # signals of a robot at rest carry no evidence about its floor
             dt[k, :n] = np.where(run.moving, run.dt, 0.0)
             gyro[k, :n] = np.nan if run.gyro is None else run.gyro
             kind[k, :n] = kinds(run, spec)
@@ -248,7 +260,7 @@ class _FilterRows(eqx.Module):
 def _beliefs(
     estimator: Estimator, std: Float[Array, "kind floor"], runs: _FilterRows
 ) -> Float[Array, "run row floor_or_none"]:
-    """Return the probability of every floor, and of none of them, after every row."""
+    """Return the probability of every floor after every row; the last column is "none of them"."""
     nothing = Readings.nothing(estimator.robot.drives)
 
     def step(state: EstimatorState, row: _FilterRows) -> tuple[EstimatorState, Array]:

@@ -1,1 +1,1 @@
-"""Classifiers of the floor by wheel speeds, currents and a gyro, without a pose."""
+"""Classifiers of the floor from wheel speeds, currents and a gyro, without a pose."""

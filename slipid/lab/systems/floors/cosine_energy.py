@@ -1,33 +1,39 @@
-"""Belyaev and Kushnarev 2025: floors by the energy that driving takes in the direction of travel.
+"""Belyaev and Kushnarev 2025: floor classification by energy use in the direction of travel.
 
-Over the last half second let (v_x, v_y, W) be the twist by the encoders, w and I speed and current
-of each motor, and
+Let (v_x, v_y, W) be the mean twist over the last half second from encoders, w_i and I_i the speed
+and current of motor i, R and C_e its resistance and back-EMF constant, m the robot's mass, L its
+base radius, and
 
     P = sum_i (R |I_i| + C_e |w_i|) |I_i|                 electric power, or without R I^2
     u = sqrt(v_x^2 + v_y^2 + (L W)^2),     phi = direction of (v_x, v_y)
     e = P / (m g u)                                       energy coefficient (cost of transport)
-    e ~ a_0 + sum_k a_k cos(k phi) + b_k sin(k phi)       of each floor, k = 1, 2, 3, ..
+    e ~ a_0 + sum_k a_k cos(k phi) + b_k sin(k phi)       for each floor, k = 1, 2, 3, ..
     log p_t = exp(-dt / memory) log p_{t-1} + (dt / apart) log N(e_t; series(phi_t), s^2) + const
 
-s is the std of a floor's residuals from its series. Wheels that do not drive sideways have no
-direction of travel; phi is then the angle of (v_x, L W): 0 is straight ahead, a right angle is
-turning on the spot. Tuned by cross-validation: whether the heat R I^2 is part of P, without which e
-depends on currents and the ratio of speeds alone, and whether e or its logarithm is modelled.
+p_t is the probability of a floor after row t, dt the duration of the row, and `memory` and `apart`
+are the times of `accumulated`. s is the std of a floor's residuals from its series. A robot that
+cannot drive sideways always travels ahead or back; phi is then the angle of (v_x, L W), where 0 is
+straight ahead and a right angle is turning on the spot. Tuned by cross-validation: whether the heat
+R I^2 is part of P, without which e depends on currents and the ratio of speeds alone, and whether e
+or its logarithm is modelled.
 
 Liberties
-- The paper was known here by its abstract and headings: an energy coefficient of motor current and
-  velocity, its dependency on the direction of motion by a discrete cosine transform, a filter of
-  the data, a probabilistic classifier with memory. The equations above are this file's.
-- A transform of evenly spread directions needs such runs; here the same series is fitted by least
-  squares with a ridge, so that any directions do. Sines are among its terms, for a robot that is
-  no mirror image of itself.
+- Only the abstract and the headings of the paper were available: they name an energy coefficient of
+  motor current and velocity, its dependence on the direction of motion by a discrete cosine
+  transform, a filter of the data, and a probabilistic classifier with memory. The equations above
+  were written for this file.
+- A discrete transform needs runs in evenly spaced directions. Here the same series is fitted by
+  least squares with a ridge, which works with any directions. It includes sines, for robots that
+  are not mirror-symmetric.
 - The filter of the data is a mean over half a second.
 - The memory is that of `accumulated`: evidence fades with time.
 - The paper's detector of unknown floors, a neural network, and their identification while driving
-  have no part in this comparison.
-- Power without the heat of the windings became a candidate after power with it had done poorly on
-  the runs that are judged; cross-validation among the training runs picks it everywhere.
-- Currents without a sign, and resistance and back-EMF as the robot's config has them.
+  are not included.
+- Power without the heat of the windings was added as a candidate after power with the heat had
+  given poor results on the evaluated runs; cross-validation among the training runs picks it
+  everywhere.
+- Currents are used without their sign; resistance and back-EMF constant are those of the robot's
+  config.
 
 Source: Belyaev and Kushnarev 2025, Robotics 14(9), 130, sections 2.1 to 2.3.
 """
@@ -52,16 +58,16 @@ from slipid.predict.slip_model import RobotSpec
 GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""
 SLOW = 0.02
-"""Speed below which a direction of travel is undefined [m/s]."""
+"""Speed u up to which a row is not used, since its direction of travel is undefined [m/s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class CosineSeries:
-    """Cosine series of each floor.
+    """Fitted series of each floor.
 
     Attributes:
-        weight: coefficients of the constant, and of cosine and sine of each harmonic in turn.
-        std: standard deviation of the residuals.
+        weight: coefficients of the constant, then of cosine and sine of each harmonic in turn.
+        std: standard deviation of the residuals from each floor's series.
     """
 
     weight: Float[np.ndarray, "floor term"]
@@ -70,14 +76,16 @@ class CosineSeries:
 
 @dataclass(frozen=True)
 class CosineEnergyClassifier(FloorClassifier):
-    """Energy coefficient as a cosine series in the direction of travel, with Gaussian residuals.
+    """Floor classifier by the energy coefficient, a series in the direction of travel.
+
+    Residuals from the series are taken as normally distributed.
 
     Attributes:
         harmonics: number of harmonics.
-        losses: the heat of the windings is part of the power.
-        logarithm: the coefficient's logarithm is modelled.
-        ridge: penalty on all terms but the constant, in rows of value zero.
-        window_s: length of the mean [s].
+        losses: True if the heat of the windings is part of the power.
+        logarithm: True if the logarithm of the energy coefficient is modelled.
+        ridge: ridge penalty on all coefficients but the constant.
+        window_s: length of the trailing window over which signals are averaged [s].
         apart_s: time between independent rows, see `accumulated` [s].
         memory_s: time constant of the evidence, see `accumulated` [s].
         fitted: the fitted series; None before a fit.
@@ -131,7 +139,10 @@ class CosineEnergyClassifier(FloorClassifier):
     def _direction_and_energy(
         self, run: FloorSignals, spec: RobotSpec
     ) -> Float[np.ndarray, "row 2"]:
-        """Return direction of travel [rad] and energy coefficient of every row, NaN where slow."""
+        """Return direction of travel [rad] and energy coefficient e of every row.
+
+        The coefficient, or its logarithm, is NaN in rows at or below the speed `SLOW`.
+        """
         window = TrailingWindow.of(run.time, self.window_s)
         x, y, yaw = (window.mean(column) for column in run.rolling(spec).T)
         turn = spec.base_radius * yaw
@@ -147,6 +158,6 @@ class CosineEnergyClassifier(FloorClassifier):
 
 
 def terms(angle: Float[np.ndarray, " row"], harmonics: int) -> Float[np.ndarray, "row term"]:
-    """Return one, and cosine and sine of each multiple of an angle in turn."""
+    """Return the terms of the series: 1, then cosine and sine of each multiple of the angle."""
     waves = [f(k * angle) for k in range(1, harmonics + 1) for f in (np.cos, np.sin)]
     return np.stack([np.ones_like(angle), *waves], axis=1)

@@ -1,17 +1,17 @@
-"""The interface of floor classifiers: what they measure, and the belief that they return.
+"""Interface of floor classifiers: the signals that they use, and the beliefs that they return.
 
 A classifier is fitted to runs whose floor is known. It then goes through other runs row by row and
-gives the probability of every floor after each row, from that row and those before it alone.
+gives the probability of every floor after each row, from that row and earlier ones alone.
 
-Features of a row are causal: they are taken over the rows of the last so many seconds, the row
-itself included:
+Features of a row are causal: they are computed over trailing windows of fixed length in seconds,
+which end with the row itself:
 
     mean and std of the current and of the speed of each drive
-    mean of the summed currents over that of the summed wheel speeds
+    mean of the summed currents divided by the mean of the summed wheel speeds
     mean magnitude of the gyro's yaw rate; mean and std of its shortfall from the encoders' yaw rate
 
-together with the time since the start, because windows are shorter there. slipid's own filter uses
-the same channels: wheels, currents, gyro. Vibration is used only where it is requested.
+The time since the start of the run is a feature too, since the first windows are shorter. slipid's
+own filter uses the same channels: wheels, currents, gyro. Vibration is used only on request.
 """
 
 import abc
@@ -62,18 +62,18 @@ class FloorSignals:
 
     @property
     def dt(self) -> Float[np.ndarray, " row"]:
-        """Duration of each row [s]: time since the row before, and the median for the first."""
+        """Duration of each row: time since the previous row; for the first row the median [s]."""
         steps = np.diff(self.time)
         first = float(np.median(steps)) if len(steps) else 0.0
         return np.append(first, steps)
 
     @property
     def moving(self) -> Bool[np.ndarray, " row"]:
-        """Rows in which a wheel turns; a robot at rest has no evidence on its floor."""
+        """True in rows in which a wheel turns; at rest there is no evidence about the floor."""
         return np.asarray(np.abs(self.speed).max(axis=1) > STILL)
 
     def rows(self, first: int, last: int) -> "FloorSignals":
-        """Return the rows from `first` up to and without `last`."""
+        """Return the run's rows from `first` up to but not including `last`."""
         part = slice(first, last)
         return replace(
             self,
@@ -85,13 +85,13 @@ class FloorSignals:
         )
 
     def segment_start(self, seconds: float) -> Int[np.ndarray, " row"]:
-        """Return the first row of each row's segment, for segments of this length [s]."""
+        """Return the index of the first row of each row's segment; segments last `seconds` [s]."""
         start = np.cumsum(self.dt) - self.dt
         number = np.floor(start / seconds + 1e-6)
         return np.searchsorted(number, number)
 
     def segments(self, seconds: float) -> list["FloorSignals"]:
-        """Return the run cut into consecutive segments of this length [s]; the last is shorter."""
+        """Return consecutive segments of the run of this length [s]; the last may be shorter."""
         edges = [*np.unique(self.segment_start(seconds)), len(self)]
         return [self.rows(int(a), int(b)) for a, b in pairwise(edges)]
 
@@ -113,7 +113,7 @@ class FloorClassifier(abc.ABC):
     labels: tuple[str, ...] = ()
 
     def candidates(self) -> Sequence["FloorClassifier"]:
-        """Return at most `TRIES` variants with other settings; cross-validation picks one."""
+        """Return variants with different settings, of which cross-validation picks one."""
         return (self,)
 
     @abc.abstractmethod
@@ -141,7 +141,7 @@ def floors_of(runs: Sequence[FloorSignals]) -> tuple[str, ...]:
 def training_rows(
     runs: Sequence[FloorSignals], features: Callable[[FloorSignals], Features], every_s: float = 0.0
 ) -> tuple[Features, np.ndarray]:
-    """Return features and floor names of the moving rows of runs, about `every_s` [s] apart."""
+    """Return features and floor names of rows in which robots move, about `every_s` [s] apart."""
     found, floors = [], []
     for run in runs:
         every = max(1, round(every_s / max(float(np.median(run.dt)), 1e-3)))
@@ -157,13 +157,13 @@ def accumulated(
     apart_s: float,
     memory_s: float = np.inf,
 ) -> Beliefs:
-    """Return the beliefs by the likelihood of every row, from equal probabilities at the start.
+    """Return the belief after every row from the likelihoods l_t of the floors in each row.
 
     log p_t = exp(-dt / memory) log p_{t-1} + (dt / apart) log l_t + const,   p_0 uniform
 
-    Rows are not independent: those within `apart_s` [s] count as one observation. Evidence fades
-    with the time constant `memory_s` [s]. A row in which the robot stands, or whose likelihood is
-    not finite, changes nothing.
+    Rows are not independent: all rows within `apart_s` [s] together count as one observation.
+    Evidence fades with the time constant `memory_s` [s]. A row in which the robot stands, or whose
+    likelihood is not finite, does not change the belief.
     """
     used = run.moving & np.isfinite(log_likelihood).all(axis=1)
     evidence = np.where(used[:, None], log_likelihood, 0.0) * (run.dt / apart_s)[:, None]
@@ -181,9 +181,9 @@ class FeatureChannels:
     """Optional channels of the features; wheel speeds are always used.
 
     Attributes:
-        current: currents of the motors are used.
-        gyro: the gyro is used.
-        vibration: the vertical vibration is used.
+        current: True if the currents of the motors are used.
+        gyro: True if the gyro is used.
+        vibration: True if the vertical vibration is used.
     """
 
     current: bool = True
@@ -198,9 +198,9 @@ def features(
     windows_s: Sequence[float] = WINDOWS_S,
     restart_s: float = np.inf,
 ) -> Features:
-    """Return the features of every row by the rows up to it; NaN where a channel has no value.
+    """Return the features of every row from the rows up to it; NaN where a channel has no value.
 
-    After every `restart_s` [s] earlier rows are forgotten, as if the run started there.
+    After every `restart_s` [s], windows start anew without earlier rows, as at the start of a run.
     """
     start = run.segment_start(restart_s)
     columns = [np.minimum(run.time - run.time[start], max(windows_s))]
@@ -223,16 +223,20 @@ def features(
 def yaw_rate_shortfall(
     gyro: Float[np.ndarray, " row"], rolling: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, " row"]:
-    """Return the encoders' yaw rate less the gyro's, positive where the body turns less [rad/s]."""
+    """Return by how much the body turns less than the rolling wheels suggest [rad/s].
+
+    It is the difference of the yaw rates from encoders and gyro, positive where the body turns
+    less, whatever the sense of rotation.
+    """
     return np.asarray(np.where(rolling < 0, gyro - rolling, rolling - gyro))
 
 
 @dataclass(frozen=True, eq=False)
 class TrailingWindow:
-    """Rows of the last seconds up to and including every row.
+    """Trailing window of each row: the rows of the last seconds, including the row itself.
 
     Attributes:
-        first: first row in the window of each row.
+        first: index of the first row in the window of each row.
     """
 
     first: Int[np.ndarray, " row"]
@@ -244,7 +248,7 @@ class TrailingWindow:
         seconds: float,
         start: Int[np.ndarray, " row"] | None = None,
     ) -> "TrailingWindow":
-        """Return windows of a length at rows of these times [s], with no row before `start`."""
+        """Return windows of `seconds` [s] for rows at times `time` [s], no row before `start`."""
         first = np.searchsorted(time, time - seconds + 1e-6)
         return cls(first if start is None else np.maximum(first, start))
 
@@ -255,7 +259,7 @@ class TrailingWindow:
     def mean_and_std(self, x: Float[np.ndarray, " row"]) -> list[Float[np.ndarray, " row"]]:
         """Return mean and std of the finite values in each window; NaN where there is none."""
         known = np.isfinite(x)
-        # relative to the first value, so that squares lose fewer digits
+        # the first value is subtracted, so that the difference of squares loses fewer digits
         offset = float(x[known][0]) if known.any() else 0.0
         value = np.where(known, x - offset, 0.0)
         count = self._sum(known.astype(float))

@@ -1,31 +1,33 @@
 """Floor classifiers learned from window features: a Gaussian per floor, and boosted trees.
 
-Gaussian per floor: the baseline that a practitioner writes in ten lines.
+Gaussian per floor. This is a simple baseline, which a practitioner writes in ten lines.
 
-    x ~ N(m_floor, S_floor),   S_floor = (1 - a) (own covariance) + a (that of all floors together)
+    x ~ N(m_floor, S_floor),   S_floor = (1 - a) (floor's covariance) + a (mean over all floors)
     log p_t = log p_{t-1} + (dt / apart) log N(x_t; m_floor, S_floor) + const
 
-x are the features of a window, standardised; missing features count as the mean. a = 1 is linear
-discriminant analysis, a = 0 quadratic. Tuned by cross-validation: a.
+x are the standardised features of a window; missing features count as the mean. p_t is the
+probability of a floor after row t, dt the duration of the row, `apart` the time between independent
+rows. a = 1 is linear discriminant analysis, a = 0 quadratic. Tuned by cross-validation: a.
 
 Liberties of the Gaussian
-- No published system is copied. A ridge is added to every covariance, since features overlap.
-- Only the window of `window_s` is used: nested windows nearly repeat it.
+- It follows no particular published system. A ridge is added to every covariance, since features
+  are correlated.
+- Only one window length, `window_s`, is used: features of nested windows are nearly the same.
 
 Source: Friedman 1989, Journal of the American Statistical Association 84(405), for the mixture of
 the covariances.
 
-Gradient-boosted trees: off-the-shelf machine learning on the same features.
+Gradient-boosted trees. This is off-the-shelf machine learning on the same features.
 
     log l_t = log P(floor | x_t) - log P(floor),   x_t: features of the last 0.5, 1 and 2 s
     log p_t = exp(-dt / memory) log p_{t-1} + (dt / apart) log l_t + const
 
-P is that of scikit-learn's `HistGradientBoostingClassifier`, an ensemble of decision trees each of
-which is fitted to the residuals of those before it; P(floor) is the frequency of a floor in the
-training rows. Tuned by cross-validation: leaves per tree, and the time constant of the evidence.
+P(floor | x) is the output of scikit-learn's `HistGradientBoostingClassifier`, an ensemble of
+decision trees each of which is fitted to the residuals of those before it; P(floor) is the
+frequency of a floor in the training rows. Tuned by cross-validation: leaves per tree.
 
-Trees also learn the driving style on each floor: if only asphalt was driven fast, fast means
-asphalt whatever the motor currents are. Two more rows show how much that contributes.
+Trees also learn the driving style on each floor: if the robot drove fast on asphalt only, a high
+speed means asphalt whatever the motor currents are. Two more rows show how much that contributes.
 `boosted_trees_driving` uses the wheel speeds alone. `boosted_trees_felt` removes the driving style,
 
     log l_t = log P(floor | x_t) - log P(floor | features of the wheel speeds alone)
@@ -35,12 +37,13 @@ that a model of the robot provides. `boosted_trees_vibration` also uses the acce
 slipid does not.
 
 Liberties of the trees
-- No published system is copied; the features are those of `slipid.lab.systems.floors.interface`.
+- They follow no particular published system; the features are those of
+  `slipid.lab.systems.floors.interface`.
 - Training runs start anew every `restart_s`, so that trees are also trained on windows that have
-  just begun, as at the start of the runs that are judged.
-- One training row is used of every few: neighbours carry nearly the same information.
-- Settings that are no candidates, and those of the additional rows, are the best of six that were
-  tried on the very runs of `borealtc` on which they are judged.
+  just begun, as at the start of the evaluated stretches.
+- Training rows are `rows_s` apart: neighbouring rows carry nearly the same information.
+- Settings that are not tuned, and those of the additional rows, are the best of six that were tried
+  on the same runs of `borealtc` on which they are evaluated.
 
 Source: Friedman 2001, Annals of Statistics 29(5), for boosting; Ke et al. 2017, NeurIPS, for trees
 on histograms.
@@ -72,11 +75,11 @@ if TYPE_CHECKING:
 
 LogLikelihood = Float[np.ndarray, "row floor"]
 LEAST = 1e-4
-"""Lower limit of the probability of a floor after one row."""
+"""Lower limit of the probability of a floor that the trees give for one row."""
 DEFAULT_CHANNELS = FeatureChannels()
-"""Channels that slipid uses too."""
+"""Channels that slipid uses too: wheel speeds, currents and gyro."""
 DRIVING = FeatureChannels(current=False, gyro=False)
-"""Wheel speeds alone."""
+"""Wheel speeds as the only channel, to learn floors from the driving style."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +89,9 @@ class FloorGaussians:
     Attributes:
         middle: mean of each feature over all training rows.
         scale: standard deviation of each feature over all training rows.
-        mean: mean of each floor.
+        mean: mean of the standardised features on each floor.
         root: inverse of the Cholesky factor of each floor's covariance.
-        log_volume: logarithm of the factor's determinant.
+        log_volume: logarithm of the determinant of each Cholesky factor.
     """
 
     middle: Float[np.ndarray, " feature"]
@@ -110,10 +113,10 @@ class FloorGaussians:
 
 @dataclass(frozen=True)
 class GaussianClassifier(FloorClassifier):
-    """Gaussian per floor with accumulated window likelihoods.
+    """Floor classifier with a Gaussian per floor, whose likelihoods are accumulated over rows.
 
     Attributes:
-        shared: weight of the covariance that floors have in common.
+        shared: weight a of the mean covariance of all floors.
         ridge: variance added to every covariance of standardised features.
         window_s: length of the windows [s].
         apart_s: time between independent rows, see `accumulated` [s].
@@ -160,13 +163,13 @@ class GaussianClassifier(FloorClassifier):
         return floors * (count + count * (count + 1) // 2)
 
     def _features(self, run: FloorSignals, spec: RobotSpec, restart_s: float = np.inf) -> Features:
-        """Return the features of one window, without the time since the start."""
+        """Return the features of each row over one window, without the time since the start."""
         return features(run, spec, windows_s=(self.window_s,), restart_s=restart_s)[:, 1:]
 
 
 @dataclass(frozen=True, eq=False)
 class TreeEnsemble:
-    """Trees fitted to some channels.
+    """Boosted trees that give floor probabilities from the features of some channels.
 
     Attributes:
         channels: channels of the features.
@@ -179,7 +182,10 @@ class TreeEnsemble:
     frequency: Float[np.ndarray, " floor"]
 
     def log_likelihood(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> LogLikelihood:
-        """Return the log likelihood of every floor, up to a factor per row, all runs in a row."""
+        """Return the log likelihood of every floor in each row, up to a constant for each row.
+
+        The rows of all runs are concatenated.
+        """
         rows = np.concatenate([features(run, spec, self.channels) for run in runs])
         with one_thread():
             probability = self.trees.predict_proba(rows)
@@ -188,20 +194,20 @@ class TreeEnsemble:
 
 @dataclass(frozen=True)
 class BoostedTreesClassifier(FloorClassifier):
-    """Gradient-boosted trees on windows with accumulated log probabilities.
+    """Floor classifier with boosted trees, whose log likelihoods are accumulated over rows.
 
     Attributes:
         channels: channels of the features.
-        without_driving: the likelihood by wheel speeds alone is subtracted.
+        without_driving: True if the log likelihood from wheel speeds alone is subtracted.
         leaves: largest number of leaves of a tree.
-        trees: boosting steps, with one tree per floor each.
+        trees: number of boosting steps, each of which adds one tree per floor.
         rate: learning rate.
         apart_s: time between independent rows, see `accumulated` [s].
         memory_s: time constant of the evidence, see `accumulated` [s].
         rows_s: time between training rows [s].
         restart_s: time after which training runs start anew [s].
-        tuned: cross-validation picks settings.
-        fitted: the ensemble, and then the one whose likelihood is subtracted.
+        tuned: True if cross-validation picks the settings.
+        fitted: the fitted ensemble and, if `without_driving`, the one that is subtracted.
     """
 
     name: str = "boosted_trees"
@@ -266,7 +272,7 @@ class BoostedTreesClassifier(FloorClassifier):
 
 
 def tree_classifiers() -> list[BoostedTreesClassifier]:
-    """Return the trees, and the rows that show the effects of driving style and vibration."""
+    """Return the tuned trees, and variants that show the effects of driving style and vibration."""
     trees = BoostedTreesClassifier()
     fixed = replace(trees, tuned=False)
     return [

@@ -1,1 +1,1 @@
-"""Published systems that predict motion or slip."""
+"""Published systems that predict the body's motion or slip."""

@@ -1,25 +1,26 @@
-"""Inputs and targets that learned methods use, in windows of half a second.
+"""Inputs and targets of the learned methods, in windows of half a second.
 
-Inputs of a window, all measured by the robot itself, means over the window:
+The inputs of a window are means over it of what the robot itself measures:
 
     rolling twist (vx, vy, W), as if nothing slipped; speed of each drive
     direction (vx, vy, L W) / size, with size = |(vx, vy, L W)| and L the base radius,
     and its second harmonic ((vx^2 - vy^2), 2 vx vy) / size^2
-    |current| of each drive; commanded twist; gyro, and (gyro - W) L / size; each if it was logged
+    if they were logged: |current| of each drive; commanded twist; gyro and (gyro - W) L / size
 
 The target is the slip ratio of the body,
 
     ratio = (true twist - rolling twist) (1, 1, L) / size
 
 It has no unit and hardly depends on the speed where friction does not, so that a fit at one speed
-carries over to others; a target in m/s would not. Noise of the pose is divided by the size too, so
-windows are weighted by
+also holds at others; a target in m/s would not. The noise of the pose is divided by the size too,
+so windows are weighted by
 
-    weight ~ size^2 / (size^2 + (typical size / 2)^2)
+    weight ~ size^2 / (size^2 + (median size / 2)^2)
 
-which rises with the square where that noise dominates, and is level where the unexplained part of
-the slip dominates; windows in which the wheels rest are left out. A ratio is multiplied by the size
-again where it is used, so that a robot at rest does not slip.
+This weight rises with the square of the size at low speeds, where the noise of the pose dominates,
+and is constant at high speeds, where the unexplained part of the slip dominates. Windows in which
+the wheels rest are left out. Predicted ratios are multiplied by the size again, so that a robot at
+rest does not slip.
 """
 
 from collections.abc import Sequence
@@ -43,26 +44,26 @@ from slipid.predict.slip_model import (
 )
 
 REST = 0.02
-"""Size of a rolling twist below which a robot counts as at rest [m/s]."""
+"""Size of the rolling twist below which a robot counts as at rest [m/s]."""
 
 Inputs = Float[np.ndarray, "window input"]
 Ratios = Float[np.ndarray, "window 3"]
-"""Slip ratio of the body in each window: ahead, to the left, turning."""
+"""Slip ratio of the body in each window: forward, to the left, turning."""
 
 
 @runtime_checkable
 class Regressor(Protocol):
-    """The method that is used of scikit-learn's fitted regressors."""
+    """Interface of scikit-learn's fitted regressors, as far as it is used here."""
 
     def predict(self, X: np.ndarray) -> np.ndarray: ...
 
 
 @dataclass(frozen=True, eq=False)
 class SignalWindows:
-    """Windows of several runs, one run after the other.
+    """Signals of several runs in windows of half a second, one run after the other.
 
     Attributes:
-        signals: each run in windows.
+        signals: signals of each run, averaged over its windows.
         rolling: body twist without slip.
         size: size of the rolling twist [m/s]; a yaw rate counts as speed at the base radius.
         run: index of the run of each window.
@@ -75,7 +76,7 @@ class SignalWindows:
 
     @classmethod
     def of(cls, runs: Sequence[RunSignals], spec: RobotSpec) -> "SignalWindows":
-        """Return the windows of runs given in their own steps."""
+        """Return the windows of runs whose signals are given in shorter steps."""
         joined = [run.windowed() for run in runs]
         rolling = np.concatenate([run.rolling(spec) for run in joined])
         size = np.sqrt(((rolling * spec.size) ** 2).sum(axis=1))
@@ -83,11 +84,11 @@ class SignalWindows:
 
     @property
     def moving(self) -> Bool[np.ndarray, " window"]:
-        """Windows in which the wheels turn fast enough for a slip ratio."""
+        """True for windows in which the wheels turn fast enough to define a slip ratio."""
         return self.size >= REST
 
     def direction(self, spec: RobotSpec) -> Float[np.ndarray, "window 3"]:
-        """Return the rolling twist over its size: ahead, to the left, turning."""
+        """Return the rolling twist divided by its size: forward, to the left, turning."""
         return np.asarray(self.rolling * spec.size / self.size.clip(min=REST)[:, None])
 
     def speed(self) -> Float[np.ndarray, "window drive"]:
@@ -99,7 +100,7 @@ class SignalWindows:
         return np.abs(self._channel("current"))
 
     def inputs(self, spec: RobotSpec, channels: frozenset[Channel]) -> Inputs:
-        """Return all inputs, including those of the given channels.
+        """Return the inputs from encoders and from the given channels.
 
         Raises:
             ValueError: a run lacks one of the channels.
@@ -118,7 +119,7 @@ class SignalWindows:
         return np.concatenate(columns, axis=1)
 
     def _channel(self, name: Channel) -> Float[np.ndarray, "window *of"]:
-        """Return a channel of all windows."""
+        """Return the values of a channel in all windows; ValueError if a run lacks it."""
         for run in self.signals:
             if getattr(run, name) is None:
                 raise ValueError(f"{run.name}: no {name}, but the training runs have one")
@@ -127,14 +128,14 @@ class SignalWindows:
 
 @dataclass(frozen=True, eq=False)
 class SlipExamples:
-    """Training windows in which wheels turn, with their true slip ratio by the pose.
+    """Training windows in which the wheels turn, with true slip ratios from the poses.
 
     Attributes:
-        windows: all windows; the rows of the other attributes are those that move.
+        windows: all windows; the other attributes have rows only for windows with turning wheels.
         channels: channels that every run has and whose inputs are used.
         inputs: inputs of the learned methods.
         ratio: true slip ratio.
-        weight: weight of each window; the mean is one.
+        weight: weight of each window; the mean of all weights is one.
         run: index of the run of each window.
     """
 
@@ -189,9 +190,9 @@ class Scale:
 
     @classmethod
     def of(cls, x: Float[np.ndarray, "row column"]) -> "Scale":
-        """Return the scale of training rows."""
+        """Return the standardisation of the columns of these training rows."""
         std = x.std(axis=0)
-        # a constant column has a std of rounding errors only
+        # the computed std of a constant column is not zero but of the size of rounding errors
         flat = std <= 1e-9 * np.abs(x).max(axis=0)
         return cls(x.mean(axis=0), np.where(flat, 1.0, std), x.min(axis=0), x.max(axis=0))
 
@@ -200,12 +201,12 @@ class Scale:
         return np.asarray((x.clip(self.low, self.high) - self.mean) / self.std)
 
     def back(self, x: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
-        """Return standardised values in their own units, clipped to the training range."""
+        """Return the values, in their original units and range, of standardised values."""
         return np.asarray((x * self.std + self.mean).clip(self.low, self.high))
 
 
 def common(runs: Sequence[Run]) -> frozenset[Channel]:
-    """Return the channels besides the encoders that all runs have."""
+    """Return the channels that all runs have, other than encoders."""
     every: tuple[Channel, ...] = ("current", "gyro", "command")
     return frozenset(
         name for name in every if all(getattr(run.signals, name) is not None for run in runs)
@@ -213,7 +214,7 @@ def common(runs: Sequence[Run]) -> frozenset[Channel]:
 
 
 def weight_of(size: Float[np.ndarray, " window"]) -> Float[np.ndarray, " window"]:
-    """Return weights of windows of these sizes, with a mean of one."""
+    """Return the weights of windows with rolling twists of these sizes; their mean is one."""
     weight = size**2 / (size**2 + (0.5 * np.median(size)) ** 2)
     return np.asarray(weight / weight.mean())
 
@@ -221,9 +222,9 @@ def weight_of(size: Float[np.ndarray, " window"]) -> Float[np.ndarray, " window"
 def with_slip(
     runs: Sequence[RunSignals], windows: SignalWindows, ratio: Ratios, spec: RobotSpec
 ) -> list[PredictedRun]:
-    """Return paths of runs at their own steps by encoders and the predicted slip of each window.
+    """Return predicted paths of runs, integrated from encoders and each window's slip ratio.
 
-    A window's slip velocity holds for all of its steps.
+    The slip velocity of a window is added to the rolling twist in all of its steps.
     """
     slip = at_steps(ratio * windows.size[:, None] / spec.size, windows, runs)
     return [
@@ -235,7 +236,7 @@ def with_slip(
 def at_steps(
     values: Float[np.ndarray, "window value"], windows: SignalWindows, runs: Sequence[RunSignals]
 ) -> list[Float[np.ndarray, "_ value"]]:
-    """Return the value of the window around every step, one array for each run."""
+    """Return for every step the value of its window, in one array for each run."""
     ends = np.searchsorted(windows.run, np.arange(len(runs) + 1))
     return [
         np.repeat(values[start:stop], np.diff(groups(run.dt, WINDOW_S), append=len(run)), axis=0)

@@ -4,9 +4,10 @@
     mean(x) = k(x, X) (K + noise I)^-1 y
     var(x) = k(x, x) + noise - k(x, X) (K + noise I)^-1 k(X, x)
 
-All outputs share one kernel, each in units of its own standard deviation. Hyperparameters maximise
-the marginal likelihood of `TUNED` windows, in at most `ROUNDS` steps from one start; `KEPT` windows
-make the posterior. Windows are drawn in proportion to their weight, with a fixed seed.
+X are the training inputs, y their outputs and K = k(X, X). All outputs share one kernel, each in
+units of its own standard deviation. Hyperparameters maximise the marginal likelihood of `TUNED`
+windows, in at most `ROUNDS` steps from one start point; the posterior is conditioned on `KEPT`
+windows. Windows are drawn in proportion to their weight, with a fixed seed.
 
 Source: Rasmussen, Williams 2006, Gaussian Processes for RobotSpec Learning, MIT Press, equations
 2.25, 2.26, 4.17 and 5.8.
@@ -26,23 +27,28 @@ if TYPE_CHECKING:
     from sklearn.gaussian_process import GaussianProcessRegressor
 
 KEPT = 1000
+"""Largest number of windows in the posterior."""
 TUNED = 150
+"""Largest number of windows to which hyperparameters are fitted."""
 ROUNDS = 20
+"""Largest number of optimiser steps in the fit of hyperparameters."""
 SEED = 0
 
 LENGTHS = (0.1, 100.0)
+"""Bounds of the length scales, in units of the inputs."""
 VARIANCES = (1e-2, 1e2)
+"""Bounds of the variance of the process, relative to the variance of the outputs."""
 NOISES = (1e-4, 2.0)
-"""Bounds of the hyperparameters, variances in units of the outputs' variance."""
+"""Bounds of the variance of the noise, relative to the variance of the outputs."""
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """Hyperparameters, variances in units of the outputs' variance.
+    """Hyperparameters of the process; variances are relative to the variance of the outputs.
 
     Attributes:
-        lengths: length scale of each input, or a single one for all.
-        free: the lengths are fitted.
+        lengths: length scale of each input, or a single one for all inputs.
+        free: True if the length scales are fitted.
         variance: variance of the process.
         noise: variance of the measurement noise.
     """
@@ -58,7 +64,10 @@ class Kernel:
         return 2 + (len(self.lengths) if self.free else 0)
 
     def tuned(self, rows: "ProcessRows") -> "Kernel":
-        """Return the most likely kernel for a sample of the rows, found from this one."""
+        """Return the kernel of largest marginal likelihood for a sample of the rows.
+
+        The search starts from this kernel.
+        """
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.gaussian_process import GaussianProcessRegressor
 
@@ -67,7 +76,7 @@ class Kernel:
             _sklearn_kernel(self), optimizer=_few_steps, normalize_y=True
         )
         with one_thread(), warnings.catch_warnings():
-            # a length at its bound means an irrelevant input, which needs no warning
+            # a length scale at its upper bound only means that its input is irrelevant
             warnings.simplefilter("ignore", ConvergenceWarning)
             best = start.fit(some.x, some.y).kernel_
         return replace(
@@ -93,11 +102,11 @@ class ProcessRows:
     weight: Float[np.ndarray, " row"]
 
     def only(self, take: Bool[np.ndarray, " row"]) -> "ProcessRows":
-        """Return some of the rows."""
+        """Return the rows where `take` is True."""
         return ProcessRows(self.x[take], self.y[take], self.weight[take])
 
     def drawn(self, most: int) -> "ProcessRows":
-        """Return at most so many rows, drawn in proportion to their weight."""
+        """Return at most `most` rows, drawn at random in proportion to their weight."""
         share, rng = self.weight / self.weight.sum(), np.random.default_rng(SEED)
         count = min(most, int(np.count_nonzero(share)))
         some = rng.choice(len(share), count, replace=False, p=share)
@@ -106,7 +115,7 @@ class ProcessRows:
 
 @dataclass(frozen=True, eq=False)
 class ProcessPrediction:
-    """Mean and standard deviation of a new measurement, its noise included."""
+    """Mean and standard deviation of predicted outputs, including measurement noise."""
 
     mean: Float[np.ndarray, "row output"]
     std: Float[np.ndarray, "row output"]
@@ -118,7 +127,7 @@ class GaussianProcess:
 
     Attributes:
         kernel: hyperparameters.
-        known: the sample of rows.
+        known: rows on which the posterior is conditioned.
         regressor: scikit-learn's process.
     """
 
@@ -128,7 +137,7 @@ class GaussianProcess:
 
     @classmethod
     def of(cls, rows: ProcessRows, kernel: Kernel) -> "GaussianProcess":
-        """Return the posterior given at most `KEPT` of some rows."""
+        """Return the posterior given a random sample of at most `KEPT` of the rows."""
         from sklearn.gaussian_process import GaussianProcessRegressor
 
         known, start = rows.drawn(KEPT), _sklearn_kernel(kernel)
@@ -139,14 +148,14 @@ class GaussianProcess:
         return cls(kernel, known, fitted)
 
     def predict(self, x: Float[np.ndarray, "row input"]) -> ProcessPrediction:
-        """Return the prediction at some inputs."""
+        """Return the predicted outputs at the inputs."""
         mean, std = self.regressor.predict(x, return_std=True)
         outputs = self.known.y.shape[1]
         return ProcessPrediction(mean.reshape(-1, outputs), std.reshape(-1, outputs))
 
     @property
     def numbers(self) -> int:
-        """Number of hyperparameters and of entries of (K + noise I)^-1 y."""
+        """Number of fitted numbers: hyperparameters and the entries of (K + noise I)^-1 y."""
         return self.kernel.numbers + self.known.y.size
 
 
@@ -163,7 +172,10 @@ def _sklearn_kernel(kernel: Kernel) -> object:
 def _few_steps(
     loss: Callable, start: Float[np.ndarray, " log"], bounds: Float[np.ndarray, "log 2"]
 ) -> tuple[Float[np.ndarray, " log"], float]:
-    """Return logarithms of the hyperparameters and the loss after at most `ROUNDS` steps."""
+    """Return the minimiser and the loss after at most `ROUNDS` steps of L-BFGS-B.
+
+    It is an optimiser in scikit-learn's form; the variables are logarithms of hyperparameters.
+    """
     from scipy.optimize import minimize
 
     found = minimize(

@@ -1,29 +1,30 @@
-"""Andrakhanov and Belyaev predict slip by GMDH networks, one set for all floors or one for each.
+"""Andrakhanov and Belyaev: slip predicted by GMDH networks, one set for all floors or one for each.
 
-There is a network of quadratic neurons (see `polynomial_network`) for each component of the body's
-slip in half a second, over the inputs of `features`. `gmdh_one` has one set of networks whatever
-the floor. `gmdh_class` first classifies the floor and then uses the networks of that floor. The
-classifier is one network g_k per floor, trained to be one on its own floor and zero on others:
+Each component of the body's slip ratio in windows of half a second is the output of a network of
+quadratic neurons (see `polynomial_network`), whose inputs are those of `features`. `gmdh_one` has
+one set of networks for all floors. `gmdh_class` first classifies the floor and then uses the
+networks of that floor. Its classifier has one network g_k per floor, trained to give one on its own
+floor and zero on others:
 
-    p_k = max(g_k, 0.05) / sum_j max(g_j, 0.05)              of one window
-    e_k <- 0.9 e_k + log p_k,   P_k = exp(e_k) / sum_j exp(e_j)    of the run so far
+    p_k = max(g_k, 0.05) / sum_j max(g_j, 0.05)                    for one window
+    e_k <- 0.9 e_k + log p_k,   P_k = exp(e_k) / sum_j exp(e_j)    for the run so far
 
-and takes the floor of the largest P_k. A floor that is given and was trained on is used instead.
+The floor with the largest P_k is used, unless the floor is given and was among the training floors.
 
 Two settings are tuned: the ridge and the number of layers.
 
 Liberties:
-    - The papers predict displacement by a robot with other sensors; here it is slip as a ratio, of
-      the same half second, from the inputs that all learned methods get.
-    - Halves A and B are runs drawn at random, of every floor alike, since windows of one run are
-      nearly copies of each other.
+    - The papers predict the displacement of a robot with other sensors. Here the networks predict
+      the slip ratio in the same half second, from the inputs that all learned methods get.
+    - Halves A and B of the data are random halves of each floor's runs, not of its windows, since
+      windows of one run are nearly copies of each other.
     - Ridge replaces plain least squares; inputs and outputs are clipped to the training range.
-    - Slow windows have less weight in the networks of slip; floors have equal weight in those of
-      floors.
-    - Evidence on the floor is added up along the run and fades, since a run may cross floors.
-      Probabilities of floors come from the signals, also where the floor is given.
-    - Floors without training runs in the present load set-up, which a robot knows, are left out.
-    - Twenty neurons of a layer are kept and inputs of earlier layers are not offered again.
+    - Slow windows have less weight in the networks for slip; all floors have the same total weight
+      in the networks of the classifier.
+    - Evidence about the floor is accumulated along the run and fades, since a run may cross floors.
+      The reported floor probabilities always come from the signals, even if the floor is given.
+    - The robot knows its load set-up: floors without training runs with it have probability zero.
+    - Twenty neurons of a layer are kept, and the next layer has only their outputs as inputs.
 
 Source: Andrakhanov, Belyaev 2017, Navigation learning system for mobile robot in heterogeneous
 environment: inductive modeling approach, CSIT; Andrakhanov, Belyaev 2018, GMDH-based learning
@@ -51,10 +52,11 @@ from slipid.lab.systems.motion.polynomial_network import Growth, PolynomialNetwo
 from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, RunSignals, SlipModel
 
 KEPT = 20
+"""Number of neurons of a layer whose outputs are the inputs of the next layer."""
 LEAST = 0.05
-"""Lower limit of a floor's probability in one window: outputs of networks may be negative."""
+"""Lower limit of the classifier's output for a floor in one window, which may be negative."""
 MEMORY = 0.9
-"""Factor by which the evidence fades from window to window."""
+"""Factor by which evidence about the floor fades from window to window."""
 CANDIDATES = (
     Growth(1e-3, KEPT, 5),
     Growth(1e-1, KEPT, 5),
@@ -66,11 +68,11 @@ SEED = 0
 
 @dataclass(frozen=True, eq=False)
 class NetworkSet:
-    """A network for each of several outputs.
+    """Networks for several outputs, one for each.
 
     Attributes:
-        inputs: scale of the inputs.
-        outputs: scale of the outputs.
+        inputs: standardisation of the inputs.
+        outputs: standardisation of the outputs.
         each: network of each output.
     """
 
@@ -87,7 +89,7 @@ class NetworkSet:
         in_a: Bool[np.ndarray, " window"],
         growth: Growth,
     ) -> "NetworkSet":
-        """Return networks grown on the windows of half A and ranked on the others."""
+        """Return networks fitted to the windows of half A and selected on those of half B."""
         inputs, outputs = Scale.of(x), Scale.of(y)
         scaled = inputs.scaled(x)
         each = [grown(scaled, column, weight, in_a, growth) for column in outputs.scaled(y).T]
@@ -107,7 +109,7 @@ class NetworkSet:
 @final
 @dataclass(frozen=True, eq=False)
 class GmdhOne(SlipModel):
-    """One set of networks for all floors.
+    """Slip model with one set of networks for all floors.
 
     Attributes:
         growth: settings of the networks' growth.
@@ -144,7 +146,7 @@ class GmdhOne(SlipModel):
 @final
 @dataclass(frozen=True, eq=False)
 class GmdhClass(SlipModel):
-    """Networks that classify the floor, and then networks of the slip on that floor.
+    """Slip model that classifies the floor by networks, and has networks of the slip on each floor.
 
     Attributes:
         growth: settings of the networks' growth.
@@ -217,7 +219,7 @@ class GmdhClass(SlipModel):
             return np.ones((len(inputs), 1))
         share = self.classifier.output(inputs).clip(min=LEAST)
         evidence = np.log(share / share.sum(axis=1, keepdims=True))
-        # a robot at rest has no evidence on its floor
+        # signals of a robot at rest carry no evidence about its floor
         evidence[~windows.moving] = 0.0
         possible = np.array([[run.load in loads for loads in self.loads] for run in runs])
         possible |= ~possible.any(axis=1, keepdims=True)
@@ -233,7 +235,10 @@ class GmdhClass(SlipModel):
 def first_half(
     run: Int[np.ndarray, " window"], floor_of_run: Sequence[str]
 ) -> Bool[np.ndarray, " window"]:
-    """Return half A of the windows: half of each floor's runs, or every other window of one run."""
+    """Return True for the windows of half A: those of half of each floor's runs, at random.
+
+    On a floor with only one run, half A has every other window.
+    """
     rng = np.random.default_rng(SEED)
     floors = np.array(floor_of_run)[run]
     in_a = np.zeros(len(run), dtype=bool)
@@ -250,10 +255,10 @@ def first_half(
 def remembered(
     evidence: Float[np.ndarray, "window floor"], run: Int[np.ndarray, " window"]
 ) -> Float[np.ndarray, "window floor"]:
-    """Return the accumulated evidence of each run, in which older evidence fades."""
+    """Return the evidence accumulated up to each window of a run; older evidence fades."""
     place = np.arange(len(run)) - np.searchsorted(run, run)
     total = evidence.copy()
-    # all runs at once, window by window
+    # the k-th windows of all runs are updated together
     for k in range(1, place.max(initial=0) + 1):
         here = np.flatnonzero(place == k)
         total[here] += MEMORY * total[here - 1]

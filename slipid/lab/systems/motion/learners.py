@@ -1,20 +1,20 @@
-"""Two learned slip models on all signals of the robot: boosted trees and a small neural network.
+"""Two learned slip models from all signals of the robot: boosted trees, a small neural network.
 
 Boosted trees. Each component of the body's slip ratio in windows of half a second (see `features`)
 is
 
-    f_0 + rate (tree_1 + tree_2 + ... ),    each tree least squares of the residuals of those before
+    f_0 + rate (tree_1 + tree_2 + ... )
 
-with inputs in at most 255 bins and trees grown leaf by leaf. Outside the training inputs the output
-is that of the nearest ones.
+Each tree is a least squares fit to the residuals of the trees before it; `rate` is the learning
+rate. Inputs are sorted into at most 255 bins and trees are grown leaf by leaf. Outside the range of
+the training inputs, the output is that at the edge of the range.
 
-Tuned: learning rate and leaves of a tree, of which there are sixty.
+Tuned: the learning rate and the number of leaves of each of the sixty trees.
 
 Liberties of the trees:
-    - Not a published slip system: the obvious first method for a table of numbers.
-    - Three independent sets of trees, one for each component; no shrinkage but the rate; no early
-      stopping.
-    - Windows are drawn with a probability in proportion to their weight, and then count alike.
+    - They are not a published slip system, but the obvious first method for tabular data.
+    - Each component has its own trees; there is no shrinkage but the rate, and no early stopping.
+    - Windows are drawn at random in proportion to their weight and then have equal weights.
 
 Source: Friedman 2001, Greedy function approximation: a gradient boosting spec, Annals of
 Statistics 29(5); the binning of Ke and others 2017, LightGBM, NeurIPS, as scikit-learn has it.
@@ -23,16 +23,17 @@ Neural network. All three components of the slip ratio at once are
 
     W_n relu(... relu(W_1 x + b_1) ...) + b_n
 
-of standardised inputs and outputs, fitted by Adam to mean square error + alpha |W|^2 until the loss
-on a tenth of the windows, drawn at random and left out, stops falling.
+where x are standardised inputs and the outputs are standardised too. Adam minimises the mean square
+error + alpha |W|^2 until the loss stops falling on a tenth of the windows, which are drawn at
+random and held out.
 
 Tuned: size of the one hidden layer, and alpha.
 
 Liberties of the network:
-    - Not one published network: those of the literature differ in inputs and sizes from robot to
-      robot, and this is their common core.
+    - It is not one published network: those in the literature differ in inputs and sizes from robot
+      to robot, and this is what they have in common.
     - Inputs and outputs are clipped to the training range.
-    - Windows left out for early stopping are neighbours of training windows.
+    - Windows held out for early stopping are neighbours of training windows.
 
 Source: scikit-learn's multilayer perceptron; Kingma, Ba 2015, Adam, ICLR; early stopping as in
 Goodfellow, Bengio, Courville 2016, Deep Learning, MIT Press, section 7.8.
@@ -57,7 +58,7 @@ from slipid.lab.systems.one_thread import one_thread
 from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, RunSignals, SlipModel
 
 FEWEST = 20
-"""Smallest number of windows in a leaf, and smallest number of windows for early stopping."""
+"""Smallest number of windows in a leaf, and of training windows for early stopping."""
 SEED = 0
 PASSES = 60
 """Largest number of passes of the network's training through all windows."""
@@ -68,14 +69,14 @@ PATIENCE = 6
 @final
 @dataclass(frozen=True, eq=False)
 class BoostedTrees(SlipModel):
-    """Boosted trees for each component of the slip.
+    """Slip model by boosted trees for each component of the slip ratio.
 
     Attributes:
         rate: learning rate.
         leaves: largest number of leaves of a tree.
         trees: number of trees of each component.
         channels: channels of the inputs besides the encoders.
-        each: scikit-learn's trees of each component.
+        each: scikit-learn's fitted ensemble for each component.
         windows: number of training windows.
     """
 
@@ -95,7 +96,7 @@ class BoostedTrees(SlipModel):
         from sklearn.ensemble import HistGradientBoostingRegressor
 
         examples = SlipExamples.of(runs, spec)
-        # scikit-learn takes ten times as long for bins of weighted inputs
+        # rows are drawn by weight, since scikit-learn takes ten times as long to bin weighted rows
         chance = np.random.default_rng(SEED).uniform(size=len(examples.weight))
         kept = chance <= examples.weight / examples.weight.max()
         with one_thread():
@@ -123,7 +124,7 @@ class BoostedTrees(SlipModel):
 
     @property
     def numbers(self) -> int:
-        """Largest number of leaves and thresholds; trees of few windows have fewer."""
+        """Largest possible number of leaf values and thresholds; small trees have fewer."""
         leaves = min(self.leaves, max(1, self.windows // FEWEST))
         return len(self.each) * self.trees * (2 * leaves - 1)
 
@@ -131,15 +132,15 @@ class BoostedTrees(SlipModel):
 @final
 @dataclass(frozen=True, eq=False)
 class NeuralNetwork(SlipModel):
-    """A multilayer perceptron for the slip.
+    """Slip model by a multilayer perceptron for all components of the slip ratio.
 
     Attributes:
         hidden: sizes of the hidden layers.
         alpha: penalty on squared weights.
         channels: channels of the inputs besides the encoders.
-        inputs: scale of the inputs.
-        outputs: scale of the outputs.
-        network: scikit-learn's network.
+        inputs: standardisation of the inputs.
+        outputs: standardisation of the outputs.
+        network: scikit-learn's fitted network.
     """
 
     name: str = "neural_network"
@@ -170,7 +171,7 @@ class NeuralNetwork(SlipModel):
             random_state=SEED,
         )
         with one_thread(), warnings.catch_warnings():
-            # the number of passes is limited on purpose, as an alternative to early stopping
+            # the number of passes is limited on purpose, so reaching the limit needs no warning
             warnings.simplefilter("ignore", ConvergenceWarning)
             x, y = inputs.scaled(examples.inputs), outputs.scaled(examples.ratio)
             network.fit(x, y, sample_weight=examples.weight)

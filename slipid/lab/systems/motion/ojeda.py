@@ -1,40 +1,43 @@
-"""Ojeda et al. 2006: rim speeds corrected by motor currents where all wheels slip.
+"""Ojeda et al. 2006: rim speeds are corrected by motor currents while all wheels slip.
 
     dv_i = k0 + k1 I~_i         |v_i| <- max(|v_i| - dv_i, 0)     while all-wheel slip is flagged
     flagged where mean_i I~_i > mean + 3 sigma of the hard floor,  xi = back v
 
-v_i is the rim speed of a drive by its encoder, I~_i the current through a first-order low pass.
-k0 and k1 belong to a floor, are shared by all wheels, and are fitted in one of three ways:
+v_i is the rim speed of drive i by its encoder, I~_i its current after a first-order low pass, xi
+the corrected twist of the body and `back` the matrix from rim speeds to the twist. k0 and k1 belong
+to a floor, are shared by all wheels, and are fitted in one of three ways:
 
     ojeda_continuous   the pose is known all the time: recursive least squares in the body's
-                       displacement, window by window of half a second, forgetting 0.995
-    ojeda_sporadic     the place is known now and then: least squares in the place at the end of
-                       each segment, here each run, relative to its start
+                       displacement in windows of half a second, forgetting factor 0.995
+    ojeda_sporadic     the position is known occasionally: least squares in the position at the end
+                       of each segment, here each run, relative to its start
     ojeda_gyro         no pose: least squares in the encoders' yaw rate less the gyro's
 
-The hard floor is the one among the training floors on which encoders err least; the currents on it
-serve all floors, as if they had been measured once before. If all training runs are on one floor,
-without information on a harder one, it is the quarter of the runs in which encoders err least: then
-little is flagged.
+The hard floor is the one among the training floors on which encoders have the smallest errors. The
+threshold for slip comes from the currents on it and is used on all floors. If all training runs are
+on one floor, the quarter of the runs with the smallest encoder errors takes the place of a hard
+floor; little slip is flagged then.
 
-The method handles floors itself: k0 and k1 for each floor that it was trained on, and from all runs
-together where the floor is not given or not known. Tuned: the low pass's time constant.
+The method handles floors itself: it has k0 and k1 for each training floor, and a pair fitted to all
+runs for runs whose floor is not given or was not trained. Tuned: the low pass's time constant.
 
 Liberties:
-    - The equations are restated, not copied: length of a window, variance before learning, order of
-      the runs and solvers are ours. The authors' correction for the pitch of the ground does not
-      apply here and is left out.
-    - The original corrects rovers along their direction of motion; here every drive is corrected
-      along its own, so that omni robots are too. A wheel is never turned backwards.
+    - The equations are restated, not copied: the length of windows, the prior variance, the order
+      of the runs and the solvers are ours. The authors' correction for the pitch of the ground does
+      not apply here and is left out.
+    - The original corrects the velocity of rovers along their direction of motion; here the rim
+      speed of each drive is corrected, which also works for omni robots. A correction never
+      reverses a wheel.
     - Statistics of the hard floor are over all steps in which the robot moves, in any direction.
       The hard floor is found from training poses, also for `ojeda_gyro`.
     - `ojeda_continuous` learns online in the order of the runs, as published, and stops after the
-      last: forgetting 0.995 per window keeps about the last 100 s that were flagged.
-    - `ojeda_sporadic` solves for the place after integration, which is not linear, by a trust
-      region; it uses the heading of the corrected wheels.
-    - Where the gyro does not identify both k0 and k1 (straight runs of a skid steer), dv is zero at
+      last run. A forgetting factor of 0.995 per window keeps about the last 100 s of flagged slip.
+    - In `ojeda_sporadic` the end position is not linear in k0 and k1; it is fitted by a trust
+      region method. The heading comes from the corrected rim speeds.
+    - If the gyro does not identify both k0 and k1 (straight runs of a skid steer), dv is zero at
       the hard floor's mean current.
-    - `slipping` is the excess of the mean current over the hard floor's mean, in sigma.
+    - The slip score `slipping` is the excess of the mean current over the hard floor's mean, in
+      sigma.
 
 Source: Ojeda, Cruz, Reina, Borenstein 2006, "Current-Based Slippage Detection and Odometry
 Correction for Mobile Robots and Planetary Rovers", IEEE Transactions on Robotics 22(2).
@@ -60,15 +63,17 @@ from slipid.predict.slip_model import (
 from slipid.predict.steps import Steps, TrainingWindows, scaled_least_squares
 
 Line = Float[np.ndarray, "2"]
-"""k0 [m/s] and k1 [m/s/A]."""
+"""Coefficients k0 [m/s] and k1 [m/s/A] of the correction."""
 Tuning = Literal["continuous", "sporadic", "gyro"]
 FORGETTING = 0.995
+"""Factor by which the weight of a window falls with each later window."""
 SIGMAS = 3.0
-"""Excess of the mean current over the hard floor's mean from which slip is flagged [std there]."""
+"""Slip is flagged if the mean current exceeds the hard floor's mean by this many std of the latter.
+"""
 MOVING = 0.02
-"""Mean rim speed above which the robot moves [m/s]."""
+"""Mean rim speed above which the robot counts as moving [m/s]."""
 PRIOR = 1e6
-"""Prior variance of k0 and k1, in their own units."""
+"""Prior variance of k0 [m^2/s^2] and k1 [m^2/s^2/A^2], so large that it has hardly any effect."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ class HardFloor:
     std: float
 
     def sigmas(self, current: Float[np.ndarray, "step drive"]) -> Float[np.ndarray, " step"]:
-        """Return the excess of the wheels' mean current over the hard floor's mean, in its stds."""
+        """Return the excess of the wheels' mean current over the hard floor's mean, in std."""
         return np.asarray((current.mean(axis=1) - self.mean) / self.std)
 
 
@@ -91,7 +96,7 @@ class FlaggedSteps:
         steps: steps of the runs.
         rim: rim speed of each drive [m/s].
         current: smoothed current of each drive [A].
-        flagged: steps in which all wheels slip.
+        flagged: True in steps in which all wheels are flagged as slipping.
     """
 
     steps: Steps
@@ -100,12 +105,18 @@ class FlaggedSteps:
     flagged: Bool[np.ndarray, " step"]
 
     def features(self, middle: float = 0.0) -> Float[np.ndarray, "step drive 2"]:
-        """Return derivatives of each rim speed's loss by k0 and k1; currents are from `middle`."""
+        """Return derivatives of each rim speed's reduction with respect to k0 and k1.
+
+        `middle` [A] is subtracted from currents; k0 is then the reduction at this current.
+        """
         sign = np.sign(self.rim) * self.flagged[:, None]
         return np.stack([sign, sign * (self.current - middle)], axis=-1)
 
     def twist(self, line: Float[np.ndarray, "*step 2"], spec: RobotSpec) -> Twists:
-        """Return the corrected body twist of every step, by one k0 and k1 or one for each step."""
+        """Return the corrected body twist of every step.
+
+        `line` has k0 and k1, either one pair for all steps or one for each step.
+        """
         less = self.flagged[:, None] * (line[..., :1] + line[..., 1:] * self.current)
         rim = np.sign(self.rim) * np.maximum(np.abs(self.rim) - less, 0.0)
         return np.asarray(rim @ spec.back.T)
@@ -114,12 +125,12 @@ class FlaggedSteps:
 @final
 @dataclass(frozen=True)
 class Ojeda(SlipModel):
-    """Slip correction by currents, see the top of this module; it handles floors itself.
+    """Slip correction by currents, as the module's docstring describes it.
 
     Attributes:
         tuning: one of the three ways to fit k0 and k1.
         time_constant: time constant of the low pass [s].
-        hard: the hard floor, once fitted.
+        hard: currents on the hard floor; None before a fit.
         lines: k0 and k1 of each floor; those under None are for unknown floors.
     """
 
@@ -168,7 +179,7 @@ class Ojeda(SlipModel):
         return FlaggedSteps(steps, rim, current, hard.sigmas(current) > SIGMAS)
 
     def _line(self, runs: Sequence[Run], hard: HardFloor, spec: RobotSpec) -> Line:
-        """Return k0 [m/s] and k1 [m/s/A] of some runs; zero where no slip was flagged."""
+        """Return k0 [m/s] and k1 [m/s/A] fitted to runs; zeros if no slip was flagged."""
         steps = self._flagged([run.signals for run in runs], hard, spec)
         if not steps.flagged.any():
             return np.zeros(2)
@@ -181,7 +192,10 @@ class Ojeda(SlipModel):
 
 
 def hard_runs(runs: Sequence[Run], spec: RobotSpec) -> list[Run]:
-    """Return the runs on the floor where encoders err least, or the best quarter of one floor."""
+    """Return the runs on the floor on which encoders have the smallest mean error.
+
+    If all runs are on one floor, return the quarter of them with the smallest errors.
+    """
     steps = Steps.of([run.signals for run in runs])
     rolling = steps.signals.rolling(spec)
     gap = np.linalg.norm((steps.ends(rolling) - true_ends(runs)) * spec.size, axis=1)
@@ -202,7 +216,7 @@ def true_ends(runs: Sequence[Run]) -> Float[np.ndarray, "run 3"]:
 
 
 def continuous(steps: FlaggedSteps, w: TrainingWindows, spec: RobotSpec) -> Line:
-    """Return k0 and k1 by poses at all times, from windows with flagged slip."""
+    """Return k0 and k1 fitted to displacements in windows with flagged slip, for known poses."""
     rows = w.rows(spec.back @ steps.features(), spec)
     used = rows.parts.any(axis=(1, 2))
     return forgetful(rows.parts[used], rows.gap[used], FORGETTING, PRIOR)
@@ -214,10 +228,11 @@ def forgetful(
     forgetting: float,
     variance: float,
 ) -> Float[np.ndarray, " k"]:
-    """Return the result of recursive least squares with forgetting, from zero with a variance.
+    """Return the result of recursive least squares with forgetting.
 
-    For N windows it is the minimum of sum_n forgetting^(N-1-n) |parts_n k - gap_n|^2
-    + forgetting^N |k|^2 / variance, which needs no recursion.
+    The recursion starts at zero with the given prior variance. For N windows, its result is the
+    minimiser k of sum_n forgetting^(N-1-n) |parts_n k - gap_n|^2 + forgetting^N |k|^2 / variance,
+    which is computed directly.
     """
     count = len(gap)
     weight = np.repeat(forgetting ** (0.5 * np.arange(count - 1, -1, -1)), gap.shape[1])
@@ -227,7 +242,7 @@ def forgetful(
 
 
 def sporadic(steps: FlaggedSteps, runs: Sequence[Run], spec: RobotSpec) -> Line:
-    """Return k0 and k1 by the place at the end of each run."""
+    """Return k0 and k1 fitted to the position at the end of each run."""
     from scipy.optimize import least_squares
 
     place = true_ends(runs)[:, :2]
@@ -239,7 +254,11 @@ def sporadic(steps: FlaggedSteps, runs: Sequence[Run], spec: RobotSpec) -> Line:
 
 
 def by_gyro(steps: FlaggedSteps, w: TrainingWindows, middle: float, spec: RobotSpec) -> Line:
-    """Return k0 and k1 by the yaw rate alone; `middle` is the hard floor's mean current [A]."""
+    """Return k0 and k1 fitted to yaw rates alone; `middle` is the hard floor's mean current [A].
+
+    Raises:
+        ValueError: the signals have no gyro.
+    """
     signals = steps.steps.signals
     if signals.gyro is None:
         raise ValueError(f"{signals.name}: no gyro; this method needs one")
@@ -250,7 +269,7 @@ def by_gyro(steps: FlaggedSteps, w: TrainingWindows, middle: float, spec: RobotS
 
 
 def ojeda_rows() -> list[SlipModel]:
-    """Return the three rows, unfitted."""
+    """Return the three rows of this method, unfitted."""
     return [
         Ojeda("ojeda_continuous", "continuous"),
         Ojeda("ojeda_sporadic", "sporadic"),

@@ -1,16 +1,17 @@
-"""GMDH network: layers of quadratic neurons of two inputs, added while held-out data improve.
+"""GMDH network: layers of quadratic neurons, added while the error on held-out data falls.
 
 The output of a neuron is  z = w . (1, x1, x2, x1 x2, x1^2, x2^2),  with
 
     w = argmin  mean_A (z - y)^2 + ridge |w without its constant|^2        on half A of the data
 
-Every pair of inputs gets one. They are ranked by mean_B (z - y)^2 on half B, the best few are kept,
-and their outputs are the inputs of the next layer. Growth ends where the best neuron of a new layer
-is no better on B than that of the layer before. The network is that best neuron with all neurons
-that it depends on.
+where y is the target. There is a neuron for every pair of inputs. Neurons are ranked by
+mean_B (z - y)^2 on half B of the data; the best few are kept, and their outputs are the inputs of
+the next layer. Growth ends when the best neuron of a new layer is no better on B than that of the
+layer before. The network is that best neuron with all neurons that it depends on.
 
-Both means are quadratic in w, with sums of x_i^a x_j^b (a + b <= 4) as coefficients. These are
-products of few matrices, and all pairs are solved at once without forming their regressors.
+Both means are quadratic in w, and their coefficients are sums of x_i^a x_j^b (a + b <= 4). A few
+matrix products give these sums for all pairs, so that all neurons are solved at once without
+forming the terms of each pair.
 
 Source: Ivakhnenko 1971, Polynomial theory of complex systems, IEEE Transactions on Systems, Man,
 and Cybernetics 1(4).
@@ -25,9 +26,9 @@ from jaxtyping import Bool, Float, Int
 POWERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [2, 0], [0, 2]])
 """Exponents of the first and the second input in a neuron's terms."""
 GAIN = 1e-3
-"""Share of the error on B that a new layer must remove; smaller gains are chance."""
+"""Smallest relative fall of the mean square error on B by a new layer; less may be chance."""
 NOTHING = 1e-12
-"""Error on B that consists of rounding errors only, for outputs of variance about one."""
+"""Mean square error on B up to which it counts as rounding error, for outputs of variance one."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Layer:
 
     Attributes:
         inputs: indices of the two inputs of each neuron.
-        weight: weights of each neuron's terms.
+        weight: weight w of each of the neuron's six terms.
     """
 
     inputs: Int[np.ndarray, "neuron 2"]
@@ -64,7 +65,7 @@ class Layer:
         return np.asarray(sum(w * term for w, term in zip(self.weight.T, terms, strict=True)))
 
     def only(self, neurons: Int[np.ndarray, " some"]) -> "Layer":
-        """Return some of the neurons."""
+        """Return a layer with only the neurons of these indices."""
         return Layer(self.inputs[neurons], self.weight[neurons])
 
 
@@ -99,7 +100,7 @@ def grown(
     in_a: Bool[np.ndarray, " row"],
     growth: Growth,
 ) -> PolynomialNetwork:
-    """Return the grown network of one output.
+    """Return a network grown for one target.
 
     Args:
         x: at least two inputs, each of about mean zero and variance one.
@@ -125,7 +126,7 @@ def grown(
 
 
 def pruned(layers: Sequence[Layer]) -> list[Layer]:
-    """Return layers with only the neurons that the last layer's first neuron depends on."""
+    """Return layers reduced to the last layer's first neuron and the neurons it depends on."""
     needed, kept = np.zeros(1, dtype=int), []
     for layer in reversed(layers):
         part = layer.only(needed)
@@ -138,10 +139,10 @@ def pruned(layers: Sequence[Layer]) -> list[Layer]:
 
 @dataclass(frozen=True, eq=False)
 class PairMoments:
-    """Means over some rows from which the neurons of all pairs of inputs are solved and scored.
+    """Means over rows of data from which the neurons of all pairs of inputs are solved and scored.
 
     Attributes:
-        inputs: indices of both inputs of each pair.
+        inputs: indices of the two inputs of each pair.
         gram: mean products of a pair's terms with each other.
         moment: mean products of a pair's terms with the target.
         square: mean square of the target.
@@ -159,7 +160,7 @@ class PairMoments:
         y: Float[np.ndarray, " row"],
         weight: Float[np.ndarray, " row"],
     ) -> "PairMoments":
-        """Return the weighted means over some rows."""
+        """Return the means over the rows with inputs x, targets y and these weights."""
         weight = weight / weight.sum()
         pair = np.triu_indices(x.shape[1], 1)
         a, b = (POWERS[:, k, None] + POWERS[None, :, k] for k in (0, 1))
@@ -190,7 +191,7 @@ def _products(
     sums = np.full((most + 1, most + 1, inputs, inputs), np.nan)
     powers = [np.ones_like(x)]
     for _ in range(most):
-        # twenty times as fast as x**k
+        # repeated multiplication is twenty times as fast as x**k
         powers.append(powers[-1] * x)
     for a in range(most + 1):
         sums[a, 0] = (weight @ powers[a])[:, None]

@@ -1,44 +1,48 @@
-"""Quann and others: energy by a law of the motion and a map, slip by a Gaussian process.
+"""Quann and others: energy by a linear law and a map of residuals, slip by a Gaussian process.
 
-In `quann_energy` the energy per metre  y = P / max(|v|, 0.02)  is linear in (1, |v|, |v|^2, |W|),
-plus a Gaussian process over the place. Power is predicted from encoders alone as
-y max(|v|, 0.02).
+In `quann_energy` the energy per metre  y = P / max(|v|, 0.02)  [J/m] is a linear function of
+(1, |v|, |v|^2, |W|) plus a Gaussian process over the position. P is the electric power [W], v the
+velocity [m/s] and W the yaw rate [rad/s] of the rolling wheels. Power is predicted from encoders
+alone as y max(|v|, 0.02).
 
-One setting is tuned, by the energy of whole runs: the length scale of the map.
+One setting is tuned by the energy error of whole runs: the length scale of the map.
 
 Liberties of the energy:
-    - The papers map energy over places that a robot team shares; here the map is relative to the
-      pose at a run's start, since no absolute place is given.
-    - A thousand windows are drawn at random instead of taking all, slow ones less often.
+    - The papers map energy over positions in a site that a robot team shares. Here the map is over
+      positions relative to the pose at a run's start, since no absolute position is given.
+    - The process uses a thousand windows drawn at random, slow ones less often, instead of all.
     - The linear law is found by least squares weighted by max(|v|, 0.02)^2, which is least squares
-      of power. The process is then fitted to the residuals, with the length scale given and its
-      variances by marginal likelihood.
-    - Speeds and yaw rates above those of the training runs are clipped to them in the law: a law
-      fitted at a single speed is off a hundredfold at twice that speed.
-    - Power is that of the motors by currents and datasheet, not of the whole robot.
-    - The path is that of the encoders.
+      of power. The process is then fitted to the residuals: its length scale is the tuned setting,
+      its variances maximise the marginal likelihood.
+    - In the law, speeds and yaw rates are clipped to the largest of the training runs: a law fitted
+      at a single speed is wrong by a factor of a hundred at twice that speed.
+    - Power is that of the motors from currents and datasheet, not of the whole robot.
+    - The predicted path is that of the encoders.
 
 In `quann_slip` the body's slip ratio in windows of half a second (see `features`) is a Gaussian
-process of |I| and |w| of each drive and of the direction of travel, its components ahead, to the
-left and turning. Within a run, the errors of a component are taken to be the same share of their
-standard deviation in all windows, so that the end of the path has the covariance
+process of |I| and |w| of each drive and of the direction of travel; its components are forward, to
+the left and turning. Within a run, the error of a component is assumed to be the same multiple of
+its standard deviation in all windows, so that the end of the path has the covariance
 
     C = inflation S S^T,   S = sum_k [R_k e_x s_x, R_k e_y s_y, J (p_end - p_k) s_W]_k dt_k
 
-where R_k is the heading, s are the standard deviations as velocities, and J is a quarter turn.
-Inflation is the mean of e^T (S S^T)^-1 e / 2 over runs, where e is the error at the end of a run
-that the process was not fitted to: each quarter of the runs is predicted by a fit to the others.
+where R_k is the rotation by the heading and p_k the position in step k of duration dt_k, s_x, s_y
+and s_W are the standard deviations as velocities, e_x and e_y unit vectors, and J is a rotation by
+90 degrees. The inflation is the mean of e^T (S S^T)^-1 e / 2 over runs, where e is the end-point
+error of a run that the process was not fitted to: each quarter of the runs is predicted by a fit to
+the others.
 
 One setting is tuned: whether each input has its own length scale.
 
 Liberties of the slip:
-    - The papers map slip over places that a robot team shares; here slip depends on what the robot
-      measures.
-    - A direction is a unit vector with a turning part instead of a heading, and slip is a ratio.
-    - A thousand windows are drawn at random instead of taking all, slow ones less often, and
+    - The papers map slip over positions in a site that a robot team shares; here slip depends on
+      the robot's own measurements.
+    - The direction of travel is a unit vector with a turning component instead of a heading, and
+      slip is a ratio.
+    - The process uses a thousand windows drawn at random, slow ones less often, instead of all, and
       inputs are clipped to the training range.
-    - The covariance of the end, and its inflation, are ours; a std of a millimetre is added in each
-      direction.
+    - The covariance of the end point and its inflation are ours, and include a std of 1 mm in each
+      direction for the camera.
 
 Source: Quann, Ojeda, Smith, Rizzo, Castanier, Barton 2017, An energy-efficient method for
 multi-robot reconnaissance in an unknown environment, American Control Conference; the same 2020,
@@ -75,19 +79,19 @@ from slipid.predict.slip_model import (
 )
 
 SLOW = 0.02
-"""Speed below which energy is counted per time instead of per metre [m/s]."""
+"""Lower limit of |v| in the energy per metre, which is proportional to power below it [m/s]."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class QuannEnergy(SlipModel):
-    """Energy per metre as a linear law of the motion and a Gaussian process of the place.
+    """Energy per metre as a linear function of the motion plus a Gaussian process of the position.
 
     Attributes:
         length: length scale of the map [m].
         law: coefficients of (1, |v|, |v|^2, |W|).
         fastest: largest |v| and |W| of the training runs [m/s], [rad/s].
-        process: process of the law's residuals over places relative to a run's start.
+        process: process of the law's residuals over positions relative to a run's start [m].
     """
 
     name: str = "quann_energy"
@@ -133,46 +137,46 @@ class QuannEnergy(SlipModel):
 
 
 def rate(twist: Twists) -> Float[np.ndarray, " row"]:
-    """Return the speed [m/s], not less than `SLOW`."""
+    """Return the larger of |v| and `SLOW` in each row [m/s]."""
     return motions(twist)[:, 0].clip(min=SLOW)
 
 
 def motions(twist: Twists) -> Float[np.ndarray, "row 2"]:
-    """Return |v| [m/s] and |W| [rad/s]."""
+    """Return |v| [m/s] and |W| [rad/s] of twists."""
     return np.stack([np.hypot(twist[:, 0], twist[:, 1]), np.abs(twist[:, 2])], axis=1)
 
 
 def law_terms(motion: Float[np.ndarray, "row 2"]) -> Float[np.ndarray, "row 4"]:
-    """Return (1, |v|, |v|^2, |W|)."""
+    """Return the terms (1, |v|, |v|^2, |W|) of the linear law in each row."""
     speed, turning = motion.T
     return np.stack([np.ones_like(speed), speed, speed**2, turning], axis=1)
 
 
 def places(windows: SignalWindows, spec: RobotSpec) -> Float[np.ndarray, "window 2"]:
-    """Return the place in the middle of each window by encoders, from the run's start [m]."""
+    """Return the position in the middle of each window by encoders, relative to the start [m]."""
     paths = [path_of(run.rolling(spec), run.dt)[:, :2] for run in windows.signals]
     return np.concatenate([0.5 * (path[1:] + path[:-1]) for path in paths])
 
 
 PARTS = 4
-"""Number of parts of the runs, each predicted by a fit to the others for the inflation."""
+"""Number of parts of the runs; to find the inflation, a fit to the others predicts each part."""
 START = 2.0
 """Initial length scale of every input, in standard deviations of the input."""
 CAMERA = 1e-3
-"""Standard deviation of a pose by the camera, for any camera [m]."""
+"""Assumed standard deviation of a camera's position, whichever camera was used [m]."""
 SEED = 0
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class QuannSlip(SlipModel):
-    """Slip as a Gaussian process of currents, speeds and direction.
+    """Slip as a Gaussian process of currents, wheel speeds and direction of travel.
 
     Attributes:
-        anisotropic: each input has its own length scale.
-        scale: scale of the inputs.
+        anisotropic: True if each input has its own length scale.
+        scale: standardisation of the inputs.
         process: process of the slip ratio's three components.
-        inflation: factor of the covariance of a path's end.
+        inflation: factor of the covariance of the end of a path.
     """
 
     name: str = "quann_slip"
@@ -195,7 +199,7 @@ class QuannSlip(SlipModel):
         squares = []
         for part in parts(np.unique(examples.run)):
             mine = np.isin(examples.run, part)
-            # a single run is predicted by a fit to itself
+            # if there is only one run, it is predicted by a fit to itself
             others = GaussianProcess.of(rows if mine.all() else rows.only(~mine), kernel)
             known = replace(self, scale=scale, process=others, inflation=1.0)
             squares.append(end_squares(known, [runs[k] for k in part], spec))
@@ -228,7 +232,7 @@ def slip_inputs(windows: SignalWindows, spec: RobotSpec) -> Inputs:
 
 
 def parts(numbers: Int[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]]:
-    """Return the runs split into a few parts at random."""
+    """Return the run indices split at random into `PARTS` parts, or fewer if there are few runs."""
     drawn = np.random.default_rng(SEED).permutation(numbers)
     return list(np.array_split(drawn, min(PARTS, len(numbers))))
 
@@ -236,7 +240,10 @@ def parts(numbers: Int[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]]:
 def end_spread(
     path: Float[np.ndarray, "edge 3"], std: Twists, dt: Float[np.ndarray, " step"]
 ) -> Float[np.ndarray, "2 2"]:
-    """Return the covariance of the end place if a component has the same error in all steps."""
+    """Return the covariance S S^T of the end position without inflation [m^2].
+
+    The errors of each component are the same multiple of its `std` in all steps.
+    """
     middle = 0.5 * (path[1:] + path[:-1])
     c, s = np.cos(middle[:, 2]), np.sin(middle[:, 2])
     ahead, left = np.stack([c, s]), np.stack([-s, c])
@@ -250,7 +257,7 @@ def end_spread(
 def end_squares(
     fitted: QuannSlip, runs: Sequence[Run], spec: RobotSpec
 ) -> Float[np.ndarray, " run"]:
-    """Return the squared error at each run's end over its covariance, per dimension."""
+    """Return e^T C^-1 e / 2 for each run, with the end-point error e and its covariance C."""
     predicted = fitted.predict([run.signals for run in runs], spec)
     error = np.stack(
         [

@@ -1,39 +1,43 @@
 """Reina and others: slip detection by indicators from encoders, gyro and currents.
 
-The decision is by thresholds or by fuzzy rules. Signals are smoothed by a causal exponential mean
-(I~, w, gyro). Let J_i be the rim speed of wheel i per body twist, xi_c the commanded twist and
-xi_enc the twist by the encoders. The indicators are
+Slip is flagged by thresholds or by fuzzy rules. Signals (I~, w, gyro) are smoothed by a causal
+exponential mean. Let J_i be the row vector that maps the body twist to the rim speed of wheel i,
+w_i the wheel's speed and r its radius, xi_c the commanded twist, xi_enc the twist by the encoders
+and W_enc its yaw rate. The indicators are
 
     w_ref,i = J_i xi_c / r  median_j(r w_j / J_j xi_c)   (without a command: xi_enc for xi_c)
     EI = sat(max_i max(|w_i - w_ref,i| / |w_ref,i|, |dw_i/dt| / a_max))
     GI = sat(|W_enc - gyro| / g_th)
-    CI = sat((min_i I~_i - I_lo) / (I_hi - I_lo)),       sat(x) = x cut to 0..1
+    CI = sat((min_i I~_i - I_lo) / (I_hi - I_lo)),       sat(x) = x clipped to 0..1
 
 `reina_deterministic` flags slip where GI >= 1 or CI >= 1. `reina_fuzzy` feeds EI, CI and GI into
-Sugeno's inference with fuzzy sets on 0..1, whose consequents are trained by least squares on
-whether the training windows slip, and flags slip where the output is at least one half. A window of
-half a second slips where |xi - xi_enc| > 0.2 |xi_enc|, with yaw rates weighted by the base radius.
+Sugeno's inference with fuzzy sets on 0..1 and flags slip where its output is at least 0.5. The
+consequents of its rules are trained by least squares: the target is 1 in training windows that
+slip, else 0. A window of half a second slips if |xi - xi_enc| > 0.2 |xi_enc|, where xi is the true
+twist and yaw rates are multiplied by the base radius.
 
-Two settings are tuned: the quantile of windows without slip that sets a_max, g_th and I_hi, and the
-time constant of the smoothing. The fuzzy row has the number of fuzzy sets tuned instead of the
-quantile.
+Two settings are tuned: the time constant of the smoothing, and for `reina_deterministic` the
+quantile of steps without slip that sets a_max, g_th and I_hi, for `reina_fuzzy` the number of fuzzy
+sets.
 
 Liberties:
-- The original only detects. Here the path is that of the encoders, whose twist is scaled by 1 - s
-  where slip is flagged; s is the mean slip of the flagged training windows (least squares).
-- Thresholds are quantiles over the training windows without slip (for I_lo the median); where all
-  windows slip, they are the smallest value.
+- The original only detects slip. Here the path is integrated from the encoders' twist, scaled by
+  1 - s where slip is flagged; s is the mean slip of flagged training windows by least squares.
+- Thresholds are quantiles over training steps without slip (for I_lo the median); if all windows
+  slip, they are the smallest value of the signal.
 - Where there is no gyro, EI >= 1 takes the place of GI >= 1.
 - The original compares the wheels of a rover with each other. An omni robot's wheels turn at
-  different speeds, so they are compared with the shape of the commanded twist. The deviation of a
-  slow wheel is divided by 0.3 of the fastest reference instead of its own. Three omni wheels fit
-  any twist exactly: EI then measures how well wheels follow their command, not whether they slip,
-  and without a command only the acceleration term remains.
+  different speeds, so their speeds are compared with those in proportion to the commanded twist.
+  The deviation of a slow wheel is divided by 0.3 of the fastest reference instead of its own. The
+  speeds of three omni wheels agree with some twist exactly, whatever they are: EI then measures how
+  well wheels follow their command, not whether they slip, and without a command only the
+  acceleration term remains.
 - The smallest current is taken over wheels that turn with at least 0.3 of the fastest rim speed;
-  the load of the others carries no information on slip.
+  the load of slower wheels carries no information about slip.
 - Fuzzy sets are triangles, every combination of sets has a rule, and consequents are constants
-  that are trained on poses; the original's own sets and rules are not taken over.
-- The score is the larger of the uncut indicators that flag, or the fuzzy output; it is 0 at rest.
+  that are trained on poses; the original's own sets and rules are not used.
+- The slip score is the largest unclipped indicator of those that flag slip, or the fuzzy output; it
+  is 0 at rest.
 - The original also measures the sinkage of its wheels by a camera; that is left out.
 
 Source: Reina, Ojeda, Milella, Borenstein 2006, "Wheel slippage and sinkage detection for planetary
@@ -71,13 +75,13 @@ _CURRENT: frozenset[Channel] = frozenset({"current"})
 
 @dataclass(frozen=True)
 class _Detector(SlipModel):
-    """Common part of both rows.
+    """Base class of both slip detectors.
 
     Attributes:
         smoothing: time constant of the smoothing [s].
-        quantile: quantile of the steps without slip that sets the thresholds.
+        quantile: quantile of signals in steps without slip that sets the thresholds.
         limits: fitted thresholds.
-        slip: fitted share of the encoders' twist that is lost where slip is flagged.
+        slip: fitted share of the encoders' twist that is subtracted where slip is flagged.
     """
 
     needs: frozenset[Channel] = field(default=_CURRENT, kw_only=True)
@@ -108,7 +112,7 @@ class _Detector(SlipModel):
         )
 
     def _mean_slip(self, examples: Sequence[LabelledRun]) -> float:
-        """Return the slip of the flagged parts of windows by least squares in their twists."""
+        """Return the mean slip of flagged steps, by least squares in the twists of windows."""
         against = square = 0.0
         for example in examples:
             flags = (self.score(example.signals) >= self._threshold).astype(float)
@@ -119,17 +123,17 @@ class _Detector(SlipModel):
         return against / square if square > 0.0 else 0.0
 
     def _trained(self, examples: Sequence[LabelledRun]) -> "_Detector":
-        """Return the detector with the parameters that are trained besides the thresholds."""
+        """Return the detector with its remaining parameters trained; thresholds are set already."""
         return self
 
     @property
     @abc.abstractmethod
     def _threshold(self) -> float:
-        """Smallest score that flags slip."""
+        """Score from which slip is flagged."""
 
     @abc.abstractmethod
     def _moving_score(self, indicators: Indicators) -> Numbers:
-        """Return the score of moving steps."""
+        """Return the slip score of steps in which the robot moves."""
 
 
 @final

@@ -1,21 +1,22 @@
-"""Reina's slip indicators, and Sugeno's fuzzy inference with trained constants.
+"""Reina's slip indicators, and Sugeno's fuzzy inference with trained consequents.
 
-Fuzzy inference. Every input lies in 0..1 and belongs to `sets` triangular sets, whose peaks are
-evenly spaced and whose memberships sum to one: for two sets, low is 1 - x and high is x. There is
-one rule for every combination of sets of the inputs. The strength of a rule is the product of its
-memberships, and the output is the mean of the rules' consequents, weighted by their strengths:
+Fuzzy inference. Every input x_i lies in 0..1 and has a membership mu in each of `sets` triangular
+fuzzy sets, whose peaks are evenly spaced and whose memberships sum to one: with two sets, the
+membership in "low" is 1 - x and in "high" x. There is one rule for every combination of sets of the
+inputs. The strength f_k of rule k is the product of its memberships, and the output is the mean of
+the rules' consequents c_k, weighted by the strengths:
 
     y = sum_k f_k c_k,    f_k = prod_i mu_ik(x_i),    sum_k f_k = 1
 
-Consequents are fitted by least squares with a weak prior at the output of a logical OR, so that a
-rule without samples keeps the meaning of its words.
+Consequents are fitted by least squares with a weak prior, whose mean is the output of a logical OR
+of the inputs; a rule without samples keeps this output.
 
-Source: Takagi & Sugeno 1985, IEEE Transactions on Systems, Man, and Cybernetics 15(1); of order
-zero.
+Source: Takagi & Sugeno 1985, IEEE Transactions on Systems, Man, and Cybernetics 15(1), with
+constant consequents (order zero).
 
 Indicators. Signals of a run are smoothed in every step. Thresholds are quantiles of the signals of
-training steps without slip, and indicators are signals over their thresholds. The formulas are at
-the top of `reina.py`.
+training steps without slip, and indicators are signals relative to their thresholds. The formulas
+are in the docstring of `reina.py`.
 """
 
 from collections.abc import Sequence
@@ -27,12 +28,12 @@ from jaxtyping import Bool, Float
 from slipid.predict.slip_model import WINDOW_S, Numbers, RobotSpec, Run, RunSignals, groups
 
 _PRIOR = 1.0
-"""Weight of the prior at the logical OR in every rule, in samples."""
+"""Weight of the prior of each rule's consequent, in samples."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sugeno:
-    """Fuzzy rules on a grid of sets.
+    """Fuzzy rules, one for every combination of the inputs' fuzzy sets.
 
     Attributes:
         sets: number of fuzzy sets of each input.
@@ -44,13 +45,13 @@ class Sugeno:
 
     @classmethod
     def logical_or(cls, inputs: int, sets: int) -> "Sugeno":
-        """Return rules that compute OR: the output is the largest peak of the inputs' sets."""
+        """Return rules for a logical OR: a rule's output is the largest peak of its sets."""
         peak = np.linspace(0.0, 1.0, sets)
         grid = np.stack(np.meshgrid(*[peak] * inputs, indexing="ij"), axis=-1)
         return cls(sets, grid.max(axis=-1).ravel())
 
     def strengths(self, x: Float[np.ndarray, "sample input"]) -> Float[np.ndarray, "sample rule"]:
-        """Return the strength of each rule; the rules of a sample sum to one."""
+        """Return the strength of each rule; the strengths for one sample sum to one."""
         peak = np.linspace(0.0, 1.0, self.sets)
         member = np.maximum(1.0 - np.abs(x[..., None] - peak) * (self.sets - 1), 0.0)
         strength = member[:, 0]
@@ -73,23 +74,24 @@ class Sugeno:
 
 
 SLIPS = 0.2
-"""Smallest slip of a slipping window, relative to the encoders' twist."""
+"""Difference of true and encoders' twist, relative to the latter, above which a window slips."""
 _REST = 0.01
-"""Rim speed below which a robot counts as at rest [m/s]."""
+"""Speed of the fastest rim up to which a robot counts as at rest [m/s]."""
 _DRIVING = 0.3
-"""Smallest rim speed of a driving wheel, relative to the fastest wheel."""
+"""Smallest rim speed, relative to the fastest wheel's, at which a wheel counts as driving."""
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothedSignals:
-    """Smoothed signals behind the indicators in every step of a run.
+    """Smoothed signals in every step of a run, from which the indicators are computed.
 
     Attributes:
-        deviation: largest relative deviation of a wheel from its reference.
-        change: largest acceleration of a wheel [rad/s^2].
-        turning: difference of the yaw rates by encoders and gyro [rad/s], or None.
+        deviation: largest deviation of a wheel's speed from its reference, relative to that.
+        change: largest magnitude of a wheel's acceleration [rad/s^2].
+        turning: magnitude of the difference of the yaw rates from encoders and gyro [rad/s]; None
+            without a gyro.
         amps: smallest current of the driving wheels [A].
-        moving: steps in which the wheels turn.
+        moving: True in steps in which the wheels turn.
     """
 
     deviation: Numbers
@@ -125,7 +127,8 @@ class SlipThresholds:
 
     Attributes:
         change: a_max, acceleration of a wheel [rad/s^2].
-        turning: g_th, difference of the yaw rates by encoders and gyro [rad/s].
+        turning: g_th, difference of the yaw rates from encoders and gyro [rad/s]; infinite if a
+            training run has no gyro.
         usual: I_lo, median of the smallest current of the driving wheels [A].
         highest: I_hi, upper quantile of the smallest current of the driving wheels [A].
     """
@@ -137,7 +140,7 @@ class SlipThresholds:
 
     @classmethod
     def of(cls, examples: "Sequence[LabelledRun]", quantile: float) -> "SlipThresholds":
-        """Return the quantiles of the steps that do not slip."""
+        """Return the thresholds at this quantile of the signals in steps without slip."""
         signals = [example.signals for example in examples]
         slips = np.concatenate([example.slips for example in examples])
 
@@ -161,12 +164,12 @@ class SlipThresholds:
 
 @dataclass(frozen=True, eq=False)
 class Indicators:
-    """Indicators of slip in every step, before they are cut to 0..1.
+    """Indicators of slip in every step, before they are clipped to 0..1.
 
     Attributes:
-        encoder: EI.
-        current: CI.
-        gyro: GI, or None without a gyro.
+        encoder: EI, from wheel speeds and accelerations.
+        current: CI, from motor currents.
+        gyro: GI, from yaw rates; None without a gyro.
     """
 
     encoder: Numbers
@@ -186,14 +189,15 @@ class Indicators:
 
 @dataclass(frozen=True, eq=False)
 class LabelledRun:
-    """A training run: its signals, and the slip of each window by the pose.
+    """A training run: its signals, and the slip of each window from the poses.
 
     Attributes:
         signals: smoothed signals of its steps.
-        first: first step of every window.
+        first: index of the first step of every window.
         slips: 1 in steps whose window slips, 0 where it does not, NaN at rest.
-        against: excess of the encoders' twist times that twist, in each window [m^2/s^2].
-        square: square of the encoders' twist, in each window [m^2/s^2].
+        against: scalar product, in each window, of the encoders' twist and its excess over the true
+            twist [m^2/s^2].
+        square: squared norm of the encoders' twist in each window [m^2/s^2].
     """
 
     signals: SmoothedSignals
@@ -221,7 +225,10 @@ class LabelledRun:
 
 
 def smoothing(dt: Numbers, seconds: float) -> Float[np.ndarray, "step step"]:
-    """Return the matrix of a causal exponential mean over the middles of the steps."""
+    """Return the matrix that maps a signal in steps to its causal exponential mean.
+
+    The age of a step is measured between the middles of steps; `seconds` is the time constant.
+    """
     middle = np.cumsum(dt) - 0.5 * dt
     age = middle[:, None] - middle[None, :]
     weight = np.where(age >= 0.0, np.exp(-np.maximum(age, 0.0) / seconds), 0.0) * dt
@@ -234,7 +241,11 @@ def _deviation(
     run: RunSignals,
     spec: RobotSpec,
 ) -> Numbers:
-    """Return the largest relative deviation of a wheel from the shape of the commanded twist."""
+    """Return the largest relative deviation of a wheel's rim speed from its reference in each step.
+
+    The references are the rim speeds of the commanded twist, or of the encoders' twist without a
+    command, times the median ratio of measured to commanded rim speeds.
+    """
     forward = spec.forward.T
     shape = mean @ (run.rolling(spec) @ forward)
     if run.command is not None:
@@ -243,7 +254,8 @@ def _deviation(
         shape = np.where(is_commanded, commanded, shape)
     turns = np.abs(shape) >= np.maximum(_DRIVING * np.abs(shape).max(axis=1, keepdims=True), 1e-9)
     ratio = np.sort(np.where(turns, rim / np.where(turns, shape, 1.0), np.inf), axis=1)
-    # wheels that do not turn are sorted to the end: the median is in the middle of the others
+    # ratios of wheels that do not turn are infinite and sorted last, so that they can be left out
+    # of the median
     count = np.maximum(turns.sum(axis=1, keepdims=True), 1)
     middle = np.concatenate([(count - 1) // 2, count // 2], axis=1)
     median = np.take_along_axis(ratio, middle, axis=1).mean(axis=1, keepdims=True)
