@@ -1,1 +1,1 @@
-"""Configs, and the work behind each command."""
+"""Configs, and the work of each command except its output."""

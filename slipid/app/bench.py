@@ -1,4 +1,4 @@
-"""Identify motors on a bench, from a config or from a single log file."""
+"""Identification of motors on a test bench, from a config or from a single log file."""
 
 import fnmatch
 import time
@@ -35,15 +35,17 @@ from slipid.support.progress import Reporter
 
 @dataclass(frozen=True, eq=False)
 class BenchTask:
-    """Records of every motor by its label ("" for a single one), and the choices for its numbers.
+    """Everything that a fit of motors on a bench needs.
+
+    Motors have labels; a single motor has the label "".
 
     Attributes:
-        records: records of each motor by its label.
-        choices: fixed, free and prior values of each motor's numbers by its label.
-        skipped: a line for each log that is not used.
-        columns_used: a line for each channel that columns of a single file were assigned to.
-        unit_is_known: the unit of the current was given, or the resistance is restricted, so that
-            an unlikely current is no error.
+        records: records of each motor, by the motor's label.
+        choices: fixed, free and prior values of each motor's parameters, by the motor's label.
+        skipped: one line about each log that is not used.
+        columns_used: for a single file, one line about each channel and the columns assigned to it.
+        unit_is_known: whether the unit of the current was given or the config has a choice for the
+            resistance, so that an unlikely current is not refused.
     """
 
     records: Mapping[str, tuple[BenchRecord, ...]]
@@ -53,7 +55,7 @@ class BenchTask:
     unit_is_known: bool = False
 
     def fit(self, report: Reporter) -> BenchFit:
-        """Return the fit of every motor; raise `DataError` where the records cannot be right."""
+        """Return the fit of every motor; raise `DataError` if the records cannot be right."""
         setup_jax(quiet=True)
         for label, records in self.records.items():
             check_records(records, label, self.unit_is_known)
@@ -65,7 +67,11 @@ class BenchTask:
 
 
 def read_bench_task(config: Config, root: Path, report: Reporter) -> BenchTask:
-    """Read every log that a motor config names; raise `DataError` where anything is wrong."""
+    """Return the task of a config of motors, after reading all its logs.
+
+    Raises:
+        DataError: a log cannot be read, or the config or the logs are wrong.
+    """
     report.stage("reading logs")
     found, skipped = of_config.required_files(config, config.content.logs, root)
     parts: list[list[BenchRecord]] = []
@@ -103,7 +109,17 @@ def read_bench_task(config: Config, root: Path, report: Reporter) -> BenchTask:
 def read_motor_log(
     path: Path, given: Mapping[str, GivenColumns], delimiter: str | None, signed: bool
 ) -> BenchTask:
-    """Read one file: `given` columns as named, every other channel by its column name."""
+    """Return the task of motors in a single log file.
+
+    Args:
+        path: the log file.
+        given: columns that the user named, by channel; other channels are found by column names.
+        delimiter: text between cells, or None to guess it.
+        signed: whether currents have a sign.
+
+    Raises:
+        DataError: the file cannot be read, or lacks a channel.
+    """
     layout = motor_layout(format_of(path, delimiter), given, signed)
     logs = counted_once(read_logs(path, layout, path.parent, None, "bench").logs)
     refuse_misordered(logs)
@@ -119,7 +135,7 @@ def read_motor_log(
 
 
 def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
-    """Return the record of each motor of a log, at the motor shaft."""
+    """Return a record for each motor in a log, with its speed at the motor shaft."""
     if log.current is None:
         raise DataError(f"{log.name}: no current; expected a column for each motor")
     if not log.wheels:
@@ -131,7 +147,7 @@ def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
     current = log.current if log.current_is_signed else np.abs(log.current) * np.sign(speed)
     out = []
     for k in range(speed.shape[1]):
-        # the two halves of a window are independent only if every row is a new reading
+        # A fit needs rows with independent errors, so only rows with new readings are used.
         read = _read(log, k)
         out.append(
             BenchRecord(
@@ -148,7 +164,7 @@ def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
 
 
 def _read(log: Log, motor: int) -> Bool[np.ndarray, " time"]:
-    """Return which rows have a new reading of a motor's current and voltage."""
+    """Return whether each row has a new reading of both current and voltage of a motor."""
     out = np.ones(log.samples, dtype=bool)
     for fresh in (log.current_fresh, log.voltage_fresh):
         if fresh is not None:
@@ -170,7 +186,11 @@ def _labels(names: Sequence[str], motors: int, where: str) -> tuple[str, ...]:
 
 
 def _choices(config: Config, label: str) -> tuple[Choice, ...]:
-    """Return the config's choices for a motor's numbers; raise `DataError` for an unknown name."""
+    """Return the config's choices for the parameters of the motor with a label.
+
+    Raises:
+        DataError: a pattern matches no parameter, or a choice is impossible.
+    """
     paths = [e.path for e in entries(BenchRoot(BenchMotor()))]
     choices = []
     for pattern in config.content.parameters:
@@ -186,7 +206,14 @@ def _choices(config: Config, label: str) -> tuple[Choice, ...]:
 def identify_bench(
     config: Config, data: Path, out: Path, report: Reporter
 ) -> tuple[BenchFit, tuple[str, ...]]:
-    """Fit the motors of a config, write identified.json, and return the fit and the file names."""
+    """Return the fit of the motors of a config, and the names of the written files.
+
+    Args:
+        config: config of the motors.
+        data: folder of the logs.
+        out: folder to write to.
+        report: reporter of the progress.
+    """
     began = time.monotonic()
     task = read_bench_task(config, data, report)
     fit = task.fit(report)
@@ -207,9 +234,9 @@ def identify_bench(
 def check_bench(
     config: Config, data: Path, out: Path | None, report: Reporter
 ) -> tuple[BenchFit, Content]:
-    """Return a fit and the content of check.json, which is also written to `out` where given.
+    """Return a fit of motors and the content of check.json, which is written to `out` if given.
 
-    A fit of a motor takes less than a second, so the check reports the verdicts of a real fit.
+    The check reports the verdicts of a real fit, since a fit of a motor takes less than a second.
     """
     task = read_bench_task(config, data, report)
     fit = task.fit(report)
@@ -234,7 +261,7 @@ def check_bench(
 
 
 def _record_summary(name: str, r: BenchRecord) -> Content:
-    """Return the channels and their ranges in one motor's record."""
+    """Return the part of check.json about one motor's record: its duration and ranges of values."""
 
     def span(x: np.ndarray | None) -> list[float] | None:
         return None if x is None else [float(x.min()), float(x.max())]

@@ -1,4 +1,4 @@
-"""Priors of a robot's motor from a fit of that motor on a bench."""
+"""Priors of the parameters of a robot's motor, from a fit of that motor on a test bench."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,17 +13,18 @@ from slipid.support.files import read_json
 
 SCHEMA = "slipid.identified/1"
 COPY_NAME = "motor_bench.json"
-"""Copy of the bench's file beside a robot's results."""
+"""Name of the copy of the bench file in the folder of a robot's results."""
 GEAR_STD = 0.3
-"""Std of the friction that a gear may add or remove, as a part of the friction on the bench."""
+"""Std of the change of friction by the robot's gear, relative to the friction on the bench [1]."""
 NAMES = ("resistance", "back_emf", "brush_drop", "coulomb_friction", "viscous_friction")
-"""Numbers taken from a bench. Sensor offsets belong to the bench's meters and are left out."""
+"""Names of the parameters taken from a bench. Sensor offsets are not, since they belong to the
+meters of the bench."""
 _EXPECTED = "what `slipid identify` of a motor, or `slipid motor --out`, wrote"
 
 
 @dataclass(frozen=True)
 class BenchEstimate:
-    """Estimate of one number of one motor on a bench."""
+    """Estimate of one parameter of one motor on a bench: value, std and verdict."""
 
     value: float
     std: float
@@ -32,35 +33,41 @@ class BenchEstimate:
 
 @dataclass(frozen=True)
 class BenchFile:
-    """Path of a bench's file, and its estimates by name, one for each motor."""
+    """Content of a bench file.
+
+    Attributes:
+        path: path of the file.
+        numbers: estimates of each parameter, one for each motor, by the parameter's name.
+    """
 
     path: Path
     numbers: Mapping[str, list[BenchEstimate]]
 
 
 def bench_of(config: Config) -> BenchFile | None:
-    """Return the bench file that the config names; None where it names none.
+    """Return the bench file that a config names, or None if it names none.
 
     Raises:
-        DataError: the file is missing, damaged, or not from a bench.
+        DataError: the file is missing, damaged, or not the result of a bench.
     """
     named = config.content.wheels.motor
     if named is None:
         return None
-    # a result folder has its own copy, so that later commands need no other folder
+    # The folder of a robot's results has a copy of the file, so that later commands do not need
+    # the bench's folder.
     kept = config.path.parent / COPY_NAME
     path = kept if kept.is_file() else config.path.parent / named
     return BenchFile(path, _read(path, f"{config.path}: robot.motor"))
 
 
 def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[str]]:
-    """Return priors of `motor.*` from the config's bench file, and lines about numbers left out.
+    """Return priors of `motor.*` from a config's bench file, and lines about what was taken.
 
-    Seen from the wheel, a friction torque of the shaft is n times as large, and a friction per
-    speed n^2 times.
+    With a gear ratio n, a friction torque at the shaft is n times as large at the wheel, and a
+    friction torque per speed n^2 times.
 
     Raises:
-        DataError: as in `bench_of`.
+        DataError: the file is missing, damaged, or not the result of a bench.
     """
     bench = bench_of(config)
     if bench is None:
@@ -85,14 +92,20 @@ def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[
 
 
 def _pooled(sure: list[BenchEstimate]) -> tuple[float, float]:
-    """Return the mean of several motors and the std of one: its error and their spread together."""
+    """Return the mean of the estimates of several motors, and the std of a single motor's value.
+
+    The std combines the std of the estimates with their spread between motors.
+    """
     values = [t.value for t in sure]
     spread = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
     return float(np.mean(values)), float(np.hypot(spread, np.mean([t.std for t in sure])))
 
 
 def _read(path: Path, where: str) -> Mapping[str, list[BenchEstimate]]:
-    """Return the estimates of a bench by name, one for each of its motors."""
+    """Return the estimates in a bench file by the parameter's name, one for each motor.
+
+    `where` is the config and key that name the file, for messages.
+    """
     content = read_json(path, _EXPECTED)
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema != SCHEMA or content.get("drive") != "motor":

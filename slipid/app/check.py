@@ -1,4 +1,4 @@
-"""Check logs and config before a fit, and predict how well a fit will know each number."""
+"""Check of logs and config before a fit, and prediction of how certain each estimate will be."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -27,11 +27,11 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 _AT_MOTOR = ("wheel_ticks", "motor_angle", "motor_speed", "motor_speed_command")
-"""Channels that the gear ratio of a layout converts to motion of the wheel."""
+"""Channels at the motor shaft, which the gear ratio of a layout converts to motion of the wheel."""
 
 
 def sanity(task: FitTask) -> tuple[Finding, ...]:
-    """Return findings about the runs of a task, and about its config if it has one; worst first."""
+    """Return the findings about the runs of a task and about its config, if any, worst first."""
     mass = task.config.content.wheels.mass_kg if isinstance(task, ConfigFitTask) else None
     found = [*_braking(task), *findings(task.dataset, task.robot.geometry, mass)]
     if isinstance(task, ConfigFitTask):
@@ -50,10 +50,10 @@ def refuse_if_wrong(found: Sequence[Finding]) -> None:
 
 
 def _braking(task: FitTask) -> Iterator[Finding]:
-    """Find unsigned currents beside voltages on robots whose wheels drag each other along in turns.
+    """Yield a finding if unsigned currents and voltages are logged on a robot that scrubs in turns.
 
-    On simulated runs of a skid-steer robot the resistance was then wrong by ten standard deviations
-    and yet called identified.
+    On such a robot some wheels drag others along, which brake. In simulated runs of a skid-steer
+    robot, the resistance was then wrong by ten standard deviations, with the verdict "identified".
     """
     runs = task.dataset
     has = runs.current is not None and runs.voltage is not None
@@ -68,7 +68,7 @@ def _braking(task: FitTask) -> Iterator[Finding]:
 
 
 def _missing_sizes(task: ConfigFitTask) -> Iterator[Finding]:
-    """Find numbers of the robot that torques scale with and that were left at their defaults."""
+    """Yield a finding if mass or gear ratio, with which torques scale, is missing in the config."""
     logged = [n for n in ("current", "voltage") if getattr(task.dataset, n) is not None]
     robot = task.config.content.wheels
     absent = ["mass_kg"] if robot.mass_kg is None else []
@@ -86,7 +86,7 @@ def _missing_sizes(task: ConfigFitTask) -> Iterator[Finding]:
 
 
 def _different_gears(task: ConfigFitTask) -> Iterator[Finding]:
-    """Find gear ratios that differ between the robot and a layout."""
+    """Yield a finding for each layout whose gear ratio differs from that of the robot."""
     robot = task.config.content.wheels
     if "gear_ratio" not in robot.model_fields_set:
         return
@@ -115,12 +115,13 @@ _CHANNELS = (
 
 @dataclass(frozen=True)
 class ExpectedEstimates:
-    """Expected verdict of every number and ratio, by path.
+    """Estimates that a fit is expected to have, before it is made.
 
     Attributes:
-        parameters: expected estimate of each number.
-        derived: expected estimate of each ratio.
-        messages: a sentence for each thing that stays unknown, with a measurement that would help.
+        parameters: expected estimate of each parameter, by its path.
+        derived: expected estimate of each derived ratio of parameters, by its name.
+        messages: one sentence about each combination of parameters that stays unknown, with a
+            measurement that would help.
     """
 
     parameters: dict[str, Estimate]
@@ -128,7 +129,7 @@ class ExpectedEstimates:
     messages: tuple[str, ...]
 
     def to_json(self) -> Content:
-        """Return the part of check.json that holds the expectations."""
+        """Return the part of check.json with the expected estimates."""
         return {
             "parameters": {path: _expected_json(e) for path, e in self.parameters.items()},
             "derived": {path: _expected_json(e) for path, e in self.derived.items()},
@@ -139,7 +140,14 @@ class ExpectedEstimates:
 def check(
     config_path: Path, data: Path, out: Path | None, report: Reporter
 ) -> tuple[Runs, Content]:
-    """Return the runs and the content of check.json, which is also written to `out` where given."""
+    """Return the runs of a config, and the content of check.json, also written to `out` if given.
+
+    Args:
+        config_path: the config.
+        data: folder of the logs.
+        out: folder to write to, or None.
+        report: reporter of the progress.
+    """
     setup_jax(quiet=True)
     task = read_fit_task(read_config(config_path), data, report)
     report.stage("do logs and config go together?")
@@ -157,12 +165,16 @@ def check(
 
 
 def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
-    """Return findings, runs by floor, load and session, channels, repairs, and skipped logs."""
+    """Return the part of check.json about the logs.
+
+    It has the findings, the runs by floor, load set-up and session, the channels, the repairs by
+    the reader, and the `skipped` logs.
+    """
     data = task.dataset
     groups: dict[tuple[str, str, str], list[int]] = {}
     for k, log in enumerate(data.logs):
         groups.setdefault((log.surface or "unknown", log.load, data.session[k]), []).append(k)
-    # the same repair in many files is one line: numbers and names are taken out
+    # Equal notes on several runs become one note with a count.
     notes = Counter(note for log in data.logs for note in log.notes)
     return {
         "schema": "slipid.check/1",
@@ -189,7 +201,7 @@ def overview(task: FitTask, skipped: Sequence[str] = ()) -> Content:
 
 
 def _clock(clock: Clock) -> Content:
-    """Return the clock of a run's poses relative to the robot's clock, with 90 % intervals."""
+    """Return the part of check.json about the clock of a run's poses, with its 90 % interval."""
     return {
         "offset_s": clock.offset,
         "offset_interval90_s": clock.offset_interval90,
@@ -200,7 +212,7 @@ def _clock(clock: Clock) -> Content:
 
 
 def _channels(logs: tuple[Log, ...]) -> list[str]:
-    """Return the names of the logged channels, each with its exceptions."""
+    """Return the names of the logged channels, with remarks such as "(3 of 5 runs)"."""
     names = []
     for name in _CHANNELS:
         if count := sum(getattr(log, name) is not None for log in logs):
@@ -211,11 +223,12 @@ def _channels(logs: tuple[Log, ...]) -> list[str]:
 
 
 def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
-    """Return verdicts from the expected information, with the noise that the runs show.
+    """Return the expected estimates from the expected information at the start of a fit.
 
-    The floors' numbers are not known yet. Therefore the start values and every creep that a fit
-    starts from are tried: each number gets its least informative estimate, and the messages
-    describe the start with the largest covariance of all.
+    The noise variances are estimated from the runs. The parameters of the floors are not known yet;
+    therefore the start values with every creep that a fit starts from are tried. Each parameter
+    gets the least informative of its estimates, and the messages describe the start with the
+    largest determinant of the covariance.
     """
     space, w = problem.space, problem.windows
     log_v, keep, volt = scatter(problem), np.ones(len(w)), w.has_voltage
@@ -226,7 +239,7 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
     most = -np.inf
     starts = (space.start, *(np.where(creep, np.log(c), space.start) for c in CREEPS))
     covariances = [problem.laplace(z, log_v, keep) for z in starts]
-    # after them: what it compiles they have traced
+    # This comes after the covariances, whose compiled functions it shares.
     robot = space.tree(space.start)
     validity = curves_of.validity(task.dataset, robot, problem.batch)
     where = w.has_current, volt, validity, robot.geometry.determines_twist
@@ -242,7 +255,7 @@ def expected(task: FitTask, problem: Problem) -> ExpectedEstimates:
 
 
 def _least(kept: dict[str, Estimate], found: Iterable[Estimate]) -> None:
-    """Keep the less informative of two estimates of every number."""
+    """Replace the kept estimates by those found, wherever these are less informative."""
     order = ("identified", "weak", "not_identified")
 
     def promise(e: Estimate) -> tuple[int, float]:

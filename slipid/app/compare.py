@@ -1,6 +1,6 @@
-"""Compare slip models on held-out runs, and predict runs open loop with a fit.
+"""Comparison of slip models on held-out runs, and open-loop prediction of runs by a fit.
 
-These are `slipid compare` and `slipid validate` without their pictures.
+This is the work of `slipid compare` and `slipid validate` except their pictures.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,21 +32,25 @@ from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.comparison/1"
 FOLDS = "folds"
-"""Folder with finished folds inside the result folder; these are not fitted again."""
+"""Name of the folder, inside the result folder, with the checkpoints of finished folds."""
 
 
 def compare(
     config_path: Path, data: Path, out: Path, questions: Sequence[str], report: Reporter
 ) -> Content:
-    """Judge every slip model on held-out runs and write comparison.json to `out`.
+    """Return the comparison of slip models on held-out runs, and write it as comparison.json.
 
-    Folds that are finished in `out` are not fitted again.
+    Folds whose results are in `out` already are not fitted again.
 
     Args:
-        questions: ways to leave runs out, some of `slipid.predict.folds.QUESTIONS`.
+        config_path: the config.
+        data: folder of the logs.
+        out: folder to write to.
+        questions: kinds of folds, some of `slipid.predict.folds.QUESTIONS`.
+        report: reporter of the progress.
 
     Raises:
-        DataError: config, logs or questions are wrong; nothing was written then.
+        DataError: config, logs or questions are wrong; in this case nothing was written.
     """
     setup_jax(quiet=True)
     config = read_config(config_path)
@@ -96,7 +100,10 @@ def _rows(folds: Sequence[Content]) -> list[Content]:
 
 
 def _cost(folds: Sequence[Content]) -> Content:
-    """Return fitted numbers per floor and seconds per fold of fit and prediction, by slip model."""
+    """Return, by slip model, the number of fitted parameters and the times per fold [s].
+
+    The times are those of the fit and of the prediction.
+    """
     out = {}
     for model, numbers in folds[0]["numbers"].items():
         seconds = [fold["seconds"][model] for fold in folds]
@@ -115,7 +122,15 @@ def _folds(
     kept: Checkpoint,
     report: Reporter,
 ) -> tuple[dict[str, list[Content]], Robot]:
-    """Return the results of every fold by question, and the robot fitted to all runs."""
+    """Return the results of all folds by the kind of fold, and the robot fitted to all runs.
+
+    Args:
+        task: the fit task.
+        problem: likelihood of all runs.
+        folds_by_question: fold of each run, by the kind of fold.
+        kept: checkpoint of finished folds.
+        report: reporter of the progress.
+    """
     settings = task.settings
 
     def tell(state: FitState) -> None:
@@ -147,7 +162,10 @@ def _folds(
 
 
 def finished(kept: Checkpoint, name: str, make: Callable[[], Content]) -> Content:
-    """Return a checkpointed result, computed and kept first where the checkpoint has none."""
+    """Return the result under a name in a checkpoint; if it is missing, compute and save it first.
+
+    The result is always read from the checkpoint, so that it is the same after an interrupt.
+    """
     content: Content | None = kept.load_json(name)
     if content is None:
         kept.save_json(name, make())
@@ -157,7 +175,16 @@ def finished(kept: Checkpoint, name: str, make: Callable[[], Content]) -> Conten
 
 
 def validate(out: Path, data: Path, report: Reporter) -> tuple[Fit, Runs, Validation]:
-    """Return a fit, runs from `data`, and their predictions by the fit and every simpler model."""
+    """Return a fit, runs to predict, and their predictions by the fit and by all simpler models.
+
+    Args:
+        out: folder that `slipid identify` wrote.
+        data: folder of the logs of the runs.
+        report: reporter of the progress.
+
+    Raises:
+        DataError: there is no fit, or the logs cannot be read or predicted.
+    """
     setup_jax(quiet=True)
     fit = load(out)
     config = read_config(out / "config.toml")

@@ -1,4 +1,4 @@
-"""Look up the floor under each wheel in logged runs, with a map and a fitted camera."""
+"""Look-up of the floor under each wheel in logged runs, with a map and a fitted camera."""
 
 import io
 from dataclasses import dataclass
@@ -26,15 +26,15 @@ SCHEMA = "slipid.floors/1"
 
 @dataclass(frozen=True, eq=False)
 class RunFloors:
-    """A run with the floor under each wheel, in the rows that have a new pose.
+    """The floor under each wheel in one run, in the rows with a new pose.
 
     Attributes:
         name: name of the run.
         time: time of each row [s].
         pose: pose of the body in the frame of the map: x, y [m], heading [rad].
         surface: number of the surface under each wheel.
-        border: distance of each wheel from the nearest other surface [m].
-        inside: whether each wheel is on the map; elsewhere its floor is unknown.
+        border: distance of each wheel from the nearest place with another surface [m].
+        inside: whether each wheel is on the map; if not, its floor is unknown.
     """
 
     name: str
@@ -48,16 +48,20 @@ class RunFloors:
 def floors_under(
     out: Path, map_file: Path, data: Path, glob: str | None, report: Reporter
 ) -> tuple[FloorLookup, list[RunFloors]]:
-    """Return the floor under each wheel in runs over a map, using the camera of a fit.
+    """Return the look-up table of a map, and the floor under each wheel in runs over the map.
+
+    The poses of the runs are corrected by the camera of a fit.
 
     Args:
         out: folder that `slipid identify` wrote.
         map_file: map of the floor, in the frame of the poses.
         data: folder of the logs.
-        glob: selects logs below it; by default those that the fit's config names with a map.
+        glob: glob of logs below the data folder; None for those that the config of the fit names
+            with a map.
+        report: reporter of the progress.
 
     Raises:
-        DataError: no fit, no map, no logs, or logs without poses.
+        DataError: there is no fit, map or log, or a log has no poses.
     """
     fit = load(out)
     lookup = FloorLookup.read(map_file)
@@ -110,7 +114,10 @@ def _run_floors(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> Ru
 
 
 def write_floors(folder: Path, lookup: FloorLookup, runs: list[RunFloors]) -> list[Path]:
-    """Write a CSV file for each run: time, pose, and each wheel's floor and border distance."""
+    """Write a CSV file for each run, and return the paths of the files.
+
+    The columns are time [s], pose [m, rad], and the floor and border distance [m] of each wheel.
+    """
     paths = []
     for run in runs:
         wheels = run.surface.shape[1]
@@ -135,7 +142,7 @@ def write_floors(folder: Path, lookup: FloorLookup, runs: list[RunFloors]) -> li
 
 
 def summary(lookup: FloorLookup, runs: list[RunFloors]) -> Content:
-    """Return the share of each run that every wheel spent on every floor."""
+    """Return the shares of rows in which each wheel was on each floor, for each run."""
     return {
         "schema": SCHEMA,
         "surfaces": list(lookup.surfaces),

@@ -1,4 +1,4 @@
-"""Fit a robot, from a config and its logs or from runs, with verdicts and result files."""
+"""Fit of a robot to the logs of a config or to runs, with verdicts and result files."""
 
 import math
 import time
@@ -32,9 +32,10 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 NEAR_OPTIMUM = 3
-"""Round from which a fit counts as near its optimum."""
+"""Round number given to a start near the optimum, so that the fit does not repeat its first rounds,
+which take more steps."""
 CHECKPOINT = "checkpoint"
-"""Name of the file with the state of an unfinished fit."""
+"""Name, without suffix, of the file with the state of an unfinished fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +44,10 @@ class IdentifyResult:
 
     Attributes:
         fit: the fit.
-        task: the runs, the config and the choices that it was made from.
+        task: runs, config and choices from which the fit was made.
         trust: verdict on the fit by its open-loop predictions.
-        profiles: the requested profile likelihoods.
-        written: names of the files.
+        profiles: profile likelihoods that were requested.
+        written: names of the written files.
     """
 
     fit: Fit
@@ -64,16 +65,20 @@ def identify(
     profiles: Sequence[str] = (),
     anyway: bool = False,
 ) -> IdentifyResult:
-    """Fit the robot of a config to its logs and write everything to `out`.
+    """Return the fit of a config's robot to its logs, and write all results to `out`.
 
-    A fit that was interrupted there is continued.
+    If `out` has the checkpoint of the same fit, interrupted before, that fit is continued.
 
     Args:
-        profiles: paths of numbers whose likelihood is profiled.
-        anyway: fit even where logs and config contradict each other, and report that.
+        config_path: the config.
+        data: folder of the logs.
+        out: folder to write to.
+        report: reporter of the progress.
+        profiles: paths of parameters whose profile likelihood is computed.
+        anyway: whether to fit even if logs and config contradict each other, which is reported.
 
     Raises:
-        DataError: config or logs are wrong; nothing was written then.
+        DataError: config or logs are wrong; in this case nothing was written.
     """
     began = time.monotonic()
     setup_jax(quiet=True)
@@ -120,7 +125,7 @@ def identify(
 
 
 def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
-    """Return a sentence where a folder has the fit of another config or other logs, else None."""
+    """Return a sentence if a folder has a fit of another config or of other logs, else None."""
     try:
         before = read_json(out / "run.json", "what identify wrote")
         config, data = before["config"], before["data"]
@@ -133,7 +138,7 @@ def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
 
 
 def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:
-    """Report contradictions between logs and config; refuse them unless `anyway`."""
+    """Report the findings of the sanity check; raise `DataError` for wrong ones unless `anyway`."""
     report.stage("do logs and config go together?")
     result = sanity(task)
     if not anyway:
@@ -146,7 +151,7 @@ def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:
 def _write_run(
     task: ConfigFitTask, trust: TrustReport, data: Path, out: Path, seconds: float
 ) -> None:
-    """Write run.json and the copies of config and bench file that later commands read."""
+    """Write run.json, and copies of the config and the bench file, which later commands read."""
     config = task.config
     if (bench := config.content.wheels.motor) is not None:
         write_json(out / COPY_NAME, read_json(config.path.parent / bench, "the numbers of a motor"))
@@ -164,11 +169,16 @@ def _write_run(
 def optimised(
     task: FitTask, problem: Problem, kept: Checkpoint | None, report: Reporter
 ) -> tuple[Problem, Optimum]:
-    """Return the optimum of a task and the problem it belongs to, starting from `task.problem()`.
+    """Return the problem of a task whose optimum was found, and this optimum.
 
-    Windows are cut again, which makes another problem, where the fitted lag differs from the
-    expected one (see `FitTask.cutting_robot`). The fit continues from the checkpoint of this very
-    task, and every round is kept there.
+    If the fitted lag differs too much from the assumed one (see `FitTask.cutting_robot`), windows
+    are cut again, which makes another problem, and the fit is repeated from its optimum.
+
+    Args:
+        task: the fit task.
+        problem: the task's problem at first, `task.problem()`.
+        kept: checkpoint from which the fit continues, and in which every round is saved, or None.
+        report: reporter of the progress.
     """
     optimum = _optimised(task, problem, _restored(kept, report), kept, report)
     robot = task.cutting_robot(problem.space.tree(optimum.state.z))
@@ -188,7 +198,10 @@ def _optimised(
     kept: Checkpoint | None,
     report: Reporter,
 ) -> Optimum:
-    """Return the optimum of one problem, from an earlier state and its losses, if there is one."""
+    """Return the optimum of one problem.
+
+    `before` is the state from which to continue, or None, and the losses of all rounds before it.
+    """
     settings = task.settings
     start, history = before
     first: list[float] = []
@@ -196,10 +209,10 @@ def _optimised(
     def tell(state: FitState) -> None:
         report.stage(state.stage)
         what = f"round {state.round}, loss {state.loss:.2f}, moved {state.moved:.3g} std"
-        if state.stage != "joint":  # the staged start ends after a given number of rounds
+        if state.stage != "joint":  # the stages of the start have fixed numbers of rounds
             report.note(what)
             return
-        # the end is where steps that shrink as they do fall below the tolerance
+        # Progress is measured in the logarithm of the step size, which shrinks to the tolerance.
         moved = max(state.moved, 1e-12)
         first.append(max(moved, 2 * settings.tolerance))
         whole = math.log(first[0] / settings.tolerance)
@@ -211,7 +224,7 @@ def _optimised(
     report.stage("compiling")
     rounds = settings.rounds
     if start is not None and start.moved < settings.tolerance:
-        rounds = start.round  # it had settled: only the last steps are missing
+        rounds = start.round  # the state has converged: only what follows the rounds is missing
     optimum = optimise(
         problem, start=start, most_rounds=rounds, tolerance=settings.tolerance, tell=tell
     )
@@ -219,7 +232,7 @@ def _optimised(
 
 
 def _restored(kept: Checkpoint | None, report: Reporter) -> tuple[FitState | None, list[float]]:
-    """Return the state and the losses of an interrupted fit; None and no losses without one."""
+    """Return the state of an interrupted fit from its checkpoint, or None, and its losses."""
     result = None if kept is None else kept.load(CHECKPOINT)
     if result is None or kept is None:
         return None, []
@@ -230,7 +243,10 @@ def _restored(kept: Checkpoint | None, report: Reporter) -> tuple[FitState | Non
 
 
 def summarised(task: FitTask, problem: Problem, optimum: Optimum, report: Reporter) -> Fit:
-    """Return the fit with intervals, runs over several floors, and simpler models beside it."""
+    """Return the fit from an optimum, with intervals, verdicts and simpler models for comparison.
+
+    Runs over several floors, if the task has some, are fitted as well.
+    """
     report.stage("intervals and verdicts")
     fit = summarise(problem, optimum, task.dataset, task.choices, task.settings.seed)
     if task.mixed:
@@ -242,7 +258,10 @@ def summarised(task: FitTask, problem: Problem, optimum: Optimum, report: Report
 def _with_mixed_runs(
     fit: Fit, task: FitTask, problem: Problem, optimum: Optimum, report: Reporter
 ) -> Fit:
-    """Return the fit to all runs, or to runs on one floor each where the others contradict it."""
+    """Return the fit to all runs, those over several floors included.
+
+    If these contradict the fit to runs on one floor each, that fit is returned, with the reason.
+    """
     report.stage("runs over several floors")
     mixed = multi_floor_runs(task.mixed, fit.robot)
 
@@ -275,7 +294,10 @@ def _with_mixed_runs(
 
 
 def _mixed_sentence(about: Mapping[str, Any]) -> str:
-    """Return a sentence about the prediction of runs over several floors."""
+    """Return a sentence about the prediction errors of runs over several floors.
+
+    `about` has the errors before and after learning from these runs.
+    """
 
     def off(errors: Mapping[str, float]) -> str:
         return f"{errors['yaw_rate']:.3f} rad/s and {1000 * errors['speed']:.1f} mm/s"
@@ -287,7 +309,7 @@ def _mixed_sentence(about: Mapping[str, Any]) -> str:
 
 
 def _with_baselines(fit: Fit, task: FitTask) -> Fit:
-    """Return the fit with simpler models, fitted to the same runs at its camera and lag."""
+    """Return the fit with simpler models, fitted to the same runs with the fit's camera and lag."""
     cut, shape = task.windows(fit.robot), fit.space.template.geometry
     learnt = [model.fit(cut, fit.robot) for model in slip_models(shape, fit.channels.current)]
     plain = {m.name: {floor: v.tolist() for floor, v in m.state.items()} for m in learnt}

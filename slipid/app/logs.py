@@ -1,4 +1,4 @@
-"""Read the logs that a config names into one data set, and find the files shipped with slipid."""
+"""Reading of the logs that a config names as one set of runs; also the files in the package."""
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -21,7 +21,17 @@ from slipid.support.progress import Reporter
 def read_dataset(
     config: Config, sections: Sequence[LogsSection], root: Path, report: Reporter
 ) -> tuple[Runs, list[str]]:
-    """Return the runs of some log sections, and a line for each section without files."""
+    """Return the runs of some log sections, and lines about what was left out.
+
+    Args:
+        config: the config.
+        sections: sections of the config whose logs are read.
+        root: data folder.
+        report: reporter of the progress.
+
+    Raises:
+        DataError: a log cannot be read or is found twice, or there is no run.
+    """
     found, skipped = required_files(config, sections, root)
     count = sum(len(paths) for _, paths in found)
     logs: list[Log] = []
@@ -57,7 +67,7 @@ def read_dataset(
 def required_files(
     config: Config, sections: Sequence[LogsSection], root: Path
 ) -> tuple[list[tuple[LogsSection, list[Path]]], list[str]]:
-    """Return the same as `files_of`; raise `DataError` where no section has a file."""
+    """Return the result of `files_of`; raise `DataError` if no section has a file."""
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; expected the folder of the logs (--data)")
     found, skipped = files_of(config, sections, root)
@@ -69,7 +79,7 @@ def required_files(
 def files_of(
     config: Config, sections: Sequence[LogsSection], root: Path
 ) -> tuple[list[tuple[LogsSection, list[Path]]], list[str]]:
-    """Return the files of every log section that has some, and a line for each that has none."""
+    """Return the log sections that have files, each with its files, and lines about the others."""
     found: list[tuple[LogsSection, list[Path]]] = []
     skipped: list[str] = []
     for section in sections:
@@ -84,7 +94,7 @@ def files_of(
 
 
 def layout_of(config: Config, section: LogsSection) -> AnyLayout:
-    """Return the layout that a log section names: one of the config's own, else a preset."""
+    """Return the layout that a log section names: one in the config, else a preset."""
     own = config.content.layouts
     if section.format in own:
         where, declared = f"{config.path} layouts.{section.format}", own[section.format]
@@ -107,7 +117,15 @@ def layout_of(config: Config, section: LogsSection) -> AnyLayout:
 def write_run_file(
     out: Path, config: Config, inputs: Content, seconds: float, more: Content
 ) -> None:
-    """Write config.toml, and run.json with the inputs of a run, its duration and `more`."""
+    """Write a copy of the config, and run.json, which describes how results were made.
+
+    Args:
+        out: folder to write to.
+        config: the config.
+        inputs: content about the logs.
+        seconds: duration of the computation [s].
+        more: further content.
+    """
     write_bytes(out / "config.toml", config.text.encode())
     content = {
         "schema": "slipid.run/1",
@@ -122,13 +140,13 @@ def write_run_file(
 
 
 RECORDED = Path(__file__).with_name("recorded.zip")
-"""Recorded logs of the test site that ship with slipid."""
+"""Archive of the recorded logs of the test site that ships with slipid."""
 
 
 def packaged_path(name: str) -> Path:
-    """Return the path of a config that ships with slipid, or of a file below it."""
+    """Return the path of a config, or of another file in its folder, that ships with slipid."""
     package = Path(__file__).parents[1]
-    # beside the package in a clone, inside it in an installation
+    # The folder is beside the package in a clone of the repository, and inside an installed one.
     for folder in (package / "configs", package.parent / "configs"):
         if (folder / name).is_file():
             return folder / name
@@ -141,7 +159,7 @@ def packaged_config(name: str) -> str:
 
 
 def unpack(out: Path) -> None:
-    """Write the recorded logs and their truth to a folder."""
+    """Write the recorded logs of the test site, and their true values, to a folder."""
     try:
         archive = ZipFile(RECORDED)
     except OSError as error:

@@ -1,8 +1,9 @@
-"""From a config and a data folder to a fitting problem.
+"""Set-up of the fit task and of the likelihood from a config and a data folder.
 
-Load shares follow from scales under the wheels, or from masses whose place is known: a mass m at p
-adds weights n_i to wheels at p_i, with sum n_i = m and sum n_i p_i = m p. Three wheels have one
-solution; of more, the smallest is taken, as for wheels that yield alike.
+Priors of the load shares follow from scales under the wheels, or from masses at known places: a
+mass m at p adds weights n_i on the wheels at p_i, with sum n_i = m and sum n_i p_i = m p. For three
+wheels the solution is unique; for more, that with the least sum of squares is taken, as if all
+wheels were equally stiff.
 """
 
 import fnmatch
@@ -41,10 +42,10 @@ from slipid.support.progress import Reporter
 
 
 def share_priors(weights: Mapping[str, WeightsSection], shape: Geometry) -> dict[str, Choice]:
-    """Return the prior of the load shares of every set-up whose weights are known.
+    """Return the prior of the load shares of every load set-up whose weights are known, by name.
 
     Raises:
-        ValueError: a set-up refers to an unknown one, or a wheel would lift off.
+        ValueError: a set-up refers to an unknown one, or a wheel would have no weight on it.
     """
     out = {}
     for name in weights:
@@ -58,7 +59,14 @@ def share_priors(weights: Mapping[str, WeightsSection], shape: Geometry) -> dict
 def _wheel_weights(
     weights: Mapping[str, WeightsSection], name: str, shape: Geometry, above: tuple[str, ...]
 ) -> tuple[Float[np.ndarray, " wheel"], float]:
-    """Return the weight on each wheel [kg] and its variance [kg^2]."""
+    """Return the weight on each wheel [kg] and its variance [kg^2] in a load set-up.
+
+    Args:
+        weights: known weights by load set-up.
+        name: name of the set-up.
+        shape: geometry of the robot.
+        above: names of the set-ups that refer to this one, to detect circles.
+    """
     known = weights.get(name)
     if known is None or name in above:
         there = ", ".join(k for k in weights if k not in above)
@@ -81,25 +89,27 @@ def _wheel_weights(
 
 
 FREE_LENGTH = {"poses": "robot.wheel_radius", "wheels": "camera.scale"}
-"""Number that is fitted when the other kind of length is trusted."""
+"""Parameter that is fitted, by the kind of lengths that are trusted (`fit.lengths_from`)."""
 SIZE_STD = 0.1
-"""Std of its prior as a part of the nominal value: tyres deform, and cameras are set up by eye."""
+"""Std of that parameter's prior relative to its nominal value [1]: tyres deform, and cameras are
+set up by eye."""
 RECUT_LAG_S = 0.02
-"""Difference between fitted and assumed lag from which windows are cut again [s]."""
+"""Difference between fitted and assumed lag above which windows are cut again [s]."""
 LAG_STD, MOST_LAG = 0.1, 3.0
-"""Std of the prior of a lag found from the motion, and longest lag that a fit starts from [s]."""
+"""Std of the prior of a lag that was found from the motion, and largest such lag that is used
+[s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class FitTask:
-    """Runs, the robot that drove them, and choices for its numbers: everything a fit needs.
+    """Everything that a fit needs: runs, the robot that drove them, and choices for parameters.
 
     Attributes:
-        dataset: the runs, each on one floor.
-        robot: robot with its geometry and every number at its declared start.
-        choices: free, fixed and prior values of its numbers.
-        settings: how finely runs are cut into windows, and how long to fit.
-        mixed: runs over several floors, with the map of each set.
+        dataset: runs that stay on one floor each.
+        robot: robot with its geometry and every parameter at its declared start value.
+        choices: free, fixed and prior values of parameters.
+        settings: length of the windows, and limits of the optimisation.
+        mixed: sets of runs over several floors, each with the map of the floors.
     """
 
     dataset: Runs
@@ -110,24 +120,27 @@ class FitTask:
 
     @property
     def logs(self) -> tuple[Log, ...]:
-        """Logs of all runs; those over several floors come last."""
+        """Return the logs of all runs; those over several floors come last."""
         return self.dataset.logs + tuple(log for data, _ in self.mixed for log in data.logs)
 
     @property
     def data_hash(self) -> str:
-        """Hash of the runs and their files."""
+        """Return the hash of the names and files of all runs."""
         return hash_of((log.name, log.sha256) for log in self.logs)
 
     def problem(self, near: Robot | None = None) -> Problem:
-        """Return the likelihood of the runs in windows, cut for a robot `near` an optimum."""
+        """Return the likelihood of the runs on one floor each.
+
+        If a robot `near` the optimum is known, windows are cut for it.
+        """
         return Problem(self.windows(self.cutting_robot(near)), self.robot, list(self.choices))
 
     def cutting_robot(self, near: Robot | None) -> Robot:
-        """Return the robot whose wheel radius and lag decide where windows are cut.
+        """Return the robot for whose wheel radius and lag windows are cut.
 
-        It is the robot at the start of a fit, with the lag of a robot `near` an optimum where the
-        two lags differ by more than `RECUT_LAG_S`: the wheel angle turned in a window is linear in
-        the lag only near the lag at which the window was cut.
+        It is the robot at the start of a fit. If the lag of a robot `near` an optimum differs from
+        its lag by more than `RECUT_LAG_S`, it has that other lag, because the wheel angle turned in
+        a window is linear in the lag only near the lag for which the window was cut.
         """
         robot = Space(self.robot, self.choices).template
         if near is None or abs(float(near.camera.lag - robot.camera.lag)) <= RECUT_LAG_S:
@@ -135,7 +148,7 @@ class FitTask:
         return replace(robot, camera=replace(robot.camera, lag=near.camera.lag))
 
     def windows(self, robot: Robot) -> Windows:
-        """Return windows of the runs, cut at the wheel radius and the camera lag of a robot."""
+        """Return the runs in windows, cut for the wheel radius and the camera lag of a robot."""
         return windows(
             self.dataset,
             float(robot.geometry.wheel_radius),
@@ -151,7 +164,7 @@ class ConfigFitTask(FitTask):
 
     Attributes:
         config: the config.
-        skipped: a line for each thing that the config names and the data folder lacks.
+        skipped: one line about each thing that the config names but that was not found or used.
     """
 
     config: Config
@@ -159,9 +172,9 @@ class ConfigFitTask(FitTask):
 
 
 def read_fit_task(config: Config, root: Path, report: Reporter) -> ConfigFitTask:
-    """Read every log of runs on one floor that the config names, and set up its robot.
+    """Return the fit task of a config, with the runs on one floor each that it names.
 
-    The file of its motor's bench is read first, so that a missing one costs no reading of logs.
+    The bench file of its motor is read first, so that an error in it appears before logs are read.
     """
     bench_of(config)
     report.stage("reading logs")
@@ -172,7 +185,10 @@ def read_fit_task(config: Config, root: Path, report: Reporter) -> ConfigFitTask
 
 
 def with_mixed(task: ConfigFitTask, root: Path, report: Reporter) -> ConfigFitTask:
-    """Return the task with the runs over several floors that its config names."""
+    """Return the task with the runs over several floors that its config names, if any.
+
+    `root` is the data folder.
+    """
     sections = [section for section in task.config.content.logs if section.map is not None]
     found, absent = files_of(task.config, sections, root)
     for section, _ in found:
@@ -188,7 +204,11 @@ def with_mixed(task: ConfigFitTask, root: Path, report: Reporter) -> ConfigFitTa
 
 
 def _map(task: ConfigFitTask, section: LogsSection) -> FloorMap:
-    """Return the map of a log section; raise `DataError` for a floor that no other run stays on."""
+    """Return the floor map that a log section names.
+
+    Raises:
+        DataError: the map cannot be read, or has a floor without runs on it alone.
+    """
     path = task.config.path.parent / str(section.map)
     floor = read_map(path)
     known = task.robot.surfaces.labels
@@ -201,7 +221,10 @@ def _map(task: ConfigFitTask, section: LogsSection) -> FloorMap:
 
 
 def _go_together(task: ConfigFitTask, data: Runs) -> None:
-    """Raise `DataError` where runs over several floors need what runs on one floor lack."""
+    """Raise `DataError` if runs over several floors do not fit those on one floor each.
+
+    The runs must be different ones, with known load set-ups and the same number of wheels.
+    """
     names, first = {log.name for log in task.logs}, task.dataset.logs[0]
     for log in data.logs:
         if log.name in names:
@@ -220,7 +243,10 @@ def _go_together(task: ConfigFitTask, data: Runs) -> None:
 def fit_task(
     config: Config, dataset: Runs, skipped: Sequence[str], report: Reporter
 ) -> ConfigFitTask:
-    """Return the fit task of runs that were read already."""
+    """Return the fit task of a config with runs that were read already.
+
+    `skipped` has lines about what was not found or used.
+    """
     shape = shape_of(config)
     logged = dataset.logs[0]
     if shape.drives != logged.wheels:
@@ -232,7 +258,7 @@ def fit_task(
         )
     robot = robot_for_runs(Robot.of(shape), dataset, config.content.camera.image_centre_m)
     choices, left_out = _choices(config, robot)
-    # the choices of the config come last and override the others
+    # The choices of the config come last, since later choices override earlier ones.
     given = any(fnmatch.fnmatchcase("camera.lag", p) for p in config.content.parameters)
     lag = [] if given else lag_from_motion(dataset)
     known = [*lag, *without_rollers(shape), *fixed_viscosities(dataset)]
@@ -254,7 +280,10 @@ def fit_task(
 
 
 def lag_from_motion(dataset: Runs) -> list[Choice]:
-    """Return a choice for a free camera lag near the one that the motion shows, if any."""
+    """Return a choice that frees the camera lag, with a prior at the lag found from the motion.
+
+    It is empty if the motion shows no clear lag, or one above `MOST_LAG`.
+    """
     lag = pose_lag(dataset)
     if lag is None or abs(lag.seconds) > MOST_LAG:
         return []
@@ -262,7 +291,10 @@ def lag_from_motion(dataset: Runs) -> list[Choice]:
 
 
 def lengths(trusted: str | None, shape: Geometry) -> list[Choice]:
-    """Free the wheel radius and hold the scale of the poses, or the other way round."""
+    """Return choices that free one of wheel radius and camera scale, and hold the other fixed.
+
+    `trusted` is the kind of lengths that are known, as in `FitSection.lengths_from`.
+    """
     if trusted is None:
         return []
     radius = float(shape.wheel_radius)
@@ -274,7 +306,7 @@ def lengths(trusted: str | None, shape: Geometry) -> list[Choice]:
 
 
 def without_rollers(shape: Geometry) -> list[Choice]:
-    """Hold the numbers of rollers fixed where no wheel has rollers."""
+    """Return choices that hold the parameters of rollers fixed, if no wheel has rollers."""
     if not all(shape.grips):
         return []
     names = ("roller_drag", "roller_creep", "roller_viscosity")
@@ -282,14 +314,17 @@ def without_rollers(shape: Geometry) -> list[Choice]:
 
 
 def robot_for_runs(robot: Robot, runs: Runs, centre: tuple[float, float]) -> Robot:
-    """Return a robot with the floors, load set-ups and sessions of runs; image centre in [m]."""
+    """Return a robot with the floors, load set-ups and sessions of runs.
+
+    `centre` is the centre of the image, in the frame of the poses [m].
+    """
     floors = {log.surface or "unknown" for log in runs.logs}
     loads = {log.load for log in runs.logs}
     return robot.on(sorted(floors), sorted(loads), sorted(set(runs.session)), centre)
 
 
 def shape_of(config: Config) -> Geometry:
-    """Return the geometry of the config's robot; raise `DataError` where it cannot drive."""
+    """Return the geometry of a config's robot; raise `DataError` if such a robot cannot drive."""
     try:
         return geometry(config.content.wheels)
     except ValueError as error:
@@ -300,7 +335,10 @@ _STATED = ("robot.wheel_radius", "robot.base_radius", "robot.mass")
 
 
 def stated_sizes(robot: Robot, mass: float) -> list[Choice]:
-    """Hold size and mass at their stated values, the prior means of those the config frees."""
+    """Return choices that hold sizes and mass [kg] at the values stated in the config.
+
+    If the config frees one of them, its stated value is the mean of the prior.
+    """
     choices = []
     for e in entries(robot):
         if e.path in _STATED:
@@ -311,7 +349,7 @@ def stated_sizes(robot: Robot, mass: float) -> list[Choice]:
 
 
 def _choices(config: Config, robot: Robot) -> tuple[list[Choice], list[str]]:
-    """Return the config's choices for numbers, and lines about floors and loads that are absent."""
+    """Return the config's choices for parameters, and lines about those that apply to no run."""
     paths, skipped = [e.path for e in entries(robot)], []
     choices = stated_sizes(robot, config.content.wheels.mass_kg or float(robot.body.mass))
     choices += lengths(config.content.fit.lengths_from, robot.geometry)
@@ -346,7 +384,17 @@ def unknown_parameter(config: Config, pattern: str, name: str, paths: list[str])
 
 
 def checked_choice(config: Config, pattern: str, name: str, root: Robot | BenchRoot) -> Choice:
-    """Return the choice in `[parameters]` at a pattern for `name`; `DataError` where impossible."""
+    """Return the choice that `[parameters]` has at a pattern.
+
+    Args:
+        config: the config.
+        pattern: pattern in the config.
+        name: pattern without the label of a motor, to which the choice applies.
+        root: object with the parameters.
+
+    Raises:
+        DataError: the choice is impossible, for example a value outside the bounds.
+    """
     setting = config.content.parameters[pattern]
     gauss = (setting.prior.mean, setting.prior.std) if setting.prior else (None, None)
     choice = Choice(name, setting.start, setting.fixed, setting.free, *gauss)
@@ -358,7 +406,7 @@ def checked_choice(config: Config, pattern: str, name: str, root: Robot | BenchR
 
 
 def _any_label(pattern: str) -> str:
-    """Return the pattern with the name of a floor, load or session replaced by `*`."""
+    """Return a pattern with the name of its floor, load set-up or session replaced by `*`."""
     head, at, _ = pattern.partition("@")
     parts = head.split(".")
     if parts[0] == "surface" and len(parts) == 3:

@@ -1,4 +1,4 @@
-"""Sample the posterior of a fit: the work of `slipid sample` except its pictures."""
+"""Sampling of the posterior of a fit: the work of `slipid sample` except its pictures."""
 
 import time
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 FOLDER = "sampling"
-"""Folder with the blocks of an unfinished chain, inside the result folder."""
+"""Name of the folder, inside the result folder, with the blocks of an unfinished chain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +30,9 @@ class SampleResult:
     """Result of `sample`.
 
     Attributes:
-        posterior: the draws with their diagnosis.
-        about: content of sample.json, which describes how the chains converged.
-        written: names of the files.
+        posterior: draws of the posterior, with their diagnosis.
+        about: content of sample.json, which describes the convergence of the chains.
+        written: names of the written files.
     """
 
     posterior: Posterior
@@ -41,13 +41,17 @@ class SampleResult:
 
 
 def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporter) -> SampleResult:
-    """Sample around the fit in `out`; write posterior.nc, sample.json and new intervals.
+    """Return draws of the posterior of the fit in `out`, and write them and new intervals there.
 
-    A chain that was interrupted there is continued. The intervals go to identified.json.
+    The files are posterior.nc, sample.json and, with the intervals, identified.json. An interrupted
+    chain is continued.
 
     Args:
-        data: folder of the logs; by default the folder from which they were fitted.
-        draws: draws kept of each ensemble.
+        out: folder that `slipid identify` wrote.
+        data: folder of the logs; None for the folder from which they were fitted.
+        plan: size and seed of the chains.
+        draws: number of draws kept from each ensemble.
+        report: reporter of the progress.
     """
     began = time.monotonic()
     setup_jax(quiet=True)
@@ -58,7 +62,8 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     _refuse_other_logs(fit, task)
     report.stage("compiling")
     fit = replace(fit, problem=task.problem(fit.robot), data=task.dataset)
-    # all that a chain depends on; how long it may become is not of it
+    # The key has everything that the draws depend on; the largest length of the chain is not part
+    # of it, so that a chain can be continued with a larger one.
     inputs = FORMAT, fit.data_hash, replace(plan, most=10**9), draws, sorted(fit.variance.items())
     kept = Checkpoint(out / FOLDER, key_of(*inputs, np.asarray(fit.z), np.asarray(fit.covariance)))
     posterior = sampled(fit, plan, draws, kept, report)
@@ -75,7 +80,7 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
 
 
 def _summary(posterior: Posterior, plan: Plan, seconds: float) -> Content:
-    """Return the content of sample.json: settings, convergence and diagnosis of each coordinate."""
+    """Return the content of sample.json: settings, convergence, and diagnosis by coordinate."""
     d = posterior.diagnosis
     return {
         "schema": "slipid.sample/1",
@@ -102,7 +107,11 @@ def _summary(posterior: Posterior, plan: Plan, seconds: float) -> Content:
 
 
 def _log_folder(out: Path, data: Path | None) -> Path:
-    """Return the given data folder, else the folder that the fit used, if it still exists."""
+    """Return the given folder of the logs, else that of the fit.
+
+    Raises:
+        DataError: the folder of the fit no longer exists.
+    """
     if data is not None:
         return data
     run = read_json(out / "run.json", "what `slipid identify` keeps of a run")
@@ -122,7 +131,7 @@ def _refuse_mixed(fit: Fit) -> None:
 
 
 def _refuse_other_logs(fit: Fit, task: ConfigFitTask) -> None:
-    """Raise `DataError` where the logs are not those of the fit, naming the first that differs."""
+    """Raise `DataError` if the logs are not those of the fit; it names the first that differs."""
     then, now = dict(fit.runs), {log.name: log.sha256 for log in task.dataset.logs}
     for name in [*then, *now]:
         if then.get(name) != now.get(name):

@@ -1,4 +1,4 @@
-"""Verdict on a fit: its open-loop predictions compared with those of the encoders."""
+"""Verdict on a fit, by comparison of its open-loop predictions with those of the encoders."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -17,16 +17,17 @@ from slipid.support.errors import DataError
 
 ENCODER = FloorModels(Encoder())
 MOST_RUNS = 24
-"""Most runs predicted on each floor, evenly picked from the fitted ones."""
+"""Largest number of predicted runs on each floor, which are picked evenly from the fitted runs."""
 
 
 @dataclass(frozen=True)
 class TrustReport:
-    """Verdict on a fit and the errors it rests on.
+    """Verdict on a fit, with the prediction errors on which it is based.
 
     Attributes:
-        trust: the verdict with its reasons.
-        floors: mean end-point error over path length, of the fit and of the encoders alone.
+        trust: verdict with its reasons.
+        floors: mean end-point error over path length [1], of the fit and of the encoders alone, by
+            floor.
         runs: number of predicted runs.
     """
 
@@ -36,12 +37,12 @@ class TrustReport:
 
     @property
     def warning(self) -> str | None:
-        """Warning that every picture of an unusable fit shows."""
+        """Return the warning that every picture of an unusable fit shows, or None."""
         return f"THIS FIT IS {self.trust.word.upper()}" if self.is_bad else None
 
     @property
     def is_bad(self) -> bool:
-        """True where the fit must not be used."""
+        """Return whether the fit must not be used."""
         return self.trust.word == "not to be trusted"
 
     def to_json(self) -> Content:
@@ -59,7 +60,7 @@ def trust_report(fit: Fit, data: Runs) -> TrustReport:
     runs: dict[int, ScoredRun] = {}
     try:
         cuts = replay.replay_windows(some, fit.robot)
-    except DataError:  # a fitted lag can be so long that a short run shows nothing
+    except DataError:  # the fitted lag may be so large that a short run has no windows
         cuts = []
     for w in cuts:
         plain = replay.tracks_from_increments(fit.robot, w, ENCODER.increments(w, fit.robot))
@@ -77,7 +78,7 @@ def trust_report(fit: Fit, data: Runs) -> TrustReport:
 
 
 def _picked(data: Runs) -> list[int]:
-    """Return the numbers of at most `MOST_RUNS` runs on every floor."""
+    """Return the indices of at most `MOST_RUNS` runs on every floor."""
     of_floor: dict[str, list[int]] = {}
     for k, log in enumerate(data.logs):
         of_floor.setdefault(log.surface or "unknown", []).append(k)

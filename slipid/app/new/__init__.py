@@ -1,1 +1,1 @@
-"""Write a commented config for a new robot, from answers or from its log files."""
+"""Proposal of a commented config for a new robot, from a user's answers or from log files."""

@@ -1,4 +1,4 @@
-"""Propose a layout for bags from the types and names of their topics."""
+"""Proposal of a config for bags, from the types and names of their topics."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -27,19 +27,20 @@ _EFFORT = (
 
 
 _BY_NAME = ("current", "voltage", "duty")
-"""Channels that are recognised by field names in messages of unknown types."""
+"""Channels that are recognised by the names of fields in messages of unknown types."""
 
 
 @dataclass(frozen=True)
 class _TopicChannel:
-    """Channel, or group of channels, in a topic.
+    """Channel, or group of channels, that was found in a topic.
 
     Attributes:
-        channel: name of the channel.
-        topic: topic that has it.
-        wheels: number of wheels with a value each; 0 for a channel of the whole robot.
-        question: question that is left to the user.
-        field, unit: field and unit, where the message type does not imply them.
+        channel: name of the channel or group.
+        topic: topic with the channel.
+        wheels: number of wheels, each with a value in a message; 0 for a channel of the whole
+            robot.
+        question: open question for the user; empty if there is none.
+        field, unit: field and unit of the numbers; empty if the message type implies them.
     """
 
     channel: str
@@ -51,9 +52,9 @@ class _TopicChannel:
 
 
 def bags_in(path: Path) -> list[Path]:
-    """Return the bag files at or below a path, as a config names them.
+    """Return the bags at or below a path, as a config names them.
 
-    A rosbag2 folder is named by its metadata.yaml, and its other files belong to that.
+    A bag that is a rosbag2 folder is named by its metadata.yaml; other files in it are not listed.
     """
     if path.is_file():
         return [path] if path.suffix in SUFFIXES or path.name == _METADATA else []
@@ -63,12 +64,15 @@ def bags_in(path: Path) -> list[Path]:
 
 
 def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> ConfigProposal:
-    """Return the config proposed for bags; raise `DataError` where the first is unreadable.
+    """Return the proposed config for bags, which is made from the first bag.
 
     Args:
-        bags: the files, as from `bags_in`.
-        path: the log or folder that the user named.
+        bags: the bags, from `bags_in`.
+        path: log or folder that the user named.
         options: command-line options that describe the robot.
+
+    Raises:
+        DataError: the first bag cannot be read.
     """
     bag = bags[0]
     topics = topics_of(bag)
@@ -113,7 +117,10 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
 
 
 def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
-    """Return the wheels' joint names in the order of the drives, and an open question or ""."""
+    """Return the names of the wheels' joints, in the order of the drives, and an open question.
+
+    The question is empty if there is none.
+    """
     names = tuple(dict.fromkeys(name for topic in topics for name in topic.joints))
     labels = {name: meaning_of(f"{name}_velocity") for name in names}
     wheels = [
@@ -130,7 +137,11 @@ def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
 
 
 def _best_topics(topics: Sequence[Topic], joints: int) -> Iterator[_TopicChannel]:
-    """Yield the best topic for every channel: a pose that is no odometry comes first."""
+    """Yield the best topic for every channel.
+
+    For a pose, topics other than odometry and transforms are preferred. `joints` is the number of
+    the wheels' joints.
+    """
     order = sorted(topics, key=lambda t: (t.type == _ODOMETRY, t.type == _TRANSFORMS, t.name))
     taken: set[str] = set()
     for topic in order:
@@ -149,7 +160,10 @@ def _best_topics(topics: Sequence[Topic], joints: int) -> Iterator[_TopicChannel
 def _by_field_names(
     topics: Sequence[Topic], channels: Sequence[_TopicChannel], wheels: int
 ) -> Iterator[_TopicChannel]:
-    """Yield channels in messages of unknown types, from fields with a number for every wheel."""
+    """Yield channels in messages of unknown types, recognised by the names of fields.
+
+    Such a field has a number for every wheel. `channels` were found already and are left out.
+    """
     taken = {one.channel for one in channels}
     for topic in (one for one in topics if one.count and not one.serves and not one.joints):
         for field in topic.fields:
@@ -165,7 +179,7 @@ def _by_field_names(
 
 
 def _pose_question(channel: str, topic: Topic) -> str:
-    """Return the question about a topic with a pose; empty where its type leaves none."""
+    """Return the question about a topic with a pose; empty if its type leaves no question."""
     if channel != "pose":
         return ""
     if topic.type == _ODOMETRY:
@@ -178,7 +192,7 @@ def _pose_question(channel: str, topic: Topic) -> str:
 
 
 def _topic_lines(channels: Sequence[_TopicChannel]) -> Iterator[ConfigLine]:
-    """Yield a config line for each channel."""
+    """Yield the line of the config for each channel."""
     for one in channels:
         inside = f"topic = {toml(one.topic.name)}"
         commented_out = one.question == _EFFORT
@@ -203,7 +217,7 @@ def _rate(topic: Topic) -> str:
 def _layout_lines(
     robot: RobotAnswers, joints: tuple[str, ...], channels: Sequence[_TopicChannel]
 ) -> tuple[ConfigLine, ...]:
-    """Return the keys of the layout except its topics."""
+    """Return the lines of the layout except its topics."""
 
     def line(key: str, value: object, question: str = "") -> ConfigLine:
         kind = BagLayout if key in meanings(BagLayout) else Layout

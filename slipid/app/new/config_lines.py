@@ -1,4 +1,4 @@
-"""Lines of a config: keys with explanations and open questions; also the robot drawn as text."""
+"""Lines and tables of a new config, with comments and open questions; drawing of the robot."""
 
 import json
 import math
@@ -10,23 +10,24 @@ import numpy as np
 from slipid.model.geometry import Geometry
 
 QUESTION_MARK = "# ? "
-"""Start of a line with an open question."""
+"""Beginning of a line with an open question."""
 _COLUMN = 38
-"""Column at which comments begin, if the line leaves room."""
+"""Column of the text at which comments begin, if the key and its value are short enough."""
 _WIDTH = 98
+"""Largest width of lines of comments [character]."""
 Value = str | bool | int | float | list[int] | list[float] | list[str] | list[list[int]] | object
 
 
 @dataclass(frozen=True)
 class ConfigLine:
-    """One key of a config.
+    """Line of a config with one key.
 
     Attributes:
-        key: its name.
-        value: its value as TOML.
-        comment: what the key means.
-        question: what the reader has to fill in here; empty where nothing is open.
-        commented_out: whether the line is only a comment.
+        key: name of the key.
+        value: value as TOML text.
+        comment: meaning of the key.
+        question: question that the user has to answer here; empty if there is none.
+        commented_out: whether the line is written as a comment, without effect.
     """
 
     key: str
@@ -36,7 +37,7 @@ class ConfigLine:
     commented_out: bool = False
 
     def text(self) -> str:
-        """Return the line, below its question."""
+        """Return the text of the line, preceded by its question."""
         question = _question_lines(self.question)
         line = f"{'# ' if self.commented_out else ''}{self.key} = {self.value}"
         if not self.comment:
@@ -51,13 +52,13 @@ class ConfigLine:
 
 @dataclass(frozen=True)
 class ConfigBlock:
-    """A table of a config.
+    """Table of a config.
 
     Attributes:
-        header: its header line.
-        lines: its keys.
-        above: comments above it.
-        below: comments at its end.
+        header: header line, such as `[robot]`; empty for keys or comments without a header.
+        lines: keys of the table.
+        above: comments above the table.
+        below: comments at the end of the table.
         questions: open questions about the whole table.
     """
 
@@ -68,7 +69,7 @@ class ConfigBlock:
     questions: tuple[str, ...] = ()
 
     def text(self) -> str:
-        """Return its part of the file."""
+        """Return the text of the table."""
         out = [f"# {part}".rstrip() for text in self.above for part in wrapped(text, _WIDTH - 2)]
         out += [_question_lines(question).rstrip("\n") for question in self.questions]
         out += [self.header] if self.header else []
@@ -78,13 +79,13 @@ class ConfigBlock:
 
     @property
     def open_questions(self) -> tuple[str, ...]:
-        """Every open question of the table."""
+        """Return all open questions of the table and its keys."""
         lines = (f"{line.key}: {line.question}" for line in self.lines if line.question)
         return (*self.questions, *lines)
 
 
 def toml(value: Value) -> str:
-    """Return a plain value as inline TOML, whole floats without a decimal point."""
+    """Return a plain value as TOML text on one line; whole floats have no decimal point."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
@@ -103,7 +104,7 @@ def _question_lines(question: str) -> str:
 
 
 def wrapped(text: str, width: int) -> list[str]:
-    """Return text in lines of at most `width` characters; existing line breaks stay."""
+    """Return a text as lines of at most `width` characters; existing line breaks are kept."""
     wrapper = TextWrapper(width, break_long_words=False, break_on_hyphens=False)
     lines = text.splitlines() or [""]
     return [
@@ -112,21 +113,23 @@ def wrapped(text: str, width: int) -> list[str]:
 
 
 _ARROWS = "↑↖←↙↓↘→↗"
-"""Arrows for directions, from ahead (up) counter-clockwise in steps of 45 degrees."""
+"""Arrows that show directions, from ahead (up) counter-clockwise in steps of 45 deg."""
 _LINES = r"|\-/"
-"""Lines along ahead (up), ahead left, left and back left."""
+"""Characters for lines along the directions ahead (up), ahead left, left and back left."""
 _ROWS, _COLUMNS, _LEAST = 5, 13, 3
-"""Most rows ahead of the middle, most columns left of it, and fewest rows on either side."""
+"""Size of the drawing: largest number of rows ahead of the middle, width in columns on either side
+of it, and least number of rows ahead of it."""
 _MARGIN = 12
-"""Columns beyond the wheels for the y axis and the labels."""
+"""Number of columns beyond the wheels, for the y axis and the labels."""
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+"""Letters that stand for motors that several wheels share."""
 LABEL_WIDTH = 3
-"""Characters of a wheel: its number, its arrow, and the letter of a shared drive."""
+"""Largest number of characters of a wheel: its number, its arrow, and the letter of its motor."""
 
 
 @dataclass(frozen=True)
 class _DrawnWheel:
-    """Wheel on the drawing; row 0 is the middle, rows count down and columns to the right."""
+    """Wheel in the drawing; rows count down and columns to the right, from the middle."""
 
     row: int
     column: int
@@ -134,7 +137,7 @@ class _DrawnWheel:
 
 
 def drawing(robot: Geometry) -> str:
-    """Return a drawing of the robot from above, x up and y left, and a line for every wheel.
+    """Return a drawing of the robot from above, x up and y left, and a line about every wheel.
 
     A wheel is drawn as its number in the order of the log columns, an arrow in the direction in
     which it rolls at a positive speed, and the letter of the motor that it shares with other
@@ -151,15 +154,15 @@ def drawing(robot: Geometry) -> str:
 
 
 def direction(degrees: float) -> str:
-    """Return a direction in words, counter-clockwise from ahead."""
+    """Return a direction, given as an angle counter-clockwise from ahead [deg], in words."""
     names = ("ahead", "ahead left", "left", "back left", "back", "back right", "right")
     return (*names, "ahead right")[round(degrees / 45) % 8]
 
 
 def _grid_wheels(robot: Geometry) -> list[_DrawnWheel]:
-    """Return the wheels on a character grid without overlaps.
+    """Return the wheels on a grid of characters, moved down where they would overlap.
 
-    A character is about twice as high as wide, so rows are twice as far apart as columns.
+    A character is about twice as high as wide, so one row is as far as two columns.
     """
     place = np.asarray(robot.place) * float(robot.base_radius)
     step = max(np.abs(place[:, 0]).max() / _ROWS, np.abs(place[:, 1]).max() / (_COLUMNS / 2), 1e-9)
@@ -180,7 +183,7 @@ def _label(robot: Geometry, wheel: int) -> str:
 
 
 def _letter(robot: Geometry, wheel: int) -> str:
-    """Return the letter of the motor that a wheel shares; empty where it has its own."""
+    """Return the letter of the motor that a wheel shares with others; empty if it has its own."""
     if not robot.drive_of or robot.drive_of.count(robot.drive_of[wheel]) == 1:
         return ""
     return _LETTERS[robot.drive_of[wheel] % len(_LETTERS)]
@@ -211,7 +214,7 @@ def _picture(wheels: list[_DrawnWheel]) -> list[str]:
 
 
 def _wheel_line(robot: Geometry, wheel: int) -> str:
-    """Return a line with the place, direction and rollers of a wheel."""
+    """Return a line about a wheel: its place, drive direction and rollers."""
     x, y = (float(robot.base_radius) * c for c in robot.place[wheel])
     degrees = math.degrees(robot.drive_angle[wheel]) % 360
     motion = f"drives {direction(degrees)}" + (f" ({degrees:.0f} deg)" if degrees % 90 else "")
@@ -225,22 +228,26 @@ def _wheel_line(robot: Geometry, wheel: int) -> str:
 
 
 def _tilt(drive: float, roller: float) -> str:
-    """Return how the upper rollers of a wheel lie as seen from above; empty for straight ones."""
+    """Return a text with a line that shows the tilt of a wheel's upper rollers, seen from above.
+
+    It is empty for rollers that are not tilted. `drive` is the drive direction and `roller` the
+    roller angle [deg].
+    """
     if abs(roller % 180 - 90) < 1:
         return ""
-    # on top they lie as a mirror shows those that touch the floor, whose axes are across `free`
+    # The rollers on top are tilted the opposite way to those that touch the floor.
     return f", from above {_LINES[round((drive + roller - 90) / 45) % 4]}"
 
 
 def _corner(x: float, y: float) -> str:
-    """Return the corner of the robot that a place is in."""
+    """Return the corner or side of the robot, in words, at which a place x, y [m] lies."""
     edge = 0.2 * math.hypot(x, y)
     along = "front" if x > edge else "rear" if x < -edge else ""
     return f"{along} {'left' if y > edge else 'right' if y < -edge else ''}".strip()
 
 
 def _motor_lines(robot: Geometry) -> list[str]:
-    """Return the wheels of each log column, where wheels share motors."""
+    """Return a line with the wheels of each log column; no lines if no motor has several wheels."""
     if not robot.drive_of:
         return []
     out = []

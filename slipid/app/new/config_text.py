@@ -1,4 +1,4 @@
-"""Compose the text of a new config, every key explained, and read it back before it is written."""
+"""Text of a new config, with every key explained; it is read back before it is written."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ _ANSWER_OF_KEY = {
     "roller_angles_deg": "rollers_deg",
     "drives": "shared",
 }
-"""Answer that a key of `[robot]` is made from, where the two have different names."""
+"""Name of the answer (in `RobotAnswers`) for a key of `[robot]`, where the names differ."""
 _ASK_MEASURED = "taken by default: measure it, or look it up"
 _ASK_PLACES = "taken by default: where do the wheels stand, in the order of the columns?"
 _QUESTIONS = {
@@ -70,12 +70,12 @@ _MORE_FILES = (
 
 
 def blocks_of(draft: ConfigDraft, robot: Wheels, picture: str, name: str) -> list[ConfigBlock]:
-    """Return every part of a config.
+    """Return all tables of a config in order.
 
     Args:
-        draft: content of the config.
-        robot: the `[robot]` section made from the draft's answers.
-        picture: drawing of that robot.
+        draft: draft of the config.
+        robot: section `[robot]`, made from the answers in the draft.
+        picture: drawing of the robot.
         name: name of the config file.
     """
     return [
@@ -102,14 +102,14 @@ def _head(draft: ConfigDraft, name: str) -> tuple[str, ...]:
 
 
 def _robot_block(draft: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock:
-    """Return `[robot]` below the drawing."""
+    """Return the table `[robot]`, with the drawing above it."""
     lines = [
         ConfigLine("drive", toml(robot.drive), _ORDER[robot.drive], _open_question(draft, "drive"))
     ]
     given = robot.model_dump(exclude_none=True, exclude={"drive"}, exclude_defaults=False)
     if isinstance(robot, OmniDrive) and robot.roller_angle_deg == 90.0:
-        del given["roller_angle_deg"]  # ordinary omni wheels
-    # what the drive is made of comes first, what all robots have after it
+        del given["roller_angle_deg"]  # the default, that of ordinary omni wheels
+    # The keys of the type of drive come first, those that all robots have after them.
     common = ("wheel_radius_m", "gear_ratio", "mass_kg")
     for key in (*(k for k in given if k not in common), *common):
         comment = in_short(type(robot), key)
@@ -118,7 +118,7 @@ def _robot_block(draft: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock
 
 
 def _open_question(draft: ConfigDraft, key: str) -> str:
-    """Return the question about a key that the user has not answered, else ""."""
+    """Return the question about a key of `[robot]` with a default; empty if it was answered."""
     if _ANSWER_OF_KEY.get(key, key) not in draft.robot.defaults or key == "drives":
         return ""
     hints = (hint.question for hint in draft.hints if hint.key == key and hint.question)
@@ -126,7 +126,7 @@ def _open_question(draft: ConfigDraft, key: str) -> str:
 
 
 def _layout_blocks(layout: LayoutDraft) -> list[ConfigBlock]:
-    """Return a layout with its columns, and the layouts of files beside a run's own."""
+    """Return the tables of a layout and its columns, those of further files of a run included."""
     where = f"layouts.{layout.name}"
     below = (*_OTHER_CHANNELS, *_MORE_FILES) if layout.examples else ()
     blocks = _file_blocks(where, layout.file, _COLUMNS_HELP, below)
@@ -147,7 +147,7 @@ def _file_blocks(
 
 
 def _bag_blocks(bag: BagDraft) -> list[ConfigBlock]:
-    """Return a layout of bags with its topics."""
+    """Return the tables of a layout of bags and its topics."""
     above = (
         "The topic of each channel. Known types of messages need neither field nor unit; the frame "
         "of a pose in /tf and the meaning of the effort of joints must be given.",
@@ -159,7 +159,7 @@ def _bag_blocks(bag: BagDraft) -> list[ConfigBlock]:
 
 
 def _logs_block(logs: LogsDraft, first: bool) -> ConfigBlock:
-    """Return a section of logs; the first one explains its keys."""
+    """Return the table of a section of logs; the keys are explained only in the first section."""
 
     def line(key: str, value: str, commented_out: bool = False) -> ConfigLine:
         return ConfigLine(
@@ -193,7 +193,10 @@ def _logs_block(logs: LogsDraft, first: bool) -> ConfigBlock:
 
 
 def _fit_block() -> ConfigBlock:
-    """Return the question whether poses are in true metres, which logs do not show."""
+    """Return the commented-out table `[fit]`, which asks whether poses are in true metres.
+
+    Logs do not show it.
+    """
     above = (
         "Which lengths are known? " + _LENGTHS_HELP,
         "[fit]",
@@ -214,7 +217,7 @@ def _weights_block(wheels: int) -> ConfigBlock:
 
 
 def _parameters_block(channels: frozenset[str]) -> ConfigBlock:
-    """Return choices for the parameters that logs with these channels can identify."""
+    """Return the table `[parameters]`, with choices that suit logs with the given channels."""
     current = channels & {"current", "motor_torque", "wheel_torque"}
     voltage = "voltage" in channels or {"duty", "bus_voltage"} <= channels
     yaw = '"camera.marker_yaw"'
@@ -242,13 +245,13 @@ def _parameters_block(channels: frozenset[str]) -> ConfigBlock:
 
 @dataclass(frozen=True)
 class NewConfig:
-    """A config that was read back without errors.
+    """Text of a new config that was read back without errors.
 
     Attributes:
-        text: its text.
-        robot: its robot.
+        text: text of the file.
+        robot: section `[robot]`.
         drawing: drawing of the robot.
-        questions: its open questions.
+        questions: open questions in the text.
     """
 
     text: str
@@ -257,26 +260,26 @@ class NewConfig:
     questions: tuple[str, ...]
 
     def write(self, out: Path, force: bool = False) -> None:
-        """Write the file; raise `DataError` where it exists and may not be replaced."""
+        """Write the file; raise `DataError` if it exists, unless `force`."""
         refuse_existing(out, force)
         write_bytes(out, self.text.encode())
 
 
 def refuse_existing(out: Path, force: bool) -> None:
-    """Raise `DataError` where a file exists and may not be replaced; called before any question."""
+    """Raise `DataError` if a file exists, unless `force`; this is done before the user is asked."""
     if out.exists() and not force:
         raise DataError(f"{out}: exists already; expected a new file, or --force")
 
 
 def new_config(draft: ConfigDraft, name: str) -> NewConfig:
-    """Return the config of a draft, checked by reading it back.
+    """Return the config made from a draft, which was checked by reading it back.
 
     Args:
-        draft: content of the config.
+        draft: draft of the config.
         name: name of the config file.
 
     Raises:
-        DataError: the answers describe no possible robot.
+        DataError: the answers in the draft describe no possible robot.
     """
     robot = robot_of(draft.robot)
     picture = drawing(geometry(robot))

@@ -1,4 +1,4 @@
-"""Drafts of a config and its sections before they become text, and a template without any logs."""
+"""Drafts of a config and its sections, from which its text is made; also a draft without logs."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,11 +18,15 @@ _LABELS = {
 
 @dataclass(frozen=True)
 class ChannelDraft:
-    """A channel of a layout.
+    """Draft of a channel in a layout.
 
     Attributes:
-        channel, columns, unit: as in `slipid.data.reading.layout.Channel`.
-        comment, question, commented_out: as in `ConfigLine`.
+        channel: name of the channel.
+        columns: names of the columns, or their positions from 0.
+        unit: unit of the columns.
+        comment: comment on the line of the config.
+        question: open question; empty if there is none.
+        commented_out: whether the line is written as a comment, without effect.
     """
 
     channel: str
@@ -33,7 +37,7 @@ class ChannelDraft:
     commented_out: bool = False
 
     def line(self) -> ConfigLine:
-        """Return its line in the config."""
+        """Return the line of the config for the channel."""
         several = len(self.columns) > 1
         named = toml(list(self.columns) if several else self.columns[0])
         inside = f"column{'s' if several else ''} = {named}, unit = {toml(self.unit)}"
@@ -44,16 +48,18 @@ class ChannelDraft:
 
 @dataclass(frozen=True)
 class FileDraft:
-    """Layout of one kind of file.
+    """Draft of the layout of one kind of file.
 
     Attributes:
-        channels: channels in its columns.
-        delimiter: text between columns; "" for a file that is not text (Parquet).
-        names_row, units_row, first_data_row: as in `Layout`.
-        settings: other keys of the layout.
-        above: comments on the columns.
+        channels: channels in the columns.
+        delimiter: text between columns; empty for a file that is not text (Parquet).
+        names_row, units_row, first_data_row: lines of names, units and first numbers, as in
+            `Layout`.
+        settings: lines with the other keys of the layout.
+        above: comments above the columns.
         questions: open questions about the whole file.
-        pattern: name of a file beside a run's own, as in `Layout.beside`; "" for the run's own.
+        pattern: name of a further file of a run, as in `Layout.beside`; empty for the run's own
+            file.
     """
 
     channels: tuple[ChannelDraft, ...]
@@ -67,7 +73,7 @@ class FileDraft:
     pattern: str = ""
 
     def lines(self) -> tuple[ConfigLine, ...]:
-        """Return the keys of the layout except its columns."""
+        """Return the lines of the layout except its columns."""
         if not self.delimiter:
             return self.settings
         rows = ("names_row", "units_row") if self.units_row else ("names_row",)
@@ -78,13 +84,13 @@ class FileDraft:
 
 @dataclass(frozen=True)
 class LayoutDraft:
-    """Layout of a run's files.
+    """Draft of the layout of all files of a run.
 
     Attributes:
         name: name of the layout.
-        file: the run's main file.
-        beside: further files of the run.
-        examples: whether other ways to log are shown below it.
+        file: draft for the run's own file.
+        beside: drafts for further files of the run.
+        examples: whether examples of other channels and files are written below the layout.
     """
 
     name: str
@@ -94,19 +100,19 @@ class LayoutDraft:
 
     @property
     def channels(self) -> Iterator[ChannelDraft]:
-        """Every channel in use, from all its files."""
+        """Yield every channel of all files that is not commented out."""
         for file in (self.file, *self.beside):
             yield from (channel for channel in file.channels if not channel.commented_out)
 
 
 @dataclass(frozen=True)
 class BagDraft:
-    """Layout of bags.
+    """Draft of a layout of bags.
 
     Attributes:
         name: name of the layout.
-        settings: its keys.
-        topics: a line for each topic in use.
+        settings: lines of the layout except its topics.
+        topics: a line for each channel with its topic.
         above: comments above the topics.
         questions: open questions about the whole layout.
     """
@@ -120,9 +126,14 @@ class BagDraft:
 
 @dataclass(frozen=True)
 class LogsDraft:
-    """A `[[logs]]` section; attributes as in `LogsSection`, with comments and questions.
+    """Draft of a section `[[logs]]`.
 
-    An empty session is not written, so that the default holds.
+    Attributes:
+        glob, format, surface, session: values of these keys, as in `LogsSection`; an empty session
+            is not written, so that the default holds.
+        above: comments above the section.
+        question: open question about the surface; empty if there is none.
+        commented_out: whether the section is written as a comment, without effect.
     """
 
     glob: str
@@ -136,7 +147,7 @@ class LogsDraft:
 
 @dataclass(frozen=True)
 class RobotHint:
-    """Question about a key of `[robot]` that suits the logs better than the usual one."""
+    """Question about a key of `[robot]` that replaces the usual one, since it suits the logs."""
 
     key: str
     question: str
@@ -144,16 +155,16 @@ class RobotHint:
 
 @dataclass(frozen=True)
 class ConfigDraft:
-    """A whole config.
+    """Draft of a whole config.
 
     Attributes:
         robot: answers about the robot.
-        layouts: layouts of log files; logs in a preset's format need none.
+        layouts: layouts of log files; logs in the format of a preset need none.
         logs: sections of logs.
-        preset_channels: channels of the presets in use.
-        above: comments at the beginning.
-        data: data folder, as named on the command line.
-        hints: questions about the robot that suit its logs.
+        preset_channels: channels that are logged, but not in `layouts`: those of presets and bags.
+        above: comments at the beginning of the file.
+        data: data folder, as a command line names it.
+        hints: questions about the robot that replace the usual ones.
         bags: layouts of bags.
     """
 
@@ -168,26 +179,29 @@ class ConfigDraft:
 
     @property
     def channels(self) -> frozenset[str]:
-        """Every channel that is logged."""
+        """Return the names of all channels that are logged."""
         own = (channel.channel for layout in self.layouts for channel in layout.channels)
         return self.preset_channels | frozenset(own)
 
 
 @dataclass(frozen=True)
 class ConfigProposal:
-    """Draft of a config, and sentences about what was found in the logs."""
+    """Proposed draft of a config, with sentences about what was found in the logs."""
 
     draft: ConfigDraft
     sentences: tuple[str, ...]
 
 
 def layout_line(key: str, value: object, question: str = "", comment: str = "") -> ConfigLine:
-    """Return a key of a layout with its explanation."""
+    """Return the line for a key of a layout, with its meaning as the comment by default."""
     return ConfigLine(key, toml(value), comment or in_short(Layout, key), question)
 
 
 def template_draft(answers: RobotAnswers) -> ConfigDraft:
-    """Return a draft with everything that this robot may log, in one file for each run."""
+    """Return the draft of a config without logs.
+
+    Its layout has every channel that the robot may log, in one file for each run.
+    """
     layout = LayoutDraft(
         "mine", FileDraft(_channels(answers), settings=_settings(answers)), examples=True
     )

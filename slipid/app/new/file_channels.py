@@ -1,7 +1,8 @@
-"""Recognise the channels in a file's columns, and group the log files of a folder by kind.
+"""Recognition of the channels in a file's columns, and grouping of a folder's log files by kind.
 
-Columns are recognised by their names and by their numbers. Files of one kind have the same layout:
-published formats, globs that find each kind, and files that lie together are recognised.
+Columns are recognised by their names and numbers. Files of one kind have the same layout. For each
+kind, this module finds presets that can read it, globs that match its files, and the kinds whose
+files lie beside it.
 """
 
 from collections import Counter
@@ -23,25 +24,25 @@ from slipid.data.reading.table_format import TableFormat, TableNumbers, format_o
 from slipid.support.errors import DataError
 
 _ORDER = ("fl", "fr", "ml", "mr", "rl", "rr", "l", "r")
-"""Wheel names in the order in which the drives count wheels."""
+"""Labels of wheels in the order in which the types of drive count wheels."""
 _QUATERNION = ("x", "y", "z", "w")
 WHEEL_MOTION = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
-"""Channels of wheel motion, the most informative first."""
+"""Channels with the motion of the wheels, the most informative first."""
 _LEAST_TICKS = 50
-"""Largest whole number of a position that is not taken for a count of ticks."""
+"""Magnitude above which whole numbers of a position are taken for ticks."""
 
 
 @dataclass(frozen=True, eq=False)
 class FileChannel:
-    """A channel and its columns.
+    """A channel that was found in a file, with its columns.
 
     Attributes:
-        channel: its name.
-        columns: numbers of its columns.
-        labels: wheel of each column, as its name says.
+        channel: name of the channel.
+        columns: positions of its columns, from 0.
+        labels: label of the wheel in the name of each column.
         values: values of the columns, as in the file.
-        unit: unit given by the names or a row of units; empty where they give none.
-        questions: a question for each assumption.
+        unit: unit in the names or in a row of units; empty if there is none.
+        questions: one question about each assumption that was made.
     """
 
     channel: str
@@ -54,11 +55,11 @@ class FileChannel:
 
 @dataclass(frozen=True, eq=False)
 class FileChannels:
-    """The channels of a file.
+    """All channels that were found in a file.
 
     Attributes:
-        found: its channels.
-        unused: names of other columns of numbers.
+        found: the channels.
+        unused: names of the other columns with numbers.
         notes: remarks for the user.
     """
 
@@ -67,26 +68,26 @@ class FileChannels:
     notes: tuple[str, ...] = ()
 
     def get(self, channel: str) -> FileChannel | None:
-        """Return a channel, if the file has it."""
+        """Return a channel, or None if the file does not have it."""
         return next((one for one in self.found if one.channel == channel), None)
 
     def first(self, *channels: str) -> FileChannel | None:
-        """Return the first of some channels that the file has."""
+        """Return the first of some channels that the file has, or None if it has none of them."""
         return next((found for name in channels if (found := self.get(name))), None)
 
     @property
     def turns(self) -> FileChannel | None:
-        """The most informative channel of wheel motion."""
+        """Return the most informative channel with the motion of the wheels, or None."""
         return self.first(*WHEEL_MOTION)
 
     @property
     def wheels(self) -> int:
-        """Number of wheels, or drives, that have columns."""
+        """Return the number of wheels, or drives, with columns in the file."""
         return len(self.turns.columns) if self.turns else 0
 
     @property
     def has_pose(self) -> bool:
-        """True where the file has a complete pose."""
+        """Return whether the file has a complete pose: x, y, and a heading or a quaternion."""
         turned = self.get("pose_heading") or self.get("pose_quaternion")
         return bool(self.get("pose_x") and self.get("pose_y") and turned)
 
@@ -139,7 +140,10 @@ def _file_channel(
 
 
 def rank(label: str) -> tuple[int, int, str]:
-    """Return the sort key of a wheel's name: the order of the drives, else its number."""
+    """Return the key by which labels of wheels, or components of a quaternion, are sorted.
+
+    Known labels are in the order of the drives, numbers in their order after them.
+    """
     if label in _QUATERNION:
         return (0, _QUATERNION.index(label), label)
     if label in _ORDER:
@@ -148,7 +152,10 @@ def rank(label: str) -> tuple[int, int, str]:
 
 
 def _resolved(found: list[FileChannel]) -> list[FileChannel]:
-    """Resolve ambiguous names: positions are ticks or angles, and "v" is a voltage or a speed."""
+    """Return the channels with ambiguous ones decided by their units and numbers.
+
+    Positions are ticks or angles; "v" is a voltage or a speed.
+    """
     speeds = {one.labels for one in found if one.channel.endswith("_speed")}
     out = []
     for one in found:
@@ -168,19 +175,19 @@ def _resolved(found: list[FileChannel]) -> list[FileChannel]:
 
 
 def _is_ticks(values: Float[np.ndarray, "row column"]) -> bool:
-    """Return True for whole numbers that are too large for an angle."""
+    """Return whether all values are whole numbers, some of them too large for an angle."""
     known = values[~np.isnan(values)]
     return bool((known == np.round(known)).all() and np.abs(known).max(initial=0.0) > _LEAST_TICKS)
 
 
 def _stays_up(values: Float[np.ndarray, "row column"]) -> bool:
-    """Return True for numbers away from 0, like a battery's voltage and unlike a speed."""
+    """Return whether all values are well above 0, like a battery's voltage and unlike a speed."""
     known = values[~np.isnan(values)]
     return bool(known.size) and float(known.min()) > 0.5 * float(known.max()) > 0.0
 
 
 def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
-    """Return the channels with the same wheels, and a line for each channel that is left out."""
+    """Return the channels with the same wheels as the motion, and a line about each other one."""
     turns = [one for name in WHEEL_MOTION for one in found if one.channel == name]
     per_wheel = turns or [one for one in found if one.channel in PER_WHEEL]
     count = len(per_wheel[0].columns) if per_wheel else 0
@@ -200,7 +207,10 @@ def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]
 
 
 def _same_wheels(labels: set[str], one: FileChannel) -> bool:
-    """Return True where the labels are equal, or where one names sides and the other numbers."""
+    """Return whether a channel has the same labels, or labels of the other type.
+
+    The types are names of sides, such as `fl`, and numbers, which cannot be compared.
+    """
     numbers = all(label.isdecimal() for label in labels)
     return set(one.labels) == labels or numbers != all(label.isdecimal() for label in one.labels)
 
@@ -213,7 +223,10 @@ def _odometry_note(numbers: TableNumbers, meanings: dict[int, ColumnMeaning]) ->
 
 
 def unnamed_channels(numbers: TableNumbers) -> FileChannels:
-    """Guess the channels of columns without names: time, a pose, and whole numbers as ticks."""
+    """Return guessed channels of columns without names, each with a question.
+
+    Time is the first increasing column, whole numbers are ticks, and three others are the pose.
+    """
     values = numbers.values
     whole = [k for k in range(values.shape[1]) if _is_ticks(values[:, [k]])]
     time = next((k for k in range(values.shape[1]) if (np.diff(values[:, k]) > 0).all()), None)
@@ -239,7 +252,7 @@ def unnamed_channels(numbers: TableNumbers) -> FileChannels:
 
 
 def without(channels: FileChannels, names: frozenset[str]) -> FileChannels:
-    """Return the channels of a file except those that another file of the run has as well."""
+    """Return the channels of a file without those in `names`, which come from another file."""
     kept = tuple(one for one in channels.found if one.channel not in names)
     again = sorted(one.channel for one in channels.found if one.channel in names)
     notes = (f"Also here, but taken from the other file: {', '.join(again)}.",) if again else ()
@@ -249,21 +262,21 @@ def without(channels: FileChannels, names: frozenset[str]) -> FileChannels:
 SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".parquet")
 """Suffixes of files that may be logs."""
 _TELLING_COLUMNS = 8
-"""Number of named columns that no unrelated file has by chance."""
+"""Least number of named columns of a preset for which a match of all names is not by chance."""
 _FILES_TRIED = 3
-"""Files that are read to see whether a preset fits."""
+"""Largest number of files that are read to find out whether a preset fits."""
 
 
 @dataclass(frozen=True)
 class RejectedFile:
-    """A file that is no readable log, and the reason."""
+    """A file that is not a readable log, with the reason."""
 
     path: Path
     reason: str
 
 
 def formats_below(folder: Path) -> tuple[list[TableFormat], list[RejectedFile]]:
-    """Return the format of every log in a folder and below, and the files that are none.
+    """Return the format of every log in a folder and below, and the files that are not logs.
 
     Raises:
         DataError: there is no log.
@@ -290,12 +303,12 @@ class FileKind:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Paths of the files."""
+        """Return the paths of the files."""
         return tuple(one.path for one in self.formats)
 
 
 def file_kinds(formats: Sequence[TableFormat]) -> list[FileKind]:
-    """Return files by kind, the most frequent kind first."""
+    """Return files grouped by kind, the kind with the most files first."""
     groups: dict[TableFormat, list[TableFormat]] = {}
     for one in formats:
         groups.setdefault(one.signature, []).append(one)
@@ -303,9 +316,10 @@ def file_kinds(formats: Sequence[TableFormat]) -> list[FileKind]:
 
 
 def globs_of(root: Path, kind: FileKind, others: Sequence[Path]) -> list[str]:
-    """Return globs below a folder that match the files of a kind and no other file.
+    """Return globs below a folder that together match all files of a kind and no other file.
 
-    Each top folder of files two levels deep has a glob of its own, as it marks a set of logs.
+    Files in subfolders of different top folders get separate globs, since each top folder is
+    usually a set of logs.
     """
     mine = [path.relative_to(root) for path in kind.paths]
     theirs = [PurePosixPath(path.relative_to(root)) for path in others]
@@ -317,7 +331,7 @@ def globs_of(root: Path, kind: FileKind, others: Sequence[Path]) -> list[str]:
 
 
 def _narrow_globs(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> list[str]:
-    """Return a glob for some files, or narrower ones where it matches other files."""
+    """Return a common glob for some files, or several narrower ones if it matches other files."""
     glob = common_glob(paths)
     if not any(_glob_matches(glob, path) for path in theirs):
         return [glob]
@@ -329,12 +343,12 @@ def _narrow_globs(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> li
 
 
 def common_glob(paths: Sequence[PurePosixPath]) -> str:
-    """Return a glob for paths of the same depth: their common parts around stars."""
+    """Return a glob that matches paths of the same depth; `*` stands for what differs."""
     return "/".join(_common_name(parts) for parts in zip(*(p.parts for p in paths), strict=True))
 
 
 def floor_of(glob: str) -> str:
-    """Return the name of a floor from a glob: the top folder's name, else "floor"."""
+    """Return the name of the floor of a glob's files: that of the top folder, or "floor"."""
     first, *others = glob.split("/")
     return first if len(others) > 1 and "*" not in first else "floor"
 
@@ -347,7 +361,7 @@ def _glob_matches(glob: str, path: PurePosixPath) -> bool:
 
 
 def _common_name(names: tuple[str, ...]) -> str:
-    """Return one name, or the common parts of several names around a star."""
+    """Return a pattern that matches some names; `*` stands for what differs."""
     if len(set(names)) == 1:
         return names[0]
     suffixes = {PurePosixPath(name).suffix for name in names}
@@ -355,16 +369,17 @@ def _common_name(names: tuple[str, ...]) -> str:
     counted = {sub(r"\d+", "*", name) for name in names}
     if len(counted) == 1:
         return counted.pop()
-    # digits at its end are a number, of which others may begin otherwise
+    # Digits at the end of the common beginning are part of a number, which may differ.
     first, last = min(names), max(names)
     alike = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
     return f"{first[:alike].rstrip('0123456789')}*{end}"
 
 
 def pattern_beside(main: FileKind, other: FileKind) -> str | None:
-    """Return the name of the file beside each main one, as in `Layout.beside`; None without one.
+    """Return the name, as in `Layout.beside`, by which a file of a kind lies beside each main file.
 
-    The name is the same in every folder, or contains the stem of the main file.
+    The name is the same in every folder, or contains `{stem}` for the stem of the main file. The
+    result is None if there is no such name.
     """
     there = set(other.paths)
     first = main.paths[0]
@@ -375,7 +390,7 @@ def pattern_beside(main: FileKind, other: FileKind) -> str | None:
     ]
     for pattern in patterns:
         named = [path.parent / pattern.replace("{stem}", path.stem) for path in main.paths]
-        # a name without the stem belongs to one main file a folder
+        # A name without the stem is unambiguous only if each folder has one main file.
         alone = "{stem}" in pattern or len({path.parent for path in main.paths}) == len(named)
         if alone and there.issuperset(named):
             return pattern
@@ -383,7 +398,7 @@ def pattern_beside(main: FileKind, other: FileKind) -> str | None:
 
 
 def folder_per_run(kind: FileKind) -> bool:
-    """Return True where every file is alone of its kind in its folder: a folder is a run."""
+    """Return whether every file is the only one of its kind in its folder, so a folder is a run."""
     return len(kind.paths) > 1 and len({path.parent for path in kind.paths}) == len(kind.paths)
 
 
@@ -392,8 +407,8 @@ class PresetMatches:
     """Presets that can read a kind of files.
 
     Attributes:
-        sure: preset with the most columns among those with unmistakable names, if any.
-        perhaps: other presets, whose columns any log could have.
+        sure: preset whose many column names all match, so that it is certainly right, or None.
+        perhaps: other presets, with so few columns that they may match by chance.
     """
 
     sure: str | None
@@ -412,7 +427,7 @@ def matching_presets(kind: FileKind) -> PresetMatches:
 
 
 def _matches(format: TableFormat, layout: Layout) -> bool:
-    """Return True where names and numbers stand where a layout expects them."""
+    """Return whether a format has names and numbers where a layout expects them."""
     rows = (layout.delimiter, layout.names_row, layout.first_data_row)
     if rows != (format.delimiter, format.names_row, format.first_data_row):
         return False

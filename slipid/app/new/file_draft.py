@@ -1,4 +1,4 @@
-"""Draft the layout of a log file, with units, rates and open questions, from its numbers."""
+"""Draft of the layout of a log file, with units, rates and open questions, from its numbers."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ _BATTERY_VOLTAGE = (
 
 
 def file_draft(one: FileStudy, run: RunStudy) -> FileDraft:
-    """Return the draft of one kind of file."""
+    """Return the draft of the layout of one file of a run."""
     channels = [channel_draft(one, found, run) for found in one.channels.found]
     format = one.format
     above = list(one.channels.notes)
@@ -68,13 +68,16 @@ def file_draft(one: FileStudy, run: RunStudy) -> FileDraft:
 
 
 def _units_row(one: FileStudy) -> int:
-    """Return the row of units, which the reader checks; 0 where a used column has none."""
+    """Return the row of units, which the reader checks; 0 if a used column has no unit in it."""
     used = [at for found in one.channels.found for at in found.columns]
     return one.format.units_row if all(one.format.units[at] for at in used) else 0
 
 
 def _row_lines(one: FileStudy, main: bool) -> list[ConfigLine]:
-    """Return the layout's keys about rows: start of a run, repeated times, gaps, or the period."""
+    """Return the lines of the layout about the times of rows.
+
+    They are about new runs in the file, repeated times, gaps, or the period if there is no time.
+    """
     if one.clock is None:
         ask = "no column of time: how long is a row [s]?"
         return [layout_line("row_period", 0.05, ask)]
@@ -96,7 +99,7 @@ def _row_lines(one: FileStudy, main: bool) -> list[ConfigLine]:
 
 
 def _layout_settings(run: RunStudy) -> list[ConfigLine]:
-    """Return keys about encoders and currents, which hold for all files of a run."""
+    """Return the lines of the layout about encoders and currents, for all files of a run."""
     lines = []
     robot, ticks = run.robot, run.find("wheel_ticks")
     if ticks is not None:
@@ -123,7 +126,10 @@ def _layout_settings(run: RunStudy) -> list[ConfigLine]:
 
 
 def _ticks_by_speed(run: RunStudy, ticks: FileChannel) -> str:
-    """Return a remark about ticks per turn from the reported speeds, if one file has both."""
+    """Return a remark about the ticks per turn that the reported speeds imply.
+
+    It is empty if the main file does not have both ticks and speeds.
+    """
     speed = run.main.channels.first(*reversed(SPEEDS))
     if speed is None or not speed.unit or run.main.clock is None:
         return ""
@@ -139,7 +145,7 @@ def _ticks_by_speed(run: RunStudy, ticks: FileChannel) -> str:
 
 
 def radius_hint(run: RunStudy) -> tuple[RobotHint, ...]:
-    """Return a question with the wheel radius by the poses, if all wheels point ahead."""
+    """Return a question with the wheel radius that the poses imply, if all wheels point ahead."""
     speed, ratio = run.find("wheel_speed"), run.pose_over_wheel_speed
     if ratio is None or speed is None or len(speed.columns) > 2:
         return ()
@@ -155,7 +161,7 @@ def radius_hint(run: RunStudy) -> tuple[RobotHint, ...]:
 
 
 def channel_draft(one: FileStudy, found: FileChannel, run: RunStudy) -> ChannelDraft:
-    """Return a channel with its unit, its rate and its open questions."""
+    """Return the draft of a channel, with its unit, its rate and open questions."""
     columns = tuple(one.format.column(at) for at in found.columns)
     unit = UnitGuess(found.unit) if found.unit else unit_of(one, found, run)
     comments = [reading_rate(one, found) if found.channel != "time" else "", unit.reason]
@@ -167,7 +173,7 @@ def channel_draft(one: FileStudy, found: FileChannel, run: RunStudy) -> ChannelD
 
 
 def _unused_draft(draft: ChannelDraft, found: FileChannel, run: RunStudy) -> ChannelDraft:
-    """Comment out a channel that must not be used before a question about it is answered."""
+    """Return the draft of a channel, commented out if the channel must not be used as it is."""
     speed = run.find(*SPEEDS)
     if found.channel.endswith("torque") and found.unit != "N*m":
         return replace(draft, commented_out=True, question=ASK_EFFORT)
@@ -193,13 +199,13 @@ def _unused_draft(draft: ChannelDraft, found: FileChannel, run: RunStudy) -> Cha
 
 
 def unit_of(one: FileStudy, found: FileChannel, run: RunStudy) -> UnitGuess:
-    """Return the unit of a channel whose name gives none."""
+    """Return a guess of the unit of a channel, whose name has no unit."""
     channel = found.channel
     most = float(np.nanmax(np.abs(found.values)))
     if channel == "time":
         return one.clock or UnitGuess("s")
     if channel in ("pose_x", "pose_y"):
-        # one question is enough for x and y
+        # The question about the unit is asked for x only.
         place = run.by_pose.unit
         return place if channel == "pose_x" else UnitGuess(place.unit)
     if channel == "pose_heading":
@@ -230,13 +236,16 @@ def unit_of(one: FileStudy, found: FileChannel, run: RunStudy) -> UnitGuess:
 
 
 def _pose_heading_range(run: RunStudy) -> float:
-    """Return the range of the logged heading, in its own unit."""
+    """Return the range of a run's logged heading, in the unit of the file; 0 without a heading."""
     found = run.find("pose_heading")
     return 0.0 if found is None else float(np.nanmax(found.values) - np.nanmin(found.values))
 
 
 def _heading_range(run: RunStudy) -> float:
-    """Return the range of the heading by a run's gyro or commands [rad]; 0 without them."""
+    """Return the range of the heading, integrated from a run's gyro or commands [rad].
+
+    It is 0 without them.
+    """
     for one in run.all:
         reading_rate = one.channels.first("gyro", "twist_command_yaw")
         if reading_rate is None or one.clock is None:
@@ -250,5 +259,5 @@ def _heading_range(run: RunStudy) -> float:
 
 
 def _turn_rate_unit(most: float) -> UnitGuess:
-    """Return the unit of a turn rate from its largest value."""
+    """Return a guess of the unit of a turn rate, from its largest magnitude."""
     return UnitGuess("rad/s") if most < 20 else UnitGuess("deg/s", f"up to {most:.4g}")

@@ -1,4 +1,4 @@
-"""Study a log file: its channels, its clock, and what the files of a run show together."""
+"""Study of log files: channels and clock of a file, and properties of a run's files together."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,9 +16,9 @@ from slipid.data.wheel_signals import refresh_period
 
 METRES = UnitGuess("m")
 _ALIGNED_DRIVES = 2
-"""Largest number of drives whose wheels all point ahead."""
+"""Number of drives up to which all wheels are taken to point ahead."""
 _SPARSE = 0.02
-"""Share of empty cells from which a channel counts as slower than the rows."""
+"""Share of empty cells above which a channel is slower than the rows of the file [1]."""
 CURRENTS = ("current", "motor_torque", "wheel_torque")
 SPEEDS = ("wheel_speed", "motor_speed")
 ANGLES = ("wheel_angle", "motor_angle")
@@ -26,13 +26,13 @@ ANGLES = ("wheel_angle", "motor_angle")
 
 @dataclass(frozen=True, eq=False)
 class FileStudy:
-    """One file and what its numbers show.
+    """Study of one log file.
 
     Attributes:
-        numbers: its numbers.
-        channels: its channels.
-        time: time of every row [s]; the row's number where no time is logged.
-        clock: unit of the time; None where no time is logged.
+        numbers: numbers in the file.
+        channels: channels in the file.
+        time: time of every row [s]; if no time is logged, the number of the row.
+        clock: unit of the time; None if no time is logged.
     """
 
     numbers: TableNumbers
@@ -42,19 +42,19 @@ class FileStudy:
 
     @property
     def format(self) -> TableFormat:
-        """Layout of the file's rows and columns."""
+        """Return the format of the file."""
         return self.numbers.format
 
     @property
     def usual_step(self) -> float:
-        """Median time between rows [s]."""
+        """Return the median time between rows [s]."""
         steps = np.diff(self.time)
         steps = steps[steps > 0]
         return float(np.median(steps)) if len(steps) else 1.0
 
 
 def study_file(format: TableFormat) -> FileStudy:
-    """Return the study of a file; raise `DataError` where its numbers cannot be read."""
+    """Return the study of a file; raise `DataError` if its numbers cannot be read."""
     numbers = numbers_of(format)
     columns = channels_in(numbers) if any(format.names) else unnamed_channels(numbers)
     found = columns.get("time")
@@ -66,7 +66,10 @@ def study_file(format: TableFormat) -> FileStudy:
 
 
 def reading_rate(one: FileStudy, found: FileChannel) -> str:
-    """Return the rate of a channel in words, from empty cells, repeated values or else rows."""
+    """Return the rate of a channel's readings in words; empty if it is unknown.
+
+    Empty cells and repeated values are taken into account.
+    """
     values, time = found.values[:, 0], one.time
     there = ~np.isnan(values) & ~np.isnan(time)
     if there.sum() < 3 or one.clock is None:
@@ -88,14 +91,14 @@ def _rate_text(period: float) -> str:
 
 @dataclass(frozen=True)
 class PoseMotion:
-    """Motion of the robot by its logged pose.
+    """Motion of the robot according to its logged pose; arrays are None without a pose.
 
     Attributes:
-        speed: 90 % quantile of the speed [m/s]; None where there is no pose.
-        unit: unit of x and y.
+        speed: 90 % quantile of the speed [m/s]; None without a pose.
+        unit: unit of x and y in the file.
         time: times of the poses [s].
         x, y: positions [m].
-        steps: distance of each pose from the last one [m].
+        steps: distance of each pose from the previous one [m].
     """
 
     speed: float | None = None
@@ -107,7 +110,7 @@ class PoseMotion:
 
 
 def pose_motion(one: FileStudy | None) -> PoseMotion:
-    """Return the motion by the pose in a file; empty where the file has none."""
+    """Return the motion according to the pose in a file; it is empty if the file has no pose."""
     if one is None or not one.channels.has_pose:
         return PoseMotion()
     x, y = one.channels.get("pose_x"), one.channels.get("pose_y")
@@ -130,9 +133,9 @@ def pose_motion(one: FileStudy | None) -> PoseMotion:
 
 
 def ticks_are_increments(found: FileChannel, one: FileStudy, by_pose: PoseMotion) -> bool | None:
-    """Return whether ticks are counted anew in each row; None where the file does not show it.
+    """Return whether ticks are increments since the previous row; None if it is not clear.
 
-    Path length by the pose correlates with the ticks of each row, or with their changes.
+    The path length by the pose is proportional to increments, else to the changes of the ticks.
     """
     values = np.nan_to_num(found.values)
     of_rows, of_changes = (
@@ -157,20 +160,20 @@ def ticks_are_increments(found: FileChannel, one: FileStudy, by_pose: PoseMotion
 
 
 def _block_sums(values: Float[np.ndarray, " row"], width: int) -> Float[np.ndarray, " part"]:
-    """Return sums over blocks of `width` rows: single rows are too noisy."""
+    """Return sums over blocks of `width` rows, which are less noisy than single rows."""
     count = len(values) // width
     return values[: count * width].reshape(count, width).sum(axis=1)
 
 
 def pose_over_wheel_speed(one: FileStudy, speed: FileChannel, by_pose: PoseMotion) -> float | None:
-    """Return the ratio of body speed to wheel speed while wheels turn; None without both.
+    """Return the ratio of body speed [m/s] to wheel speed [unit of the file] while wheels turn.
 
-    With wheel speeds in rad/s it is the wheel radius [m] where all wheels point ahead, and near
-    that for other robots.
+    If wheel speeds are in rad/s and all wheels point ahead, it is the wheel radius [m]; for other
+    robots it is close to that. The result is None if poses or wheel speeds are missing.
     """
     if by_pose.time is None or by_pose.x is None or by_pose.y is None or one.clock is None:
         return None
-    # two wheels point ahead: their mean has the sign of the motion; others give its size only
+    # If all wheels point ahead, their mean is the signed motion; else the rms is its magnitude.
     ahead = speed.values.shape[1] <= _ALIGNED_DRIVES
     rows = speed.values.mean(axis=1) if ahead else np.sqrt((speed.values**2).mean(axis=1))
     there = ~(np.isnan(rows) | np.isnan(one.time))
@@ -183,7 +186,7 @@ def pose_over_wheel_speed(one: FileStudy, speed: FileChannel, by_pose: PoseMotio
         return None
     edges = np.linspace(start, end, max(2, int(end - start)))
     by_wheels = np.abs(np.diff(np.interp(edges, time, turned)))
-    # chords instead of the path length along all poses, which noise increases
+    # Distances over long steps are used, since noise of the poses increases their path length.
     x, y = (np.interp(edges, by_pose.time, part) for part in (by_pose.x, by_pose.y))
     chords = np.hypot(np.diff(x), np.diff(y))
     good = by_wheels > 0.3 * by_wheels.max(initial=0.0)
@@ -192,7 +195,7 @@ def pose_over_wheel_speed(one: FileStudy, speed: FileChannel, by_pose: PoseMotio
 
 
 def has_sign(current: FileChannel, speed: FileChannel | None) -> bool | None:
-    """Return whether currents have a sign; None where nothing drove backwards to show it."""
+    """Return whether currents have a sign; None if no wheel drives backwards to show it."""
     values = current.values[~np.isnan(current.values)]
     most = float(np.abs(values).max(initial=0.0))
     if float(values.min(initial=0.0)) < -0.02 * most:
@@ -201,9 +204,9 @@ def has_sign(current: FileChannel, speed: FileChannel | None) -> bool | None:
 
 
 def has_magnitudes(current: FileChannel, speed: FileChannel | None) -> bool:
-    """Return True where currents are positive while wheels drive backwards, as magnitudes are.
+    """Return whether currents are positive while wheels drive backwards, as magnitudes are.
 
-    Files with different rows do not show it.
+    It is False if currents and speeds come from files with different rows, which do not show it.
     """
     if speed is None or speed.values.shape != current.values.shape:
         return False
@@ -214,10 +217,10 @@ def has_magnitudes(current: FileChannel, speed: FileChannel | None) -> bool:
 
 
 def is_battery_voltage(voltages: Sequence[FileChannel], speed: FileChannel | None) -> bool:
-    """Return True where voltages stay up whatever the wheels do, as a battery's voltage does.
+    """Return whether voltages stay high while wheel speeds change, as a battery's voltage does.
 
-    Every run is scaled by its own high quantile: another battery, or another charge, must not look
-    like the changing voltage of a motor.
+    Each run is divided by its 95 % quantile, so that a change of the battery or of its charge
+    between runs does not look like the changing voltage of a motor.
     """
     runs = [one.values[~np.isnan(one.values)] for one in voltages]
     high = [float(np.quantile(np.abs(run), 0.95)) if run.size else 0.0 for run in runs]
@@ -229,19 +232,19 @@ def is_battery_voltage(voltages: Sequence[FileChannel], speed: FileChannel | Non
 
 
 def file_with_pose(studies: tuple[FileStudy, ...]) -> FileStudy | None:
-    """Return the file that has the pose."""
+    """Return the first file with a pose, or None."""
     return next((one for one in studies if one.channels.has_pose), None)
 
 
 @dataclass(frozen=True, eq=False)
 class RunStudy:
-    """The files of a run together.
+    """Study of all files of a run together.
 
     Attributes:
-        robot: answers about the robot, as far as they are known.
-        main: the file with the wheels.
-        all: every file of the run.
-        others: further runs, for what a single run may not show.
+        robot: answers about the robot, with defaults for unknown ones.
+        main: file with the wheels.
+        all: all files of the run.
+        others: studies of further runs, for properties that a single run may not show.
     """
 
     robot: RobotAnswers
@@ -251,22 +254,22 @@ class RunStudy:
 
     @cached_property
     def by_pose(self) -> PoseMotion:
-        """Motion by the pose."""
+        """Return the motion according to the pose."""
         return pose_motion(file_with_pose(self.all))
 
     def find(self, *channels: str) -> FileChannel | None:
-        """Return the first of some channels in any of the files."""
+        """Return the first of some channels that is in one of the files, or None."""
         found = (one.channels.get(name) for name in channels for one in self.all)
         return next((one for one in found if one is not None), None)
 
     @property
     def runs(self) -> tuple["RunStudy", ...]:
-        """This run and the others."""
+        """Return this run and the others."""
         return (self, *self.others)
 
     @cached_property
     def pose_over_wheel_speed(self) -> float | None:
-        """Median over all runs of the ratio of body speed to wheel speed."""
+        """Return the median over all runs of the ratio of body speed to wheel speed, or None."""
         found = []
         for run in self.runs:
             speed = run.main.channels.first(*SPEEDS)
@@ -280,7 +283,7 @@ class RunStudy:
 
     @property
     def has_sign(self) -> bool | None:
-        """Whether currents have a sign in any of the runs; None where none shows it."""
+        """Return whether currents have a sign in some run; None if no run shows it."""
         signs = [
             has_sign(current, run.find(*SPEEDS))
             for run in self.runs
@@ -290,7 +293,10 @@ class RunStudy:
 
     @property
     def of_supply(self) -> bool:
-        """True where currents are the battery's: positive in both directions, negative at times."""
+        """Return whether currents are those of the supply.
+
+        They are then positive in both directions of the wheels, and negative at times.
+        """
         currents = [(run.find(*CURRENTS), run.find(*SPEEDS)) for run in self.runs]
         known = [(current, speed) for current, speed in currents if current is not None]
         both_ways = any(has_magnitudes(current, speed) for current, speed in known)
@@ -298,6 +304,6 @@ class RunStudy:
 
     @property
     def radius(self) -> float | None:
-        """Wheel radius [m], where the user gave it."""
+        """Return the wheel radius [m] if the user gave it, else None."""
         taken = "wheel_radius_m" in self.robot.defaults
         return None if taken else self.robot.wheel_radius_m

@@ -1,7 +1,7 @@
-"""Guess the robot behind logs, and sort log files into runs.
+"""Guess of the robot that drove logged runs, and sorting of log files into runs.
 
-The drive follows from the number of wheels and from sideways motion. Files of published formats are
-recognised, and files that belong to one run are put together.
+The type of drive is guessed from the number of wheels and from sideways motion. Files in published
+formats are recognised, and files of the same run are put together.
 """
 
 from dataclasses import dataclass, replace
@@ -27,19 +27,28 @@ from slipid.data.wheel_signals import body_steps
 from slipid.support.errors import DataError
 
 _SIDEWAYS = 0.3
-"""Share of sideways motion in the path length from which a robot can drive sideways."""
+"""Share of sideways motion above which a robot can drive sideways [1]."""
 
 
 @dataclass(frozen=True)
 class RobotGuess:
-    """A robot, and questions about it that suit the logs."""
+    """Guessed robot, and questions about it that suit the logs and replace the usual ones."""
 
     robot: RobotAnswers
     hints: tuple[RobotHint, ...]
 
 
 def guess_robot(options: RobotOptions, wheels: int, files: tuple[FileStudy, ...]) -> RobotGuess:
-    """Return the robot of the options, completed from the logs; raise `DataError` as in `ask`."""
+    """Return the robot that options describe, completed by guesses from the logs.
+
+    Args:
+        options: command-line options that describe the robot.
+        wheels: number of wheels with columns in the logs.
+        files: studies of the log files.
+
+    Raises:
+        DataError: an option is not valid, or belongs to another type of drive.
+    """
     drive, hint = _likely_drive(wheels, drives_sideways(files))
     drive = options.drive or drive
     if wheels == 2 and drive in ("mecanum", "skid") and options.shared is None:
@@ -53,7 +62,10 @@ def guess_robot(options: RobotOptions, wheels: int, files: tuple[FileStudy, ...]
 
 
 def _likely_drive(wheels: int, aside: bool | None) -> tuple[str, str]:
-    """Return the likeliest drive and the question that remains."""
+    """Return the likeliest type of drive, and the question about it.
+
+    `aside` is whether the robot drives sideways, None if unknown.
+    """
     if wheels == 2:
         return (
             "differential",
@@ -74,7 +86,7 @@ def _likely_drive(wheels: int, aside: bool | None) -> tuple[str, str]:
 
 
 def drives_sideways(files: tuple[FileStudy, ...]) -> bool | None:
-    """Return whether commands or poses show sideways motion; None where neither is known."""
+    """Return whether commands or poses show sideways motion; None if neither is known."""
     for one in files:
         command = one.channels.get("twist_command_y")
         if command is not None and np.nanmax(np.abs(command.values)) > 0:
@@ -95,7 +107,10 @@ def drives_sideways(files: tuple[FileStudy, ...]) -> bool | None:
 
 
 def _two_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
-    """Place wheels in a left and a right row, with an odd one at the back, as a first guess."""
+    """Return answers with wheels placed in a left and a right row, as a first guess.
+
+    If the number is odd, the last wheel is at the back in the middle.
+    """
     pairs = wheels // 2
     places = [
         (0.2 - 0.4 * k / max(pairs - 1, 1), side) for k in range(pairs) for side in (0.15, -0.15)
@@ -113,17 +128,18 @@ def _two_rows(known: RobotAnswers, wheels: int) -> RobotAnswers:
 
 
 _MORE_RUNS = 4
-"""Number of further runs that are studied beside the first."""
+"""Number of further runs that are studied besides the first."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunFiles:
-    """Files of a run: the kind with the wheels, and other files beside it.
+    """Kinds of files that together make runs, with studies of the files of the first run.
 
     Attributes:
-        kind: the files with the wheels.
-        main: study of the first of them.
-        beside: name of each other file, as in `Layout.beside`, with the study of the first.
+        kind: kind of the files with the wheels, one for each run.
+        main: study of the first of these files.
+        beside: name of each further file of a run, as in `Layout.beside`, and its study in the
+            first run.
         others: the same for further runs.
     """
 
@@ -134,12 +150,12 @@ class RunFiles:
 
     @property
     def all(self) -> tuple[FileStudy, ...]:
-        """Every file of the first run."""
+        """Return the studies of all files of the first run."""
         return (self.main, *(one for _, one in self.beside))
 
     @property
     def complete(self) -> bool:
-        """True where the run has wheels and a pose."""
+        """Return whether the run has wheels and a pose."""
         return any(one.channels.wheels for one in self.all) and any(
             one.channels.has_pose for one in self.all
         )
@@ -147,16 +163,16 @@ class RunFiles:
 
 @dataclass(frozen=True, eq=False)
 class SortedFiles:
-    """All files that were found.
+    """All files that were found, sorted.
 
     Attributes:
         root: folder of the files.
-        presets: kinds in a published format, with its name.
-        groups: other kinds as runs.
-        other_kinds: all kinds that are in no published format.
-        hints: comments about published formats that might fit.
-        sentences: lines about files found and left out.
-        no_logs: files that are no logs.
+        presets: kinds of files in a published format, each with the name of its preset.
+        groups: runs made of the other kinds.
+        other_kinds: all kinds that are not in a published format.
+        hints: comments about published formats that may fit.
+        sentences: lines about files that were found or left out.
+        no_logs: files that are not logs.
     """
 
     root: Path
@@ -169,7 +185,10 @@ class SortedFiles:
 
 
 def sort_files(path: Path) -> SortedFiles:
-    """Return all files that belong to the file or folder that the user named."""
+    """Return the log files at a path, sorted.
+
+    If the path is a file without wheels or pose, files beside it are taken into account.
+    """
     if path.is_dir():
         formats, no_logs = formats_below(path)
         root, kinds = path, file_kinds(formats)
@@ -205,7 +224,7 @@ def sort_files(path: Path) -> SortedFiles:
 
 
 def _siblings(path: Path, kind: FileKind) -> list[tuple[FileKind, FileStudy]]:
-    """Return files of other kinds beside one that lacks wheels or a pose."""
+    """Return the files of other kinds in the folder of a file, each with its study."""
     near = [p for p in sorted(path.parent.iterdir()) if p.is_file() and p.suffix in SUFFIXES]
     out = []
     for other in near:
@@ -223,11 +242,11 @@ def _is_complete(one: FileStudy) -> bool:
 
 
 def _run_files(kinds: list[tuple[FileKind, FileStudy]]) -> tuple[list[RunFiles], list[str]]:
-    """Return a run for each kind with wheels and the kinds beside it, and lines about the rest."""
+    """Return runs of each kind with wheels and the kinds beside it, and lines about the rest."""
     mains = [pair for pair in kinds if pair[1].channels.wheels] or kinds[:1]
     rest = [pair for pair in kinds if pair not in mains]
     if len(mains) > 1 and not any(_is_complete(one) for _, one in mains):
-        # the same wheels in two files: the one with the better channel leads
+        # Several kinds have wheels but none has a pose as well: the first kind is the main one.
         mains, more = mains[:1], mains[1:]
         rest = more + rest
     groups, used = [], []
@@ -241,7 +260,7 @@ def _run_files(kinds: list[tuple[FileKind, FileStudy]]) -> tuple[list[RunFiles],
             if pattern is None or not fresh or one.clock is None or main.clock is None:
                 continue
             if max(main.time[0], one.time[0]) >= min(main.time[-1], one.time[-1]):
-                continue  # files of one run cover the same time
+                continue  # the files cannot be of one run, since their times do not overlap
             beside.append((pattern, one))
             have |= fresh
             used.append(other)
@@ -253,7 +272,7 @@ def _run_files(kinds: list[tuple[FileKind, FileStudy]]) -> tuple[list[RunFiles],
 
 
 def _more_runs(group: RunFiles) -> tuple[RunFiles, ...]:
-    """Return further runs of a kind, spread evenly over all of them."""
+    """Return further runs of the same kinds, spread evenly over all runs."""
     count = len(group.kind.formats)
     chosen = sorted({k * count // (_MORE_RUNS + 1) for k in range(1, _MORE_RUNS + 1)} - {0})
     out = []
@@ -266,7 +285,7 @@ def _more_runs(group: RunFiles) -> tuple[RunFiles, ...]:
             beside = tuple((name, study_file(format_of(path))) for name, path in names)
             out.append(RunFiles(group.kind, study_file(format), beside))
         except DataError:
-            continue  # the reader will report this run; the first one is enough here
+            continue  # the error is reported when the run is read; other runs are enough here
     return tuple(out)
 
 

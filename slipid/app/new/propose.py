@@ -1,4 +1,4 @@
-"""Propose a config for a log or a folder of logs."""
+"""Proposal of a config for a log or a folder of logs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,10 +29,14 @@ _FLOOR = "on which floor was {} driven? Its name, or folder where folders are ca
 
 
 def propose(path: Path, options: RobotOptions) -> ConfigProposal:
-    """Return the config proposed for a log or a folder of logs.
+    """Return the proposed config for a log or a folder of logs.
+
+    Args:
+        path: the log or folder.
+        options: command-line options that describe the robot.
 
     Raises:
-        DataError: there is no log, or an option is not valid.
+        DataError: there is no log, an option is not valid, or the log is of a motor on a bench.
     """
     if not path.exists():
         raise DataError(f"{path}: no such file or folder; expected a log, or a folder of logs")
@@ -118,7 +122,7 @@ def _name(number: int) -> str:
 
 
 def _logs(found: SortedFiles) -> list[LogsDraft]:
-    """Return a section for each glob; sections without wheels or pose are commented out."""
+    """Return a log section for each glob; those without wheels or a pose are commented out."""
     named = [(kind, name) for kind, name in found.presets]
     named += [(group.kind, _name(k)) for k, group in enumerate(found.groups)]
     every = {path for kind, _ in named for path in kind.paths}
@@ -140,13 +144,16 @@ def _logs(found: SortedFiles) -> list[LogsDraft]:
             )
     if all(
         one.commented_out for one in out
-    ):  # a config has one section at least; the layout asks for a pose
+    ):  # a config must have at least one section; its layout asks for what is missing
         return [replace(one, commented_out=False, above=()) for one in out]
     return sorted(out, key=lambda one: one.commented_out)
 
 
 def _checked_by_reader(draft: ConfigDraft, found: SortedFiles, wheels: int) -> ConfigDraft:
-    """Return the draft with the reader's error about the first file of each layout, if any."""
+    """Return the draft, with questions about problems in reading the first file of each layout.
+
+    `wheels` is the number of wheels with columns in the logs.
+    """
     drives = geometry(robot_of(draft.robot)).drives
     layouts = []
     for layout, group in zip(draft.layouts, found.groups, strict=True):
@@ -160,9 +167,9 @@ def _checked_by_reader(draft: ConfigDraft, found: SortedFiles, wheels: int) -> C
 
 
 def _bags_checked(draft: ConfigDraft, first: Path) -> ConfigDraft:
-    """Return the draft with the reader's error about the first bag, if there is one.
+    """Return the draft for bags, with a question about a problem in reading the first bag, if any.
 
-    A bag with one long drive and pauses is cut at the pauses, and its runs share a session.
+    If the wheels pause in the bag, it is separated into runs at the pauses, in one session.
     """
     (bag,) = draft.bags
     tried = _read_first(draft, bag.name, first)
@@ -180,14 +187,20 @@ def _bags_checked(draft: ConfigDraft, first: Path) -> ConfigDraft:
 
 @dataclass(frozen=True)
 class _ReadResult:
-    """Runs that the reader made of a file, or the reason why it refused it."""
+    """Result of reading a file: its runs, or else the reader's error."""
 
     logs: tuple[Log, ...] = ()
     problem: str = ""
 
 
 def _read_first(draft: ConfigDraft, name: str, path: Path) -> _ReadResult:
-    """Read the first file of a layout with the draft's config."""
+    """Return the result of reading a file with the draft's config.
+
+    Args:
+        draft: the draft.
+        name: name of the layout.
+        path: first file of the layout.
+    """
     try:
         config = parsed(Path("robot.toml"), new_config(draft, "robot.toml").text)
         section = next((one for one in config.content.logs if one.format == name), None)

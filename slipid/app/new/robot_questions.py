@@ -1,4 +1,4 @@
-"""Questions about a robot, its drive first, and the parsing of their answers."""
+"""Questions about a robot, of which the type of drive is the first, and parsing of the answers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
@@ -15,15 +15,16 @@ from slipid.app.config import (
 from slipid.support.errors import DataError, did_you_mean
 
 Asker = Callable[[str, str, str], str]
-"""Asks the user. Arguments: question, default, and what was wrong with the last answer.
+"""Function that asks the user, and returns the answer or the default.
 
-Returns the answer, or the default.
+Its arguments are the question, the default, and a message about what was wrong with the previous
+answer (empty at first).
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotOptions:
-    """Command-line options that describe a robot, as text; None where they are not given."""
+    """Command-line options that describe a robot, as texts; None for options not given."""
 
     drive: str | None = None
     wheels: str | None = None
@@ -43,7 +44,7 @@ class RobotOptions:
 
 @dataclass(frozen=True)
 class RobotAnswers:
-    """Answers about a robot, given by the user or taken by default."""
+    """Answers about a robot, from the user or by default; units are in the names."""
 
     drive: str = "omni"
     wheels: int = 3
@@ -60,11 +61,14 @@ class RobotAnswers:
     mass_kg: float = 10.0
     ticks_per_revolution: float = 1000.0
     defaults: frozenset[str] = field(default_factory=frozenset)
-    """What nobody said: a default stands there."""
+    """Names of the attributes that have a default value because there was no answer."""
 
 
 def positive(text: str, _: RobotAnswers) -> float:
-    """Return a number above 0; like all parsers below it raises `ValueError` for any other text."""
+    """Return a number above 0 from a text.
+
+    Like all parsers below, it raises `ValueError` for any other text.
+    """
     value = number(text)
     if not 0 < value < float("inf"):
         raise ValueError("expected a number above 0")
@@ -72,7 +76,7 @@ def positive(text: str, _: RobotAnswers) -> float:
 
 
 def not_negative(text: str, _: RobotAnswers) -> float:
-    """Return a number that is 0 or more."""
+    """Return a number that is 0 or more from a text."""
     value = number(text)
     if not 0 <= value < float("inf"):
         raise ValueError("expected a number above 0, or 0 where there is none")
@@ -80,7 +84,7 @@ def not_negative(text: str, _: RobotAnswers) -> float:
 
 
 def number(text: str) -> float:
-    """Return any number."""
+    """Return the number in a text."""
     try:
         return float(text.strip().replace("_", "?"))
     except ValueError:
@@ -89,14 +93,14 @@ def number(text: str) -> float:
 
 
 def count(text: str, _: RobotAnswers) -> int:
-    """Return a number of wheels."""
+    """Return a number of wheels, from 3 to 12, from a text."""
     if not text.strip().isdecimal() or not 3 <= int(text) <= 12:
         raise ValueError("expected a whole number from 3 to 12")
     return int(text)
 
 
 def yes(text: str, _: RobotAnswers) -> bool:
-    """Return True for yes and False for no."""
+    """Return True for the text yes and False for no."""
     word = text.strip().lower()
     if word not in ("y", "yes", "true", "n", "no", "false"):
         raise ValueError("expected yes or no")
@@ -104,7 +108,7 @@ def yes(text: str, _: RobotAnswers) -> bool:
 
 
 def angles(text: str, answers: RobotAnswers) -> tuple[float, ...]:
-    """Return an angle for every wheel [deg]."""
+    """Return an angle for every wheel [deg] from a text with numbers separated by commas."""
     found = tuple(number(part) for part in text.replace(";", ",").split(","))
     if len(found) != answers.wheels:
         raise ValueError(f"{len(found)} angles; expected {answers.wheels}, one per wheel")
@@ -112,7 +116,7 @@ def angles(text: str, answers: RobotAnswers) -> tuple[float, ...]:
 
 
 def places(text: str, _: RobotAnswers) -> tuple[tuple[float, ...], ...]:
-    """Return the places of at least two wheels [m]."""
+    """Return the places x, y of at least two wheels [m] from a text such as `0.2,0.1; 0.2,-0.1`."""
     found = tuple(tuple(number(c) for c in part.split(",")) for part in text.split(";"))
     if len(found) < 2 or any(len(place) != 2 for place in found):
         raise ValueError("expected x, y of each wheel, as in: 0.2, 0.1; 0.2, -0.1; -0.2, 0")
@@ -120,7 +124,10 @@ def places(text: str, _: RobotAnswers) -> tuple[tuple[float, ...], ...]:
 
 
 def rollers(text: str, answers: RobotAnswers) -> tuple[float | None, ...]:
-    """Return the roller angle of every wheel [deg], None for a wheel without rollers."""
+    """Return the roller angle of every wheel [deg] from a text such as `45,none`.
+
+    The angle is None for a wheel without rollers.
+    """
     words = [part.strip().lower() for part in text.replace(";", ",").split(",")]
     if len(words) != answers.wheels:
         raise ValueError(f"{len(words)} rollers; expected {answers.wheels}, one per wheel")
@@ -132,10 +139,10 @@ class RobotQuestion:
     """One question about a robot.
 
     Attributes:
-        name: attribute of `RobotOptions` and `RobotAnswers` that it fills.
-        text: the question.
-        default: default answer, which may depend on earlier answers.
-        read: parses an answer; its `ValueError` says what is expected.
+        name: name of the attribute of `RobotOptions` and `RobotAnswers` for the answer.
+        text: text of the question.
+        default: default answer, or a function that returns it from the earlier answers.
+        read: function that parses an answer; its `ValueError` says what is expected.
     """
 
     name: str
@@ -145,7 +152,7 @@ class RobotQuestion:
 
     @property
     def option(self) -> str:
-        """Command-line option that answers it."""
+        """Return the command-line option that answers the question."""
         return "--" + self.name.replace("_", "-")
 
 
@@ -161,7 +168,7 @@ def _drive(text: str, _: RobotAnswers) -> str:
 
 
 def _even_azimuths(answers: RobotAnswers) -> str:
-    """Return azimuths of evenly spread wheels, none of them straight ahead."""
+    """Return the text of azimuths [deg] of evenly spread wheels, none of them straight ahead."""
     return ", ".join(f"{(k + 0.5) * 360 / answers.wheels:g}" for k in range(answers.wheels))
 
 
@@ -227,19 +234,21 @@ DRIVES: dict[str, tuple[RobotQuestion, ...]] = {
     "differential": (_TRACK,),
     "general": (_PLACES, _DIRECTIONS, _ROLLERS),
 }
-"""Questions of each drive in order; those in `COMMON` come after them."""
+"""Questions about each type of drive, in order; they are followed by those in `COMMON`."""
 
 
 def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> RobotAnswers:
-    """Return all answers that a drive needs: from an option, else from the user, else a default.
+    """Return all answers about a robot.
+
+    Each answer comes from an option, else from the user, else it is the default.
 
     Args:
-        options: answers given beforehand.
-        asker: asks the user, again after a wrong answer; None takes defaults.
-        drive: default drive.
+        options: answers given on the command line.
+        asker: function that asks the user, again after a wrong answer; None to take defaults.
+        drive: default type of drive.
 
     Raises:
-        DataError: an option is no valid answer, or belongs to another drive.
+        DataError: an option is not a valid answer, or belongs to another type of drive.
     """
     answers = _with_question(
         RobotAnswers(drive=drive), replace(DRIVE, default=drive), options, asker
@@ -263,7 +272,7 @@ def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> Robo
 def _refuse_other_drives(
     options: RobotOptions, drive: str, questions: tuple[RobotQuestion, ...]
 ) -> None:
-    """Raise `DataError` for an option that this drive would silently ignore."""
+    """Raise `DataError` for an option that this type of drive would ignore."""
     wanted = {"drive", *(question.name for question in questions)}
     for one in fields(options):
         if getattr(options, one.name) is not None and one.name not in wanted:
@@ -276,7 +285,7 @@ def _refuse_other_drives(
 def _with_question(
     answers: RobotAnswers, question: RobotQuestion, options: RobotOptions, asker: Asker | None
 ) -> RobotAnswers:
-    """Return the answers with the answer to one more question."""
+    """Return the answers, with the answer to one more question added."""
     text = getattr(options, question.name)
     if text is not None:
         try:
@@ -297,13 +306,17 @@ def _with_question(
 
 
 def _with_answer(answers: RobotAnswers, question: RobotQuestion, text: str) -> RobotAnswers:
-    """Return the answers with one parsed from a text; raise `ValueError` where it is not valid."""
+    """Return the answers, with one added that is parsed from a text.
+
+    Raises:
+        ValueError: the text is not a valid answer.
+    """
     more: dict[str, Any] = {question.name: question.read(text, answers)}
     return replace(answers, **more)
 
 
 def robot_of(answers: RobotAnswers) -> Wheels:
-    """Return the `[robot]` section; raise `DataError` where the answers make no robot."""
+    """Return the section `[robot]`; raise `DataError` if the answers describe no possible robot."""
     sizes = {
         "drive": answers.drive,
         "wheel_radius_m": answers.wheel_radius_m,

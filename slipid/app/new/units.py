@@ -1,4 +1,4 @@
-"""Guess units that no name gives, from how often robots log and how fast they move."""
+"""Guesses of units that are not in column names, from plausible rates of logs and robot speeds."""
 
 from dataclasses import dataclass
 
@@ -9,21 +9,28 @@ from slipid.data.reading.layout import CHANNELS
 from slipid.data.reading.units import factor
 
 _SECONDS = (1e9, 4e9)
-"""Plausible range of time stamps of robots [s since 1970]."""
+"""Plausible range of the time stamps of robots [s], counted from 1970."""
 _CLOCKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _STEPS = (2e-4, 2.5)
-"""Plausible time between rows of a log [s]."""
+"""Plausible range of the time between rows of a log [s]."""
 FAST = 12.0
-"""Speed above which a unit is not plausible [m/s]."""
+"""Largest plausible speed of a robot [m/s]; a unit that implies a higher one is wrong."""
 RADII = (0.012, 0.6)
 """Plausible range of wheel radii [m]."""
 _TURNED, _NEAR_TURN = 0.5, 5.0
-"""Least turn [rad] from which a turn rate decides a heading's unit, and its error factor."""
+"""Range of the integrated turn rate above which it decides the unit of a heading [rad], and factor
+by which the two ranges may then differ [1]."""
 
 
 @dataclass(frozen=True)
 class UnitGuess:
-    """A unit, the reason for it, and the question that remains."""
+    """Guess of a unit.
+
+    Attributes:
+        unit: the unit.
+        reason: reason for it, a comment in the config; empty if there is none.
+        doubt: question to the user about it; empty if there is none.
+    """
 
     unit: str
     reason: str = ""
@@ -31,7 +38,7 @@ class UnitGuess:
 
 
 def time_unit(values: Float[np.ndarray, " row"]) -> UnitGuess:
-    """Return the unit of time, from stamps since 1970 or else from the steps."""
+    """Return a guess of the unit of time: from stamps that count from 1970, else from the steps."""
     first = float(np.nanmin(np.abs(values)))
     for unit, per in _CLOCKS.items():
         if _SECONDS[0] < first / per < _SECONDS[1]:
@@ -51,7 +58,10 @@ def time_unit(values: Float[np.ndarray, " row"]) -> UnitGuess:
 def position_unit(
     time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]
 ) -> UnitGuess:
-    """Return the unit of a position, from the speed that it implies; `time` is in s."""
+    """Return a guess of the unit of positions x, y, from the speed that they imply.
+
+    `time` is in seconds.
+    """
     speed, size = speed_of(time, x, y), float(np.nanmax(np.abs([x, y])))
     if speed < FAST and size < 200:
         return UnitGuess("m", f"at most {speed:.2g} m/s")
@@ -66,7 +76,10 @@ def position_unit(
 def speed_of(
     time: Float[np.ndarray, " row"], x: Float[np.ndarray, " row"], y: Float[np.ndarray, " row"]
 ) -> float:
-    """Return the 90 % quantile of the speed over steps of one second, which averages noise."""
+    """Return the 90 % quantile of the speed [unit of x and y per s].
+
+    Speeds are over steps of about one second, which average noise.
+    """
     there = ~(np.isnan(x) | np.isnan(y) | np.isnan(time))
     time, x, y = time[there], x[there], y[there]
     if len(time) < 3:
@@ -81,10 +94,11 @@ def speed_of(
 
 
 def heading_unit(values: Float[np.ndarray, " row"], turned: float = 0.0) -> UnitGuess:
-    """Return the unit of a heading, from its jumps at a full turn, else from its size.
+    """Return a guess of the unit of a heading: from jumps by a full turn, else from its range.
 
     Args:
-        turned: range of the heading by a gyro or by commands [rad]; 0 where there are none.
+        values: headings as in the file.
+        turned: range of the heading, integrated from a gyro or commands [rad]; 0 without them.
     """
     known = values[~np.isnan(values)]
     jump, most = float(np.abs(np.diff(known)).max(initial=0.0)), float(np.abs(known).max(initial=0))
@@ -108,11 +122,12 @@ def heading_unit(values: Float[np.ndarray, " row"], turned: float = 0.0) -> Unit
 
 
 def speed_unit(ratio: float | None, radius: float | None) -> UnitGuess:
-    """Return the unit of wheel speeds, from the motion of the pose and a given radius, if known.
+    """Return a guess of the unit of wheel speeds, from the speed of the pose.
 
     Args:
-        ratio: speed of the pose over that of the wheels [m/s over their unit].
-        radius: wheel radius [m], divided by the gear ratio for motor speeds.
+        ratio: speed of the pose [m/s] over that of the wheels [unit of the file], times the gear
+            ratio for motor speeds; None if unknown.
+        radius: wheel radius [m], or None if it is unknown.
     """
     options = "rad/s, rpm or deg/s; or m/s at the rim: then divide by the radius with scale"
     if ratio is None:
@@ -134,7 +149,7 @@ def speed_unit(ratio: float | None, radius: float | None) -> UnitGuess:
 
 
 def angle_unit(ratio: float | None, radius: float | None) -> UnitGuess:
-    """Return the unit of wheel angles; arguments as in `speed_unit`."""
+    """Return a guess of the unit of wheel angles; the arguments are those of `speed_unit`."""
     if ratio is None:
         return UnitGuess("rad", doubt="radians, degrees, turns or ticks?")
     low, high = RADII if radius is None else (radius / 2, radius * 2)
@@ -145,19 +160,19 @@ def angle_unit(ratio: float | None, radius: float | None) -> UnitGuess:
 
 
 def usual_unit(channel: str) -> UnitGuess:
-    """Return the unit of channels that are almost always logged in SI."""
+    """Return the unit of a channel that is almost always logged in SI units (or ticks)."""
     return UnitGuess({"wheel_ticks": "tick"}.get(channel, CHANNELS[channel]))
 
 
 def current_unit(most: float) -> UnitGuess:
-    """Return the unit of currents from their largest value."""
+    """Return a guess of the unit of currents, from their largest magnitude."""
     if most > 120:
         return UnitGuess("mA", f"up to {most:.4g}")
     return UnitGuess("A", f"up to {most:.3g}")
 
 
 def duty_unit(most: float) -> UnitGuess:
-    """Return the unit of duty cycles from their largest value."""
+    """Return a guess of the unit of duty cycles, from their largest magnitude."""
     if most <= 1.05:
         return UnitGuess("1", f"up to {most:.3g}")
     if most <= 105:

@@ -1,1 +1,1 @@
-"""What a config may say, from the docstrings and types that check it: one source for all help."""
+"""Reference of the keys of a config, made from the docstrings and types of its models."""

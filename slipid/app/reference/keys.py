@@ -1,7 +1,7 @@
-"""Explain config keys and parameters in words, from the code that checks them.
+"""Descriptions of config keys and parameters in words, made from the code that checks them.
 
-The meaning of a key is its line in the docstring of the class that declares it, and its possible
-values follow from the type. A parameter has its unit, meaning and default prior.
+The meaning of a key is its line in the docstring of the class that declares it; its possible values
+follow from its type. The unit, meaning and default prior of a parameter are in its declaration.
 """
 
 import inspect
@@ -33,7 +33,7 @@ _NEXT_ATTRIBUTE = re.compile(r"; (?=[a-z_0-9]+: )")
 
 @lru_cache(maxsize=64)
 def meanings(kind: type) -> dict[str, str]:
-    """Return the meaning of each key of a model or a dataclass, inherited ones included."""
+    """Return the meaning of each key of a model or a dataclass, including inherited keys."""
     found: dict[str, str] = {}
     for one in reversed(kind.__mro__):
         if one.__doc__ and (issubclass(one, BaseModel) or is_dataclass(one)):
@@ -42,7 +42,7 @@ def meanings(kind: type) -> dict[str, str]:
 
 
 def meaning(kind: type, key: str) -> str:
-    """Return the meaning of one key; raise `KeyError` where its class does not explain it."""
+    """Return the meaning of one key; raise `KeyError` if its class does not explain it."""
     found = meanings(kind)
     if key not in found:
         raise KeyError(f"the docstring of {kind.__name__} has no attribute line for '{key}'")
@@ -50,25 +50,28 @@ def meaning(kind: type, key: str) -> str:
 
 
 def in_short(kind: type, key: str) -> str:
-    """Return the meaning up to its first full stop, colon or semicolon, for a short comment."""
+    """Return the meaning of a key up to its first full stop, colon or semicolon."""
     return re.split(r"[.:;](?= |$)", meaning(kind, key))[0]
 
 
 def purpose(kind: type) -> str:
-    """Return the docstring of a class before its attributes."""
+    """Return the docstring of a class without its list of attributes."""
     text = inspect.cleandoc(kind.__doc__ or "").split("\n\nAttributes:")[0]
     return " ".join(text.split())
 
 
 def keys(kind: type) -> dict[str, str]:
-    """Return attributes in the order of declaration, with their keys as a config spells them."""
+    """Return the key, as a config spells it, by attribute of a model or a dataclass.
+
+    Attributes are in the order of declaration.
+    """
     if issubclass(kind, BaseModel):
         return {name: field.alias or name for name, field in kind.model_fields.items()}
     return {field.name: field.name for field in fields(kind)} if is_dataclass(kind) else {}
 
 
 def _attributes(docstring: str) -> dict[str, str]:
-    """Return lines `key: text` below `Attributes:`, with their indented continuations."""
+    """Return the text of each attribute in the list below `Attributes:` of a docstring."""
     _, _, block = inspect.cleandoc(docstring).partition("Attributes:\n")
     found: dict[str, str] = {}
     names: tuple[str, ...] = ()
@@ -88,7 +91,7 @@ def _attributes(docstring: str) -> dict[str, str]:
 
 
 def _split_line(key: str, text: str) -> list[tuple[str, str]]:
-    """Return the attributes of a shared line: `mean: its centre; std: its width`."""
+    """Return the (name, text) of each attribute in a line such as `mean: centre; std: width`."""
     first, *others = _NEXT_ATTRIBUTE.split(text)
     pairs = [(key, first)]
     for other in others:
@@ -98,7 +101,7 @@ def _split_line(key: str, text: str) -> list[tuple[str, str]]:
 
 
 FLOOR, SESSION = "FLOOR", "SESSION"
-"""Placeholders for names that only the logs give."""
+"""Placeholders for the names of floors and sessions, which only the logs have."""
 
 
 @dataclass(frozen=True)
@@ -106,14 +109,14 @@ class ParameterRow:
     """Description of a parameter in words.
 
     Attributes:
-        path: its path name.
-        size: how many numbers it has.
-        symbol: its symbol in the equations.
-        unit: its unit.
-        means: its meaning.
-        start: its start value where nothing else is known.
-        prior: its default prior, or that it is not fitted.
-        here: the config's choice for it.
+        path: path of the parameter, by which a config names it.
+        size: number of its entries.
+        symbol: symbol in the equations.
+        unit: unit of its values.
+        means: meaning of the parameter.
+        start: declared start value.
+        prior: default prior, or that the parameter is not fitted.
+        here: choice for the parameter in the config; empty if there is none.
     """
 
     path: str
@@ -161,7 +164,7 @@ def _row(
 
 
 def prior(one: Declaration) -> str:
-    """Return the default prior in words: its width where it is fitted, else what it would be."""
+    """Return the default prior of a parameter in words, with a remark if it is not fitted."""
     if one.shares:
         width = f"shares around an even load, log-std {one.spread:g}"
     elif one.deviation:
@@ -177,7 +180,7 @@ def prior(one: Declaration) -> str:
 
 
 def _setting_text(choice: ParameterSection) -> str:
-    """Return a config's choice for a parameter in words."""
+    """Return the choice that a config has for a parameter, in words."""
     if choice.fixed is not None:
         return f"fixed = {choice.fixed}"
     parts = [] if choice.start is None else [f"start = {choice.start}"]
@@ -218,7 +221,7 @@ def keys_of(kind: type, hidden: tuple[str, ...] = ()) -> list[ConfigKey]:
             continue
         hint = hints[name]
         limits = tuple(kind.model_fields[name].metadata) if issubclass(kind, BaseModel) else ()
-        # the type of a drive lists its few values, which need no meaning
+        # The type of the key `drive` lists its few values, so its meaning need not be explained.
         listed = key == "drive" and get_origin(hint) is Literal
         means = "" if listed else meaning(kind, key)
         found.append(ConfigKey(key, in_words(hint, limits), _default(kind, name), means))
@@ -226,7 +229,7 @@ def keys_of(kind: type, hidden: tuple[str, ...] = ()) -> list[ConfigKey]:
 
 
 def in_words(hint: object, limits: tuple[object, ...] = ()) -> str:
-    """Return a type in words."""
+    """Return a type in words, with limits such as "> 0"."""
     origin, inside = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return in_words(inside[0], (*limits, *inside[1:]))
@@ -247,10 +250,10 @@ def in_words(hint: object, limits: tuple[object, ...] = ()) -> str:
 
 
 def _list(inside: tuple[object, ...], limits: tuple[object, ...]) -> str:
-    """Return a list type in words, with the number of members where it is fixed."""
+    """Return a list type in words, with the number of its members if that is fixed."""
     members = [one for one in inside if one is not Ellipsis]
     element = in_words(members[0])
-    # one alone may be written without the list
+    # With a validator that makes tuples, a single member may be written without a list.
     alone = any(type(limit).__name__ == "BeforeValidator" for limit in limits)
     counted = len(members) > 1 and Ellipsis not in inside
     many = f"{len(members)} " if counted else _length_text(limits)
@@ -278,12 +281,12 @@ def _limits(limits: tuple[object, ...]) -> str:
 
 
 def _unpacked(limits: tuple[object, ...]) -> list[object]:
-    """Return limits in `Field(...)` together with those that stand alone."""
+    """Return all limits of a type, those inside `Field(...)` included."""
     return [m for one in limits for m in (one.metadata if isinstance(one, FieldInfo) else [one])]
 
 
 def _default(kind: type, name: str) -> str:
-    """Return the default in words; "required" where there is none."""
+    """Return the default of a key in words, or "required" if there is none."""
     if issubclass(kind, BaseModel):
         field = kind.model_fields[name]
         value = field.get_default(call_default_factory=True)

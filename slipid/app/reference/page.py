@@ -1,4 +1,4 @@
-"""Write the reference of configs as Markdown, from the models that check configs."""
+"""The reference of configs as Markdown text, made from the models that check configs."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ _DRIVES: tuple[tuple[type[c.Wheels], str, dict[str, object]], ...] = (
     ),
     (c.DifferentialDrive, "differential", {"track_m": 0.3}),
 )
-"""Drives with an example robot to draw."""
+"""Model, name and sizes of an example robot for each type of drive that the reference draws."""
 _SECTIONS: tuple[tuple[str, type], ...] = (
     ("[[logs]]", c.LogsSection),
     ("[camera]", c.CameraSection),
@@ -37,14 +37,23 @@ _SECTIONS: tuple[tuple[str, type], ...] = (
 
 @dataclass(frozen=True)
 class Chapter:
-    """Part of the reference that can be requested by its name."""
+    """Part of the reference that can be requested by its name.
+
+    Attributes:
+        name: name of the part.
+        text: function that returns the text, for the robot of a config if one is given.
+    """
 
     name: str
     text: Callable[["c.Config | None"], str]
 
 
 def reference(what: str | None = None, config: "c.Config | None" = None) -> str:
-    """Return the reference, or a part of it; for a config's robot, where one is given.
+    """Return the reference of configs as Markdown.
+
+    Args:
+        what: name of the part to return; None for the whole reference.
+        config: config whose robot's parameters are listed, or None.
 
     Raises:
         DataError: no part has this name.
