@@ -1,1 +1,1 @@
-"""From a fit or a posterior to the robot's record, and to exported folders."""
+"""Conversion of a fit or a posterior to the robot's record, and export of folders for a robot."""

@@ -1,4 +1,4 @@
-"""Estimator and controller by name: the rows of a trial, and the choices of an export."""
+"""Combinations of estimator and controller by name: rows of a trial and choices of an export."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -21,16 +21,19 @@ PAPER_WHEELS = 3
 
 @dataclass(frozen=True)
 class ControllerRow:
-    """One choice of estimator and controller.
+    """A combination of estimator and controller.
 
     Attributes:
-        observer: `encoder`, `curve` (slip by current, wheel by wheel) or `contact`.
-        about: one sentence for people.
+        observer: estimator: `encoder` (odometry without slip), `curve` (odometry with slip by
+            current, wheel by wheel) or `contact` (`slipid.Estimator`).
+        about: description for people.
         correction: torque correction of the 2021 paper.
-        law: published law that replaces the pose loop, made for a robot.
-        tuned: whether it uses the tuned gains of robot.json where they are better than by hand.
+        law: function that makes, for a robot, a published law that replaces the pose loop; None
+            for the pose loop.
+        tuned: whether it uses the tuned gains of robot.json where they are better than those set by
+            hand.
         gyro: whether the robot has a gyro.
-        mapped: whether the estimator has the map of its floors.
+        mapped: whether the estimator has the map of the site's floors.
     """
 
     observer: str
@@ -42,7 +45,10 @@ class ControllerRow:
     mapped: bool = False
 
     def drives(self, robot: DeployedRobot) -> bool:
-        """Return whether it applies: torque corrections have gains for three wheels only."""
+        """Return whether the row applies to a robot.
+
+        Torque corrections have gains for three wheels only.
+        """
         return self.correction == "none" or robot.wheels == PAPER_WHEELS
 
 
@@ -73,8 +79,8 @@ def control_loop_of(
 ) -> ControlLoop[eqx.Module]:
     """Return the control loop of a row for a robot.
 
-    Rows with tuned gains use them where they are better than those by hand, or if `forced`. `floor`
-    is the map for rows that use one.
+    Rows with tuned gains use them if they are better than those set by hand, or if `forced`.
+    `floor` is the map for rows that use one.
 
     Raises:
         DataError: the row does not apply to the robot's wheels.

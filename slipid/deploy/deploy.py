@@ -1,4 +1,4 @@
-"""From a fit, its posterior or a fitted force balance to robot.json, which the robot needs."""
+"""Conversion of a fit, a posterior or a fitted force balance to robot.json."""
 
 import glob
 import json
@@ -38,14 +38,14 @@ NO_CONTROLLER = (
 DRAWS = 64
 """Number of posterior draws in robot.json."""
 SOURCE: dict[type, Source] = {Fit: "laplace", Posterior: "posterior"}
-"""Origin of a robot's intervals, by the class that it was deployed from."""
+"""Method that a robot's intervals come from, by the class that the robot was deployed from."""
 
 
 def deploy(found: Fit | Posterior) -> DeployedRobot:
     """Return the robot of a fit or of its posterior, with its first load set-up.
 
-    Its numbers are those of `identified.json`: of the posterior where there is one, else of the
-    fit's Laplace approximation. `DeployedRobot.record.source` tells which.
+    Its numbers are those of `identified.json`. They come from the posterior if there is one, else
+    from the fit's Laplace approximation; `DeployedRobot.record.source` names the method.
     """
     numbers = found.parameters
     if isinstance(found, Posterior):
@@ -91,10 +91,10 @@ def robot_of_force_balance(
     Args:
         contact: fitted force balance.
         highest_speed: highest wheel speed of the fitted runs [rad/s].
-        current_trend: trend of the currents in the fitted runs, see
-            `slipid.infer.slip_curves.current_trend`.
+        current_trend: a and b of a + b v, by which measured currents exceed the model's at speed v
+            [A, A s/m], see `slipid.infer.slip_curves.current_trend`.
         sensors: sensors of the logs; none by default.
-        load: load set-up, the first one by default.
+        load: name of the load set-up, by default the first one.
     """
     vectors = draws(contact.z, contact.covariance, DRAWS, seed=0)
     numbers = given_numbers(contact.robot)
@@ -114,7 +114,10 @@ def _record(
     current_trend: Pair,
     seen: Mapping[str, Validity] = MappingProxyType({}),
 ) -> RobotRecord:
-    """Return the record of a robot; `center` and `vectors` are search vectors of its posterior."""
+    """Return the record of a robot.
+
+    `center` is the search vector of its numbers, and `vectors` are posterior draws of it.
+    """
     return robot_record(
         robot,
         numbers,
@@ -128,9 +131,9 @@ def _record(
 
 
 def write_robot(out: Path, found: Fit | Posterior) -> tuple[str, ...]:
-    """Write robot.json beside a fit; return the names of the files written."""
+    """Write robot.json into the folder of a fit; return the names of the files written."""
     robot, path = deploy(found), out / ROBOT
-    with suppress(DataError):  # tuned gains stay valid while the numbers are the same
+    with suppress(DataError):  # keep tuned gains if the robot's numbers have not changed
         before = DeployedRobot.load(path).record if path.is_file() else robot.record
         if before.numbers == robot.record.numbers:
             robot = DeployedRobot.of(replace(robot.record, gains=before.gains))
@@ -142,7 +145,8 @@ def read_robot(out: Path, load: str | None = None) -> DeployedRobot:
     """Return the robot of a folder, which must be able to drive with a controller.
 
     Raises:
-        DataError: there is none, its wheels have no controller, or as in `DeployedRobot.load`.
+        DataError: the folder has no robot, its wheels have no controller, or reading it fails as
+            in `DeployedRobot.load`.
     """
     path = out / ROBOT
     if not path.is_file():
@@ -153,7 +157,7 @@ def read_robot(out: Path, load: str | None = None) -> DeployedRobot:
 
 
 def require_steering(path: Path, robot: DeployedRobot) -> DeployedRobot:
-    """Return the robot of a file; raise `DataError` where its wheels have no controller."""
+    """Return the robot, read from `path`; raise `DataError` if its wheels have no controller."""
     if not robot.steers:
         raise DataError(f"{path}: {NO_CONTROLLER}")
     return robot
@@ -166,19 +170,19 @@ def actuator_model_of(robot: DeployedRobot, gyro: bool) -> ActuatorModel:
 
 
 def _at(robot: Robot, numbers: Mapping[str, Estimate]) -> Robot:
-    """Return the robot with its numbers at their estimates."""
+    """Return the robot with its numbers set to their estimates."""
     fixed = [Choice(glob.escape(path), fixed=e.value) for path, e in numbers.items()]
     return Space(robot, fixed).template
 
 
 def _number(e: Estimate) -> RecordedNumber:
-    """Return an estimate as robot.json has it."""
+    """Return an estimate in the form that robot.json stores."""
     values = {f.name: getattr(e, f.name) for f in fields(RecordedNumber)}
     return typed(RecordedNumber, json.loads(json.dumps(values)), e.path)
 
 
 def given_numbers(robot: Robot) -> Mapping[str, RecordedNumber]:
-    """Return the given numbers of a robot by path."""
+    """Return the numbers of a robot by path, recorded as given and not fitted."""
     return {
         e.path: RecordedNumber.without_std(
             plain(np.asarray(e.get(robot))), e.declaration.unit, "fixed", "override"

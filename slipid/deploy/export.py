@@ -1,4 +1,4 @@
-"""From robot.json to a folder for a robot, with an example run driven on the twin."""
+"""Export of robot.json to a folder for a robot, with an example run driven on the twin."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class ExportOptions:
     """Choices of an export.
 
     Attributes:
-        forms: forms to write, of `FORMS`.
-        controller: row of the trial.
-        path: path of the example in C.
-        speed: speed along it [m/s].
-        map: file of a floor map, for a controller that uses one.
+        forms: forms to write, each one of `FORMS`.
+        controller: name of a row of `CONTROLLERS`, or of another table of rows.
+        path: name of the path that the example in C follows.
+        speed: speed along the path [m/s].
+        map: file of a floor map for a controller that uses one; None without a map.
     """
 
     forms: Sequence[str] = FORMS
@@ -68,8 +68,8 @@ class Exported:
         folder: path of the folder.
         files: names of its files.
         robot: hash of the robot's numbers.
-        forms: forms that are in it.
-        warnings: warnings about numbers that are not identified.
+        forms: forms that it contains.
+        warnings: warnings about numbers that are not identified, at a bound or disputed.
     """
 
     folder: Path
@@ -85,8 +85,9 @@ class ExampleStart:
 
     Attributes:
         floor: map of the site.
-        true: pose on the map at which the robot starts.
-        estimated: the same for its estimator; without a map it has axes of its own.
+        true: pose on the map at which the robot starts [m, m, rad].
+        estimated: pose at which its estimator starts [m, m, rad]: the true one with a map, else the
+            origin.
     """
 
     floor: FloorMap
@@ -95,7 +96,11 @@ class ExampleStart:
 
 
 def _example_start(robot: DeployedRobot, path: trajectory.Path, file: Path | None) -> ExampleStart:
-    """Return the start on patches of the robot's floors, or on a map of no other floors."""
+    """Return site and start of the example run.
+
+    The site is made of patches of the robot's floors, or is the map in a file, which must not
+    contain other floors.
+    """
     floor = twin_floor(robot) if file is None else read_map(file)
     require_known_surfaces(floor, robot, str(file))
     pose = starts(20, floor, path)[0]
@@ -103,10 +108,10 @@ def _example_start(robot: DeployedRobot, path: trajectory.Path, file: Path | Non
 
 
 def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedRobot:
-    """Return the robot of a file, or of the folder that `slipid identify` wrote.
+    """Return the robot in a file, or in a folder that `slipid identify` wrote.
 
     Raises:
-        DataError: there is none, it is damaged, or has no such load set-up or floor.
+        DataError: there is no robot, its file is damaged, or it has no such load set-up or floor.
     """
     is_file = source.suffix == ".json"
     path = source if is_file else source / ROBOT
@@ -127,11 +132,11 @@ def export(
     report: Reporter,
     rows: Mapping[str, ControllerRow] = CONTROLLERS,
 ) -> Exported:
-    """Write a robot in all requested forms to a folder, with one of the controllers `rows`.
+    """Write a robot, with one of the controllers `rows`, in all requested forms to a folder.
 
     Raises:
-        DataError: there is no such form, controller or path, a step has no form in C, or the folder
-            cannot be written or holds other files.
+        DataError: there is no such form, controller or path, a step cannot be turned into C, or the
+            folder cannot be written or contains other files.
     """
     row = _checked_row(options, rows)
     check_writable(out)
@@ -162,7 +167,7 @@ def export(
 
 
 def _checked_row(options: ExportOptions, rows: Mapping[str, ControllerRow]) -> ControllerRow:
-    """Return the row of the chosen controller; raise `DataError` for choices that do not fit."""
+    """Return the row of the chosen controller; raise `DataError` for options that do not fit."""
     if not options.forms:
         raise DataError(f"no form; expected one or more of {', '.join(FORMS)}")
     for name in options.forms:
@@ -191,7 +196,7 @@ def _c_files(
     run: Recording,
     controller: str,
 ) -> dict[str, bytes]:
-    """Return the content of the C folder; raise `DataError` for a step without a form in C."""
+    """Return the content of the C folder; raise `DataError` if a step cannot be turned into C."""
     try:
         text = c_files(robot, loop, path, run)
     except UnsupportedError as error:
@@ -200,7 +205,7 @@ def _c_files(
 
 
 class _RecordingPlant:
-    """A plant that keeps its readings."""
+    """A plant that records its readings in the list `readings`."""
 
     def __init__(self, plant: Plant, wheels: int):
         self._plant, self._wheels = plant, wheels
@@ -229,7 +234,7 @@ def record_example(
     start: ExampleStart,
     gyro: bool = False,
 ) -> Recording:
-    """Return a run of a path on the twin; the path is placed for the estimator's start."""
+    """Return a closed-loop run on the twin along a path that begins at the estimator's start."""
     model = actuator_model_of(robot, gyro=gyro)
     plant = _RecordingPlant(twin_plant(robot, start.floor, start.true, 0, model), robot.wheels)
     run = run_closed_loop(loop, path, plant, start.estimated)

@@ -1,4 +1,4 @@
-"""Lookups of a floor map, from a file or cells, for an estimator or a user."""
+"""Floor maps as arrays that estimators and users can look up in jitted functions."""
 
 from pathlib import Path
 
@@ -16,18 +16,18 @@ from slipid.support.errors import DataError
 
 
 def floor_of(floor: FloorMap, labels: tuple[str, ...]) -> Floor:
-    """Return a map as arrays with surfaces numbered as in `labels`, -1 for an unknown one."""
+    """Return a map as arrays, with surfaces numbered as in `labels` and -1 for all others."""
     return Floor.of(floor.surfaces, floor.cells, floor.corner, floor.cell, labels)
 
 
 def floor_map(path: Path | str, robot: DeployedRobot) -> Floor:
-    """Return the floor map of a TOML file, as `Estimator` takes it for a robot.
+    """Return the floor map in a TOML file, in the form that a robot's `Estimator` uses.
 
-    `Floor.save` writes it for a robot that has jax alone, whose `Floor.load` reads it. Cells of
-    surfaces that the robot does not know give it no information.
+    For a robot that has only jax installed, write it with `Floor.save` and read it there with
+    `Floor.load`. Cells with surfaces that the robot does not know give it no information.
 
     Raises:
-        DataError: the file is not a map, or has none of the robot's surfaces.
+        DataError: the file is not a map, or contains none of the robot's surfaces.
     """
     floor = read_map(Path(path))
     if not set(floor.surfaces) & set(robot.labels):
@@ -42,7 +42,7 @@ class WheelFloors(eqx.Module):
     """Floor under each wheel.
 
     Attributes:
-        surface: number of the surface, in the order of the map's.
+        surface: number of the surface in the map's list of surfaces.
         border: distance from the middle of the wheel to the nearest other surface [m], to within
             half a cell of the map; infinite on a map of a single surface.
         inside: whether the wheel is on the map; beyond its edge, surface and border are those of
@@ -84,10 +84,10 @@ class FloorLookup(eqx.Module):
 
     @eqx.filter_jit
     def under(self, pose: Float[Array, "*batch 3"], wheels: Float[Array, "wheel 2"]) -> WheelFloors:
-        """Return floor and border under the wheels of bodies at some poses.
+        """Return the floor under each wheel, and its distance to the border, at some poses.
 
         Args:
-            pose: x, y [m], heading [rad].
+            pose: x, y [m], heading [rad] of the body on the map.
             wheels: places of the wheels on the body, x ahead, y left [m].
         """
         flat = pose.reshape(-1, 3)

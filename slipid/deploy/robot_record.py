@@ -1,14 +1,17 @@
-"""Record of a robot: its numbers, and quantities computed from the model once and for all.
+"""Record of a robot: its numbers, and quantities computed once from the model.
 
-The effect table of robot.json follows from the effects that fitted runs share. The motion per metre
-along, across and in yaw, of wheels without slip, is predicted to be
+The effect table of robot.json follows from the effects that fitted runs share. As in forecasts
+(`slipid.fitting.shared_effects`), the motion along, across and in yaw, per metre that the wheels
+would roll without slip, is predicted to be
 
     contact(z) - shared(z),   shared(z) = mean + slope (z - z_fit)
 
-as forecasts have it (`slipid.fitting.shared_effects`). The table's mean is the second term at the
-robot's numbers. Its remaining variance is the covariance of the effects given the numbers, extended
-as in forecasts, and the scatter of this whole sum over draws of the numbers: near fitted runs,
-another number is compensated by another effect.
+with z the search vector, z_fit its value at the fit, contact(z) the motion by the contact model and
+shared(z) the effect estimated from the fitted runs. The table's mean is -shared at the robot's
+numbers. Its remaining variance is that of effects of single runs, plus two parts that are increased
+for extrapolation as in forecasts: the variance of the shared effects given the numbers, and the
+scatter of the predicted motion over posterior draws of z. Near fitted runs that scatter is small,
+since the estimated effect changes with the numbers and compensates them.
 """
 
 from collections.abc import Iterator, Mapping
@@ -45,19 +48,20 @@ def robot_record(
     seen: Mapping[str, Validity],
     effects: Mapping[str, EffectRecord] = MappingProxyType({}),
 ) -> record.RobotRecord:
-    """Return the record of a robot, without the origin of its numbers.
+    """Return the record of a robot, whose fields on the origin of the numbers have defaults.
 
     Args:
         robot: robot with every number at its value in `numbers`.
         numbers: numbers by path; those of the camera are left out.
-        std: std of every variance component by name (`process.gray.along`), as in forecasts of new
-            runs.
-        draws: posterior draws of the robot, stacked, for the effects of uncertain numbers.
+        std: std of every variance component by name (such as `process.gray.along`), as used in
+            forecasts of new runs.
+        draws: posterior draws of the robot, stacked, which show how uncertain numbers affect the
+            motion.
         highest_speed: highest wheel speed of the fitted runs [rad/s].
-        current_trend: a and b of a + b v, by which measured currents exceed the model's [A], [A
-            s/m].
-        seen: range of the fitted runs by floor, as far as it is known.
-        effects: effect tables by load set-up, as far as they are known.
+        current_trend: a and b of a + b v, by which measured currents exceed the model's at speed v
+            [A, A s/m].
+        seen: ranges that the fitted runs cover, by floor; floors may be absent.
+        effects: effect tables by load set-up; load set-ups may be absent.
     """
     return record.RobotRecord(
         wheels=record.Wheels(
@@ -75,7 +79,7 @@ def robot_record(
 
 
 def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numbers, ...]]]:
-    """Yield path and draws of every number that differs between draws, without the camera's."""
+    """Yield path and draws of every number that varies over draws, except those of the camera."""
     for e in entries(robot):
         leaf = np.asarray(reduce(getattr, e.leaf, draws))
         rows = leaf if e.index is None else leaf[:, e.index]
@@ -84,7 +88,7 @@ def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numb
 
 
 def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> record.FloorRecord:
-    """Return the record of a floor's errors, from stds by name."""
+    """Return the record of a floor's errors, from the stds of variance components by name."""
 
     def of(kind: str, default: record.Axes) -> np.ndarray:
         return np.array(
@@ -125,18 +129,18 @@ def _load(
 
 
 def directions(count: int) -> Float[Array, "twist 3"]:
-    """Return twists of 1 m/s in evenly spaced directions, without turning."""
+    """Return twists [m/s, m/s, rad/s] of 1 m/s in evenly spaced directions, without turning."""
     angle = jnp.linspace(0.0, 2 * jnp.pi, count, endpoint=False)
     return jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
 
 
 def _turns(frame: WheelFrame) -> Float[Array, "twist 3"]:
-    """Return twists on the spot to the left and to the right, with a rim speed of about 1 m/s."""
+    """Return twists [m/s, m/s, rad/s] on the spot, left and right, at about 1 m/s rim speed."""
     return jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / frame.base
 
 
 class _WheelArrays(eqx.Module):
-    """Geometry of the wheels as arrays, so that one compilation serves all robots of a shape."""
+    """Geometry of the wheels as arrays, so that robots of equal structure share compiled code."""
 
     frame: WheelFrame
     forward: Float[Array, "*draw drive 3"]
@@ -148,7 +152,7 @@ class _WheelArrays(eqx.Module):
         return cls(shape.frame(), shape.forward(), shape.drive_of)
 
     def rim(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """Return rim speeds of the wheels from those of their drives [m/s]."""
+        """Return the rim speeds of the wheels from those of their drives [m/s]."""
         return at_wheels(self.drive_of, of_drives)
 
 
@@ -162,7 +166,11 @@ def _circle(
     top: Array,
     twists: Float[Array, "twist 3"],
 ) -> tuple[Array, Array, Array]:
-    """Return wheel speeds, currents and slip ratios on every floor for some twists (.., drive)."""
+    """Return wheel speeds [rad/s], currents [A] and slip ratios [1] for some twists.
+
+    Twists are scaled to 0.4 and 0.8 of the highest wheel speed `top` [rad/s]. Each result has the
+    shape (floor, speed and twist, drive).
+    """
     frame = wheels.frame
     speed = twists @ wheels.forward.T / frame.radius
     speed = jnp.stack([0.4 * top, 0.8 * top])[:, None, None] * speed / jnp.max(jnp.abs(speed))
@@ -186,10 +194,11 @@ def _circle(
 
 @eqx.filter_jit
 def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
-    """Return the least squares fit of slip speed on a + b |I|, drive by drive, over all floors.
+    """Return a and b of the slip ratio a + b |I| of each drive, fitted over all floors [1, 1/A].
 
-    It is the form that the 2021 paper's robot used, refitted here. Rows count in proportion to the
-    wheel speed, so that wheels that hardly turn have little weight.
+    It is the form that the 2021 paper's robot used, refitted here to the contact model. The slip
+    speed, wheel speed times slip ratio, is fitted by least squares, so that wheels that hardly turn
+    have little weight.
     """
     flat = [x.reshape(-1, x.shape[-1]) for x in (speed, jnp.abs(amps), slip)]
 
@@ -203,10 +212,11 @@ def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
 def _spread(
     robot: Robot, frame: WheelFrame, draws: Robot, load: Array
 ) -> Float[np.ndarray, "floor 3"]:
-    """Return the posterior std of the motion per metre, a row per floor (along, across, yaw).
+    """Return the posterior std of the motion per metre on each floor, along, across and in yaw.
 
-    It is the average over all directions. Of wheels that do not drive sideways it is the largest,
-    turns on the spot included.
+    Units are [m/m, m/m, rad/m]. It is the root mean square over all directions of travel. For
+    robots that cannot drive sideways it is the largest over driving ahead, back and turning on the
+    spot.
     """
     free, speed = robot.geometry.determines_twist, jnp.asarray(0.2)
     twists = directions(12) if free else jnp.concatenate([directions(2), _turns(frame)])
@@ -215,7 +225,10 @@ def _spread(
 
 
 def spread_of(draws: Float[np.ndarray, "draw *rest"]) -> Float[np.ndarray, "*rest"]:
-    """Return the std over draws from their central 68 %, so that a few stuck draws do not count."""
+    """Return the std over draws, as half the width of their central 68 %.
+
+    A few outliers among the draws do not affect it.
+    """
     low, high = np.quantile(draws, (0.1587, 0.8413), axis=0)
     return np.asarray(high - low) / 2
 
@@ -223,13 +236,13 @@ def spread_of(draws: Float[np.ndarray, "draw *rest"]) -> Float[np.ndarray, "*res
 def moved_per_metre(
     draws: Robot, load: Array, speed: Array, twist: Float[Array, "twist 3"]
 ) -> Float[Array, "draw floor twist 3"]:
-    """Return the motion along, across and in yaw per metre that wheels would roll without slip.
+    """Return the motion along, across and in yaw, per metre that wheels would roll without slip.
 
     Args:
-        draws: stacked robots.
+        draws: robots stacked along a leading axis.
         load: number of the load set-up.
         speed: speed of the body without slip [m/s].
-        twist: twists of 1 m/s.
+        twist: twists of 1 m/s [m/s, m/s, rad/s].
     """
     rest = draws.body.load_share[:, load]
     return _moved(jax.vmap(_WheelArrays.of)(draws), draws.surfaces, rest, speed, twist)
@@ -243,7 +256,7 @@ def _moved(
     speed: Array,
     twist: Float[Array, "twist 3"],
 ) -> Array:
-    """Return what `moved_per_metre` does, compiled."""
+    """Return the result of `moved_per_metre`; this part is compiled."""
 
     def one(wheels: _WheelArrays, surfaces: ContactSurface, rest: Array) -> Array:
         rim, frame = wheels.rim(speed * twist @ wheels.forward.T), wheels.frame
@@ -258,7 +271,7 @@ def _moved(
 
 
 DIRECTIONS = 72
-"""Number of directions in the table, which are half a kernel's length apart."""
+"""Number of directions in the effect table; they are half a length of the effects' kernel apart."""
 _Grid = Float[np.ndarray, "floor speed direction 3"]
 
 
@@ -269,7 +282,7 @@ def effects_by_load(
 
     Args:
         contact: fitted force balance.
-        center: search vector of the deployed numbers.
+        center: search vector of the robot's numbers.
         draws: posterior draws of the search vector.
     """
     speeds = {s.log_speed for shared in contact.shared.values() for s in shared.speeds_and_loads}
@@ -318,5 +331,5 @@ def _rows(grid: _Grid) -> tuple[tuple[tuple[record.Axes, ...], ...], ...]:
 
 
 def _rounded(value: float) -> float:
-    """Return a number to four digits, which keeps the table short and exceeds its accuracy."""
+    """Return a number rounded to four digits, more than its accuracy, to keep the table short."""
     return float(f"{value:.4g}")

@@ -1,4 +1,4 @@
-"""Site, starts and paths of a robot's twin."""
+"""Sites, start poses and paths for runs on a robot's twin."""
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +14,14 @@ from slipid.support.errors import DataError
 
 SITE_SEED, STARTS_SEED = 7, 2021
 REST_S = 1.0
-"""Rest before the robot drives, during which a gyro learns its zero [s]."""
+"""Rest before the robot drives, during which the estimator finds the gyro's bias [s]."""
 
 
 def twin_floor(robot: DeployedRobot) -> FloorMap:
-    """Return patches about as large as the robot, half of them of the floor with the least slip.
+    """Return a map of patches about as large as the robot, half of them with the least slip.
 
-    On the test site's firm, medium and soft floors encoders then travel 80 to 90 % of the first
-    side, as on the paper's site.
+    With the test site's firm, medium and soft floors, a robot that trusts its encoders then travels
+    80 to 90 % of the first side, as on the paper's site.
     """
     labels = robot.labels
     slip = [float(np.mean(f.seen.slip)) if f.seen is not None else 0.0 for f in robot.record.floors]
@@ -33,10 +33,10 @@ def twin_floor(robot: DeployedRobot) -> FloorMap:
 
 
 def starts(count: int, floor: FloorMap, path: Path) -> list[tuple[float, float, float]]:
-    """Return poses all over a site with evenly spread headings, the same for every controller.
+    """Return start poses [m, m, rad] all over a site, the same at every call.
 
-    The middle of the path, which begins at the origin, keeps 0.8 m from the site's edge where there
-    is room.
+    Headings are evenly spread. The middle of the path, which begins at the start pose, stays 0.8 m
+    away from the site's edge where there is room.
     """
     rng = np.random.default_rng(STARTS_SEED)
     x0, y0, x1, y1 = floor.extent
@@ -54,17 +54,18 @@ def starts(count: int, floor: FloorMap, path: Path) -> list[tuple[float, float, 
 
 
 def require_known_surfaces(floor: FloorMap, robot: DeployedRobot, path: str) -> None:
-    """Raise `DataError` for a map, from this file, with a surface that the robot does not know."""
+    """Raise `DataError` if a map, read from `path`, has a surface that the robot does not know."""
     if absent := [name for name in floor.surfaces if name not in robot.labels]:
         known = ", ".join(robot.labels)
         raise DataError(f"{path}: no surface '{absent[0]}'; identified: {known}")
 
 
 def path_of(name: str, speed: float, robot: DeployedRobot) -> trajectory.Path:
-    """Return a path from the origin at a speed [m/s].
+    """Return the path with this name from the origin, at a speed [m/s].
 
     Raises:
-        DataError: there is no such path, or the wheels would exceed their highest fitted speed.
+        DataError: there is no such path, or the speed exceeds the highest rim speed of the fitted
+            runs.
     """
     if name not in trajectory.PATHS:
         raise DataError(f"no path '{name}'; expected one of {', '.join(trajectory.PATHS)}")
@@ -84,6 +85,6 @@ def twin_plant(
     seed: int,
     actuators: ActuatorModel,
 ) -> TwinPlant:
-    """Return the identified model itself as a plant, see `slipid.robot.twin`."""
+    """Return the robot's own identified model as a plant, see `slipid.robot.twin`."""
     model = Twin(robot, floor_of(floor, robot.labels), actuators)
     return TwinPlant(model, jnp.asarray(start), jax.random.key(seed))

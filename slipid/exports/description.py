@@ -1,4 +1,4 @@
-"""Texts that all exported files share: numbers of a robot, their origin, warnings, README."""
+"""Texts that exported files share: numbers of a robot, their origin, warnings and the README."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,15 +36,15 @@ class NumberRow:
     """One number of a robot, as a row of a table.
 
     Attributes:
-        group: key of its table.
-        name: name of the number, which is its path if it is in robot.json.
-        entry: "wheel 2" for example, empty for a number of the whole robot.
+        group: key of the table that it belongs to.
+        name: name of the number; its path if it is in robot.json.
+        entry: wheel that it belongs to, such as "wheel 2"; empty for a number of the whole robot.
         symbol: symbol in equations.
         value: value [unit].
         unit: unit of the value.
         interval90: 90 % interval [unit]; None where there is none.
-        verdict: how certain it is, as people read it.
-        provenance: its origin, as people read it.
+        verdict: verdict on its identification, as text for people.
+        provenance: what determines its value, as text for people.
         about: meaning in words.
     """
 
@@ -61,19 +61,19 @@ class NumberRow:
 
     @property
     def verdict_markdown(self) -> str:
-        """The verdict for Markdown, in bold where users must be warned."""
+        """Verdict as Markdown, in bold if users must be warned about it."""
         warned = self.verdict in map(verdict_text, WARNED_VERDICTS)
         return f"**{self.verdict}**" if warned else self.verdict
 
 
 def verdict_text(verdict: Verdict) -> str:
-    """Return a verdict as people read it, in capitals where they must be warned."""
+    """Return a verdict as text for people, in capitals if they must be warned about it."""
     words = verdict.replace("_", " ")
     return words.upper() if verdict in WARNED_VERDICTS else words
 
 
 def number_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
-    """Yield every number of a robot, those per wheel one by one."""
+    """Yield a row for every number of a robot, and one per wheel for numbers of wheels."""
     for e in declared_numbers(robot.record):
         number, d, group = robot.record.parameters[e.path], e.declaration, e.path.partition(".")[0]
         ends = np.reshape([] if number.interval90 is None else number.interval90, (-1, 2)).tolist()
@@ -100,7 +100,7 @@ LIMITS: Mapping[str, tuple[str, str]] = {
 
 
 def gains_origin(robot: DeployedRobot) -> str:
-    """Return sentences on the origin of a robot's gains, and that limits were not identified."""
+    """Return sentences about the origin of a robot's gains and about the limits, not identified."""
     limits = "Limits are the defaults of slipid: put in those of your motors and supply."
     tuned = robot.record.gains
     if tuned is None:
@@ -128,21 +128,22 @@ WARNINGS: Mapping[Verdict, str] = {
 
 
 def header(robot: DeployedRobot) -> list[str]:
-    """Return lines of a comment without its sign: origin, floors, loads, verdicts and warnings.
+    """Return comment lines, without comment signs, about the origin of an exported file.
 
-    Each is plain printable text, of 96 characters at most where no word is longer.
+    They name origin, floors, loads, verdicts and warnings. Each line is plain printable text of at
+    most 96 characters, unless a single word is longer.
     """
     sentences = (*_sentences(robot), *(f"WARNING: {text}" for text in warnings(robot)))
     return [line for sentence in sentences for line in wrapped(sentence)]
 
 
 def in_markdown(robot: DeployedRobot) -> list[str]:
-    """Return the head as Markdown, warnings first, with the messages of the fit."""
+    """Return the content of `header` as Markdown, warnings first, plus the fit's messages."""
     return [*warned(robot), *facts(robot)]
 
 
 def warned(robot: DeployedRobot) -> list[str]:
-    """Return the warnings as Markdown."""
+    """Return the warnings as lines of Markdown."""
     return [line for text in warnings(robot) for line in (f"> **WARNING.** {text}", "")]
 
 
@@ -153,13 +154,13 @@ def facts(robot: DeployedRobot) -> list[str]:
 
 
 def warnings(robot: DeployedRobot) -> tuple[str, ...]:
-    """Return a warning for each verdict that some number has and that a user must know of."""
+    """Return a warning for each verdict in `WARNED_VERDICTS` that any number of the robot has."""
     by_verdict = {verdict: paths_with_verdict(robot, verdict) for verdict in WARNED_VERDICTS}
     return tuple(f"{WARNINGS[v]}: {listed(paths)}." for v, paths in by_verdict.items() if paths)
 
 
 def _sentences(robot: DeployedRobot) -> Iterator[str]:
-    """Yield sentences on origin, floors, loads and verdicts."""
+    """Yield sentences about origin, floors, loads and verdicts."""
     record = robot.record
     yield f"Made by slipid {made_with()} from robot.json; make it anew rather than change it."
     yield f"Numbers: {record.numbers} (`numbers` of robot.json)."
@@ -173,7 +174,7 @@ def _sentences(robot: DeployedRobot) -> Iterator[str]:
 
 
 def made_with() -> str:
-    """Return the version of slipid."""
+    """Return the version of slipid that makes an export."""
     try:
         return version("slipid")
     except PackageNotFoundError:

@@ -1,7 +1,7 @@
 """Structs of the generated code, with a field for every array of a state, an input or an output.
 
-Their comments are those of the Python classes, whose docstrings describe each attribute with its
-unit in brackets.
+The comment of a field is the description of the attribute in the Python class's docstring, which
+contains the unit in brackets.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Kind = Literal["real", "int", "bool"]
 DTYPES: dict[Kind, type] = {"real": np.float64, "int": np.int64, "bool": np.bool_}
 UNIT = re.compile(r"\[[^\]]+\]")
 ONE = "[1]"
-"""Unit of a field without one."""
+"""Unit written for a field whose description has none."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Field:
         name: name in C.
         kind: kind of its numbers.
         shape: shape of the array; () for a single number.
-        comment: meaning with its unit.
+        comment: meaning and unit of the field.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Struct:
 
     Attributes:
         name: name of the type.
-        about: one sentence.
+        about: comment of the struct, one sentence.
         fields: fields in the order of the tree's leaves.
     """
 
@@ -60,15 +60,16 @@ class Struct:
 
     @classmethod
     def of(cls, name: str, about: str, tree: object, documented: type | None = None) -> Struct:
-        """Return the struct of a tree of arrays, or of modules with documented attributes.
+        """Return the struct for a tree of arrays or of modules with documented attributes.
 
-        `documented` is the class whose docstring describes the attributes, if not the tree's own.
+        `documented` is the class whose docstring describes the attributes; by default the class of
+        the tree.
         """
         return cls(name, about, tuple(_fields(tree, "", "", documented)))
 
 
 def kind_of(dtype: np.dtype) -> Kind:
-    """Return the kind of the numbers of a type of jax or numpy."""
+    """Return the kind of number for a data type of jax or numpy."""
     if dtype == np.bool_:
         return "bool"
     return "int" if np.issubdtype(dtype, np.integer) else "real"
@@ -96,7 +97,14 @@ def attribute_docs(kind: type) -> dict[str, str]:
 
 
 def _fields(tree: object, prefix: str, above: str, by: type | None = None) -> list[Field]:
-    """Return the fields of a tree, whose names begin with a prefix."""
+    """Return the fields of a tree.
+
+    Args:
+        tree: arrays, in modules that may contain further modules.
+        prefix: beginning of the fields' names.
+        above: description of the attribute that holds the tree, used where there is no other.
+        by: class whose docstring describes the attributes; by default that of the tree.
+    """
     if is_dataclass(tree) and not isinstance(tree, type):
         docs = attribute_docs(by or type(tree))
         parts = []

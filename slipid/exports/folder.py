@@ -1,7 +1,7 @@
 """A folder for a robot: robot.json, its exported forms, and a checksum of every file.
 
-`sha256sum -c SHA256SUMS` checks it without slipid. Folders named `build` hold what is built from it
-and do not belong to it.
+`sha256sum -c SHA256SUMS` checks the folder without slipid. Folders named `build` are ignored: they
+hold files that users build from the exported ones.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ BUILD = "build"
 
 
 def write_folder(folder: Path, content: Mapping[str, bytes]) -> None:
-    """Write files and their checksums; nothing of an older export remains.
+    """Write files and their checksums into a folder, and remove all files of an older export.
 
     Checksums are written first: a folder that lacks some files is then recognized as an incomplete
     export, and can be written again.
@@ -41,10 +41,10 @@ def write_folder(folder: Path, content: Mapping[str, bytes]) -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Refuse a folder that contains anything but an unchanged export.
+    """Raise `DataError` unless a folder is absent, empty or an unchanged export.
 
     Raises:
-        DataError: it is not a folder, or a file in it was added or changed by hand.
+        DataError: the path is not a folder, or a file in it was added or changed by hand.
     """
     if not folder.exists():
         return
@@ -66,10 +66,10 @@ def check_writable(folder: Path) -> None:
 
 
 def check_folder(folder: Path | str) -> tuple[str, ...]:
-    """Return the names of the files of a folder, all of them unchanged.
+    """Return the names of the files in an exported folder, after checking that none has changed.
 
     Raises:
-        DataError: a file is absent, changed, or was not there when the folder was written.
+        DataError: a file is absent or changed, or was added after the folder was written.
     """
     place = Path(folder)
     sums = _sums(place)
@@ -92,7 +92,7 @@ def check_folder(folder: Path | str) -> tuple[str, ...]:
 
 
 def _sums(folder: Path) -> dict[str, str]:
-    """Return the checksum of every file by its name, as they were written."""
+    """Return the checksums in the folder's checksum file, by file name."""
     try:
         text = (folder / SUMS).read_text()
     except (OSError, UnicodeDecodeError):
@@ -107,13 +107,13 @@ def _sums(folder: Path) -> dict[str, str]:
 
 
 def _whole(name: str) -> str | None:
-    """Return the file's name of which this is an unfinished part by `write_bytes`, or None."""
+    """Return the final name of a file that `write_bytes` left unfinished; None for other files."""
     match = re.fullmatch(r"((?:.*/)?)\.(.+)\.[0-9a-f]{8}", name)
     return None if match is None else match[1] + match[2]
 
 
 def _files(folder: Path) -> set[str]:
-    """Return the files of a folder except those in folders named `build`."""
+    """Return the paths of the files in a folder, except those in folders named `build`."""
     paths = (p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
     return {p.as_posix() for p in paths if BUILD not in p.parts}
 

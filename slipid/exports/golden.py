@@ -1,4 +1,4 @@
-"""Reference steps that an exported program must repeat: inputs, and the library's outputs."""
+"""Reference steps, inputs with the library's outputs, that an exported program must reproduce."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ STEPS = 48
 
 @dataclass(frozen=True)
 class Golden:
-    """Successive steps from rest at 0, 0, 0, one row each.
+    """Successive steps of a robot that starts at rest at the pose 0, 0, 0, one row each.
 
     Attributes:
-        given: leaves of the reading, the reference, and dt.
-        said: leaves of the estimate.
+        given: inputs: the arrays of the reading, the reference, and dt [s], one after the other.
+        said: outputs of the estimator: the arrays of the estimate, one after the other.
         command: wheel speeds [rad/s].
     """
 
@@ -34,7 +34,7 @@ class Golden:
 
 
 def golden(loop: ControlLoop[eqx.Module]) -> Golden:
-    """Return steps in which every sensor gives readings and is silent at least once."""
+    """Return steps in which every sensor has readings at some time and none at another."""
     run = jax.jit(lambda *inputs: loop_step(loop, *inputs))
     begin = loop.init()
     state, rows = (begin.estimator, begin.controller), []
@@ -51,14 +51,25 @@ def loop_step(
     reference: jax.Array,
     dt: jax.Array,
 ) -> tuple[tuple[eqx.Module, ControllerState], StateEstimate, jax.Array]:
-    """Return state, estimate and command of one step of a control loop with this reference."""
+    """Return the next state, the estimate and the command of a control loop's step.
+
+    Args:
+        loop: estimator and controller.
+        state: states of estimator and controller.
+        z: readings.
+        reference: pose and rates in the world [m, m, rad, m/s, m/s, rad/s].
+        dt: time since the last step [s].
+    """
     estimator, estimate = loop.estimator.step(state[0], z, dt)
     controller, command = loop.controller.step(state[1], reference, estimate, dt)
     return (estimator, controller), estimate, command
 
 
 def _inputs(loop: ControlLoop[eqx.Module]) -> Iterator[tuple[Readings, jax.Array, float]]:
-    """Yield readings, references and time steps, with a late and a lost one, and a long silence."""
+    """Yield readings, references and time steps.
+
+    Time steps include a short, a long and a zero one; readings include gaps, one of them long.
+    """
     robot = loop.controller.robot
     angle, count = np.zeros(robot.wheels), robot.wheels
     for step in range(STEPS):

@@ -1,6 +1,6 @@
 """A control loop's step as StableHLO, for programs that run XLA without slipid.
 
-Arrays go in and come out in the order that `step.json` lists, with names, shapes and units.
+`step.json` lists the input and output arrays in their order, with names, shapes and units.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from slipid.support.errors import DataError
 
 SCHEMA = "slipid.stablehlo/1"
 CLOSE = 1e-9
-"""Largest difference of a number, relative to its scale, once the program is loaded."""
+"""Largest difference between a number that the loaded program computes and the library's result,
+relative to the number's scale [1]."""
 PLATFORMS = ("cpu", "cuda", "tpu")
 """Platforms that the programs run on."""
 FILES = ("step.stablehlo", "step_batch.stablehlo", "step.json", "golden.npz")
@@ -67,10 +68,10 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Signature:
-    """Arrays of a step in their order, as step.json lists them.
+    """Input and output arrays of a step in their order, as step.json lists them.
 
     Attributes:
-        state: arrays of the state, which go in and come out.
+        state: arrays of the state, which are the first inputs and the first outputs.
         given: further inputs.
         said: further outputs.
     """
@@ -82,11 +83,11 @@ class Signature:
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A step that was read back.
+    """An exported step that was loaded from its folder.
 
     Attributes:
         signature: names and shapes of its arrays.
-        start: state of a robot at rest at 0, 0, 0.
+        start: arrays of the state of a robot at rest at the pose 0, 0, 0.
         step: step of one robot.
         batch: step of many robots, with a leading axis on every array.
     """
@@ -98,7 +99,10 @@ class Program:
 
 
 def stablehlo_files(loop: ControlLoop[eqx.Module]) -> dict[str, bytes]:
-    """Return the files' content by name: the step of one robot and of many, and its inputs."""
+    """Return the content of the folder's files by name.
+
+    They are the step of one robot, the step of many robots, a description and reference steps.
+    """
     begin = loop.init()
     state = begin.estimator, begin.controller
     nothing, zero = Readings.nothing(loop.controller.robot.wheels), jnp.zeros(())
@@ -151,10 +155,10 @@ def _leaves(name: str, tree: object, documented: type | None = None) -> list[Lea
 
 
 def load_program(folder: Path | str) -> Program:
-    """Return the step of a folder, once it has repeated the library's results.
+    """Return the step in a folder, after checking that it reproduces the library's results.
 
     Raises:
-        DataError: a file is absent, damaged or of a newer version, or numbers differ.
+        DataError: a file is absent, damaged or of another version, or results differ.
     """
     place = Path(folder)
     content = {}
@@ -187,7 +191,7 @@ def load_program(folder: Path | str) -> Program:
 
 
 def _repeated(program: Program, steps: Golden, place: Path) -> None:
-    """Refuse a program whose results differ, for one robot or for two at once."""
+    """Raise `DataError` if the program's results for one robot or for two at once differ."""
     one, two = list(program.start), [jnp.stack([x, x]) for x in program.start]
     count = len(one)
     scale = np.maximum(np.abs(steps.said).max(axis=0), 1e-3)

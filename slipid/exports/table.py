@@ -1,6 +1,6 @@
 """The numbers of a robot as plain tables, for a person who types them into a controller.
 
-`gains.md` is for reading: rounded values beside those with all digits. `gains.csv` has the same
+`gains.md` is for reading and shows each value rounded and with all digits. `gains.csv` has the same
 rows with all digits; its lines that start with # are comments.
 """
 

@@ -1,6 +1,7 @@
 """Text for people: words on one line, rounded numbers, Markdown tables.
 
-It also makes names of floors and load set-ups that ROS parameters, C++ and files can have.
+It also makes names for floors and load set-ups that are valid as ROS parameters, in C++ and in file
+names.
 """
 
 import re
@@ -8,39 +9,39 @@ import textwrap
 from collections.abc import Iterator, Sequence
 
 WIDTH = 96
-"""Longest line of a comment, without its sign."""
+"""Largest length of a comment line, without the comment sign [characters]."""
 
 
 def one_line(text: str) -> str:
-    """Return words of any origin on one line, without characters that no file may hold."""
+    """Return text on one line, with unprintable characters replaced by spaces."""
     shown = "".join(c if c.isprintable() else " " for c in text)
     return " ".join(shown.split())
 
 
 def short(value: float) -> str:
-    """Return a number rounded for people, to four digits."""
+    """Return a number rounded to four digits, for people."""
     return f"{value:.4g}"
 
 
 def interval(ends: tuple[float, float] | None) -> str:
-    """Return an interval rounded for people; empty where there is none."""
+    """Return an interval rounded to four digits, for people; empty text for None."""
     return "" if ends is None else f"{short(ends[0])} to {short(ends[1])}"
 
 
 def wrapped(text: str, width: int = WIDTH) -> Iterator[str]:
-    """Yield a paragraph as lines of a comment; paths and addresses stay whole."""
+    """Yield a paragraph as lines of a comment; words such as paths and addresses stay whole."""
     lines = textwrap.wrap(one_line(text), width, break_long_words=False, break_on_hyphens=False)
     yield from lines or [""]
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return a Markdown table."""
+    """Return the lines of a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return ["| " + " | ".join(map(_cell, line)) + " |" for line in lines]
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names with commas, or "none"."""
+    """Return names joined by commas, or "none" if there are none."""
     return ", ".join(one_line(name) for name in names) or "none"
 
 
@@ -56,14 +57,14 @@ register requires return short signed sizeof static struct switch template this 
 typedef typeid typename union unsigned using virtual void volatile while xor
 """
 _TAKEN = frozenset(_WORDS.split())
-"""Keywords of C++, which the fields of a generated struct cannot be named after."""
+"""Keywords of C++, which fields of a generated struct cannot have as names."""
 
 
 def identifiers(labels: Sequence[str], kind: str) -> tuple[str, ...]:
     """Return a unique name of small letters, digits and single underscores for each label.
 
-    They also differ without underscores, which generated structs omit. `kind` is put before a label
-    that is not a name by itself.
+    The names differ even without underscores, which generated structs omit. `kind` is put before a
+    label that is not a valid name by itself.
     """
     names: list[str] = []
     for label in labels:

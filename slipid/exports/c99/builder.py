@@ -1,8 +1,9 @@
-"""Builder that decides where every statement of a function stands.
+"""Builder that decides in which block of code each statement of a function is placed.
 
-Every number is computed once, in the earliest block that has its inputs. A block is straight code,
-or one loop over lanes, so that many operations on the same lanes form one loop. Values that are the
-same in every turn of a repetition are computed before it.
+Every number is computed once, in the earliest block that has its inputs. A block is straight-line
+code or one loop over lanes (the elements along one axis of an array), so that many operations on
+the same lanes form one loop. Values that do not change from turn to turn of a repetition are
+computed before it.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from slipid.exports.c99.ir import Array, At, Cell, CodeBlock, Memory, Nested, St
 from slipid.exports.fields import DTYPES, Kind
 
 CALLS = ("r_atan2", "r_cos", "r_exp", "r_log", "r_pow", "r_rem", "r_sin", "r_floor")
-"""Functions of C's library, which no compiler reduces to a few instructions."""
+"""Functions of C's library whose calls prevent a compiler from vectorizing a loop."""
 
 
 class Names:
-    """Numbers for names, and the tables of constants of a whole file."""
+    """Numbers that make the names in a generated file unique, and the file's constant tables."""
 
     def __init__(self) -> None:
         self._last = 0
@@ -29,7 +30,7 @@ class Names:
         return self._last
 
     def table(self, values: np.ndarray, kind: Kind) -> Memory:
-        """Return memory with constants; an existing one if it holds the same."""
+        """Return memory that holds these constants, an existing table if it holds the same."""
         flat = np.ascontiguousarray(values.reshape(-1), dtype=DTYPES[kind])
         key = (kind, flat.tobytes())
         if key not in self.tables:
@@ -45,8 +46,9 @@ class Builder:
         parent: builder of the code around it.
         turns: block that repeats this code; None if none does.
         blocks: blocks in their order.
-        source: line of Python that asks for the next statement.
-        contiguous: arrays that are in row-major order in memory as well, by their cells.
+        source: file and line of the Python code that the next statement is generated from.
+        contiguous: arrays that are also stored in row-major order, with that memory, by the
+            identity of their cells.
     """
 
     def __init__(self, names: Names, parent: Builder | None = None):
@@ -65,9 +67,14 @@ class Builder:
         lanes: int = 0,
         start: str = "",
     ) -> Variable:
-        """Return a variable computed from cells; an existing one if it was computed before.
+        """Return a variable computed from cells, an existing one if it was computed before.
 
-        With `start`, lanes are reduced to one number.
+        Args:
+            kind: kind of the number.
+            template: C expression with places {0}, {1}, ... for the cells.
+            cells: cells for these places.
+            lanes: number of lanes, 0 for a single number.
+            start: initial value of a reduction over the lanes to one number; empty for none.
         """
         around = self._around(cells)
         if around is not self:
@@ -87,12 +94,12 @@ class Builder:
         return self._known[key]
 
     def array(self, kind: Kind, size: int, cells: tuple[Cell, ...], lanes: int = 0) -> Memory:
-        """Return memory that straight code, or a loop over lanes, fills from these cells."""
+        """Return new memory that straight-line code, or a loop over lanes, fills from cells."""
         home = self._around(cells)._place(cells, lanes)
         return Memory(f"m{self.names.number()}", kind, size, home)
 
     def fill(self, memory: Memory, template: str, cell: Cell, times: int = 0) -> None:
-        """Append a statement of C that fills memory made by `array`, repeated `times` if not 0."""
+        """Append a C statement that fills memory made by `array`, in a loop if `times` is not 0."""
         block = memory.home
         assert block is not None
         block.statements.append(
@@ -102,23 +109,26 @@ class Builder:
     def append(
         self, lanes: int = 0, nested: Nested | None = None, calls: bool = False
     ) -> CodeBlock:
-        """Return a new block after all others."""
+        """Return a new block, appended after all others."""
         return self.put(CodeBlock(self, 0, lanes, calls, nested=nested))
 
     def put(self, block: CodeBlock) -> CodeBlock:
-        """Return a block that was put after all others."""
+        """Append a block after all others, and return it."""
         block.place = len(self.blocks)
         self.blocks.append(block)
         return block
 
     def _around(self, cells: tuple[Cell, ...]) -> Builder:
-        """Return the builder in which a statement stands: outside of turns that change no cell."""
+        """Return the builder for a statement: outside of repetitions that do not change its cells.
+
+        These are the cells that the statement reads.
+        """
         if self.parent is None or self.turns is None or any(map(self._changes, cells)):
             return self
         return self.parent._around(cells)
 
     def _changes(self, cell: Cell) -> bool:
-        """Return whether a cell may change from turn to turn."""
+        """Return whether a cell may change from turn to turn of this repetition."""
         if isinstance(cell, At):
             home = cell.memory.home
             by_index = cell.index is not None and self._changes(cell.index)
@@ -139,7 +149,7 @@ class Builder:
         return self.append(lanes, calls=apart)
 
     def _after(self, cell: Cell, lanes: int) -> int:
-        """Return the place of the first block in which a statement can use a cell."""
+        """Return the index of the first block in which a statement can use a cell."""
         if isinstance(cell, At):
             inner = 0 if cell.index is None else self._after(cell.index, lanes)
             return max(inner, self._behind(cell.memory.home, False))
@@ -149,5 +159,5 @@ class Builder:
 
     def _behind(self, home: CodeBlock | None, together: bool) -> int:
         if home is None or home.owner is not self:
-            return 0  # it is filled before this builder's code begins
+            return 0  # the memory is filled before this builder's code begins
         return home.place + (0 if together else 1)

@@ -1,4 +1,4 @@
-"""Header and source of a control loop in C99, generated from the steps that the tests cover."""
+"""Header and source of a control loop in C99, generated from the library's own JAX functions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Code:
     Attributes:
         robot: robot with the record of its numbers.
         loop: estimator and controller.
-        path: path placed for a robot that starts at 0.
+        path: path for a robot that starts at the origin; None without one.
         estimator: struct of the estimator's state.
         controller: struct of the controller's state.
         reading: struct of the inputs.
@@ -153,12 +153,12 @@ class Code:
 
     @property
     def kept(self) -> int:
-        """Count of the numbers in a state."""
+        """Count of the numbers in the state of estimator, controller and path."""
         return sum(f.size for s in (self.estimator, self.controller) for f in s.fields) + 1
 
     @property
     def scratch(self) -> int:
-        """Count of the numbers in arrays that a step has on the stack."""
+        """Largest count of numbers that a function keeps in arrays on the stack."""
         return max(f.scratch for f in self.functions)
 
     def header(self) -> str:
@@ -206,7 +206,7 @@ class Code:
 
 
 def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
-    """Yield sentences on axes, wheels, sensors and floors for readers of the header."""
+    """Yield sentences about axes, wheels, sensors and floors, for readers of the header."""
     robot = loop.controller.robot
     yield (
         "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: those in "
@@ -234,12 +234,12 @@ def template(name: str) -> str:
 
 
 def filled(name: str, values: dict[str, str]) -> str:
-    """Return a template with values for every @NAME@."""
+    """Return the text of a template with every @NAME@ replaced by its value."""
     return re.sub(r"@([A-Z]+)@", lambda match: values[match.group(1)], template(name))
 
 
 def _comment(*parts: str) -> list[str]:
-    """Return a comment of C."""
+    """Return the lines of a C comment."""
     lines = [line.replace("*/", "* /") for part in parts for line in wrapped(part)]
     return (
         [f"/* {lines[0]}", *(f"   {line}" for line in lines[1:-1]), f"   {lines[-1]} */"]

@@ -1,4 +1,4 @@
-"""Rules of primitives that act on numbers one by one."""
+"""Rules that turn element-wise JAX primitives into C."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ from slipid.exports.fields import Kind, kind_of
 Shaped = jax.ShapeDtypeStruct
 Rule = Callable[[Builder, list[Value], Params, Shaped], Value]
 Simpler = Callable[[tuple[Cell, ...]], Cell | None]
-"""Function that returns the cell an operation equals; None if it takes a statement."""
+"""Function that returns the cell that the result of an operation equals; None if it must be
+computed by a statement."""
 
 
 UNARY = {
@@ -72,7 +73,7 @@ BINARY = {
 OF_INTS = {"max": "i_max({0}, {1})", "min": "i_min({0}, {1})", "rem": "{0} % {1}"}
 """Templates of operations that C writes differently for whole numbers."""
 NEUTRAL = {"add": (0.0, 0.0), "sub": (None, 0.0), "mul": (1.0, 1.0), "div": (None, 1.0)}
-"""Numbers that, in the first or second place, leave the other unchanged."""
+"""Neutral numbers of an operation as its first and as its second operand; None if there is none."""
 
 
 def _never(cells: tuple[Cell, ...]) -> Cell | None:
@@ -87,7 +88,10 @@ def applied(
     shape: tuple[int, ...],
     simpler: Simpler = _never,
 ) -> Array:
-    """Return a template applied to every number of some arrays, or of single numbers for all."""
+    """Return the array computed by a C expression from each element of some arrays.
+
+    Arrays are broadcast to the shape.
+    """
     axis = _axis(values, shape)
     rows = [along(builder, v, shape, axis) for v in values]
     lanes = 0 if axis is None else shape[axis]
@@ -114,7 +118,7 @@ def lanes_of(values: Sequence[Value], shape: tuple[int, ...]) -> int:
 
 
 def _lanes(shape: tuple[int, ...], value: Value) -> int | None:
-    """Return the axis of a value's lanes if the result has as many there."""
+    """Return the axis of a value's lanes if the result is equally long along it, else None."""
     if not isinstance(value, Array) or value.axis is None or len(value.shape) != len(shape):
         return None
     return value.axis if value.shape[value.axis] == shape[value.axis] else None
@@ -162,7 +166,7 @@ def divided(
     out: Shaped,
     simpler: Simpler,
 ) -> Value:
-    """Return quotients; a hyperbolic tangent over a number is a single quotient."""
+    """Return quotients; tanh(a) / b becomes one call of `r_tanh_over`."""
 
     def once(cells: tuple[Cell, ...]) -> Cell | None:
         over, by = cells
@@ -176,7 +180,7 @@ def divided(
 
 
 def integer_pow(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return a whole power, by multiplications."""
+    """Return an integer power, computed by multiplications."""
     power = params["y"]
     if power == 0:
         raise NoFormError("a power of 0")
@@ -196,7 +200,7 @@ CONVERTED: dict[tuple[Kind, Kind], str] = {
 
 
 def converted(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return numbers of another kind."""
+    """Return the numbers converted to another kind."""
     pair = kind_of_value(values[0]), kind_of(out.dtype)
     if pair[0] == pair[1]:
         return values[0]
@@ -204,7 +208,7 @@ def converted(builder: Builder, values: list[Value], params: Params, out: Shaped
 
 
 def select(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return one of two numbers by a condition."""
+    """Return the first or second of two numbers, selected by a condition."""
 
     def simpler(cells: tuple[Cell, ...]) -> Cell | None:
         which, no, yes = cells

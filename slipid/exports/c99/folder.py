@@ -79,12 +79,12 @@ def _reading_out(struct: Struct) -> list[str]:
 
 @dataclass(frozen=True)
 class Recording:
-    """A run of a path that the library has driven, one row per period.
+    """A closed-loop run of the library along a path, one row per control period.
 
     Attributes:
         plant: description of the plant.
-        start: pose at which it began [m, m, rad].
-        given: dt [s] and the leaves of the reading.
+        start: pose at which the run began [m, m, rad].
+        given: inputs of each step: dt [s] and the arrays of the reading, one after the other.
         command: wheel speeds [rad/s].
         time: time of the path [s].
     """
@@ -119,7 +119,7 @@ def _path(path: Path) -> str:
 
 
 def _kib(numbers: int) -> str:
-    """Return the size of this count of numbers in `double`."""
+    """Return the memory that this count of numbers takes as `double`, as text."""
     return f"{numbers * 8 / 1024:.1f} KiB"
 
 
@@ -135,7 +135,7 @@ def c_files(
         robot: robot with the record of its numbers.
         loop: estimator and controller.
         path: path that the example follows.
-        recording: a run of it, as a test of the example.
+        recording: a run along the path, with which the example is tested.
 
     Raises:
         UnsupportedError: a step uses a primitive that has no form in C.

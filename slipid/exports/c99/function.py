@@ -1,4 +1,4 @@
-"""A traced function as a function of C: its arguments, its body, and the memory that it reads."""
+"""A traced function as a C function: its arguments, its body, and the memory that it reads."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from slipid.exports.fields import Field, Struct
 
 @dataclass(frozen=True)
 class Argument:
-    """An argument of a function of C.
+    """An argument of a C function.
 
     Attributes:
         name: name of the argument.
-        type: struct that the pointer points to, empty for plain numbers.
+        type: name of the struct that the argument points to; empty for plain numbers.
         fields: fields of the struct; a single one for plain numbers.
         read: whether the function reads it.
         written: whether the function fills it.
@@ -37,12 +37,12 @@ class Argument:
     def plain(
         cls, name: str, shape: tuple[int, ...], read: bool = True, written: bool = False
     ) -> Argument:
-        """Return a number or a row of numbers as an argument."""
+        """Return an argument that is a number, or an array of numbers."""
         return cls(name, "", (Field(name, "real", shape, ""),), read, written)
 
     @classmethod
     def of(cls, name: str, struct: Struct, read: bool = True, written: bool = False) -> Argument:
-        """Return a pointer to a struct as an argument."""
+        """Return an argument that is a pointer to a struct."""
         return cls(name, struct.name, struct.fields, read, written)
 
     @property
@@ -71,7 +71,7 @@ class Argument:
 
 @dataclass(frozen=True)
 class Function:
-    """A function of C.
+    """A C function.
 
     Attributes:
         name: name of the function.
@@ -79,7 +79,7 @@ class Function:
         arguments: arguments in order.
         lines: lines of its body.
         reads: names of all memory that it reads.
-        scratch: count of the numbers in arrays that it has on the stack.
+        scratch: count of the numbers that it keeps in arrays on the stack.
     """
 
     name: str
@@ -107,18 +107,18 @@ def function(
     arguments: Sequence[Argument],
     traced: Traced,
 ) -> Function:
-    """Return a traced function as a function of C.
+    """Return a traced function as a C function.
 
     Args:
-        names: names of the file.
+        names: numbers for names and constant tables of the generated file.
         name: name of the function.
         about: comment of its declaration.
         arguments: arguments in order.
-        traced: function from the fields of all arguments that are read to those of all that are
-            written, both in the order of the arguments.
+        traced: function whose inputs are the fields of all arguments that are read and whose
+            results are the fields of all arguments that are written, in the arguments' order.
 
     Raises:
-        UnsupportedError: it uses a primitive without a rule.
+        UnsupportedError: the function uses a primitive without a rule.
     """
     builder = Builder(names)
     values: list[Value] = [
@@ -144,7 +144,10 @@ def function(
 
 
 def traced(run: Callable[..., object], *like: object) -> Traced:
-    """Return a function of some trees, traced as one from their leaves to those of its result."""
+    """Return a function of trees, traced as a function of their leaves.
+
+    Its results are the leaves of the result tree. `like` are example arguments.
+    """
     structure = jax.tree.structure(like)
 
     def of(*leaves: jax.Array) -> list[jax.Array]:
@@ -154,7 +157,7 @@ def traced(run: Callable[..., object], *like: object) -> Traced:
 
 
 def _holds(memory: Memory, value: Value) -> bool:
-    """Return whether memory holds a value already."""
+    """Return whether memory already holds a value, so that nothing has to be stored."""
     if not isinstance(value, Array):
         return False
     like = in_memory(memory, value.shape)
@@ -162,7 +165,7 @@ def _holds(memory: Memory, value: Value) -> bool:
 
 
 def _unused(arguments: Sequence[Argument], reads: frozenset[str]) -> list[str]:
-    """Return statements that mark arguments as deliberately not read."""
+    """Return C statements that mark arguments as deliberately unused."""
     idle = [
         a.name for a in arguments if not a.written and not any(m.name in reads for m in a.memories)
     ]

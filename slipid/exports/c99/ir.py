@@ -1,9 +1,9 @@
 """Intermediate representation of a traced function: numbers, loops over lanes, and their blocks.
 
-An array is a numpy array of cells, one for every number. Long arrays have one axis that is a loop
-at run time, their lanes; each of their cells then stands for a whole row of numbers along it.
-Everything else is unrolled, so that slicing, stacking or transposing an array rearranges its cells
-and costs the robot nothing.
+An array is a numpy array of cells, one for every number. A long array has one axis along which the
+C code loops; the elements along it are its lanes, and each of its cells then stands for a whole row
+of numbers along that axis. All other axes are unrolled, so that slicing, stacking or transposing an
+array only rearranges its cells and takes no time on the robot.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
     from slipid.exports.c99.builder import Builder
 
 Cells = np.ndarray
-"""Array of objects, each of them a `Cell`."""
+"""Numpy array of objects, each of which is a `Cell`."""
 LANES = 7
-"""Length from which an axis is a loop."""
+"""Length from which on an axis of an array becomes a loop in C."""
 
 
 class NoFormError(Exception):
-    """Reason why there is no form in C for an application of a primitive."""
+    """Reason why a primitive, as it is used here, cannot be turned into C."""
 
 
 @dataclass(frozen=True)
 class Constant:
-    """A constant; 0 and -0 are different."""
+    """A constant number; constants compare by their text, so that 0.0 and -0.0 differ."""
 
     value: float | int | bool = field(compare=False)
     kind: Kind
@@ -45,7 +45,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class Memory:
-    """Numbers side by side: a field of a struct, an array on the stack or a table of constants.
+    """Contiguous numbers: a field of a struct, an array on the stack or a table of constants.
 
     Attributes:
         name: name in C.
@@ -54,8 +54,8 @@ class Memory:
         home: block that fills it; None where it is filled before the function begins.
         values: bytes of a table of constants, empty for other memory.
         scalar: whether it is a single number that C accesses without an index.
-        lanes: whether a loop fills it, truth values as 1 and 0: compilers vectorize loops over
-            numbers of one size.
+        lanes: whether it stores the lanes of a variable. Truth values are then stored as the
+            numbers 1 and 0, since compilers vectorize loops over numbers of one size.
     """
 
     name: str
@@ -69,7 +69,7 @@ class Memory:
 
 @dataclass(frozen=True)
 class At:
-    """A number in memory: `memory[offset + stride * lane + index]`, or `[table[lane]]`."""
+    """A number in memory: `memory[offset + stride * lane + index]`, or `memory[table[lane]]`."""
 
     memory: Memory
     offset: int
@@ -85,11 +85,11 @@ class At:
 
 @dataclass(eq=False)
 class Variable:
-    """A number that a statement computes; one for every lane where `lanes` is not 0.
+    """A number that a statement computes, or one number per lane if `lanes` is not 0.
 
     Attributes:
         kind: kind of the number.
-        number: number in its name.
+        number: number that makes its name unique.
         lanes: count of its lanes.
         home: block that computes it.
         made_by: template and cells of the statement that computes it.
@@ -103,27 +103,27 @@ class Variable:
 
     @property
     def memory(self) -> Memory:
-        """Array on the stack that keeps its lanes."""
+        """Array on the stack that stores its lanes."""
         return Memory(f"m{self.number}", self.kind, self.lanes, self.home, lanes=True)
 
 
 Cell = Constant | At | Variable
-"""A number, or one for every lane."""
+"""A single number, or one number for every lane."""
 
 
 @dataclass(eq=False)
 class Statement:
-    """`target = template` with cells for {0}, {1} and so on.
+    """The C statement `target = template`, with cells in the places {0}, {1} and so on.
 
     Attributes:
-        target: variable that it computes; None where the template is a whole statement of C.
-        template: text of C with places for cells.
+        target: variable that it computes; None where the template is a whole C statement.
+        template: C text with places for cells.
         cells: cells for these places.
         writes: memory that the template fills.
-        times: count of the numbers it fills in a loop of its own, 0 for a statement without one.
-        always: whether it stays even if nothing reads that memory.
-        start: number that a reduction starts from; empty for other statements.
-        source: line of Python that asks for it.
+        times: count of the numbers that it fills in a loop of its own; 0 for no such loop.
+        always: whether it is kept even if nothing reads that memory.
+        start: initial value of a reduction; empty for other statements.
+        source: file and line of the Python code that it is generated from.
     """
 
     target: Variable | None
@@ -142,8 +142,8 @@ class CodeBlock:
 
     Attributes:
         owner: builder that it belongs to.
-        place: its number among the blocks of the owner.
-        lanes: count of the loop's turns.
+        place: its index among the blocks of the owner.
+        lanes: number of iterations of the loop; 0 for straight-line code.
         calls: whether its statements call functions.
         statements: statements in order.
         nested: a condition or a repetition, which has blocks of its own.
@@ -159,12 +159,13 @@ class CodeBlock:
 
 @dataclass(eq=False)
 class Nested:
-    """Code that runs under a condition, or several times.
+    """A condition with two bodies of code, or a repetition of one body.
 
     Attributes:
-        when: condition of the first of two bodies, or None.
-        times: number of times that a single body runs.
-        bodies: code that runs.
+        when: condition under which the first of two bodies runs, else the second; None for a
+            repetition.
+        times: number of times that the body of a repetition runs.
+        bodies: builders of the bodies.
     """
 
     when: Cell | None
@@ -179,8 +180,8 @@ class Array:
     Attributes:
         shape: shape of the array.
         kind: kind of its numbers.
-        axis: axis of the lanes, or None.
-        cells: its cells, an array without that axis.
+        axis: axis of the lanes; None without lanes.
+        cells: cells of the array, whose shape lacks that axis.
     """
 
     shape: tuple[int, ...]
@@ -190,7 +191,7 @@ class Array:
 
 
 Value = Array | np.ndarray
-"""An array that is computed at run time, or a constant."""
+"""An array of cells computed at run time, or a numpy array of constants."""
 
 
 def kind_of_value(value: Value) -> Kind:
@@ -199,7 +200,7 @@ def kind_of_value(value: Value) -> Kind:
 
 
 def cells_of(shape: Sequence[int], cells: Sequence[Cell]) -> Cells:
-    """Return an array of cells in row-major order."""
+    """Return cells in row-major order as an array of this shape."""
     out = np.empty(len(cells), dtype=object)
     out[:] = cells
     return out.reshape(shape)
@@ -214,14 +215,14 @@ def varies(cell: Cell) -> bool:
 
 
 def longest(shape: Sequence[int]) -> int | None:
-    """Return the axis that is a loop by default; None where all are short."""
+    """Return the axis that becomes a loop by default, the longest; None where all are short."""
     if max(shape, default=0) < LANES:
         return None
     return max(range(len(shape)), key=lambda axis: (shape[axis], axis))
 
 
 def in_memory(memory: Memory, shape: tuple[int, ...]) -> Array:
-    """Return the array that is stored in memory in row-major order."""
+    """Return the array of this shape that memory holds in row-major order."""
     places = np.arange(prod(shape)).reshape(shape)
     axis = longest(shape)
     if axis is None:

@@ -1,7 +1,7 @@
 """Access to functions that JAX has traced, the same for all supported versions of JAX.
 
-No other module knows where a version keeps the parameters of a primitive, the functions that it
-calls, and the lines of Python that ask for it.
+Only this module depends on where a version of JAX stores the parameters of a primitive, the
+functions that it calls, and the line of Python code that it was traced from.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Params(dict[str, Any]):
     """Parameters of a primitive by their names in JAX.
 
     Raises:
-        DataError: this version of JAX gives the primitive no parameter of such a name.
+        DataError: in this version of JAX the primitive has no parameter of that name.
     """
 
     def __init__(self, equation: JaxprEqn):
@@ -41,7 +41,7 @@ class Traced:
 
     Attributes:
         jaxpr: its equations, arguments and results.
-        constants: arrays that stand for its first variables, one each.
+        constants: values of the constant variables of the jaxpr, in their order.
     """
 
     jaxpr: Jaxpr
@@ -49,10 +49,12 @@ class Traced:
 
     @classmethod
     def of(cls, written: object) -> Traced:
-        """Return a traced function, which JAX 0.10 keeps in two classes and later versions in one.
+        """Return a traced function from JAX's own object, in any supported version of JAX.
+
+        JAX 0.10 has two classes for it, later versions have one.
 
         Raises:
-            DataError: it is written in an unsupported way.
+            DataError: this version of JAX represents functions in an unsupported way.
         """
         jaxpr, constants = getattr(written, "jaxpr", written), getattr(written, "consts", ())
         if not isinstance(jaxpr, Jaxpr) or len(jaxpr.constvars) != len(constants):
@@ -62,12 +64,13 @@ class Traced:
 
 @dataclass(frozen=True)
 class ScanParameters:
-    """Parameters of a scan, which applies a function to its own results again and again.
+    """Parameters of a scan, which applies a function repeatedly to its own results.
 
     Attributes:
-        body: the function; turns: how often it is applied.
-        constants: number of its first arguments, which are the same in every turn.
-        carried: number of its next arguments, which are results of the turn before.
+        body: the function.
+        turns: number of times that it is applied.
+        constants: number of leading arguments that are the same in every turn.
+        carried: number of the arguments after these, which are the results of the last turn.
     """
 
     body: Traced
@@ -80,7 +83,7 @@ class ScanParameters:
         """Return the parameters from the numbers of JAX 0.10 or the trees of later versions.
 
         Raises:
-            DataError: they are written in an unsupported way.
+            DataError: this version of JAX represents them in an unsupported way.
         """
         if "num_carry" in params:
             constants, carried = params["num_consts"], params["num_carry"]
@@ -98,12 +101,12 @@ def called(params: Params) -> Traced:
 
 
 def branches(params: Params) -> list[Traced]:
-    """Return the functions of a condition, one of which is called."""
+    """Return the functions among which a condition selects one to call."""
     return [Traced.of(branch) for branch in params["branches"]]
 
 
 def source_line(equation: JaxprEqn) -> str:
-    """Return file and line of the innermost own code that asks for an equation, or ""."""
+    """Return file and line of the innermost code of slipid that created an equation, or ""."""
     traceback = equation.source_info.traceback
     for frame in traceback.frames if traceback is not None else ():
         path = Path(frame.file_name)
@@ -114,7 +117,7 @@ def source_line(equation: JaxprEqn) -> str:
 
 
 def unknown(what: str) -> DataError:
-    """Return the error for a version of JAX that writes something in an unsupported way."""
+    """Return the error for a version of JAX that represents something in an unsupported way."""
     return DataError(
         f"jax {jax.__version__} writes {what} in a way that this version of slipid does not know; "
         f"expected a version that it knows: pip install 'jax{KNOWN}'"

@@ -1,4 +1,4 @@
-"""Lowering of traced functions to statements; constants are computed now, the rest on the robot."""
+"""Lowering of traced functions to C statements; whatever is constant is computed at export."""
 
 from __future__ import annotations
 
@@ -51,27 +51,30 @@ RULES: dict[str, Rule] = {
     "scatter-mul": moves.scattered("mul", 1.0),
     "select_n": elementwise.select,
 }
-"""Rule that turns a primitive into C, by its name.
+"""Rules that turn a primitive into C, by the primitive's name.
 
-Primitives that only move numbers need no rule of their own: JAX itself is asked where the numbers
-of their result come from."""
+Primitives that only move numbers need no rule of their own: they are applied to the indices of the
+numbers, which shows where the numbers of their result come from."""
 INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
-"""Primitives that call a function, which is inlined."""
+"""Primitives that call a function; its statements are inlined."""
 
 _TYPES = frozenset(map(np.dtype, ("float64", "int64", "int32", "bool")))
 """Types of numbers that have a counterpart in C."""
 
 
 class UnsupportedError(Exception):
-    """A step that has no form in C, with the primitive and the line of Python that asks for it."""
+    """Error for a function that cannot be turned into C.
+
+    The message names the primitive and the line of Python code that it comes from.
+    """
 
 
 def lowered(builder: Builder, traced: Traced, values: Sequence[Value]) -> list[Value]:
-    """Return the results of a traced function of these values.
+    """Return the results of a traced function for these inputs; its statements go to `builder`.
 
     Raises:
-        UnsupportedError: it uses a primitive without a rule.
-        DataError: this version of JAX writes it in an unsupported way.
+        UnsupportedError: the function uses a primitive without a rule.
+        DataError: this version of JAX represents the function in an unsupported way.
     """
     return _Lowering(builder).run(traced, values)
 
@@ -131,13 +134,13 @@ class _Lowering:
         return [RULES[name](self._builder, values, params, shaped)]
 
     def _several(self, equation: JaxprEqn, value: Value) -> list[Value]:
-        """Return the results of a primitive that takes an array apart."""
+        """Return the results of a primitive that splits an array into several."""
         places = np.arange(prod(value.shape)).reshape(value.shape)
         parts = equation.primitive.bind(places, **equation.params)
         return [rearranged(self._builder, [value], np.asarray(part)) for part in parts]
 
     def _cond(self, params: Params, values: list[Value]) -> list[Value]:
-        """Return the results of one of two functions."""
+        """Return the results of a condition: those of one of two functions."""
         builder, which, choices = self._builder, values[0], branches(params)
         if len(choices) != 2:
             raise NoFormError("more than two branches")
@@ -185,7 +188,10 @@ class _Lowering:
 
 
 def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
-    """Return a result without cells of memory that is about to be overwritten, by its names."""
+    """Return a result, with cells in memory that will be overwritten copied to variables.
+
+    `overwritten` are the names of that memory.
+    """
     if not isinstance(value, Array):
         return value
     lanes = 0 if value.axis is None else value.shape[value.axis]
@@ -224,12 +230,12 @@ def _place(memory: Memory, offset: int, stride: int) -> str:
 
 
 def _filled(value: Value) -> Value:
-    """Return the value itself, or a constant if it has no numbers at all."""
+    """Return the value itself, or a constant array if it has no elements."""
     return value if prod(value.shape) else np.zeros(value.shape, DTYPES[kind_of_value(value)])
 
 
 def _evaluated(equation: JaxprEqn, values: list[Value]) -> list[Value]:
-    """Return results that depend on constants alone."""
+    """Return the results of a primitive whose inputs are all constant."""
     avals: list[Any] = [atom.aval for atom in equation.invars]
     inputs = [jax.numpy.asarray(v, a.dtype) for v, a in zip(values, avals, strict=True)]
     with jax.ensure_compile_time_eval():

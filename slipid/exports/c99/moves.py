@@ -1,4 +1,4 @@
-"""Rules of primitives that take arrays apart and join them, at constant or variable places."""
+"""Rules of primitives that slice, join and index arrays, at constant or variable indices."""
 
 from __future__ import annotations
 
@@ -32,15 +32,16 @@ MOVES = frozenset(
         *("reshape", "rev", "slice", "split", "squeeze", "stack", "transpose", "unstack"),
     }
 )
-"""Primitives that only move numbers, if their places are constant."""
+"""Primitives that only move numbers, provided that their indices are constant."""
 SOURCES = {"gather": 1, "dynamic_slice": 1}
-"""Number of first arguments that a primitive moves, the others being places; all by default."""
+"""Number of leading arguments whose numbers a primitive moves; the others are indices. Primitives
+that are not listed move all arguments."""
 
 
 def moved(primitive: Primitive, sources: int) -> Rule:
-    """Return the rule of a primitive that moves numbers of its first arguments.
+    """Return the rule of a primitive that moves numbers of its first `sources` arguments.
 
-    The other arguments must be constant.
+    The other arguments, the indices, must be constant; with 0 `sources` all arguments are moved.
     """
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
@@ -57,7 +58,7 @@ def moved(primitive: Primitive, sources: int) -> Rule:
 
 
 def scatter(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return an array with some numbers replaced at constant places."""
+    """Return an array with some numbers replaced at constant indices."""
     old, where, new = values
     fresh = old_size = prod(old.shape)
     places = _scattered(np.arange(old_size).reshape(old.shape), where, new.shape, params, fresh)
@@ -65,9 +66,9 @@ def scatter(builder: Builder, values: list[Value], params: Params, out: Shaped) 
 
 
 def scattered(name: str, neutral: float) -> Rule:
-    """Return the rule of a primitive that adds to or multiplies numbers at constant places.
+    """Return the rule of a primitive that adds to or multiplies numbers at constant indices.
 
-    Each place may occur once.
+    Each index may occur only once. `neutral` is the neutral number of the operation.
     """
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
@@ -83,7 +84,10 @@ def scattered(name: str, neutral: float) -> Rule:
 def _scattered(
     old: np.ndarray, where: Value, shape: tuple[int, ...], params: Params, fresh: int
 ) -> np.ndarray:
-    """Return where every number comes from: `old`, or new ones numbered from `fresh`."""
+    """Return `old` with the indices of the new numbers, counted from `fresh`, put in their places.
+
+    `where` are the places to replace, and `shape` is the shape of the new numbers.
+    """
     if isinstance(where, Array):
         raise NoFormError("places that are not known before the robot runs")
     kept = {k: params[k] for k in ("dimension_numbers", "indices_are_sorted", "mode")}
@@ -96,7 +100,7 @@ def _scattered(
 
 
 def dynamic_slice(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return a part of an array from a place that is known at run time."""
+    """Return a part of an array that begins at an index computed at run time."""
     whole, starts, sizes = values[0], values[1:], params["slice_sizes"]
     memory = contiguous(builder, whole)
     base = _offset(builder, [along(builder, s, (), None).item() for s in starts], whole, sizes)
@@ -115,9 +119,9 @@ def dynamic_slice(builder: Builder, values: list[Value], params: Params, out: Sh
 def _offset(
     builder: Builder, starts: Sequence[Cell], whole: Value, sizes: Sequence[int], lanes: int = 0
 ) -> Variable:
-    """Return the position of the first number of a part of an array, limited to its bounds.
+    """Return the flat index of the first number of a part of an array, limited to its bounds.
 
-    There is one for every lane if any start differs from lane to lane.
+    It has lanes if any start index differs from lane to lane.
     """
     terms, cells = [], []
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
@@ -130,7 +134,7 @@ def _offset(
 
 
 def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return parts of an array from places that are known at run time, limited to its bounds."""
+    """Return parts of an array at indices computed at run time, limited to its bounds."""
     whole, where = values
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     if numbers.operand_batching_dims or numbers.start_indices_batching_dims:

@@ -1,4 +1,4 @@
-"""Arrays of cells: taken apart, rearranged, and brought to the same lanes."""
+"""Arrays of cells: access to single numbers, rearrangement, and conversion to common lanes."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from slipid.exports.c99.ir import (
 from slipid.exports.fields import kind_of
 
 UNROLLED = 64
-"""Largest count of numbers for which an array without lanes stays unrolled."""
+"""Largest count of numbers in an array without lanes that stays unrolled in C."""
 
 
 class Sources:
-    """Numbers of some arrays, one after the other.
+    """Numbers of some arrays, flattened and joined; a place is an index into all of them.
 
     Attributes:
-        constant: whether all are constants.
-        numbers: the constants, if all are.
+        constant: whether all numbers are constants.
+        numbers: the constants, if all numbers are constants.
         kind: kind of the numbers.
     """
 
@@ -54,7 +54,10 @@ class Sources:
         return self._sources[k], place - int(self._starts[k])
 
     def best_axis(self, places: np.ndarray) -> int | None:
-        """Return the axis along which most rows are lanes of a source already; None if none is."""
+        """Return the axis along which most rows are already lanes of a source.
+
+        Without such an axis it is the longest axis of a large result, and None for a small one.
+        """
         free = {axis: self._free(places, axis) for axis in range(places.ndim)}
         axis = max(free, key=lambda a: (free[a], places.shape[a], a), default=None)
         if axis is not None and 2 * free[axis] * places.shape[axis] >= places.size > 0:
@@ -62,7 +65,7 @@ class Sources:
         return longest(places.shape) if self._laned(places) else None
 
     def _laned(self, places: np.ndarray) -> bool:
-        """Return whether the result has lanes, being long and not one number repeated."""
+        """Return whether the result is long enough for lanes, and not one number repeated."""
         return len(np.unique(places)) > UNROLLED or max(places.shape, default=0) >= 2 * LANES
 
     def _free(self, places: np.ndarray, axis: int) -> int:
@@ -89,7 +92,7 @@ class Sources:
         return cell
 
     def one(self, place: int) -> Cell:
-        """Return the number at a place."""
+        """Return the cell of the number at a place."""
         if place not in self._ones:
             self._ones[place] = self._one(place)
         return self._ones[place]
@@ -140,13 +143,13 @@ class Sources:
         return At(first.memory, 0, table=self._builder.names.table(places, "int"))
 
     def _laned_source(self, row: np.ndarray) -> bool:
-        """Return whether all of a row comes from one array that has lanes."""
+        """Return whether all numbers of a row come from one array that has lanes."""
         source, _ = self._source(int(row[0]))
         same = all(self._source(int(place))[0] is source for place in row)
         return same and isinstance(source, Array) and source.axis is not None
 
     def copied(self, places: np.ndarray) -> Memory:
-        """Return memory that holds these numbers side by side, without a copy where it exists."""
+        """Return memory that holds these numbers contiguously; a copy is made only if needed."""
         cells = [self.one(int(place)) for place in places]
         offsets = _places(cells)
         first = cells[0]
@@ -162,7 +165,7 @@ class Sources:
         return memory
 
     def _copy(self, memory: Memory, start: int, group: list[Cell]) -> None:
-        """Fill memory from a place with evenly spaced numbers, or with one."""
+        """Fill memory from index `start` on with a group of evenly spaced numbers, or with one."""
         first = group[0]
         if len(group) == 1:
             self._builder.fill(memory, f"{{memory}}[{start}] = {{0}};", first)
@@ -211,7 +214,7 @@ def _values(table: Memory) -> np.ndarray:
 
 
 def _places(cells: Sequence[Cell]) -> np.ndarray | None:
-    """Return offsets of cells that are all in one memory; None if they are not."""
+    """Return the offsets of cells in their common memory; None if they have none."""
     first = cells[0]
     for cell in cells:
         if not isinstance(cell, At) or not isinstance(first, At):
@@ -222,7 +225,10 @@ def _places(cells: Sequence[Cell]) -> np.ndarray | None:
 
 
 def _runs(cells: Sequence[Cell]) -> list[list[Cell]]:
-    """Return cells in their order, grouped where three or more are evenly spaced in one memory."""
+    """Return cells in their order, in groups of three or more evenly spaced ones in one memory.
+
+    All other cells form groups of one.
+    """
     runs: list[list[Cell]] = []
     for cell in cells:
         if runs and _goes_on(runs[-1], cell):
@@ -242,13 +248,13 @@ def _goes_on(run: list[Cell], cell: Cell) -> bool:
 def rearranged(
     builder: Builder, sources: Sequence[Value], places: np.ndarray, axis: int | None = -1
 ) -> Value:
-    """Return the array whose numbers are at these places of all sources, flat and joined.
+    """Return the array whose numbers are at these places of the sources, flattened and joined.
 
     Args:
         builder: builder of the code.
-        sources: arrays.
-        places: place of every number of the result.
-        axis: axis of the result's lanes, None for none; by default the cheapest one.
+        sources: arrays that the numbers come from.
+        places: place of every number of the result in the joined sources.
+        axis: axis of the result's lanes, None for no lanes; by default (-1) the cheapest one.
     """
     known = Sources(builder, sources)
     if known.constant:
@@ -282,7 +288,7 @@ def along(builder: Builder, value: Value, shape: tuple[int, ...], axis: int | No
 
 
 def _table(builder: Builder, row: np.ndarray) -> Cell:
-    """Return a row of constants as a cell."""
+    """Return a row of constants as a cell: a table, or one constant if all are equal."""
     kind = kind_of(row.dtype)
     if row.tobytes() == len(row) * row[:1].tobytes():
         return Constant(row[0].item(), kind)

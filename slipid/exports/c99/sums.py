@@ -1,7 +1,7 @@
 """Sums and other reductions, over cells and over lanes.
 
-A product with a constant 0 is left out of a sum of products. For finite numbers that makes no
-difference; infinity and NaN do not propagate through it as they would in JAX.
+A product with a constant 0 is omitted from a sum of products. The result is the same for finite
+numbers, but infinity and NaN do not propagate through such a product as they would in JAX.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ REDUCED = {
 
 
 def chained(builder: Builder, template: str, kind: Kind, cells: Cells, lanes: int) -> Cell:
-    """Return cells combined one after the other."""
+    """Return the cell that results from combining cells one after the other."""
     done: Cell = cells[0]
     for cell in cells[1:]:
         count = lanes if varies(done) or varies(cell) else 0
@@ -77,7 +77,7 @@ def reduced(name: str) -> Rule:
 
 
 def _of_ints(start: str) -> str:
-    """Return the neutral element of a reduction of whole numbers, from that of reals."""
+    """Return the initial value of a reduction of whole numbers, from that of reals."""
     known = {"R(0.0)": "0", "R(1.0)": "1", "R_INFINITY": "INT32_MAX", "-R_INFINITY": "INT32_MIN"}
     if start not in known:
         raise NoFormError("of whole numbers")
@@ -87,13 +87,13 @@ def _of_ints(start: str) -> str:
 def over_lanes(
     builder: Builder, template: str, kind: Kind, cell: Cell, lanes: int, start: str
 ) -> Cell:
-    """Return a cell reduced over its lanes."""
+    """Return a cell reduced over its lanes to one number, from the initial value `start`."""
     text = template.replace("{0}", "{acc}").replace("{1}", "{0}")
     return builder.compute(kind, text, (cell,), lanes, start)
 
 
 def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return the index of the first lane with the least number, or with NaN."""
+    """Return the index of the first lane that has the least number or NaN."""
     value = values[0]
     if len(value.shape) > 1 or kind_of_value(value) != "real":
         raise NoFormError("an argmin of other than one axis of reals")
@@ -106,7 +106,7 @@ def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -
 
 
 def dot(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-    """Return sums of products."""
+    """Return sums of products of two arrays, as `dot_general` of JAX defines them."""
     (by_left, by_right), (batch_left, batch_right) = params["dimension_numbers"]
     left, right = values
     free_left = [d for d in range(len(left.shape)) if d not in (*by_left, *batch_left)]
@@ -134,14 +134,14 @@ def dot(builder: Builder, values: list[Value], params: Params, out: Shaped) -> V
 
 @dataclass(frozen=True)
 class _DotAxes:
-    """Axes along which the lanes of a product of arrays lie.
+    """Axes of the lanes in a product of two arrays.
 
     Attributes:
-        left: axis of the left array; None where it has no lanes.
-        right: axis of the right array; None where it has no lanes.
-        out: axis of the result; None where it has no lanes.
-        lanes: count of the lanes.
-        summed: whether the sum goes over them.
+        left: axis of the lanes in the left array; None where it has no lanes.
+        right: axis of the lanes in the right array; None where it has no lanes.
+        out: axis of the lanes in the result; None where it has no lanes.
+        lanes: number of lanes.
+        summed: whether the products are summed over the lanes.
     """
 
     left: int | None = None

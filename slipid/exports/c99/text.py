@@ -1,4 +1,4 @@
-"""Statements as text of C99: which of them are used, and which arrays can share memory."""
+"""Conversion of statements to C99 text, without unused statements and with shared arrays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from slipid.exports.fields import DTYPES, Kind
 
 
 class Usage:
-    """Use of the statements and arrays of a builder.
+    """Record of which statements and arrays of a builder are used, and when.
 
     It is determined backwards from the end, since a statement is needed if a later one uses its
     result; steps are numbered downwards, so that earlier ones have smaller numbers.
@@ -39,7 +39,7 @@ class Usage:
             self.sizes[array] = self._lives[name].memory.size
 
     def _scan(self, builder: Builder) -> None:
-        """Mark what is used, from the end to the beginning."""
+        """Mark the statements and arrays that are used, from the end to the beginning."""
         for block in reversed(builder.blocks):
             self._step -= 1
             if block.nested is not None:
@@ -51,7 +51,7 @@ class Usage:
                     self._mark(statement, block)
 
     def _mark(self, statement: Statement, block: CodeBlock) -> None:
-        """Mark a statement as needed, with everything that it uses."""
+        """Mark a statement as needed, and all cells and arrays that it uses."""
         self.live.add(id(statement))
         writes, target = statement.writes, statement.target
         if writes is not None and writes.home is not None:
@@ -62,7 +62,7 @@ class Usage:
             self._uses(cell, block)
 
     def _inside(self, nested: Nested) -> None:
-        """Mark what bodies use; memory from before a repetition is live until its end."""
+        """Mark what the bodies use; memory filled before a repetition stays live until its end."""
         end = self._step
         for body in nested.bodies:
             self._scan(body)
@@ -102,7 +102,7 @@ class Usage:
 
 @dataclass
 class _Life:
-    """First and last step of the program that use an array."""
+    """First and last step of the program at which an array is used."""
 
     memory: Memory
     first: int
@@ -118,7 +118,10 @@ def _within(memory: Memory, nested: Nested) -> bool:
 
 
 def _shared(arrays: list[_Life]) -> dict[str, tuple[Kind, str]]:
-    """Return kind and name of an array for each; those used one after another share one."""
+    """Return kind and name of the stack array for each memory, by the memory's name.
+
+    Memories of one kind and size that are not in use at the same time share an array.
+    """
     slots: dict[tuple[Kind, int], list[_Life]] = {}
     names: dict[str, tuple[Kind, str]] = {}
     for life in sorted(arrays, key=lambda life: life.first):
@@ -132,13 +135,13 @@ def _shared(arrays: list[_Life]) -> dict[str, tuple[Kind, str]]:
 
 
 TYPES: dict[Kind, str] = {"real": "real_t", "int": "int32_t", "bool": "bool"}
-"""Types of numbers in C."""
+"""C type of each kind of number."""
 WIDTH = 100
 FLOAT_MAX = float(np.finfo(np.float32).max)
 
 
 def number(value: float | int | bool, kind: Kind) -> str:
-    """Return a constant as text."""
+    """Return a constant as C text."""
     if kind == "bool":
         return "true" if value else "false"
     if kind == "int":
@@ -153,7 +156,7 @@ def number(value: float | int | bool, kind: Kind) -> str:
 
 
 def table(memory: Memory) -> list[str]:
-    """Return the definition of a table of constants."""
+    """Return the lines of C that define a table of constants."""
     values = np.frombuffer(memory.values, dtype=DTYPES[memory.kind]).tolist()
     small = memory.kind == "int" and min(values) >= 0 and max(values) < 2**15
     kind = "int16_t" if small else TYPES[memory.kind]
@@ -162,7 +165,7 @@ def table(memory: Memory) -> list[str]:
 
 
 def wrapped(words: Iterable[str], indent: str) -> list[str]:
-    """Return words with commas between them in lines."""
+    """Return words joined by commas, in lines of at most `WIDTH` characters."""
     lines, line = [], indent
     for word in words:
         if len(line) + len(word) + 2 > WIDTH and line.strip():
@@ -173,11 +176,11 @@ def wrapped(words: Iterable[str], indent: str) -> list[str]:
 
 
 class FunctionBody:
-    """Text of the code of a builder, without unused statements.
+    """C text of the code of a builder, without unused statements.
 
     Attributes:
-        reads: names of all memory that is read.
-        scratch: count of the numbers in arrays on the stack.
+        reads: names of all memory that the code reads.
+        scratch: count of the numbers in its arrays on the stack.
     """
 
     def __init__(self, builder: Builder):
@@ -188,7 +191,7 @@ class FunctionBody:
         self.scratch = sum(self._usage.sizes.values())
 
     def lines(self) -> list[str]:
-        """Return declarations and statements."""
+        """Return the lines of declarations and statements."""
         sizes = self._usage.sizes
         arrays = [f"  {TYPES[kind]} {name}[{size}];" for (kind, name), size in sizes.items()]
         return [*arrays, *self._lines]
@@ -251,7 +254,7 @@ class FunctionBody:
         return [f"{indent}{text}"]
 
     def _where(self, statement: Statement, indent: str) -> list[str]:
-        """Return a comment with the line of Python of a statement, where it changes."""
+        """Return a comment with the Python line of a statement, if it differs from the last one."""
         if statement.source == self._source:
             return []
         self._source = statement.source
@@ -275,18 +278,18 @@ class FunctionBody:
         return self._number(cell.memory, " + ".join(terms))
 
     def _number(self, memory: Memory, place: str) -> str:
-        """Return the text of a number in memory."""
+        """Return the C expression of a number in memory; `place` is the text of its index."""
         text = f"{self._name(memory)}[{place}]"
         return f"({text} != R(0.0))" if memory.lanes and memory.kind == "bool" else text
 
     def _name(self, memory: Memory) -> str:
-        """Return the name in C: that of the shared array on the stack, or its own."""
+        """Return the name of memory in C: that of its shared stack array, or else its own."""
         shared = self._usage.shared.get(memory.name)
         return memory.name if shared is None else shared[1]
 
 
 def folded(text: str, indent: str) -> list[str]:
-    """Return a long statement over several lines."""
+    """Return the lines of a statement, wrapped at `WIDTH` characters."""
     if len(indent) + len(text) <= WIDTH:
         return [indent + text]
     lines, line = [], indent

@@ -1,1 +1,1 @@
-"""The parts of a ROS 2 folder; `slipid.exports.ros.folder` puts them together."""
+"""The files of a ROS 2 folder; `slipid.exports.ros.folder` combines them."""

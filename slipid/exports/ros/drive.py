@@ -1,13 +1,14 @@
-"""The drive controller of ros2_controllers with a robot's kinematics, if there is one.
+"""The drive controller of ros2_controllers that has a robot's kinematics, if there is one.
 
 Such controllers convert a body twist (vx, vy, yaw rate W) to wheel speeds by
 
     omni      r w_k = sin(t_k) vx - cos(t_k) vy - R W,   t_k = wheel_offset + 2 pi k / n
     mecanum   r w   = vx -/+ vy -/+ s W,                 s = lx + ly, about the middle of the wheels
 
-with mecanum's signs - - front left, + + front right, - + rear right, + - rear left. Omni wheels
-stand evenly on a circle and count counter-clockwise; a positive speed turns the robot clockwise.
-Wheels count from 0 here.
+where w_k is the speed of wheel k [rad/s], r the wheel radius [m] and R the base radius [m]. For
+mecanum wheels the two signs are - - front left, + + front right, - + rear right and + - rear left;
+lx and ly are half the wheelbase and half the track [m]. The n omni wheels stand evenly on a circle
+and are numbered counter-clockwise from 0; a positive speed turns the robot clockwise.
 
 Source: github.com/ros-controls/ros2_controllers, `compute_robot_velocity` of
 omni_wheel_drive_controller, `update_and_write_commands` of mecanum_drive_controller.
@@ -22,10 +23,10 @@ from slipid.exports.ros.yaml_text import Parameter
 from slipid.robot.deployed import DeployedRobot
 
 MOST = 0.05
-"""Largest difference of kinematics with which a controller still fits the robot.
+"""Largest difference of kinematics up to which a controller still fits a robot.
 
-It is a share of a rim speed, for a body that moves at 1, or turns so that points on its base radius
-do."""
+It is the error of a rim speed as a share of the body's speed [1], the speed being that of points on
+the base radius where the body turns on the spot."""
 CORNERS = ("front_left", "front_right", "rear_right", "rear_left")
 
 
@@ -36,7 +37,7 @@ class ControllerPlugin:
     Attributes:
         name: name of the controller.
         plugin: type of the controller.
-        odometry: topic of its odometry, below the name.
+        odometry: topic of its odometry, relative to the controller's name.
         pose: parameter with the diagonal of the pose's covariance.
         twist: parameter with the diagonal of the twist's covariance.
     """
@@ -66,15 +67,14 @@ MECANUM = ControllerPlugin(
 
 @dataclass(frozen=True)
 class DriveController:
-    """A controller with the numbers of a robot.
+    """A drive controller with its parameters set for a robot.
 
     Attributes:
-        controller: names of the controller.
-        wheels: the robot's wheels in the controller's order.
-        turned: whether a wheel's positive speed is the controller's negative one, in that order.
+        controller: type of the controller and its names.
+        wheels: numbers of the robot's wheels in the controller's order.
+        turned: for each of these, whether the controller counts its speed with the opposite sign.
         parameters: parameters of the controller.
-        off: largest difference of the controller's kinematics from the robot's `forward`, as in
-            `MOST`.
+        off: largest difference of the controller's kinematics from the robot's, see `MOST` [1].
     """
 
     controller: ControllerPlugin
@@ -97,7 +97,13 @@ def joint(wheel: int) -> str:
 
 @dataclass(frozen=True)
 class _OrderedWheels:
-    """The robot's wheels in a controller's order, with its rows of kinematics and signs."""
+    """The robot's wheels in a controller's order.
+
+    Attributes:
+        order: numbers of the robot's wheels.
+        turned: whether the controller counts the speed of each wheel with the opposite sign.
+        rows: rows of the robot's kinematics J with the controller's signs.
+    """
 
     order: Int[np.ndarray, " wheel"]
     turned: tuple[bool, ...]
@@ -107,7 +113,7 @@ class _OrderedWheels:
     def of(
         cls, robot: DeployedRobot, order: Int[np.ndarray, " wheel"], axis: int, sign: float
     ) -> "_OrderedWheels":
-        """Return the wheels with signs that give the entries of an axis of the twist this sign."""
+        """Return the wheels, their signs such that column `axis` of the kinematics has `sign`."""
         rows = np.asarray(robot.forward)[order]
         turned = rows[:, axis] * sign < 0
         return cls(order, tuple(turned.tolist()), np.where(turned, -1.0, 1.0)[:, None] * rows)
@@ -119,7 +125,7 @@ class _OrderedWheels:
         own: Float[np.ndarray, "wheel 3"],
         parameters: tuple[Parameter, ...],
     ) -> DriveController:
-        """Return the controller whose kinematics are these rows."""
+        """Return the controller with kinematics `own`, and its difference from the robot's."""
         scale = np.array([1.0, 1.0, 1.0 / float(robot.frame.base)])
         return DriveController(
             controller=controller,
@@ -131,10 +137,13 @@ class _OrderedWheels:
 
 
 def _omni(robot: DeployedRobot) -> DriveController | None:
-    """Return the controller of wheels evenly on a circle, the robot's first wheel first."""
+    """Return the controller for omni wheels evenly on a circle, beginning with the first wheel.
+
+    It is None for fewer than three wheels.
+    """
     places, count = np.asarray(robot.places), robot.wheels
     azimuth = np.arctan2(places[:, 1], places[:, 0])
-    # wheels a rounding error before the first one count as being at 0
+    # a wheel whose azimuth is a rounding error below that of the first one counts as being at 0
     order = np.argsort(np.mod(azimuth - azimuth[0] + 1e-6, 2 * np.pi))
     wheels = _OrderedWheels.of(robot, order, axis=2, sign=-1.0)
     even = 2 * np.pi * np.arange(count) / count
@@ -152,7 +161,7 @@ def _omni(robot: DeployedRobot) -> DriveController | None:
 
 
 def _mecanum(robot: DeployedRobot) -> DriveController | None:
-    """Return the controller of four wheels, one at each corner about their middle."""
+    """Return the controller for four mecanum wheels at the corners of a rectangle, or None."""
     places = np.asarray(robot.places)
     middle = places.mean(axis=0)
     by_corner = {(x > 0, y > 0): k for k, (x, y) in enumerate((places - middle).tolist())}

@@ -1,6 +1,6 @@
 """A ROS 2 folder of an identified robot: drive controller, localization, parameters, README.
 
-All numbers are written so that they read back to the last bit.
+All numbers in YAML files are written with all digits, so that they are read back exactly.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,9 +38,9 @@ class ReadmeContent:
 
     Attributes:
         robot: the robot.
-        drive: drive controller; None where none fits.
+        drive: drive controller; None where none fits the robot.
         errs: errors of odometry on each floor.
-        worst: errors on the worst floor.
+        worst: errors of odometry on the floor with the largest position error.
         files: use of each file, by its path.
     """
 
@@ -52,7 +52,7 @@ class ReadmeContent:
 
 
 def readme(folder: ReadmeContent) -> str:
-    """Return the whole text."""
+    """Return the text of README.md."""
     parts = (_head, _files, _wheels, _odometry, _floors_and_loads, _numbers, _left_out)
     return "\n".join(line for part in parts for line in part(folder)) + "\n"
 
@@ -84,7 +84,7 @@ def _files(folder: ReadmeContent) -> Iterator[str]:
 
 
 def _wheels(folder: ReadmeContent) -> Iterator[str]:
-    """Yield order, places and directions of the wheels."""
+    """Yield the section with order, places and directions of the wheels."""
     robot, drive = folder.robot, folder.drive
     yield from ("## Wheels", "")
     yield (
@@ -114,7 +114,7 @@ def _wheels(folder: ReadmeContent) -> Iterator[str]:
 
 
 def _odometry(folder: ReadmeContent) -> Iterator[str]:
-    """Yield the stds of odometry on every floor."""
+    """Yield the section with the stds of odometry on every floor."""
     yield from ("## Odometry", "")
     robot, speed = folder.robot, top_speed(folder.robot)
     lines = []
@@ -137,7 +137,7 @@ def _stds(variances: Sequence[float]) -> str:
 
 
 def _floors_and_loads(folder: ReadmeContent) -> Iterator[str]:
-    """Yield labels and the names that parameters have for them."""
+    """Yield the section with the names of floors and load set-ups in parameters."""
     yield from ("## Floors and load set-ups", "")
     record = folder.robot.record
     loads = tuple(load.name for load in record.loads)
@@ -151,7 +151,7 @@ def _floors_and_loads(folder: ReadmeContent) -> Iterator[str]:
 
 
 def _numbers(folder: ReadmeContent) -> Iterator[str]:
-    """Yield every number with its origin."""
+    """Yield the section with every number and its origin."""
     yield from ("## Numbers", "")
     yield "Every number with its origin; `slipid.yaml` has them to the last digit."
     lines = []
@@ -212,7 +212,7 @@ USES: Mapping[str, str] = {
     "slipid_parameters.yaml": "their declaration for generate_parameter_library: types, "
     "descriptions with verdicts, validators; the defaults are the numbers themselves",
 }
-"""Use of each file that is not about a single floor."""
+"""Use of each file, by name, without the files for single floors."""
 _FLOOR = (
     "covariances of the drive controller and process noise of `robot_localization.yaml` on this "
     "floor: give it after those files, it overrides them"
@@ -222,7 +222,8 @@ _FLOOR = (
 def ros2_files(robot: DeployedRobot) -> dict[str, str]:
     """Return the text of the files of a ROS 2 folder by path, for the robot's load set-up.
 
-    There is no drive controller where none of ros2_controllers has the robot's kinematics.
+    The file of the drive controller is absent if no controller of ros2_controllers has the robot's
+    kinematics.
     """
     drive, errs = drive_controller_of(robot), odometry_errors(robot)
     own = tuple(e.without_slip() for e in errs)
@@ -255,7 +256,7 @@ def ros2_files(robot: DeployedRobot) -> dict[str, str]:
 def _of_floors(
     robot: DeployedRobot, drive: DriveController | None, errs: tuple[OdometryErrors, ...]
 ) -> Iterator[tuple[str, Sequence[str]]]:
-    """Yield a file per floor with the parameters that differ on it."""
+    """Yield path and lines of a file per floor, with the parameters that depend on the floor."""
     names = identifiers(robot.labels, "floor")
     for name, e in zip(names, errs, strict=True):
         parts: list[tuple[str, tuple[Parameter, ...]]] = [
@@ -269,7 +270,7 @@ def _of_floors(
 def _covariances(
     robot: DeployedRobot, drive: DriveController, e: OdometryErrors
 ) -> tuple[Parameter, ...]:
-    """Return the diagonals of a drive controller on a floor, with their derivation."""
+    """Return the covariance diagonals of a drive controller on a floor, with their derivation."""
     speed = top_speed(robot)
     own, slip = (", ".join(map(short, axes)) for axes in (e.effect, e.slip))
     pose = (

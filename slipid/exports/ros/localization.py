@@ -1,14 +1,16 @@
 """Errors of odometry on each floor as variances for ROS messages, and filter parameters.
 
-Over a path length d [m] an error grows by a part that stays the same (effect e [per m]) and one
-that is drawn anew (process q [per sqrt(m)]), so that its variance is (e d)^2 + q^2 d. Odometry that
-ignores slip also has the slip of its wheels as an error: its e^2 is effect^2 + slip^2, slip being
-the root mean square over directions of travel of the contact model's slip. A constant covariance
-does not know the direction of travel, so x and y both get the larger of along and across. A wrong
-heading carries the robot sideways: with e_w and q_w of the yaw, by (e_w d^2 / 2)^2 + q_w^2 d^3 / 3.
+Over a path length d [m] an error grows by a constant part (std e of the effect [m/m, rad/m]) and by
+a random part (std q of the process noise [m/sqrt(m), rad/sqrt(m)]), so that its variance is
+(e d)^2 + q^2 d. Odometry that ignores slip also has the slip of its wheels as an error: its e^2 is
+effect^2 + slip^2, where slip is the root mean square of the contact model's slip over directions of
+travel. A constant covariance does not depend on the direction of travel, so x and y both get the
+larger variance of along and across. A wrong heading moves the robot sideways; with e_w and q_w of
+the yaw this adds the variance (e_w d^2 / 2)^2 + q_w^2 d^3 / 3.
 
 ROS drive controllers put one constant diagonal into every message, which is not a true covariance
-of odometry; it is taken at `DISTANCE_M`, and for twists at the highest speed of the fitted runs.
+of odometry. It is computed here for the path length `DISTANCE_M`, and that of twists for the
+highest speed of the fitted runs.
 
 The filter is robot_localization's extended Kalman filter for the odometry of a robot. Its state is
 x, y, z, roll, pitch, yaw, their rates in the body frame, and accelerations ahead, sideways and up;
@@ -34,13 +36,13 @@ from slipid.robot.deployed import DeployedRobot, RobotArrays
 from slipid.robot.record import Axes, axes_of
 
 DISTANCE_M = 1.0
-"""Path length since the last correction of the pose for which constant variances hold [m]."""
+"""Path length since the last correction of the pose for which the variances are computed [m]."""
 PERIOD_S = 0.02
-"""Time between two messages of odometry for which they hold [s]."""
+"""Time between two messages of odometry for which the variances of twists are computed [s]."""
 UNKNOWN = 1e6
-"""Variance of height, roll and pitch, which wheels do not measure."""
+"""Variance of height [m^2], roll and pitch [rad^2], which wheels do not measure."""
 DIRECTIONS = 24
-"""Number of directions of travel over which slip is averaged."""
+"""Number of directions of travel over which the mean square slip is taken."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class OdometryErrors:
 
     @property
     def stays(self) -> Axes:
-        """Error per metre that stays the same, of odometry that ignores slip."""
+        """Std of the constant error per metre of path, effect and slip together [m/m, rad/m]."""
         return axes_of(np.hypot(self.effect, self.slip))
 
     def without_slip(self) -> "OdometryErrors":
@@ -69,7 +71,7 @@ class OdometryErrors:
         return replace(self, slip=(0.0, 0.0, 0.0))
 
     def pose(self, distance: float) -> Axes:
-        """Return the variance of x, y and heading after a path length [m^2, m^2, rad^2]."""
+        """Return the variances of x, y and heading [m^2, m^2, rad^2] after a path length [m]."""
         e, q = np.asarray(self.stays), np.asarray(self.process)
         along, across, yaw = (e * distance) ** 2 + q**2 * distance
         across += (e[2] * distance**2 / 2) ** 2 + q[2] ** 2 * distance**3 / 3
@@ -77,12 +79,19 @@ class OdometryErrors:
         return axes_of(np.array([place, place, yaw]))
 
     def twist(self, speed: float, period: float) -> Axes:
-        """Return the variance of the velocity over one period, (e v)^2 + q^2 v / period."""
+        """Return the variances of the velocity over a period [m^2/s^2, m^2/s^2, rad^2/s^2].
+
+        They are (e v)^2 + q^2 v / period at the speed v [m/s].
+        """
         e, q = np.asarray(self.stays), np.asarray(self.process)
         return _level((e * speed) ** 2 + q**2 * speed / period)
 
     def walk(self, speed: float, distance: float) -> Axes:
-        """Return the variance per second of a random walk that errs by e d after d: e^2 d v."""
+        """Return the variances per second of a random walk [m^2/s, m^2/s, rad^2/s].
+
+        After the path length d [m] at the speed v [m/s] its std equals the constant error e d, so
+        the variance per second is e^2 d v.
+        """
         return _level(np.asarray(self.stays) ** 2 * distance * speed)
 
 
@@ -107,14 +116,14 @@ def top_speed(robot: DeployedRobot) -> float:
 
 
 def diagonal(planar: Axes) -> tuple[float, ...]:
-    """Return the variances of x, y, z, roll, pitch and yaw."""
+    """Return the variances of x, y, z [m^2], roll, pitch and yaw [rad^2]."""
     x, y, yaw = planar
     return (x, y, UNKNOWN, UNKNOWN, UNKNOWN, yaw)
 
 
 @eqx.filter_jit
 def _slip(robot: RobotArrays, speed: Float[Array, ""]) -> Float[Array, "floor 3"]:
-    """Return the root mean square slip per metre, along, across and in yaw."""
+    """Return the root mean square slip on each floor, along, across [m/m] and in yaw [rad/m]."""
     angle = jnp.linspace(0.0, 2 * jnp.pi, DIRECTIONS, endpoint=False)
     twist = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(DIRECTIONS)], axis=-1)
     rim = speed * twist @ robot.forward.T
@@ -129,7 +138,7 @@ def _slip(robot: RobotArrays, speed: Float[Array, ""]) -> Float[Array, "floor 3"
 
 
 def _level(row: Float[np.ndarray, "3"]) -> Axes:
-    """Return the same errors with the larger of along and across for both."""
+    """Return the variances with the larger one of along and across in both places."""
     return axes_of(np.array([row[:2].max(), row[:2].max(), row[2]]))
 
 
@@ -137,17 +146,26 @@ NODE = "ekf_filter_node"
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 STATE = (*_POSE, *(f"v{name}" for name in _POSE), "ax", "ay", "az")
 FUSED = ("vx", "vy", "vyaw")
-"""States that the filter takes from odometry, whose pose is the sum of the same velocities."""
+"""States that the filter takes from odometry. The odometry's pose is not used, since it is the
+integral of the same velocities."""
 HELD = 1e-6
-"""Process noise of the states that `two_d_mode` keeps at zero."""
+"""Process noise, variance per second, of the states that `two_d_mode` keeps at zero."""
 ACCELERATION = 0.01
-"""Process noise of accelerations, which nothing measures here: the package's own default."""
+"""Process noise of accelerations, variance per second [m^2/s^5]. No sensor measures them here, so
+it is the default of robot_localization."""
 
 
 def filter_parameters(
     robot: DeployedRobot, errs: OdometryErrors, odometry: str, whose: str
 ) -> tuple[Parameter, ...]:
-    """Return all parameters for odometry on a topic, of `whose` kind and with these errors."""
+    """Return all parameters of the filter.
+
+    Args:
+        robot: identified robot.
+        errs: errors of the odometry.
+        odometry: topic of the odometry.
+        whose: description of the odometry's source, for a comment.
+    """
     about = (
         f"Odometry of {whose}. Velocities only are fused: its pose is their sum, and would count "
         "twice. Order: " + ", ".join(STATE) + "."
@@ -169,7 +187,7 @@ def filter_parameters(
 
 
 def process_noise(robot: DeployedRobot, errs: OdometryErrors) -> Parameter:
-    """Return the process noise on a floor, 15 x 15 as rows."""
+    """Return the process noise on a floor, a 15 x 15 matrix in row-major order."""
     matrix, most = np.diag(_diagonal(robot, errs)), float(Limits().acceleration)
     about = (
         f"On '{errs.floor}'. Pose: errors that stay the same over the path, and so are no noise "
@@ -183,7 +201,11 @@ def process_noise(robot: DeployedRobot, errs: OdometryErrors) -> Parameter:
 
 
 def _diagonal(robot: DeployedRobot, errs: OdometryErrors) -> Float[np.ndarray, " state"]:
-    """Return process noise per second: `OdometryErrors.walk`, and (a T)^2 per period T."""
+    """Return the process noise of each state, as variance per second.
+
+    That of the pose is `OdometryErrors.walk`, that of velocities (a T)^2 per period T [s], with a
+    the largest acceleration [m/s^2, rad/s^2].
+    """
     pose = errs.walk(top_speed(robot), DISTANCE_M)
     change = float(Limits().acceleration) * float(robot.frame.radius)
     speed, turn = change**2 * PERIOD_S, (change / float(robot.frame.base)) ** 2 * PERIOD_S

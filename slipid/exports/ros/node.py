@@ -1,7 +1,7 @@
-"""Parameters of a node `slipid`: the robot's numbers by their paths in robot.json.
+"""Parameters of a ROS node `slipid`: the robot's numbers, named by their paths in robot.json.
 
-Floors and load set-ups are named by `identifiers`. Arrays per wheel are in the order of robot.json;
-matrices are rows one after another.
+Names of floors and load set-ups are those of `identifiers`. Arrays per wheel are in the order of
+robot.json; matrices are in row-major order.
 """
 
 import math
@@ -26,7 +26,7 @@ _ZEROS = Check("lower_element_bounds<>", (0.0,))
 
 
 def node_parameters(robot: DeployedRobot) -> tuple[Parameter, ...]:
-    """Return all parameters, those of a group together."""
+    """Return all parameters; those of a group stand together."""
     return (*_choices(robot), *_numbers(robot), *_shape(robot), *_errors(robot), *_controls(robot))
 
 
@@ -49,7 +49,7 @@ def _choices(robot: DeployedRobot) -> Iterator[Parameter]:
 
 
 def _numbers(robot: DeployedRobot) -> Iterator[Parameter]:
-    """Yield every number of the record; those of a group stand together as they are declared."""
+    """Yield every number of the record; groups and their numbers are in the declared order."""
     floors = dict(zip(robot.labels, identifiers(robot.labels, "floor"), strict=True))
     names = [load.name for load in robot.record.loads]
     loads = dict(zip(names, identifiers(names, "load"), strict=True))

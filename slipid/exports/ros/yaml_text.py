@@ -1,7 +1,7 @@
 """YAML of ROS 2 parameters, and their declaration for `generate_parameter_library`.
 
-The declaration is a tree of names whose leaves state type, default, description, whether the
-parameter is read-only, and validators by name with their arguments.
+The declaration is a tree of names. Its leaves contain type, default, description, whether the
+parameter is read-only, and the names and arguments of validators.
 """
 
 import textwrap
@@ -17,7 +17,7 @@ _TYPES = {bool: "bool", float: "double", str: "string"}
 
 @dataclass(frozen=True)
 class Check:
-    """A validator of `generate_parameter_library`, by its name, and its arguments."""
+    """A validator of `generate_parameter_library`: its name and arguments."""
 
     name: str
     arguments: tuple[Scalar | tuple[str, ...], ...]
@@ -30,10 +30,10 @@ class Parameter:
     Attributes:
         name: name, with a point between the names of groups.
         value: value, which is the default in a declaration.
-        about: one paragraph, empty where the one before it covers it.
-        checks: validators.
-        read_only: whether it can be set at the start only.
-        per_line: entries of an array per line, 0 for as many as fit.
+        about: description in one paragraph; empty where that of the parameter before covers both.
+        checks: validators of the value.
+        read_only: whether it can be set only when the node starts.
+        per_line: number of array entries per line; 0 for as many as fit.
     """
 
     name: str
@@ -45,20 +45,20 @@ class Parameter:
 
     @property
     def type(self) -> str:
-        """Its type in declarations."""
+        """Type of the parameter in declarations."""
         several = isinstance(self.value, tuple)
         one = self.value[0] if isinstance(self.value, tuple) else self.value
         return _TYPES[type(one)] + "_array" * several
 
 
 _Leaf = Callable[[Parameter, str, str], Iterator[str]]
-"""Lines of a parameter, for its own name and an indent."""
+"""Function that yields the lines of a parameter, given its name without groups and an indent."""
 
 
 def scalar(value: Scalar) -> str:
-    """Return a value that YAML 1.1 and 1.2 read back unchanged, to the last bit.
+    """Return a value as text that YAML 1.1 and 1.2 read back unchanged, to the last bit.
 
-    Floats have a point, and a sign in the exponent: `1e-05` and `1.0e6` would be words.
+    Floats get a point, and a sign in the exponent, since `1e-05` and `1.0e6` would be read as text.
     """
     if isinstance(value, bool):
         return "true" if value else "false"
@@ -73,12 +73,15 @@ def scalar(value: Scalar) -> str:
 
 
 def comment(lines: Sequence[str]) -> list[str]:
-    """Return lines as comments."""
+    """Return lines as comments of YAML."""
     return [f"# {line}".rstrip() for line in lines]
 
 
 def nodes(parts: Sequence[tuple[str, Sequence[Parameter]]]) -> list[str]:
-    """Return the parameters of nodes by the nodes' names; those of a group must stand together."""
+    """Return the lines of a parameter file for some nodes, each a name with its parameters.
+
+    Parameters of a group must stand together.
+    """
     lines: list[str] = []
     for node, parameters in parts:
         lines += ["", f"{node}:", "  ros__parameters:", *_nested(parameters, 2, _valued)]
@@ -86,7 +89,7 @@ def nodes(parts: Sequence[tuple[str, Sequence[Parameter]]]) -> list[str]:
 
 
 def declaration(namespace: str, parameters: Sequence[Parameter]) -> list[str]:
-    """Return the declaration of parameters with their values as defaults."""
+    """Return the lines that declare parameters, with their values as defaults."""
     return ["", f"{namespace}:", *_nested(parameters, 1, _declared)]
 
 
@@ -127,7 +130,7 @@ def _declared(parameter: Parameter, name: str, indent: str) -> Iterator[str]:
 
 
 def _key(parameter: Parameter, name: str, indent: str) -> Iterator[str]:
-    """Yield name and value, an array over several lines where it is long."""
+    """Yield the lines of name and value; a long array takes several lines."""
     value = parameter.value
     if not isinstance(value, tuple):
         yield f"{indent}{name}: {scalar(value)}"
