@@ -20,8 +20,7 @@ STEPS = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0])
 
 
 def coverage_picture(quality: Quality, path: Path) -> Path:
-    """Write a picture of a lens fit: board corners with residuals, and image cells without corners.
-    """
+    """Write a picture of a lens fit: corners with residuals, and image cells without corners."""
     fit, covered = quality.fit, quality.coverage
     width, height = fit.lens.image_px
     title = (

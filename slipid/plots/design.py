@@ -121,8 +121,7 @@ def _colour(d: PlannedRun) -> str:
 
 
 def _falling(ax: Axes, saved: Content) -> None:
-    """Draw the uncertainty over the number of runs for each curve, as if there were no earlier data.
-    """
+    """Draw each curve of the uncertainty over the number of runs, without earlier data."""
     for key, colour, style, label in CURVES:
         curve = saved["curves"][key]
         std = np.sqrt(curve["criterion"])

@@ -31,7 +31,7 @@ class MeasuredWindows:
 
     Attributes:
         group: index of each segment's floor and load set-up in `groups`.
-        groups: pairs (floor, load set-up), floors sorted by their median slip.
+        groups: pairs (floor, load set-up), sorted from the floor with the smallest median slip.
         speed: commanded speed of the body, or that by encoders without a command, rounded to
             0.01 m/s [m/s].
         heading: direction of travel by encoders in the body frame, 0 to 360 [deg].
@@ -44,7 +44,7 @@ class MeasuredWindows:
         wheel_slip: 1 - (speed over the floor) / (rim speed) [1]; NaN for a wheel that hardly
             turned.
         sideways: ratio of the wheel's sideways rolling speed to its rim speed [1].
-        share: share of the weight on the wheel [1].
+        share: share of the weight on the wheel in motion [1].
         amps: measured current [A]; None if currents were not logged.
         amps_model: predicted current [A].
         torque: predicted traction torque at the wheel [N m].

@@ -19,10 +19,8 @@ SIDEWAYS_COLOUR = "#35B779"
 STANDING = 0.05
 """Ratio of a wheel's speed to that of the fastest wheel up to which it counts as at rest."""
 ROLLING = 0.3
-"""Ratio of a wheel's speed to that of the fastest wheel up to which its slip is not drawn.
-
-It would be too uncertain.
-"""
+"""Ratio of a wheel's speed to that of the fastest wheel up to which its slip is not drawn, since it
+would be too uncertain."""
 
 
 def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:

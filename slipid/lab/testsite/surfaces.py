@@ -57,7 +57,7 @@ class SurfacePhysics:
 
     @property
     def settling_s(self) -> float:
-        """Time constant t of the engine's contact spring [s]; a wheel sinks in by about 1.9 g t^2."""
+        """Time constant t of the engine's contact spring [s]; a wheel sinks by about 1.9 g t^2."""
         return float((self.softness_m / (1.9 * GRAVITY)) ** 0.5)
 
 
