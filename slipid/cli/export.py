@@ -1,4 +1,4 @@
-"""`slipid export`: a folder for a robot, in the forms that robots load."""
+"""`slipid export`: write an identified robot to a folder in forms that robots can load."""
 
 from pathlib import Path
 from typing import Annotated
