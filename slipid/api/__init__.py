@@ -1,1 +1,1 @@
-"""Public functions of `import slipid`: fit, check, simulate, drive, export and track."""
+"""Public functions of `import slipid`: fit, check, simulate_runs, drive, export and track."""

@@ -1,4 +1,4 @@
-"""Poses of a robot from the video of an overhead camera."""
+"""Function `track`: poses of a robot from the video of an overhead camera."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,25 +22,27 @@ def track(
 ) -> TrackingResult:
     """Return the poses of a robot with a marker in a video or a folder of pictures.
 
-    `tracked.tracks[0].pose` has x, y [m] and heading [rad] of every frame, NaN where it was
-    rejected and the flag gives the reason; `tracked.write(path)` writes the file that the format
-    `tracked` reads beside a log.
+    With the result `tracked`, `tracked.tracks[0].pose` has x, y [m] and heading [rad] in every
+    frame, or NaN in a rejected frame, whose flag gives the reason. `tracked.write(path)` writes the
+    poses to a file that the preset `tracked` reads beside a robot's log.
 
     Args:
         video: file of the video, or folder of the pictures.
-        camera: calibrated camera with its place above the floor, or its file.
-        marker: marker in the middle of the robot; or a file of several markers, boards or robots.
-        fps: frames per second where the video has no times.
-        times: CSV file of frame and time, instead.
-        quiet: whether to report no progress.
+        camera: calibrated camera with its place above the floor, or the path of its file.
+        marker: marker in the middle of the robot, or the path of a file that describes several
+            markers, boards or robots.
+        fps: frames per second, if the video has no times.
+        times: CSV file with the columns frame and time, if the video has no times.
+        quiet: True to report no progress.
 
     Raises:
-        DataError: an unreadable file, no marker, or frames of another size than calibrated.
+        DataError: a file is unreadable, no marker is found, or the frames have another size than
+            the calibrated ones.
     """
     above = camera if isinstance(camera, OverheadCamera) else OverheadCamera.load(camera)
     source = open_source(str(video), fps, None if times is None else Path(times))
     above.lens.check_size(source.image_px, source.name)
-    # results stay in memory: nobody resumes from this folder
+    # The folder is temporary, since the results are kept in memory and nothing is resumed from it.
     with TemporaryDirectory() as folder, Reporter(quiet=quiet) as report:
         bodies: tuple[Target, ...]
         if isinstance(marker, LoneMarker):

@@ -1,4 +1,4 @@
-"""Fit a robot to runs, with priors and choices as a notebook writes them."""
+"""Function `fit`: fit a robot to runs, with priors and choices given as arguments."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,12 @@ Numbers = int | float | Sequence[int | float]
 
 @dataclass(frozen=True)
 class Prior:
-    """Gaussian prior of a number, or of every entry of a short vector, in its own unit."""
+    """Gaussian prior of a number, or of every entry of a vector, in the number's unit.
+
+    Attributes:
+        mean: mean, one number for all entries or one for each.
+        std: standard deviation, one number for all entries or one for each.
+    """
 
     mean: Numbers
     std: Numbers
@@ -42,24 +47,27 @@ def fit(
 ) -> Fit:
     """Fit motors, floors, wheel loads and camera to runs, end to end.
 
-    Names of numbers are paths such as `motor.resistance` or `surface.gray.creep`; `*` and `?` stand
-    for any text. Numbers that are not named keep their declared prior or value.
+    Parameters are named by paths such as `motor.resistance` or `surface.gray.creep`, in which `*`
+    stands for any text and `?` for any character. Parameters that are not named keep their declared
+    prior or value.
 
     Args:
         runs: runs from `read_runs`, each on one floor.
-        robot: robot that drove them, such as `Robot.omni(...)`.
-        priors: prior knowledge of numbers, which are then fitted.
-        fixed: numbers that keep a value [SI].
-        start: start values of the search [SI].
-        free: numbers that are fitted with their declared priors although they are not by default.
-        image_centre: place where the camera's tilt and distortion are zero [m].
-        windows_per_piece: how finely runs are cut.
-        seed: seed of the draws behind the bands of slip curves.
-        quiet: show no progress.
+        robot: robot that drove the runs, such as `Robot.omni(...)`.
+        priors: priors of parameters by path; these parameters are fitted.
+        fixed: values of parameters that are not fitted, by path [SI].
+        start: start values of the search, by path [SI].
+        free: paths of parameters that are fitted with their declared priors although they are not
+            fitted by default.
+        image_centre: point x, y in the frame of the poses at which the camera's tilt and distortion
+            cause no error [m].
+        windows_per_piece: number of windows in a segment of a run.
+        seed: seed of the draws from which the bands of slip curves are computed.
+        quiet: True to report no progress.
 
     Raises:
         DataError: the runs cannot be cut into windows, or columns of wheels are exchanged.
-        ValueError: no such number, or a value outside its bounds.
+        ValueError: there is no such parameter, or a value is outside its bounds.
 
     Source: the contact law of `slipid.model.contact_law`, the likelihood of `slipid.fitting`.
     """
@@ -82,7 +90,7 @@ def fit_task_of(
     windows_per_piece: int = 4,
     seed: int = 0,
 ) -> FitTask:
-    """Return the fit task of runs and choices; arguments as in `fit`."""
+    """Return the fit task of runs and choices; the arguments are those of `fit`."""
     full = robot_for_runs(robot, runs, image_centre)
     choices = [*fixed_viscosities(runs), *stated_sizes(full, float(full.body.mass))]
     choices += [Choice(path, free=True) for path in free]
@@ -97,5 +105,5 @@ def fit_task_of(
 
 
 def _json_numbers(value: Numbers) -> float | list[float]:
-    """Return a number, or a list of them, as JSON holds them."""
+    """Return a number, or several numbers as a list, in types that JSON has."""
     return np.asarray(value, float).tolist()

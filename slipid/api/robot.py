@@ -1,4 +1,4 @@
-"""Drive a deployed robot on its own model, and export it in the forms that robots load."""
+"""Functions `drive` and `export`, which simulate a deployed robot and export it for real robots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,12 +26,13 @@ from slipid.support.progress import Reporter
 
 @dataclass(frozen=True, eq=False)
 class DriveResult:
-    """One closed-loop run; `print` shows how well the path was kept.
+    """Result of one closed-loop run; `print` shows how well the robot kept to the path.
 
     Attributes:
-        run: path, true and believed poses, commands and estimates, a row per period.
+        run: path, true and estimated poses, commands and estimates, with a row for each control
+            period.
         floor: map of the floor.
-        metrics: path errors by the true poses.
+        metrics: errors of the true poses relative to the path.
     """
 
     run: closed_loop.ClosedLoopRun
@@ -40,7 +41,7 @@ class DriveResult:
 
     @property
     def course(self) -> closed_loop.ClosedLoopRun:
-        """Older name of `run`."""
+        """Return `run`, of which this is an older name."""
         return self.run
 
     def __str__(self) -> str:
@@ -62,24 +63,24 @@ def drive(
     start: int = 0,
     seed: int = 0,
 ) -> DriveResult:
-    """Drive the 2021 paper's rectangle, or another path, on the twin of a robot.
+    """Return a closed-loop run of a robot's twin along the 2021 paper's rectangle or another path.
 
-    The twin is the model itself, with delays and noise.
+    The twin is the identified model as a plant, with delays and sensor noise.
 
     Args:
-        robot: a fit's or a posterior's `deploy()`, or `DeployedRobot.load`.
-        controller: a controller of `slipid trial`: `encoder`, `contact`, `contact_map`,
+        robot: robot from `deploy()` of a fit or a posterior, or from `DeployedRobot.load`.
+        controller: name of a controller of `slipid trial`: `encoder`, `contact`, `contact_map`,
             `contact_gyro`, ...
-        map: file of a floor map; patches of the robot's floors by default.
+        map: path of a floor map; by default a random map of patches of the robot's floors.
         path: `rectangle`, `circle`, `eight` or `turning`.
-        speed: speed along it [m/s].
-        start: number of one of twenty start poses on the map.
+        speed: speed along the path [m/s].
+        start: number of one of twenty start poses on the map, from 0.
         seed: seed of the sensors' noise.
 
     Raises:
-        ValueError: no such controller or start, or wheels that have no controller.
-        DataError: no such path or map, a speed beyond those of the fit, or a floor that the robot
-            does not know.
+        ValueError: there is no such controller or start, or no controller for the robot's wheels.
+        DataError: there is no such path or map, the speed is beyond those of the fit, or the map
+            has a floor that the robot does not know.
     """
     if not robot.steers:
         raise ValueError(NO_CONTROLLER)
@@ -112,19 +113,20 @@ def export(
     """Write a robot to a folder: robot.json, a README, checksums, and the exported forms.
 
     Args:
-        robot: a fit's or a posterior's `deploy()`, or `DeployedRobot.load`; `on(...)` leaves floors
-            out.
-        folder: a new or empty folder, or an older export, which is then replaced.
-        to: `c` (C99 of the very steps of estimator and controller), `ros2` (parameters by the names
-            of ros2_controllers and robot_localization), `stablehlo`, `table` (Markdown and CSV).
-        controller: a controller of `slipid trial`.
+        robot: robot from `deploy()` of a fit or a posterior, or from `DeployedRobot.load`; its
+            method `on(...)` selects some of its floors.
+        folder: new or empty folder, or the folder of an older export, which is replaced.
+        to: forms to write: `c` (C99 code of the same steps of estimator and controller), `ros2`
+            (parameters with the names of ros2_controllers and robot_localization), `stablehlo`,
+            `table` (Markdown and CSV).
+        controller: name of a controller of `slipid trial`.
         path: path that the example in C follows.
-        speed: speed along it [m/s].
-        map: file of a floor map, for `contact_map`, which needs one.
+        speed: speed along the path [m/s].
+        map: path of a floor map, which the controller `contact_map` needs.
 
     Raises:
-        DataError: no such form, controller or path, a step that has no form in C, or a folder with
-            other files.
+        DataError: there is no such form, controller or path, a step cannot be written in C, or the
+            folder has other files.
     """
     file = None if map is None else Path(map)
     options = ExportOptions(tuple(to), controller, path, speed, map=file)

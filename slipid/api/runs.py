@@ -1,4 +1,4 @@
-"""Check runs before a fit, simulate runs with known numbers, and predict steady motions."""
+"""Functions that check runs before a fit, simulate runs, and predict the motion of a robot."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,11 +24,11 @@ from slipid.support.content import Content
 
 @dataclass(frozen=True, eq=False)
 class LogCheck:
-    """Content of runs and expected verdicts; `print` shows it, `check[path]` is one number.
+    """Result of a check of runs; `print` shows it, `check[path]` is one expected estimate.
 
     Attributes:
-        content: runs by floor, channels, repairs of the reader.
-        result: expected verdicts, and what stays unknown.
+        content: summary of the runs by floor, of their channels, and of the reader's repairs.
+        result: expected verdict of each parameter, and sentences about what stays unknown.
     """
 
     content: Content
@@ -38,7 +38,7 @@ class LogCheck:
         return text_of(show_check, self.content | self.result.to_json())
 
     def __getitem__(self, path: str) -> Estimate:
-        """Return the expected estimate of one number; raise `KeyError` for an unknown path."""
+        """Return the expected estimate of one parameter; raise `KeyError` for an unknown path."""
         return self.result.parameters[path]
 
 
@@ -50,18 +50,21 @@ def check(
     fixed: Mapping[str, Numbers] | None = None,
     free: Sequence[str] = (),
 ) -> LogCheck:
-    """Check runs before a fit, which takes far longer; arguments and errors as in `fit`."""
+    """Return the result of a check of runs, which takes far less time than a fit.
+
+    Arguments and errors are those of `fit`.
+    """
     task = fit_task_of(runs, robot, priors or {}, fixed or {}, {}, free)
     return LogCheck(overview(task), expected(task, task.problem()))
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRuns:
-    """Simulated runs and their truth.
+    """Simulated runs and their true parameters.
 
     Attributes:
         runs: the runs, as `read_runs` would return them.
-        robot: robot that drove them, a three-wheeled Robotino; no fit sees it.
+        robot: robot that drove the runs, a three-wheeled Robotino, with its true parameters.
     """
 
     runs: Runs
@@ -69,7 +72,7 @@ class SimulatedRuns:
 
     @cached_property
     def truth(self) -> dict[str, float | list[float]]:
-        """Every true number by its path [SI]."""
+        """Return the true value of every parameter by its path [SI]."""
         return known.true_numbers(self.robot)
 
 
@@ -84,22 +87,22 @@ def simulate_runs(
     voltage: bool = True,
     seed: int = 0,
 ) -> SimulatedRuns:
-    """Simulate a grid of runs with known numbers and with sensor noise like a real Robotino's.
+    """Return simulated runs of a robot with known parameters, and sensor noise as on a Robotino.
 
-    Its older name `made_runs` still works.
+    An older name, `made_runs`, still works.
 
     Args:
-        floors: names of the floors; `firm` and `soft` have numbers of their own, others the
-            declared ones.
-        headings: number of headings, evenly spread, on every floor at every speed.
-        speeds: speeds [m/s].
-        turns: number of curved runs beside them, at every speed.
-        truth: other true numbers, by path [SI].
-        current, voltage: whether those of the motors are logged.
+        floors: names of the floors; `firm` and `soft` have parameters of their own, other floors
+            have the declared start values.
+        headings: number of evenly spread directions of travel, on every floor at every speed.
+        speeds: speeds of the runs [m/s].
+        turns: number of additional curved runs, on every floor at every speed.
+        truth: true values of parameters, by path, that replace the usual ones [SI].
+        current, voltage: whether currents and voltages of the motors are logged.
         seed: seed of the noise.
 
     Raises:
-        ValueError: no such number; the message lists those there are.
+        ValueError: there is no such parameter; the message lists all parameters.
     """
     drives = known.heading_grid([(floor, "as_built") for floor in floors], headings, speeds, turns)
     robot = known.true_robot(drives, truth)
@@ -115,14 +118,15 @@ def simulate_runs(
 
 @dataclass(frozen=True, eq=False)
 class SteadyMotion:
-    """Steady motions, a row per command.
+    """Steady motions of a robot, with a row for each command.
 
     Attributes:
         twist: twist of the body: x [m/s], y [m/s], yaw rate [rad/s].
         wheel_speed: commanded speed of each wheel [rad/s].
-        slip: 1 - v / (r w) of every wheel along its drive; NaN for a wheel that stands.
-        torque: torque of the traction at every wheel, positive where it drives [N m].
-        current: current of every motor, positive where it drives [A].
+        slip: slip 1 - v / (r w) of every wheel [1], where v is the speed of its centre along the
+            drive direction, r the radius and w the wheel speed; NaN for a wheel that stands still.
+        torque: torque of the traction force at every wheel [N m], positive if the wheel drives.
+        current: current of every motor [A], positive if the motor drives.
     """
 
     twist: Float[np.ndarray, "command 3"]
@@ -137,16 +141,16 @@ def steady_motion(
 ) -> SteadyMotion:
     """Return the steady motion of a robot whose wheels keep the commanded speeds.
 
-    Its older name `move` still works.
+    An older name, `move`, still works.
 
     Args:
-        robot: robot with its numbers, such as `fit.robot`.
+        robot: robot with its parameters, such as `fit.robot`.
         floor: name of the floor.
-        command: body twists x [m/s], y [m/s], yaw rate [rad/s], a row each.
-        load: name of the load set-up, the first one by default.
+        command: commanded body twists x [m/s], y [m/s], yaw rate [rad/s], one in each row.
+        load: name of the load set-up; by default the robot's first one.
 
     Raises:
-        ValueError: no such floor or load set-up.
+        ValueError: there is no such floor or load set-up.
 
     Source: the force balance of `slipid.model.contact`.
     """

@@ -1,1 +1,1 @@
-"""The command line, a file per command."""
+"""The command line of slipid, with a module for each command."""

@@ -1,4 +1,4 @@
-"""`slipid benchmark`: every published system on the same logs, beside slipid."""
+"""`slipid benchmark`: run published slip systems and slipid on the same logs."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""`slipid calibrate`: the overhead camera, its lens and its place above the floor."""
+"""`slipid calibrate`: calibrate the lens of an overhead camera and its place above the floor."""
 
 import math
 from pathlib import Path
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from slipid.report.page import Page
 
 SIZE_STD = 0.001
-"""Relative std of the size of a printed board or a tape [1]."""
+"""Relative std of the lengths of a printed board or a measuring tape [1], by default."""
 
 
 @guarded
@@ -120,7 +120,7 @@ def calibrate(
         if camera is not None:
             lens = lens_from_file(camera)
         else:
-            assert known_board is not None  # there are pictures
+            assert known_board is not None  # since there are pictures
             lens = lens_from_pictures(words, known_board, k3)
         fit = None
         if points is not None:
@@ -138,7 +138,7 @@ def calibrate(
 def _refuse_combinations(
     words: list[str], camera: Path | None, floor: Path | None, points: Path | None
 ) -> None:
-    """Raise `DataError` where options contradict each other."""
+    """Raise `DataError` if options contradict each other; `words` are the pictures of a board."""
     if bool(words) == (camera is not None):
         raise DataError("expected either pictures of a board, or --camera FILE with a known lens")
     if floor is not None and points is not None:
@@ -148,7 +148,7 @@ def _refuse_combinations(
 
 
 def _positive(option: str, value: float | None) -> float:
-    """Return the value of an option; DataError where it is missing or not above 0."""
+    """Return the value of an option; raise `DataError` if it is missing or not above 0."""
     if value is None or not 0 < value < math.inf:
         problem = "is missing" if value is None else f"{value:g}"
         raise DataError(f"{option} {problem}; expected a number above 0")
@@ -158,7 +158,10 @@ def _positive(option: str, value: float | None) -> float:
 def _board(
     size: str | None, edges: tuple[float | None, float | None], dictionary: str, legacy: bool
 ) -> "Board":
-    """Return the board of the options; `edges` are those of a square and of a marker [m]."""
+    """Return the board that the options describe.
+
+    `edges` are the edge lengths of a square and of a marker [m].
+    """
     from slipid.camera.calibration.board import board_of
 
     if size is None:
@@ -174,7 +177,10 @@ def _uncalibrated(
     out: Path,
     json: str | None,
 ) -> int:
-    """Write a camera that looks straight down, by metres per pixel, height [m] and turn [deg]."""
+    """Write and print a camera that looks straight down, and return the exit code.
+
+    `described` has the metres per pixel [m], the height of the lens [m] and the turn [deg].
+    """
     from slipid.camera.calibration.calibrate import straight_camera
 
     per_pixel = _positive("--metres-per-pixel", described[0])
@@ -188,7 +194,7 @@ def _uncalibrated(
 
 
 def _write(lens: "CalibratedLens", fit: "FloorFit | None", out: Path, json: str | None) -> int:
-    """Write the camera and its pictures, and print the report."""
+    """Write the camera and its pictures, print the report, and return the exit code."""
     from slipid.plots.calibration import coverage_picture, floor_picture
     from slipid.support.files import read_json, write_json
 
@@ -207,7 +213,7 @@ def _write(lens: "CalibratedLens", fit: "FloorFit | None", out: Path, json: str 
 
 
 def _show(page: "Page", report: Content, lens_too: bool = True) -> None:
-    """Print the report of a camera."""
+    """Print the report of a camera, including that of its lens if `lens_too`."""
     from slipid.camera.calibration.report import report_lines
 
     for line in report_lines(report, lens_too):

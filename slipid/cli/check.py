@@ -1,4 +1,4 @@
-"""`slipid check`: what logs can identify, before any fit."""
+"""`slipid check`: check logs before a fit, and predict what a fit can identify from them."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,7 +41,7 @@ def check(
 
 
 def bench(config: "Config", data: Path, out: Path | None, json: str | None, quiet: bool) -> int:
-    """Check the logs of motors on a bench."""
+    """Check the logs of motors on a bench, print the result, and return the exit code."""
     from slipid.app.bench import check_bench
     from slipid.report.estimates import show_bench_check
 

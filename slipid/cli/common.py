@@ -1,4 +1,4 @@
-"""Shared by all commands: option types, exit codes, and JSON output for programs."""
+"""Code that commands share: types of options, exit codes, and output for people and programs."""
 
 import functools
 import os
@@ -39,7 +39,10 @@ Words = ParamSpec("Words")
 
 
 def executor_of(jobs: int | None) -> "Executor":
-    """Return an executor with `jobs` processes, by default one per core; 1 means this process."""
+    """Return an executor with `jobs` processes, by default one per core.
+
+    If the number is 1, jobs run in this process.
+    """
     from slipid.support.executor import InProcess, Processes
 
     count = jobs or os.cpu_count() or 1
@@ -47,7 +50,10 @@ def executor_of(jobs: int | None) -> "Executor":
 
 
 def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
-    """Turn bad input into one message and exit code 2, an interrupt into exit code 130."""
+    """Return a command whose errors become exit codes.
+
+    Bad input (`DataError`) becomes a message and exit code 2, an interrupt exit code 130.
+    """
 
     @functools.wraps(command)
     def run(*args: Words.args, **options: Words.kwargs) -> None:
@@ -65,9 +71,10 @@ def guarded(command: Callable[Words, int]) -> Callable[Words, None]:
 
 
 def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:
-    """Like `guarded`, for a command that does not apply to a motor on a bench and says so first.
+    """Return a command as `guarded` does, which first refuses the config or result of a bench.
 
-    The config, or the folder of a result, is the first path among the arguments of a command.
+    It is for commands that do not apply to motors on a bench. The config, or the folder of a
+    result, is the first path among the arguments of a command.
     """
 
     @functools.wraps(command)
@@ -85,7 +92,7 @@ def for_robots(command: Callable[Words, int]) -> Callable[Words, None]:
 
 
 def is_bench(path: Path) -> bool:
-    """Return True where a config, or the folder of a result, is of a motor on a bench."""
+    """Return whether a config, or the result in a folder, is of motors on a bench."""
     import tomllib
 
     if path.is_dir():
@@ -106,10 +113,15 @@ def emit(
     out: Path | None = None,
     written: Sequence[str] = (),
 ) -> None:
-    """Print a result for people with the files written to `out`; write JSON where `--json` says so.
+    """Print a result for people, and write it as JSON if the option `--json` is given.
 
-    The JSON goes to a file, which is written whole or not at all, or for `-` to stdout, which then
-    has nothing else.
+    Args:
+        json: file for the JSON; `-` writes it to stdout, and then nothing else is printed; None for
+            no JSON.
+        content: content of the JSON.
+        show: function that prints the result on a page.
+        out: folder to which the command wrote files, or None.
+        written: names of these files, which are printed.
     """
     from slipid.report.page import Page
     from slipid.support.files import json_text, write_json

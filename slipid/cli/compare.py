@@ -1,4 +1,4 @@
-"""`slipid compare`: which slip model is right for each floor."""
+"""`slipid compare`: judge slip models on each floor by their predictions of held-out runs."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""`slipid demo`: identify a robot from logs of the virtual test site, and show the truth."""
+"""`slipid demo`: identify a robot from logs of the virtual test site, and show the true values."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from slipid.app.identify import IdentifyResult
 
 PARTS = ("fit", "unseen")
-"""Folders of the runs to fit and to predict; their configs are `testsite_<part>.toml`."""
+"""Folders of the runs to fit and of those to predict; the config of each is
+`testsite_<part>.toml`."""
 
 
 @guarded
@@ -50,10 +51,17 @@ def demo(
 def run(
     out: Path, plant: str, seed: int | None, executor: "Executor", report: Reporter
 ) -> tuple["IdentifyResult", Content, Content]:
-    """Return a fit to logs of the test site, the predictions of unseen runs, and the truth.
+    """Return a fit to logs of the test site, predictions of runs not fitted, and the true values.
+
+    Args:
+        out: folder to write to.
+        plant: `recorded` for the logs that ship with slipid, `mujoco` to simulate new ones.
+        seed: seed of the simulation, or None.
+        executor: executor of the simulated runs.
+        report: reporter of the progress.
 
     Raises:
-        DataError: no such plant, a seed for recorded logs, or MuJoCo is missing.
+        DataError: there is no such plant, a seed is given for recorded logs, or MuJoCo is missing.
     """
     from slipid.app.logs import packaged_config, unpack
     from slipid.cli.identify import run as identify
@@ -80,7 +88,7 @@ def run(
 
 
 def drive_anew(out: Path, seed: int, executor: "Executor", report: Reporter) -> None:
-    """Drive the runs that ship recorded, and those to be predicted, on the test site."""
+    """Simulate anew, on the test site, all runs whose recorded logs ship with slipid."""
     from slipid.app.logs import packaged_config
     from slipid.lab.testsite.config import plan
     from slipid.lab.testsite.simulate import simulate

@@ -1,4 +1,4 @@
-"""`slipid design`: the next runs to drive."""
+"""`slipid design`: propose the next runs to drive."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -74,7 +74,10 @@ def design(
 
 
 def write(found: "Design", out: Path) -> list[str]:
-    """Write a design; files of an earlier one are removed where it proposes no runs."""
+    """Write a design to a folder, and return the names of the files.
+
+    If the design proposes no runs, the files of an earlier design are removed.
+    """
     from slipid.infer.design.proposal import commands
     from slipid.plots.design import design_figure
     from slipid.plots.drawing import save

@@ -1,4 +1,4 @@
-"""`slipid export`: a folder for a robot, in the forms that robots load."""
+"""`slipid export`: write an identified robot to a folder in forms that robots can load."""
 
 from pathlib import Path
 from typing import Annotated
@@ -75,7 +75,7 @@ def export(
         options = ExportOptions(_names(to), controller, path, speed, map)
         done = run(robot, out, options, report, ROWS)
     content = {
-        "schema": "slipid.exports/1",
+        "schema": "slipid.export/1",
         "folder": str(done.folder),
         "robot": done.robot,
         "forms": list(done.forms),

@@ -1,4 +1,4 @@
-"""`slipid floors`: the floor under each wheel in logged runs."""
+"""`slipid floors`: find the floor under each wheel in logged runs."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 MOST_BEYOND = 0.05
-"""Part of the rows in which wheels may be beyond the map, for exit code 0."""
+"""Largest share of wheel positions beyond the map with which the exit code is 0 [1]."""
 
 
 @for_robots
@@ -50,7 +50,7 @@ def floors(
 
 
 def show(page: "Page", content: Content) -> None:
-    """Print the share of each run in which each floor was under each wheel."""
+    """Print, for each run, the share of time in which each floor was under each wheel."""
     from slipid.report.page import table
 
     shares = table(("run", *content["surfaces"]), "percent of the time under wheel 1, 2, ...")

@@ -64,10 +64,12 @@ def run(
     profiles: Sequence[str] = (),
     anyway: bool = False,
 ) -> "IdentifyResult":
-    """Return the fit and write its pictures; arguments as in `slipid.app.identify.identify`.
+    """Return the fit of a robot to its logs, and write all results and pictures.
+
+    Arguments are those of `slipid.app.identify.identify`.
 
     Raises:
-        DataError: config or logs are wrong; nothing was written then.
+        DataError: config or logs are wrong; in this case nothing was written.
     """
     from slipid.app.identify import identify
     from slipid.deploy.deploy import write_robot
@@ -81,7 +83,7 @@ def run(
     try:
         warning = done.trust.warning
         drawn += identify_plots(done.fit, done.task.dataset, out, warning)
-    except DataError as error:  # the numbers are written even if a run is too short to draw
+    except DataError as error:  # a run is too short to draw; the numbers are written already
         report.line(f"no more pictures: {error}")
     if done.profiles:
         drawn.append(save(profile_figure(done.profiles), out / "profile.png"))
@@ -91,7 +93,7 @@ def run(
 def bench(
     config: "Config", data: Path, out: Path, profile: Sequence[str], json: str | None, quiet: bool
 ) -> int:
-    """Identify motors on a bench."""
+    """Identify motors on a bench, write and print the result, and return the exit code."""
     from slipid.app.bench import identify_bench
     from slipid.plots.bench import bench_plots
     from slipid.report.estimates import show_bench

@@ -1,4 +1,7 @@
-"""The command line. Imports are late: `slipid --help` answers before numpy is loaded."""
+"""The command line with all commands.
+
+Commands import their libraries when they run, so that `slipid --help` does not load numpy.
+"""
 
 import _thread
 import sys
@@ -39,10 +42,10 @@ for command in (
     *(design, trial, export, simulate, calibrate, track, map_, floors, paper),
     *(benchmark, demo),
 ):
-    app.command(command.__name__.rstrip("_"))(command)  # map is a word of Python
+    app.command(command.__name__.rstrip("_"))(command)  # `map_` is named so because of Python's map
 
 AGAIN_S = 0.05
-"""Time after which an interrupt that Python had to ignore is sent again [s]."""
+"""Delay after which an interrupt that Python had to ignore is sent again [s]."""
 
 
 def main() -> None:
@@ -52,13 +55,14 @@ def main() -> None:
 
 
 def _interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
-    """Send an interrupt again that Python had to ignore where it arrived.
+    """Send an interrupt again if Python had to ignore it.
 
-    In a finaliser or a callback of the garbage collector (jax has one) no exception can be raised.
+    Python ignores it if it arrives in a finaliser or in a callback of the garbage collector (jax
+    has one), where no exception can be raised.
     """
     if lost.exc_type is KeyboardInterrupt:
         again = threading.Timer(AGAIN_S, _thread.interrupt_main)
-        again.daemon = True  # a command that has ended by then is not disturbed
+        again.daemon = True  # so that a command that ends does not wait for the timer
         again.start()
     else:
         sys.__unraisablehook__(lost)

@@ -1,4 +1,4 @@
-"""`slipid map`: a map of the surfaces of a floor from a picture from above."""
+"""`slipid map`: make a map of the surfaces of a floor from a picture taken from above."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -61,7 +61,7 @@ def map_(
     from slipid.support.files import write_bytes
     from slipid.support.jax_setup import one_blas_thread
 
-    one_blas_thread()  # many small matrices
+    one_blas_thread()  # the computation uses many small matrices
     robot = RobotShape(dictionary, robot_radius, marker_height)
     options = MapOptions(config, surfaces, robot, cell)
     with Reporter(quiet=quiet) as report:
@@ -83,7 +83,7 @@ def map_(
 
 
 def show(page: "Page", result: "PictureMap", out: Path) -> None:
-    """Print the surfaces, warnings, and what to do next."""
+    """Print the surfaces of a map, its warnings, and the next step."""
     from slipid.report.page import table
 
     content = result.to_json()

@@ -1,4 +1,4 @@
-"""`slipid motor`: identify a motor on a bench from a single file."""
+"""`slipid motor`: identify a motor on a bench from a single log file, without a config."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -84,7 +84,7 @@ def motor(
 
 
 def _given(columns: dict[str, str | None]) -> "dict[str, GivenColumns]":
-    """Return the columns named on the command line, by channel."""
+    """Return the columns that options name, by channel; `columns` has the texts of the options."""
     from slipid.data.reading.motor_layout import given_columns
 
     given = {channel: text for channel, text in columns.items() if text is not None}

@@ -98,7 +98,16 @@ def new(
 
 
 def _ask(asks: str, default: str, wrong: str) -> str:
-    """Return the user's answer."""
+    """Return the user's answer to a question.
+
+    Args:
+        asks: the question.
+        default: answer if the user only presses Enter.
+        wrong: message about what is wrong with the previous answer; empty for the first.
+
+    Raises:
+        DataError: there is no answer, because the input has ended.
+    """
     from slipid.support.errors import DataError
 
     if wrong:
@@ -115,7 +124,7 @@ def _ask(asks: str, default: str, wrong: str) -> str:
 
 
 def _show(config: "NewConfig", out: Path, data: str) -> None:
-    """Print the robot as it was understood, the open questions, and the next command."""
+    """Print a drawing of the robot, the open questions, and the next command."""
     typer.echo(f"\n{config.drawing}\n")
     if config.questions:
         typer.echo(f'{out} has open questions, lines that begin with "# ?":')

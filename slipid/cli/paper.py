@@ -1,4 +1,4 @@
-"""`slipid paper`: regenerate the 2021 paper from its own data."""
+"""`slipid paper`: regenerate the tables and figures of the 2021 paper from its own data."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""`slipid reference`: every key of a config, from the models that check configs."""
+"""`slipid reference`: print every key of a config, from the models that check configs."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""`slipid simulate`: make logs on the virtual test site."""
+"""`slipid simulate`: simulate runs on the virtual test site, and write their logs."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,7 +33,7 @@ def simulate(
 
 
 def show(page: "Page", found: Content, plan: "SimulationPlan", out: Path) -> None:
-    """Print how much was driven, and the next command."""
+    """Print the number and duration of the simulated runs, and the next commands."""
     from slipid.lab.testsite.config import can_identify
 
     page.line(f"{len(found['runs'])} runs, {found['driven']} of them driven now")

@@ -1,4 +1,4 @@
-"""`slipid track`: poses from a video."""
+"""`slipid track`: find the poses of a robot in a video."""
 
 import math
 from pathlib import Path
@@ -115,7 +115,11 @@ def track(
 
 
 def _region(text: str | None) -> "Region | None":
-    """Return a region of the picture from four numbers; DataError where they are not such."""
+    """Return the region of a picture from the text `X0,Y0,X1,Y1` [pixel], or None for no text.
+
+    Raises:
+        DataError: the text is not four whole numbers.
+    """
     from slipid.camera.tracking.detector import Region
     from slipid.support.errors import DataError
 

@@ -1,4 +1,4 @@
-"""`slipid validate`: predict runs open loop."""
+"""`slipid validate`: predict runs open loop with a fit, and compare them with their poses."""
 
 from pathlib import Path
 
@@ -19,7 +19,10 @@ def validate(out: OutFolder, data: DataFolder, json: Json = None, quiet: Quiet =
 
 
 def run(out: Path, data: Path, report: Reporter) -> Content:
-    """Write pictures and return the validation file; as in `slipid.app.compare.validate`."""
+    """Return the content of the validation file of runs, and draw their pictures.
+
+    Arguments are those of `slipid.app.compare.validate`.
+    """
     from slipid.app.compare import validate
     from slipid.plots.fit import validate_plots
 

@@ -1,7 +1,8 @@
-"""Files of a fit: fit.json refers to its arrays by their hash, identified.json is for people.
+"""Files of a fit: fit.json, its arrays in an npz file named by their hash, and identified.json.
 
-One checksum covers the whole fit, and the renaming of fit.json replaces an old fit by the new one:
-a process that dies before it leaves the old fit, one that dies after it leaves the new one.
+identified.json is for people. One checksum covers the whole fit. An old fit is replaced in one
+step, the renaming of fit.json: if the process dies before, the old fit is intact; if it dies after,
+the new one is.
 """
 
 import hashlib
@@ -29,7 +30,7 @@ from slipid.support.files import checksum, json_text, read_json, write_bytes
 
 FIT, IDENTIFIED = "fit.json", "identified.json"
 _RESULT = "the result of `slipid identify`"
-SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fitting/6"
+SCHEMA, SCHEMA_FIT = "slipid.identified/1", "slipid.fit/6"
 _PLAIN = ("converged", "reason", "rounds", "remaining")
 _CURVE = ("torque_nm", "slip", "slip_lo", "slip_hi")
 _SHARED = ("std", "coefs", "by_number", "covariance")
@@ -66,7 +67,7 @@ def write_identified(folder: Path, content: Content) -> None:
 
 
 def load(folder: Path) -> Fit:
-    """Read a fit from the files that `save` wrote.
+    """Return the fit that `save` wrote to a folder.
 
     Raises:
         DataError: a file is absent, damaged, of another version or of another fit.
@@ -244,7 +245,7 @@ def _tuples(plain: Content) -> Content:
 
 
 def _robot_json(robot: Robot) -> Content:
-    """Return a robot as plain values: its shape, its names, every number."""
+    """Return a robot as plain values: geometry, names of floors, loads, sessions, every number."""
     return {
         "geometry": {name: getattr(robot.geometry, name) for name in _SHAPE},
         "surfaces": list(robot.surfaces.labels),

@@ -1,4 +1,4 @@
-"""The result of a fit: a frozen value with intervals and verdicts, identifiability included.
+"""Result of a fit: fitted numbers with intervals and verdicts on their identifiability.
 
 Modules that show, sample, deploy or write a fit are loaded when a method needs them.
 """
@@ -44,12 +44,19 @@ if TYPE_CHECKING:
 Evidence = TypeVar("Evidence")
 
 CONFLICT = 4.0
-"""Distance from the prior mean beyond which a message warns [prior std]."""
+"""Distance of a number from its prior mean above which a message warns [prior std]."""
 
 
 @dataclass(frozen=True)
 class Channels:
-    """Logged channels, whether the current is signed, and the number of windows per segment."""
+    """Channels of the fitted logs.
+
+    Attributes:
+        current: True if currents are logged.
+        voltage: True if voltages are logged.
+        signed: True if currents have a sign, False if they are magnitudes.
+        windows: number of windows per segment.
+    """
 
     current: bool = True
     voltage: bool = False
@@ -66,28 +73,31 @@ class Fit:
         choices: user's priors, start values and fixed values.
         z: search vector at the optimum.
         covariance: Laplace covariance of the search vector, with shared effects marginalised.
-        laplace: Laplace covariance without shared effects, from the runs' likelihood alone.
-        shared: shared effects of neighbouring runs, by floor.
-        extrapolation: factors of the variances of unseen runs, by floor@load.
+        laplace: Laplace covariance as if runs shared no effects.
+        shared: fitted shared effects of neighbouring runs, by floor.
+        extrapolation: factors that multiply variances of numbers and shared effects for runs that
+            were not fitted, by floor@load.
         variance: variance components by name, those of sessions included [unit squared].
         variance_unit: unit of each component's std.
         runs: (name, sha256) of every fitted run, runs over several floors last.
         channels: logged channels.
-        curves: slip over torque of every floor.
-        current_trend: a, b of the measured less the predicted current a + b v [A], [A s/m].
+        curves: curve of slip over torque, by floor.
+        current_trend: a [A] and b [A s/m] of the line a + b v fitted to measured less predicted
+            currents, v the speed of the body.
         validity: ranges that the runs on each floor cover.
-        converged: True if the rounds settled and the remaining step is small.
+        converged: True if the last round changed little and the remaining step is small.
         reason: sentence on how the fit ended.
         rounds: number of rounds.
         history: loss after each round.
-        remaining: largest coordinate of the full Gauss-Newton step at the end [posterior std]; a
-            solver that stops without descending need not be at an optimum.
-        lag: camera lag of the windows [s].
-        seed: seed of the draws behind the curves' bands.
+        remaining: largest coordinate of the full Gauss-Newton step at the end [posterior std]. It
+            shows a solver that stopped away from an optimum.
+        lag: camera lag for which the windows were cut [s].
+        seed: seed of the draws from which the bands of the curves are computed.
         baselines: fitted numbers of simpler slip models, for comparison.
-        mixed: predictions of runs over several floors before they were fitted, and by a fit to
-            half of them; end-point errors of the other runs before and after, by floor.
-        refused: the same, with the reason why runs that contradict the others were not fitted.
+        mixed: errors of predictions of runs over several floors, by the fit without them and by
+            fits to half of them, and end-point errors of the other runs before and after, by floor.
+        refused: the same for runs over several floors that contradict the others and were not
+            fitted, with the reason.
         data: runs on one floor each; None for a fit that was loaded from its files.
         problem: likelihood of those runs; None for a loaded fit.
         optimum: end of the search; None for a loaded fit.
@@ -132,7 +142,7 @@ class Fit:
         return str(self)
 
     def __getitem__(self, path: str) -> Estimate:
-        """Return one number with its interval and verdict.
+        """Return the number of a path with its interval and verdict.
 
         Raises:
             KeyError: the fit has no such number; the message lists all.
@@ -218,9 +228,9 @@ class Fit:
         return compared(problem, self.choices, data, question, parts, quiet)
 
     def design(self, *parameters: str, runs: int = 12) -> "Design":
-        """Propose the next runs: those that shrink the intervals of some numbers most.
+        """Return the next runs to drive, which reduce the intervals of given numbers most.
 
-        Without names they serve the predictions and all numbers with the verdict weak.
+        Without names, they are chosen for predictions and for all numbers with the verdict weak.
 
         Raises:
             DataError: a number does not exist or is fixed.
@@ -279,7 +289,10 @@ class Fit:
 
     @cached_property
     def verdict_space(self) -> Space:
-        """Search space with the fitted prior std of deviations; verdicts compare stds with it."""
+        """Search space with the fitted prior std of load biases.
+
+        Verdicts compare posterior stds with its prior stds.
+        """
         if POOLED not in self.variance:
             return self.space
         return self.space.with_pooled(float(np.sqrt(self.variance[POOLED])))
@@ -291,7 +304,10 @@ class Fit:
 
     @cached_property
     def flat(self) -> tuple[FlatDirection, ...]:
-        """Flat directions of the likelihood; shared effects widen intervals but open none."""
+        """Flat directions of the likelihood, from the covariance without shared effects.
+
+        Shared effects widen intervals but do not make a direction flat.
+        """
         has, sideways = self.channels, self.robot.geometry.determines_twist
         return flat_directions(
             self.space, self.laplace, has.current, has.voltage, self.validity, sideways
@@ -299,7 +315,7 @@ class Fit:
 
     @cached_property
     def derived(self) -> dict[str, Estimate]:
-        """Ratios that may be identified where the numbers themselves are not."""
+        """Ratios of numbers by path, which may be identified where the numbers are not."""
         found = derived(self.space, self.z, self.covariance, self.channels.voltage)
         return {e.path: e for e in found}
 
@@ -333,7 +349,7 @@ class Fit:
 
 
 def required(evidence: Evidence | None) -> Evidence:
-    """Return the data or likelihood of a fit; raise `ValueError` if it was loaded from files."""
+    """Return the argument; raise `ValueError` if it is None, as in a fit loaded from files."""
     if evidence is None:
         raise ValueError(
             "this fit was loaded from its files, which hold neither runs nor their likelihood; "
@@ -343,7 +359,7 @@ def required(evidence: Evidence | None) -> Evidence:
 
 
 def draws(z: Search, covariance: Square, count: int, seed: int) -> Float[np.ndarray, "draw free"]:
-    """Return draws of a Gaussian in the search space."""
+    """Return draws of the Gaussian N(z, covariance) in the search space."""
     rng = np.random.default_rng(seed)
     root = np.linalg.cholesky(covariance)
     return z + rng.standard_normal((count, len(root))) @ root.T

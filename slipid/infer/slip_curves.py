@@ -1,4 +1,4 @@
-"""Slip over torque of every floor with its 90 % band, and the ranges that the data cover."""
+"""Curves of slip over torque on every floor with 90 % bands, and the ranges that the runs cover."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -21,11 +21,12 @@ from slipid.search_space import Space
 POINTS = 41
 """Number of points of a curve."""
 _STEADY = 0.1
-"""Largest deviation of a row's command from the run's median command, relative to it."""
+"""Largest deviation of a steady command from the run's median command, relative to the latter."""
 _MOVED = 0.1
-"""Speed over that of the fastest window above which a window counts as moving."""
+"""Ratio of a window's speed to that of the fastest one above which the window counts as moving."""
 _SECTOR, _COMMON = 30.0, 0.02
-"""Width of a sector of headings [deg], and the share of windows above which a sector counts."""
+"""Width of a sector of headings [deg], and the fraction of windows that makes a heading a driven
+one."""
 _SLIP = np.concatenate([np.linspace(0, 0.2, 81), np.linspace(0.2, 1.0, 81)[1:]])
 
 
@@ -54,8 +55,8 @@ class SlipCurve:
 def wheel_states(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
     """Return wheel speeds [rad/s], torques [N m] and slips (segment, window, wheel).
 
-    The slip is the sliding speed over the root sum of squares of rim and roller speed, so that it
-    stays finite for a wheel at rest.
+    Slip is the sliding speed divided by the wheel activity, sqrt(rim speed^2 + roller speed^2), so
+    that it is finite for a wheel at rest.
     """
     frame = robot.geometry.frame()
     speed = robot.geometry.at_wheels(lk.wheel_speed(robot, b))
@@ -97,7 +98,8 @@ def curves(
 ) -> dict[str, SlipCurve]:
     """Return slip over torque by floor with a 90 % band, up to the measured torques.
 
-    Curves are computed at the median speed of the wheels that turned, for an even load.
+    Curves are computed at the median speed of the wheels that turned, for equal loads on all
+    wheels.
     """
     robot = space.tree(jnp.asarray(z))
     speed, torque = (np.abs(np.asarray(x)) for x in wheel_states(robot, b)[:2])
@@ -134,7 +136,7 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
     """Return the ranges of speed, torque, slip and motion that the runs on each floor cover."""
     speed, torque, slip = (np.asarray(x) for x in wheel_states(robot, b))
     back = np.asarray(robot.geometry.pseudo_inverse()) * float(robot.geometry.wheel_radius)
-    # the encoders show the driven motion, without slip
+    # ranges are those of the motion by the encoders, without slip
     twist = np.asarray(lk.wheel_speed(robot, b)) @ back.T
     yaw = twist[..., 2]
     floor, length = np.asarray(b.surface), travel(b, robot)[0].sum(axis=1)
@@ -179,7 +181,7 @@ class DrivenRange(NamedTuple):
 
 
 def has_steady_command(log: Log) -> bool:
-    """Return True if a run had one command most of the time, which then describes its motion."""
+    """Return True if a run had nearly the same command in more than half of its rows."""
     if log.twist_command is None:
         return False
     gap = np.linalg.norm(log.twist_command - np.median(log.twist_command, axis=0), axis=1)
@@ -188,7 +190,10 @@ def has_steady_command(log: Log) -> bool:
 
 
 def by_encoders(twist: Float[np.ndarray, "window 3"]) -> DrivenRange:
-    """Return the driven motions by the encoders, roughly: common headings, quantiles of speeds."""
+    """Return approximate driven motions from encoder twists.
+
+    They are the frequent headings, and the 10, 50 and 90 % quantiles of speeds and yaw rates.
+    """
     speed = np.linalg.norm(twist[:, :2], axis=1)
     ahead = speed > _MOVED * speed.max(initial=0.0)
     turned = np.abs(twist[:, 2])
@@ -204,14 +209,15 @@ def by_encoders(twist: Float[np.ndarray, "window 3"]) -> DrivenRange:
 
 
 def distinct(x: np.ndarray, digits: int) -> tuple[float, ...]:
-    """Return the finite values, rounded, each once, in rising order."""
+    """Return the distinct finite values, rounded to `digits`, in rising order."""
     return tuple(sorted({round(float(v), digits) + 0.0 for v in x[np.isfinite(x)]}))
 
 
 def current_trend(robot: Robot, b: lk.Batch) -> tuple[float, float]:
-    """Return a [A], b [A s/m] of the least squares line a + b v of the current residual's size.
+    """Return a [A] and b [A s/m] of the line a + b v fitted to current residuals, v the speed.
 
-    The residual is measured less predicted current along the predicted one, on all floors.
+    A residual is measured less predicted current, times the sign of the predicted current; all
+    floors are fitted together.
     """
     predicted = lk.predicted_current(robot, b, lk.predict(robot, b).motor_force)
     residual = np.asarray((b.current - predicted) * jnp.sign(predicted))

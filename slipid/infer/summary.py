@@ -1,4 +1,4 @@
-"""Summary of an optimisation as a fit, with a check of its convergence."""
+"""Conversion of an optimisation's result to a `Fit`, with a check of its convergence."""
 
 from collections.abc import Iterable
 
@@ -31,7 +31,7 @@ def summarise(
         optimum: end of the search.
         data: runs on one floor each that the problem's windows were cut from.
         choices: user's choices that the problem was built with.
-        seed: seed of the draws behind the curves' bands.
+        seed: seed of the draws from which the bands of the curves are computed.
     """
     z, log_v = optimum.state.z, optimum.state.log_variance
     contact = force_balance_of(problem, optimum.state, optimum.covariance, problem.full_weight)
@@ -80,12 +80,13 @@ def summarise(
 def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
     """Return the largest coordinate of a full Gauss-Newton step [posterior std], and its name.
 
-    The stds are those of the Laplace covariance, as in the stopping rule of the rounds: the
-    solver's own rows take contact forces as exact, and so determine friction far better than logs.
+    The stds are those of the Laplace covariance, as in the stopping rule of the rounds. Those from
+    the solver's own rows would be too small for friction, since the solver holds the contact forces
+    fixed.
 
-    delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), W with the weights of outliers, g
-    the slope of log |d residuals / d data|; where currents were logged, their rows move the
-    electric numbers only.
+    The step is delta = -(J^T W J + S^-2)^-1 (J^T W r + S^-2 (z - mean) - g), with W the weighted
+    inverse noise covariance, S the prior stds, and g the gradient of log |d residuals / d data|.
+    Currents and voltages change the electric numbers only.
     """
     state, every = optimum.state, problem.full_weight
     z, log_v = state.z, state.log_variance

@@ -1,1 +1,1 @@
-"""Slip models: one interface, open-loop prediction, scores, ranking."""
+"""Slip models: their common interface, open-loop prediction, scores, and ranking."""

@@ -1,23 +1,25 @@
-"""Checks of what other runs did to the fit of runs on one floor, and the scatter of runs.
+"""Agreement of runs over several floors with runs on one floor, and the scatter of runs.
 
 Two questions are answered here: whether a fit that includes runs over several floors still predicts
 the runs on one floor, and how much runs scatter before any physics is fitted to them.
 
 For the scatter, the motion of the body is regressed on smooth functions of the wheels' motion, by
-floor and load set-up: a Fourier series in the direction of travel, yaw, the change with a lag of
-the camera, and the change by turning of a marker whose position on the body is unknown. Every run
-is predicted by the others. The remainder in window k of run r, over the distance d_rk, is
+floor and load set-up: a Fourier series in the direction of travel, the yaw, the change of the
+wheels' motion per lag of the camera and, where the position of the marker on the body is fitted,
+the displacement of the marker by turning. Every run is predicted from the others. The residual in
+window k of run r, over the distance d_rk, is
 
     e_rk = a_r d_rk + s_rk,   var a = v_run,   var s_rk = v_process d_rk
 
-and the two variances follow from its squares within and between runs, which with D_r = sum_k d_rk
-and a^_r = sum_k e_rk / D_r are expected to be
+with a_r the run's own effect and s_rk process noise. With D_r = sum_k d_rk and
+a^_r = sum_k e_rk / D_r, the two variances are estimated by equating squares within and between runs
+to their expectations:
 
     sum_rk (e_rk - a^_r d_rk)^2 = v_process sum_r (D_r - sum_k d_rk^2 / D_r)
     sum_r (sum_k e_rk)^2        = v_run sum_r D_r^2 + v_process sum_r D_r
 
-Squares are summed before anything is divided by a distance: where a robot stands or nearly so, the
-poses' own noise over the small distance would dominate.
+Squares are summed before they are divided by distances, because in windows in which a robot hardly
+moves, the noise of the poses divided by the small distance would dominate.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,18 +44,29 @@ from slipid.predict.slip_model import body_twist, turned
 from slipid.search_space import Space
 
 WORSE = 1.5
-"""Factor by which end-point errors on a floor may grow; a wrong map makes it several."""
+"""Largest accepted ratio of a floor's end-point errors after a fit to more runs to those before.
+
+With a wrong map the ratio is several.
+"""
 FAR = 4.0
-"""Standard errors by which runs over several floors may move a number known from single floors."""
+"""Largest accepted shift of a number, in its standard errors, when runs over several floors are
+added to those on single floors."""
 BETTER = 0.8
-"""Share of the error by a map below which a single floor explains runs better than the map."""
+"""Ratio of the error as if all wheels were on one floor to the error with the map, below which the
+map is rejected."""
 SURE = 3.0
-"""Standard errors of paired differences beyond which a growth is not chance."""
+"""Standard errors of paired differences above which a growth of errors is not due to chance."""
 
 
 @dataclass(frozen=True)
 class FloorErrors:
-    """End-point errors of the runs on one floor over the distance driven, before and after."""
+    """End-point errors of the runs on one floor, divided by the distance driven.
+
+    Attributes:
+        before: error of the fit without runs over several floors.
+        after: error of the fit that includes them.
+        is_worse: True if the error grew by more than `WORSE` and by more than chance.
+    """
 
     before: float
     after: float
@@ -77,7 +90,7 @@ def compared(
     new: Float[np.ndarray, " run"],
     distance: Float[np.ndarray, " run"],
 ) -> dict[str, FloorErrors]:
-    """Return old and new errors of runs by floor, for the distances [m] that the runs drove."""
+    """Return old and new errors by floor, from errors [m] and distances driven [m] of each run."""
     out = {}
     for name in dict.fromkeys(floors):
         mine = np.array([floor == name for floor in floors])
@@ -96,7 +109,7 @@ def compared(
 def end_errors(
     model: PredictiveModel, data: Runs
 ) -> tuple[Float[np.ndarray, " run"], Float[np.ndarray, " run"]]:
-    """Return the distance of predicted from measured end, and the chord, of each run [m]."""
+    """Return the end-point error and the straight-line displacement of each run [m]."""
     error, distance = np.zeros(len(data)), np.zeros(len(data))
     for w in replay.replay_windows(data, model.robot):
         tracks, _ = model.ends(w)
@@ -106,7 +119,12 @@ def end_errors(
 
 
 class LargestShift(NamedTuple):
-    """The number that additional runs moved most, and by how many of its former standard errors."""
+    """The fitted number that changed most when runs were added.
+
+    Attributes:
+        name: name of the coordinate.
+        sigma: size of its change, in the standard errors it had before.
+    """
 
     name: str
     sigma: float
@@ -115,9 +133,10 @@ class LargestShift(NamedTuple):
 def largest_shift(
     space: Space, before: Search, covariance: Square, after: Search, settled: bool
 ) -> LargestShift:
-    """Return the largest shift among numbers known from motion; infinite if the fit did not settle.
+    """Return the largest shift among numbers estimated from motion, the camera's excepted.
 
-    Runs that agree move a number by less than the standard error it had without them (Hausman 1978,
+    It is infinite if the fit with the added runs did not settle. Added runs that agree with the
+    model change a number by less than the standard error it had without them (Hausman 1978,
     Econometrica 46(6)).
     """
     known = ~space.electric & ~space.where(lambda e: e.part == "camera")
@@ -132,9 +151,9 @@ def contradiction(
     """Return why runs over several floors are not used, None where they agree with the others.
 
     Args:
-        found: errors of the runs on one floor each.
-        moved: number that was moved most.
-        by_map: error of the runs over several floors [m/s], with the map for the wheels' floors.
+        found: errors of the runs on one floor each, by floor.
+        moved: fitted number that changed most.
+        by_map: error of the runs over several floors [m/s], the wheels' floors taken from the map.
         as_if: error as if all wheels had always stood on one floor, by floor [m/s].
     """
     worse = ", ".join(
@@ -161,14 +180,14 @@ def contradiction(
 
 
 _TINY = 1e-6
-"""Ridge for runs too few to be predicted, relative to a feature's own size."""
+"""Ridge relative to the sum of squares of each feature, for floors with too few runs."""
 
 
 def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
-    """Return the log variance of every noise component: the scatter of runs, or the typical one.
+    """Return the log variance of every noise component: of the scatter, or typical if larger.
 
-    The larger of the two counts. A model that is no better than smooth counts all else as noise.
-    The scatter is large on a floor with too few runs to predict one from the others.
+    These variances take as noise everything that smooth functions of the wheels' motion do not
+    explain. The scatter is large on a floor with too few runs to predict each from the others.
     """
     w, robot = problem.windows, problem.robot
     distance, _ = travel(w, robot)
@@ -192,7 +211,10 @@ def scatter(problem: Problem) -> Float[np.ndarray, " variance"]:
 def _unpredicted_motion(
     w: Windows, robot: Robot, place_is_free: bool
 ) -> Float[np.ndarray, "segment window 3"]:
-    """Return the motion along, across and in yaw that other runs do not predict [m, m, rad]."""
+    """Return the motion along, across and in yaw that other runs do not predict [m, m, rad].
+
+    With `place_is_free` the position of the marker on the body is regressed, too.
+    """
     shape = robot.geometry
     back = np.asarray(shape.pseudo_inverse()).T * float(shape.wheel_radius)
     step, late = w.turn @ back, w.speed_change @ back

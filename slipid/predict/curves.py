@@ -1,8 +1,9 @@
-"""Slip of each wheel by a curve of its own current or torque, fitted to the motion of the body.
+"""Slip models with a curve of each wheel's slip over its current or torque.
 
     xi = J^+ r (w_i (1 - s_i))
 
-Residuals are displacements, so that nothing is divided by a wheel speed.
+xi is the body twist, r w_i the rim speed of wheel i and s_i its slip. The curves are fitted to the
+motion of the body. Residuals are displacements, so that nothing is divided by a wheel speed.
 """
 
 import abc
@@ -22,16 +23,16 @@ from slipid.predict.steps import Steps, TrainingWindows, TwistModel, scaled_leas
 
 Slips = Float[np.ndarray, "step drive"]
 Regressor = Callable[[RunSignals, RobotSpec], Slips]
-"""Function that returns the argument of each wheel's slip curve in every step."""
+"""Function that returns the argument x of each wheel's slip curve in every step."""
 Features = Callable[[np.ndarray], np.ndarray]
 """Function from the regressor (...,) to features (..., k); slip is their weighted sum."""
 HELD = 1e12
-"""Precision of a coefficient that rests on its bound."""
+"""Precision assigned to a coefficient at its bound, which is thereby treated as fixed."""
 RIDGE = 1e-6
-"""Ridge on each coefficient of a monotone curve, relative to the length of its column.
+"""Ridge on each coefficient of a monotone curve, relative to the norm of its column.
 
-It is too weak to matter where runs determine the coefficients; where they do not, it selects the
-smallest ones instead of those that rounding happens to prefer.
+It has no visible influence where runs determine the coefficients. Where they do not, it selects the
+smallest coefficients; without it, rounding errors would decide.
 """
 
 
@@ -41,10 +42,10 @@ def current(signals: RunSignals, spec: RobotSpec) -> Slips:
 
 
 def soft_torque(signals: RunSignals, spec: RobotSpec) -> Slips:
-    """Return the torque of every wheel [N m] by the motor's model; zeros without logged currents.
+    """Return the torque of every motor [N m] by its model; zeros without logged currents.
 
-    The sign of a current fades as a wheel comes to rest, I = |I| w / sqrt(w^2 + w0^2), because an
-    unsigned ammeter does not show it.
+    Currents fade to zero near standstill, I = |I| w / sqrt(w^2 + w0^2), because an unsigned ammeter
+    does not show the sign of a current there.
     """
     shaft = np.abs(spec.gear_ratio * signals.speed)
     amps = current(signals, spec) * shaft / np.sqrt(shaft**2 + REST**2)
@@ -72,15 +73,15 @@ class CurveModel(WheelSlip):
         s_i = sum_k beta_k phi_k(x_i)
 
     Attributes:
-        features: phi.
-        regressor: x, the current [A] or a torque [N m].
-        per_wheel: whether every wheel has its own coefficients.
-        monotone: whether no coefficient but the first may be negative.
-        insensitive: whether the loss is epsilon-insensitive instead of least squares, as in support
+        features: functions phi_k of the regressor.
+        regressor: function that returns x, the current [A] or a torque [N m].
+        per_wheel: True if every wheel has its own coefficients.
+        monotone: True if only the first coefficient may be negative.
+        insensitive: True for an epsilon-insensitive loss instead of least squares, as in support
             vector regression with a linear kernel; epsilon is a tenth of a robust std of the
             displacement lost to slip.
         smoothing: time constant of a low pass of x [s], None for no smoothing.
-        most: largest slip of either sign; where a wheel is dragged along its slip is negative.
+        most: largest magnitude of the slip; slip is negative where a wheel is dragged along.
     """
 
     features: Features
@@ -108,7 +109,7 @@ class CurveModel(WheelSlip):
         return np.clip(self.regressors(steps, spec) @ self.known, -self.most, self.most)
 
     def regressors(self, steps: Steps, spec: RobotSpec) -> Float[np.ndarray, "step drive k"]:
-        """Return the values that slip is linear in."""
+        """Return the features whose sum, weighted by the coefficients, is each drive's slip."""
         x = self.regressor(steps.signals, spec)
         phi = self.features(x if self.smoothing is None else steps.smoothed(x, self.smoothing))
         if not self.per_wheel:
@@ -116,16 +117,16 @@ class CurveModel(WheelSlip):
         return np.einsum("sdk,de->sdek", phi, np.eye(phi.shape[1])).reshape(*phi.shape[:2], -1)
 
     def stiffness(self, w: TrainingWindows, spec: RobotSpec) -> Float[np.ndarray, "k k"]:
-        """Return a large precision for coefficients that rest on their bound."""
+        """Return precision `HELD` for coefficients at their bound of zero, and zero for others."""
         held = self.monotone & (np.arange(self.numbers) > 0) & (self.known <= 0)
         return np.diag(held * HELD)
 
 
 def insensitive(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the least sum of max(|a beta - b| - epsilon, 0), epsilon a tenth of a robust std of b.
+    """Return the beta that minimises the sum of max(|a beta - b| - epsilon, 0).
 
-    This is support vector regression (Vapnik 1995) with a negligible penalty on beta, as a linear
-    program.
+    epsilon is a tenth of a robust std of b. This is support vector regression (Vapnik 1995) with a
+    negligible penalty on beta, solved as a linear program.
     """
     epsilon = 0.1 * robust_std(b)
     over = sparse.eye_array(len(b))
@@ -140,18 +141,19 @@ def insensitive(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def robust_std(x: Float[np.ndarray, " sample"]) -> float:
-    """Return a std from the interquartile range, which is 1.349 stds of a Gaussian."""
+    """Return the std of a Gaussian with the interquartile range of x, which is 1.349 stds."""
     return float(np.subtract(*np.percentile(x, (75, 25)))) / 1.349
 
 
 @final
 @dataclass(frozen=True)
 class Saturating(WheelSlip):
-    """Janosi-Hanamoto curve inverted: M = M_max (1 - exp(-s / kappa)), s on the rising branch.
+    """Slip of each wheel by the inverted Janosi-Hanamoto curve, M = M_max (1 - exp(-s / kappa)).
 
         s = -kappa log(1 - min(M / M_max, 0.98))
 
-    The coefficients are the logarithms of kappa and M_max. Source: Janosi and Hanamoto 1961.
+    M is the wheel's torque [N m]. The coefficients are the logarithms of kappa and M_max. Source:
+    Janosi and Hanamoto 1961.
     """
 
     name: str = "saturating"
@@ -162,7 +164,7 @@ class Saturating(WheelSlip):
 
         torque = soft_torque(w.steps.signals, spec)
         top = float(np.log(max(torque.max(), 1e-3) * 1.5))
-        # the cap makes several minima, between which one-sided differences choose by rounding
+        # the cap of 0.98 causes several minima; with one-sided differences, rounding selects one
         starts = ([np.log(k), top] for k in (0.05, 0.3, 1.0))
         tries = [least_squares(errors, x, jac="3-point", max_nfev=200) for x in starts]
         return replace(self, coefficients=min(tries, key=lambda r: r.cost).x)
@@ -179,14 +181,14 @@ def powers(*exponents: int) -> Features:
 
 
 def above(threshold: float) -> Features:
-    """Return the deployed form of the 2021 paper: affine above a current, no slip below."""
+    """Return the features of the 2021 paper's deployed form: affine above a current, else zero."""
     return lambda x: np.stack([np.where(x > threshold, x, 0.0), (x > threshold) * 1.0], -1)
 
 
 def ramps(knots: Sequence[float]) -> Features:
-    """Return an I-spline of degree 1: a constant and rising ramps between knots.
+    """Return the features of an I-spline of degree 1: a constant and a rising ramp between knots.
 
-    It is monotone if its weights are not negative.
+    The curve is monotone if the weights of all ramps are not negative.
     """
 
     def phi(x: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A slip model with noise variances of its own, so that it forecasts as the force balance does."""
+"""Slip models with noise variances of their own, so that they forecast distributions of runs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -28,16 +28,27 @@ from slipid.predict.slip_models import FloorModels
 from slipid.search_space import Space
 
 MOST_TURNS, SCORING, SETTLED = 15, 4, 0.02
-"""Rounds of a model's covariance, scoring steps per round, and the change that counts as rest."""
+"""Limits of the fit of variances: largest number of rounds, scoring steps per round, and the change
+of every log variance below which rounds stop.
+
+The covariance of the model's numbers is computed once per round.
+"""
 VAGUE = 1e-2
-"""Precision of a model's numbers before any data: for slips below one, a std of 10 is vague."""
+"""Prior precision of a model's numbers: a std of 10 is uninformative for slips below one."""
 STEP = 1e-4
-"""Step of the difference quotients by a model's numbers."""
+"""Step of the difference quotients with which a model is differentiated by its numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedSlipModel(PredictiveModel):
-    """A slip model with noise of its own and a fit's camera, whose errors its numbers follow."""
+    """A fitted slip model with noise variances of its own and the camera of the force balance.
+
+    The model's numbers depend on the camera's, so that errors of the camera propagate to them.
+
+    Attributes:
+        model: the slip model, fitted floor by floor.
+        contact: fitted force balance, from which the camera is taken.
+    """
 
     model: FloorModels
     contact: ForceBalance
@@ -83,7 +94,7 @@ def fit_with_noise(
     """Return a slip model fitted to the kept segments of a problem, with noise from its residuals.
 
     Variances are estimated by Fisher scoring of the restricted likelihood, as for the force
-    balance; the degrees of freedom of the model's own numbers are subtracted.
+    balance, which accounts for the degrees of freedom of the model's own numbers.
     """
     robot = contact.robot
     w = problem.windows.at_lag(float(robot.camera.lag)).segments(np.flatnonzero(keep > 0))
@@ -113,7 +124,7 @@ def fit_with_noise(
 
 
 def _prior_precision(model: FloorModels, w: Windows, robot: Robot) -> np.ndarray:
-    """Return the precision of a model's numbers without the data."""
+    """Return the prior precision of a model's numbers: `VAGUE`, plus ridges and active bounds."""
     held = model.stiffness(w, robot)
     parts = [VAGUE * np.eye(v.size) + held.get(key, 0.0) for key, v in model.state.items()]
     return np.asarray(block_diag(np.zeros((0, 0)), *parts))
@@ -122,7 +133,15 @@ def _prior_precision(model: FloorModels, w: Windows, robot: Robot) -> np.ndarray
 def _number_covariance(
     before: np.ndarray, common: np.ndarray, scale: np.ndarray, slope: Slopes, keep: np.ndarray
 ) -> np.ndarray:
-    """Return the covariance of a model's numbers and the camera's; the former follow the latter."""
+    """Return the covariance of a model's numbers and the camera's, on which they depend.
+
+    Args:
+        before: prior precision of the model's numbers.
+        common: covariance of the camera's numbers.
+        scale: noise covariance of every segment.
+        slope: derivative of the residuals by the model's numbers, then by the camera's.
+        keep: 1 for fitted segments, else 0.
+    """
     own, m = len(before), slope.shape[1]
     factor = keep * (DEGREES + m) / (DEGREES + m + 2)
     weighted = np.linalg.solve(scale, slope[..., :own]) * factor[:, None, None]
@@ -149,9 +168,10 @@ _residual_jacobian = eqx.filter_jit(jax.jacfwd(_residual, argnums=1))
 
 
 def slopes(model: FloorModels, w: Windows, of: Callable[[FloorModels], np.ndarray]) -> np.ndarray:
-    """Return the derivative of a function of a model by its numbers (segment, ..., number).
+    """Return the derivative of function `of` of a model by its numbers (segment, ..., number).
 
-    Numbers are in order of the keys. Keys share no segment, so one number of each is moved at once.
+    Numbers are in the order of the keys of `state`. Each segment depends on the numbers of one key
+    only, so that one number of every key is varied at the same time.
     """
     ends = np.cumsum([0, *(v.size for v in model.state.values())]).tolist()
     now = of(model)

@@ -1,7 +1,7 @@
-"""Judgement of every slip model on held-out runs: the folds, and the scores of each fold.
+"""Cross-validation of every slip model: the folds of runs, and the scores of each fold.
 
-Runs of one heading are in one fold at every speed and on every floor, so that a held-out heading is
-not fitted anywhere.
+Where headings are held out, all runs of a heading are in the same fold, at every speed and on every
+floor, so that a held-out heading is not fitted anywhere.
 """
 
 import time
@@ -32,9 +32,9 @@ class FoldKey:
     """Properties of a run by which folds are made.
 
     Attributes:
-        floor: floor with load set-up.
-        heading_deg: commanded direction [deg].
-        speed: commanded speed [m/s].
+        floor: floor, with the load set-up if that is not the main one (`score.setups`).
+        heading_deg: commanded direction of travel [deg], nan if unknown.
+        speed: commanded speed [m/s], nan if unknown.
     """
 
     floor: str
@@ -50,24 +50,27 @@ def fold_keys(data: Runs) -> list[FoldKey]:
 
 
 def sectors(keys: Sequence[FoldKey]) -> Fold:
-    """Return the fold of every run by its commanded heading's 60 deg sector, -1 without one."""
+    """Return the fold of every run: the 60 deg sector of its commanded heading, -1 if unknown."""
     heading, known = _headings(keys)
     return np.where(known, (np.floor((heading % 360.0 + 1e-6) / 60.0) % 6).astype(int), -1)
 
 
 def random_headings(keys: Sequence[FoldKey]) -> Fold:
-    """Return a random one of six folds for every 5 deg of heading, -1 for runs without one."""
+    """Return the fold of every run: one of six, drawn at random for every 5 deg of heading.
+
+    Runs without a commanded heading have fold -1.
+    """
     dealt = np.random.default_rng(0).permutation(72) % 6
     heading, known = _headings(keys)
     return np.where(known, dealt[np.round(heading / 5.0).astype(int) % 72], -1)
 
 
 def speeds(keys: Sequence[FoldKey], most: int | None = None) -> Fold:
-    """Return the fold of every run by its commanded speed, -1 where there is nothing to hold out.
+    """Return the fold of every run by its commanded speed, -1 for runs that are never held out.
 
-    This is so where the runs of its floor and load set-up are all in one fold. If there are more
-    than twice `most` speeds, the folds are `most` groups of equally many speeds. Turns on the spot
-    have no speed to hold out.
+    Never held out are turns on the spot, runs without a commanded speed, and runs whose floor and
+    load set-up has all its runs in one fold. Every speed is a fold; if there are more than twice
+    `most` speeds, the folds are `most` groups of equally many speeds.
     """
     speed = np.round([f.speed for f in keys], 3)
     where, known = np.array([f.floor for f in keys]), np.isfinite(speed) & (speed > 0)
@@ -85,7 +88,7 @@ def speeds(keys: Sequence[FoldKey], most: int | None = None) -> Fold:
 def _headings(
     keys: Sequence[FoldKey],
 ) -> tuple[Float[np.ndarray, " run"], Bool[np.ndarray, " run"]]:
-    """Return commanded headings, zero where there is none [deg], and whether there is one."""
+    """Return commanded headings [deg], zero where unknown, and a mask of the known ones."""
     heading = np.array([f.heading_deg for f in keys], float)
     known = np.isfinite(heading)
     return np.where(known, heading, 0.0), known
@@ -96,14 +99,24 @@ QUESTIONS: dict[str, Callable[[Sequence[FoldKey]], Fold]] = {
     "speeds": speeds,
     "random": random_headings,
 }
-"""Runs held out together: 60-degree sectors of headings, one speed, or random headings."""
+"""Functions that assign runs to folds, by the name of the question that the comparison answers.
+
+Held out together are the runs of a 60 degree sector of headings, of one speed, or of random
+headings.
+"""
 
 
 def nested(data: Runs, question: str, judged: np.ndarray) -> Fold:
-    """Return the folds in which a model tunes itself for a question, on runs that are not judged.
+    """Return the folds of a model's inner cross-validation, with which it selects its settings.
 
-    A sector beside a judged one would leave a wider gap than the question has: its fold is -1,
-    always fitted, where two sectors or more are left.
+    They hold out runs as the question does. A sector next to a judged one is not held out (fold -1)
+    if at least two others are left, since the gap of the two together would be wider than that
+    of the question.
+
+    Args:
+        data: all runs.
+        question: a key of `QUESTIONS`.
+        judged: indices of the runs that are judged, which the model does not see.
     """
     fold = QUESTIONS[question](fold_keys(data))
     if question != "sectors":
@@ -116,10 +129,11 @@ def nested(data: Runs, question: str, judged: np.ndarray) -> Fold:
 
 
 def folds_of(data: Runs, question: str, parts: int | None = None) -> Fold:
-    """Return the fold of every run; -1 for one that cannot be judged and is always fitted.
+    """Return the fold of every run; -1 for runs that are always fitted and never judged.
 
-    Holding out its fold would leave nothing of its floor and load set-up. With `parts`, every
-    parts-th fold is held out together.
+    These have no value by which to hold them out, or holding out their fold would leave no run of
+    their floor and load set-up. With `parts`, folds whose numbers have the same remainder modulo
+    `parts` are merged.
 
     Raises:
         DataError: no such question.
@@ -148,8 +162,8 @@ class FoldResult:
 
     Attributes:
         rows: scores of every run.
-        seconds: time to `fit` and to `predict`, by model.
-        numbers: count of fitted numbers by floor, by model.
+        seconds: time to `fit` and to `predict` [s], by model.
+        numbers: count of fitted numbers, by model and floor.
         converged: whether the fit of the force balance converged.
         reason: why that fit stopped.
     """
@@ -166,13 +180,13 @@ class FoldResult:
 
 @dataclass(frozen=True, eq=False)
 class FoldModels:
-    """Every model, the force balance first, fitted to some runs of a problem.
+    """Every model, fitted to the runs that a fold does not hold out.
 
     Attributes:
         problem: problem of the fit.
-        optimum: end of the fit of the force balance.
-        models: the fitted models.
-        seconds: time to fit, by model.
+        optimum: result of the fit of the force balance.
+        models: the fitted models, the force balance first.
+        seconds: time to fit [s], by model.
     """
 
     problem: Problem
@@ -189,9 +203,9 @@ def fit_fold(
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
 ) -> FoldModels:
-    """Return every slip model fitted without some runs; arguments as in `judge`.
+    """Return every slip model fitted without the runs `judged`; arguments as in `judge`.
 
-    Nothing but the numbers of the held-out runs is used of them.
+    No measurement of the held-out runs is used.
     """
     fitted = np.setdiff1d(np.arange(len(data)), judged)
     problem = problem_of_runs(problem, choices, data, fitted)
@@ -212,11 +226,14 @@ def fit_fold(
 def problem_of_runs(
     problem: Problem, choices: Sequence[Choice], data: Runs, fitted: np.ndarray
 ) -> Problem:
-    """Return the problem of a fit to some of its runs; what these cannot determine is fixed."""
+    """Return the problem of a fit to some of its runs; numbers they cannot determine are fixed.
+
+    `fitted` are the indices of these runs.
+    """
     fixed = [*fixed_viscosities(data, fitted), *choices]
     if Space(problem.robot, fixed).names == problem.space.names:
         return problem
-    # the fitted runs had one speed only on some floor
+    # on some floor, the fitted runs have one speed only: its viscosities are fixed
     return Problem(problem.windows, problem.robot, fixed)
 
 
@@ -228,15 +245,15 @@ def judge(
     judged: np.ndarray,
     fit: Callable[..., Optimum] = optimise,
 ) -> FoldResult:
-    """Return the scores of one fold: every slip model fitted without some runs, and judged on them.
+    """Return the scores of one fold: every slip model fitted without its runs, and judged on them.
 
     Args:
         problem: problem of all the runs of `data`, made with the choices.
         choices: the user's choices for numbers.
         data: all runs.
-        question: the one of the `QUESTIONS` for which runs are held out, and for which a model
-            tunes itself on the other runs.
-        judged: numbers of the held-out runs.
+        question: key of `QUESTIONS` by which runs are held out, and by which models select their
+            settings on the other runs.
+        judged: indices of the held-out runs.
         fit: function that fits the problem.
     """
     fold = fit_fold(problem, choices, data, question, judged, fit)

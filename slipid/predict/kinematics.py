@@ -1,47 +1,50 @@
 """Kinematic slip models: encoders, and the corrections that practitioners fit by least squares.
 
-With (s, 0, d) the body twist J^+ r w of wheels that do not slip:
+With (s, 0, d) the body twist J^+ r w of wheels that do not slip, s ahead [m/s] and d in yaw
+[rad/s]:
 
-    encoder                 v_x = s              yaw = d              v_y by the wheels
+    encoder                 v_x = s              yaw = d              v_y from J^+ r w
     effective_track         v_x = a s            yaw = b d            v_y = -x yaw
     instantaneous_centres   v_x = a s + c d      yaw = b d + e s      v_y = -x yaw
     full_linear             v_x = a s + c d      yaw = b d + e s      v_y = f s - x yaw
 
 a is the relative size of the wheels, 1 / b the relative track (over a), x the position on the
 longitudinal axis about which the robot turns [m]; c and e describe a robot whose sides differ. All
-but the encoders are for wheels that do not determine motion sideways, skid steer and differential
-drives: on other robots v_y is not -x yaw. Nothing is tuned.
+models but `encoder` are for wheels that do not determine motion sideways (skid steer and
+differential drives): on other robots v_y is not -x yaw. None of them has settings.
 
 Liberties:
-    - The five numbers of the instantaneous centres are those of Mandow et al. in another form: they
-        give the positions y_left, y_right, x of three centres and two gains, alpha_left,
+    - The five numbers of the instantaneous centres are those of Mandow et al. in another form;
+        theirs are the positions y_left, y_right, x of three centres and two gains, alpha_left,
         alpha_right.
-    - Least squares of displacements over windows instead of an optimiser over whole paths; the
-        effective track of a ROS controller is usually trimmed by hand and has no position x.
-    - Where the lag of the poses behind the wheels is not known, it is one number more.
+    - Displacements over windows are fitted by least squares, instead of whole paths by an
+        optimiser; the effective track of a ROS controller is usually adjusted by hand and has no
+        position x.
+    - Where the lag of the poses behind the wheels is not known, it is fitted, too.
 
 Source: Mandow et al. 2007, "Experimental kinematics for wheeled skid-steer mobile robots", IROS,
 eq. 1 to 5; effective track: the `wheel_separation_multiplier` of ROS controllers; encoders of omni
 wheels: Indiveri 2009, IEEE Transactions on Robotics 25(1).
 
-`HeadingLookup` corrects encoders by a table over the direction of travel, a smooth Fourier series:
+`HeadingLookup` corrects encoders by a smooth function of the direction of travel, a Fourier series:
 
     (along, across, yaw) = (far, 0, turn) + far sum_k c_k phi_k(angle)
 
-with far, angle and turn the encoders' displacement, its direction in the body frame and their yaw,
-and phi = 1, cos angle, sin angle, ..., cos 6 angle, sin 6 angle. The coefficients c are estimated
-by ridge regression on windows; the k-th harmonic is penalised by weight k^4 times the sum of far^2,
-the constant not at all. The weight is chosen in one of two ways:
+with far the displacement by the encoders, angle its direction in the body frame, turn the yaw by
+the encoders, and phi = 1, cos angle, sin angle, ..., cos 6 angle, sin 6 angle. The coefficients c
+are estimated by ridge regression on windows; the penalty on the k-th harmonic is weight k^4 times
+the sum of far^2, and the constant is not penalised. The weight is chosen in one of two ways:
 
-    - The benchmark sets it, like any other setting: it tries `RIDGES`. A floor's loads are pooled.
-    - Otherwise the table selects it from `WEIGHTS` by a cross-validation of its own: over runs that
-      are held out `together`, which suits the table to the question it is judged by, or over random
-      runs, which suits it to interpolation. In the comparison a floor has one table for
+    - The benchmark selects it from `RIDGES`, as it selects every setting. All load set-ups of a
+      floor are pooled.
+    - Otherwise the model selects it from `WEIGHTS` by a cross-validation of its own: over the
+      groups of runs `together`, which optimises the table for the question it is judged by, or over
+      random runs, which optimises it for interpolation. In the comparison a floor has one table for
       each load set-up it was driven with.
 
 Liberties:
     - It is not a published system. A table of corrections over the direction of travel is what a
-        practitioner would make for an omni robot, and what any model of slip has to beat.
+        practitioner would make for an omni robot, and any slip model should predict better.
     - Harmonics above the sixth are omitted.
     - It does not depend on speed: runs of all speeds are pooled.
 
@@ -60,9 +63,9 @@ from slipid.predict.slip_model import Channel, RobotSpec, Twists, turned
 from slipid.predict.steps import Steps, TrainingWindows, TwistModel
 
 TERMS = {"effective_track": 3, "instantaneous_centres": 5, "full_linear": 6}
-"""Number of coefficients of each model beside its lag."""
+"""Number of coefficients of each model, its lag not counted."""
 LONGEST_LAG = 2.0
-"""Lag beyond which the windows' own lag no longer tells where a wheel was [s]."""
+"""Largest difference of a fitted lag from the assumed lag of the steps [s]."""
 
 
 @final
@@ -71,8 +74,8 @@ class Encoder(TwistModel):
     """No slip: xi = J^+ r w. Nothing is fitted; every other model is compared with it.
 
     Attributes:
-        shape: sizes to use instead of the robot's, None for the robot's own.
-        lag: lag of the poses [s], None for that of the steps.
+        shape: geometry to use instead of the robot's, None for the robot's own.
+        lag: lag of the poses behind the wheels [s], None for that of the steps.
     """
 
     learns: ClassVar[bool] = False
@@ -89,7 +92,7 @@ class Encoder(TwistModel):
 
 
 def nominal(shape: Geometry) -> Encoder:
-    """Return encoders with radius and positions as in the config and no lag: today's user model."""
+    """Return encoders with the geometry of the config and no lag, as users run them today."""
     return Encoder("nominal", shape, 0.0)
 
 
@@ -98,11 +101,11 @@ def nominal(shape: Geometry) -> Encoder:
 class Corrected(TwistModel):
     """Kinematics corrected by least squares; see the module docstring.
 
-    The coefficients are a, b, x, then c, e, then f, as far as its name has them; the lag [s] is
-    last where steps have one.
+    The coefficients are a, b, x, then c, e, then f, as far as the model with this `name` has them;
+    a fitted lag [s] comes last.
 
     Attributes:
-        shape: sizes that are corrected instead of the robot's, None for the robot's own.
+        shape: geometry whose encoder twists are corrected, None for the robot's own.
     """
 
     shape: Geometry | None = None
@@ -139,12 +142,13 @@ def corrected(rolling: Twists, numbers: Float[np.ndarray, " number"]) -> Twists:
 
 
 HARMONICS = 6
+"""Number of harmonics of the Fourier series over directions of travel."""
 RIDGES = (1e-5, 1e-3, 1e-1, 10.0)
 """Weights of the ridge that the benchmark tries."""
 WEIGHTS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
-"""Weights from which the table selects its own."""
+"""Weights of the ridge from which `HeadingLookup` selects by its own cross-validation."""
 Together = Int[np.ndarray, " run"]
-"""A number for every run: runs with equal numbers are held out together, those with -1 never."""
+"""Group number of every run: runs with equal numbers are held out together, -1 never."""
 
 
 @final
@@ -156,7 +160,7 @@ class HeadingLookup(TwistModel):
 
     Attributes:
         ridge: weight of the ridge, None to select it by cross-validation.
-        together: runs held out together in that cross-validation.
+        together: group number of every run in that cross-validation, None for random groups.
     """
 
     by_load: ClassVar[bool] = True
@@ -201,7 +205,13 @@ class HeadingLookup(TwistModel):
 
 
 class _HeadingTable(NamedTuple):
-    """Features (window, k), the displacements they explain, and folds."""
+    """Ridge regression of displacements on features, window by window.
+
+    Attributes:
+        phi: features (window, k) [m].
+        gap: measured displacements less those of the encoders (window, 3) [m, m, rad].
+        fold: fold of every window in the cross-validation.
+    """
 
     phi: np.ndarray
     gap: np.ndarray
@@ -212,7 +222,7 @@ class _HeadingTable(NamedTuple):
         return np.asarray(weight * np.sum(self.phi[:, 0] ** 2) * np.diag(rough))
 
     def solved(self, weight: float) -> np.ndarray:
-        # a robot that never moved has no direction of travel and no correction: minimum norm
+        # of a robot that never moved all features are zero: lstsq then returns zero corrections
         gram = self.phi.T @ self.phi + self.penalty(weight)
         return np.asarray(np.linalg.lstsq(gram, self.phi.T @ self.gap, rcond=None)[0])
 
@@ -220,7 +230,7 @@ class _HeadingTable(NamedTuple):
         return min(WEIGHTS, key=self._left_out)
 
     def _left_out(self, weight: float) -> float:
-        """Return the squared error over the folds."""
+        """Return the sum of squared errors on held-out windows, over all folds."""
         loss = 0.0
         for test in (self.fold == k for k in set(self.fold.tolist()) - {-1}):
             if not test.all():
@@ -236,7 +246,7 @@ def _direction(rolling: Float[np.ndarray, "*step 3"]) -> Float[np.ndarray, "*ste
 
 
 def fourier(rolling: Float[np.ndarray, "*step 3"]) -> Float[np.ndarray, "*step k"]:
-    """Return far phi(angle) of the encoders' twists, or of displacements [m]."""
+    """Return far phi(angle), as in the module docstring, of twists [m/s] or displacements [m]."""
     angle = _direction(rolling)
     waves = [wave(k * angle) for k in range(1, HARMONICS + 1) for wave in (np.cos, np.sin)]
     far = np.hypot(rolling[..., 0], rolling[..., 1])

@@ -1,7 +1,7 @@
-"""Open-loop prediction of paths from the first pose on, with the uncertainty of their ends.
+"""Open-loop prediction of paths from the first pose, with the uncertainty of their end points.
 
-All poses are in the corrected metres of the fitted camera; the measured pose is used once, at the
-start.
+All poses are in metres as corrected by the fitted camera. Of the measured poses, only the first one
+is used for a prediction.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,12 +27,18 @@ STEP = 0.5
 """Longest step of a replay [s]."""
 Numbers = Array | np.ndarray
 TOGETHER = 32
-"""Number of runs replayed in one call."""
+"""Number of runs that are predicted in one compiled call."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Paths of runs cut into the same number of steps: marker poses in corrected metres."""
+    """Predicted and measured paths of runs, all with the same number of steps.
+
+    Attributes:
+        run: index of each run.
+        predicted: predicted marker poses (x, y in corrected metres, heading [rad]).
+        measured: measured marker poses.
+    """
 
     run: np.ndarray
     predicted: Float[np.ndarray, "run edge 3"]
@@ -40,14 +46,14 @@ class Tracks:
 
     @property
     def gap(self) -> Float[np.ndarray, "run 3"]:
-        """Predicted less measured end pose."""
+        """Predicted less measured end pose [m, m, rad]."""
         return self.predicted[:, -1] - self.measured[:, -1]
 
 
 def replay_windows(data: Runs, robot: Robot) -> list[Windows]:
     """Return the runs, each as one segment of short steps, `TOGETHER` at a time.
 
-    Numbers of steps are powers of two, so that few shapes are compiled.
+    The number of steps of a run is a power of two, so that few shapes are compiled.
     """
     steps = []
     for k, log in enumerate(data.logs):
@@ -109,11 +115,11 @@ def tracks_from_increments(
 
 
 class IncrementCorrection(eqx.Module):
-    """Correction to be subtracted from predicted increments.
+    """Expected shared effects, to be subtracted from predicted increments.
 
     Attributes:
-        moved: increments to subtract.
-        by_number: their derivative by the search vector.
+        moved: increments to subtract [m, m, rad].
+        by_number: derivative of these increments by the search vector.
     """
 
     moved: Float[Array, "segment window 3"]
@@ -129,9 +135,9 @@ def end_jacobian(
     twist: Numbers | None = None,
     corrected: IncrementCorrection | None = None,
 ) -> Float[Array, "segment 2 free"]:
-    """Return the derivative of the ends by the search vector, from given start poses.
+    """Return the derivative of the end points by the search vector, from given start poses.
 
-    The path is that of the contact equilibrium with its correction, or of given body twists
+    The path is that of the contact equilibrium less `corrected`, or that of given body twists
     (segment, window, 3).
     """
 
@@ -157,16 +163,21 @@ def end_covariance(
     shared: Float[np.ndarray, "segment 3 3"],
     of_parameters: Float[np.ndarray, "segment 2 2"],
 ) -> Float[np.ndarray, "segment 2 2"]:
-    """Return the covariance of predicted less measured ends [m^2], scale matrix of a Student t.
+    """Return the scale matrices of the Student t of predicted less measured end points [m^2].
 
-    It includes process noise, the run's own effect and the shared ones, camera noise at both ends
-    and in the start heading, and the parameters' uncertainty, each propagated to the end along the
-    predicted path.
+    They include process noise, the run's own effect, shared effects, camera noise of both end
+    points and of the start heading, and the uncertainty of the parameters; each is propagated to
+    the end point along the predicted path.
+
+    Args:
+        variance: variances of the noise components by name.
+        shared: covariance of the shared effects along, across and in yaw.
+        of_parameters: covariance of the end points due to uncertain parameters.
     """
     far, u = travel(w, robot)
     p = tracks.predicted
     cov = of_parameters.copy()
-    lever = turned_left(p[:, -1:, :2] - p[:, 1:, :2])  # motion of the end per turn at each step
+    lever = turned_left(p[:, -1:, :2] - p[:, 1:, :2])  # shift of the end point per yaw in each step
     way = p[:, :-1, 2]
     along, across = turned(way, u), turned(way, turned_left(u))
     process, run = (by_axis(variance, k, w) for k in ("process", "run"))

@@ -1,16 +1,18 @@
 """Predictive distributions of fitted models for runs they were not fitted to.
 
 Every model gets a predictive distribution of the same form: a Student t around its prediction, with
-scale
+the scale matrix
 
     V + E diag(v) E^T + J C J^T
 
-V of its own camera, process and run variances, found by restricted likelihood from its own
-residuals; v the variances of shared effects and E their derivative; J the derivative by its own
-numbers and the camera's, C their covariance. Simpler models have v of sessions
-(`slipid.fitting.session_effects`); the force balance has the effects of sessions and neighbours of
-its fit (`slipid.fitting.shared_effects`), and its v grows where held-out sectors ask for it. All
-models share the fitted camera; the numbers of a simpler model follow it.
+V is the noise covariance, with camera, process and run variances estimated from the model's own
+residuals by restricted likelihood. v are the variances of shared effects and E the derivative of
+increments by effects. J is the derivative by the model's and the camera's numbers, and C their
+covariance. Simpler models have session effects only (`slipid.fitting.session_effects`). The force
+balance has the session and neighbours' effects of its fit (`slipid.fitting.shared_effects`), and
+its variances are multiplied by a factor from held-out sectors (`hierarchy.extrapolation`). All
+models use the camera fitted with the force balance, and errors of the camera propagate to the
+numbers of the simpler models.
 """
 
 import abc
@@ -50,13 +52,13 @@ Fitted = TypeVar("Fitted", bound="PredictiveModel")
 
 @dataclass(frozen=True, eq=False)
 class PredictiveModel(abc.ABC):
-    """A fitted model with noise of its own, and the camera of its robot.
+    """A fitted model that predicts distributions, with noise variances of its own.
 
     Attributes:
         robot: the fitted robot, for its camera and geometry.
         variance: variance of every noise component by name, and of session effects where there are
             any.
-        covariance: covariance of the model's numbers and the camera's.
+        covariance: covariance of the model's numbers, followed by the camera's.
     """
 
     robot: Robot
@@ -71,7 +73,7 @@ class PredictiveModel(abc.ABC):
     @property
     @abc.abstractmethod
     def numbers(self) -> dict[str, int]:
-        """Count of fitted numbers by floor, and of those `shared` by all, except the camera's."""
+        """Count of fitted numbers by floor, and of those `shared` by all floors; without camera."""
 
     def log_variance(self, problem: Problem) -> Float[np.ndarray, " variance"]:
         """Return the log variance of every noise component of a problem."""
@@ -83,10 +85,10 @@ class PredictiveModel(abc.ABC):
 
     @abc.abstractmethod
     def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
-        """Return tracks of whole runs and the derivative of their ends (segment, 2, number)."""
+        """Return tracks of whole runs and the derivatives of end points (segment, 2, number)."""
 
     def ends(self, w: Windows) -> tuple[replay.Tracks, Float[np.ndarray, "segment 2 2"]]:
-        """Return tracks of whole runs and the scale matrix of their ends' Student t."""
+        """Return tracks of whole runs and the scale matrices [m^2] of their end points."""
         tracks, slope = self.tracks_and_slopes(w)
         numbers, effect = self._number_covariance(w, slope), self.effect_covariance(w)
         return tracks, replay.end_covariance(self.robot, w, tracks, self.variance, effect, numbers)
@@ -101,19 +103,22 @@ class PredictiveModel(abc.ABC):
         return residual, noise + np.einsum("nma,nab,nlb->nml", e, v, e) + numbers
 
     def _number_covariance(self, w: Windows, slope: Slopes) -> Float[np.ndarray, "segment m m"]:
-        """Return the covariance due to the uncertain numbers, grown for new runs."""
+        """Return the covariance due to uncertain numbers, times `growth`."""
         return self.growth(w)[:, None, None] * parameter_covariance(slope, self.covariance)
 
     def growth(self, w: Windows) -> Float[np.ndarray, " segment"]:
-        """Return the factor of the variances of numbers and shared effects for new runs."""
+        """Return the factor of the variances of numbers and shared effects for runs not fitted."""
         return np.ones(len(w))
 
     def effect_covariance(self, w: Windows) -> Float[np.ndarray, "segment 3 3"]:
-        """Return the covariance of a run's shared effects in a session that was not fitted."""
+        """Return the covariance of the shared effects of runs in sessions that were not fitted."""
         return by_axis(self.variance, "session", w)[:, :, None] * np.eye(len(AXES))
 
     def log_density(self, problem: Problem) -> Float[np.ndarray, " segment"]:
-        """Return the log density of every segment's logged poses but the first, in logged units."""
+        """Return the predictive log density of every segment's logged poses, given the first one.
+
+        The density is per logged unit of position and heading.
+        """
         return log_student(*self.scale(problem)) + np.asarray(
             _camera_log_jacobian(self.robot, problem.batch.pose)
         )
@@ -125,7 +130,14 @@ class PredictiveModel(abc.ABC):
         wide: np.ndarray,
         keep: np.ndarray,
     ) -> Fitted:
-        """Return the model with session effects in its variances and in its covariance."""
+        """Return the model with session effects in its variances and in its covariance.
+
+        Args:
+            problem: problem to whose segments the model was fitted.
+            linear: residuals of these segments and their derivative.
+            wide: covariance of the numbers before the floor's own runs were used.
+            keep: 1 for fitted segments, else 0.
+        """
         model = LinearModel(
             *linear,
             covariance=self.covariance,
@@ -164,9 +176,9 @@ class ForceBalance(PredictiveModel):
     Attributes:
         space: free numbers and their prior.
         z: search vector of the fit.
-        shared: effects that neighbouring runs share, by floor.
-        extrapolation: factor, by floor and load, of the variances of numbers and shared effects for
-            runs that were not fitted.
+        shared: fitted effects that neighbouring runs share, by floor.
+        extrapolation: factor, by `floor@load`, that multiplies the variances of numbers and shared
+            effects for runs that were not fitted.
     """
 
     space: Space
@@ -180,7 +192,11 @@ class ForceBalance(PredictiveModel):
 
     @property
     def forecast(self) -> dict[str, float]:
-        """Variances for runs that were not fitted, at each floor's least certain load set-up."""
+        """Variances by name for runs that were not fitted.
+
+        Those of shared effects are multiplied by the largest extrapolation factor of the floor's
+        load set-ups.
+        """
         out = dict(self.variance)
         for name in out:
             kind, _, rest = name.partition(".")
@@ -191,7 +207,7 @@ class ForceBalance(PredictiveModel):
         return out
 
     def expected_effects(self, w: Windows) -> EffectForecast:
-        """Return the effects of runs that are expected from their fitted neighbours."""
+        """Return the shared effects that fitted neighbours predict for runs."""
         return forecast_effects(self.shared, w, self.robot, self.space.size)
 
     def effect_covariance(self, w: Windows) -> Float[np.ndarray, "segment 3 3"]:
@@ -221,7 +237,10 @@ class ForceBalance(PredictiveModel):
         return np.asarray(blocks["motion"]) - residual, np.asarray(jac["motion"]) - slope
 
     def _correction(self, w: Windows) -> tuple[Residuals, Slopes]:
-        """Return the expected effects on increments, and their derivative; both are subtracted."""
+        """Return the change of increments by expected effects, and its derivative by z.
+
+        Both are to be subtracted from the predictions of the contact law.
+        """
         expected, e = self.expected_effects(w), effects(w, self.robot)
         mean = np.einsum("nma,na->nm", e, expected.mean)
         return mean, np.einsum("nma,nap->nmp", e, expected.slope)
@@ -246,7 +265,7 @@ class ForceBalance(PredictiveModel):
 def force_balance_of(
     problem: Problem, state: FitState, covariance: Square, keep: Float[np.ndarray, " segment"]
 ) -> ForceBalance:
-    """Return the force balance at the end of a fit of the kept segments, with shared effects."""
+    """Return the force balance as fitted to the kept segments, with its shared effects."""
     robot, variance = problem.space.tree(state.z), by_name(problem, state.log_variance)
     z, log_v = np.asarray(state.z), np.asarray(state.log_variance)
     blocks, jacobian = problem.linear(z, problem.electric(z, log_v))
@@ -269,7 +288,7 @@ def force_balance_of(
 def fitted_effects(
     problem: Problem, state: FitState, keep: Float[np.ndarray, " segment"]
 ) -> dict[str, FittedEffects]:
-    """Return the effects that neighbouring runs share on every floor, by a fit of some segments."""
+    """Return the fitted effects that neighbouring runs share, by floor; `keep` marks the runs."""
     log_v, free = jnp.asarray(state.log_variance), problem.space.size
     residual, jacobian = problem.linear(state.z, problem.electric(state.z, log_v))
     weighed = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
@@ -296,7 +315,7 @@ def fitted_effects(
 
 
 def parameter_covariance(jac: Slopes, cov: np.ndarray) -> np.ndarray:
-    """Return J C J^T of every segment, without the columns that are zero for it."""
+    """Return J C J^T of every segment, computed without the columns that are zero for it."""
     used = (jac != 0.0).any(axis=1)
     patterns, which = np.unique(used, axis=0, return_inverse=True)
     out = np.zeros((len(jac), jac.shape[1], jac.shape[1]))

@@ -1,8 +1,9 @@
 """Ranking of slip models by held-out runs, and transfer of slip curves between floors.
 
-The transfer asks whether slip against current carries over to a floor it was not fitted on: one
-curve s = b0 + b1 |I| for all wheels is fitted to all floors but one and judged on that one, beside
-a constant fitted to the same floors and a curve fitted to the floor itself.
+The transfer tests whether a curve of slip over current is valid on a floor it was not fitted to:
+one curve s = b0 + b1 |I| for all wheels is fitted to all floors but one and judged on that one. It
+is compared with a constant slip fitted to the same floors and with a curve fitted to the floor
+itself.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,11 +30,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SURE, SMALL = 2.0, 4.0
-"""Standard errors, and nats over all runs together, from which a difference counts.
+"""Smallest difference of two models that counts: in standard errors, and in nats over all runs.
 
-Below four nats models predict alike, and the standard error of their difference is unreliable: a
-model with one idle number more loses a little in every run. Source: Sivula, Magnusson, Matamoros
-and Vehtari 2020, arXiv:2008.10296.
+Below four nats in total, models predict equally well and the standard error of their difference is
+unreliable: a model with one superfluous number, for example, loses a little in every run. Source:
+Sivula, Magnusson, Matamoros and Vehtari 2020, arXiv:2008.10296.
 """
 
 
@@ -47,10 +48,10 @@ class RankedModel:
         se: standard error of the difference over runs.
         se_clustered: standard error of the difference over sectors of headings.
         verdict: `best`, `tied` or `worse`.
-        endpoint_error: mean end-point error.
-        endpoint_error_se: its standard error over sectors of headings.
+        endpoint_error: mean end-point error, over the straight-line displacement of a run.
+        endpoint_error_se: standard error of that mean over sectors of headings.
         energy_score: mean energy score [m].
-        coverage50, coverage90: share of runs that ended in the region of this probability.
+        coverage50, coverage90: share of runs that ended in their 50 % or 90 % region.
         heading_error_median_deg: median heading error [deg].
     """
 
@@ -76,8 +77,8 @@ class Ranking:
         clusters: number of sectors of headings.
         best: name of the best model.
         sentence: summary for a reader.
-        band50, band90: range of coverages that calibrated forecasts have, see `_band`.
-        models: every model by name.
+        band50, band90: range in which the coverage of calibrated forecasts lies, see `_band`.
+        models: scores of every model, by name.
     """
 
     runs: int
@@ -119,7 +120,14 @@ def _floor(floor: str, runs: Sequence[ScoredRun]) -> Ranking:
 def _ranked(
     scores: Sequence[Score], behind: np.ndarray, is_best: bool, cluster: np.ndarray
 ) -> RankedModel:
-    """Return a model with these differences of log densities to the best model's."""
+    """Return the ranked model with the given scores.
+
+    Args:
+        scores: scores of every run.
+        behind: log density of every run less that of the best model [nats].
+        is_best: True for the best model itself.
+        cluster: sector of headings of every run.
+    """
     difference, se, clustered = mean_error(behind, cluster)
     far, _, far_se = mean_error(np.array([s.endpoint_error for s in scores]), cluster)
     level = np.array([s.level for s in scores], float)
@@ -140,7 +148,10 @@ def _ranked(
 
 
 def _band(runs: int, share: float) -> tuple[float, float]:
-    """Return the range of coverages that 99 % of calibrated forecasts of so many runs have."""
+    """Return the 99 % interval of a calibrated model's coverage over a number of runs.
+
+    `share` is the probability of the forecast regions.
+    """
     low, high = (float(binom.ppf(q, runs, share)) / runs for q in (0.005, 0.995))
     return low, high
 
@@ -175,7 +186,7 @@ class Comparison:
 
     Attributes:
         floors: ranking by floor.
-        question: which runs were held out together.
+        question: key of `folds.QUESTIONS`, by which runs were held out together.
     """
 
     floors: dict[str, Ranking]
@@ -216,7 +227,7 @@ def compared(
 
 
 LEAST = 0.2
-"""Speed of a wheel over the fastest one's from which it counts in a window."""
+"""Smallest ratio of a wheel's speed to that of the fastest wheel with which it gives a row."""
 VARIANTS: dict[str, tuple[float, bool, bool]] = {
     "all": (LEAST, False, False),
     "slower wheels too": (0.1, False, False),
@@ -224,18 +235,20 @@ VARIANTS: dict[str, tuple[float, bool, bool]] = {
     "as built only": (LEAST, True, False),
     "0 < s <= 1, I > 0.25 A only": (LEAST, False, True),
 }
-"""Alternative choices: least speed of a wheel, one load set-up, the 2021 paper's filter.
+"""Choices of rows for `transfer`, by name: (least relative wheel speed, main load set-up only,
+filter of the 2021 paper).
 
-The filter truncates the response and so underestimates the remaining errors.
+The filter truncates the slip and therefore underestimates the remaining errors.
 """
 
 
 def transfer(w: Windows, robot: Robot) -> dict[str, Content]:
-    """Return leave-one-surface-out errors of slip, per variant of the rows; empty for one floor.
+    """Return leave-one-floor-out errors of slip, by the variants of rows; empty for one floor.
 
-    They are root mean squares over all `rows`, means over `floors`, and of `each` floor, of the
-    slip that remains after the curve of the other floors (`pooled`), their mean slip (`constant`),
-    and the floor's own curve (`per_surface`); `count` is the number of rows.
+    A variant has errors after subtracting the curve of the other floors (`pooled`), the mean slip
+    of the other floors (`constant`), and the floor's own curve (`per_surface`), and the `count` of
+    rows. Errors are the root mean square over all `rows`, that of `each` floor, and the mean of the
+    latter over `floors`.
 
     A row is one wheel in one window: s = 1 - J xi / (r w), xi the body twist from the camera in
     corrected metres, I the mean magnitude of the wheel's current.
@@ -262,7 +275,7 @@ def transfer(w: Windows, robot: Robot) -> dict[str, Content]:
 
 
 def errors_by_floor(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Content:
-    """Return the errors of rows of slip and current [A] on named floors, see `transfer`."""
+    """Return the errors for given rows of slip, current [A] and floor; see `transfer`."""
     pooled, constant, own = {}, {}, {}
     line = np.stack([np.ones_like(amps), amps], axis=-1)
     for name in sorted(set(floor.tolist())):

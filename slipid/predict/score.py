@@ -10,10 +10,10 @@ from scipy.stats import f as fisher
 from slipid.fitting.variances import DEGREES
 
 CLUSTER_DEG = 30.0
-"""Width of a sector of headings that counts as one observation of a clustered standard error.
+"""Width of the sectors of headings over which standard errors are clustered [deg].
 
-Runs of neighbouring headings share their errors: their correlation is a half at 5 degrees and none
-at 30.
+The errors of runs in neighbouring headings are correlated: by 0.5 at 5 degrees and not at all at
+30 degrees.
 """
 
 
@@ -23,13 +23,14 @@ class Score:
 
     Attributes:
         predicted_end: predicted pose at the end, x, y [m] and yaw [rad].
-        endpoint_error: distance of the ends over the chord.
-        endpoint_error_over_path: distance of the ends over the path, which is meaningful on closed
-            paths, too.
+        endpoint_error: distance between predicted and measured end point, divided by the measured
+            chord (straight-line displacement).
+        endpoint_error_over_path: the same distance divided by the measured path length, which is
+            meaningful on closed paths, too.
         length_error: relative error of the chord.
         heading_error_deg: error of the final heading, at most 180 [deg].
-        level: probability of the region whose edge the end lies on, None for a model without
-            regions.
+        level: probability of the predicted region on whose boundary the measured end point lies,
+            None for a model without regions.
         covered90: whether the level is at most 0.9, None for a model without regions.
         energy_score: energy score [m].
         log_density: log density of the logged poses [nats], None where it was not computed.
@@ -52,12 +53,13 @@ def scores(
     cov: Float[np.ndarray, "run 2 2"] | None,
     freedom: float = DEGREES,
 ) -> list[Score]:
-    """Return the scores of predicted paths from the measured start on, one by one.
+    """Return the score of every predicted path; paths begin at the measured start.
 
     Args:
         predicted, measured: poses x, y [m] and yaw [rad] in one frame.
-        cov: scale matrices of the ends' Student t [m^2], None for a model without.
-        freedom: its degrees of freedom, infinite for a Gaussian.
+        cov: scale matrices of the end points' Student t [m^2], None for a model without
+            uncertainty.
+        freedom: degrees of freedom of the Student t, infinite for a Gaussian.
     """
     gap = predicted[:, -1] - measured[:, -1]
     off = np.linalg.norm(gap[:, :2], axis=1)
@@ -94,11 +96,13 @@ def forecast(
     cov: Float[np.ndarray, "run 2 2"] | None,
     freedom: float = DEGREES,
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return the probability of the region whose edge each end lies on, and its energy score [m].
+    """Return the level of every measured end point, and its energy score [m].
 
-    An end lies in the 90 % region where the probability is at most 0.9. The predictive distribution
-    is a Student t with so many degrees of freedom; without one (None) the energy score is the
-    distance itself, as for a point forecast. Source: Gneiting and Raftery 2007, JASA 102, eq. 22.
+    The level is the probability of the predicted region on whose boundary the end point lies; an
+    end point lies in the 90 % region where the level is at most 0.9. The predictive distribution is
+    a Student t with scale matrix `cov` and `freedom` degrees of freedom. For `cov` None there is no
+    level, and the energy score is the distance itself, as for a point forecast. Source: Gneiting
+    and Raftery 2007, JASA 102, eq. 22.
     """
     if cov is None:
         return None, np.linalg.norm(gap, axis=1)
@@ -117,9 +121,9 @@ def forecast(
 
 
 def clusters(heading_deg: Sequence[float | None]) -> Int[np.ndarray, " run"]:
-    """Return the sector of heading of each run; a run without heading is a sector of its own.
+    """Return the index of each run's sector of headings.
 
-    Such sectors have negative numbers.
+    A run without a heading is a sector of its own, with a negative index.
     """
     return np.array(
         [
@@ -136,8 +140,9 @@ def mean_error(
 
         se^2 = G / (G - 1) sum_g (sum_{i in g} (x_i - mean))^2 / n^2
 
-    Source: Cameron and Miller 2015, J. Human Resources 50, for a regression on a constant. With one
-    run, or one cluster, an error is not known and is nan.
+    G is the number of clusters g, and of runs for the error over runs. Source: Cameron and Miller
+    2015, J. Human Resources 50, for a regression on a constant. With one run, or one cluster, the
+    error cannot be estimated and is nan.
     """
     n = len(value)
     gap = value - value.mean()
@@ -151,7 +156,7 @@ def mean_error(
 
 
 def main_load(loads: Sequence[str]) -> str:
-    """Return the set-up as built if it occurs, else the most common one."""
+    """Return the load set-up `as_built` if it occurs, else the most common one."""
     return "as_built" if "as_built" in loads else max(sorted(set(loads)), key=loads.count)
 
 

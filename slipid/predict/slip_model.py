@@ -1,7 +1,7 @@
-"""Slip models: the common interface of all of them, and the runs that they predict.
+"""Common interface of slip models, and the runs that they are fitted to and predict.
 
-A slip model is fitted to runs with poses, and then predicts runs from what the robot itself
-measures: wheels, currents, commands, perhaps a gyro. All are given the same steps of the same runs.
+A slip model is fitted to runs with poses, and then predicts runs from the robot's own measurements:
+wheels, currents, commands, perhaps a gyro. All models get the same steps of the same runs.
 """
 
 import abc
@@ -31,7 +31,10 @@ def as_increments(twist: np.ndarray, w: Windows, robot: Robot) -> Increments:
 
 
 def body_twist(w: Windows, robot: Robot) -> np.ndarray:
-    """Return the measured body twist of every window, without yaw and position of the marker."""
+    """Return the measured body twist of every window [m/s, m/s, rad/s], from marker poses.
+
+    The yaw and the position of the marker on the body are removed.
+    """
     moved = np.asarray(_measured_increments(robot, jnp.asarray(w.pose)))
     yaw = moved[..., 2]
     yaws = {s: float(robot.camera.yaw(robot.session_index(s))) for s in set(w.session)}
@@ -39,7 +42,7 @@ def body_twist(w: Windows, robot: Robot) -> np.ndarray:
     chord = turned(psi, moved[..., :2])
     place = np.broadcast_to(np.asarray(robot.camera.marker_place), chord.shape)
     chord -= turned(yaw, place) - place
-    # a chord is the arc times sinc, and points half the turn away from its start
+    # chord = arc sinc(yaw / 2), at half the yaw to the start heading
     arc = turned(-0.5 * yaw, chord) / np.sinc(yaw / (2 * np.pi))[..., None]
     return np.concatenate([arc, yaw[..., None]], -1) / w.dt[..., None]
 
@@ -56,18 +59,22 @@ def turned_left(v: np.ndarray) -> np.ndarray:
 
 
 Channel = Literal["current", "gyro", "command", "twist"]
-"""Input a model may need beside the encoders; `twist`: wheels that determine the body's twist."""
+"""Requirement of a model beside the encoders.
+
+`current`, `gyro` and `command` are logged channels; `twist` stands for wheels whose rotations
+determine the body's twist.
+"""
 Aim = Literal["end", "energy"]
-"""Prediction of a model for a run: its end, or its electric energy."""
+"""Quantity that a model predicts for a run: its end pose, or its electric energy."""
 Numbers = Float[np.ndarray, " step"]
 Twists = Float[np.ndarray, "step 3"]
-"""Body twist of each step: ahead [m/s], to the left [m/s], yaw [rad/s]."""
+"""Body twist of each step: ahead [m/s], to the left [m/s], yaw rate [rad/s]."""
 TRIES = 4
-"""Number of settings that a model may try in its inner cross-validation, the same for all."""
+"""Largest number of settings that any model may try in its inner cross-validation."""
 WINDOW_S = 0.5
 """Length of the windows on which models are trained and twists are judged [s]."""
 SHAFT_W0 = 3.0
-"""Shaft speed below which a current's power does not determine its torque [rad/s]."""
+"""Motor shaft speed w0 below which M = U I / w, infinite at rest, is reduced [rad/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +84,15 @@ class RobotSpec:
     A drive is a motor with all the wheels that it turns: one wheel, or a side of a skid steer.
 
     Attributes:
-        forward: rim speed of each drive [m/s] from the body twist.
-        back: body twist from the drives' rim speeds if nothing slips, by least squares.
-        wheel_radius, base_radius: radii [m].
+        forward: J, which gives the rim speed of each drive [m/s] from the body twist.
+        back: J^+, which gives the body twist from the drives' rim speeds without slip, by least
+            squares.
+        wheel_radius, base_radius: radius of the wheels, and base radius of the geometry [m].
         gear_ratio: motor turns per wheel turn.
-        resistance, back_emf: constants of the motor by its datasheet [ohm], [V s/rad].
+        resistance, back_emf: constants of the motor from its datasheet [ohm], [V s/rad].
         mass: mass of the robot [kg].
-        determines_twist: whether the drives determine the body's twist; a skid steer's do not.
+        determines_twist: True if the drives determine the body's twist; those of a skid steer do
+            not.
     """
 
     forward: Float[np.ndarray, "drive 3"]
@@ -114,13 +123,13 @@ class RobotSpec:
         )
 
     def of_shape(self, shape: Geometry) -> "RobotSpec":
-        """Return the same robot with other wheel sizes and positions for reading encoders."""
+        """Return the same robot with another geometry for the conversion of encoders to twists."""
         back = np.asarray(shape.pseudo_inverse())
         return replace(self, back=back, wheel_radius=float(shape.wheel_radius))
 
     @property
     def size(self) -> Float[np.ndarray, "3"]:
-        """Weights that make a yaw rate comparable with a speed: one, one, base radius [m]."""
+        """Weights (1, 1, base radius [m]) that convert a twist to three speeds."""
         return np.array([1.0, 1.0, self.base_radius])
 
 
@@ -134,10 +143,10 @@ class RunSignals:
         turn: rotation of each drive's wheels in the step [rad].
         current: mean current of each motor [A], signed along its wheel's forward direction where
             `current_is_signed`, else its magnitude; None where it was not logged.
-        gyro: mean yaw rate [rad/s], or None.
-        command: commanded twist, or None.
+        gyro: mean yaw rate from the gyro [rad/s], or None.
+        command: commanded twist [m/s, m/s, rad/s], or None.
         floor: name of the floor; None where a model has to infer it.
-        load: name of the load set-up, which a robot knows.
+        load: name of the load set-up, which is known to the robot.
     """
 
     name: str
@@ -159,7 +168,7 @@ class RunSignals:
         return self.turn / self.dt[:, None]
 
     def rolling(self, spec: RobotSpec) -> Twists:
-        """Return the body twist if nothing slips, by the encoders alone."""
+        """Return the body twist without slip, from the encoders alone."""
         return np.asarray(self.speed * spec.wheel_radius @ spec.back.T)
 
     def along(self, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
@@ -178,15 +187,15 @@ class RunSignals:
     def torque(self, spec: RobotSpec, rest: float = SHAFT_W0) -> Float[np.ndarray, "step drive"]:
         """Return M = C_e I + R I^2 w / (w^2 + w0^2) [N m], w the shaft's speed and w0 `rest`.
 
-        The 2021 paper's torque characterising variable M = U I / w, with U = C_e w + R I, regular
-        at rest. It is positive where the motor drives.
+        It is the 2021 paper's torque characterising variable M = U I / w, with U = C_e w + R I,
+        made finite at rest by w0. It is positive where the motor drives the wheel.
         """
         amps, shaft = self.along(spec), np.abs(spec.gear_ratio * self.speed)
         heat = spec.resistance * amps**2 * shaft / (shaft**2 + rest**2)
         return np.asarray(spec.back_emf * amps + heat)
 
     def power(self, spec: RobotSpec) -> Numbers:
-        """Return the electric power of all motors [W], by the currents and the motor's datasheet.
+        """Return the electric power of all motors [W], from currents and the motor's datasheet.
 
         P = sum_i (R I_i + C_e |w_i|) I_i
         """
@@ -194,7 +203,7 @@ class RunSignals:
         return np.asarray(((spec.resistance * amps + spec.back_emf * shaft) * amps).sum(1))
 
     def windowed(self, seconds: float = WINDOW_S) -> "RunSignals":
-        """Return the same run in longer steps: neighbours joined to about that length."""
+        """Return the same run with neighbouring steps joined to steps of about `seconds` [s]."""
         first = groups(self.dt, seconds)
         dt = np.add.reduceat(self.dt, first)
 
@@ -216,15 +225,15 @@ class RunSignals:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run with the pose of its body, for training and judgement.
+    """A run with the measured poses of the body, for training and judging models.
 
     Attributes:
-        signals: measurements of the robot; their `floor` is None where models do not know it.
+        signals: measurements of the robot; `signals.floor` is None where models do not know it.
         pose: x, y [m] and heading [rad] of the body at the edges of the steps, in true metres.
-        floor: name of the floor it was driven on.
+        floor: name of the floor of the run.
         load: name of the load set-up.
-        heading: commanded direction of travel [rad], nan where there is none.
-        speed: commanded speed [m/s], nan where none was logged.
+        heading: commanded direction of travel [rad], nan if unknown.
+        speed: commanded speed [m/s], nan if unknown.
     """
 
     signals: RunSignals
@@ -236,16 +245,16 @@ class Run:
 
     @property
     def twist(self) -> Twists:
-        """Body twist of every step by the poses: constant over a step, exact on SE(2)."""
+        """Constant body twist of every step that connects its poses (exact SE(2))."""
         return body_increments(self.pose) / self.signals.dt[:, None]
 
     def windowed(self, seconds: float = WINDOW_S) -> "Run":
-        """Return the same run in longer steps."""
+        """Return the same run with neighbouring steps joined to steps of about `seconds` [s]."""
         edges = np.append(groups(self.signals.dt, seconds), len(self.signals))
         return replace(self, signals=self.signals.windowed(seconds), pose=self.pose[edges])
 
     def with_floor(self, floor: bool) -> "Run":
-        """Return the same run, its floor known to models or not."""
+        """Return the same run; models know its floor if `floor` is True."""
         return replace(self, signals=replace(self.signals, floor=self.floor if floor else None))
 
 
@@ -255,12 +264,12 @@ class PredictedRun:
 
     Attributes:
         path: pose at every edge of the steps, relative to the pose at the start [m, m, rad].
-        end_covariance: covariance of the end position, relative to the start [m^2]; None for a
-            model without uncertainty.
-        freedom: degrees of freedom of the Student t whose scale matrix it is; infinite for a
-            Gaussian's covariance.
-        slipping: confidence that the robot slips in a step, on any rising scale; None to derive it
-            from the difference of twist and encoders.
+        end_covariance: scale matrix of the Student t of the end position, relative to the start
+            [m^2]; None for a model without uncertainty.
+        freedom: degrees of freedom of that Student t; infinite for a Gaussian, whose scale matrix
+            is its covariance.
+        slipping: score of each step that increases with the confidence that the robot slips; None
+            to derive it from the difference of predicted and encoder twists.
         floors: probability of each floor in every step, by name; None for a model that does not
             infer floors.
         power: electric power of all motors in every step [W], predicted without the currents; None
@@ -280,9 +289,9 @@ class SlipModel(abc.ABC):
     """A model that predicts the motion of the body from wheels, before or after it is fitted.
 
     Attributes:
-        name: name of its row.
-        needs: channels without which it does not run.
-        aim: what it predicts, by which its settings are selected.
+        name: name of the model in tables.
+        needs: channels that the model requires.
+        aim: predicted quantity by whose errors settings are selected.
     """
 
     name: str
@@ -290,7 +299,7 @@ class SlipModel(abc.ABC):
     aim: Aim = field(default="end", kw_only=True)
 
     def candidates(self) -> Sequence["SlipModel"]:
-        """Return the model with other settings, at most `TRIES`, for cross-validation."""
+        """Return at most `TRIES` models with different settings, to choose by cross-validation."""
         return (self,)
 
     @abc.abstractmethod
@@ -308,17 +317,17 @@ class SlipModel(abc.ABC):
 
 
 def groups(dt: Float[np.ndarray, " step"], seconds: float) -> np.ndarray:
-    """Return the first step of every group of neighbours that together last about so long [s]."""
+    """Return the index of the first step of every group of neighbours, each about `seconds` [s]."""
     count = max(1, round(float(dt.sum()) / seconds))
     number = np.minimum((np.cumsum(dt) - 0.5 * dt) / dt.sum() * count, count - 1).astype(int)
     return np.flatnonzero(np.diff(number, prepend=-1))
 
 
 def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, "edge 3"]:
-    """Return poses from the origin on for a twist constant over each step (exact SE(2))."""
+    """Return the poses of a path from the origin, with a constant twist per step (exact SE(2))."""
     heading = np.concatenate([[0.0], np.cumsum(twist[:, 2] * dt)])
     middle = 0.5 * (heading[1:] + heading[:-1])
-    # a chord is the arc times sinc, and points half the turn away from its start
+    # chord = arc sinc(yaw / 2), at half the yaw to the start heading
     chord = np.sinc(np.diff(heading) / (2 * np.pi)) * dt
     step = turned(middle, twist[:, :2] * chord[:, None])
     place = np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
@@ -326,13 +335,13 @@ def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, 
 
 
 def relative_to_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "edge 3"]:
-    """Return poses relative to the first of them."""
+    """Return poses in the frame of the first of them."""
     offset = path - path[0]
     return np.column_stack([turned(-path[0, 2], offset[:, :2]), offset[:, 2]])
 
 
 def body_increments(pose: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "step 3"]:
-    """Return the logarithm on SE(2) of each step of a path: twist times time [m, m, rad]."""
+    """Return the body twist times the time of each step of a path (SE(2) logarithm) [m, m, rad]."""
     turn = np.diff(pose[:, 2])
     middle = 0.5 * (pose[1:, 2] + pose[:-1, 2])
     arc = turned(-middle, np.diff(pose[:, :2], axis=0)) / np.sinc(turn / (2 * np.pi))[:, None]

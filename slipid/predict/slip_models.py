@@ -1,6 +1,6 @@
 """Slip models that are compared with the force balance, fitted floor by floor.
 
-`slip_models` lists them, `restored` builds them again from files. `FloorModels` fits a model to
+`slip_models` returns them, `restored` builds fitted ones from files. `FloorModels` fits a model to
 the windows of each floor, `ByFloor` to the runs of each floor.
 """
 
@@ -35,8 +35,8 @@ class FloorModels:
 
     Attributes:
         model: the slip model, not fitted.
-        fitted: the model fitted to the windows of each floor, or of each `floor@load` where the
-            model needs it.
+        fitted: the model fitted to the windows of each floor, or of each `floor@load` for a model
+            that is fitted by load set-up.
     """
 
     model: TwistModel
@@ -49,7 +49,7 @@ class FloorModels:
 
     @property
     def state(self) -> dict[str, np.ndarray]:
-        """Fitted numbers by floor: with the name, enough to build the models again."""
+        """Fitted numbers by key of `fitted`; together with the name they restore the models."""
         return {key: m.coefficients for key, m in self.fitted.items() if m.coefficients is not None}
 
     def with_state(self, state: Mapping[str, np.ndarray]) -> "FloorModels":
@@ -86,7 +86,7 @@ class FloorModels:
     def key_of(self, surface: str, load: str) -> str:
         """Return the key of the model of a floor and load set-up.
 
-        A load set-up that was not fitted takes the one the floor was first driven with.
+        For a load set-up that was not fitted, it is the key of the floor's first load set-up.
 
         Raises:
             ValueError: the floor was not fitted.
@@ -101,7 +101,7 @@ class FloorModels:
         return floors[surface]
 
     def stiffness(self, w: Windows, robot: Robot) -> dict[str, np.ndarray]:
-        """Return the precision of each key's flat numbers that comes from anything but the data."""
+        """Return the precision of each key's numbers that is due to ridges and bounds, not data."""
         spec, parts = RobotSpec.of(robot), self._parts(w)
         return {
             key: model.stiffness(training_windows(parts[key], robot), spec)
@@ -116,7 +116,7 @@ class FloorModels:
 
 
 def steps_of(w: Windows) -> Steps:
-    """Return the windows as steps, each segment a run; currents are magnitudes."""
+    """Return the windows as steps, every segment as one run; currents are magnitudes."""
     drives = w.turn.shape[-1]
     signals = RunSignals(
         name="windows",
@@ -129,27 +129,35 @@ def steps_of(w: Windows) -> Steps:
 
 
 def training_windows(w: Windows, robot: Robot) -> TrainingWindows:
-    """Return the windows with the body twists measured in them, each window a step."""
+    """Return the windows with their measured body twists, every window as one step."""
     twist, run = body_twist(w, robot).reshape(-1, 3), np.repeat(w.run, w.dt.shape[1])
     return TrainingWindows(steps_of(w), np.arange(w.dt.size), w.dt.ravel(), twist, run)
 
 
 FEWEST = 5
-"""Runs on a floor, or with a load, below which a model uses its fit to all runs for them."""
+"""Smallest number of runs on a floor, or with a load set-up, to which a model is fitted.
+
+Groups with fewer runs use the fit to all runs.
+"""
 KNOTS = (0.0, 0.02, 0.04, 0.06, 0.1, 0.15, 0.25)
 """Knots of the monotone spline [N m]."""
 PAPER_THRESHOLD = 0.4
-"""Current above which the 2021 paper's deployed form corrects [A]."""
+"""Current above which the deployed form of the 2021 paper corrects slip [A]."""
 
 
 def slip_models(
     shape: Geometry, has_current: bool, together: Together | None = None
 ) -> list[FloorModels]:
-    """Return every slip model the logs allow, not fitted; `paper` is the form the authors ran.
+    """Return every slip model that the logs and the wheels allow, not fitted.
 
-    The shape is the robot's as in its config: wheels that do not determine the twist have models of
-    their own. The threshold of `paper` and the spline's knots are for motors of that size. Runs
-    held out `together` are also held out together where a model tunes itself.
+    The model `paper` is the form that the authors of the 2021 paper ran on their robot; its
+    threshold and the knots of the spline suit motors of that size.
+
+    Args:
+        shape: geometry of the robot as in its config. For wheels that do not determine the twist
+            there are other models than for those that do.
+        has_current: True if currents are logged.
+        together: group number of every run, by which a model's inner cross-validation holds out.
     """
     models: list[TwistModel] = [nominal(shape), Encoder()]
     if shape.determines_twist:
@@ -160,7 +168,7 @@ def slip_models(
 
 
 def _of_wheels(has_current: bool, together: Together | None) -> list[TwistModel]:
-    """Return models of slip by wheel, and by direction of travel."""
+    """Return the models for wheels that determine the twist: by wheel, by direction of travel."""
     out: list[TwistModel] = [CurveModel("constant", powers(0))]
     if has_current:
         out += [
@@ -195,9 +203,9 @@ class ByFloor(SlipModel):
 
     Attributes:
         method: the model, not fitted.
-        pooled: whether it ignores floors and loads, and is fitted once to all runs.
-        fitted: the model fitted to the runs of each group, by name, the largest group first; under
-            None to all runs.
+        pooled: True if floors and loads are ignored and the model is fitted once to all runs.
+        fitted: the model fitted to the runs of each group, by the group's name, the largest group
+            first; the name of the group of all runs is None.
     """
 
     method: SlipModel
@@ -232,7 +240,11 @@ class ByFloor(SlipModel):
         return [found[k] for k in range(len(runs))]
 
     def _fitted_group(self, signals: RunSignals) -> str | None:
-        """Return the group of a run; the usual one for a load set-up that no training run had."""
+        """Return the group of a run; the largest group for a load set-up without training runs.
+
+        Raises:
+            ValueError: the floor of the run was not fitted.
+        """
         group = self.group_of(signals)
         if group not in self.fitted:
             if signals.floor is not None:
@@ -242,7 +254,7 @@ class ByFloor(SlipModel):
         return group
 
     def group_of(self, signals: RunSignals) -> str | None:
-        """Return the group a run is fitted with: its floor where known, else its load set-up."""
+        """Return the group of a run: its floor if known, else its load set-up; None if pooled."""
         if self.pooled:
             return None
         return signals.load if signals.floor is None else signals.floor

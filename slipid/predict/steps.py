@@ -1,4 +1,4 @@
-"""Steps of many runs together, and slip models that predict a body twist in each of them."""
+"""Steps of many runs in common arrays, and slip models that predict a body twist in each step."""
 
 import abc
 from collections.abc import Sequence
@@ -30,8 +30,8 @@ class Steps:
     Attributes:
         signals: all steps as if they were one run; its name and floor are those of the first run.
         first: first step of each run.
-        faster: wheel speed at the end of each step less that at its start [rad/s], so that d turn /
-            d lag = -faster; None where the lag of the poses is known.
+        speed_change: wheel speed at the end of each step less that at its start [rad/s], so that
+            d turn / d lag = -speed_change; None where the lag of the poses is known.
         lag: assumed lag of the poses behind the wheels [s].
     """
 
@@ -63,7 +63,7 @@ class Steps:
         return cls(signals, np.cumsum([0, *(len(run) for run in runs[:-1])]))
 
     def at_lag(self, lag: float) -> "Steps":
-        """Return the same steps at another lag, to first order [s]; unchanged where it is known."""
+        """Return the same steps at another lag [s], to first order; unchanged if it is known."""
         if self.speed_change is None:
             return self
         turn = self.signals.turn - (lag - self.lag) * self.speed_change
@@ -77,7 +77,7 @@ class Steps:
     def predicted(
         self, twist: Twists, slipping: Float[np.ndarray, " step"] | None = None
     ) -> list[PredictedRun]:
-        """Return each run's path from all twists [m/s, m/s, rad/s], and its slip if known."""
+        """Return each run's prediction from the twists and slip scores of all steps."""
         parts = zip(self._runs(twist), self._runs(self.signals.dt), strict=True)
         paths = [path_of(xi, dt) for xi, dt in parts]
         if slipping is None:
@@ -120,17 +120,17 @@ class Steps:
 
 @dataclass(frozen=True, eq=False)
 class TrainingWindows:
-    """Windows of about half a second of the same steps, with the true twist in each.
+    """Steps of runs, grouped to windows of about half a second, with the measured twist in each.
 
-    A camera's noise is large over one step, so models are trained on windows, with the mean over a
-    window of what they compute in each step.
+    The noise of a camera is large over one step. Models are therefore trained on windows: the mean
+    of their predictions over the steps of a window is compared with the measured twist.
 
     Attributes:
         steps: steps of all runs.
-        first: first step of each window.
+        first: index of the first step of each window.
         dt: length of each window [s].
-        twist: twist by the poses [m/s, m/s, rad/s].
-        run: number of the run of each window.
+        twist: body twist of each window from the poses [m/s, m/s, rad/s].
+        run: index of the run of each window.
     """
 
     steps: Steps
@@ -155,20 +155,23 @@ class TrainingWindows:
 
     @property
     def signals(self) -> RunSignals:
-        """Measurements with each window as one step."""
+        """Measurements of the robot, with every window as one step."""
         signals = self.steps.signals
         current = None if signals.current is None else self.means(signals.current)
         turn = np.add.reduceat(signals.turn, self.first)
         return replace(signals, dt=self.dt, turn=turn, current=current, gyro=None, command=None)
 
     def means(self, values: Float[np.ndarray, "step *any"]) -> Float[np.ndarray, "window *any"]:
-        """Return the mean over time of every window."""
+        """Return the means of values over the windows, weighted by the length of the steps."""
         one = [1] * (values.ndim - 1)
         total = np.add.reduceat(values * self.steps.signals.dt.reshape(-1, *one), self.first)
         return np.asarray(total / self.dt.reshape(-1, *one))
 
     def errors(self, twist: Twists, spec: RobotSpec) -> Float[np.ndarray, " row"]:
-        """Return displacement errors of the twists of all steps, yaw times the base radius."""
+        """Return the displacement errors of all windows [m], from predicted twists of all steps.
+
+        There are three per window; that in yaw is multiplied by the base radius.
+        """
         return np.asarray(((self.means(twist) - self.twist) * self._scale(spec)).ravel())
 
     def _scale(self, spec: RobotSpec) -> Float[np.ndarray, "window 3"]:
@@ -176,9 +179,10 @@ class TrainingWindows:
         return self.dt[:, None] * spec.size
 
     def rows(self, parts: Float[np.ndarray, "step 3 k"], spec: RobotSpec) -> "SlipEquations":
-        """Return equations for the excess of the encoders' displacement as a weighted sum of parts.
+        """Return linear equations for the coefficients of a slip model.
 
-        gap = (rolling - twist) dt = sum_k weight_k part_k dt, yaw times the base radius.
+        They equate the encoders' displacement less the measured one to a weighted sum of `parts`:
+        (rolling - twist) dt = sum_k coefficient_k part_k dt, with yaw times the base radius.
         """
         gap = self.means(self.steps.signals.rolling(spec)) - self.twist
         scale = self._scale(spec)
@@ -190,8 +194,8 @@ class SlipEquations:
     """Equations that are linear in a model's coefficients, three for each window.
 
     Attributes:
-        parts: displacement that each coefficient subtracts from the encoders' [m per unit].
-        gap: displacement to be subtracted [m].
+        parts: displacement that is subtracted from the encoders' per unit of each coefficient [m].
+        gap: displacement by the encoders less the measured one [m].
     """
 
     parts: Float[np.ndarray, "window 3 k"]
@@ -201,7 +205,10 @@ class SlipEquations:
 def scaled_least_squares(
     a: Float[np.ndarray, "row k"], b: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, " k"]:
-    """Return least squares with columns scaled to one length; the shortest of many solutions."""
+    """Return the least-squares solution, computed with columns scaled to unit norm.
+
+    Of several solutions it is the one with the smallest norm of the scaled coefficients.
+    """
     size = np.linalg.norm(a, axis=0)
     # a column that contains only rounding errors is ignored
     size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
@@ -213,11 +220,11 @@ class TwistModel(SlipModel, abc.ABC):
     """A slip model that predicts the body twist of every step from the signals of its run.
 
     Attributes:
-        coefficients: fitted numbers; None before a fit, and for a model that learns nothing.
+        coefficients: fitted numbers; None before a fit, and for a model without fitted numbers.
     """
 
     learns: ClassVar[bool] = True
-    """Whether numbers are fitted."""
+    """Whether the model has fitted numbers."""
     by_load: ClassVar[bool] = False
     """Whether `slipid compare` fits every load set-up of a floor separately."""
     coefficients: np.ndarray | None = field(default=None, kw_only=True)
@@ -231,7 +238,7 @@ class TwistModel(SlipModel, abc.ABC):
         """Return the body twist of every step [m/s, m/s, rad/s]."""
 
     def stiffness(self, w: TrainingWindows, spec: RobotSpec) -> Float[np.ndarray, "k k"]:
-        """Return the precision of the flat coefficients that does not come from the windows."""
+        """Return the precision of the flat coefficients due to ridges and bounds, not to data."""
         return np.zeros((self.numbers, self.numbers))
 
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "TwistModel":

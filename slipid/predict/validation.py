@@ -1,4 +1,4 @@
-"""Open-loop prediction of runs that were not fitted, by the fit and by every other slip model."""
+"""Open-loop prediction of runs by a fit and by every other slip model, and their scores."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -30,10 +30,10 @@ class ScoredRun:
         name: name of the run.
         surface: floor of the run.
         load: load set-up of the run.
-        heading_deg: commanded heading [deg], None where not known.
-        speed: commanded speed [m/s], None where not known.
-        chord: straight-line displacement by the camera [m].
-        path: path length by the camera [m].
+        heading_deg: commanded heading [deg], None if unknown.
+        speed: commanded speed [m/s], None if unknown.
+        chord: straight-line displacement measured by the camera [m].
+        path: path length measured by the camera [m].
         measured_end: measured pose at the end (x, y [m], yaw [rad]).
         models: scores by model.
         session: session of the run.
@@ -60,7 +60,7 @@ class ScoredRun:
 
 
 def plain_values(values: Iterable[tuple[str, object]]) -> Content:
-    """Return plain values without optional ones that were not computed."""
+    """Return a dict of the values; `session` and `log_density` are omitted where they are None."""
     return {k: v for k, v in values if v is not None or k not in ("session", "log_density")}
 
 
@@ -85,7 +85,7 @@ class Validation:
 
     Attributes:
         runs: runs with the scores of every model.
-        new: number of them that were not fitted.
+        new: number of these runs that were not fitted.
     """
 
     runs: tuple[ScoredRun, ...]
@@ -107,7 +107,7 @@ class Validation:
 
     @property
     def summary(self) -> dict[str, dict[str, FloorSummary]]:
-        """Means by floor and model; a floor with another load set-up is a floor of its own."""
+        """Mean scores by floor and model; another load set-up makes a floor of its own."""
         return {
             name: {m: _mean([run.models[m] for run in runs]) for m in runs[0].models}
             for name, runs in by_floor(self.runs).items()
@@ -137,13 +137,12 @@ class Validation:
 def validation(
     fit: ForceBalance, models: Sequence[FloorModels], data: Runs, new: int = 0
 ) -> Validation:
-    """Return the prediction of runs on known floors by a fit and by every slip model.
+    """Return the scores of runs on known floors, predicted by a fit and by every slip model.
 
-    `new` of the runs were not fitted.
-
-    As in `folds`, every run is predicted as of a session of its own: its shared session effect
-    widens its region by the variance found in fitting, whether or not other runs of that session
-    were fitted. A run begins at its first pose after the wheels moved 10 mm.
+    As in `folds`, every run is predicted as if it were the only run of its session: the session
+    effect is unknown and widens the region by its fitted variance, even if other runs of the
+    session were fitted. A run begins at its first pose after the wheels moved 10 mm. `new` is the
+    number of runs that were not fitted.
 
     Raises:
         DataError: a run on a floor or with a load set-up that was not identified.
@@ -178,10 +177,10 @@ def add_scores(
     tracks: replay.Tracks,
     cov: Float[np.ndarray, "run 2 2"] | None,
 ) -> None:
-    """Add the scores of a model's tracks to those of their runs.
+    """Add the scores of a model's tracks to `runs`.
 
-    `runs` are keyed by their number in `data`; new ones are added. `cov` is the covariance of the
-    ends, None for a model without.
+    Keys of `runs` are indices of runs in `data`; missing runs are added. `cov` holds the scale
+    matrices of the end points, None for a model without uncertainty.
     """
     found = scores(tracks.predicted, tracks.measured, cov)
     chord, path = chords(tracks.measured), lengths(tracks.measured)
@@ -203,14 +202,14 @@ def add_scores(
 
 
 def finite(x: float) -> float | None:
-    """Return a number, None for one that is not finite."""
+    """Return x, or None if it is not finite."""
     return float(x) if np.isfinite(x) else None
 
 
 def by_floor(runs: Sequence[ScoredRun]) -> dict[str, list[ScoredRun]]:
-    """Return the runs of every floor, those of other load set-ups separately.
+    """Return the runs of every floor; runs with other load set-ups than the main one are separate.
 
-    A set-up other than the one as built, else the most common, is written `<floor>@<load>`.
+    Their key is `<floor>@<load>`; the main set-up is that of `score.main_load`.
     """
     groups: dict[str, list[ScoredRun]] = {}
     for name, run in zip(

@@ -1,1 +1,1 @@
-"""Support that knows nothing of robots: errors, files, checkpoints, executors, progress."""
+"""General support, independent of robots: errors, files, checkpoints, executors and progress."""

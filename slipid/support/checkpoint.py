@@ -1,4 +1,4 @@
-"""Checkpoints: finished parts of a long job on disk, from which the same job continues."""
+"""Checkpoints: finished parts of a long job in files, from which an interrupted job continues."""
 
 import hashlib
 import platform
@@ -29,7 +29,7 @@ LIBRARIES = (
 
 
 def versions() -> dict[str, str]:
-    """Return the version of Python and of every library that numbers depend on, by name."""
+    """Return the versions of Python and of the `LIBRARIES`, on which results depend, by name."""
     found = {"python": platform.python_version()}
     for name in LIBRARIES:
         try:
@@ -40,7 +40,10 @@ def versions() -> dict[str, str]:
 
 
 def source_hash(*rooms: str) -> bytes:
-    """Return the hash of the sources of some packages and modules of slipid, with their paths."""
+    """Return the hash of the source files of some packages and modules of slipid.
+
+    `rooms` are paths of packages or modules below `slipid`, such as `data/reading`.
+    """
     root = Path(__file__).resolve().parents[1]
     files = [path for room in rooms for path in (root / room).rglob("*.py")]
     found = sorted(files + [root / f"{room}.py" for room in rooms if not (root / room).is_dir()])
@@ -48,12 +51,12 @@ def source_hash(*rooms: str) -> bytes:
 
 
 def key_of(*parts: object) -> str:
-    """Return the hash of everything a job depends on, library versions included.
+    """Return the hash of everything that the result of a job depends on, and of the versions.
 
     Args:
         parts: arrays, bytes, and values whose `repr` is complete: numbers, strings, plain
-            containers and dataclasses of those. The `repr` of an array inside a container is not
-            complete, so every array has to be a part of its own.
+            containers and dataclasses of those. The `repr` of an array inside a container is
+            abbreviated, so every array must be a separate part.
     """
     mark = hashlib.sha256()
     for part in (*parts, sorted(versions().items())):
@@ -61,21 +64,23 @@ def key_of(*parts: object) -> str:
             data = f"{part.dtype.str} {part.shape} ".encode() + part.tobytes()
         else:
             data = part if isinstance(part, bytes) else repr(part).encode()
-        # the length goes first, so that no two lists of parts give the same bytes
+        # The length of each part precedes it, so that different lists of parts give different
+        # bytes.
         mark.update(len(data).to_bytes(8, "little") + data)
     return mark.hexdigest()
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Named parts in files of one folder; those of other jobs are treated as absent.
+    """Finished parts of one job, by name, in files of one folder.
 
-    A part is written whole or not at all, and a damaged one counts as absent: whatever is loaded is
-    valid, and whatever is not is computed again.
+    A part is written completely or not at all. Damaged parts, and parts of other jobs, count as
+    absent, so that they are computed again.
 
     Attributes:
         folder: folder of the files; it is made with the first part.
-        key: hash of everything the parts depend on, see `key_of`.
+        key: hash of everything that the parts depend on (see `key_of`), by which parts of other
+            jobs are recognised.
     """
 
     folder: Path
@@ -88,9 +93,9 @@ class Checkpoint:
         write_arrays(path, content | {"key": np.asarray(self.key)}, compress=False)
 
     def load(self, name: str) -> dict[str, np.ndarray] | None:
-        """Return the arrays under a name; None where this very job has left none."""
+        """Return the arrays saved under a name, or None if this job has saved none."""
         try:
-            # opened here because numpy leaves damaged files open
+            # The file is opened here because numpy would leave a damaged one open.
             path = self.folder / f"{name}.npz"
             with path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
                 if str(kept["key"]) != self.key:
@@ -105,7 +110,7 @@ class Checkpoint:
         write_json(path, {"schema": SCHEMA, "key": self.key, "content": content})
 
     def load_json(self, name: str) -> Any:
-        """Return the plain values under a name; None where this very job has left none."""
+        """Return the plain values saved under a name, or None if this job has saved none."""
         try:
             kept = read_json(self.folder / f"{name}.json", "a checkpoint")
             if kept["schema"] == SCHEMA and kept["key"] == self.key:
@@ -115,7 +120,10 @@ class Checkpoint:
         return None
 
     def remove(self, pattern: str = "*") -> None:
-        """Delete files by name, of whatever job, and the folder if it is then empty."""
+        """Delete the files that match a glob, also those of other jobs.
+
+        The folder is deleted, too, if it is then empty.
+        """
         for path in self.folder.glob(pattern):
             path.unlink()
         if self.folder.is_dir() and not any(self.folder.iterdir()):

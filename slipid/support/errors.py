@@ -1,4 +1,4 @@
-"""The error for bad input, and the common form of its messages."""
+"""The error for bad input of a user, and functions for the common form of its messages."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -6,7 +6,10 @@ from pathlib import Path
 
 
 class DataError(ValueError):
-    """Error about unreadable user data; the message names file, row or column, and the remedy."""
+    """Error about wrong input of a user: files, options or configs.
+
+    The message names the file, the row or column, and the remedy.
+    """
 
 
 def bad_data(
@@ -20,8 +23,12 @@ def bad_data(
     """Return a `DataError` in the common form `file row 12, column 'x': found; expected ...`.
 
     Args:
-        row: line number in the file, counted from 1 (in Parquet the record), or first and last.
-        column: name of the column, as the file has it.
+        path: the file.
+        found: what is wrong.
+        expected: what was expected instead.
+        row: line number in the file (record number in Parquet), counted from 1, or the first and
+            last line.
+        column: name of the column, as in the file.
     """
     where = str(path)
     if isinstance(row, tuple):
@@ -34,12 +41,15 @@ def bad_data(
 
 
 def did_you_mean(name: object, choices: Iterable[str]) -> str:
-    """Return `, did you mean this or that?` where choices are spelled alike, else an empty text."""
+    """Return `, did you mean this or that?` with the choices most similar to a name.
+
+    The text is empty if no choice is similar.
+    """
     found = get_close_matches(str(name), list(choices), n=2)
     return f", did you mean {' or '.join(found)}?" if found else ""
 
 
 def first_names(names: Iterable[str], none: str = "none") -> str:
-    """Return the first dozen names for a message, or `none` where there are none."""
+    """Return the first twelve names as a text for a message, or `none` if there are no names."""
     every = list(names)
     return ", ".join(every[:12] + ["..."] * (len(every) > 12)) or none

@@ -1,7 +1,8 @@
-"""Executors: this process, or local processes that end with the process that started them.
+"""Executors of independent jobs: in this process, or in local processes that end with this one.
 
-Functions with independent jobs take a `concurrent.futures.Executor`, so that any engine can run
-them: the called function is at the top of a module, and its arguments and results can be pickled.
+Functions that run independent jobs take a `concurrent.futures.Executor`, so that any executor can
+run them. The function of a job is therefore at the top level of a module, and its arguments and
+results can be pickled.
 """
 
 import os
@@ -35,9 +36,10 @@ class InProcess(Executor):
 
 
 class Processes(ProcessPoolExecutor):
-    """Processes of this machine, started on demand and ended by an interrupt or a kill.
+    """Executor with processes on this machine, which are started on demand.
 
-    They are spawned, since forked processes would inherit the threads of the caller's libraries.
+    They end when the process that started them is interrupted or killed. They are spawned, not
+    forked, since forked processes would inherit the threads of the caller's libraries.
     """
 
     def __init__(self, jobs: int) -> None:
@@ -47,7 +49,7 @@ class Processes(ProcessPoolExecutor):
     def submit(
         self, fn: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
     ) -> Future[Result]:
-        with _interrupts_ignored():  # Ctrl-C is for this process alone
+        with _interrupts_ignored():  # so that Ctrl-C interrupts only this process
             return super().submit(fn, *args, **kwargs)
 
     def __exit__(
@@ -56,7 +58,10 @@ class Processes(ProcessPoolExecutor):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Wait for the jobs, or terminate them after an error, since written files are atomic."""
+        """Wait for the jobs, or terminate their processes after an error.
+
+        Terminating them is safe, since files are written completely or not at all.
+        """
         self.shutdown(wait=error is None, cancel_futures=True)
         for child in set(active_children()) - self._others:
             child.terminate()
@@ -68,15 +73,16 @@ def results(
     todo: Mapping[str, Given],
     report: Reporter,
 ) -> list[Result]:
-    """Return results in the order in which they are completed, and report each of them.
+    """Return the results of jobs in the order of their completion, and report the progress.
 
     Args:
         executor: executor of the jobs.
-        work: a function at the top of a module.
-        todo: its arguments by name.
+        work: function of a job, at the top level of a module.
+        todo: argument of each job, by the name of the job.
+        report: reporter of the progress.
 
     Raises:
-        DataError: a process was ended by the system.
+        DataError: the system ended a process before its job was done.
     """
     found: list[Result] = []
     waiting: dict[Future[Result], str] = {}
@@ -101,7 +107,10 @@ def results(
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Ignore interrupts; processes started meanwhile ignore them for good."""
+    """Return a context in which interrupts are ignored.
+
+    Processes that are started in it ignore interrupts for their whole life.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -113,7 +122,10 @@ def _interrupts_ignored() -> Iterator[None]:
 
 
 def _end_with(parent: int) -> None:
-    """Leave interrupts to the parent, and exit when it has been killed."""
+    """Set up a process that ignores interrupts and ends when its parent process has ended.
+
+    `parent` is the id of the parent process.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

@@ -1,4 +1,4 @@
-"""Files that are either complete or absent: atomic writes, strict JSON, arrays without pickle."""
+"""Reading and writing of files: atomic writes, strict JSON, and arrays without pickle."""
 
 import hashlib
 import io
@@ -16,7 +16,11 @@ from slipid.support.errors import DataError
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file so that a reader, or a crash, finds the old one or the new one, never a part."""
+    """Write a file atomically: after a crash there is the old or the new file, never a part.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
     partial = path.parent / f".{path.name}.{secrets.token_hex(4)}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -33,7 +37,10 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def writable(folder: Path) -> None:
-    """Make a folder and check that it is writable, before hours of work that end there."""
+    """Make a folder and raise `DataError` if it is not writable.
+
+    It is called before long work whose results are written to the folder.
+    """
     write_bytes(folder / ".writable", b"")
     (folder / ".writable").unlink()
 
@@ -44,12 +51,16 @@ def write_json(path: Path, value: object) -> None:
 
 
 def json_text(value: object) -> str:
-    """Return JSON of plain values and numpy numbers; raise `ValueError` for NaN and infinity."""
+    """Return the JSON text of plain values, numpy arrays and paths.
+
+    Raises:
+        ValueError: a number is NaN or infinite.
+    """
     return json.dumps(value, indent=1, allow_nan=False, default=_plain) + "\n"
 
 
 def checksum(content: Mapping[str, object]) -> str:
-    """Return the SHA-256 of JSON with sorted keys and without spaces, as Python writes it."""
+    """Return the SHA-256 hash of the JSON text of plain values, with sorted keys and no spaces."""
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -63,7 +74,11 @@ def _plain(value: object) -> object:
 
 
 def read_json(path: Path, what: str) -> Any:
-    """Return the JSON of a file that slipid wrote; `DataError` names the expected file."""
+    """Return the content of a JSON file that slipid wrote.
+
+    Raises:
+        DataError: the file is missing or not JSON; the message has `what` was expected.
+    """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -81,6 +96,6 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray], compress: bool = Tru
 
 
 def hash_of(runs: Iterable[tuple[str, str]]) -> str:
-    """Return the hash of a set of runs from their names and file hashes, whatever their order."""
+    """Return the hash of a set of runs, from pairs of name and file hash in any order."""
     lines = "".join(f"{name} {sha}\n" for name, sha in sorted(runs))
     return hashlib.sha256(lines.encode()).hexdigest()

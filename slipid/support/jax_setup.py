@@ -1,4 +1,4 @@
-"""JAX setup: float64, plain loops and a persistent compilation cache."""
+"""Setup of JAX: float64, XLA without fusion emitters, and a persistent compilation cache."""
 
 import os
 import sys
@@ -10,11 +10,12 @@ PLAIN_LOOPS = "--xla_cpu_use_fusion_emitters=false"
 
 
 def plain_loops() -> None:
-    """Make XLA write loops without its fusion emitters, unless XLA_FLAGS mentions them.
+    """Make XLA compile loops without its fusion emitters, unless XLA_FLAGS already mentions them.
 
-    A fit is compiled in three quarters of the time and runs as fast; rollouts of the twin take 0.3
-    to 0.6 of the time. It must be called before JAX first computes. XLA ends the process at unknown
-    flags, so only the versions that were measured are changed, and a file of flags is left alone.
+    The compilation of a fit then takes three quarters of the time, and the fit runs as fast;
+    rollouts of the twin take 0.3 to 0.6 of the time. The function must be called before the first
+    computation of JAX. XLA ends the process at unknown flags, so the flag is set only for versions
+    of jaxlib with which this was measured. If XLA_FLAGS names a file of flags, it is not changed.
     """
     flags = os.environ.get("XLA_FLAGS", "").strip()
     more = "fusion_emitters" not in flags and (not flags or flags.startswith("-"))
@@ -25,8 +26,8 @@ def plain_loops() -> None:
 def one_blas_thread() -> None:
     """Make BLAS and LAPACK compute in one thread.
 
-    The matrices here are small, and threads that wait for each other by spinning make a Cholesky
-    factor of 570 rows take 800 ms instead of 3 on two cores on which another job runs.
+    The matrices of slipid are small. Their threads wait for each other in busy loops, so that on
+    two cores with another job the Cholesky factor of a 570 x 570 matrix takes 800 ms, not 3 ms.
     """
     import scipy.linalg  # noqa: F401  # loads what JAX computes with
     from threadpoolctl import threadpool_limits
@@ -35,7 +36,7 @@ def one_blas_thread() -> None:
 
 
 def cache_folder() -> Path:
-    """Return the folder of compiled functions: SLIPID_CACHE, else the platform's for caches."""
+    """Return the folder of slipid's cache: SLIPID_CACHE, else one in the platform's cache."""
     if given := os.environ.get("SLIPID_CACHE"):
         return Path(given)
     if sys.platform == "win32":
@@ -48,9 +49,10 @@ def cache_folder() -> Path:
 
 
 def setup_jax(quiet: bool = False) -> None:
-    """Apply the whole setup and print it on stderr; every command that computes calls this first.
+    """Set JAX up, and print the setup on stderr unless quiet.
 
-    A cache named by JAX's own variable is kept; an unwritable one only costs time.
+    Every command that computes calls this first. A compilation cache that is named by JAX's own
+    environment variable is kept. If the cache is not writable, compilation only takes longer.
     """
     plain_loops()
     import jax

@@ -1,4 +1,4 @@
-"""Progress of long jobs on stderr: a bar on a terminal, plain lines elsewhere."""
+"""Progress of long jobs, reported on stderr: by a bar on a terminal, by plain lines elsewhere."""
 
 import time
 from typing import TYPE_CHECKING
@@ -7,16 +7,18 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 EVERY_S = 2.0
-"""Least time between two plain lines of one stage [s]."""
+"""Least time between two plain lines about one stage [s]."""
 MEMORY_S = 3600.0
-"""Time over which speed is averaged, since a step of a fit may take minutes [s]."""
+"""Time over which the speed of progress is averaged for the remaining time [s]; it is long, since a
+step of a fit may take minutes."""
 
 
 class Reporter:
-    """Reporter of progress, silent if quiet; use it as a context."""
+    """Reporter of the progress of a job, used as a context manager; silent if `quiet`."""
 
     def __init__(self, quiet: bool = False):
-        # imported late: every command imports this module, and `--help` needs no bar
+        # Rich is imported here because every command imports this module, and `--help` needs no
+        # progress bar.
         from rich import progress as bars
         from rich.console import Console
 
@@ -30,7 +32,7 @@ class Reporter:
             console=self._console,
             transient=True,
             speed_estimate_period=MEMORY_S,
-            # away from a terminal it only computes the remaining time
+            # Without a terminal the bar is not shown, and only computes the remaining time.
             disable=quiet or not self._console.is_terminal,
         )
         self._task: "TaskID | None" = None
@@ -44,11 +46,11 @@ class Reporter:
         self._bars.stop()
 
     def line(self, text: str) -> None:
-        """Print one sentence that stays."""
+        """Print a sentence, which stays on the terminal above the bar."""
         self._console.print(text, markup=False, soft_wrap=True)
 
     def stage(self, name: str) -> None:
-        """Start a new stage of the work."""
+        """Start a stage of the job, unless it is the current one."""
         if name == self._stage:
             return
         if self._task is not None:
@@ -59,16 +61,19 @@ class Reporter:
             self.line(f"{name} ...")
 
     def note(self, what: str) -> None:
-        """Show the current activity, on a bar only."""
+        """Show a text about the current activity beside the bar; without a bar, do nothing."""
         if self._task is not None:
             self._bars.update(self._task, what=what)
 
     def advance(self, done: int | float, total: int | float, what: str | None = None) -> None:
-        """Report progress; away from a terminal print a line now and then, and the last one.
+        """Report the progress of the current stage.
+
+        Without a terminal a line is printed at most every `EVERY_S`, and at the end of the stage.
 
         Args:
-            done, total: amounts in any unit; the total is constant throughout a stage.
-            what: the same in words, `done of total` by default.
+            done, total: finished and total amount of work in any unit; the total is constant
+                throughout a stage.
+            what: text about the progress, `done of total` by default.
         """
         if self._task is None:
             return

@@ -1,4 +1,4 @@
-"""TOML files checked against a pydantic model: every mistake on one line, with its key."""
+"""Checking of TOML files against pydantic models; each mistake is a line that names its key."""
 
 import tomllib
 from collections.abc import Sequence
@@ -14,14 +14,14 @@ from slipid.support.content import Content
 from slipid.support.errors import DataError, did_you_mean
 
 CLOSED = ConfigDict(extra="forbid")
-"""Config of dataclasses in a TOML file: unknown keys are refused."""
+"""Pydantic config of dataclasses that describe tables of a TOML file: unknown keys are refused."""
 Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
 Part = Annotated[float, Field(ge=0, lt=1)]
-"""Share of a whole, below 1."""
+"""Share of a whole, at least 0 and below 1 [1]."""
 Model = TypeVar("Model")
 Step = str | int
-"""Key of a table, or index in a list."""
+"""Step of a location in a TOML file: the key of a table, or the index in a list."""
 
 
 class Section(BaseModel):
@@ -31,7 +31,7 @@ class Section(BaseModel):
 
 
 def text_of(path: Path, what: str = "a config") -> str:
-    """Return the text of a file of some type; raise `DataError` where it is unreadable."""
+    """Return the text of a file; raise `DataError`, with `what` was expected, if unreadable."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
@@ -41,7 +41,7 @@ def text_of(path: Path, what: str = "a config") -> str:
 
 
 def mapping_of(path: Path, text: str) -> Content:
-    """Return the content of TOML text; raise `DataError` where it is no TOML."""
+    """Return the content of a TOML text; raise `DataError` if the text is not valid TOML."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -49,7 +49,16 @@ def mapping_of(path: Path, text: str) -> Content:
 
 
 def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
-    """Return a mapping as a pydantic model or dataclass; `DataError` lists every mistake."""
+    """Return a mapping as an instance of a pydantic model or dataclass.
+
+    Args:
+        path: file, or name of the section, for messages.
+        mapping: content of the file or section.
+        model: type of the result.
+
+    Raises:
+        DataError: the mapping does not fit the model; every mistake is a line of the message.
+    """
     try:
         return TypeAdapter(model).validate_python(mapping)
     except ValidationError as error:
@@ -58,7 +67,7 @@ def checked(path: Path | str, mapping: object, model: type[Model]) -> Model:
 
 
 def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) -> str:
-    """Return one mistake as one line: file, key, what was found, what was expected."""
+    """Return a line about one mistake: file, key, what was found and what was expected."""
     kind, given, context = error["type"], error["input"], error.get("ctx", {})
     steps = _steps(mapping, error["loc"])
     where = f"{path}: {_spelled(steps)}" if steps else str(path)
@@ -85,7 +94,10 @@ def _line(path: Path | str, mapping: object, root: type, error: ErrorDetails) ->
 
 
 def _steps(mapping: object, loc: Sequence[Step]) -> list[Step]:
-    """Return the part of pydantic's location in the file, without names of union members."""
+    """Return the steps to a mistake in the file, from the location that pydantic reports.
+
+    Pydantic's location also has names of union members, which are left out.
+    """
     steps: list[Step] = []
     here = mapping
     for k, part in enumerate(loc):
@@ -100,7 +112,7 @@ def _steps(mapping: object, loc: Sequence[Step]) -> list[Step]:
 
 
 def _spelled(steps: Sequence[Step]) -> str:
-    """Return a location as text, such as `a.b[2]`; items of lists count from 1."""
+    """Return a location as a text such as `a.b[2]`, in which items of lists count from 1."""
     out = ""
     for step in steps:
         if isinstance(step, int):
@@ -112,14 +124,18 @@ def _spelled(steps: Sequence[Step]) -> str:
 
 
 def _below(here: object, step: Step) -> object:
-    """Return the value one step below, or None."""
+    """Return the value one step below a value, or None if there is none."""
     if isinstance(here, list) and isinstance(step, int):
         return here[step]
     return here.get(step) if isinstance(here, dict) else None
 
 
 def _kinds_at(mapping: object, root: object, steps: Sequence[Step]) -> list[object]:
-    """Return the models and dataclasses that may describe a place of the file, by its literals."""
+    """Return the models and dataclasses that may describe a place in the file.
+
+    Of the members of a union, those whose literals (such as `drive = "omni"`) match the file are
+    taken.
+    """
     found, here = [root], mapping
     for step in steps:
         inner = [t for kind in found for t in _inner(kind, step)]
@@ -129,14 +145,14 @@ def _kinds_at(mapping: object, root: object, steps: Sequence[Step]) -> list[obje
 
 
 def _inner(kind: object, step: Step) -> list[object]:
-    """Return the types of the value one step below."""
+    """Return the possible types of the value one step below a value of some type."""
     if get_origin(kind) in (list, dict):
         return _members(get_args(kind)[-1])
     return _members(_annotations(kind).get(str(step)))
 
 
 def _members(annotation: object) -> list[object]:
-    """Return the alternatives of a type."""
+    """Return the members of a union type, or a single type in a list; `Annotated` is removed."""
     if get_origin(annotation) in (Union, UnionType):
         return [m for a in get_args(annotation) for m in _members(a)]
     return (
@@ -145,7 +161,7 @@ def _members(annotation: object) -> list[object]:
 
 
 def _annotations(kind: object) -> dict[str, object]:
-    """Return the types of the keys of a model or a dataclass; empty for others."""
+    """Return the type of each key of a model or a dataclass; empty for other types."""
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         return {f.alias or name: f.annotation for name, f in kind.model_fields.items()}
     if isinstance(kind, type) and is_dataclass(kind):
@@ -155,7 +171,7 @@ def _annotations(kind: object) -> dict[str, object]:
 
 
 def _fits(kind: object, here: object) -> bool:
-    """Return whether the literals of a type are those of the file."""
+    """Return whether the values in the file are among those of the type's `Literal` keys."""
     return all(
         here[key] in get_args(annotation)
         for key, annotation in _annotations(kind).items()

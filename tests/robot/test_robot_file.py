@@ -218,7 +218,7 @@ def test_what_is_no_robot_is_refused(tmp_path):
     for text in (
         "{}",
         "3",
-        '{"schema": "slipid.fitting/1"}',
+        '{"schema": "slipid.fit/1"}',
         '{"schema": 7}',
         '{"schema": "slipid.robot/x"}',
     ):

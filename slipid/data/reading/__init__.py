@@ -1,1 +1,1 @@
-"""Reading of files of any layout as logs in SI units, with all checks."""
+"""Reading of log files of any layout: the result is checked logs in SI units."""

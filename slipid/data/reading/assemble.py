@@ -1,8 +1,8 @@
-"""Assembly of the signals of one run into its log: one clock, and the latest value of each sensor.
+"""Assembly of the signals of one run, each at its own times, into a log with common times.
 
-The clock has every time at which something was measured. Wheel angles are linear between two
-readings of their own; every other channel holds its last reading, which is marked as stale, so that
-no reading counts twice.
+The log has a row for every time at which something was measured. Wheel angles are interpolated
+linearly between their readings; every other channel keeps its latest reading, and repeated readings
+are marked as not fresh, so that none counts twice.
 """
 
 from collections.abc import Iterator, Mapping
@@ -22,7 +22,7 @@ from slipid.data.wheel_signals import integral, readings
 from slipid.support.errors import bad_data
 
 EPOCH = 1e6
-"""Time from which on a clock counts from 1970 and not from the start of the robot [s]."""
+"""Time above which a clock must count from 1970, not from the start of the robot [s]."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,8 @@ def assembled(
     """Return the log of one run from its signals by channel.
 
     Raises:
-        DataError: the wheels were not measured for a while, or a channel has no value at all.
+        DataError: there is no channel, the wheels were not measured for too long, or a channel has
+            no value at all.
     """
     if not signals:
         found = "no column of anything but the time is known"
@@ -85,7 +86,7 @@ def assembled(
 
 
 def _check_gaps(signal: Signal, layout: SensorLayout) -> None:
-    """Raise `DataError` where wheels were not measured for too long, as their motion is lost."""
+    """Raise `DataError` if a wheel was not measured for too long, since its motion is then lost."""
     for column in range(signal.values.shape[1]):
         there = np.flatnonzero(~np.isnan(signal.values[:, column]))
         steps = np.diff(signal.time[there])
@@ -104,7 +105,7 @@ def _check_gaps(signal: Signal, layout: SensorLayout) -> None:
 
 
 def _held(signal: Signal, clock: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time column"]:
-    """Return the latest reading at every time; before the first reading, that one."""
+    """Return the latest reading at every time of the clock; before the first reading, the first."""
     if signal.time is clock and not np.isnan(signal.values).any():
         return signal.values.copy()
     out = np.empty((len(clock), signal.values.shape[1]))
@@ -120,7 +121,10 @@ def _held(signal: Signal, clock: Float[np.ndarray, " time"]) -> Float[np.ndarray
 def _fresh(
     signals: Mapping[str, Signal], clock: Float[np.ndarray, " time"], names: tuple[str, ...]
 ) -> Bool[np.ndarray, "time column"] | None:
-    """Return where the first available channel was measured; None where it always was."""
+    """Return whether a channel was measured at each time; None if it was at all times.
+
+    The channel is the first available one of `names`; the result is None as well if there is none.
+    """
     name = next((name for name in names if name in signals), None)
     if name is None:
         return None
@@ -141,7 +145,11 @@ def _angle(
     clock: Float[np.ndarray, " time"],
     notes: list[str],
 ) -> Float[np.ndarray, "time wheel"]:
-    """Return the cumulative wheel angle, from ticks, else angles, else integrated speeds."""
+    """Return the cumulative angle of each wheel [rad], 0 in the first row.
+
+    It is computed from the channel `name`: ticks, angles, or speeds, which are integrated. Without
+    such a channel (None) the result has no columns. Remarks are appended to the notes.
+    """
     if name is None:
         return np.zeros((len(clock), 0))
     signal, columns, slow = signals[name], [], 0
@@ -165,7 +173,7 @@ def _angle(
 
 
 def _per_wheel(name: str, layout: SensorLayout) -> float:
-    """Return the angle of a wheel per tick, or per unit of the measured angle."""
+    """Return the angle of the wheel per tick [rad], or per angle at the measured shaft [1]."""
     if name == "wheel_ticks":
         return 2.0 * np.pi / (float(layout.ticks_per_revolution or 1.0) * layout.gear_ratio)
     return 1.0 / layout.gear_ratio if name.startswith("motor") else 1.0
@@ -174,7 +182,10 @@ def _per_wheel(name: str, layout: SensorLayout) -> float:
 def _ticks(
     ticks: Float[np.ndarray, " sample"], layout: SensorLayout, notes: list[str]
 ) -> Float[np.ndarray, " sample"]:
-    """Return cumulative ticks, without the wrap-around of a counter of `tick_bits` bits."""
+    """Return the cumulative ticks of one wheel.
+
+    Increments are summed; the wrap-around of a counter of `tick_bits` bits is removed, with a note.
+    """
     if layout.ticks_are_increments:
         return np.cumsum(ticks)
     period = 2.0**layout.tick_bits
@@ -188,7 +199,10 @@ def _ticks(
 
 
 def _at_wheel(held: Mapping[str, np.ndarray], layout: SensorLayout, what: str) -> np.ndarray | None:
-    """Return a measured or commanded speed at the wheel, from either side of the gear."""
+    """Return a speed of the wheels, logged at the wheels or at the motors, or None.
+
+    `what` is `speed` (reported) or `speed_command`.
+    """
     if f"wheel_{what}" in held:
         return held[f"wheel_{what}"]
     if f"motor_{what}" in held:
@@ -197,7 +211,7 @@ def _at_wheel(held: Mapping[str, np.ndarray], layout: SensorLayout, what: str) -
 
 
 def _current(held: Mapping[str, np.ndarray], layout: SensorLayout) -> np.ndarray | None:
-    """Return the logged current, else the reported torque divided by the torque constant."""
+    """Return the logged current, else the reported torque over the torque constant, else None."""
     if "current" in held:
         return held["current"]
     for name, ratio in (("motor_torque", 1.0), ("wheel_torque", layout.gear_ratio)):
@@ -207,14 +221,14 @@ def _current(held: Mapping[str, np.ndarray], layout: SensorLayout) -> np.ndarray
 
 
 def _voltage(held: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """Return the logged voltage, else duty cycle times bus voltage where both are logged."""
+    """Return the logged voltage, else duty cycle times bus voltage if both were logged, or None."""
     if "voltage" not in held and {"duty", "bus_voltage"} <= held.keys():
         return held["duty"] * held["bus_voltage"]
     return held.get("voltage")
 
 
 def _twist(held: Mapping[str, np.ndarray], rows: int) -> np.ndarray | None:
-    """Return the commanded twist with zeros for absent axes; None where no axis is logged."""
+    """Return the commanded twist, zero along axes that were not logged; None if none was."""
     names = [f"twist_command_{axis}" for axis in ("x", "y", "yaw")]
     if not held.keys() & set(names):
         return None
@@ -224,7 +238,7 @@ def _twist(held: Mapping[str, np.ndarray], rows: int) -> np.ndarray | None:
 def _pose(
     signals: Mapping[str, Signal], clock: Float[np.ndarray, " time"]
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Return the pose with the heading unwrapped, and whether each row has a new one."""
+    """Return the pose at every time, its heading unwrapped, and whether each row has a new pose."""
     if "pose_x" not in signals:
         return None, None
     turned = heading(signals)
@@ -250,7 +264,7 @@ def _pose(
 
 
 def heading(signals: Mapping[str, Signal]) -> Signal:
-    """Return the heading [rad] as logged, else from a quaternion x, y, z, w."""
+    """Return the logged heading [rad], else the yaw angle of the logged quaternion x, y, z, w."""
     if "pose_heading" in signals:
         return signals["pose_heading"]
     turned = signals["pose_quaternion"]
@@ -273,11 +287,13 @@ def clock_against(
     identity: Identity,
     poses: Mapping[str, Signal],
 ) -> Clock:
-    """Return the clock of poses relative to the robot's signals, from the motion of both.
+    """Return the clock of poses relative to the robot's clock, estimated from the motion.
 
     Args:
-        robot: signals of the robot's own file by channel; layout and identity belong to it.
-        poses: signals of a pose by channel, on their own clock.
+        robot: signals of the robot's own file, by channel.
+        layout: layout of that file.
+        identity: name and origin of the run.
+        poses: signals of the pose's channels, on their own clock.
 
     Raises:
         UnusablePose: the motion does not determine the offset between the clocks.
@@ -295,7 +311,7 @@ def clock_against(
             f"{log.name}; expected poses of the same run, with starts, stops and turns in both, "
             "and the video's frame rate"
         )
-    # the log of a clock that counts from 1970 starts at zero
+    # If the robot's clock counts from 1970, the times of the log start at zero instead.
     turns = next(name for name in TURNS if name in robot)
     start = float(robot[turns].time[0] - log.time[0])
     return replace(clock, offset=clock.offset + start)
@@ -304,7 +320,10 @@ def clock_against(
 def _motion_pairs(
     robot: Log, time: Float[np.ndarray, " pose"], pose: Float[np.ndarray, "pose 3"]
 ) -> Iterator[MotionPair]:
-    """Yield the motion pair of the gyro, which turns with the body, then that of the wheels."""
+    """Yield the motion pair of the gyro, if there is one, then that of the wheels.
+
+    The gyro comes first because it turns exactly with the body, whereas wheels slip.
+    """
     if robot.gyro is not None:
         yield MotionPair.of_gyro(robot.time, robot.gyro, time, pose)
     yield MotionPair.of_wheels(robot.time, robot.wheel_angle, time, pose)

@@ -1,4 +1,4 @@
-"""Checks that every log passes once; each error names file, row and what was expected."""
+"""Checks of every log that is read; each error names the file, the row and what was expected."""
 
 from collections.abc import Mapping
 
@@ -13,16 +13,16 @@ from slipid.data.wheel_signals import integral
 from slipid.support.errors import DataError, bad_data
 
 MIN_ROWS = 2
-"""Least number of rows of a run with motion."""
+"""Least number of rows of a run; fewer rows show no motion."""
 
-# Magnitudes above these are impossible for wheeled robots: the unit or the sensor must be wrong.
+# Largest possible magnitudes for wheeled robots; above them the unit or the sensor must be wrong.
 _LIMITS = {
     "wheel_speed": (1000.0, "rad/s"),
     "wheel_speed_command": (1000.0, "rad/s"),
     "current": (1000.0, "A"),
     "bus_voltage": (1000.0, "V"),
     "duty": (1.5, "(a share of 1)"),
-    "voltage": (1000.0, "V"),  # possibly the product of both, which are checked first
+    "voltage": (1000.0, "V"),  # may be the product of the two channels above, hence checked later
     "gyro": (100.0, "rad/s"),
 }
 
@@ -59,11 +59,23 @@ def check_time(table: Table, layout: Layout, time: Float[np.ndarray, " row"]) ->
 
 
 class UnusablePose(DataError):
-    """Error about a run whose pose jumps or has no determined clock; other runs stay readable."""
+    """Error about a single run whose poses jump, or whose clock the motion does not determine.
+
+    Such a run is left out, and the other runs are read.
+    """
 
 
 def check_log(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:
-    """Raise `DataError` for impossible magnitudes, signs or jumps, and for stuck channels."""
+    """Raise `DataError` if a log has impossible magnitudes, signs or jumps, or a stuck channel.
+
+    Args:
+        log: the log.
+        signals: signals from which the log was assembled, for the origin of a wrong value.
+        layout: layout of the log's file.
+
+    Raises:
+        UnusablePose: the pose jumps.
+    """
     for name, (limit, unit) in _LIMITS.items():
         values = getattr(log, name)
         if values is not None and np.abs(values).max(initial=0.0) > limit:
@@ -83,12 +95,12 @@ def check_log(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> 
 
 
 def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:
-    """Raise `DataError` for angles no wheel can make, or a commanded wheel that does not turn."""
+    """Raise `DataError` if a wheel turns impossibly fast, or does not turn although commanded."""
     if not log.wheels:
         return
     rates = np.abs(np.diff(log.wheel_angle, axis=0)) / np.diff(log.time)[:, None]
-    # Telemetry that stalls and catches up causes tenfold rates in sound logs; a counter that
-    # restarts causes hundredfold ones.
+    # In correct logs, the jump after a telemetry stall looks like ten times the usual wheel speed;
+    # a counter that restarts looks like a hundred times.
     limit = max(30.0, 20.0 * float(np.quantile(rates, 0.99)))
     if rates.max() > limit:
         i, j = _first(rates > limit)
@@ -100,7 +112,7 @@ def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: SensorLayout)
     command = log.wheel_speed_command
     if command is None:
         return
-    # A radian of commanded motion without any measured motion of the wheel.
+    # A wheel is dead if it was commanded to turn by more than 1 rad and its angle never changes.
     commanded = np.abs(integral(log.time, command)[-1])
     still = np.ptp(log.wheel_angle, axis=0) == 0
     dead = np.flatnonzero(still & (commanded > 1.0))
@@ -111,7 +123,7 @@ def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: SensorLayout)
 
 
 def _check_pose(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:
-    """Raise `DataError` for a pose that is stuck while wheels turn, `UnusablePose` for a jump."""
+    """Raise `UnusablePose` if a pose jumps, `DataError` if it is constant while wheels turn."""
     assert log.pose is not None
     assert log.pose_fresh is not None
     rows = np.flatnonzero(log.pose_fresh)
@@ -135,7 +147,7 @@ def _check_pose(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -
 
 
 def _first(mask: np.ndarray) -> tuple[int, int]:
-    """Return row and column of the first True."""
+    """Return the row and column of the first True; the column is 0 if there are no columns."""
     at = np.argwhere(mask)[0]
     return int(at[0]), int(at[1]) if len(at) > 1 else 0
 
@@ -148,7 +160,7 @@ _NAMES = {
     "voltage": ("voltage", "duty"),
     "pose_heading": ("pose_heading", "pose_quaternion"),
 }
-"""Channels of a file from which each channel of a log may come."""
+"""Channels of a file, by the name of the log's channel that may be computed from them."""
 
 
 def _at(
@@ -160,7 +172,17 @@ def _at(
     found: str,
     expected: str,
 ) -> DataError:
-    """Return the error at row i of the log, in column j of the channel that `name` comes from."""
+    """Return the error about a value of the log, with its place in the file that it comes from.
+
+    Args:
+        log: the log.
+        signals: signals from which the log was assembled.
+        name: channel of the log.
+        i: row of the log, or None for an error about all rows.
+        j: column of the channel.
+        found: what is wrong.
+        expected: what was expected instead.
+    """
     signal = next((signals[n] for n in _NAMES.get(name, (name,)) if n in signals), None)
     if signal is None:
         return bad_data(log.path, found, expected)

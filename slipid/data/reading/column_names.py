@@ -1,4 +1,4 @@
-"""Dictionary of column and topic names, and the channel and unit that a name stands for."""
+"""Dictionary of words in column and topic names, by which a name is assigned a channel and unit."""
 
 import re
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from slipid.data.reading.layout import CHANNELS
 from slipid.data.reading.units import converts
 
 _TABLE: dict[str, str] = {
-    # name of the wheel
+    # words that name the wheel
     "side l": "left l lt lh links",
     "side r": "right r rt rh rechts",
     "end f": "front fore forward f",
@@ -21,7 +21,7 @@ _TABLE: dict[str, str] = {
     "corner rr": "rr br",
     "kind motor": "motor motors m mot engine",
     "kind wheel": "wheel wheels whl joint joints tyre tire track",
-    # measured quantity
+    # words that name the measured quantity
     "what time": "t time stamp timestamp times tstamp seconds elapsed clock zeit",
     "what ticks": "tick ticks enc encoder encoders count counts counter pulse pulses cnt",
     "what position": "pos position positions pose place loc location translation p",
@@ -45,13 +45,13 @@ _TABLE: dict[str, str] = {
     "what orientation": "orientation quaternion quat q attitude",
     "what quaternion": "qx qy qz qw",
     "what axis": "x y z",
-    # known, but of no use to slipid
+    # words that mark a column which slipid does not use
     "not odometry": "odom odometry odo",
     "not wanted": (
         "delta diff d dt dx dy dtheta accel acc acceleration mag temp temperature std cov "
         "covariance error err sum mean row index seq id flag status roll pitch lat lon rssi step"
     ),
-    # without meaning
+    # words that have no meaning for the channel
     "noise": (
         "data field fields msg value values actual measured meas feedback fb state states link "
         "robot base body global world map camera cam mocap vicon optitrack tag marker tracker "
@@ -59,7 +59,7 @@ _TABLE: dict[str, str] = {
         "log sensor drive shaft nsec sec secs ros"
     ),
 }
-"""Words in column names, by their role and its value: `side l` is the role `side`, value `l`."""
+"""Words in column names, by role and value: the key `side l` is the role `side` with value `l`."""
 _ROLES: dict[str, tuple[str, str]] = {
     word: (role.partition(" ")[0], role.partition(" ")[2])
     for role, words in _TABLE.items()
@@ -67,9 +67,9 @@ _ROLES: dict[str, tuple[str, str]] = {
 }
 _LONG = [word for word in _ROLES if len(word) >= 4]
 _NEAR = 0.82
-"""Similarity from which a word counts as a misspelled one."""
+"""Least similarity (`difflib`) for which a word counts as a misspelling of a known one [1]."""
 _LETTERS = 3
-"""Longest word that may consist of single letters alone, such as wl or u1l."""
+"""Largest length of a word that may be read as a sequence of one-letter words, such as wl."""
 _SUFFIXES = {
     **{"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "us": "us"},
     **{"usec": "us", "ns": "ns", "nsec": "ns", "m": "m", "mm": "mm", "cm": "cm"},
@@ -80,10 +80,10 @@ _SUFFIXES = {
     **{"a": "A", "amps": "A", "ma": "mA", "v": "V", "mv": "mV", "nm": "N*m"},
     **{"%": "%", "percent": "percent", "pct": "percent"},
 }
-"""Ends of names that are units."""
+"""Units by the ending of a column name that stands for them."""
 _BY_UNIT = {"tick": "ticks", "A": "current", "V": "voltage", "N*m": "torque", "rad/s": "speed"}
 _SHORT = ("v", "a", "s", "m")
-"""Ends of names that are units only where the name with them is not understood."""
+"""Endings that count as units only if the name is not understood with them as words."""
 
 
 @dataclass(frozen=True)
@@ -91,11 +91,12 @@ class ColumnMeaning:
     """Meaning of a column's name.
 
     Attributes:
-        channel: one of `CHANNELS`, or `wheel_position` or `wheel_v` (also `motor_`) where only the
-            numbers can decide between two channels; empty where the name has no meaning.
-        label: name of the wheel, or component of a quaternion.
-        unit: unit in the name, else empty.
-        doubt: assumption about the name, else empty.
+        channel: one of `CHANNELS`; or `wheel_position`, `wheel_v`, `motor_position` or `motor_v` if
+            only the numbers can decide between two channels; or `odometry`; empty if the name has
+            no known meaning.
+        label: name of the wheel, such as `fl` or `2`, or component of a quaternion; else empty.
+        unit: unit in the name or in the row of units; empty if there is none that fits.
+        doubt: text about an assumption that was made, for the user to confirm; else empty.
     """
 
     channel: str = ""
@@ -109,8 +110,9 @@ def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMe
 
     Args:
         name: name of the column.
-        unit: unit in a row of units, if there is one.
-        of_motor: whether the log has motors alone, so that columns need not name a wheel or motor.
+        unit: cell of the column in a row of units; empty without such a row.
+        of_motor: whether the log is of motors without a robot, so that columns need not name a
+            wheel or motor.
     """
     bare, suffix = without_unit(name)
     unit = unit_in(unit) or unit or suffix
@@ -131,19 +133,22 @@ def meaning_of(name: str, unit: str = "", *, of_motor: bool = False) -> ColumnMe
 
 @lru_cache(maxsize=4096)
 def is_unit(text: str) -> bool:
-    """Return whether a text is a unit of some channel."""
+    """Return whether a text is a unit that converts to the unit of some channel."""
     return bool(text.strip()) and any(
         converts(text, target) for target in {*CHANNELS.values(), "pixel"}
     )
 
 
 def unit_in(text: str) -> str:
-    """Return the unit that a text consists of, such as V or ma; empty where it is none."""
+    """Return the unit that a text stands for, such as V or ma; empty if it is not a unit."""
     return text if is_unit(text) else _SUFFIXES.get(text.lower(), "")
 
 
 def without_unit(name: str) -> tuple[str, str]:
-    """Return a name without its unit, and the unit: in brackets, after a comma, or as a suffix."""
+    """Return a column name without its unit, and the unit, empty if the name has none.
+
+    The unit may be in brackets, after a comma, or a suffix.
+    """
     if inside := re.match(r"^(.*\S)\s*[\[(]([^\])]*)[\])]\s*$", name):
         if inside[2].isdecimal():
             return name, ""
@@ -159,7 +164,7 @@ def without_unit(name: str) -> tuple[str, str]:
 
 
 def _fits(channel: str, unit: str) -> bool:
-    """Return whether a unit is possible for a channel."""
+    """Return whether a unit is given and possible for a channel."""
     targets = {
         "position": ("rad", "tick"),
         "v": ("V", "rad/s", "m/s"),
@@ -172,13 +177,13 @@ def _fits(channel: str, unit: str) -> bool:
 
 @dataclass(frozen=True)
 class NameParts:
-    """Words of a column's name by role.
+    """Words of a column's name, with their roles.
 
     Attributes:
-        roles: role, value and word of each known word, such as ("what", "speed", "vel").
-        numbers: digits in the name.
+        roles: (role, value, word) of each known word, such as ("what", "speed", "vel").
+        numbers: numbers in the name, as texts.
         unknown: words that are not in the dictionary.
-        mended: corrected words, written as `headng -> heading`.
+        mended: corrected misspellings, written as `headng -> heading`.
     """
 
     roles: tuple[tuple[str, str, str], ...]
@@ -187,7 +192,7 @@ class NameParts:
     mended: tuple[str, ...]
 
     def has(self, role: str, *values: str) -> bool:
-        """Return whether a word has a role, with one of these values if there are any."""
+        """Return whether some word has a role and, if values are given, one of these values."""
         return any(r == role and (not values or v in values) for r, v, _ in self.roles)
 
     def of(self, role: str) -> list[str]:
@@ -195,12 +200,12 @@ class NameParts:
         return [v for r, v, _ in self.roles if r == role]
 
     def words(self, *values: str) -> list[str]:
-        """Return the words of the measured quantity that have one of these values."""
+        """Return the words with the role `what` (measured quantity) and one of these values."""
         return [w for r, v, w in self.roles if r == "what" and v in values]
 
 
 def name_parts(name: str) -> NameParts:
-    """Return a column's name split into words, misspelled ones corrected."""
+    """Return the words of a column's name; misspelled words are corrected."""
     roles, numbers, unknown, mended = [], [], [], []
     for part in _split(name):
         if part.isdecimal():
@@ -219,7 +224,10 @@ def name_parts(name: str) -> NameParts:
 
 
 def _split(name: str) -> list[str]:
-    """Return lower-case words and numbers, split at capitals, digits and signs; `1st` becomes 1."""
+    """Return the words and numbers of a name, in lower case.
+
+    A name is split at capitals, digits, and characters that are neither; `1st` becomes 1.
+    """
     name = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Za-z])(?=\d)", "_", name)
     name = re.sub(r"(\d)(?:st|nd|rd|th)\b", r"\1", name.lower())
     name = re.sub(r"(?<=\d)(?=[a-z])", "_", name)
@@ -227,7 +235,10 @@ def _split(name: str) -> list[str]:
 
 
 def _apart(word: str) -> list[str]:
-    """Return the fewest words that form a compound such as setvel or wl, else the word itself."""
+    """Return the fewest known words that a compound such as `setvel` or `wl` consists of.
+
+    If there are none, the result is the word itself.
+    """
     best: list[list[str] | None] = [[]] + [None] * len(word)
     for end in range(1, len(word) + 1):
         for start in range(end):
@@ -246,7 +257,7 @@ def _apart(word: str) -> list[str]:
 
 
 def _doubt(parts: NameParts, channel: str) -> str:
-    """Return an assumption about a name, else an empty text."""
+    """Return a text about an assumption made about a name, empty if none was made."""
     if channel.startswith("twist") and not parts.has("what", "command"):
         return "is it a command? Measured speeds do not belong here"
     if parts.mended:
@@ -255,7 +266,7 @@ def _doubt(parts: NameParts, channel: str) -> str:
 
 
 def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
-    """Return channel and label of a name, or None where it has no meaning."""
+    """Return the channel and the label of a name, or None if it has no known meaning."""
     if parts.has("not"):
         return ("odometry", "") if parts.has("not", "odometry") else None
     label = _label(parts)
@@ -273,7 +284,7 @@ def _channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
 
 
 def _motor_channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
-    """Return channel and label of a name in a log of motors alone, or None if it has none."""
+    """Return the channel and the label of a name in a log of motors without a robot, or None."""
     if parts.has("not"):
         return None
     single = _single(parts)
@@ -285,7 +296,7 @@ def _motor_channel(parts: NameParts, unit: str) -> tuple[str, str] | None:
 
 
 def _label(parts: NameParts) -> str:
-    """Return the wheel in a name, such as fl, r or 2; empty for none."""
+    """Return the label of the wheel in a name, such as fl, r or 2; empty if it names no wheel."""
     if parts.has("corner"):
         return parts.of("corner")[0]
     side = parts.of("side")[:1]
@@ -296,7 +307,10 @@ def _label(parts: NameParts) -> str:
 
 
 def _measured(parts: NameParts, unit: str) -> str | None:
-    """Return the measured quantity of a wheel: the end of the channel's name."""
+    """Return the measured quantity of a wheel or motor, or None.
+
+    It is the channel's name after `wheel_` or `motor_`; `position` and `v` may mean two channels.
+    """
     if parts.has("what", "command"):
         return "speed_command" if not parts.has("what", "current", "torque", "voltage") else None
     if parts.has("what", "rpm"):
@@ -315,7 +329,10 @@ def _measured(parts: NameParts, unit: str) -> str | None:
 
 
 def _single(parts: NameParts) -> tuple[str, str] | None:
-    """Return the channel of the whole robot, and the component of a quaternion."""
+    """Return the channel, if it is one of the whole robot, and the component of a quaternion.
+
+    The component is empty for other channels; the result is None for channels of wheels.
+    """
     what = set(parts.of("what"))
     axis = parts.words("axis")
     if what and what <= {"time"}:
@@ -342,7 +359,12 @@ def _single(parts: NameParts) -> tuple[str, str] | None:
 
 
 def _twist(what: set[str], axis: list[str]) -> tuple[str, str] | None:
-    """Return the component of a commanded twist."""
+    """Return the channel of a commanded twist, with an empty label, or None.
+
+    Args:
+        what: values of the words that name the measured quantity.
+        axis: words among x, y and z.
+    """
     turning = what & {"w", "yaw", "angular", "angle"}
     if turning and axis in ([], ["z"]):
         return "twist_command_yaw", ""

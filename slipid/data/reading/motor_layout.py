@@ -1,4 +1,4 @@
-"""Layout of a log of motors alone: given columns, and others by their names."""
+"""Layout of a log of motors without a robot, from columns that a person or their names identify."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,22 +11,26 @@ from slipid.data.reading.units import converts
 from slipid.support.errors import DataError, bad_data, did_you_mean
 
 SHAFT = 10.0
-"""Gear ratio of such a layout: a shaft may turn so much faster than a wheel's speed limit."""
+"""Gear ratio of the layout; it is not a real one, but allows a motor shaft to turn ten times faster
+than the checks allow a wheel to."""
 _CHANNELS = ("time", "voltage", "current", "motor_speed", "motor_angle", "duty", "bus_voltage")
 _INSTEAD = {"motor_speed": "motor_angle", "motor_angle": "motor_speed"}
-"""Channels of which one is enough."""
+"""Alternative channels: each is not searched for if the other is there."""
 
 
 @dataclass(frozen=True)
 class GivenColumns:
-    """Columns of a channel as a person named them, and their unit; None for the usual one."""
+    """Columns of a channel, named by a person, and their unit; None for the channel's SI unit."""
 
     columns: tuple[str, ...]
     unit: str | None
 
 
 def given_columns(text: str, channel: str) -> GivenColumns:
-    """Return the columns in `NAME`, `NAME:UNIT`, or several names by commas for several motors."""
+    """Return the columns of a channel from an option's text: `NAME` or `NAME:UNIT`.
+
+    For several motors, several names are separated by commas.
+    """
     names, colon, unit = text.rpartition(":")
     if colon and converts(unit, CHANNELS[channel]):
         return GivenColumns(tuple(n.strip() for n in names.split(",")), unit)
@@ -34,7 +38,9 @@ def given_columns(text: str, channel: str) -> GivenColumns:
 
 
 def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed: bool) -> Layout:
-    """Return the layout of a log of motors: given columns, and others named like channels.
+    """Return the layout of a log of motors.
+
+    Channels without given columns take the columns whose names stand for them.
 
     Args:
         format: position of names and numbers in the file.
@@ -42,7 +48,7 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
         signed: whether currents have a sign.
 
     Raises:
-        DataError: a column is absent, or there is none of time, current or speed.
+        DataError: a given column is absent, or there is no column for time, current or speed.
     """
     names = [name for name in format.names if name]
     if not names:
@@ -83,9 +89,10 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
 
 
 def _called(channel: str, meanings: Mapping[str, ColumnMeaning]) -> tuple[str, ...]:
-    """Return the columns named after a channel, one where the channel has one column.
+    """Return the columns whose names stand for a channel; a single one for time and bus voltage.
 
-    Certain names come before doubtful ones, and names with a motor's number before those without.
+    Names that need an assumption are used only if there are no others, and so are names without a
+    motor's number.
     """
     found = {name: one for name, one in meanings.items() if one.channel == channel}
     names = [name for name, one in found.items() if not one.doubt] or list(found)
@@ -96,7 +103,11 @@ def _called(channel: str, meanings: Mapping[str, ColumnMeaning]) -> tuple[str, .
 def _channel(
     channel: str, columns: tuple[str, ...], format: TableFormat, unit: str | None = None
 ) -> Channel:
-    """Return columns with their unit: given, or in a row of units or a name, or the usual one."""
+    """Return a channel from its columns.
+
+    The unit is the given one, else that in the column's name or in the row of units, else the
+    channel's SI unit.
+    """
     usual, name = CHANNELS[channel], columns[0]
     row = format.units[format.names.index(name)]
     own = (meaning_of(name, row, of_motor=True).unit, unit_in(row), without_unit(name)[1])
@@ -105,7 +116,10 @@ def _channel(
 
 
 def _check_whole(path: Path, channels: Mapping[str, Channel], names: list[str]) -> None:
-    """Raise `DataError` where a channel is missing, or where the numbers of motors differ."""
+    """Raise `DataError` if a required channel is missing, or the numbers of motors differ.
+
+    `names` are the columns of the file, for the message.
+    """
     have = f"it has {', '.join(names)}"
     for wanted, option in (
         (("time",), "--time"),

@@ -1,7 +1,7 @@
-"""Layouts of published log formats by name, and those that a config declares.
+"""Layouts of log files: presets for published formats by name, and those that a config declares.
 
-Signs, offsets and orders were checked against the logs themselves, by regression of the wheel
-speeds on the twist of the tracked pose; the tests repeat it where the logs are present.
+Signs, offsets and orders of the presets were checked against the published logs, by regression of
+the wheel speeds on the twist of the tracked pose; the tests repeat this if the logs are present.
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from slipid.support.toml_file import checked
 
 
 def preset(name: str) -> Layout:
-    """Return the layout of a known type of log file; raise `DataError` if it is unknown."""
+    """Return the layout of a published log format; raise `DataError` if the name is unknown."""
     if name not in PRESETS:
         raise DataError(f"preset: {unknown('format', name, PRESETS)}")
     return PRESETS[name]
@@ -27,9 +27,10 @@ def _motors(pattern: str, unit: str) -> Channel:
     return Channel(tuple(pattern.format(i) for i in (1, 2, 3)), unit)
 
 
-# Overhead camera of the Robotino logs: x right, y DOWN. X = -x, Y = y is right-handed as the robot
-# is seen from above, and the heading is measured from there. The logged steps dx, dy are not used:
-# they are body-frame steps at the same scale, but most steps above 5 pixels are cut short in them.
+# The overhead camera of the Robotino logs has x to the right and y DOWN. X = -x, Y = y is a
+# right-handed frame seen from above, in which the heading is measured. The logged columns dx, dy
+# are not used: they are steps in the body frame at the same scale, but most steps above 5 pixels
+# are cut short in them.
 def _camera(x: str, y: str, angle: str, unit: str = "pixel") -> dict[str, Channel]:
     return {
         "pose_x": _one(x, unit, scale=-1.0),
@@ -38,8 +39,8 @@ def _camera(x: str, y: str, angle: str, unit: str = "pixel") -> dict[str, Channe
     }
 
 
-# As its owners calibrated it, per axis. Motion in this scale is too short by a factor of about
-# 1.117, which a fit estimates; the reader does not correct it.
+# Scale of the camera along x and y, as its owners calibrated it. Motion at this scale is too short
+# by a factor of about 1.117, which a fit estimates; the reader does not correct it.
 _METRES_PER_PIXEL = (1.8404619693756104e-3, 1.8371639251708984e-3)
 _ROBOTINO = Layout(
     name="robotino",
@@ -74,21 +75,22 @@ _DRIVE_2021 = {
 }
 
 _LAYOUTS = (
-    # One run: straight drive under the overhead camera.
+    # One run per file: a straight drive under the overhead camera.
     replace(
         _ROBOTINO_2022,
         name="robotino2022",
         metres_per_pixel=_METRES_PER_PIXEL,
         channels=_DRIVE_2022 | _camera("xpos", "ypos", "ang"),
     ),
-    # The same robot out of the camera's sight.
+    # The same robot out of sight of the camera, hence without poses.
     replace(_ROBOTINO_2022, name="robotino2022_blind", channels=_DRIVE_2022),
-    # Wheels in the air, speed steps. The tick columns are left out on purpose: they do not
-    # accumulate in these files, so the angle comes from the reported speed.
+    # Speed steps with the wheels in the air. The tick columns are left out on purpose: they do not
+    # accumulate in these files, so the wheel angle is integrated from the reported speed.
     replace(_ROBOTINO_2022, name="robotino2022_motor", channels=_MOTORS_2022),
-    # Means of 13 samples each, 204 runs a file, separated by encoders that restart from 0. There is
-    # no time: ticks over reported speed (which reads 1.3 % high) give 0.45 s a row. Angles near the
-    # wrap are means of 0 and 360, hence wrong; so no jump of the heading is refused.
+    # Each row is a mean of 13 samples; a file has 204 runs, at whose start the encoders restart
+    # from 0. There is no time column: ticks over reported speed (which is 1.3 % too high) give
+    # 0.45 s between rows. Headings near 0 and 360 deg are wrong, since they are means of both; so
+    # no jump of the heading is refused.
     replace(
         _ROBOTINO,
         name="robotino2021",
@@ -98,8 +100,9 @@ _LAYOUTS = (
         metres_per_pixel=_METRES_PER_PIXEL,
         channels=_DRIVE_2021,
     ),
-    # 69 runs over the whole field, one row each 0.5 s. The gyro is in deg/s, with the sign of the
-    # heading. (Columns X_new, Y_new are the pixels shrunk by 0.895 towards the image centre.)
+    # 69 runs over the whole field, with a row every 0.5 s. The gyro is in deg/s and has the sign of
+    # the heading. (Columns X_new, Y_new, not used here, are the pixel coordinates shrunk by a
+    # factor of 0.895 towards the image centre.)
     replace(
         _ROBOTINO,
         name="robotino2021_field",
@@ -107,8 +110,8 @@ _LAYOUTS = (
         metres_per_pixel=_METRES_PER_PIXEL,
         channels=_DRIVE_2021 | {"time": _one("Time, ms", "ms"), "gyro": _one("Z gyro", "deg/s")},
     ),
-    # Speeds at the motor shaft; currents are magnitudes here as well. Where the reference steps,
-    # the row occurs twice, before and after the step.
+    # Speeds are at the motor shaft; currents are magnitudes here, too. Where the reference speed
+    # steps, two rows have the same time, one before and one after the step.
     Layout(
         name="robotino2021_motor",
         drop_repeated_time=True,
@@ -121,13 +124,15 @@ _LAYOUTS = (
             "current": _motors("motor{}_current", "A"),
         },
     ),
-    # Camera only: no wheel of these runs was logged. Millimetres already, axes of the image.
+    # Only the camera's log: no wheel was logged in these runs. Positions are in mm along the axes
+    # of the image.
     Layout(
         name="robotino2021_camera",
         channels={"time": _one("time_s", "s"), **_camera("x_mm", "y_mm", "angle_deg", "mm")},
     ),
-    # No names: t, x, y, heading, then the ticks of each wheel since the last row, which count
-    # backwards. With the sign turned, the wheels stand at azimuths 300, 60 and 180 deg.
+    # The file has no column names. The columns are time, x, y, heading, then the ticks of each
+    # wheel since the previous row, with reversed sign. With the sign corrected, the wheels are at
+    # azimuths of 300, 60 and 180 deg.
     Layout(
         name="omni3_optitrack",
         names_row=0,
@@ -143,7 +148,7 @@ _LAYOUTS = (
             "wheel_ticks": Channel((4, 5, 6), "tick", scale=(-1.0,)),
         },
     ),
-    # Files that `slipid track` writes for a video that was started by hand.
+    # Files that `slipid track` writes for a video whose recording was started by hand.
     Layout(
         name="tracked",
         clock="own",
@@ -162,7 +167,7 @@ _SETTINGS = [f.name for f in fields(Layout) if f.name not in ("name", "channels"
 
 
 def layout(table: Mapping[str, object]) -> Layout:
-    """Return a layout for `read_runs`, from what `[layouts.NAME]` of a config contains.
+    """Return the layout for `read_runs` from the content of a table `[layouts.NAME]` of a config.
 
     Raises:
         DataError: unknown key, channel, unit or format, wrong dimension, wrong type.
@@ -171,9 +176,10 @@ def layout(table: Mapping[str, object]) -> Layout:
 
 
 def declared_layout(table: Mapping[str, object], where: str) -> Layout:
-    """Return the layout in a config: `format` names a preset, the other keys override it.
+    """Return the layout that a table of a config declares.
 
-    `columns` maps each channel to `{columns = [...] or column = ..., unit, scale, offset}`; `false`
+    The key `format` names a preset, whose settings the other keys override. `columns` maps each
+    channel to `{columns = [...] or column = ..., unit, scale, offset}`, or to `false`, which
     removes a channel of the preset. `beside` has a layout for each further file of a run.
 
     Args:
@@ -198,7 +204,7 @@ def declared_layout(table: Mapping[str, object], where: str) -> Layout:
 
 
 def _declared_file(table: Mapping[str, object], where: str) -> Layout:
-    """Return the layout of a single file."""
+    """Return the layout of a single file from its table; `where` is its name in messages."""
     given = dict(table)
     name, columns = given.pop("format", None), given.pop("columns", {})
     if name is not None and name not in PRESETS:
@@ -229,7 +235,7 @@ def _declared_file(table: Mapping[str, object], where: str) -> Layout:
 
 
 def _file_problem(layout: Layout) -> str | None:
-    """Return a contradiction within the layout of a file, or None."""
+    """Return a text about a contradiction in the layout of a single file, or None."""
     have = layout.channels
     single = {name: len(c.columns) for name, c in have.items() if name in SINGLE}
     if not have:
@@ -249,7 +255,7 @@ def _file_problem(layout: Layout) -> str | None:
 
 
 def _problem(layout: Layout) -> str | None:
-    """Return a contradiction between the layouts of all files of a run, or None."""
+    """Return a text about a contradiction between the layouts of a run's files, or None."""
     files = [layout, *layout.beside.values()]
     names = [name for one in files for name in one.channels if name != "time"]
     if twice := [name for name in names if names.count(name) > 1]:

@@ -1,4 +1,4 @@
-"""Reader of logs: from files and their layout to checked runs in SI units."""
+"""Reader of logs: functions that read files with a layout and return checked runs in SI units."""
 
 import hashlib
 import re
@@ -24,9 +24,10 @@ from slipid.data.runs import Runs, collect, counted_once, default_session
 from slipid.support.errors import DataError, first_names
 
 AnyLayout = Layout | BagLayout
-"""Layout of a file of rows or of a bag."""
+"""Layout of a file of rows (CSV or Parquet) or of a bag."""
 Session = Literal["surface/load/speed", "folder", "file"]
-"""Property that runs of a session share; within a session the camera's marker stayed in place."""
+"""Property that the runs of one session have in common; within a session the camera's marker stayed
+in place on the robot."""
 
 
 def read_runs(
@@ -40,16 +41,16 @@ def read_runs(
 ) -> Runs:
     """Return every run of the files that match a glob.
 
-    Runs of another load set-up are read by another call and added: `as_built + moved`.
+    Runs with another load set-up are read by another call and added: `as_built + moved`.
 
     Args:
-        folder: data folder, which the names of the runs are relative to.
+        folder: data folder, to which the names of the runs are relative.
         pattern: glob below the folder, such as `one_surface/*/*.csv`.
         layout: layout of the files, or the name of a preset.
-        surface: name of the floor, `folder` for that of the folder each file lies in, or None where
-            it is unknown.
+        surface: name of the surface; `folder` stands for the name of each file's folder; None if it
+            is unknown.
         load: name of the load set-up.
-        session: property that runs of a session share.
+        session: property that the runs of one session have in common.
 
     Raises:
         DataError: no file matches, or one is wrong; the message names the file and the row.
@@ -68,9 +69,9 @@ def read_runs(
 
 
 def session_of(log: Log, session: Session) -> str:
-    """Return the session of a run: its file, the folder of its file, or its floor, load and speed.
+    """Return the name of a run's session: its file, its folder, or its surface, load and speed.
 
-    The runs that one file holds share it.
+    The runs in one file have the same file and folder.
     """
     if session == "file":
         return re.sub(r"#\d+$", "", log.name)
@@ -81,7 +82,12 @@ def session_of(log: Log, session: Session) -> str:
 
 @dataclass(frozen=True)
 class FileRuns:
-    """Runs in a file, and a line for each run that is left out because its pose jumps."""
+    """Runs in one file.
+
+    Attributes:
+        logs: runs that were read.
+        aside: one line about each run that was left out because its poses are unusable.
+    """
 
     logs: tuple[Log, ...]
     aside: tuple[str, ...]
@@ -90,18 +96,20 @@ class FileRuns:
 def read_logs(
     path: Path, layout: AnyLayout, root: Path, surface: str | None, load: str
 ) -> FileRuns:
-    """Return every run in a CSV or Parquet file or in a bag, and a line for each run left out.
+    """Return every run in a CSV or Parquet file or in a bag.
 
-    A run is left out where its pose jumps, because the marker was confused with another one or the
-    matching of scans failed, or where its poses have a clock that the motion does not determine.
-    `layout.new_run` separates the runs of a file of rows, `layout.runs` those of a bag. Parts of a
-    file with a single row hold no motion and are dropped.
+    A run is left out if its pose jumps, because the marker was confused with another one or the
+    matching of scans failed, or if its poses have a clock that the motion does not determine.
+    `layout.new_run` separates the runs in a file of rows, `layout.runs` those in a bag. Parts of a
+    file with a single row show no motion and are dropped.
 
     Args:
-        root: data folder above the file, which the names of the runs are relative to.
-        surface: name of the floor; `folder` stands for the name of the file's folder without
+        path: the file.
+        layout: layout of the file.
+        root: data folder above the file, to which the names of the runs are relative.
+        surface: name of the surface; `folder` stands for the name of the file's folder without
             `_surface`. A bag, or the table of its runs, may name another.
-        load: name of the load set-up; a bag may name another.
+        load: name of the load set-up; a bag, or the table of its runs, may name another.
     """
     surface = path.parent.name.removesuffix("_surface") if surface == "folder" else surface
     known = Identity(path.relative_to(root).as_posix(), path, "", surface, load)
@@ -127,7 +135,7 @@ def read_logs(
 
 
 class _RawRun(NamedTuple):
-    """A run that was read and is not assembled yet."""
+    """A run whose signals were read, before they are assembled into a log."""
 
     identity: Identity
     signals: dict[str, Signal]
@@ -135,7 +143,7 @@ class _RawRun(NamedTuple):
 
 
 def _bag_runs(known: Identity, layout: BagLayout) -> list[_RawRun]:
-    """Return the runs of a bag."""
+    """Return the runs in a bag; `known` is the identity of its file."""
     return [
         _RawRun(
             Identity(
@@ -153,7 +161,7 @@ def _bag_runs(known: Identity, layout: BagLayout) -> list[_RawRun]:
 
 
 def _table_runs(known: Identity, layout: Layout) -> list[_RawRun]:
-    """Return the runs of a file of rows, with the channels of the files beside it."""
+    """Return the runs in a file of rows, with the channels of the files beside it."""
     table = read_table(known.path, layout)
     if layout.drop_repeated_time:
         table = table.rows(np.append(np.diff(_time(table, layout)) != 0, True))
@@ -179,7 +187,7 @@ def _table_runs(known: Identity, layout: Layout) -> list[_RawRun]:
 
 
 def _parts(table: Table, layout: Layout) -> list[tuple[Table, str]]:
-    """Return the runs of a table, and the suffix of each run's name."""
+    """Return the part of a table for each run, and the suffix of the run's name."""
     starts = _run_starts(table, layout)
     if len(starts) == 1:
         return [(table, "")]
@@ -189,7 +197,7 @@ def _parts(table: Table, layout: Layout) -> list[tuple[Table, str]]:
 
 
 def _beside(path: Path, pattern: str, layout: Layout) -> Table:
-    """Return the table of a file that lies beside a run's own and has more of its channels."""
+    """Return the table of a further file of a run, which lies beside the run's own file `path`."""
     other = path.parent / pattern.replace("{stem}", path.stem)
     if not other.is_file():
         there = sorted(p.name for p in path.parent.iterdir() if p.is_file() and p != path)
@@ -201,7 +209,11 @@ def _beside(path: Path, pattern: str, layout: Layout) -> Table:
 
 
 def find_logs(root: Path, pattern: str) -> list[Path]:
-    """Return files under `root` that match a glob, sorted by name; `DataError` if none do."""
+    """Return the files and bag folders under `root` that match a glob, sorted by name.
+
+    Raises:
+        DataError: none matches.
+    """
     if not root.is_dir():
         raise DataError(f"{root}: no such folder; expected the folder of the logs")
     found = sorted(p for p in root.glob(pattern) if p.is_file() or (p / "metadata.yaml").is_file())
@@ -220,9 +232,9 @@ def find_logs(root: Path, pattern: str) -> list[Path]:
 
 
 def without_beside(paths: Sequence[Path], layout: AnyLayout) -> list[Path]:
-    """Return the files that do not lie beside another of them as a part of its run.
+    """Return the runs' own files, without the further files of these runs that lie beside them.
 
-    A glob such as `*.csv` finds both; where the layout puts nothing beside, all are kept.
+    A glob such as `*.csv` finds both kinds; if the layout has no further files, all are returned.
     """
     if isinstance(layout, BagLayout):
         return list(paths)
@@ -240,14 +252,15 @@ def _run_starts(table: Table, layout: Layout) -> list[int]:
         time = table.stacked(layout.channels["time"])[:, 0]
         return [0, *(np.flatnonzero(np.diff(time) <= 0) + 1).tolist()]
     if layout.new_run == "ticks_restart":
-        # A run that only drives away from its start counts up in magnitude on its fastest wheel.
+        # In each of these runs the largest count grows in magnitude, since the robot only drives
+        # away from its start; so a decrease is a restart.
         count = np.abs(table.stacked(layout.channels["wheel_ticks"])).max(axis=1)
         return [0, *(np.flatnonzero(np.diff(count) < 0) + 1).tolist()]
     return [0]
 
 
 def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Signal]:
-    """Return the channels of a table in SI units, each at the times at which it has a value.
+    """Return the signals of a table in SI units by channel, each at the times of its own values.
 
     Remarks about empty cells are appended to the notes.
     """

@@ -1,4 +1,4 @@
-"""Samples of one sensor at its own times: the common form of files and bags."""
+"""Class `Signal`: samples of one channel at its own times, as read from a file or a bag."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,10 +15,10 @@ class SignalSource:
     """Origin of the samples of a signal, for messages.
 
     Attributes:
-        path: the file.
-        columns: name of each column of the values, as the file or the message has it.
-        lines: row in the file of every sample, or number of the message in its topic, from 1.
-        topic: topic of a bag, None for a file of rows.
+        path: path of the file.
+        columns: name of each column of the values, as in the file or the message.
+        lines: row of every sample in the file, or number of its message in the topic, from 1.
+        topic: topic of the bag, or None for a file of rows.
     """
 
     path: Path
@@ -29,7 +29,14 @@ class SignalSource:
     def error(
         self, found: str, expected: str, sample: int | None = None, column: int | None = None
     ) -> DataError:
-        """Return the error about a sample (counted from 0), or about all of them."""
+        """Return the error about a sample, counted from 0, or (None) about all samples.
+
+        Args:
+            found: what is wrong.
+            expected: what was expected instead.
+            sample: index of the sample, or None.
+            column: index of the column, or None.
+        """
         row = None if sample is None else int(self.lines[sample])
         name = None if column is None or not self.columns else self.columns[column]
         if self.topic is None:
@@ -39,7 +46,7 @@ class SignalSource:
         return bad_data(where, found, expected, column=name)
 
     def part(self, which: slice | np.ndarray) -> "SignalSource":
-        """Return the source of some of the samples."""
+        """Return the source of the selected samples."""
         return SignalSource(self.path, self.columns, self.lines[which], self.topic)
 
 
@@ -50,7 +57,8 @@ class Signal:
     Attributes:
         time: increasing times on the clock that all signals of a run share [s]; they may count from
             1970.
-        values: values in the unit of `CHANNELS` (SI), wheels or drives in the columns.
+        values: values in the SI unit of the channel (see `CHANNELS`), with a column for each wheel
+            or drive, or a single column.
         source: origin of the samples.
     """
 
@@ -59,12 +67,12 @@ class Signal:
     source: SignalSource
 
     def part(self, which: slice | np.ndarray) -> "Signal":
-        """Return some of the samples."""
+        """Return the selected samples."""
         return Signal(self.time[which], self.values[which], self.source.part(which))
 
 
 def clock_of(signals: Sequence[Signal]) -> Float[np.ndarray, " time"]:
-    """Return every time at which one of some signals was sampled, each once [s]."""
+    """Return all times at which some of the signals was sampled, increasing, each once [s]."""
     first = signals[0].time
     if all(signal.time is first for signal in signals) and (np.diff(first) > 0).all():
         return first

@@ -1,4 +1,4 @@
-"""Numbers of a CSV or Parquet file, or an error about the wrong cell."""
+"""Reading of the numbers of a CSV or Parquet file; an error names the wrong cell."""
 
 import hashlib
 import re
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from pyarrow import Table as ParquetTable
 
 MISSING = {"", "nan", "na", "n/a", "null", "none"}
-"""Cells without a number."""
+"""Texts of cells, in lower case, that mean a missing number."""
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Columns of one file as they are in it: no unit converted, nothing repaired.
+    """Numbers of one file, unchanged: no unit is converted and nothing is repaired.
 
     Attributes:
-        path: the file.
-        sha256: hash of its bytes.
-        names: names of the columns read, or their positions.
-        values: the cells, NaN where a cell is empty.
+        path: path of the file.
+        sha256: SHA-256 hash of the file's bytes.
+        names: names of the columns that were read, or their positions.
+        values: numbers in the cells, NaN where a cell is empty.
         lines: line number in the file of each row of `values` (record number for Parquet), from 1.
     """
 
@@ -49,7 +49,7 @@ class Table:
         return self.values[:, [self.names.index(c) for c in channel.columns]]
 
     def rows(self, which: slice | np.ndarray) -> "Table":
-        """Return the table with some of its rows."""
+        """Return the table with the selected rows."""
         return replace(self, values=self.values[which], lines=self.lines[which])
 
 
@@ -57,11 +57,13 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     """Return the numbers of a CSV or Parquet file, each cell checked.
 
     Args:
-        layout: positions of names and numbers, and the wanted columns.
-        all_columns: read every column of the file and not only those the layout uses.
+        path: the file.
+        layout: layout with the positions of names and numbers, and with the columns to read.
+        all_columns: whether to read all columns of the file instead of those that the layout uses.
 
     Raises:
-        DataError: names the file, the row or column, what is there and what was expected.
+        DataError: the file does not match the layout; the message names the file, the row or
+            column, what is there and what was expected.
     """
     raw = bytes_of(path)
     sha256 = hashlib.sha256(raw).hexdigest()
@@ -90,7 +92,11 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
 
 
 def bytes_of(path: Path, limit: int = -1) -> bytes:
-    """Return the bytes of a file, or its first ones; `DataError` if unreadable or empty."""
+    """Return the bytes of a file, or the first `limit` of them.
+
+    Raises:
+        DataError: the file cannot be read, or is empty.
+    """
     if path.is_dir():
         raise bad_data(path, "a folder", "a CSV or Parquet file")
     try:
@@ -104,7 +110,11 @@ def bytes_of(path: Path, limit: int = -1) -> bytes:
 
 
 def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
-    """Return the table in the bytes of a Parquet file; `DataError` if it is none or empty."""
+    """Return the table in the bytes of a Parquet file.
+
+    Raises:
+        DataError: the bytes are not a Parquet file, the table is empty, or pyarrow is missing.
+    """
     try:
         import pyarrow
         import pyarrow.parquet as parquet
@@ -123,7 +133,7 @@ def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
 def _parquet(
     path: Path, raw: bytes, layout: Layout, all_columns: bool
 ) -> tuple[tuple[str | int, ...], Float[np.ndarray, "row column"]]:
-    """Return names and numbers of the wanted columns of a Parquet file."""
+    """Return the names and the numbers of the columns to read from a Parquet file."""
     import pyarrow
 
     table = parquet_of(path, raw)
@@ -141,7 +151,10 @@ def _parquet(
 
 
 def text_lines(path: Path, raw: bytes) -> list[str]:
-    """Return the lines of a UTF-8 file, with or without a byte order mark, with any line ends."""
+    """Return the lines of a text file from its bytes; raise `DataError` unless they are UTF-8.
+
+    A byte order mark is removed; any kind of line end is accepted.
+    """
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise bad_data(path, "text in UTF-16", "UTF-8", row=1)
     if b"\0" in raw:
@@ -166,16 +179,20 @@ def cells_of(line: str, delimiter: str) -> list[str]:
 
 
 def number_in(cell: str) -> float | None:
-    """Return the number in a cell, or None where it holds something else."""
+    """Return the number in a cell, or None if the cell is not a number."""
     try:
-        # Python would read 1_000 as a thousand; no logger writes that on purpose.
+        # Python would read 1_000 as a thousand, which no logger writes on purpose.
         return float(cell) if "_" not in cell else None
     except ValueError:
         return None
 
 
 def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
-    """Return the names of the columns, empty ones included; all are empty without a names row."""
+    """Return the name of every column, empty where it has none or there is no row of names.
+
+    Raises:
+        DataError: the file ends before, another delimiter is used, or the names are numbers.
+    """
     row = layout.names_row or layout.first_data_row
     if len(lines) < row:
         expected = f"column names in row {row}" if layout.names_row else f"numbers from row {row}"
@@ -200,7 +217,11 @@ def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
 def wanted_names(
     path: Path, header: list[str], layout: Layout, all_columns: bool
 ) -> tuple[str | int, ...]:
-    """Return names or positions of the columns to read; `DataError` unless each occurs once."""
+    """Return the names, or positions, of the columns to read.
+
+    Raises:
+        DataError: a column of the layout is missing, or a name occurs more than once.
+    """
     if not layout.names_row:
         for position in layout.columns:
             if int(position) >= len(header):
@@ -224,7 +245,7 @@ def wanted_names(
 
 
 def check_fields(path: Path, body: list[str], header: list[str], layout: Layout) -> None:
-    """Raise `DataError` for rows with a wrong number of cells; one trailing delimiter is fine."""
+    """Raise `DataError` if a row has a wrong number of cells; a trailing delimiter is allowed."""
     counts = np.array([line.count(layout.delimiter) for line in body]) + 1
     expected = len(header)
     if (counts == expected).all():
@@ -250,7 +271,7 @@ def check_fields(path: Path, body: list[str], header: list[str], layout: Layout)
 
 
 def check_units(path: Path, line: str, header: list[str], layout: Layout) -> None:
-    """Raise `DataError` where the units row has another unit than the layout declares."""
+    """Raise `DataError` if the row of units has another unit than the layout declares."""
     units = cells_of(line, layout.delimiter)
     for channel in layout.channels.values():
         for column in channel.columns:
@@ -266,7 +287,15 @@ def check_units(path: Path, line: str, header: list[str], layout: Layout) -> Non
 def cell_numbers(
     body: Sequence[str], delimiter: str, where: Sequence[int]
 ) -> tuple[Float[np.ndarray, "row column"], Bool[np.ndarray, "row column"]]:
-    """Return the numbers in some columns of lines, NaN without one, and which cells are texts."""
+    """Return the numbers in some columns of lines, and whether each cell is a text.
+
+    Numbers are NaN where a cell is empty or a text.
+
+    Args:
+        body: lines of the file.
+        delimiter: character between cells.
+        where: positions of the columns.
+    """
     wrong = np.zeros((len(body), len(where)), dtype=bool)
     try:
         values = np.loadtxt(body, delimiter=delimiter, usecols=where, ndmin=2, comments=None)

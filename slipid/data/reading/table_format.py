@@ -1,4 +1,7 @@
-"""Format of a table without a layout: position of names, units and numbers, and the numbers."""
+"""Detection of the format of a file of rows without a layout.
+
+The format is the delimiter, and the lines of names, units and numbers.
+"""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -20,14 +23,14 @@ from slipid.data.reading.table import (
 from slipid.support.errors import bad_data
 
 ROWS = 50_000
-"""Most rows that are read to judge the numbers."""
+"""Largest number of rows whose numbers are examined."""
 _DELIMITERS = (",", ";", "\t", "|", " ")
 _HEAD = 60
-"""Lines that are searched for the header."""
+"""Number of first lines in which the header is searched."""
 _FEW = 10
-"""Least number of rows of numbers in a log; files of settings have fewer."""
+"""Least number of rows of numbers in a log; files with settings have fewer."""
 _BEGINNING = 200_000
-"""Bytes of a file that are read to find its format."""
+"""Number of first bytes of a file in which its format is searched."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +38,13 @@ class TableFormat:
     """Format of a file of rows.
 
     Attributes:
-        path: the file.
-        delimiter: character between its cells; empty for Parquet.
-        names_row: line with the column names, counted from 1; 0 where there is none.
-        units_row: line with the units; 0 where there is none.
-        first_data_row: line of the first numbers.
-        names: names of its columns, empty ones where it has none.
-        units: units of its columns in a row of units, empty ones where there is none.
+        path: path of the file.
+        delimiter: character between cells; empty for Parquet.
+        names_row: line with the column names, counted from 1; 0 if there is none.
+        units_row: line with the units, counted from 1; 0 if there is none.
+        first_data_row: first line of numbers, counted from 1.
+        names: name of each column, empty if it has none.
+        units: unit of each column in the row of units, empty if there is none.
     """
 
     path: Path
@@ -54,11 +57,11 @@ class TableFormat:
 
     @property
     def signature(self) -> "TableFormat":
-        """Return the format without its path; files of one type have it in common."""
+        """Return the format without its path, which is equal for all files of one type."""
         return replace(self, path=Path())
 
     def column(self, at: int) -> str | int:
-        """Return the name of a column in a layout, or its position."""
+        """Return what a layout calls a column: its name, or its position in files without names."""
         return self.names[at] if self.names_row else at
 
 
@@ -68,8 +71,8 @@ class TableNumbers:
 
     Attributes:
         format: format of the file.
-        values: its cells, NaN where they are empty or no number.
-        texts: columns that hold something else than numbers.
+        values: numbers in the cells, NaN where a cell is empty or a text.
+        texts: positions of the columns with texts in them.
     """
 
     format: TableFormat
@@ -82,10 +85,10 @@ def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
 
     Args:
         path: the file.
-        delimiter: character between its cells; None where it is unknown.
+        delimiter: character between cells; None if it is unknown.
 
     Raises:
-        DataError: it cannot be read, is empty, or is no log of rows of numbers.
+        DataError: the file cannot be read, is empty, or is not a log with rows of numbers.
     """
     if path.suffix == ".parquet":
         header = tuple(parquet_of(path, bytes_of(path)).column_names)
@@ -104,7 +107,7 @@ def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
     width = len(top) or len(rows[first])
     names = [*top, *[""] * width][:width]
     if names_row and width > 1 and not names[-1]:
-        width -= 1  # a delimiter at the end of every line
+        width -= 1  # every line ends with a delimiter
     units = rows[units_row - 1] if units_row else []
     units = [*units, *[""] * width][:width]
     where = (names_row, units_row, first + 1)
@@ -123,7 +126,7 @@ def numbers_of(format: TableFormat) -> TableNumbers:
 
 
 def _parquet_numbers(format: TableFormat) -> TableNumbers:
-    """Return the numbers of a Parquet file."""
+    """Return the numbers in the first `ROWS` rows of a Parquet file."""
     import pyarrow
 
     table = parquet_of(format.path, bytes_of(format.path))
@@ -139,7 +142,7 @@ def _parquet_numbers(format: TableFormat) -> TableNumbers:
 
 
 def _lines(path: Path, limit: int = -1) -> list[str]:
-    """Return the lines of a text file, or whole lines of its beginning."""
+    """Return the lines of a text file, or the complete lines in its first `limit` bytes."""
     raw = bytes_of(path, limit)
     if len(raw) == limit and b"\n" in raw:
         raw = raw[: raw.rindex(b"\n")]
@@ -147,7 +150,10 @@ def _lines(path: Path, limit: int = -1) -> list[str]:
 
 
 def _delimiter_of(lines: list[str]) -> str:
-    """Return the character with the most constant count per line; of several, the most frequent."""
+    """Return the delimiter: the character whose count is the same in most lines.
+
+    Of several such characters the most frequent one is returned.
+    """
 
     def score(delimiter: str) -> tuple[float, int]:
         counts = Counter(line.count(delimiter) for line in lines[:_HEAD] if line.strip())
@@ -161,7 +167,7 @@ def _delimiter_of(lines: list[str]) -> str:
 
 
 def _first_numbers(rows: list[list[str]]) -> int | None:
-    """Return the index of the first row that holds mostly numbers."""
+    """Return the index of the first row with mostly numbers, or None if there is none."""
     usual = Counter(len(row) for row in rows).most_common(1)[0][0]
     for k, row in enumerate(rows):
         filled = [cell for cell in row if cell.lower() not in MISSING]
@@ -172,13 +178,18 @@ def _first_numbers(rows: list[list[str]]) -> int | None:
 
 
 def _header_rows(rows: list[list[str]], width: int) -> tuple[int, int]:
-    """Return the rows of names and of units, counted from 1, 0 where there is none."""
+    """Return the row of names and the row of units, counted from 1; 0 if there is none.
+
+    Args:
+        rows: cells of the rows above the numbers.
+        width: number of cells in the first row of numbers.
+    """
     names = units = 0
     for k, row in enumerate(rows, start=1):
         filled = [cell for cell in row if cell]
         if len(row) < width - 1 or len(filled) < len(row) - 2:
             continue
-        # single letters are units below the names; above, they may be names themselves
+        # Single letters are units if they are below the names; otherwise they may be names.
         counted = sum(map(bool, map(unit_in, filled))) if names else sum(map(is_unit, filled))
         if counted > 0.5 * len(filled) and (names or any(len(c) > 1 for c in filled)):
             units = k
@@ -186,14 +197,21 @@ def _header_rows(rows: list[list[str]], width: int) -> tuple[int, int]:
             names = k
     if names or not units:
         return names, units
-    # written-out units that occur once each are the names of their columns
+    # Without names, written-out units that occur only once each serve as names of the columns.
     cells = [cell for cell in rows[units - 1] if cell]
     words = any(len(cell) > 4 and cell.isalpha() for cell in cells)
     return (units, 0) if words and len(set(cells)) == len(cells) else (0, 0)
 
 
 def _refuse_commas(path: Path, body: list[list[str]], delimiter: str, first: int) -> None:
-    """Raise `DataError` for decimal commas, since no layout could read them."""
+    """Raise `DataError` if numbers have decimal commas, since no layout can read them.
+
+    Args:
+        path: the file.
+        body: cells of the rows of numbers.
+        delimiter: character between cells.
+        first: index of the first of these rows in the file.
+    """
     if delimiter == ",":
         return
     for k, cells in enumerate(body[:_HEAD]):

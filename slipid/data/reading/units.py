@@ -1,4 +1,4 @@
-"""Units of log columns: conversion from a declared unit to SI, with the dimension checked."""
+"""Units of log columns: their conversion to SI units, with a check of the dimension."""
 
 from contextlib import suppress
 from functools import lru_cache
@@ -9,8 +9,8 @@ from slipid.support.errors import did_you_mean
 if TYPE_CHECKING:
     import pint
 
-# The registry has its own units for one reason: here an angle is a dimension. With an angle as a
-# pure number, as in SI, "Hz" would silently pass as rad/s and a duty cycle as an angle.
+# The registry defines its own units so that angle is a dimension. If an angle were a pure number,
+# as in SI, "Hz" would silently convert to rad/s, and a duty cycle to an angle.
 _PREFIXES = (
     "nano- = 1e-9 = n-",
     "micro- = 1e-6 = u- = µ-",
@@ -46,8 +46,9 @@ KNOWN = (
 
 @lru_cache(maxsize=1)
 def _registry() -> "pint.UnitRegistry[Any]":
-    # Imported late: pint takes as long as numpy, and most commands read no log.
-    """Return the registry of units."""
+    # Pint is imported here because its import takes as long as numpy's, and most commands read no
+    # log.
+    """Return pint's registry with the units above."""
     import pint
 
     registry: pint.UnitRegistry[Any] = pint.UnitRegistry(None)
@@ -58,16 +59,16 @@ def _registry() -> "pint.UnitRegistry[Any]":
 
 @lru_cache(maxsize=256)
 def factor(unit: str, target: str) -> float:
-    """Return the factor from a unit ("rpm", "mm/s", "%") to one of the same dimension.
+    """Return the factor that converts values in a unit ("rpm", "mm/s", "%") to a target unit.
 
     Raises:
-        ValueError: the unit is unknown, or of another dimension.
+        ValueError: the unit is unknown, or has another dimension than the target.
     """
     registry = _registry()
     wanted = registry.parse_units(_ALIASES.get(target, target))
     try:
         given = registry.parse_units(_ALIASES.get(unit.strip(), unit.strip()))
-    except Exception as error:  # pint raises a dozen types of errors, among them one of tokenize
+    except Exception as error:  # pint raises a dozen types of errors, even one of tokenize
         known = f"{did_you_mean(unit, KNOWN)} (known: {', '.join(KNOWN)})"
         raise ValueError(f"unknown unit '{unit}'{known}") from error
     if given.dimensionality != wanted.dimensionality:
@@ -76,14 +77,17 @@ def factor(unit: str, target: str) -> float:
 
 
 def converts(unit: str, target: str) -> bool:
-    """Return whether a unit is known and has the dimension of another."""
+    """Return whether a unit is known and has the same dimension as the target."""
     with suppress(ValueError):
         return factor(unit, target) > 0
     return False
 
 
 def same_unit(one: str, other: str) -> bool:
-    """Return whether two texts mean the same unit, as "pix" and "pixel"; False where unreadable."""
+    """Return whether two texts mean the same unit, such as "pix" and "pixel".
+
+    The result is False if one of them is not a known unit.
+    """
     with suppress(ValueError):
         return abs(factor(one, other) - 1.0) < 1e-9
     return False

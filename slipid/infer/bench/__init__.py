@@ -1,1 +1,1 @@
-"""Motors on a bench: constants with intervals from voltage, current and speed."""
+"""Motors on a bench: constants with intervals, fitted to voltage, current and speed."""

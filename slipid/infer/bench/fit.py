@@ -5,12 +5,13 @@ With the moments g of both equations, their scatter S and Gaussian priors in the
     -2 log pi(z) = g(z)^T S^-1 g(z) + |(z - mean) / std|^2 + const
 
 (Chernozhukov and Hong 2003: it may replace a likelihood if only the mean of g is known). Weights, S
-and z are updated in turn. The curvature J^T J of the residuals in that sum equals the sandwich of
-robust statistics: intervals are valid although noise is neither white nor Gaussian nor known.
+and z are updated in turn. With J the derivative of the residuals in that sum, the inverse of J^T J
+equals the sandwich covariance of robust statistics: intervals are valid although the noise is
+neither white nor Gaussian nor known.
 
 Least squares and Kalman smoothers are unsuitable because the current is a noisy input: least
-squares underestimates R by the share of noise in the current's variance, and a smoother needs the
-spectra of three noises and the voltage between rows. The moments need neither.
+squares underestimates R by the fraction of noise in the current's variance, and a smoother needs
+the spectra of three noises and the voltage between rows. Moments need none of these.
 """
 
 import fnmatch
@@ -52,11 +53,14 @@ from slipid.search_space import Choice, Space
 ROUNDS = 30
 """Largest number of updates of weights, scatter and numbers."""
 SETTLED = 0.02
-"""Largest change of a number in a round of a converged fit [std]."""
+"""Largest change of a number in the last round of a converged fit [std]."""
 CONSTANT_S = 2e-3
-"""Prior std of the electrical time constant [s]."""
+"""Prior std of the electrical time constant L_a / R [s]."""
 MOMENTS = (len(VOLTS) - 1, len(AMPS))
-"""Number of moments of each equation; only the mechanical one uses the sign of a magnitude."""
+"""Numbers of moments of the electrical and of the mechanical equation.
+
+The last signal, the sign given to unsigned currents, is an instrument in the mechanical one only.
+"""
 
 
 class Equation(NamedTuple):
@@ -65,8 +69,8 @@ class Equation(NamedTuple):
     Attributes:
         channel: `voltage` or `current`.
         unit: unit of the channel.
-        windows: windows of the records.
-        sums: weights and residuals.
+        windows: windows of the records, with the signals of the equation.
+        sums: moments of the equation, with their weights and residuals.
     """
 
     channel: str
@@ -85,7 +89,7 @@ class MotorFit:
         space: free and fixed numbers with their priors.
         choices: user's choices.
         z: search vector at the optimum.
-        covariance: its covariance.
+        covariance: covariance of the search vector.
         equations: the electrical equation, absent without voltage, and the mechanical one.
         noise: noise of the sensors.
         correlation_time: time over which residuals are correlated [s].
@@ -121,12 +125,15 @@ class MotorFit:
 
     @property
     def period(self) -> float:
-        """Usual time between rows [s]."""
+        """Median time between rows [s]."""
         return float(np.median([r.period for r in self.records]))
 
 
 class _EquationSums(eqx.Module):
-    """Sums of one equation, zero without windows."""
+    """Sums h (`constant`), G (`slope`) and `tangent` of one equation, as in `MomentSums`.
+
+    They are zero for an equation without windows.
+    """
 
     constant: Array
     slope: Array
@@ -140,7 +147,14 @@ class _EquationSums(eqx.Module):
 
 
 class _Objective(eqx.Module):
-    """Sums of both equations, S^-1/2 and priors: the arguments of the search."""
+    """Arguments of the search for the optimum.
+
+    Attributes:
+        space: free numbers with their priors.
+        volts: sums of the electrical equation.
+        amps: sums of the mechanical equation.
+        root: S^-1/2, which whitens the moments.
+    """
 
     space: Space
     volts: _EquationSums
@@ -148,7 +162,7 @@ class _Objective(eqx.Module):
     root: Array
 
     def tangents(self) -> "_Objective":
-        """Return the objective with tangents as slopes, which determine the uncertainty."""
+        """Return the objective with tangents in place of slopes, for the covariance."""
         slopes = self.volts.tangent, self.amps.tangent
         return eqx.tree_at(lambda h: (h.volts.slope, h.amps.slope), self, slopes)
 
@@ -156,13 +170,13 @@ class _Objective(eqx.Module):
 def fit_motor(
     records: Sequence[BenchRecord], choices: Sequence[Choice] = (), label: str = ""
 ) -> MotorFit:
-    """Fit one motor to its records, either all with voltages or none."""
+    """Return the fit of one motor to its records, of which all or none have voltages."""
     amps, volts = mechanical(records), electrical(records, 0.0)
     first = _first(volts, amps, all(r.signed for r in records))
     scaled = [*_scaled(records, float(first.resistance)), *choices]
     space = Space(BenchRoot(BenchMotor()), scaled)
     z = space.vector(BenchRoot(first))
-    # numbers with a start value of the user keep it
+    # numbers for which the user has given a start value begin there
     z = np.where(_chosen(space, choices), space.start, z)
     zero, moved, rounds = 0.0, np.inf, 0
     while moved >= SETTLED and rounds < ROUNDS:
@@ -199,14 +213,14 @@ def fit_motor(
 
 
 def _first(volts: BenchWindows | None, amps: BenchWindows, signed: bool) -> BenchMotor:
-    """Return start values from each equation by itself; negative ones keep their defaults."""
+    """Return start values from each equation alone; negative ones are replaced by defaults."""
     usual = BenchMotor()
     r, c, drop, slow, one = float(usual.resistance), float(usual.back_emf), 0.0, 0.0, 0.0
     if volts is not None:
         found = start(volts, MOMENTS[0])
         r, c = (float(x) if x > 0 else y for x, y in zip(found, (r, c), strict=False))
         drop, slow, one = map(float, found[2:5])
-    # the zero of a magnitude and friction have the same signal, so the zero is left out
+    # in unsigned currents, the ammeter's zero and friction have the same signal: it is left out
     k = start(amps, MOMENTS[1] if signed else MOMENTS[1] - 1)
     torque = (usual.rotor_inertia, usual.coulomb_friction, usual.viscous_friction)
     j, tau, b = (float(x) * c if x > 0 else float(y) for x, y in zip(k, torque, strict=False))
@@ -218,7 +232,11 @@ def _first(volts: BenchWindows | None, amps: BenchWindows, signed: bool) -> Benc
 
 
 def _scaled(records: Sequence[BenchRecord], resistance: float) -> list[Choice]:
-    """Return priors scaled to the motor: its time constant, a tenth of its largest signals."""
+    """Return priors scaled to the motor.
+
+    The stds of the meters' zeros are a tenth of the largest signals, and that of the inductance is
+    `CONSTANT_S` times the resistance.
+    """
     amps = 0.1 * max(float(np.abs(r.current).max()) for r in records)
     chosen = [Choice("motor.current_offset", prior_mean=0.0, prior_std=max(amps, 1e-6))]
     known = [r.voltage for r in records if r.voltage is not None]
@@ -230,7 +248,7 @@ def _scaled(records: Sequence[BenchRecord], resistance: float) -> list[Choice]:
 
 
 def _chosen(space: Space, choices: Sequence[Choice]) -> np.ndarray:
-    """Return a mask of the coordinates with a start value of the user."""
+    """Return a mask of the coordinates for which the user has given a start value."""
     wanted = [c.pattern for c in choices if c.start is not None]
     return space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in wanted))
 
@@ -238,7 +256,11 @@ def _chosen(space: Space, choices: Sequence[Choice]) -> np.ndarray:
 def _scatter(
     equations: Sequence[Equation],
 ) -> tuple[Float[np.ndarray, "moment moment"], float, float]:
-    """Return the scatter of all moments, the correlation time [s], and the count of such times."""
+    """Return the covariance S of all moments, and the correlation time of residuals [s].
+
+    The third result is the number of independent times: the length of the records in units of twice
+    the correlation time.
+    """
     length = cell_length([e.windows for e in equations])
     parts = [celled(e.sums.moments, e.windows, length) for e in equations]
     count = max(len(p) for p in parts)
@@ -254,7 +276,7 @@ def _solved(
 ) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"]]:
     """Return the optimum at fixed weights and scatter, and its covariance."""
     std = np.sqrt(np.maximum(np.diag(s), 1e-300))
-    # signals may be collinear, as in a log at one speed; then S is singular without the 1e-9
+    # S is singular for collinear signals, as in a log at one speed, hence the 1e-9
     root = np.linalg.inv(np.linalg.cholesky(s / std / std[:, None] + 1e-9 * np.eye(len(s)))) / std
     if v is None:
         root = np.concatenate([np.zeros((len(root), MOMENTS[0])), root], axis=1)

@@ -1,22 +1,24 @@
-"""Moments: sums of residuals times signals that share no noise with them, and their scatter.
+"""Moments: sums of residuals times signals with independent noise, and the covariance of the sums.
 
-Let r be the residual of a window, and z the signals that its coefficients multiply, in its even (e)
-and its odd (o) rows. At the true numbers p
+Let r be the residual of a window, and z the signals that the coefficients of its equation multiply,
+in its even (e) and its odd (o) rows. At the true numbers p
 
     E g = 0,    g(p) = sum over windows of (w_e z_o r_e(p) + w_o z_e r_o(p)) / 2,
 
-whatever the noise of voltage, current and speed: none enters the mean. (Least squares has
-E sum z r = -n R sigma_I^2 in it, and finds R too small.) As r is linear in the coefficients k(p),
+whatever the noise of voltage, current and speed, which has no influence on the mean. (The normal
+equations of least squares have E sum z r = -n R sigma_I^2 instead of 0, and their R is too small.)
+As r is linear in the coefficients k(p),
 
     g(p) = h - G k(p).
 
 Weights w of Student's t with 4 degrees of freedom reduce the effect of outliers. A weight depends
-on its residual and not on the signals beside it, or it would bring back their noise. The
-uncertainty of k depends on G with the derivative of w r in place of w.
+on the residual only and not on the signals z that multiply it, whose noise would otherwise
+correlate with the weight. The uncertainty of k depends on G with the derivative of w r by r in
+place of w.
 
-The sum scatters with S = sum_k (1 - |k| / K) sum_c g_c g_c+k^T over cells c of time (Newey and West
-1987), where K is longer than the correlation time of residuals: quantisation and a lasting misfit
-widen it. A misfit over speed and current widens it as well: see `widened`.
+The covariance of the sum is S = sum_k (1 - |k| / K) sum_c g_c g_c+k^T over cells c of time (Newey
+and West 1987), where K is longer than the correlation time of residuals. Quantisation and a lasting
+misfit make it larger. A misfit over speed and current makes it larger, too: see `widened`.
 """
 
 from collections.abc import Sequence
@@ -28,15 +30,18 @@ from jaxtyping import Float
 from slipid.infer.bench.windows import BenchWindows, HalfSignals
 
 DEGREES = 4.0
-"""Degrees of freedom of Student's t."""
+"""Degrees of freedom of Student's t in the weights."""
 FORGOTTEN = 0.05
 """Autocorrelation below which residuals count as uncorrelated."""
 CELL_S = 0.01
-"""Length of the cells of time, two strides of windows at least [s]."""
+"""Smallest length of the cells of time, over which moments are summed [s]."""
 FEWEST = 12
-"""Smallest number of correlation times in a record, or its scatter could not be estimated."""
+"""Smallest ratio of a record's length to the estimated correlation time.
+
+Longer correlation times are not looked for, as the covariance could not be estimated from them.
+"""
 SPEEDS, CURRENTS = 6, 4
-"""Number of bins over speed, and over current within each, for misfits."""
+"""Numbers of bins over speed, and over current within each bin of speed, in which misfits show."""
 
 Moments = Float[np.ndarray, " moment"]
 Square = Float[np.ndarray, "moment moment"]
@@ -48,8 +53,8 @@ class HalfMoments:
 
     Attributes:
         residual: residual of every window [V] or [A].
-        weight: its weight.
-        moments: its summand of g.
+        weight: weight of every residual.
+        moments: summand of every window in g.
     """
 
     residual: Float[np.ndarray, " window"]
@@ -59,15 +64,15 @@ class HalfMoments:
 
 @dataclass(frozen=True, eq=False)
 class MomentSums:
-    """h and G of an equation, with the moments that they are sums of.
+    """Sums h and G of an equation, g = h - G k, and the moments of its windows.
 
     Attributes:
         constant: h.
         slope: G.
         tangent: -dg / dk with the change of weights, which determines the uncertainty of k.
         even: moments from the residuals of even rows.
-        odd: moments from the residuals of odd rows; both add up to g.
-        scale: robust std of a residual of one half.
+        odd: moments from the residuals of odd rows; the sum of both over windows is g.
+        scale: robust std of the residuals, averaged over even and odd rows.
     """
 
     constant: Moments
@@ -88,7 +93,10 @@ class MomentSums:
 
 
 def sums(w: BenchWindows, coefficients: Float[np.ndarray, " column"], signals: int) -> MomentSums:
-    """Return the sums at some coefficients, with the first `signals` signals as instruments."""
+    """Return the sums of an equation at given coefficients.
+
+    The first `signals` signals are the instruments, which residuals are multiplied by.
+    """
     totals, halves = [], []
     for mine, other in ((w.even, w.odd), (w.odd, w.even)):
         residual = mine.measured - mine.signals @ coefficients
@@ -105,7 +113,7 @@ def sums(w: BenchWindows, coefficients: Float[np.ndarray, " column"], signals: i
 
 
 def start(w: BenchWindows, count: int, rounds: int = 12) -> np.ndarray:
-    """Return the first `count` coefficients that make their moments vanish, 0 for the others."""
+    """Return coefficients at which the first `count` moments vanish; the other ones are 0."""
     found = np.zeros(w.even.signals.shape[1])
     weight = [w.usable.astype(float)] * 2
     for _ in range(rounds):
@@ -126,7 +134,7 @@ def _weights(half: HalfSignals, coefficients: np.ndarray, usable: np.ndarray) ->
 
 
 def _scale(residual: np.ndarray) -> float:
-    """Return a robust std, at least rounding errors of numbers of order one."""
+    """Return a robust std of residuals, at least 1e-9, the rounding errors of sums."""
     return max(1.4826 * float(np.median(np.abs(residual))) if len(residual) else 1.0, 1e-9)
 
 
@@ -143,7 +151,7 @@ def celled(
 
 
 def cell_length(windows: Sequence[BenchWindows]) -> float:
-    """Return the length of cells that hold some windows each [s]."""
+    """Return the length of the cells of time [s], at least two strides between windows."""
     strides = [float(np.median(np.diff(w.time))) for w in windows if len(w.time) > 1]
     return max(CELL_S, *(2 * s for s in strides))
 
@@ -163,7 +171,7 @@ def correlation_cells(x: Float[np.ndarray, " cell"]) -> int:
 
 
 def scatter(g: Float[np.ndarray, "cell moment"], lags: int) -> Square:
-    """Return the covariance of the sum of cells whose correlation time is about half of `lags`."""
+    """Return the covariance of the sum over cells; `lags` is about twice the correlation time."""
     s = g.T @ g
     for k in range(1, min(lags, len(g))):
         c = g[:-k].T @ g[k:]
@@ -173,10 +181,11 @@ def scatter(g: Float[np.ndarray, "cell moment"], lags: int) -> Square:
 
 
 def widened(s: Square, groups: Float[np.ndarray, "group moment"]) -> Square:
-    """Return the scatter, at least that between groups of windows of similar speed and current.
+    """Return the larger of two covariances of a sum, along every direction.
 
-    Noise scatters as much between groups as between cells of time, up to chance; a misfit scatters
-    more between groups. Along each direction the larger scatter counts.
+    One is `s`, estimated from cells of time; the other is estimated from sums over groups of
+    windows with similar speed and current, less what chance explains. Both are equal for pure
+    noise, whereas a misfit over speed or current makes the second one larger.
     """
     root = np.linalg.cholesky(s + 1e-12 * np.diag(np.diag(s) + 1e-300))
     white = np.linalg.solve(root, groups.T)
@@ -187,10 +196,10 @@ def widened(s: Square, groups: Float[np.ndarray, "group moment"]) -> Square:
 
 
 def grouped(s: MomentSums, w: BenchWindows) -> Float[np.ndarray, "group moment"]:
-    """Return sums over windows of similar speed, and among these of similar current.
+    """Return sums of moments over groups of windows with similar speed and similar current.
 
-    Groups have about equal sizes. The rows that a residual is not computed from determine the
-    group of its window, or its own noise would sort residuals.
+    Groups have about equal sizes. A residual from even rows is grouped by the speed and current of
+    odd rows, and vice versa, so that its own noise does not determine its group.
     """
     total = np.zeros((SPEEDS * CURRENTS, s.even.moments.shape[1]))
     for half, other in ((s.even, w.odd), (s.odd, w.even)):

@@ -5,9 +5,9 @@ With <x> for the mean and [x] for the mean slope of a signal over a window,
     <U> = R <I> + C_e <w> + U_b s(<I> - I_0) + L_a [I] + U_0 - R I_0      s(i) = tanh(i / 0.05 A)
     <I> = (J [w] + tau_c tanh(<w> / w0) + b <w>) / C_e + I_0              w0 = 2.5 rad/s
 
-where everything is at the motor shaft, and the torque constant equals the back-EMF constant by
-conservation of energy. If the ammeter shows magnitudes, its zero has the sign of the motion:
-sign(w) I_0.
+where speed, inertia and friction are those at the motor shaft, and the torque constant equals the
+back-EMF constant by conservation of energy. If the ammeter shows magnitudes, the zero I_0 is
+multiplied by the sign of the speed w.
 
 Both equations are linear in coefficients, which are functions of the numbers of the motor. The
 signals that they multiply are listed in `VOLTS` and `AMPS`.
@@ -24,13 +24,13 @@ from jaxtyping import Array, Float
 from slipid.parameter import parameter
 
 BRUSH_CURRENT = 0.05
-"""Current scale of the change of sign of the brushes' drop, as in `model.motor` [A]."""
+"""Current over which the voltage drop of the brushes changes its sign, as in `model.motor` [A]."""
 REST = 2.5
-"""Shaft speed scale of the change of sign of friction, as in `model.motor` [rad/s]."""
+"""Shaft speed w0 over which friction changes its sign [rad/s]."""
 VOLTS = ("current", "speed", "sign of the current", "slope of the current", "one", "along")
-"""Signals of the electrical equation; the last is the sign that magnitudes were given."""
+"""Signals of the electrical equation; `along` is the sign given to unsigned currents, else 1."""
 AMPS = ("slope of the speed", "sign of the speed", "speed", "along")
-"""Signals of the mechanical equation."""
+"""Signals of the mechanical equation; `along` as in `VOLTS`."""
 
 
 class BenchMotor(eqx.Module):
@@ -99,13 +99,13 @@ class BenchRecord:
 
     @property
     def period(self) -> float:
-        """Usual time between rows [s]."""
+        """Median time between rows [s]."""
         return float(np.median(np.diff(self.time)))
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Std of white noise of each sensor, quantisation included.
+    """Std of the white noise of each sensor, quantisation included.
 
     Attributes:
         voltage: noise of the voltmeter, None without one [V].
@@ -131,8 +131,8 @@ def noise_of(records: Sequence[BenchRecord]) -> SensorNoise:
 def noise(signals: Sequence[Float[np.ndarray, " row"]]) -> float:
     """Return the std of white noise from second differences, at least that of rounding.
 
-    For white noise (x_k-1 - 2 x_k + x_k+1) / sqrt(6) has its std; the median ignores jumps.
-    Rounding is to the smallest step between rows.
+    For white noise, (x_k-1 - 2 x_k + x_k+1) / sqrt(6) has the same std as x; its median is not
+    affected by jumps. The resolution of the signal is the smallest step between rows.
     """
     bent = np.concatenate([np.diff(x, 2) for x in signals]) / np.sqrt(6)
     steps = np.abs(np.concatenate([np.diff(x) for x in signals]))

@@ -12,11 +12,11 @@ from slipid.support.errors import DataError
 FEWEST_WINDOWS = 30
 """Smallest number of windows of an equation for a fit."""
 SURE = 5.0
-"""Size of a coefficient of the wrong sign above which a column is wrong [std]."""
+"""Size of a coefficient with the wrong sign above which its column is refused [std]."""
 FAST = 3000.0
-"""Shaft speed above that of any brushed motor [rad/s]."""
+"""Shaft speed that no brushed motor reaches [rad/s]."""
 POWER = 2e4
-"""Power U^2 / R at standstill above which the current is rather in milliamperes [W]."""
+"""Power U^2 / R at standstill above which the current is assumed to be in milliamperes [W]."""
 
 
 def check_records(records: Sequence[BenchRecord], label: str, unit_known: bool = False) -> None:
@@ -50,7 +50,7 @@ def _fail(where: str, found: str, expected: str) -> None:
 
 
 def _signed(where: str, speed: np.ndarray, current: np.ndarray) -> None:
-    """Refuse magnitudes of a current that is configured as signed."""
+    """Raise `DataError` if a current that is configured as signed consists of magnitudes."""
     back = speed < -0.2 * float(np.abs(speed).max())
     level = 0.1 * float(np.abs(current).max())
     negative = (current < -level).mean()
@@ -67,11 +67,12 @@ def _signed(where: str, speed: np.ndarray, current: np.ndarray) -> None:
 def _signs(
     where: str, records: Sequence[BenchRecord], volts: BenchWindows | None, amps: BenchWindows
 ) -> None:
-    """Refuse exchanged or reversed columns, by coefficients of the wrong sign.
+    """Raise `DataError` for exchanged or reversed columns, shown by coefficients of wrong sign.
 
-    Inertia makes the current rise with acceleration, and back-EMF the voltage with speed.
+    Current increases with acceleration because of inertia, and voltage with speed because of
+    back-EMF.
     """
-    # the sign of a magnitude comes from the speed, so it is no evidence
+    # unsigned currents were given the sign of the speed, which is no evidence of a direction
     inertia = _sure(amps, 0) if all(r.signed for r in records) else 0.0
     if volts is None:
         if inertia < -SURE:
@@ -92,7 +93,7 @@ def _signs(
 
 
 def _sure(w: BenchWindows, column: int) -> float:
-    """Return a coefficient over its std, from the equation alone without priors."""
+    """Return a coefficient divided by its std, estimated from one equation without priors."""
     signals = w.even.signals.shape[1] - (w.even.signals.shape[1] == 6)
     found = start(w, signals)
     s = sums(w, found, signals)

@@ -19,15 +19,15 @@ from slipid.support.content import Content
 from slipid.support.files import hash_of
 
 BINS = 8
-"""Number of bins of about equal counts of windows."""
+"""Number of bins over speed, current or time, with about equal counts of windows."""
 SURE = 5.0
-"""Smallest mean of a bin that is a misfit [std]."""
+"""Smallest mean residual of a bin that is reported as a misfit [std of the mean]."""
 MATTERS = 0.01
-"""Smallest mean of a bin that is a misfit, over the range of the voltage or the current."""
+"""Smallest mean residual that is reported as a misfit, divided by the range of the channel."""
 FEWEST = 5
-"""Smallest number of cells of time in a bin for an estimate of its scatter."""
+"""Smallest number of cells of time in a bin from which the std of its mean is estimated."""
 LONG_S = 0.3
-"""Correlation time of residuals above which a message mentions it [s]."""
+"""Correlation time of residuals above which a message reports it [s]."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Misfit:
         channel: `voltage` or `current`.
         unit: unit of the channel.
         off: mean residual in the bin [unit].
-        over: quantity that is binned.
-        at: range of the bin with its unit.
-        sure: size of the mean residual [std].
+        over: quantity by which windows are binned: speed, current or time.
+        at: range of that quantity in the bin, with its unit, as text.
+        sure: size of the mean residual [std of the mean].
     """
 
     channel: str
@@ -66,7 +66,7 @@ def misfits(fit: MotorFit) -> tuple[Misfit, ...]:
 
 
 def _worst(fit: MotorFit, equation: Equation) -> Misfit | None:
-    """Return the largest mean of a bin [std] over speed, current and time."""
+    """Return the most significant misfit of an equation over speed, current and time, or None."""
     w = equation.windows
     size = MATTERS * float(np.ptp(w.both.measured))
     best: Misfit | None = None
@@ -76,7 +76,7 @@ def _worst(fit: MotorFit, equation: Equation) -> Misfit | None:
         ("current", (w.odd.current, w.even.current), "A"),
         ("time", (w.time, w.time), "s"),
     ):
-        # residuals of even rows are binned by odd rows and vice versa, or noise would choose bins
+        # residuals of even rows are binned by odd rows and vice versa: their noise is independent
         bins = [np.array_split(used[np.argsort(v[used], kind="stable")], BINS) for v in (odd, even)]
         for one, other in zip(*bins, strict=True):
             off, sure = _mean(fit, equation, one, other)
@@ -89,9 +89,10 @@ def _worst(fit: MotorFit, equation: Equation) -> Misfit | None:
 def _mean(
     fit: MotorFit, equation: Equation, even: Int[np.ndarray, " some"], odd: Int[np.ndarray, " some"]
 ) -> tuple[float, float]:
-    """Return the weighted mean residual of even and odd rows of some windows, and its size [std].
+    """Return the weighted mean residual of some windows, and its size [std of the mean].
 
-    Cells as long as the residuals' correlation time count as independent.
+    `even` and `odd` are the windows whose residuals of even and of odd rows are averaged. Cells of
+    time as long as the residuals' correlation time count as independent.
     """
     w, s = equation.windows, equation.sums
     weight, sum_ = np.zeros(len(w.time)), np.zeros(len(w.time))
@@ -112,7 +113,7 @@ def _mean(
 
 
 ROWS_ELECTRICAL, ROWS_MECHANICAL = 2.0, 6.0
-"""Smallest number of rows in a time constant, L/R or J R / C_e^2, that determines the number."""
+"""Smallest numbers of rows per time constant, L_a / R and J R / C_e^2, that identify L_a and J."""
 _OF = {
     "voltage": tuple(
         f"motor.{name}"
@@ -123,11 +124,11 @@ _OF = {
         for name in ("coulomb_friction", "viscous_friction", "rotor_inertia", "current_offset")
     ),
 }
-"""Numbers of the equation of each channel."""
+"""Paths of the numbers that the equation of each channel determines."""
 ONE_POINT = 0.05
-"""Range of the speed over its largest value below which a log shows one operating point."""
+"""Ratio of the range of speeds to the largest one below which a log has one operating point."""
 SLOW_S = 1.0
-"""Time between rows above which a message questions its unit [s]."""
+"""Time between rows above which a message asks whether its unit is right [s]."""
 _REMEDIES = (
     (("motor.inductance",), "log faster, several rows in L/R, with steps of the voltage"),
     (("motor.rotor_inertia",), "speed up and slow down, over some tenths of a second"),
@@ -141,7 +142,8 @@ _REMEDIES = (
     (("motor.brush_drop",), "let small and large currents flow, both ways"),
     (("motor.viscous_friction",), "turn faster: at these speeds it has little effect"),
 )
-"""Quantities that must all occur, and their remedy; the first match counts."""
+"""Remedies for flat directions: the first one whose quantities all occur in the direction is used.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +155,7 @@ class BenchFit:
         parameters: numbers by path, with `@label` of a motor.
         derived: quotients of numbers by path, with `@label` of a motor.
         messages: warnings, one sentence each.
-        misfits: misfits by label.
+        misfits: misfits by label of the motor.
     """
 
     fits: tuple[MotorFit, ...]
@@ -238,7 +240,7 @@ def _remedy(paths: Sequence[str], has_voltage: bool) -> str:
 
 
 def _too_slow(f: MotorFit) -> dict[str, str]:
-    """Return numbers whose transients fall between the rows, with a sentence for each."""
+    """Return a sentence, by path, for each number whose time constant is too short for the rows."""
     m, rows, slow = f.motor, f.period, {}
     if not f.has_voltage:
         return {}
@@ -258,7 +260,7 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
 
 
 def _one_point(f: MotorFit) -> bool:
-    """Return True if the speed keeps to one value."""
+    """Return True if the speed is nearly constant (`ONE_POINT`)."""
     amps = f.equations[-1].windows
     used = amps.both.speed[amps.usable]
     return float(np.ptp(np.quantile(used, (0.02, 0.98)))) < ONE_POINT * float(np.abs(used).max())
@@ -271,7 +273,11 @@ def _time(seconds: float) -> str:
 def _with_verdict(
     f: MotorFit, e: Estimate, slow: Collection[str], misfitted: Collection[str]
 ) -> Estimate:
-    """Return an estimate with a weaker verdict for slow rows, a value near 0, or a misfit."""
+    """Return an estimate with a weaker verdict where the logs do not support the one it has.
+
+    Reasons are rows too far apart (`slow`), a single speed, an inductance near 0, and a misfit of
+    the number's equation.
+    """
     if (e.path in slow or _one_point(f)) and e.verdict not in ("fixed", "not_identified"):
         return replace(e, verdict="not_identified", provenance="borrowed")
     small = e.path == "motor.inductance" and e.std is not None and e.value < FROM_ZERO * e.std

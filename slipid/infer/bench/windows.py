@@ -1,4 +1,4 @@
-"""Short windows of a record, each measured twice: by its even and by its odd rows.
+"""Short windows of a record, each with two sets of signals: from its even and from its odd rows.
 
 No derivative of a noisy signal is taken. With a kernel c(t) over a window, of integral 1, each
 equation is integrated, <x> = int c x dt and [x] = int c (dx/dt) dt. For signals that are straight
@@ -7,10 +7,12 @@ lines between rows both are sums over the rows l of the window, whatever the ker
     <x> = sum_l c_l (t_l+1 - t_l) (x_l + x_l+1) / 2        [x] = sum_l c_l (x_l+1 - x_l)
 
 One sum goes over the even rows of a window, another over the odd ones. Their sensor noises are
-independent, so that the residual of one can be correlated with the signals of the other.
+independent, so that the residual of one can be multiplied by the signals of the other without bias
+(`slipid.infer.bench.moments`).
 
 Windows with a gap in time are left out, as are those with a jump of the voltage inside or shortly
-before them: its time between two rows is unknown, and the current is no straight line there.
+before them: the time of the jump between two rows is unknown, and the current is not a straight
+line there.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,23 +24,28 @@ from jaxtyping import Bool, Float, Int
 from slipid.infer.bench.motor import BRUSH_CURRENT, REST, BenchRecord
 
 ELECTRICAL_S, MECHANICAL_S = 3e-3, 1e-2
-"""Half the length of windows of each equation, about a time constant of small motors [s]."""
+"""Half the length of a window of each equation, about a time constant of small motors [s]."""
 LEAST, ENOUGH = 2, 8
-"""Half the length of a window: smallest, for odd rows to give a slope, and desired [row]; windows
-are never made longer than those of the mechanical equation for it."""
+"""Smallest and desired half length of a window [row].
+
+The smallest one is needed for a slope from odd rows. Windows with fewer than the desired number of
+rows are lengthened to it, but not beyond those of the mechanical equation (`MECHANICAL_S`).
+"""
 MOST = 20_000
 """Largest number of windows of one record."""
 WIDE = 4
-"""Length of the window from which the sign of a small current is taken, over that of a window."""
+"""Ratio of the longer window, whose mean gives the sign of a small current, to a window."""
 STRAY = 1.5
-"""Duration of a window over its nominal one above which it spans a gap between rows."""
+"""Ratio of a window's duration to its nominal one above which it spans a gap between rows."""
 JUMP = 6.0
-"""Step of the voltage between rows above which it is a jump [robust std]."""
+"""Step of the voltage between rows above which it counts as a jump [robust std of steps]."""
 SETTLED_S, SETTLED_ROWS = 5e-3, 4
-"""Time after a jump of the voltage until currents are straight lines between rows [s], [row]; the
-shorter one counts."""
+"""Time after a jump of the voltage until currents are straight lines between rows [s], [row].
+
+The shorter of the two applies.
+"""
 BRAKES = 4.0
-"""Deceleration of the shaft above which the motor may be braking [robust std]."""
+"""Deceleration of the shaft above which the motor may be braking [robust std of accelerations]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +53,7 @@ class HalfSignals:
     """Signals of every window from its even, or from its odd, rows.
 
     Attributes:
-        signals: signals that the coefficients of an equation multiply.
+        signals: signals that the coefficients of the equation multiply, `VOLTS` or `AMPS`.
         measured: left side of the equation, the mean voltage [V] or current [A].
         speed: mean speed [rad/s].
         current: mean current [A].
@@ -66,8 +73,8 @@ class BenchWindows:
         even: signals from even rows.
         odd: signals from odd rows.
         time: middle of each window, from the first row of its record [s].
-        record: number of the record.
-        usable: False where the equation does not or may not hold, as at rest.
+        record: index of the record of each window.
+        usable: False for windows in which the equation may not hold, as at rest.
     """
 
     even: HalfSignals
@@ -78,7 +85,7 @@ class BenchWindows:
 
     @property
     def both(self) -> HalfSignals:
-        """Means of both halves."""
+        """Means of the signals from even and from odd rows."""
         pairs = zip(vars(self.even).values(), vars(self.odd).values(), strict=True)
         return HalfSignals(*((a + b) / 2 for a, b in pairs))
 
@@ -86,7 +93,8 @@ class BenchWindows:
 def electrical(records: Sequence[BenchRecord], zero: float) -> BenchWindows | None:
     """Return windows of the electrical equation [V], None without voltages.
 
-    `zero` is the reading of the ammeter without a current, for the signs of small currents [A].
+    `zero` is the reading of the ammeter at zero current [A], from which small currents get their
+    signs.
     """
     parts = []
     for k, r in enumerate(records):
@@ -108,7 +116,10 @@ def electrical(records: Sequence[BenchRecord], zero: float) -> BenchWindows | No
 
 
 def mechanical(records: Sequence[BenchRecord]) -> BenchWindows:
-    """Return windows of the mechanical equation [A]; at rest friction is unknown."""
+    """Return windows of the mechanical equation [A]; they are not usable at rest.
+
+    At rest the friction may have any value up to that of motion.
+    """
     parts = []
     for k, r in enumerate(records):
         at = _WindowPlaces(r, MECHANICAL_S)
@@ -128,7 +139,7 @@ def mechanical(records: Sequence[BenchRecord]) -> BenchWindows:
 
 
 class _WindowPlaces:
-    """Positions of the windows of a record: middles and half the length [row]."""
+    """Positions of the windows of a record: `middle` row of each, and `half` their length [row]."""
 
     def __init__(self, r: BenchRecord, half_s: float):
         half_s = max(half_s, min(ENOUGH * r.period, MECHANICAL_S))
@@ -140,7 +151,7 @@ class _WindowPlaces:
 
 
 class _HalfKernel:
-    """Kernel over every second row of the windows, starting `first` rows inside them."""
+    """Kernel c over every second row of the windows: even rows for `first` 0, odd ones for 1."""
 
     def __init__(self, r: BenchRecord, at: _WindowPlaces, first: int):
         self.rows = at.middle[:, None] + np.arange(first - at.half, at.half - first + 1, 2)
@@ -158,7 +169,7 @@ class _HalfKernel:
         return np.asarray((self.kernel * self.step * (x[:, 1:] + x[:, :-1]) / 2).sum(axis=1))
 
     def long_mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, " window"]:
-        """Return the mean over a longer window of the same half of the rows, for a sign."""
+        """Return the mean over a longer window of the same rows, whose sign is more reliable."""
         return np.asarray(signal[self.wide].mean(axis=1))
 
     def slope(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, " window"]:
@@ -172,11 +183,19 @@ def _cut(
     half: Callable[[_HalfKernel], HalfSignals],
     usable: Bool[np.ndarray, " window"] | None = None,
 ) -> BenchWindows:
-    """Return the windows of one record."""
+    """Return the windows of one record.
+
+    Args:
+        r: the record.
+        number: index of the record.
+        at: positions of the windows.
+        half: function that returns the signals of the windows by one kernel.
+        usable: False for windows in which the equation may not hold, all True by default.
+    """
     even, odd = halves = _HalfKernel(r, at, 0), _HalfKernel(r, at, 1)
     usable = np.ones(len(at.middle), bool) if usable is None else usable
     if not r.signed:
-        # magnitudes have the sign of the speed, which is wrong if the motor brakes
+        # unsigned currents were given the sign of the speed, which is wrong if the motor brakes
         speed, slope = (sum(getattr(h, k)(r.speed) for h in halves) for k in ("mean", "slope"))
         faster = slope * np.sign(speed)
         spread = 1.4826 * np.median(np.abs(faster)) if len(faster) else 0.0

@@ -1,1 +1,1 @@
-"""Proposals of the next runs to drive."""
+"""Optimal design: proposals of the next runs to drive."""

@@ -1,15 +1,16 @@
-"""Fisher information of sets of runs, and the choice of the runs that add most.
+"""Fisher information of sets of runs, and the choice of the most informative runs.
 
-Motion residuals inform the numbers m of the motion; currents and voltages inform the electric
-numbers e given the motion, as in the fit. With whitened Jacobians J of the motion and (E, C) of
-currents and voltages by e and m,
+As in the fit, motion residuals determine the numbers m of the motion; currents and voltages
+determine the electric numbers e given the motion. With the whitened Jacobian J of the motion by m,
+and those of currents and voltages, E by e and C by m,
 
     M = M0 + sum J^T J,   O = O0 + sum E^T E,   X = X0 + sum E^T C
     cov(m) = M^-1,   e = e(m) - L (m - m^),  L = O^-1 X,   cov(e) = O^-1 + L M^-1 L^T
 
-so M, O and X of different runs add. If currents inform the motion, or there are none, all numbers
-count as m. A criterion is tr(G cov G^T) of a matrix G (Fedorov 1972; Atkinson, Donev and Tobias
-2007, Optimum Experimental Designs, sections 10 and 12: c- and A-optimality, exchange).
+with M0, O0 and X0 from earlier runs and priors, so that M, O and X of different runs add. If no
+currents are logged, all numbers count as m. The criterion to be minimised is tr(G cov G^T), where
+the matrix G selects the quantities of interest (Fedorov 1972; Atkinson, Donev and Tobias 2007,
+Optimum Experimental Designs, sections 10 and 12: c- and A-optimality, exchange).
 """
 
 from collections.abc import Sequence
@@ -21,16 +22,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 ENDLESS = 1e3
-"""Repetitions of every candidate that stand for endless driving."""
+"""Number of repetitions of every candidate run that stands for unlimited driving."""
 
 
 class RunJacobians(NamedTuple):
     """Whitened Jacobians of runs.
 
     Attributes:
-        motion: J of the motion residuals.
-        electric: E of currents and voltages by electric numbers (k is 0 without currents).
-        carried: C of currents and voltages by numbers of the motion.
+        motion: J, derivative of motion residuals by the numbers of the motion.
+        electric: E, derivative of currents and voltages by the electric numbers (k is 0 without
+            currents).
+        carried: C, derivative of currents and voltages by the numbers of the motion.
     """
 
     motion: Float[np.ndarray, "run m motion"]
@@ -47,13 +49,13 @@ class RunJacobians(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Information on all numbers.
+    """Fisher information about all numbers, as the matrices of the module docstring.
 
     Attributes:
         is_electric: mask of the electric numbers.
-        motion: M.
-        own: O.
-        cross: X.
+        motion: M, information about the numbers of the motion.
+        own: O, information about the electric numbers given the motion.
+        cross: X, which relates errors of electric numbers to errors of the motion.
     """
 
     is_electric: Bool[np.ndarray, " free"]
@@ -63,7 +65,7 @@ class Information:
 
     def plus(self, rows: RunJacobians, times: float = 1.0) -> "Information":
         """Return the information with these runs added `times` times; -1 removes them."""
-        # reshape(-1, ...) would fail for a part without numbers
+        # reshape(-1, ...) would fail for arrays without columns
         j, e, c = (x.reshape(x.shape[0] * x.shape[1], x.shape[2]) for x in rows)
         return Information(
             self.is_electric,
@@ -89,7 +91,7 @@ class Information:
         return out
 
     def criterion(self, goal: Float[np.ndarray, "k free"]) -> float:
-        """Return tr(G cov G^T) of the matrix G of a goal."""
+        """Return tr(G cov G^T) for the matrix G of a goal."""
         return float(np.einsum("ki,ij,kj->", goal, self.covariance, goal))
 
     def after_each(
@@ -98,7 +100,7 @@ class Information:
         """Return the criterion after one more run, for every candidate.
 
         By Woodbury's identity (M + J^T J)^-1 = M^-1 - W^T (1 + W J^T)^-1 W with W = J M^-1, the
-        inverted matrix has the size of a run, not of all numbers.
+        inverted matrix is as large as the residuals of one run, not as the vector of all numbers.
         """
         of_motion, of_electric = goal[:, ~self.is_electric], goal[:, self.is_electric]
         rest: np.ndarray | float = 0.0
@@ -120,7 +122,7 @@ class Information:
 def information_of(
     covariance: Float[np.ndarray, "free free"], is_electric: Bool[np.ndarray, " free"]
 ) -> Information:
-    """Return the information with this covariance."""
+    """Return the information that gives this covariance of all numbers."""
     e, m = np.flatnonzero(is_electric), np.flatnonzero(~is_electric)
     of_motion = covariance[np.ix_(m, m)]
     motion = _inverse(of_motion)
@@ -136,7 +138,15 @@ def criterion_path(
     order: Sequence[int] | np.ndarray,
     at: Sequence[int] | None = None,
 ) -> list[float]:
-    """Return the criterion along an order of runs, before and after each or at chosen counts."""
+    """Return the criterion as runs are added in a given order.
+
+    Args:
+        start: information before the first run.
+        rows: Jacobians of the runs.
+        goal: matrix G of the criterion.
+        order: indices of the runs.
+        at: counts of runs for which the criterion is returned; by default none, one, two, ... all.
+    """
     counts = range(len(order) + 1) if at is None else at
     found, now, done = [], start, 0
     for count in counts:
@@ -148,12 +158,12 @@ def criterion_path(
 def greedy(
     start: Information, rows: RunJacobians, goal: np.ndarray, most: int, target: float = 0.0
 ) -> tuple[list[int], list[float]]:
-    """Choose at most `most` runs, each the one that lowers the criterion most, with repetition.
+    """Return at most `most` runs, each of which reduces the criterion most; runs may be repeated.
 
     The choice stops once the criterion has fallen to the target.
 
     Returns:
-        the runs, and the criterion before and after each.
+        indices of the runs, and the criterion before the first and after each of them.
     """
     now, chosen, found = start, [], [start.criterion(goal)]
     while len(chosen) < most and found[-1] > target:
@@ -167,7 +177,7 @@ def greedy(
 def exchanged(
     start: Information, rows: RunJacobians, goal: np.ndarray, chosen: Sequence[int]
 ) -> list[int]:
-    """Exchange each run once for the best one in its place; return the most useful first."""
+    """Return the runs after each was replaced by the best run in its place, most useful first."""
     kept = list(chosen)
     for k in range(len(kept)):
         others = start.plus(rows.pick(kept[:k] + kept[k + 1 :]))

@@ -1,4 +1,4 @@
-"""Runs that could be driven: their commands, grids of them, and the simulated windows."""
+"""Planned runs: their commands, grids of runs, and the windows that are simulated for them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,11 +16,11 @@ from slipid.model.robot import Robot
 from slipid.predict.open_loop import chain
 
 SESSION = "next"
-"""Session of new runs, for which the marker is mounted anew."""
+"""Name of the session of new runs, for which the marker is mounted anew."""
 HEADINGS = tuple(15.0 * k for k in range(24))
 """Headings of candidate runs and of predictions [deg]."""
 BEND = 0.5
-"""Rim speed of a curved candidate's turn over its speed."""
+"""Ratio of yaw rate times base radius to speed in curved candidate runs."""
 
 Setup = tuple[str, str]
 """A floor and a load set-up."""
@@ -48,7 +48,7 @@ class PlannedRun:
 
     @property
     def session(self) -> str:
-        """Name of the session, in which the marker stays in place, as in `slipid.data.windows`."""
+        """Name of the session, within which the marker is not remounted (`slipid.data.windows`)."""
         return f"{self.surface}/{self.load}/{self.speed:.2f}"
 
     @property
@@ -58,7 +58,7 @@ class PlannedRun:
         return np.array([self.speed * ahead, self.speed * left, self.turn])
 
     def seconds(self, base_radius: float) -> float:
-        """Return the duration [s] for a robot with this radius of its rim [m]."""
+        """Return the duration [s] for a robot with this base radius [m]."""
         return self.distance / (self.speed or abs(self.turn) * base_radius)
 
 
@@ -70,7 +70,7 @@ def candidates(
     headings_deg: Sequence[float] = HEADINGS,
     turns: Sequence[float] | None = None,
 ) -> tuple[PlannedRun, ...]:
-    """Return runs in every heading at every speed of a floor, straight, turning and on the spot.
+    """Return candidate runs: straight and curved in every heading and speed, and on the spot.
 
     Args:
         setups: floors and load set-ups.
@@ -78,8 +78,8 @@ def candidates(
         distance: path length by floor [m].
         base_radius: distance of the wheels from the robot's centre [m].
         headings_deg: directions of travel [deg].
-        turns: yaw rates [rad/s]; by default zero and those with a rim speed of `BEND` times the
-            speed, and on the spot those with a rim speed equal to the speed.
+        turns: yaw rates [rad/s]. By default they are zero and, in both senses, `BEND` times the
+            speed over the base radius; turns on the spot have the speed over the base radius.
     """
     out = []
     for surface, load in setups:
@@ -96,11 +96,11 @@ def candidates(
 
 
 def paper_grid(setups: Iterable[Setup], distance: Mapping[str, float]) -> tuple[PlannedRun, ...]:
-    """Return the 36 commands of the 2021 paper, each with every set-up before the next.
+    """Return the 36 commands of the 2021 paper, each with every set-up before the next command.
 
-    They go along x and y at 100 to 400 mm/s, along the diagonals at 100 to 300 mm/s in x and in y,
-    and turn on the spot at 20 to 50 deg/s. Source: Belyaev, Brylev and Ivanov 2021, commands of
-    its logs.
+    They are along x and y at 100 to 400 mm/s, along the diagonals at 100 to 300 mm/s in both x and
+    y, and turns on the spot at 20 to 50 deg/s. Source: Belyaev, Brylev and Ivanov 2021, commands in
+    their logs.
     """
     settings = [(a, v, 0.0) for v in (0.1, 0.2, 0.3, 0.4) for a in (0.0, 180.0, 90.0, 270.0)]
     settings += [(0.0, 0.0, s * rate) for rate in (20.0, 30.0, 40.0, 50.0) for s in (1, -1)]
@@ -115,7 +115,7 @@ def paper_grid(setups: Iterable[Setup], distance: Mapping[str, float]) -> tuple[
 def heading_grid(
     setups: Iterable[Setup], speeds: Mapping[str, Sequence[float]], distance: Mapping[str, float]
 ) -> tuple[PlannedRun, ...]:
-    """Return straight runs in headings every 5 degrees at every speed, like the 2022 logs."""
+    """Return straight runs in headings 5 degrees apart at every speed, as in the 2022 logs."""
     headings = np.radians(np.arange(0.0, 360.0, 5.0))
     return tuple(
         PlannedRun(f, load, float(heading), speed, 0.0, distance[f])
@@ -146,9 +146,9 @@ def steady_windows(
 ) -> Windows:
     """Return noise-free windows of runs at steady wheel speeds, one segment per run.
 
-    However long a run is, it is one segment, as it has one run effect. Runs are centred in the
-    image, and the marker's heading is zero at their start. The ammeter counts as exact, since its
-    noise is not known beforehand and averages out over a window.
+    A run of any length is one segment, as it has one run effect. Runs are centred in the image, and
+    the marker's heading is zero at their start. Currents have no ammeter noise, since it is not
+    known beforehand and averages out over a window.
     """
     n, per_piece, motors = len(runs), channels.windows, robot.geometry.drives
     base, radius = float(robot.geometry.base_radius), float(robot.geometry.wheel_radius)

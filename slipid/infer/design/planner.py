@@ -1,4 +1,4 @@
-"""Expected information of runs not yet driven, from simulation with the fitted robot."""
+"""Expected Fisher information of planned runs, from simulation with the fitted robot."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,11 +30,11 @@ _TOGETHER = 256
 
 
 class Planner:
-    """Simulation of new runs and their Fisher information, with choices and variances as fitted.
+    """Simulation of planned runs and their Fisher information, for a fit's robot and variances.
 
-    New runs have a session of their own. Vectors hold the numbers of the search space, followed by
-    the effects of the new session along, across and in yaw [std of such effects] on floors where
-    sessions differ.
+    Planned runs belong to a new session. Its effects along, across and in yaw are further unknowns
+    on floors where sessions differ: vectors hold the numbers of the search space, followed by these
+    effects, in units of their std.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class Planner:
         self._differ = np.array([any(map(self.variance.get, names)) for names in of_floor])
         self.effects = len(AXES) * int(self._differ.sum())
         self.is_electric = np.concatenate([electric, np.zeros(self.effects, bool)])
-        # shared effects of neighbouring runs count as each run's own
+        # shared effects of neighbouring runs are treated as effects of each run alone
         own = {f"run.{x}.{a}": f"neighbours.{x}.{a}" for x in robot.surfaces.labels for a in AXES}
         self._log_v = np.log(
             [
@@ -80,13 +80,16 @@ class Planner:
         return steady_windows(runs, self.robot, self.channels, session)
 
     def nothing(self) -> Information:
-        """Return the information of the prior; marker yaws of single sessions count as known."""
+        """Return the information of the prior alone; marker yaws of sessions count as known."""
         single = self.space.where(lambda e: e.session is not None)
         std = np.where(single, 1e-6, self.space.prior_std)
         return self._known(np.diag(std**2))
 
     def after(self, fit: Fit) -> Information:
-        """Return the information of a fit without its sessions' marker yaws, of no further use."""
+        """Return the information after a fit.
+
+        The marker yaws of its sessions are marginalised, as planned runs have a new session.
+        """
         place = {name: k for k, name in enumerate(fit.space.names)}
         mine = [k for k, name in enumerate(self.space.names) if name in place]
         theirs = [place[self.space.names[k]] for k in mine]
@@ -113,7 +116,7 @@ class Planner:
         effect = effects(windows, self.robot) * std[:, None]
         on = np.eye(len(self._differ))[np.asarray(this.batch.surface)][:, self._differ]
         moved = (effect[:, :, None, :] * on[:, None, :, None]).reshape(*effect.shape[:2], -1)
-        # effects of a session enter the motion only
+        # effects of the session change the motion only
         wider = ((0, 0), (0, 0), (0, self.effects))
         of_motion = jnp.concatenate([jacobian["motion"], -moved], axis=2)
         jacobian = {k: jnp.pad(j, wider) for k, j in jacobian.items()} | {"motion": of_motion}
@@ -128,9 +131,9 @@ class Planner:
         )
 
     def ends(self, runs: Sequence[PlannedRun]) -> Float[np.ndarray, "run 2 number"]:
-        """Return the derivative of each run's end point over its distance, by the numbers.
+        """Return the derivative of each run's end point by the numbers, divided by its distance.
 
-        Effects and the marker yaw of a single session are no part of a prediction.
+        Effects and the marker yaw of a single session are not part of a prediction.
         """
         b = lk.batch(self._windows(runs, session=""), self.robot)
         jacobian = np.array(end_jacobian(self.space, self.z, b, np.zeros((len(runs), 3))))
@@ -140,14 +143,14 @@ class Planner:
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """A quantity whose std sqrt(tr(G cov G^T)) the proposed runs are to shrink.
+    """A quantity whose std, sqrt(tr(G cov G^T)), the proposed runs are to reduce.
 
     Attributes:
         name: name of the parameter or prediction.
         unit: unit of the std.
         rows: the matrix G.
-        floors: floors whose runs serve the goal, empty for any.
-        loads: load set-ups whose runs serve the goal, empty for any.
+        floors: floors on which runs inform directly about the goal, empty for any.
+        loads: load set-ups with which runs inform directly about the goal, empty for any.
     """
 
     name: str
@@ -157,7 +160,7 @@ class Goal:
     loads: frozenset[str] = frozenset()
 
     def is_about(self, setup: Setup) -> bool:
-        """Return True if runs with this floor and load serve the goal directly."""
+        """Return True if runs on this floor with this load inform directly about the goal."""
         floor, load = setup
         return floor in (self.floors or {floor}) and load in (self.loads or {load})
 
@@ -167,7 +170,7 @@ class Goal:
 
 
 def parameter_goal(planner: Planner, path: str) -> Goal:
-    """Return the goal of a parameter's std, the root mean square over the entries of a vector."""
+    """Return the goal to reduce a parameter's std, or the root mean square of a vector's stds."""
     entry = next(e for e in planner.space.free if e.path == path)
     at = planner.space.slices[path]
     rows = np.zeros((entry.size, len(planner.is_electric)))
@@ -182,7 +185,10 @@ def parameter_goal(planner: Planner, path: str) -> Goal:
 
 
 def prediction_goal(planner: Planner, name: str, runs: Sequence[PlannedRun]) -> Goal:
-    """Return the goal of the parameters' contribution to end-point errors, rms over distance."""
+    """Return the goal to reduce the end-point errors of `runs` due to uncertain parameters.
+
+    Its std is their root mean square, divided by the distance.
+    """
     rows = planner.ends(runs)
     return Goal(
         name,
@@ -194,12 +200,12 @@ def prediction_goal(planner: Planner, name: str, runs: Sequence[PlannedRun]) -> 
 
 
 def weighed(goals: Sequence[Goal], now: Information, weight: Sequence[float]) -> np.ndarray:
-    """Return G of the criterion sum_g weight_g (std_g / std_g now)^2, which is 1 at present."""
+    """Return G of the weighted mean of (std_g / present std_g)^2 over goals g, which is 1 now."""
     share = np.asarray(weight, float) / np.sum(weight)
     parts = [np.sqrt(w) / g.std(now) * g.rows for g, w in zip(goals, share, strict=True)]
     return _compact(np.concatenate(parts))
 
 
 def _compact(rows: Float[np.ndarray, "k free"]) -> Float[np.ndarray, "few free"]:
-    """Return fewer rows with the same G^T G."""
+    """Return a matrix with the same G^T G and at most as many rows as columns."""
     return np.asarray(np.linalg.qr(rows, mode="r")) if len(rows) > rows.shape[1] else rows

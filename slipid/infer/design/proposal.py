@@ -1,4 +1,4 @@
-"""Proposal of the next runs: those that shrink the wanted intervals most, and what they save."""
+"""Proposal of the next runs that reduce given stds most, and comparison with grids of runs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,11 +22,12 @@ if TYPE_CHECKING:
 
 SCHEMA = "slipid.design/1"
 REACHED = 0.9
-"""Remaining share of a goal's std after endless driving above which the goal is unreachable."""
+"""Ratio of a goal's std after unlimited driving to its present std above which it is unreachable.
+"""
 ORDERS = 8
-"""Number of random orders of a grid that are averaged."""
+"""Number of random orders of a grid's runs over which the criterion is averaged."""
 POINTS = 40
-"""Number of points on the curve of a grid."""
+"""Number of counts of runs at which the criterion of a grid is computed."""
 ASSUMPTIONS = (
     "noise and run effects are as fitted, and each run is one observation however long it is",
     "effects that runs in similar directions share count as each run's own",
@@ -43,11 +44,12 @@ class Design:
     """Proposed runs, the most useful first; `print` shows their commands as CSV.
 
     Attributes:
-        content: content of design.json, with expected stds after each run and savings over grids.
+        content: content of design.json, with expected stds after each run, and the numbers of runs
+            saved compared with grids.
         runs: the proposed runs.
         base_radius: distance of the wheels from the robot's centre [m].
-        validity: driven ranges by floor of the fit.
-        reachable: True if candidate runs can shrink every requested goal.
+        validity: ranges that the runs of the fit cover, by floor.
+        reachable: True if candidate runs can reduce the std of every requested goal.
     """
 
     content: Content
@@ -68,7 +70,7 @@ class Design:
 
 
 def design(fit: Fit, options: DesignOptions) -> Design:
-    """Propose the runs that shrink the wanted goals most, and count the savings over grids.
+    """Return the runs that reduce the stds of the goals most, and a comparison with grids of runs.
 
     Raises:
         DataError: the fit lacks a requested parameter, floor, load or prediction.
@@ -154,7 +156,7 @@ def _goals(fit: Fit, options: DesignOptions, scope: Scope, planner: Planner) -> 
 
 
 def _paths(fit: Fit, patterns: Sequence[str]) -> list[str]:
-    """Return the free parameters that match the patterns, in order."""
+    """Return the paths of the free parameters that match the patterns, in order of the patterns."""
     out: list[str] = []
     can = [e.path for e in fit.space.free if e.session is None]
     for pattern in patterns:
@@ -170,8 +172,8 @@ def _paths(fit: Fit, patterns: Sequence[str]) -> list[str]:
 def _out_of_reach(
     fit: Fit, goal: Goal, now: info.Information, last: info.Information, count: int
 ) -> str | None:
-    """Return the reason why no candidate shrinks a goal, None if one does."""
-    # priors of other numbers must not lend them a scale
+    """Return the reason why no candidate reduces a goal's std, None if one does."""
+    # without voltages, the scale of these numbers comes from priors of other numbers only
     scaleless = goal.name in NEEDS_VOLTAGE and not fit.channels.voltage
     part = goal.std(last) / goal.std(now)
     if part < REACHED and not scaleless:
@@ -182,7 +184,7 @@ def _out_of_reach(
 
 
 def _extrapolated(fit: Fit, runs: Sequence[PlannedRun]) -> list[str]:
-    """Return warnings for proposed runs outside the driven ranges, where the law is untested."""
+    """Return warnings for proposed runs outside the fitted ranges, where the law is untested."""
     out = []
     for floor, valid in fit.validity.items():
         mine = [d for d in runs if d.surface == floor]
@@ -210,10 +212,10 @@ def _saved(
     candidates: Sequence[PlannedRun],
     rows: info.RunJacobians,
 ) -> Content:
-    """Return how many runs, chosen greedily without earlier data, are worth as much as grids.
+    """Return the numbers of greedily chosen runs that reach the criterion of whole grids of runs.
 
-    The runs are chosen among the candidates and the grid's own runs. The grids cover the floors
-    and loads of earlier runs that the goals depend on.
+    Both begin without data. The runs are chosen among the candidates and the grid's own runs. The
+    grids cover the floors and load set-ups of the fit that the goals depend on.
     """
     setups = [s for s in scope.setups if any(g.is_about(s) for g in goals)]
     setups = [s for s in setups if s in scope.driven] or setups or list(scope.setups)

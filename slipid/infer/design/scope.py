@@ -98,7 +98,10 @@ class Scope:
 
     @cached_property
     def driven_speeds(self) -> dict[str, tuple[float, ...]]:
-        """A few driven speeds of each floor, or parts of the fastest wheel's rim speed [m/s]."""
+        """Up to `MOST_SPEEDS` speeds of each floor's runs [m/s].
+
+        Where none is known, they are half and all of the largest rim speed.
+        """
         out = {}
         for floor, valid in self.fit.validity.items():
             found = [v for v in valid.speeds if v > 0]
@@ -111,7 +114,7 @@ class Scope:
 
     @property
     def distance(self) -> dict[str, float]:
-        """Path length of each floor's candidates, the mean of its runs by default [m]."""
+        """Path length of each floor's candidates [m], by default the mean of its runs."""
         if self.options.distance is not None:
             return dict.fromkeys(self.fit.validity, self.options.distance)
         return {floor: round(v.distance, 2) for floor, v in self.fit.validity.items()}

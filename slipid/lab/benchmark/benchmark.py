@@ -25,7 +25,7 @@ from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
-SCHEMA = "slipid.lab.benchmark/1"
+SCHEMA = "slipid.benchmark/1"
 Tables = dict[str, dict[str, dict[str, RowSummary]]]
 """Row summaries, by name of the data set, then of the protocol, then of the row."""
 

@@ -27,7 +27,7 @@ from slipid.support.files import writable, write_json
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
-SCHEMA = "slipid.lab.selftest/1"
+SCHEMA = "slipid.selftest/1"
 CHANCE = 1e-3
 """Significance level of the two tests of a parameter's errors over all replicates.
 

@@ -219,7 +219,7 @@ def test_a_plan_with_voltage_recovers_the_motor(tested):
     out, _, _, result = tested
     assert result.exit_code == 0, result.output
     found = json.loads((out / "selftest.json").read_text(), parse_constant=pytest.fail)
-    assert found["schema"] == "slipid.lab.selftest/1"
+    assert found["schema"] == "slipid.selftest/1"
     assert (found["source"], found["replicates"], found["runs"]) == ("plan", 2, 14)
     for path in ("motor.resistance", "motor.back_emf", "motor.resistance/motor.back_emf"):
         e = found["parameters"][path]

@@ -1,1 +1,1 @@
-"""Bags of ROS messages: rosbag1, rosbag2 (sqlite3) and MCAP, read without a ROS install."""
+"""Reading of ROS bags (rosbag1, rosbag2 with sqlite3, MCAP) without an installation of ROS."""

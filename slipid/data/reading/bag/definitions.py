@@ -1,4 +1,7 @@
-"""Definitions of message types as numbers and texts, from bag, .msg files or ROS itself."""
+"""Definitions of message types: the numbers and texts in a message of each type.
+
+They come from the bag, else from .msg files, else from the standard types of ROS.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +16,7 @@ if TYPE_CHECKING:
     import rosbags.interfaces.typing
 
 FieldType = Union["NumberType", "TextType", "ArrayType", "MessageType"]
-"""Type of a field: one number, one text, several of a type, or another message."""
+"""Type of a field: a number, a text, an array, or another message."""
 _DTYPES = {
     **{f"int{8 * size}": f"i{size}" for size in (1, 2, 4, 8)},
     **{f"uint{8 * size}": f"u{size}" for size in (1, 2, 4, 8)},
@@ -25,24 +28,24 @@ _SEPARATOR = "=" * 80 + "\n"
 
 @dataclass(frozen=True)
 class NumberType:
-    """A number; `dtype` is its numpy type without byte order, such as `f8`."""
+    """Type of a number; `dtype` is its numpy type without byte order, such as `f8`."""
 
     dtype: str
 
     @property
     def size(self) -> int:
-        """Return the number of bytes."""
+        """Return the number of bytes of the number."""
         return int(self.dtype[1:])
 
 
 @dataclass(frozen=True)
 class TextType:
-    """A text in UTF-8."""
+    """Type of a text in UTF-8."""
 
 
 @dataclass(frozen=True)
 class ArrayType:
-    """Several elements of a type: `count` of them, or None where messages differ in length."""
+    """Type of an array of `count` elements; None if the count differs between messages."""
 
     element: FieldType
     count: int | None
@@ -50,7 +53,7 @@ class ArrayType:
 
 @dataclass(frozen=True)
 class MessageField:
-    """A field of a message by name."""
+    """A field of a message type: its name and its type."""
 
     name: str
     kind: FieldType
@@ -58,11 +61,11 @@ class MessageField:
 
 @dataclass(frozen=True)
 class MessageType:
-    """A type of message.
+    """A message type.
 
     Attributes:
-        name: such as `sensor_msgs/msg/Imu`.
-        fields: its fields in order.
+        name: name of the type, such as `sensor_msgs/msg/Imu`.
+        fields: fields of the type, in their order in a message.
     """
 
     name: str
@@ -70,12 +73,15 @@ class MessageType:
 
     @property
     def paths(self) -> dict[str, str]:
-        """Return the type of every number and text by its dotted path: `float64[]`, `text`."""
+        """Return the type, such as `float64[]` or `text`, of every number and text by its path.
+
+        A path has the names of nested fields, separated by dots.
+        """
         return dict(_below(self, ""))
 
 
 def _below(kind: FieldType, path: str) -> Iterator[tuple[str, str]]:
-    """Yield the paths at and below a field, with their types."""
+    """Yield the path and the type of every number and text in a field."""
     if isinstance(kind, NumberType):
         yield path, _NAMES.get(kind.dtype, kind.dtype)
     elif isinstance(kind, TextType):
@@ -83,7 +89,7 @@ def _below(kind: FieldType, path: str) -> Iterator[tuple[str, str]]:
     elif isinstance(kind, ArrayType):
         count = "" if kind.count is None else str(kind.count)
         for below, what in _below(kind.element, path):
-            # an array inside messages of an array: the brackets follow the name of the number
+            # Brackets follow the type of the number, also for arrays inside messages of an array.
             yield below, f"{what}[{count}]"
     else:
         for field in kind.fields:
@@ -91,7 +97,7 @@ def _below(kind: FieldType, path: str) -> Iterator[tuple[str, str]]:
 
 
 class NoDefinition(ValueError):
-    """Error about a type without definition; its argument is the name."""
+    """Error about a message type without definition; its argument is the name of the type."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,15 +105,15 @@ class Definitions:
     """Definitions of a bag's message types.
 
     Attributes:
-        own: types that the bag itself defines, as rosbags parsed them.
-        folder: folder of .msg files, or None; it is searched after `own`.
+        own: definitions in the bag itself, as rosbags parsed them.
+        folder: folder of .msg files, in which types that `own` lacks are searched, or None.
     """
 
     own: "rosbags.interfaces.typing.Typesdict"
     folder: Path | None
 
     def message(self, name: str) -> MessageType:
-        """Return a message type with all fields resolved; raise `NoDefinition` where one is not."""
+        """Return a message type with all nested types; raise `NoDefinition` if one is not found."""
         fields = self.own.get(name) or _from_folder(self.folder, name) or _standard().get(name)
         if fields is None:
             raise NoDefinition(name)
@@ -115,7 +121,7 @@ class Definitions:
         return MessageType(name, tuple(found))
 
     def _kind(self, description: "rosbags.interfaces.typing.FieldDesc") -> FieldType:
-        """Return the type of a field from its description."""
+        """Return the type of a field from its description by rosbags."""
         from rosbags.interfaces import Nodetype
 
         what = description[0]
@@ -140,14 +146,14 @@ def definition_of(
     """Return the definition of a topic's message type.
 
     Args:
-        path: the bag, for messages.
-        topic: the topic, for messages.
+        path: the bag, for error messages.
+        topic: the topic, for error messages.
         name: name of the type, such as `robotino_msgs/msg/MotorReadings`.
-        carried: definition in the bag, perhaps empty.
-        folder: folder of .msg files that are used where the bag has no definition, or None.
+        carried: definition in the bag; it may be empty.
+        folder: folder of .msg files that are used if the bag has no definition, or None.
 
     Raises:
-        DataError: it is defined nowhere, or the definition cannot be read.
+        DataError: the type is defined nowhere, or its definition cannot be read.
     """
     where = f"{path} topic '{topic}'"
     try:
@@ -174,7 +180,7 @@ def definition_of(
 def _parsed(
     name: str, carried: "rosbags.interfaces.MessageDefinition"
 ) -> "rosbags.interfaces.typing.Typesdict":
-    """Return the types in the text of a definition; empty where the bag carries none."""
+    """Return the types in the text of a definition; empty if the bag has no definition."""
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
@@ -193,7 +199,10 @@ def _parsed(
 def _from_folder(
     folder: Path | None, name: str
 ) -> "tuple[rosbags.interfaces.typing.Constdefs, rosbags.interfaces.typing.Fielddefs] | None":
-    """Return the definition in a .msg file, preferably below a folder of its package, or None."""
+    """Return the definition in a .msg file of the folder, or None if there is no such file.
+
+    A file below a folder with the name of the type's package is preferred.
+    """
     if folder is None:
         return None
     from rosbags.typesys import get_types_from_msg
@@ -209,7 +218,7 @@ def _from_folder(
 
 @lru_cache(maxsize=1)
 def _standard() -> "rosbags.interfaces.typing.Typesdict":
-    """Return the standard types of ROS 2 Humble; bags of Iron and later carry their own."""
+    """Return the standard types of ROS 2 Humble; bags of later versions contain definitions."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE).fielddefs

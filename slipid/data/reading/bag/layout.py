@@ -1,4 +1,4 @@
-"""Layout of a bag: the topic of each channel, and the rule that separates its runs."""
+"""Layout of a bag: the topic of each channel, and the rule that separates the bag's runs."""
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
@@ -18,9 +18,9 @@ GROUPS = {
     "pose": ("pose_x", "pose_y", "pose_heading"),
     "twist_command": ("twist_command_x", "twist_command_y", "twist_command_yaw"),
 }
-"""Channels that one message holds together, by their common name in a layout."""
+"""Groups of channels that one message contains, by the name of the group in a layout."""
 EFFORT = '"A" (current), "N*m" (motor_torque or wheel_torque), "V" (voltage) or "1" (duty)'
-"""Units that drivers use for the effort of a JointState."""
+"""Text, for error messages, about the units that drivers use for the effort of a JointState."""
 
 
 Texts = Annotated[tuple[StrictStr, ...], BeforeValidator(several)]
@@ -164,7 +164,7 @@ def declared_bag_layout(
 
 
 def _channel_problem(name: str, channel: TopicChannel) -> str | None:
-    """Return a contradiction within one channel, or None."""
+    """Return a text about a contradiction in the position of one channel, or None."""
     if channel.frame is not None and name != "pose":
         return "frame and child, which belong to a pose; expected neither"
     if name in GROUPS:
@@ -186,7 +186,7 @@ def _channel_problem(name: str, channel: TopicChannel) -> str | None:
 
 
 def _problem(layout: BagLayout) -> str | None:
-    """Return a contradiction within the layout, or None."""
+    """Return a text about a contradiction in the layout, or None."""
     have = set(layout.topics)
     for group, inner in GROUPS.items():
         if group in have and (twice := have & set(inner)):

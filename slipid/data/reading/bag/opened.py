@@ -1,4 +1,4 @@
-"""An open bag: its topics, their messages, and one type of error for all damage."""
+"""An open bag with its topics and messages; every damage is reported as a `DataError`."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -26,7 +26,7 @@ _METADATA = "copy the folder again, or run: ros2 bag reindex {file}"
 
 
 class RawMessage(NamedTuple):
-    """A stored message: its topic, time of receipt [ns] and bytes."""
+    """A message as stored: its topic, the time at which it was received [ns], and its bytes."""
 
     topic: str
     received: int
@@ -39,8 +39,8 @@ class MessageBatch:
 
     Attributes:
         topic: name of the topic.
-        received: time at which the recorder received each of them [ns].
-        data: their bytes.
+        received: time at which the recorder received each message [ns].
+        data: bytes of each message.
     """
 
     topic: str
@@ -54,10 +54,10 @@ class StoredTopic:
 
     Attributes:
         name: name of the topic.
-        type: type of its messages, such as `sensor_msgs/msg/Imu`; all types where there are
-            several.
+        type: type of the messages, such as `sensor_msgs/msg/Imu`; if there are several, all of
+            them joined by " and ".
         count: number of messages.
-        carried: definition of the type in the bag, perhaps empty.
+        carried: definition of the type in the bag; it may be empty.
     """
 
     name: str
@@ -68,12 +68,12 @@ class StoredTopic:
 
 @dataclass(frozen=True, eq=False)
 class OpenBag:
-    """A bag while it is open.
+    """A bag that is open for reading.
 
     Attributes:
-        files: its files.
-        readers: rosbags' readers, one for each separately read part.
-        notes: defects that were repaired, one sentence each.
+        files: files of the bag.
+        readers: readers of the package rosbags, one for each part that is read separately.
+        notes: defects of the files that were worked around, one sentence each.
     """
 
     files: BagFiles
@@ -82,12 +82,12 @@ class OpenBag:
 
     @property
     def path(self) -> Path:
-        """Return the name of the bag in messages."""
+        """Return the path of the bag, as error messages name it."""
         return self.files.path
 
     @property
     def cdr(self) -> bool:
-        """Return whether messages are serialised as in ROS 2."""
+        """Return whether messages are serialised as in ROS 2 (CDR), not as in ROS 1."""
         return self.files.storage != "rosbag1"
 
     @cached_property
@@ -101,15 +101,15 @@ class OpenBag:
 
     @property
     def end(self) -> int:
-        """Return the time of the last message [ns]."""
+        """Return the time at which the last message was received [ns]."""
         return max(reader.end_time for reader in self.readers)
 
     def messages(self, topics: Sequence[str], start: int | None = None) -> Iterator[RawMessage]:
         """Yield messages of some topics in the order in which they were received.
 
         Args:
-            topics: their names.
-            start: first time of receipt [ns]; earlier messages are left out.
+            topics: names of the topics.
+            start: messages received before this time [ns] are left out; None for all messages.
 
         Raises:
             DataError: the bag is damaged.
@@ -121,7 +121,7 @@ class OpenBag:
             yield RawMessage(connection.topic, received, data)
 
     def _stored(self, topics: Sequence[str], start: int | None) -> Iterator[Any]:
-        """Yield connection, time of receipt [ns] and data of messages, as rosbags does."""
+        """Yield the connection, time of receipt [ns] and bytes of each message, as rosbags does."""
         for reader in self.readers:
             if wanted := [c for c in reader.connections if c.topic in topics]:
                 try:
@@ -130,9 +130,9 @@ class OpenBag:
                     raise damage_error(self.files, error) from error
 
     def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
-        """Yield the same messages topic by topic, about a megabyte at a time.
+        """Yield all messages of some topics in batches of one topic, of about a megabyte.
 
-        All work for each single message is in this one loop, which takes most time of a big bag.
+        All work for single messages is in this loop, which takes most of the time for a large bag.
 
         Raises:
             DataError: the bag is damaged.
@@ -152,10 +152,10 @@ class OpenBag:
 
 
 def _source(reader: "Reader") -> Callable[..., Iterator[Any]]:
-    """Return the function that iterates over messages.
+    """Return the function that iterates over the messages of a reader.
 
-    Where an MCAP file has no index, rosbags refuses messages out of order, which slipid sorts
-    itself: the scan below it is used.
+    If an MCAP file has no index, `messages` of rosbags refuses messages that are not in order of
+    time. Slipid sorts messages itself, so the storage's plain scan is used instead.
     """
     storage = getattr(reader, "storage", None)
     if storage is not None and getattr(storage, "chunks", None) == []:
@@ -165,10 +165,10 @@ def _source(reader: "Reader") -> Callable[..., Iterator[Any]]:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[OpenBag]:
-    """Open a bag for reading, and close it.
+    """Return a context manager that opens a bag for reading, and closes it at its end.
 
     Raises:
-        DataError: there is none, or it is damaged; the message says how to repair it.
+        DataError: there is no bag, or it is damaged; the message says how to repair it.
     """
     files = files_of(path)
     with ExitStack() as stack:
@@ -177,7 +177,10 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
 
 
 def _readers(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str]]":
-    """Return open readers of a bag, which a stack closes, and notes on its defects."""
+    """Return open readers of a bag, and notes on defects that were worked around.
+
+    The readers are closed with the stack.
+    """
     notes = [
         f"{part.name}-wal has messages of the bag that are not read; "
         f"to add them run: sqlite3 {part} 'PRAGMA wal_checkpoint'"
@@ -222,14 +225,14 @@ def _reader(path: Path | RepairedMcap, files: BagFiles, stack: ExitStack) -> "Re
     try:
         if files.storage == "rosbag1":
             return stack.enter_context(rosbag1.Reader(files.path))
-        # a repaired file has the methods of a path that rosbags uses
+        # `RepairedMcap` has those methods of a path that rosbags calls.
         return stack.enter_context(rosbag2.Reader(cast(Path, path)))
-    except Exception as error:  # rosbags raises errors of many types on damaged bytes
+    except Exception as error:  # rosbags raises many types of errors on damaged bytes
         raise damage_error(files, error) from error
 
 
 def _topic(name: str, same: "list[rosbags.interfaces.Connection]") -> StoredTopic:
-    """Return a topic from its connections."""
+    """Return a topic from its connections, which are rosbags' records of its publishers."""
     types = dict.fromkeys(connection.msgtype for connection in same)
     carried = [c.msgdef for c in same if c.msgdef.format.value] or [same[0].msgdef]
     count = sum(connection.msgcount for connection in same)
@@ -237,7 +240,7 @@ def _topic(name: str, same: "list[rosbags.interfaces.Connection]") -> StoredTopi
 
 
 def damage_error(files: BagFiles, error: Exception) -> DataError:
-    """Return the error about a bag that rosbags cannot read."""
+    """Return the error about a bag that rosbags cannot read, with a remedy."""
     text = (str(error).splitlines() or [type(error).__name__])[0][:200]
     file = files.parts[0]
     if "not indexed" in text:

@@ -1,6 +1,6 @@
-"""Fields and units of known message types for each channel.
+"""Plan of reading a bag: for each channel its topics, and the numbers to take from their messages.
 
-Plan of reading a bag: for each channel its topics, and the numbers in their messages.
+The module also knows, for common message types, the fields and units that belong to each channel.
 """
 
 from dataclasses import dataclass
@@ -32,20 +32,21 @@ _JOINT_ARRAYS = {"position": "rad", "velocity": "rad/s", "effort": None}
 
 @dataclass(frozen=True)
 class _KnownField:
-    """Path of a known field, and the unit of its numbers."""
+    """Path of a field of a known message type, and the unit of its numbers."""
 
     path: str
     unit: str
 
 
-# Fields by the name of the type; without a package where several packages have a copy of it.
+# Known fields by channel, by name of the message type. The name has no package if several packages
+# have a copy of the type.
 _KNOWN: dict[str, dict[str, _KnownField]] = {
     "sensor_msgs/msg/Imu": {"gyro": _KnownField("angular_velocity.z", "rad/s")},
     "sensor_msgs/msg/BatteryState": {
         "bus_voltage": _KnownField("voltage", "V"),
         "current": _KnownField("current", "A"),
     },
-    # the packages robotino_msgs and rto_msgs
+    # These types are in the packages robotino_msgs and rto_msgs.
     "MotorReadings": {
         "motor_speed": _KnownField("velocities", "rpm"),
         "wheel_ticks": _KnownField("positions", "tick"),
@@ -72,8 +73,8 @@ class UnsuitableType(ValueError):
     """Error about a message type that does not fit a channel.
 
     Attributes:
-        found: type or field in the bag.
-        expected: types or settings that would fit.
+        found: text about the type or field in the bag.
+        expected: text about types or settings that would fit.
     """
 
     def __init__(self, found: str, expected: str) -> None:
@@ -83,14 +84,17 @@ class UnsuitableType(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class PickedNumbers:
-    """Numbers of a message that form a channel, with their unit; SI for poses and twists."""
+    """Numbers to take from a message for a channel, and their unit.
+
+    The unit is empty for poses and twists, whose numbers are in SI units.
+    """
 
     pick: Pick
     unit: str
 
 
 def fits(channel: str, message: MessageType) -> bool:
-    """Return whether messages of a type form a channel without any setting but their topic."""
+    """Return whether messages of a type contain a channel, with no setting needed but the topic."""
     if channel == "pose":
         return is_transforms(message) or bool(_group_paths(channel, message, ""))
     if channel == "twist_command":
@@ -101,15 +105,20 @@ def fits(channel: str, message: MessageType) -> bool:
 
 
 def is_transforms(message: MessageType) -> bool:
-    """Return whether messages hold transforms between frames, as those of `/tf` do."""
+    """Return whether messages of a type contain transforms between frames, like those of `/tf`."""
     return "transforms.transform.translation.x" in message.paths
 
 
 def group_meaning(channel: str, spec: TopicChannel, message: MessageType) -> PickedNumbers:
     """Return the numbers of a pose (x, y, quaternion or heading) or a twist (x, y, yaw rate).
 
+    Args:
+        channel: `pose` or `twist_command`.
+        spec: position of the channel in the layout.
+        message: type of the topic's messages.
+
     Raises:
-        UnsuitableType: the type holds none.
+        UnsuitableType: the type contains no pose or twist.
     """
     if channel == "twist_command" and message.name == _ODOMETRY:
         raise UnsuitableType(
@@ -127,10 +136,16 @@ def group_meaning(channel: str, spec: TopicChannel, message: MessageType) -> Pic
 def channel_meaning(
     channel: str, spec: TopicChannel, message: MessageType, joints: tuple[str, ...]
 ) -> PickedNumbers:
-    """Return the numbers of any other channel.
+    """Return the numbers of a channel that is not a pose or a twist.
+
+    Args:
+        channel: name of the channel.
+        spec: position of the channel in the layout.
+        message: type of the topic's messages.
+        joints: names of the drives' joints, for messages of the type JointState.
 
     Raises:
-        UnsuitableType: the type does not fit, or a field or a unit must be given.
+        UnsuitableType: the type does not fit, or a field or a unit must be given in the layout.
     """
     if message.name == JOINT_STATE and not any("[" in path for path in spec.fields):
         return _joint_meaning(channel, spec, joints)
@@ -156,7 +171,7 @@ def channel_meaning(
 
 
 def _joint_meaning(channel: str, spec: TopicChannel, joints: tuple[str, ...]) -> PickedNumbers:
-    """Return the numbers of a channel that is an array of JointState."""
+    """Return the numbers of a channel that comes from an array of JointState messages."""
     array = spec.fields[0] if spec.fields else _array_of(channel)
     if array not in _JOINT_ARRAYS or len(spec.fields) > 1:
         found = f"no array '{array}' in {JOINT_STATE}{did_you_mean(array, _JOINT_ARRAYS)}"
@@ -175,7 +190,7 @@ def _joint_meaning(channel: str, spec: TopicChannel, joints: tuple[str, ...]) ->
 
 
 def _array_of(channel: str) -> str:
-    """Return the most likely array of JointState for a channel."""
+    """Return the array of JointState that most likely contains a channel."""
     if channel.endswith("_angle"):
         return "position"
     return "velocity" if "_speed" in channel else "effort"
@@ -209,12 +224,15 @@ def _check_number(path: str, message: MessageType) -> None:
 
 
 def _known(message: MessageType) -> dict[str, _KnownField]:
-    """Return the known fields of a type, by its whole name, else without the package."""
+    """Return the known fields of a type, by channel; empty for an unknown type."""
     return _KNOWN.get(message.name) or _KNOWN.get(message.name.rsplit("/", 1)[-1], {})
 
 
 def _group_paths(channel: str, message: MessageType, prefix: str) -> tuple[str, ...]:
-    """Return the paths of the numbers of a pose or a twist at or below a field."""
+    """Return the paths of the numbers of a pose or a twist in a field; empty if there is none.
+
+    `prefix` is the path of the field, or empty for the whole message.
+    """
     for inner in _TWISTS if channel == "twist_command" else _POSES:
         at = ".".join(part for part in (prefix, inner) if part)
         dot = f"{at}." if at else ""
@@ -227,7 +245,7 @@ def _group_paths(channel: str, message: MessageType, prefix: str) -> tuple[str, 
 
 
 def _forms(channel: str) -> tuple[tuple[str, ...], ...]:
-    """Return the names of the numbers of a pose or a twist in messages."""
+    """Return the forms that a pose or a twist has in messages: names of its numbers, in order."""
     if channel == "twist_command":
         return (("linear.x", "linear.y", "angular.z"),)
     axes = ("x", "y", "z", "w")
@@ -247,7 +265,7 @@ def _listed(message: MessageType) -> str:
 
 @dataclass(frozen=True, eq=False)
 class TopicPick:
-    """Numbers of the messages of one topic."""
+    """Numbers to take from the messages of one topic."""
 
     topic: str
     message: MessageType
@@ -259,11 +277,11 @@ class ChannelPlan:
     """Source of the numbers of a channel, or of a pose or a twist.
 
     Attributes:
-        channel: its name in the layout.
-        spec: its section of the layout.
-        unit: unit of the numbers; empty for a pose or a twist, which are in SI.
-        wanted: the numbers, topic by topic.
-        links: chain of transforms that a pose is composed of; empty otherwise.
+        channel: name of the channel, pose or twist in the layout.
+        spec: position of the channel in the layout.
+        unit: unit of the numbers; empty for a pose or a twist, whose numbers are in SI units.
+        wanted: numbers to take from the messages of each topic.
+        links: chain of transforms that a pose is composed of; empty for other channels and poses.
     """
 
     channel: str
@@ -277,8 +295,8 @@ def plan(bag: OpenBag, layout: BagLayout) -> tuple[ChannelPlan, ...]:
     """Return the plan of every channel of a layout.
 
     Raises:
-        DataError: a topic is missing or empty, its messages do not fit the channel, or no
-            definition of them is found.
+        DataError: a topic is missing or empty, its messages do not fit the channel, or their type
+            has no definition.
     """
     return tuple(_planned(bag, layout, name, spec) for name, spec in layout.topics.items())
 
@@ -314,7 +332,10 @@ def _planned(bag: OpenBag, layout: BagLayout, channel: str, spec: TopicChannel) 
 def _transformed(
     bag: OpenBag, layout: BagLayout, spec: TopicChannel, topic: str, message: MessageType
 ) -> ChannelPlan:
-    """Return the plan of a pose from transforms, with those of the static topic."""
+    """Return the plan of a pose that is composed of transforms.
+
+    Constant transforms are taken from the topic with the suffix `_static`, if there is one.
+    """
     messages = {topic: message}
     static = topic + STATIC
     if static in bag.topics and bag.topics[static].count:
@@ -334,7 +355,11 @@ def _transformed(
 
 
 def message_of(bag: OpenBag, layout: BagLayout, name: str, channel: str) -> MessageType:
-    """Return the type of a topic's messages; `DataError` where the topic is missing or empty."""
+    """Return the type of a topic's messages.
+
+    Raises:
+        DataError: the topic is missing or empty, has several types, or has no definition.
+    """
     topic = bag.topics.get(name)
     if topic is None:
         found = f"no topic '{name}' for {channel}{did_you_mean(name, bag.topics)}"
@@ -349,7 +374,7 @@ def message_of(bag: OpenBag, layout: BagLayout, name: str, channel: str) -> Mess
 
 
 def _one_of(bag: OpenBag, layout: BagLayout, channel: str) -> str:
-    """Return the topics that fit a channel, else every topic, for error messages."""
+    """Return a text for error messages that lists the topics that fit a channel, or all topics."""
 
     def serves(topic: StoredTopic) -> bool:
         try:
@@ -367,7 +392,7 @@ def _one_of(bag: OpenBag, layout: BagLayout, channel: str) -> str:
 def first_shapes(
     bag: OpenBag, topic: str, message: MessageType, count: int
 ) -> tuple[MessageShape, ...]:
-    """Return the shapes of the first messages of a topic."""
+    """Return the shapes of the first `count` messages of a topic."""
     raws = islice(bag.messages((topic,)), count)
     try:
         return tuple(shape_of(raw.data, message, cdr=bag.cdr) for raw in raws)

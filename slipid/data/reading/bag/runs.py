@@ -1,4 +1,4 @@
-"""Begin and end of the runs of a bag: by a topic, by pauses or by a table."""
+"""Begin and end of the runs in a bag, which a topic, pauses or a table separate."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -20,23 +20,24 @@ from slipid.data.reading.signal import Signal
 from slipid.support.errors import bad_data, did_you_mean
 
 STILL = 0.02
-"""Angle [rad] or speed [rad/s] of a wheel below which it stands still."""
+"""Change of angle [rad], or speed [rad/s], above which a wheel moves."""
 PAUSE_S = 1.0
-"""Pause at which `slipid new` proposes to cut a long drive [s]."""
+"""Least pause between runs that `slipid new` proposes for a bag with one long drive [s]."""
 COLUMNS = ("start", "end", "surface", "load", "name", "bag")
-"""Possible columns of a table of runs; the first two are required."""
+"""Columns that a table of runs may have; the first two are required."""
 Value = str | float
 
 
 @dataclass(frozen=True)
 class RunSpan:
-    """One run in time.
+    """Interval of time of one run.
 
     Attributes:
-        start: its first time [s].
-        end: first time after it [s].
-        suffix: suffix of the bag's name; empty where the run gets a number.
-        surface: name of the floor, or None.
+        start: time at which the run starts [s].
+        end: time at which the run has ended [s].
+        suffix: suffix that follows the bag's name in the run's name; empty if the run has no name
+            of its own.
+        surface: name of the surface, or None.
         load: name of the load set-up, or None.
     """
 
@@ -50,9 +51,9 @@ class RunSpan:
 def run_spans(
     bag: OpenBag, layout: BagLayout, signals: Mapping[str, Signal], notes: list[str]
 ) -> tuple[RunSpan, ...]:
-    """Return the runs of a bag, or the whole bag where the layout has no rule.
+    """Return the runs in a bag; without a rule in the layout, the whole bag is one run.
 
-    Runs in which a wheel has fewer than two samples are left out, with a note.
+    Runs in which the wheels have fewer than two samples are left out, with a note.
 
     Raises:
         DataError: there is no run, or the topic or the table of runs is wrong.
@@ -77,14 +78,17 @@ def run_spans(
 
 
 def _sampled(signals: Mapping[str, Signal], span: RunSpan) -> bool:
-    """Return whether a run has two samples of every signal of the wheels, or of all without any."""
+    """Return whether every signal of the wheels has two samples in a run.
+
+    Without signals of the wheels, every signal must have them.
+    """
     moving = [signals[name] for name in TURNS if name in signals] or list(signals.values())
     ends = [np.searchsorted(signal.time, (span.start, span.end)) for signal in moving]
     return all(end - first >= 2 for first, end in ends)
 
 
 def _none(rule: RunRule, found: Sequence[RunSpan], samples: str) -> tuple[str, str]:
-    """Return texts about what was found instead of runs, and what was expected."""
+    """Return texts for the error that no run is usable: what was found, and what was expected."""
     times = ", ".join(f"{one.start:.3f} to {one.end:.3f} s" for one in found[:3])
     if rule.pause_s is not None:
         return "no run: no wheel moves", f"a wheel that turns by more than {STILL:g} rad"
@@ -103,7 +107,7 @@ def _none(rule: RunRule, found: Sequence[RunSpan], samples: str) -> tuple[str, s
 
 
 def _named(found: Sequence[RunSpan]) -> tuple[RunSpan, ...]:
-    """Return the runs with their names, else numbers; a single one needs none."""
+    """Return the runs with suffixes: those without a name get a number, except a single run."""
     if len(found) == 1:
         return tuple(found)
     width = max(2, len(str(len(found))))
@@ -113,11 +117,11 @@ def _named(found: Sequence[RunSpan]) -> tuple[RunSpan, ...]:
 
 
 def by_pauses(layout: BagLayout, signals: Mapping[str, Signal], pause_s: float) -> list[RunSpan]:
-    """Return the runs between pauses, each with half of the shortest pause before and after it.
+    """Return the runs between pauses, each extended by half of the shortest pause at both ends.
 
     Args:
-        layout: layout of the wheels.
-        signals: signals with one of `TURNS`.
+        layout: layout with the settings of the encoders.
+        signals: signals by channel; one of `TURNS` is among them.
         pause_s: shortest time without motion between two runs [s].
     """
     moves = _moves(layout, signals)
@@ -131,7 +135,7 @@ def by_pauses(layout: BagLayout, signals: Mapping[str, Signal], pause_s: float) 
 
 
 def _moves(layout: BagLayout, signals: Mapping[str, Signal]) -> Float[np.ndarray, " move"]:
-    """Return the times by which some wheel has moved [s]."""
+    """Return the times at which some wheel moves [s]."""
     name = next(name for name in TURNS if name in signals)
     time, values = signals[name].time, signals[name].values
     if name.startswith("motor_") or name == "wheel_ticks":
@@ -146,9 +150,9 @@ def _moves(layout: BagLayout, signals: Mapping[str, Signal]) -> Float[np.ndarray
 
 
 def _moved(angle: Float[np.ndarray, " sample"]) -> list[int]:
-    """Return the samples at which an angle has changed by `STILL` since the last such sample.
+    """Return the samples at which an angle [rad] has changed by `STILL` since the last such sample.
 
-    So neither the flickering last digit of an encoder nor noise counts as motion.
+    Therefore neither an encoder that flickers between two ticks nor noise counts as motion.
     """
     found, held = [], float(angle[0])
     changed = np.flatnonzero(np.diff(angle)) + 1
@@ -160,19 +164,19 @@ def _moved(angle: Float[np.ndarray, " sample"]) -> list[int]:
 
 
 def runs_between_pauses(log: Log, pause_s: float) -> int:
-    """Return the number of runs into which longer pauses of its wheels would cut a log."""
+    """Return the number of runs in a log if pauses longer than `pause_s` [s] separated them."""
     turned = np.abs(np.diff(log.wheel_angle, axis=0)) > STILL * np.diff(log.time)[:, None]
     moves = log.time[1:][turned.any(axis=1)]
     return int((np.diff(moves) > pause_s).sum()) + 1 if len(moves) else 0
 
 
 def by_table(path: Path, rule: RunRule, zero: float) -> list[RunSpan]:
-    """Return the runs in a CSV file.
+    """Return the runs that a CSV table lists.
 
     Args:
-        path: the bag; rows whose column `bag` names another are left out.
-        rule: the rule with the name of the table.
-        zero: time from which its times count [s].
+        path: the bag; rows whose column `bag` names another bag are left out.
+        rule: rule with the name of the table.
+        zero: time on the bag's clock at which the times of the table are 0 [s].
 
     Raises:
         DataError: the table is missing or wrong; the message names the row.
@@ -216,7 +220,14 @@ def _time(file: Path, row: int, column: str, cell: str | None) -> float:
 
 @dataclass(frozen=True)
 class _TimedValue:
-    """Value of one message with its time [s], and names of the floor and the load set-up."""
+    """Content of one message of the topic that separates runs.
+
+    Attributes:
+        time: time of the message [s].
+        value: value of the field that separates runs.
+        surface: name of the surface, or None.
+        load: name of the load set-up, or None.
+    """
 
     time: float
     value: Value
@@ -225,12 +236,14 @@ class _TimedValue:
 
     @property
     def marked(self) -> tuple[Value, str | None, str | None]:
-        """Return everything but the time."""
+        """Return value, surface and load; a run lasts while they stay the same."""
         return self.value, self.surface, self.load
 
 
 def by_topic(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[RunSpan]:
-    """Return one run for each constant value of a topic, except values between runs.
+    """Return a run for each time in which the topic's values stay the same.
+
+    The values that the rule names as being between runs are no runs.
 
     Raises:
         DataError: the topic or a field is missing.
@@ -248,7 +261,7 @@ def by_topic(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[RunSpan]:
 
 
 def _timed_values(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[_TimedValue]:
-    """Return every message of the topic in order of time."""
+    """Return the content of every message of the rule's topic, in order of time."""
     name = str(rule.topic)
     message = message_of(bag, layout, name, "runs")
     for path in (rule.field, rule.surface, rule.load):
@@ -273,7 +286,10 @@ def _timed_values(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[_Timed
 
 
 def _value(shape: MessageShape, block: np.ndarray, path: str) -> Value:
-    """Return the text or number at a path; ValueError where there is none."""
+    """Return the text or number at a path in a message; raise `ValueError` if there is none.
+
+    `block` has the bytes of the message, in a single row.
+    """
     steps = steps_of(path)
     if texts := shape.texts(steps):
         return texts[0]
@@ -284,6 +300,6 @@ def _value(shape: MessageShape, block: np.ndarray, path: str) -> Value:
 
 
 def _text(shape: MessageShape, path: str | None) -> str | None:
-    """Return the text at a path, None where there is none or it is empty."""
+    """Return the text at a path in a message, or None if there is no path or no text."""
     texts: Sequence[str] = shape.texts(steps_of(path)) if path else ()
     return (texts[0] or None) if texts else None

@@ -1,10 +1,10 @@
-"""Places of the numbers in the bytes of a serialised message.
+"""Positions of numbers in the bytes of serialised messages.
 
-Messages of one topic mostly have one shape: the same texts, and arrays of the same lengths. So one
-message is walked through field by field, and the numbers of all others that have its shape are
-taken from the same places, thousands at a time.
+Most messages of a topic have the same shape: equal texts, and arrays of equal lengths. So one
+message is decoded field by field, and the numbers of all others with the same shape are taken from
+the same byte positions, thousands of messages at a time.
 
-Numbers are picked by paths, by names of joints, or by frames of a transform.
+Numbers are picked by paths of fields, by names of joints, or by frames of a transform.
 """
 
 import struct
@@ -27,7 +27,7 @@ from slipid.data.reading.bag.definitions import (
 
 @dataclass(frozen=True)
 class PathStep:
-    """One step of a path: the name of a field, and the index of an element, or None for all."""
+    """One step of a path: the name of a field, and the index of an element or None for all."""
 
     name: str
     index: int | None = None
@@ -35,21 +35,21 @@ class PathStep:
 
 @dataclass(frozen=True)
 class BytePlace:
-    """A number in a message: its first byte, and its numpy type with byte order."""
+    """Position of a number in a message: its first byte, and its numpy type with byte order."""
 
     offset: int
     dtype: str
 
     def of(self, block: UInt8[np.ndarray, "message byte"]) -> Float[np.ndarray, " message"]:
-        """Return the number in each of some messages of one shape."""
+        """Return the number in each message of a block, all of one shape."""
         return self._cells(block).astype(float)
 
     def whole(self, block: UInt8[np.ndarray, "message byte"]) -> Int[np.ndarray, " message"]:
-        """Return the same for a whole number, without rounding."""
+        """Return the whole number in each message of a block, without rounding."""
         return self._cells(block).astype(np.int64)
 
     def _cells(self, block: UInt8[np.ndarray, "message byte"]) -> np.ndarray:
-        """Return the number in each message with its own type."""
+        """Return the number in each message, with the type that it has in the message."""
         cells = np.ascontiguousarray(block[:, self.offset : self.offset + int(self.dtype[2:])])
         return cells.view(self.dtype)[:, 0]
 
@@ -59,11 +59,11 @@ class MessageLeaf:
     """A number, an array of numbers or a text at one path of a message.
 
     Attributes:
-        path: the steps from the message to it.
-        dtype: type of its numbers, with byte order; empty for a text.
-        offset: first byte.
-        count: number of elements, None where it is no array.
-        text: content of a text.
+        path: path in the message.
+        dtype: numpy type of the numbers, with byte order; empty for a text.
+        offset: position of the first byte.
+        count: number of elements of an array; None for a single number or a text.
+        text: content of a text; empty for numbers.
     """
 
     path: tuple[PathStep, ...]
@@ -73,7 +73,7 @@ class MessageLeaf:
     text: str = ""
 
     def places(self, index: int | None) -> tuple[BytePlace, ...]:
-        """Return the places of its numbers, or of the one with an index."""
+        """Return the places of all numbers, or only of the one with an index."""
         size = int(self.dtype[2:])
         every = range(1 if self.count is None else self.count)
         if index is not None:
@@ -83,12 +83,13 @@ class MessageLeaf:
 
 @dataclass(frozen=True, eq=False)
 class MessageShape:
-    """Byte layout that messages of a topic have in common.
+    """Byte layout that many messages of a topic have in common.
 
     Attributes:
-        size: bytes of the message.
-        leaves: everything in it, in order.
-        fixed: bytes that are the same in all messages of this shape: texts and lengths of arrays.
+        size: number of bytes of a message.
+        leaves: all numbers, arrays and texts, in the order of the bytes.
+        fixed: positions of the bytes that are equal in all messages of this shape: those of texts
+            and of lengths of arrays.
         values: values of these bytes.
     """
 
@@ -98,11 +99,11 @@ class MessageShape:
     values: UInt8[np.ndarray, " fixed"]
 
     def fits(self, block: UInt8[np.ndarray, "message byte"]) -> Bool[np.ndarray, " message"]:
-        """Return which of some messages of its size have this shape."""
+        """Return whether each of some messages, all of this shape's size, has this shape."""
         return np.all(block[:, self.fixed] == self.values, axis=1)
 
     def places(self, path: Sequence[PathStep]) -> tuple[BytePlace, ...]:
-        """Return the places of the numbers at a path; empty where there are none."""
+        """Return the places of the numbers at a path; empty if there are none."""
         return tuple(p for leaf, index in self._at(path) if leaf.dtype for p in leaf.places(index))
 
     def texts(self, path: Sequence[PathStep]) -> tuple[str, ...]:
@@ -114,7 +115,7 @@ class MessageShape:
         return sum(1 if leaf.count is None else leaf.count for leaf, _ in self._at(path))
 
     def _at(self, path: Sequence[PathStep]) -> list[tuple[MessageLeaf, int | None]]:
-        """Return the leaves at a path, with the index of the element for each."""
+        """Return the leaves at a path, each with the index of an array element or None for all."""
         found = []
         for leaf in self._by_names.get(tuple(step.name for step in path), ()):
             ends = zip(leaf.path[:-1], path[:-1], strict=True)
@@ -135,7 +136,11 @@ class MessageShape:
 
 
 def steps_of(path: str) -> tuple[PathStep, ...]:
-    """Return the steps of a path such as `motors[0].current`; ValueError if it is none."""
+    """Return the steps of a path such as `motors[0].current`.
+
+    Raises:
+        ValueError: the text is not such a path.
+    """
     steps = []
     for part in path.split("."):
         name, bracket, rest = part.partition("[")
@@ -151,12 +156,12 @@ def shape_of(raw: bytes, message: MessageType, *, cdr: bool) -> MessageShape:
     """Return the shape of one message.
 
     Args:
-        raw: its bytes.
-        message: its type.
-        cdr: whether it is serialised as in ROS 2 (CDR), else as in ROS 1.
+        raw: bytes of the message.
+        message: type of the message.
+        cdr: whether the message is serialised as in ROS 2 (CDR), not as in ROS 1.
 
     Raises:
-        ValueError: the bytes are no such message; the text says why.
+        ValueError: the bytes are not a message of this type; the text says why.
     """
     walk = _MessageWalk(raw, cdr)
     walk.through(message, ())
@@ -169,7 +174,17 @@ def shape_of(raw: bytes, message: MessageType, *, cdr: bool) -> MessageShape:
 
 
 class _MessageWalk:
-    """A walk through the bytes of one message that collects its leaves."""
+    """Decoder that goes through the bytes of one message and collects its leaves.
+
+    Attributes:
+        raw: bytes of the message.
+        cdr: whether the message is serialised as in ROS 2 (CDR).
+        order: byte order of numbers, `<` or `>`.
+        at: position of the next byte.
+        origin: position from which alignment counts.
+        leaves: leaves found so far.
+        fixed: ranges of bytes of texts and lengths found so far.
+    """
 
     def __init__(self, raw: bytes, cdr: bool) -> None:
         self.raw, self.cdr, self.order = raw, cdr, "<"
@@ -211,7 +226,12 @@ class _MessageWalk:
             self.through(kind.element, (*before, PathStep(last.name, k)))
 
     def numbers(self, size: int, count: int) -> int:
-        """Pass some numbers and return their first byte."""
+        """Skip some numbers, aligned as CDR demands, and return the position of their first byte.
+
+        Args:
+            size: bytes of one number.
+            count: number of numbers.
+        """
         if count and self.cdr:
             self.at += -(self.at - self.origin) % size
         first = self.at
@@ -221,23 +241,23 @@ class _MessageWalk:
         return first
 
     def length(self) -> int:
-        """Pass the length of an array or a text, and return it."""
+        """Return the length of an array or a text, which comes next, and go past it."""
         at = self.numbers(4, 1)
         self.fixed.append((at, at + 4))
         return int(struct.unpack_from(self.order + "I", self.raw, at)[0])
 
     def text(self) -> str:
-        """Pass a text and return it."""
+        """Return the text that comes next, and go past it."""
         size = self.length()
         at = self.numbers(1, size)
         self.fixed.append((at, at + size))
         text = self.raw[at : at + size]
-        # CDR counts the zero at the end
+        # In CDR a text ends with a zero byte, which its length includes.
         return (text[:-1] if self.cdr else text).decode(errors="replace")
 
 
 _STAMPS = ("header.stamp", "stamp")
-"""Paths of the time in messages that have one."""
+"""Paths at which a message may have its own time."""
 POSITION = ("translation.x", "translation.y", "translation.z")
 ROTATION = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
 
@@ -247,9 +267,10 @@ class Located:
     """Places of the picked numbers in messages of one shape.
 
     Attributes:
-        seconds: seconds of the message's own time, None where it has none.
-        nanoseconds: nanoseconds of the message's own time, None where it has none.
-        numbers: picked numbers in order, None for one that is not in these messages.
+        seconds: place of the seconds of the message's own time, None if it has none.
+        nanoseconds: place of the nanoseconds of the message's own time, None if it has none.
+        numbers: places of the picked numbers in order, None for a number that is not in these
+            messages.
     """
 
     seconds: BytePlace | None
@@ -257,7 +278,7 @@ class Located:
     numbers: tuple[BytePlace | None, ...]
 
     def stamp(self, block: UInt8[np.ndarray, "message byte"]) -> Int[np.ndarray, " message"] | None:
-        """Return the messages' own times [ns], None where they have none."""
+        """Return the messages' own times [ns], or None if they have none."""
         if self.seconds is None or self.nanoseconds is None:
             return None
         return self.seconds.whole(block) * 10**9 + self.nanoseconds.whole(block)
@@ -265,23 +286,26 @@ class Located:
 
 @runtime_checkable
 class Pick(Protocol):
-    """Numbers picked from the messages of a topic, as any number of rows per message."""
+    """Rule that picks numbers from the messages of a topic.
+
+    A message yields any number of rows: for example none if it lacks the numbers.
+    """
 
     def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        """Return the rows in messages of a shape."""
+        """Return the places of the numbers of each row in a message of a shape."""
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Return the name of each number in a row; possibly none before the first message."""
+        """Return the name of each number in a row; it may be empty before the first message."""
 
 
 @dataclass(eq=False)
 class FieldPick:
-    """Numbers by the paths of their fields; an array without an index counts with all elements.
+    """Pick of numbers by the paths of their fields; a path to an array picks all its elements.
 
     Attributes:
         paths: paths of the fields.
-        names: name of each number in the first message.
+        names: names of the numbers, set by the first message with numbers.
     """
 
     paths: tuple[str, ...]
@@ -306,12 +330,12 @@ class FieldPick:
 
 @dataclass(eq=False)
 class JointPick:
-    """Numbers of joints by name, from messages like JointState.
+    """Pick of numbers by the names of joints, from messages like JointState.
 
     Attributes:
         joints: names of the picked joints, in the order of the columns.
         array: array with the numbers: `position`, `velocity` or `effort`.
-        names: every name that occurred in some message.
+        names: all names of joints that have occurred in some message.
     """
 
     joints: tuple[str, ...]
@@ -326,7 +350,7 @@ class JointPick:
         names = shape.texts((PathStep("name"),))
         self.names.update(dict.fromkeys(names))
         places = shape.places((PathStep(self.array),))
-        # an array may be empty; one of another length does not match the names
+        # The array may be empty; an array of another length does not match the names.
         have = dict(zip(names, places, strict=True)) if len(places) == len(names) else {}
         numbers = [have.get(joint) for joint in self.joints]
         if not any(numbers):
@@ -336,7 +360,7 @@ class JointPick:
 
 @dataclass(frozen=True)
 class Edge:
-    """A transform by its names: the pose of frame `child` in frame `parent`."""
+    """Names of the frames of a transform, which is the pose of frame `child` in frame `parent`."""
 
     parent: str
     child: str
@@ -344,7 +368,10 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class TransformPick:
-    """Translation and rotation of one edge in messages that hold several (TFMessage)."""
+    """Pick of the translation and rotation of one transform from messages with several of them.
+
+    The message type is TFMessage.
+    """
 
     edge: Edge
 
@@ -364,7 +391,10 @@ class TransformPick:
 
 
 def edges_of(shape: MessageShape) -> tuple[Edge, ...]:
-    """Return every transform of a TFMessage, without the leading slash of names in early ROS 1."""
+    """Return the frames of every transform in a TFMessage.
+
+    The leading slash that names have in early ROS 1 is removed.
+    """
     parents = shape.texts(steps_of("transforms.header.frame_id"))
     children = shape.texts(steps_of("transforms.child_frame_id"))
     pairs = zip(parents, children, strict=True)
@@ -374,7 +404,10 @@ def edges_of(shape: MessageShape) -> tuple[Edge, ...]:
 def located_with_time(
     shape: MessageShape, first: tuple[PathStep, ...], numbers: Sequence[BytePlace | None]
 ) -> Located:
-    """Return places with the time of the message, or of its part at the path `first`."""
+    """Return the places of picked numbers, with that of their time.
+
+    The time is that of the message, or of the part of it at the path `first`.
+    """
     for stamp in _STAMPS:
         whole, part = (
             shape.places((*first, *steps_of(f"{stamp}.{unit}"))) for unit in ("sec", "nanosec")

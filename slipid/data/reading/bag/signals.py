@@ -1,6 +1,6 @@
-"""Signals of channels, poses and twists, from rows of numbers of one or several topics.
+"""Signals of channels, poses and twists from the numbers in the messages of topics.
 
-The rows are sorted by the clock that the layout names, each time once.
+The rows are sorted by time on the clock that the layout selects; repeated times are left out.
 """
 
 from collections.abc import Sequence
@@ -20,18 +20,20 @@ from slipid.data.reading.units import factor
 from slipid.support.errors import DataError, did_you_mean, first_names
 
 APART_NOTED = 0.5
-"""Difference between two clocks that is worth a note [s]."""
+"""Difference between stamps and times of receipt above which there is a note [s]."""
 APART_REFUSED = 60.0
-"""Difference between two clocks that makes their times incomparable [s]."""
+"""Difference between stamps and times of receipt above which they cannot be combined [s]."""
 ABSURD = 1e30
-"""Number above any sensor's range, in whatever unit; the bag is damaged."""
+"""Magnitude that no sensor measures in any unit; such a number means that the bag is damaged."""
 TILT_NOTED = np.radians(20.0)
-"""Tilt of a robot on a floor that is worth a note, since the z axis may not point up [rad]."""
+"""Tilt of a pose above which there is a note, since the z axis may not point up [rad]."""
 _RECEIVED = 'to use the time of receipt set stamp = "received"'
 
 
 def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
-    """Return the rows of a stream in the order of their time, each time once.
+    """Return the rows of a stream in the order of their times, without repeated times.
+
+    Of several rows with the same time the last one is kept.
 
     Raises:
         DataError: stamps are zero, or the clock jumps back.
@@ -61,7 +63,7 @@ def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream
             f"{late.max() / 1e9:.3g} s were sorted"
         )
     order = np.argsort(time, kind="stable")
-    # the last of several messages with the same stamp is kept
+    # Of several messages with the same stamp the last one is kept.
     last = np.append(np.diff(time[order]) != 0, True)
     if repeated := int((~last).sum()):
         notes.append(
@@ -71,17 +73,17 @@ def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream
 
 
 def clock(stream: Stream, layout: BagLayout) -> Int[np.ndarray, " row"]:
-    """Return the time of each row on the clock that the layout names [ns]."""
+    """Return the time of each row on the clock that the layout selects [ns]."""
     if layout.stamp == "header" and stream.stamp is not None:
         return stream.stamp
     return stream.received
 
 
 def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str]) -> None:
-    """Compare the clock of stamped messages with that of the recorder where both are used.
+    """Append a note if stamps and times of receipt are both used and differ by `APART_NOTED`.
 
     Raises:
-        DataError: they are so far apart that their times cannot be compared.
+        DataError: they differ by more than `APART_REFUSED`.
     """
     bare, delays = [], {}
     for stream in streams:
@@ -107,17 +109,20 @@ def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str])
 
 
 def signal_of(stream: Stream, layout: BagLayout) -> Signal:
-    """Return the rows of a stream as in the messages, no unit converted, at their times."""
+    """Return the rows of a stream as a signal, with the numbers as in the messages.
+
+    No unit is converted.
+    """
     source = SignalSource(stream.path, stream.columns, stream.number, stream.topic)
     seconds, nanoseconds = np.divmod(clock(stream, layout), 10**9)
     return Signal(seconds + nanoseconds / 1e9, stream.values, source)
 
 
 def whole_signal(stream: Stream, layout: BagLayout, notes: list[str]) -> Signal:
-    """Return the rows of one stream that have every number, ordered in time.
+    """Return the complete rows of one stream as a signal, in the order of their times.
 
     Raises:
-        DataError: there are none, numbers are not finite, or the clock jumps.
+        DataError: numbers are not finite, or the clock jumps.
     """
     stream = in_time_order(finite(stream, layout, notes), layout, notes)
     whole = np.all(~stream.absent, axis=1)
@@ -133,20 +138,21 @@ def whole_signal(stream: Stream, layout: BagLayout, notes: list[str]) -> Signal:
 def side_by_side(
     streams: Sequence[Stream], layout: BagLayout, notes: list[str], *, by_name: bool
 ) -> Signal:
-    """Return columns of several topics, or of messages that have some of them only, side by side.
+    """Return a signal whose columns come from different messages.
 
-    They are at the times of the first column; the others are interpolated linearly there, and times
-    that they do not span are left out.
+    They come from several topics, or from messages that have only some of the columns. The signal
+    has the times of the first column, to which the others are interpolated linearly; times outside
+    the record of some column are left out.
 
     Args:
         streams: streams with the columns.
         layout: layout of the bag.
         notes: list to which notes are appended.
-        by_name: whether the streams have the same columns, of which each is taken from the first
-            stream with numbers in it; else all columns of all streams are used.
+        by_name: whether all streams have the same columns, so that each column is taken from the
+            first stream with numbers in it; else all columns of all streams are used.
 
     Raises:
-        DataError: as `whole_signal`, or no time is common to the columns.
+        DataError: numbers are not finite, a clock jumps, or the columns share no time.
     """
     ordered = [in_time_order(finite(one, layout, notes), layout, notes) for one in streams]
     columns = _columns(ordered, layout, by_name)
@@ -174,7 +180,7 @@ def _columns(streams: Sequence[Stream], layout: BagLayout, by_name: bool) -> lis
     """Return each column as a signal of its own."""
     pairs = [(stream, j) for stream in streams for j in range(len(stream.columns))]
     if by_name:
-        # every stream has a column for every joint, and most of them are empty
+        # Every stream has a column for every joint, but most of its columns are empty.
         having = [(stream, j) for stream, j in pairs if not stream.absent[:, j].all()]
         owner = {j: stream for stream, j in reversed(having)}
         pairs = [(owner[j], j) for j in sorted(owner)]
@@ -193,7 +199,13 @@ def mostly_whole(stream: Stream) -> bool:
 
 
 def finite(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
-    """Return rows without NaN, where the layout drops these; `DataError` for other bad numbers."""
+    """Return the rows with finite numbers.
+
+    Rows with NaN are left out, with a note, if the layout says so (`drop_nan`).
+
+    Raises:
+        DataError: there are other numbers that are not finite, or no row is left.
+    """
     bad = ~np.all(np.abs(stream.values) < ABSURD, axis=1)
     if not bad.any():
         return stream
@@ -217,7 +229,7 @@ def finite(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
 def channel_signal(
     plan: ChannelPlan, streams: Sequence[Stream], layout: BagLayout, notes: list[str]
 ) -> Signal:
-    """Return the signal of a channel.
+    """Return the signal of a channel, in SI units.
 
     Args:
         plan: plan of the channel.
@@ -226,7 +238,7 @@ def channel_signal(
         notes: list to which notes are appended.
 
     Raises:
-        DataError: a joint or a number is missing, not finite, or out of time.
+        DataError: a joint or a number is missing or not finite, or a clock jumps.
     """
     by_name = isinstance(plan.wanted[0].pick, JointPick)
     if by_name:
@@ -250,7 +262,7 @@ def channel_signal(
 
 
 def checked_stream(stream: Stream) -> Stream:
-    """Return the same stream; raise `DataError` where no message has the numbers."""
+    """Return the given stream; raise `DataError` if no message has its numbers."""
     if len(stream.number):
         return stream
     found = f"no numbers in {', '.join(stream.columns)} of any message"
@@ -258,7 +270,7 @@ def checked_stream(stream: Stream) -> Stream:
 
 
 def _check_joints(plan: ChannelPlan, streams: Sequence[Stream]) -> None:
-    """Raise `DataError` for joints that no message has, with the names in the messages."""
+    """Raise `DataError` if a joint is in no message, or has no number in any."""
     picks = [wanted.pick for wanted in plan.wanted if isinstance(wanted.pick, JointPick)]
     there = list(dict.fromkeys(name for pick in picks for name in pick.names))
     for j, joint in enumerate(picks[0].joints):
@@ -283,7 +295,7 @@ def group_signals(
         notes: list to which notes are appended.
 
     Raises:
-        DataError: numbers are missing, not finite, or out of time.
+        DataError: numbers are missing or not finite, or a clock jumps.
     """
     if plan.links:
         samples = _transformed(plan, streams, layout, notes)
@@ -293,7 +305,7 @@ def group_signals(
     if plan.channel == "pose":
         values = _planar(samples, notes)
     names = GROUPS[plan.channel]
-    # one column each, all at the times of the messages
+    # Each signal has a single column; all have the times of the messages.
     return {
         name: Signal(samples.time, values[:, [j]], _column(samples.source, j))
         for j, name in enumerate(names)
@@ -301,7 +313,10 @@ def group_signals(
 
 
 def _column(source: SignalSource, j: int) -> SignalSource:
-    """Return the source of one column; a heading may come from a whole quaternion."""
+    """Return the source of column j of a pose or a twist, for messages.
+
+    A heading from a quaternion is named by the quaternion.
+    """
     names = source.columns
     name = names[min(j, len(names) - 1)]
     if j == 2 and len(names) > 3:
@@ -310,7 +325,10 @@ def _column(source: SignalSource, j: int) -> SignalSource:
 
 
 def _planar(samples: Signal, notes: list[str]) -> Float[np.ndarray, "sample 3"]:
-    """Return x, y and heading from x, y and a quaternion, or from x, y and a wrapped heading."""
+    """Return x [m], y [m] and heading [rad], without wrap-around, of poses.
+
+    The samples have x, y and either a quaternion or a heading. A large tilt is noted.
+    """
     place = samples.values[:, :2]
     if samples.values.shape[1] == 3:
         return np.column_stack([place, np.unwrap(samples.values[:, 2])])
@@ -326,12 +344,13 @@ def _planar(samples: Signal, notes: list[str]) -> Float[np.ndarray, "sample 3"]:
 def _transformed(
     plan: ChannelPlan, streams: Sequence[Stream], layout: BagLayout, notes: list[str]
 ) -> Signal:
-    """Return x, y and the quaternion of a chain of transforms."""
+    """Return the signal of x, y and the quaternion of a pose composed of a chain of transforms."""
     moving: dict[Edge, TransformSeries] = {}
     sources: dict[Edge, SignalSource] = {}
     for stream, wanted in zip(streams, plan.wanted, strict=True):
         assert isinstance(wanted.pick, TransformPick)
-        # moving topics come first in a plan; the static one repeats constant transforms
+        # In a plan, topics of changing transforms come first. The static topic repeats constant
+        # transforms, of which the last message is used.
         if wanted.pick.edge not in moving and len(stream.number):
             if stream.topic.endswith(STATIC):
                 stream = finite(stream.part(np.array([len(stream.number) - 1])), layout, notes)
@@ -359,7 +378,7 @@ def _transformed(
 def _unit(
     rotation: Float[np.ndarray, "sample 4"], source: SignalSource
 ) -> Float[np.ndarray, "sample 4"]:
-    """Return quaternions of length 1; raise `DataError` where they are far from it."""
+    """Return quaternions normalised to length 1; raise `DataError` if one is far from it."""
     length = np.linalg.norm(rotation, axis=1)
     wrong = np.flatnonzero(np.abs(length - 1.0) > 0.1)
     if len(wrong):

@@ -1,6 +1,6 @@
-"""Files of a bag, their type and hash.
+"""Files of a bag, their storage format and hash.
 
-An MCAP file that was cut off is presented to a reader as if it ended with its last whole record.
+An MCAP file that was cut off can be read as if it ended after its last complete record.
 """
 
 import hashlib
@@ -29,13 +29,13 @@ _BLOCK = 1 << 20
 
 @dataclass(frozen=True)
 class BagFiles:
-    """The files of one bag.
+    """Files of one bag.
 
     Attributes:
         path: the given file, or the folder of a rosbag2.
         storage: storage format of the messages.
-        parts: the files with messages, in order of their numbers.
-        metadata: metadata.yaml of a rosbag2 folder, None for a single file or where it is missing.
+        parts: files with messages, sorted by the numbers in their names.
+        metadata: metadata.yaml of a rosbag2 folder, None for a single file or if it is missing.
     """
 
     path: Path
@@ -45,7 +45,10 @@ class BagFiles:
 
     @property
     def sha256(self) -> str:
-        """Return the hash of the only file, else of the lines that sha256sum would print."""
+        """Return the SHA-256 hash of the bag.
+
+        It is the hash of the file, or for several files that of the text that `sha256sum` prints.
+        """
         files = [*self.parts, *([self.metadata] if self.metadata else [])]
         if len(files) == 1:
             return _hash(files[0])
@@ -58,10 +61,10 @@ def files_of(path: Path) -> BagFiles:
     """Return the files of a bag.
 
     Args:
-        path: a file, the folder of a rosbag2, or the metadata.yaml in it.
+        path: a file, the folder of a rosbag2, or the metadata.yaml in such a folder.
 
     Raises:
-        DataError: there is no bag.
+        DataError: there is no bag at the path.
     """
     if path.name == "metadata.yaml":
         path = path.parent
@@ -81,7 +84,11 @@ def files_of(path: Path) -> BagFiles:
 
 
 def _storage_of(path: Path) -> Storage:
-    """Return the storage format by a file's first bytes, which must agree with its name."""
+    """Return the storage format of a file by its first bytes.
+
+    Raises:
+        DataError: the file is not a bag, or its suffix is that of another format.
+    """
     try:
         with path.open("rb") as file:
             start = file.read(16)
@@ -99,13 +106,13 @@ def _storage_of(path: Path) -> Storage:
 
 
 def _numbers_in_name(path: Path) -> tuple[tuple[int, str], ...]:
-    """Return a key that sorts `bag_10` after `bag_9`."""
+    """Return a key that sorts file names by the numbers in them, `bag_10` after `bag_9`."""
     parts = re.split(r"(\d+)", path.name)
     return tuple((int(part), "") if part.isdigit() else (-1, part) for part in parts)
 
 
 def _hash(path: Path) -> str:
-    """Return the hash of a file, read block by block."""
+    """Return the SHA-256 hash of a file, which is read block by block."""
     digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
@@ -117,17 +124,17 @@ def _hash(path: Path) -> str:
 
 
 _DATA_END, _FOOTER = 0x0F, 0x02
-# A footer without a summary, so that readers go through the records themselves.
+# End of an MCAP file without a summary, so that readers go through all records.
 _END = struct.pack("<BQQQI", _FOOTER, 20, 0, 0, 0) + _MAGIC["mcap"]
 
 
 @dataclass(frozen=True)
 class RepairedMcap:
-    """Path of a cut MCAP file that opens as a whole one.
+    """Object like a path, which opens a cut MCAP file as if it were complete.
 
     Attributes:
-        path: the file.
-        end: byte after its last whole record.
+        path: path of the file.
+        end: position after the last complete record [byte].
     """
 
     path: Path
@@ -152,12 +159,12 @@ class RepairedMcap:
         return False
 
     def open(self, *_: object, **__: object) -> io.BufferedReader:
-        """Return the whole records, followed by an end."""
+        """Return a stream of the complete records, followed by the end of an MCAP file."""
         return io.BufferedReader(_RepairedBytes(self.path, self.end), buffer_size=1 << 16)
 
 
 def repaired(path: Path) -> RepairedMcap | None:
-    """Return the whole records of a cut MCAP file, or None if there are none or it is complete."""
+    """Return a cut MCAP file up to its last complete record, or None if it has no message."""
     size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(8) != _MAGIC["mcap"]:
@@ -168,16 +175,16 @@ def repaired(path: Path) -> RepairedMcap | None:
             if len(head) < 9:
                 break
             kind, length = struct.unpack("<BQ", head)
-            # no message follows the begin of the summary
+            # After the end of the data there are no more messages.
             if kind == _DATA_END or kind == 0 or end + 9 + length > size:
                 break
             end, records = file.seek(end + 9 + length), records + 1
-    # the first record is a header, which alone is not a bag
+    # The first record is a header; a file with nothing else contains no message.
     return RepairedMcap(path, end) if records > 1 else None
 
 
 class _RepairedBytes(io.RawIOBase):
-    """Bytes of a file up to an end, followed by the end of an MCAP file."""
+    """Stream of the bytes of a file up to a position, followed by the end of an MCAP file."""
 
     def __init__(self, path: Path, end: int) -> None:
         super().__init__()

@@ -1,4 +1,7 @@
-"""Messages of a topic as arrays that grow batch by batch; no message is kept."""
+"""Collection of the picked numbers of a topic's messages, batch by batch, in arrays.
+
+The messages themselves are not kept in memory.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -13,9 +16,11 @@ from slipid.data.reading.bag.shape import Located, MessageShape, Pick, shape_of
 from slipid.support.errors import DataError, bad_data
 
 MAX_SHAPES = 256
-"""Number of remembered shapes of a topic; when there are more, all are forgotten."""
+"""Largest number of known shapes of a topic; when it is reached, all are forgotten, to save memory
+and time."""
 FEW_SHAPES = 16
-"""Number of new shapes in a batch that are searched in all of it; then each message has its own."""
+"""Number of new shapes in a batch with which all its messages are compared; after these, every
+message is decoded on its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,14 +28,14 @@ class Stream:
     """Rows of numbers from the messages of a topic, in the order of receipt.
 
     Attributes:
-        path: the bag.
-        topic: the topic.
-        columns: name of each number of a row.
-        stamp: the messages' own time [ns], or None where they have none.
-        received: time at which the recorder received them [ns].
-        number: number of the message in its topic, from 1.
-        values: the numbers, as they are in the messages.
-        absent: True for numbers that the message did not have, such as other joints.
+        path: path of the bag.
+        topic: name of the topic.
+        columns: name of each number in a row.
+        stamp: the messages' own times [ns], or None if they have none.
+        received: times at which the recorder received the messages [ns].
+        number: number of the row's message in its topic, from 1.
+        values: numbers as in the messages, 0 where absent.
+        absent: True for numbers that the message does not have, such as those of other joints.
     """
 
     path: Path
@@ -43,12 +48,12 @@ class Stream:
     absent: Bool[np.ndarray, "row column"]
 
     def error(self, found: str, expected: str, row: int | None = None) -> DataError:
-        """Return the error about a row (counted from 0), or about the topic."""
+        """Return the error about a row, counted from 0, or (None) about the topic."""
         message = None if row is None else int(self.number[row])
         return topic_error(self.path, self.topic, found, expected, message)
 
     def part(self, which: Int[np.ndarray, " part"] | Bool[np.ndarray, " row"]) -> "Stream":
-        """Return some of the rows."""
+        """Return the selected rows."""
         return replace(
             self,
             stamp=None if self.stamp is None else self.stamp[which],
@@ -61,7 +66,7 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class _KnownShape:
-    """A known shape, and the places of each pick's numbers in it."""
+    """A shape that has occurred before, and for each pick the places of its rows of numbers."""
 
     shape: MessageShape
     places: tuple[tuple[Located, ...], ...]
@@ -69,7 +74,13 @@ class _KnownShape:
 
 @dataclass(frozen=True, eq=False)
 class _SameShape:
-    """Messages of one shape: indices in a batch, bytes, and places as in `_KnownShape`."""
+    """Messages of one shape in a batch.
+
+    Attributes:
+        which: indices of the messages in the batch.
+        block: bytes of the messages.
+        places: for each pick the places of its rows of numbers.
+    """
 
     which: Int[np.ndarray, " message"]
     block: UInt8[np.ndarray, "message byte"]
@@ -77,7 +88,7 @@ class _SameShape:
 
 
 class TopicStreams:
-    """Collector of the picked numbers in the messages of a topic."""
+    """Collector of the picked numbers in the messages of one topic."""
 
     def __init__(
         self, path: Path, topic: str, message: MessageType, picks: Sequence[Pick], *, cdr: bool
@@ -89,7 +100,7 @@ class TopicStreams:
         self._shapes: dict[int, list[_KnownShape]] = {}
 
     def add(self, batch: MessageBatch) -> None:
-        """Add the next messages of the topic."""
+        """Add the numbers in the next messages of the topic."""
         if set(map(type, batch.data)) != {bytes}:
             raise topic_error(self.path, self.topic, "a message that is no bytes", "a whole bag")
         received = np.array(batch.received, dtype=np.int64)
@@ -101,7 +112,7 @@ class TopicStreams:
         self.count += len(received)
 
     def stream(self, pick: Pick) -> Stream:
-        """Return every row of one of the picks."""
+        """Return all rows collected so far for one of the picks."""
         parts = self._rows[self.picks.index(pick)]
         widths = {part.values.shape[1] for part in parts}
         if len(widths) > 1:
@@ -123,12 +134,12 @@ class TopicStreams:
             values=_concatenated([part.values for part in parts], empty),
             absent=_concatenated([part.absent for part in parts], empty.astype(bool)),
         )
-        # the rows of different shapes, and of transforms of one message, are appended in turn
+        # Rows were appended shape by shape, and transform by transform, not in order of messages.
         in_order = (np.diff(number) >= 0).all()
         return stream if in_order else stream.part(np.argsort(number, kind="stable"))
 
     def _by_shape(self, data: Sequence[bytes]) -> Iterator[_SameShape]:
-        """Yield messages by shape."""
+        """Yield the messages of a batch, grouped by their shape."""
         lengths = np.fromiter(map(len, data), np.int64, len(data))
         for length in np.unique(lengths).tolist():
             rest = np.flatnonzero(lengths == length)
@@ -150,7 +161,10 @@ class TopicStreams:
                     rest, block = rest[~same], block[~same]
 
     def _known(self, data: bytes, number: int) -> _KnownShape:
-        """Return the new shape of a message, with the places of the picked numbers."""
+        """Return the shape of a message, and add it to the known shapes.
+
+        `number` is the number of the message in its topic, for errors.
+        """
         try:
             shape = shape_of(data, self.message, cdr=self.cdr)
         except ValueError as error:
@@ -171,7 +185,7 @@ class TopicStreams:
         number: Int[np.ndarray, " message"],
         located: Located,
     ) -> Stream:
-        """Return the picked numbers of some messages of one shape."""
+        """Return a row of picked numbers for each of some messages of one shape."""
         columns = [np.zeros(len(block)) if p is None else p.of(block) for p in located.numbers]
         absent = np.tile([place is None for place in located.numbers], (len(block), 1))
         where = (self.path, self.topic, pick.columns)
@@ -180,7 +194,7 @@ class TopicStreams:
 
 
 def _concatenated(parts: Sequence[np.ndarray], none: np.ndarray) -> np.ndarray:
-    """Return arrays end to end, or `none` where there are none."""
+    """Return arrays end to end, or `none` if there are no arrays."""
     return np.concatenate(parts) if parts else none
 
 

@@ -1,7 +1,7 @@
 """Topics and runs of a bag.
 
-Topics are listed with the content of their first messages, without reading the whole bag. Reading a
-bag returns every channel of a layout, each at its own times, run by run.
+`topics_of` describes every topic by its first messages, without reading the whole bag. `read_bag`
+returns the runs of a bag, each with all channels of a layout at their own times.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from slipid.data.reading.signal import Signal
 from slipid.support.errors import DataError
 
 _FIRST_MESSAGES = 10
-"""Number of first messages of a topic that are examined."""
+"""Number of first messages of a topic that its description is based on."""
 _SECOND = 10**9
 _SELF_EXPLAINED = (
     "pose",
@@ -41,11 +41,11 @@ _JOINTS = {"wheel_angle": "position", "wheel_speed": "velocity"}
 
 @dataclass(frozen=True)
 class TopicField:
-    """A number, text or array in the messages of a topic.
+    """Description of a number, text or array in the messages of a topic.
 
     Attributes:
-        path: its path in a layout, such as `motors.current`.
-        type: such as `float64`, `float64[]`, `text`.
+        path: path by which a layout names it, such as `motors.current`.
+        type: type, such as `float64`, `float64[]` or `text`.
         count: number of elements in the first message.
     """
 
@@ -56,20 +56,21 @@ class TopicField:
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag.
+    """Description of a topic of a bag.
 
     Attributes:
         name: name of the topic.
-        type: type of its messages, such as `sensor_msgs/msg/JointState`.
+        type: type of the messages, such as `sensor_msgs/msg/JointState`.
         count: number of messages.
-        first: time of receipt of the first message [s], None where there is none.
-        last: time of receipt of the last message [s].
-        fields: fields of its messages; empty where there are none, or `problem` says why.
-        joints: names in the first messages of a JointState.
+        first: time of receipt of the first message [s], None if there is none.
+        last: time of receipt of the last message [s], None if there is none.
+        fields: fields of the messages; empty if there is no message or they could not be examined.
+        joints: names of joints in the first messages of type JointState.
         frames: parent and child of each transform in the first messages, as `map -> base_link`.
-        serves: channels, or groups of them, that a layout may take from it without a field or a
-            unit; the effort of joints is not among them, since its meaning is unknown.
-        problem: reason why its messages could not be examined, or None.
+        serves: channels, or groups of channels, that a layout can take from the topic without
+            naming a field or a unit; the effort of joints is not among them, since its meaning is
+            unknown.
+        problem: reason why the messages could not be examined, or None.
     """
 
     name: str
@@ -85,14 +86,14 @@ class Topic:
 
 
 def topics_of(path: Path, definitions: Path | None = None) -> tuple[Topic, ...]:
-    """Return every topic of a bag, from its index and the first messages of each.
+    """Return the description of every topic of a bag, from its index and first messages.
 
     Args:
         path: a .bag, .db3 or .mcap file, the folder of a rosbag2, or the metadata.yaml in it.
-        definitions: folder of .msg files, for types whose definition the bag lacks.
+        definitions: folder of .msg files, for types whose definition the bag lacks, or None.
 
     Raises:
-        DataError: it is no bag, or is damaged.
+        DataError: there is no bag, or it is damaged.
     """
     with open_bag(path) as bag:
         return tuple(_described(bag, stored, definitions) for stored in bag.topics.values())
@@ -122,21 +123,27 @@ def _described(bag: OpenBag, stored: StoredTopic, definitions: Path | None) -> T
 
 
 def _served(message: MessageType, shape: MessageShape) -> tuple[str, ...]:
-    """Return the channels that messages of a type have by themselves, and filled-in joints."""
+    """Return the channels that messages of a type contain, for `Topic.serves`.
+
+    For a JointState these are the channels whose arrays are not empty.
+    """
     if message.name == JOINT_STATE:
         return tuple(name for name, array in _JOINTS.items() if shape.places(steps_of(array)))
     return tuple(name for name in _SELF_EXPLAINED if fits(name, message))
 
 
 def _fields(message: MessageType, shape: MessageShape) -> tuple[TopicField, ...]:
-    """Return all fields of a type of message, with their number of elements in one message."""
+    """Return the fields of a message type, with the number of elements in one message."""
     return tuple(
         TopicField(path, what, shape.count(steps_of(path))) for path, what in message.paths.items()
     )
 
 
 def _last(bag: OpenBag, stored: StoredTopic, known: int) -> int:
-    """Return the time of receipt of a topic's last message [ns], searched from the bag's end."""
+    """Return the time of receipt of a topic's last message [ns].
+
+    It is searched backwards from the end of the bag, to time `known` [ns] of an earlier message.
+    """
     back = _SECOND
     while (start := bag.end - back) > known:
         received = [raw.received for raw in bag.messages((stored.name,), start)]
@@ -151,12 +158,13 @@ class BagRun:
     """One run of a bag.
 
     Attributes:
-        name_suffix: suffix of the bag's name: empty for the only run, else `#03` or `#name`.
-        sha256: hash of the bag's files.
+        name_suffix: suffix that follows the bag's name in the run's name, such as `#03` or `#name`;
+            empty for a single run.
+        sha256: SHA-256 hash of the bag's files.
         signals: signals by channel, in the units of `CHANNELS`; a pose as pose_x, pose_y and
             pose_heading (without wrap-around), a twist as twist_command_x, _y and _yaw.
-        surface: name of the floor in the bag or the table of runs, else None.
-        load: name of the load set-up, likewise.
+        surface: name of the surface, if the bag or the table of runs gives it, else None.
+        load: name of the load set-up, if the bag or the table of runs gives it, else None.
         notes: repairs and omissions, one sentence each.
     """
 
@@ -173,19 +181,19 @@ def read_bag(path: Path, layout: BagLayout) -> tuple[BagRun, ...]:
 
     Args:
         path: a .bag, .db3 or .mcap file, the folder of a rosbag2, or the metadata.yaml in it.
-        layout: topics of the channels.
+        layout: layout of the bag.
 
     Raises:
         DataError: the bag is damaged, or does not match the layout; the message names the topic,
             what is there, and the next step.
     """
     with open_bag(path) as bag, ThreadPoolExecutor(1) as beside:
-        # hashing releases the interpreter lock, so on two cores it takes no extra time
+        # Hashing releases the interpreter lock, so on two cores it runs while the bag is read.
         sha256 = beside.submit(lambda: bag.files.sha256)
         notes = list(bag.notes)
         signals = _signals(bag, layout, notes)
         spans = run_spans(bag, layout, signals, notes)
-        # two channels of one topic repeat its notes
+        # If two channels come from one topic, its notes occur twice.
         unique = tuple(dict.fromkeys(notes))
         return tuple(_run(signals, span, sha256.result(), unique) for span in spans)
 
@@ -207,7 +215,7 @@ def _run(
 
 
 def _signals(bag: OpenBag, layout: BagLayout, notes: list[str]) -> dict[str, Signal]:
-    """Return every signal of the layout, from one pass over the bag."""
+    """Return the signals of all channels in the layout, from one pass over the bag."""
     plans = plan(bag, layout)
     collected = _collected(bag, plans)
     signals: dict[str, Signal] = {}
@@ -228,7 +236,7 @@ def _signals(bag: OpenBag, layout: BagLayout, notes: list[str]) -> dict[str, Sig
 
 
 def _collected(bag: OpenBag, plans: Sequence[ChannelPlan]) -> list[list[Stream]]:
-    """Return the numbers of every plan, topic by topic."""
+    """Return, for every plan, the numbers from each of its topics."""
     topics = {}
     for name in dict.fromkeys(w.topic for one in plans for w in one.wanted):
         wanted = [w for one in plans for w in one.wanted if w.topic == name]

@@ -1,4 +1,4 @@
-"""Transforms over time: the chain from one frame to another, its composition and heading."""
+"""Transforms between frames over time: chains of them, their composition, heading and tilt."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,12 +14,12 @@ from slipid.data.reading.bag.streams import TopicStreams, topic_error
 from slipid.support.errors import did_you_mean, first_names
 
 STATIC = "_static"
-"""Suffix of the topic of constant transforms beside `/tf`."""
+"""Suffix of the topic of constant transforms, such as `/tf_static` for `/tf`."""
 
 
 @dataclass(frozen=True)
 class ChainLink:
-    """One transform of a chain; it is inverted where the chain passes it from child to parent."""
+    """One transform of a chain; it is inverted if the chain leads from its child to its parent."""
 
     edge: Edge
     inverted: bool
@@ -31,8 +31,8 @@ class TransformSeries:
 
     Attributes:
         time: increasing times [s].
-        translation: translations [m].
-        rotation: unit quaternions x, y, z, w.
+        translation: position of the child in the parent's frame [m].
+        rotation: rotation of the child in the parent's frame, as unit quaternions x, y, z, w.
     """
 
     time: Float[np.ndarray, " sample"]
@@ -40,7 +40,11 @@ class TransformSeries:
     rotation: Float[np.ndarray, "sample 4"]
 
     def at(self, time: Float[np.ndarray, " time"]) -> "TransformSeries":
-        """Interpolate linearly and along the short arc; a single sample holds for all times."""
+        """Return the transform at other times [s].
+
+        Translations are interpolated linearly, rotations linearly along the shorter arc. A single
+        sample holds for all times.
+        """
         if len(self.time) == 1:
             rows = np.zeros(len(time), dtype=int)
             return TransformSeries(time, self.translation[rows], self.rotation[rows])
@@ -61,16 +65,20 @@ class TransformSeries:
         return TransformSeries(self.time, -back.apply(self.translation), back.as_quat())
 
     def then(self, other: "TransformSeries") -> "TransformSeries":
-        """Return the composition with a transform from this one's child on, at the same times."""
+        """Return this transform followed by another, whose parent is this one's child.
+
+        Both have the same times.
+        """
         first, second = Rotation.from_quat(self.rotation), Rotation.from_quat(other.rotation)
         translation = self.translation + first.apply(other.translation)
         return TransformSeries(self.time, translation, (first * second).as_quat())
 
 
 def composed(links: Sequence[ChainLink], moving: Mapping[Edge, TransformSeries]) -> TransformSeries:
-    """Return the pose of the last frame of a chain in the first, at its densest times.
+    """Return the pose of a chain's last frame in its first frame.
 
-    Times that some other transform does not span are left out.
+    It has the times of the transform with the most samples, without those outside the record of
+    another transform.
     """
     densest = max((moving[link.edge] for link in links), key=lambda one: len(one.time))
     time = densest.time
@@ -93,7 +101,7 @@ def heading(rotation: Float[np.ndarray, "sample 4"]) -> Float[np.ndarray, " samp
 
 
 def tilt(rotation: Float[np.ndarray, "sample 4"]) -> Float[np.ndarray, " sample"]:
-    """Return the angle between the vertical and the rotated vertical [rad]."""
+    """Return the angle between the z axis before and after a rotation [rad]."""
     x, y, _, _ = rotation.T
     return np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))
 
@@ -101,16 +109,18 @@ def tilt(rotation: Float[np.ndarray, "sample 4"]) -> Float[np.ndarray, " sample"
 def chain_of(
     bag: OpenBag, messages: Mapping[str, MessageType], frame: str, child: str
 ) -> tuple[ChainLink, ...]:
-    """Return the transforms that lead from a frame to another, from as few messages as possible.
+    """Return the chain of transforms that leads from a frame to another.
+
+    The bag is read only until the chain is complete.
 
     Args:
         bag: the bag.
-        messages: type of each topic that holds transforms.
+        messages: message type of each topic with transforms.
         frame: first frame of the chain.
         child: last frame of the chain.
 
     Raises:
-        DataError: no chain leads there; the message lists the frames.
+        DataError: no chain connects the frames; the message lists the frames in the bag.
     """
     parents = _FrameParents()
     streams = {
@@ -138,7 +148,12 @@ def chain_of(
 
 @dataclass(eq=False)
 class _FrameParents:
-    """A pick without numbers that collects the parent of every frame."""
+    """Pick that takes no numbers from messages, but collects the parent of every frame.
+
+    Attributes:
+        parent: parent of each frame.
+        columns: names of the picked numbers, of which there are none.
+    """
 
     parent: dict[str, str] = field(default_factory=dict)
     columns: tuple[str, ...] = ()
@@ -150,7 +165,10 @@ class _FrameParents:
 
 
 def _links(parent: Mapping[str, str], frame: str, child: str) -> tuple[ChainLink, ...]:
-    """Return the chain, empty while it is not known."""
+    """Return the chain between two frames, empty if the known parents do not connect them.
+
+    `parent` is the parent of each frame.
+    """
     up, down = _ancestors(parent, frame), _ancestors(parent, child)
     common = next((name for name in down if name in up), None)
     if common is None or frame == child:
@@ -163,7 +181,7 @@ def _links(parent: Mapping[str, str], frame: str, child: str) -> tuple[ChainLink
 
 
 def _ancestors(parent: Mapping[str, str], name: str) -> list[str]:
-    """Return a frame, its parent, and so on; no frame twice."""
+    """Return a frame, its parent, the parent's parent and so on, without repetition."""
     names = [name]
     while (above := parent.get(names[-1])) is not None and above not in names:
         names.append(above)
