@@ -116,8 +116,8 @@ def _parquet(track: TrackedPoses) -> bytes:
 GRID = 0.25
 """Distance between neighbouring lines of the grid drawn on the floor [m]."""
 FLOOR, EDGE, AHEAD, LEFT = (190, 190, 60), (0, 170, 255), (40, 40, 230), (60, 190, 60)
-"""Colours, as blue, green, red, of the grid on the floor, the markers' edges, and a body's axes that
-point ahead and to the left."""
+"""Colours, as blue, green, red, of the grid on the floor, the edges of markers, and the axes of a
+body that point ahead and to the left."""
 
 
 def write_preview(
