@@ -24,7 +24,7 @@ def bench_plots(fit: BenchFit, out: Path) -> list[Path]:
 
 
 def bench_figure(fit: MotorFit) -> Figure:
-    """Draw voltage and current, measured and fitted, and residuals over time, speed and current."""
+    """Draw each measured and fitted signal, and residuals over time, speed and current."""
     count = len(fit.equations)
     which = f"motor {fit.label}: " if fit.label else ""
     made = figure(

@@ -20,7 +20,7 @@ from slipid.predict.validation import Validation
 
 
 def raw_plots(data: Runs, out: Path) -> list[Path]:
-    """Write the picture `plot_runs` of each floor and load set-up; return the files."""
+    """Write a picture of the logged signals for each floor and load set-up; return the files."""
     return [
         save(plot_runs(data, runs, f"{floor}, {load}"), out / f"raw_{floor}_{load}.png")
         for (floor, load), runs in sorted(runs_by_setup(data).items())

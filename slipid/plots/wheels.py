@@ -185,7 +185,7 @@ def _amps(
     ax: Axes, measured: MeasuredWindows, mine: np.ndarray, wheel: int, top: float
 ) -> PathCollection:
     assert measured.amps is not None
-    # a wheel at rest is held by its gear, which the motor model does not describe
+    # wheels at rest are left out: their gear holds them, which the motor model does not describe
     speed, fastest = measured.wheel_speed[:, wheel], np.abs(measured.wheel_speed).max(axis=1)
     mine = mine & (np.abs(speed) > STANDING * fastest)
     speed = speed[mine]

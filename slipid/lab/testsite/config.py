@@ -262,7 +262,7 @@ def all_filmed(plan: SimulationPlan) -> bool:
 
 
 def _inline(value: object) -> str:
-    """Return a value as TOML."""
+    """Return a value as TOML text on one line."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{k} = {_inline(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list):

@@ -234,7 +234,7 @@ def _towards(
 
 
 def _moved(pose: Float[np.ndarray, "3"], step: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Return the pose after a small displacement in the body frame."""
+    """Return the pose after a small displacement (x, y, turn) in the body frame [m, m, rad]."""
     middle = pose[2] + 0.5 * step[2]
     c, s = np.cos(middle), np.sin(middle)
     return pose + np.array([c * step[0] - s * step[1], s * step[0] + c * step[1], step[2]])

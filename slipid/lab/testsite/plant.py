@@ -16,7 +16,7 @@ TIMESTEP = 1e-3
 SETTLING = 0.4
 """Time for which the robot settles on the floor before anything is recorded [s]."""
 LOOKUP_STEPS = 5
-"""Time steps between two lookups of the floor beneath the rollers."""
+"""Number of time steps from one lookup of the floor beneath the rollers to the next."""
 CREEP = 0.02
 """Speed at which compaction and body drag reach 0.7 of their full force [m/s]."""
 

@@ -1,4 +1,4 @@
-"""Build of the test site's robot: DC motors, wheel speed loop, and its MuJoCo model."""
+"""Properties of the test site's robot: DC motors, wheel speed loop, body, and its MuJoCo model."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field

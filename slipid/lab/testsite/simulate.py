@@ -209,7 +209,7 @@ def _truth_path(task: SiteTask) -> Path:
 
 
 def drive_and_write(task: SiteTask) -> float:
-    """Drive one run, write its log and its truth, and return its duration [s]."""
+    """Drive one run, write its logs and its truth, and return the simulated duration [s]."""
     try:
         trace = drive(task.run, task.site, task.seed)
     except ValueError as error:  # the engine also raises it for a robot that it cannot build

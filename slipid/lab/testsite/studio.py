@@ -93,7 +93,7 @@ class Studio:
 
     @property
     def _size(self) -> tuple[int, int]:
-        """Width and height of the drawing before the lens bends it [pixel]."""
+        """Width and height of the drawing before lens distortion is applied [pixel]."""
         return round(DRAWN_SHARE * self.camera.width_px), round(DRAWN_SHARE * self.camera.height_px)
 
     def close(self) -> None:

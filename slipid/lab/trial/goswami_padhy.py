@@ -182,7 +182,7 @@ def twist(gains: PlaneVector, e: PlaneVector, rates: PlaneVector, heading: Numbe
 
 
 class GoswamiPadhy(eqx.Module):
-    """The law with its gains k1, k2, k3 [1/s]."""
+    """Goswami and Padhy's control law with its gains k1, k2, k3 [1/s]."""
 
     gains: Float[Array, "3"]
 

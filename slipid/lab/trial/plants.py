@@ -1,4 +1,4 @@
-"""The virtual test site as the plant of a trial, and robots drawn from a posterior."""
+"""Plants of a trial: the virtual test site, and robots drawn from a posterior."""
 
 from functools import partial
 

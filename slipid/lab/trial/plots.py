@@ -17,7 +17,7 @@ from slipid.support.content import Content
 
 Paths = Mapping[str, np.ndarray]
 TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
-"""Colours of floors, in the order of the map."""
+"""Colours of surfaces, in the order of the map's surfaces."""
 OTHERS, MARKED = "#56B4E9", "#D55E00"
 ERRORS = {
     "closure_error_median": "closure error [mm]",

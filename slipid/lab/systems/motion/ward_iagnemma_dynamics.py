@@ -18,7 +18,7 @@ from slipid.predict.slip_model import RobotSpec, RunSignals
 
 Drives = Float[np.ndarray, "run drive"]
 Speeds = Float[np.ndarray, "run 3"]
-"""q: body twist times (1, 1, base radius) [m/s]."""
+"""Speeds q of each run: the body twist times (1, 1, base radius) [m/s]."""
 Each = Float[np.ndarray, " run"]
 GRAVITY = 9.81
 REST = 0.02
@@ -26,7 +26,7 @@ REST = 0.02
 _OVER_MASS = np.array([1.0, 1.0, 2.0])
 """Diagonal of m M^-1: acceleration of q per force divided by mass; the inertia is m L^2 / 2."""
 _MOST_STEPS = 25
-"""Largest number of Newton steps."""
+"""Largest number of Newton steps in a time step."""
 _SOLVED = 1e-7
 """Residual below which an equation of a time step counts as solved [m/s]."""
 

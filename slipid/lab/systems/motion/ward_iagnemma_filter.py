@@ -141,7 +141,7 @@ class SlipFilter:
         by = np.tile(np.eye(8), (len(dt), 1, 1))
         by[:, :3, :3], by[:, :3, 3] = step.by_speeds, step.by_rolling
         after = state.moved(np.concatenate([step.speeds, state.mean[:, 3:]], axis=1), by)
-        # white noise of the twist whose integral has the variance of the drift
+        # noise of the twist, white over steps, whose integral over a second has the std `drift`
         rate = np.where(dt > 0.0, 1.0 / np.where(dt > 0.0, dt, 1.0), 0.0)[:, None]
         after.covariance[:, range(3), range(3)] += np.square(self.noise.drift) * rate
         after.covariance[:, 3, 3] += self.wander**2 * dt
