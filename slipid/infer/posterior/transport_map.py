@@ -7,9 +7,8 @@ It is a triangular map (Knothe-Rosenblatt) from coordinates x to u, through v:
                             v_i = (w_i - a_i(w_1 .. w_i-1)) exp(-b_i(w_1 .. w_i-1))
 
 with the mean m, Cholesky factors L of (conditional) covariances, regression coefficients B on the
-shared coordinates, s the shared part of x - m, polynomials a and b, and a sinh-arcsinh map (Jones
-and Pewsey 2009,
-Biometrika 96, eq. 2) of every coordinate from v to u,
+shared coordinates, s the shared part of x - m, and polynomials a and b. A sinh-arcsinh map (Jones
+and Pewsey 2009, Biometrika 96, eq. 2) leads from v to u, coordinate by coordinate:
 
     sinh(tail arcsinh((v - place) / scale) - skew)
 

@@ -92,8 +92,7 @@ def marked(numbers: Mapping[str, Estimate], found: Sequence[Dispute]) -> dict[st
 Word = Literal["trusted", "doubtful", "not to be trusted"]
 WORDS: tuple[Word, ...] = ("trusted", "doubtful", "not to be trusted")
 WORSE, MUCH_WORSE = 1.1, 1.5
-"""Ratios of the model's error to the encoders' above which a fit is doubtful, or not to be trusted.
-"""
+"""Ratios of the model's to the encoders' error above which a fit is doubtful, not to be trusted."""
 SMALL = 0.005
 """Difference of model's and encoders' end-point errors over path length that does not count."""
 ABSURD = 0.5

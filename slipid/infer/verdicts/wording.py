@@ -152,7 +152,7 @@ _CAMERA = (
     (("camera.scale",), "measure a length in the camera's picture"),
     (("robot.wheel_radius",), "measure the wheel radius"),
 )
-"""Remedies for flat directions: the first one whose quantities all occur in the direction is used.
+"""Remedies for flat directions: the first whose quantities all occur in the direction is used.
 
 `_FLOOR` stands for any quantity of a floor.
 """
