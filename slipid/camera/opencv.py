@@ -115,7 +115,7 @@ def read_picture(path: Path) -> np.ndarray:
     cv2 = opencv()
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error:  # the picture is larger than OpenCV reads
+    except cv2.error:  # OpenCV raises this for too large pictures
         picture = None
     if picture is None:
         raise DataError(f"{path}: no picture that OpenCV reads; expected PNG, JPEG or the like")

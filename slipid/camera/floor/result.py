@@ -140,7 +140,7 @@ def map_from(
             f"{100 * MOST_UNKNOWN:.0f} %: a region that holds nothing but floor, and points on "
             "every surface"
         )
-    if not region.robots and is_picture(source.path):  # a video's median does not show it
+    if not region.robots and is_picture(source.path):  # the median of a video shows no moving robot
         warnings.append(
             "no marker of a robot was detected, so none is masked; where one stands, mask it in "
             "the config, or name the --dictionary of its marker"
@@ -215,7 +215,7 @@ def _vector(
             f"{100 * unknown:.1f} % of the map's rectangle is unknown ({100 * requested:.1f} % of "
             "the requested floor): read as a floor map it has the nearest surface there"
         )
-    with source.path.open("rb") as file:  # a video may be larger than memory
+    with source.path.open("rb") as file:  # not read at once: a video may exceed memory
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     return VectorMap(
         patches,

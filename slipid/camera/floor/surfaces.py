@@ -231,7 +231,7 @@ def _updated(
     samples = ColourSamples(at, few.rgb.reshape(-1, 3)[cells].astype(float), own, weight)
     fit = fit_illumination(samples, surfaces.lit)
     texture, spread = surfaces.texture.copy(), surfaces.spread.copy()
-    for k in np.unique(own):  # robustly, around the expected appearance
+    for k in np.unique(own):  # robust spread about the expected appearance
         mine = own == k
         texture[k] = np.median(appearance[mine, 3])
         expected = lab_of(fit.illumination.rgb_of(fit.colours[k : k + 1], at[mine])[0])
@@ -293,7 +293,7 @@ def without_small_patches(labels: Labels, visible: Mask, width: int) -> Labels:
         mine = (labels == surface).astype(np.uint8)
         _, parts, stats, _ = cv2.connectedComponentsWithStats(mine, connectivity=4)
         big = stats[:, cv2.CC_STAT_AREA] >= SMALL
-        big[0] = False  # the background
+        big[0] = False  # component 0 is the background
         large |= big[parts]
     return np.where(visible, _nearest(labels, large & visible), UNKNOWN)
 

@@ -91,7 +91,7 @@ def poses_of(
     valid &= valid.sum(axis=1, keepdims=True) >= 3
     some = valid.any(axis=1)
     out = FittedPoses(*(np.full((frames, *shape), np.nan) for shape in ((3,), (3, 3), (), (), ())))
-    if not some.any():  # this body is in no frame
+    if not some.any():  # the body appears in no frame
         return out
     place, per_pixel, used = place[some], per_pixel[some], valid[some]
     place = np.where(used[..., None], place, 0.0)
