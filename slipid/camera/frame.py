@@ -1,4 +1,4 @@
-"""Video frames: their pixels, their times, and the interface of everything that supplies them."""
+"""Video frames with their pixels and times, and the interface of sources that supply them."""
 
 import csv
 from abc import ABC, abstractmethod
@@ -15,11 +15,13 @@ from slipid.camera.opencv import Grey, opencv
 from slipid.support.errors import DataError, bad_data
 
 LOST = 0.02
-"""Part of the announced frames that a file may lack: some formats only estimate their number."""
+"""Share of the announced frames that a file may lack, since some formats only estimate their
+number [1]."""
 UNEVEN = 0.2
-"""Part by which intervals between frames may differ from their median and still count as even."""
+"""Largest relative difference of an interval between frames from the median interval for which the
+frame rate still counts as even [1]."""
 DEPTH = 8
-"""Number of frames that are decoded ahead."""
+"""Number of frames that are decoded in advance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,9 +29,9 @@ class Frame:
     """One picture of a video.
 
     Attributes:
-        index: its number, from 0.
+        index: number of the frame, from 0.
         time: time at which it was taken [s].
-        grey: its grey levels, from 0 to 255.
+        grey: grey levels of its pixels, from 0 to 255.
     """
 
     index: int
@@ -42,11 +44,11 @@ class FrameSource(ABC):
     """A video, a folder of pictures or a device that supplies frames.
 
     Attributes:
-        name: its name in messages.
-        image_px: width and height of every frame.
-        count: expected number of frames; None where it is not known.
-        exact: whether `count` is exact, as where each frame has a given time.
-        identity: text that changes with its content, such as name, size and date.
+        name: name of the source in messages.
+        image_px: width and height of every frame [pixel].
+        count: expected number of frames; None if it is not known.
+        exact: whether `count` is exact, as it is if a time is given for each frame.
+        identity: text that differs if the content differs, such as name, size and date of a file.
     """
 
     name: str
@@ -57,11 +59,11 @@ class FrameSource(ABC):
 
     @abstractmethod
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Yield the frames from a number on, in order."""
+        """Yield the frames in order, beginning with number `first`."""
 
 
 def cut_off(source: FrameSource, count: int) -> str | None:
-    """Return a sentence where a source ended too early after `count` frames; None otherwise."""
+    """Return a sentence if a source ended too early, after `count` frames; None otherwise."""
     if source.count is None or count == source.count:
         return None
     if source.exact:
@@ -75,13 +77,13 @@ def cut_off(source: FrameSource, count: int) -> str | None:
 
 
 def stamp(path: Path) -> tuple[str, int, int]:
-    """Return name, size and date of a file, which change when its content does."""
+    """Return name, size and date of a file, by which a change of its content is recognised."""
     status = path.stat()
     return path.name, status.st_size, status.st_mtime_ns
 
 
 def grey_of(picture: np.ndarray) -> Grey:
-    """Return the grey levels of a picture in blue, green, red, or of one that is grey already."""
+    """Return the grey levels of a picture, which may be in blue, green, red or already grey."""
     if picture.ndim == 2 or picture.shape[2] == 1:
         return np.asarray(picture).reshape(picture.shape[:2])
     cv2 = opencv()
@@ -92,7 +94,8 @@ def read_times(path: Path) -> Float[np.ndarray, " frame"]:
     """Return the times [s] of frames 0, 1, 2, ... from a CSV file with columns frame and time.
 
     Raises:
-        DataError: unreadable, other columns, missing frames, or times that do not increase.
+        DataError: the file is unreadable or has other columns, frames are missing, or times do not
+            increase.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -118,7 +121,7 @@ def read_times(path: Path) -> Float[np.ndarray, " frame"]:
 
 
 def even_times(count: int, fps: float) -> Float[np.ndarray, " frame"]:
-    """Return the times [s] of frames at an even rate from 0 on.
+    """Return the times [s] of frames at a constant rate `fps` [1/s], beginning at 0.
 
     Raises:
         DataError: the rate is not a positive number.
@@ -129,7 +132,7 @@ def even_times(count: int, fps: float) -> Float[np.ndarray, " frame"]:
 
 
 def uneven(times: Sequence[float] | Float[np.ndarray, " frame"]) -> str | None:
-    """Return a sentence for the user where frames do not come evenly; None otherwise."""
+    """Return a sentence for the user if frame times [s] are not evenly spaced; None otherwise."""
     steps = np.diff(np.asarray(times, float))
     if len(steps) < 2:
         return None
@@ -143,9 +146,10 @@ def uneven(times: Sequence[float] | Float[np.ndarray, " frame"]) -> str | None:
 
 
 def read_ahead(frames: Iterator[Frame]) -> Generator[Frame]:
-    """Yield the same frames, decoded ahead in a thread; its errors are raised here.
+    """Yield the same frames, decoded in advance in a thread.
 
-    Decoding ends with the frames, or when this generator is closed.
+    Errors of the thread are raised here. Decoding ends with the last frame, or when this generator
+    is closed.
     """
     with ThreadPoolExecutor(1) as thread:
         decoded = deque(thread.submit(next, frames, None) for _ in range(DEPTH))

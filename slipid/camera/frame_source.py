@@ -1,4 +1,4 @@
-"""Frames from the file, folder or device that a user names, and one still picture of a floor."""
+"""Frames from the file, folder or device that a user names, and still pictures from videos."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -15,10 +15,10 @@ from slipid.camera.opencv import opencv, read_picture, size_of
 from slipid.support.errors import DataError
 
 BROKEN = 25
-"""Frames in a row that cannot be decoded, after which a video counts as ended."""
+"""Number of consecutive frames that cannot be decoded after which a video counts as ended."""
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 MEDIAN_FRAMES = 25
-"""Number of frames of a video from which a still picture is made."""
+"""Approximate number of frames of a video whose median is its still picture."""
 Times = Float[np.ndarray, " frame"]
 """Times of frames [s]."""
 
@@ -27,7 +27,7 @@ class Capture:
     """OpenCV's reader of a file or a device.
 
     Raises:
-        DataError: it cannot be opened.
+        DataError: the file or device cannot be opened.
     """
 
     def __init__(self, place: str):
@@ -40,7 +40,10 @@ class Capture:
             )
 
     def next_picture(self, decode: bool = True) -> np.ndarray | None:
-        """Return the next frame, or an empty one where it is not decoded; None at the end."""
+        """Return the next frame, or None at the end.
+
+        Without `decode` the frame is skipped, and an empty array is returned.
+        """
         for _ in range(BROKEN):
             if not self._capture.grab():
                 continue
@@ -62,11 +65,11 @@ class Capture:
 
 @dataclass(frozen=True, eq=False)
 class Video(FrameSource):
-    """A video file, with its own times or with given ones.
+    """A video file, with its own frame times or with given ones.
 
     Attributes:
-        times: given time of each frame [s]; None takes the file's own.
-        fps: given frame rate [1/s], instead of times.
+        times: given time of each frame [s]; None to use those of the file, or `fps`.
+        fps: given frame rate from which times are computed [1/s]; None without one.
     """
 
     times: Times | None
@@ -74,7 +77,11 @@ class Video(FrameSource):
 
     @classmethod
     def at(cls, path: Path, fps: float | None, times: Times | None) -> "Video":
-        """Return a video; DataError where OpenCV cannot open it or decode its first frame."""
+        """Return the video in a file.
+
+        Raises:
+            DataError: OpenCV cannot open the file or cannot decode its first frame.
+        """
         if fps is not None:
             even_times(1, fps)
         with closing(Capture(str(path))) as capture:
@@ -92,10 +99,10 @@ class Video(FrameSource):
         return cls(str(path), size_of(first), count, times is not None, identity, times, fps)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Yield the frames from a number on; those before are skipped without decoding.
+        """Yield the frames from number `first` on; earlier ones are skipped without decoding.
 
         Raises:
-            DataError: the file has no times, they do not increase, or too few were given.
+            DataError: the file has no times, times do not increase, or too few were given.
         """
         before = -np.inf
         with closing(Capture(self.name)) as capture:
@@ -114,7 +121,7 @@ class Video(FrameSource):
                     yield Frame(k, at, grey_of(picture))
 
     def _time(self, k: int, capture: Capture) -> float:
-        """Return the time of the frame that was read last [s]."""
+        """Return the time of frame number `k`, which was read last [s]."""
         if self.fps is not None:
             return k / self.fps
         if self.times is None:
@@ -129,9 +136,9 @@ class Video(FrameSource):
 
 @dataclass(frozen=True, eq=False)
 class Device(FrameSource):
-    """A camera plugged into this computer; times are of its clock, from the first frame on.
+    """A camera connected to this computer; frame times are the computer's, from the first frame on.
 
-    Its identity never comes twice, since its frames do not either.
+    Every recording has its own identity, since its frames cannot be read again.
 
     Attributes:
         place: number or path of the device.
@@ -143,7 +150,7 @@ class Device(FrameSource):
 
     @classmethod
     def at(cls, place: str, seconds: float) -> "Device":
-        """Return a camera; DataError where it supplies no frame."""
+        """Return a camera; raise `DataError` if it supplies no frame."""
         name = f"device {place}"
         with closing(Capture(place)) as capture:
             first = capture.next_picture()
@@ -152,7 +159,7 @@ class Device(FrameSource):
         return cls(name, size_of(first), None, False, f"{place} {time.time_ns()}", place, seconds)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Yield the frames from now on, until the recording is over."""
+        """Yield the frames from now on until the recording's duration is over."""
         began: float | None = None
         with closing(Capture(self.place)) as capture:
             for k in numbers():
@@ -166,11 +173,11 @@ class Device(FrameSource):
 
 @dataclass(frozen=True, eq=False)
 class PictureFolder(FrameSource):
-    """Pictures in the order of their names, all of one size.
+    """Pictures in the order of their file names, all of one size.
 
     Attributes:
         paths: files of the pictures.
-        times: time of each [s].
+        times: time of each picture [s].
     """
 
     paths: tuple[Path, ...]
@@ -178,10 +185,10 @@ class PictureFolder(FrameSource):
 
     @classmethod
     def at(cls, folder: Path, fps: float | None, times: Times | None) -> "PictureFolder":
-        """Return every picture in a folder, at a rate or at given times.
+        """Return the pictures in a folder, with a frame rate [1/s] or given times [s].
 
         Raises:
-            DataError: there is no picture, or not one time for each.
+            DataError: there is no picture, or the numbers of pictures and times differ.
         """
         paths = sorted(p for p in folder.iterdir() if is_picture(p))
         if not paths:
@@ -198,12 +205,16 @@ class PictureFolder(FrameSource):
 
     @classmethod
     def of(cls, place: Path, paths: Sequence[Path], times: Times) -> "PictureFolder":
-        """Return pictures of the first one's size; DataError where the first is no picture."""
+        """Return pictures of the first one's size.
+
+        Raises:
+            DataError: the first file is not a picture.
+        """
         size, identity = size_of(read_picture(paths[0])), repr([stamp(path) for path in paths])
         return cls(str(place), size, len(paths), True, identity, tuple(paths), times)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """Yield the pictures from a number on; DataError where one has another size."""
+        """Yield the pictures from number `first` on; raise `DataError` if one has another size."""
         for k in range(first, len(self.paths)):
             picture = read_picture(self.paths[k])
             if size_of(picture) != self.image_px:
@@ -221,13 +232,13 @@ def open_source(
     """Return the frames of a video file, a folder of pictures or a device.
 
     Args:
-        place: a file, a folder, or a device: its number, or its path such as /dev/video0.
-        fps: frames per second where times are not to be taken from the source.
-        times: CSV file with the columns frame and time [s], instead.
-        seconds: how long to record from a device, which has no end.
+        place: a file, a folder, or a device given by its number or its path such as /dev/video0.
+        fps: frame rate from which times are computed [1/s]; None to use those of the source.
+        times: CSV file with the columns frame and time [s], used instead of the source's times.
+        seconds: duration of the recording from a device [s]; None for other sources.
 
     Raises:
-        DataError: nothing there that can be read, or no times.
+        DataError: the source cannot be read, has no times, or options do not fit it.
     """
     if fps is not None and times is not None:
         raise DataError("--fps and --times at once; expected one of them")
@@ -257,15 +268,15 @@ def open_source(
 
 
 def is_picture(path: Path) -> bool:
-    """Return whether a file is a picture, by the end of its name."""
+    """Return whether a file is a picture, judged by its suffix."""
     return path.suffix.lower() in PICTURES
 
 
 def still(path: Path) -> np.ndarray:
     """Return a picture, or the median of a video's frames, as rows, columns and blue, green, red.
 
-    An object that moves through a video is not in the median, unless it stands in one place half of
-    the time.
+    An object that moves through a video does not appear in the median, unless it stands in one
+    place for half of the time.
 
     Raises:
         DataError: the file is neither a picture nor a video.
@@ -281,7 +292,7 @@ def still(path: Path) -> np.ndarray:
             if picture is None:
                 break
             kept += [picture] if chosen else []
-            if len(kept) == 2 * MEDIAN_FRAMES:  # of a video that does not know its length
+            if len(kept) == 2 * MEDIAN_FRAMES:  # only if the file states no length
                 kept, every = kept[::2], 2 * every
     if not kept:
         raise DataError(f"{path}: no frame that OpenCV can decode; expected a picture or a video")

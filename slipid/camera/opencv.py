@@ -1,4 +1,4 @@
-"""OpenCV, imported when first needed, with what differs between its versions 4 and 5."""
+"""OpenCV, imported when first needed, with wrappers for what differs in its versions 4 and 5."""
 
 import os
 from collections.abc import Sequence
@@ -14,18 +14,19 @@ from jaxtyping import Bool, Float, Int, UInt8
 from slipid.support.errors import DataError, did_you_mean
 
 NEARLY = 0.8
-"""Part of the largest number of markers with which a smaller dictionary is preferred."""
+"""Share of the largest number of detected markers from which on a smaller dictionary is preferred
+[1]."""
 Mask = Bool[np.ndarray, "row column"]
-"""Some of the pixels of a picture or of the cells of a grid."""
+"""Boolean mask over the pixels of a picture or the cells of a grid."""
 Labels = Int[np.ndarray, "row column"]
-"""A number for each cell of a grid."""
+"""Number of the surface or patch in each cell of a grid."""
 Grey = UInt8[np.ndarray, "row column"]
 """Grey levels of a picture, from 0 to 255."""
 
 
 @cache
 def opencv() -> ModuleType:
-    """Return the module cv2, with its own messages about unreadable files switched off.
+    """Return the module cv2, with OpenCV's own messages about unreadable files switched off.
 
     Raises:
         DataError: OpenCV is absent, too old, or built without its ArUco module.
@@ -56,7 +57,7 @@ def dictionary_names() -> list[str]:
 
 
 def marker_dictionary(name: str) -> Any:
-    """Return OpenCV's marker dictionary of a name such as `4X4_50` or `DICT_4X4_50`.
+    """Return OpenCV's marker dictionary with a name such as `4X4_50` or `DICT_4X4_50`.
 
     Raises:
         DataError: no dictionary has that name.
@@ -77,14 +78,17 @@ def marker_count(dictionary: str) -> int:
 
 @dataclass(frozen=True)
 class VisibleMarkers:
-    """Numbers of the markers in pictures, and the name of their dictionary."""
+    """Numbers of the markers detected in pictures, and the name of their dictionary."""
 
     dictionary: str
     numbers: list[int]
 
 
 def visible_markers(pictures: Sequence[np.ndarray]) -> VisibleMarkers:
-    """Return the markers in pictures, by the smallest dictionary with nearly most of them."""
+    """Return the markers in pictures, whatever their dictionary.
+
+    Of the dictionaries with nearly the most detected markers, the smallest one is chosen.
+    """
     aruco, numbers = opencv().aruco, dict[str, set[int]]()
     for name in dictionary_names():
         detector = aruco.ArucoDetector(marker_dictionary(name))
@@ -111,7 +115,7 @@ def read_picture(path: Path) -> np.ndarray:
     cv2 = opencv()
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error:  # the picture is larger than OpenCV reads
+    except cv2.error:  # OpenCV raises this for too large pictures
         picture = None
     if picture is None:
         raise DataError(f"{path}: no picture that OpenCV reads; expected PNG, JPEG or the like")
@@ -128,7 +132,10 @@ def ideal_points(
     matrix: Float[np.ndarray, "3 3"],
     distortion: Float[np.ndarray, " coefficient"],
 ) -> Float[np.ndarray, "point 1 2"]:
-    """Return pixels as a pinhole of focal length 1 would show them, iterated to convergence."""
+    """Return the places at which a pinhole camera of focal length 1 would show pixels.
+
+    The distortion is inverted by iteration to convergence.
+    """
     cv2 = opencv()
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
     iterated = getattr(cv2, "undistortPointsIter", None)

@@ -1,10 +1,11 @@
 """The overhead camera: its lens, its place above the floor, and places of pixels at a known height.
 
-A pixel determines a ray, not a place. A point `h` above the floor lies where its ray crosses the
-plane z = h. For a camera at height H that looks straight down, a marker's corners appear
-H / (H - h) times as far from the point below the lens as the robot really is. If a marker on a
-robot is read as if it lay on the floor, every path length is too large by that factor (12 % where h
-is 0.105 H), and the marker looks too large by the same factor, which reveals such a mistake.
+A pixel determines a ray, not a place. A point at height h above the floor lies where its ray
+crosses the plane z = h. For a camera at height H that looks straight down, a marker at height h
+appears H / (H - h) times as far from the point below the lens as it really is. If the place of a
+robot's marker is computed as if it lay on the floor, every path length is too large by that factor
+(12 % for h = 0.105 H), and the marker appears too large by the same factor, which reveals the
+mistake.
 """
 
 from dataclasses import dataclass, field
@@ -29,12 +30,12 @@ Three = Annotated[list[Row], Field(min_length=3, max_length=3)]
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A lens: OpenCV's pinhole model with distortion.
+    """A lens, by OpenCV's pinhole model with distortion.
 
     Attributes:
         image_px: width and height of its images [pixel].
-        matrix: focal lengths and principal point [pixel].
-        distortion: k1, k2, p1, p2, k3, ... of OpenCV's model.
+        matrix: camera matrix, with focal lengths and principal point [pixel].
+        distortion: coefficients k1, k2, p1, p2, k3, ... of OpenCV's distortion model.
     """
 
     image_px: tuple[int, int]
@@ -51,17 +52,18 @@ class Lens:
         }
 
     def ideal(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Return the places of pixels in the picture of a pinhole of focal length 1."""
+        """Return the places at which a pinhole camera of focal length 1 would show pixels."""
         flat = np.ascontiguousarray(pixels, float).reshape(-1, 1, 2)
         if not len(flat):
             return flat.reshape(np.shape(pixels))
         return ideal_points(flat, self.matrix, self.distortion).reshape(np.shape(pixels))
 
     def check_size(self, image_px: tuple[int, int], source: Path | str) -> None:
-        """Check that images have the size at which the lens was calibrated.
+        """Raise `DataError` unless images have the size at which the lens was calibrated.
 
         Raises:
-            DataError: they have another; a smaller image may be a part of the picture or shrunk.
+            DataError: the size differs. It cannot be corrected, since a smaller image may be either
+                cropped or scaled.
         """
         if tuple(image_px) != tuple(self.image_px):
             w, h = self.image_px
@@ -78,10 +80,10 @@ class OverheadCamera:
 
     Attributes:
         lens: the lens.
-        rotation: rotation from the world to the camera's axes: x right, y down, z away.
+        rotation: rotation from the world's axes to the camera's: x right, y down, z away from it.
         place: place of the lens in the world [m].
-        scale_std: relative std of lengths on the floor [1]; None where it is not known.
-        report: report of the calibration, kept as it stands.
+        scale_std: relative std of lengths on the floor [1]; None if it is not known.
+        report: report of the calibration, as in the camera file.
     """
 
     lens: Lens
@@ -100,19 +102,20 @@ class OverheadCamera:
     ) -> "OverheadCamera":
         """Return a camera without distortion that looks straight down.
 
-        World x points to the picture's right, y up; the origin is in the middle of the picture.
+        The world's x points to the right in the picture and y up; its origin is in the middle of
+        the picture.
 
         Args:
-            image_px: width and height of its pictures.
-            metres_per_pixel: size of a pixel on the floor.
-            height_m: height of the lens above the floor.
+            image_px: width and height of the camera's pictures [pixel].
+            metres_per_pixel: size of a pixel on the floor [m].
+            height_m: height of the lens above the floor [m].
             turn_deg: angle by which the world's x and y are turned to the left in the picture,
-                about z; at 180, x points to the picture's left and y down.
+                about z [deg]; at 180, x points to the left in the picture and y down.
         """
         focal, (width, height) = height_m / metres_per_pixel, image_px
         matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
         cosine, sine = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-        # columns are the world's x, y, z in the axes right, down, away
+        # columns are the world's x, y and z axes in the camera's axes: right, down, away
         rotation = np.array([[cosine, -sine, 0], [-sine, -cosine, 0], [0, 0, -1]])
         return cls(Lens(image_px, matrix, np.zeros(4)), rotation, np.array([0.0, 0.0, height_m]))
 
@@ -136,9 +139,9 @@ class OverheadCamera:
     def on_plane(
         self, pixels: Float[np.ndarray, "*batch 2"], height_m: float
     ) -> Float[np.ndarray, "*batch 2"]:
-        """Return x and y [m] of points at a height above the floor that appear at some pixels.
+        """Return x and y [m] of the points at a height [m] that appear at some pixels.
 
-        They are NaN where a ray does not descend to that height.
+        They are NaN where the ray of a pixel does not descend to that height.
         """
         ideal = self.lens.ideal(pixels)
         rays = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1) @ self.rotation
@@ -148,7 +151,7 @@ class OverheadCamera:
         return np.asarray(np.where(depth > 0, xy, np.nan))
 
     def to_json(self) -> Content:
-        """Return the content of a camera file, as `load` reads it."""
+        """Return the content of a camera file, which `load` can read."""
         return self.lens.to_json() | {
             "rotation_from_world": self.rotation.tolist(),
             "place_m": self.place.tolist(),
@@ -160,7 +163,7 @@ class OverheadCamera:
         """Write the camera as a JSON file.
 
         Raises:
-            DataError: nothing can be written there.
+            DataError: the file cannot be written.
         """
         write_json(Path(path), self.to_json())
 
@@ -169,7 +172,7 @@ class OverheadCamera:
         """Return the camera in a file that `slipid calibrate` or `slipid simulate` wrote.
 
         Raises:
-            DataError: the file is absent or no camera file, or its floor was not calibrated.
+            DataError: the file is absent, is not a camera file, or contains a lens alone.
         """
         return read_camera(Path(path)).above_floor(path)
 
@@ -180,7 +183,7 @@ class CameraFile:
 
     Attributes:
         lens: the lens.
-        camera: the whole camera; None where its floor was not calibrated.
+        camera: the lens at its place above the floor; None if the file contains the lens alone.
         report: report of the calibration.
     """
 
@@ -189,7 +192,7 @@ class CameraFile:
     report: Content
 
     def above_floor(self, path: Path | str) -> OverheadCamera:
-        """Return the camera; DataError where its floor was not calibrated."""
+        """Return the camera; raise `DataError` if the file `path` contains the lens alone."""
         if self.camera is None:
             raise DataError(
                 f"{path}: a lens without a floor; expected one with rotation_from_world and "
@@ -199,7 +202,7 @@ class CameraFile:
 
 
 class _CameraSection(Section):
-    """A camera file as it stands."""
+    """Keys of a camera file."""
 
     schema_: Literal["slipid.camera/1"] = Field(alias="schema")
     image_px: tuple[Pixels, Pixels]
@@ -213,10 +216,10 @@ class _CameraSection(Section):
 
 
 def read_camera(path: Path) -> CameraFile:
-    """Return the content of a camera file, checked.
+    """Return the checked content of a camera file.
 
     Raises:
-        DataError: absent, no camera file, or values that no camera can have.
+        DataError: the file is absent, is not a camera file, or has values that no camera can have.
     """
     expected = "a camera file (slipid.camera/1) that `slipid calibrate` wrote"
     given = checked(path, read_json(path, expected), _CameraSection)

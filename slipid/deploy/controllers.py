@@ -94,6 +94,6 @@ def control_loop_of(
     estimator: AbstractEstimator[Any] = Estimator(robot, settings, floor if row.mapped else None)
     if row.observer != "contact":
         estimator = Odometry(robot, settings, curve=row.observer == "curve")
-        gains = replace(gains, preview=jnp.asarray(0.0))  # the paper's loop has none
+        gains = replace(gains, preview=jnp.asarray(0.0))  # the paper's loop has no preview
     law = None if row.law is None else row.law(robot)
     return ControlLoop(estimator, Controller(robot, gains, correction=row.correction, law=law))

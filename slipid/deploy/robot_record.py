@@ -305,7 +305,7 @@ def _effect_table(
     robots = jax.vmap(contact.space.tree)(jnp.asarray(draws))
     k = jnp.asarray(contact.robot.load_index(load))
     moved = [moved_per_metre(robots, k, jnp.exp(s), directions(DIRECTIONS)) for s in log_speed]
-    predicted = np.concatenate([np.asarray(x) for x in moved], axis=2)  # one speed after the other
+    predicted = np.concatenate([np.asarray(x) for x in moved], axis=2)  # directions, by speed
     shape = (len(labels), count, DIRECTIONS, len(AXES))
     mean, left = np.zeros(shape), np.zeros(shape)
     for n, floor in enumerate(labels):

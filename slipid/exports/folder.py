@@ -53,7 +53,7 @@ def check_writable(folder: Path) -> None:
     sums = _sums(folder) if (folder / SUMS).is_file() else {}
     for name in sorted(_files(folder) - {SUMS}):
         if _whole(name) in {SUMS, *sums}:
-            continue  # an unfinished file of a process that was killed
+            continue  # left unfinished by an export that was killed
         if name not in sums:
             raise DataError(
                 f"{folder}: has files that no export wrote ({name}); name another folder with --out"

@@ -101,7 +101,7 @@ def _curve(robot: DeployedRobot) -> Iterator[NumberRow]:
 def _csv(robot: DeployedRobot, lines: tuple[NumberRow, ...]) -> str:
     text = io.StringIO()
     for line in header(robot):
-        text.write(f"# {line}".replace('"', "'") + "\n")  # a quote could join lines
+        text.write(f"# {line}".replace('"', "'") + "\n")  # CSV readers join lines at quotes
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(HEAD)
     for x in lines:

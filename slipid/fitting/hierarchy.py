@@ -335,7 +335,12 @@ def pooled(precision: Square, z: Search, objective: Objective, log_v: Variances)
 
 
 class PooledStds(NamedTuple):
-    """Candidate stds of the load biases of floors and their probabilities, which sum to one."""
+    """Posterior of the std of the load biases of floors, on a grid.
+
+    Attributes:
+        std: candidate stds.
+        weight: probability of each candidate; the sum is one.
+    """
 
     std: Float[np.ndarray, " grid"]
     weight: Float[np.ndarray, " grid"]

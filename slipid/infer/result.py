@@ -176,7 +176,9 @@ class Fit:
             return profile(required(self.problem), required(self.optimum), path)
 
     def validate(self, runs: Runs) -> Validation:
-        """Predict runs open loop with the fit and with every simpler slip model fitted beside it.
+        """Return the scores of runs predicted open loop by the fit and by simpler slip models.
+
+        The simpler models are those that were fitted to the same runs.
 
         Raises:
             DataError: a run has a floor or a load set-up that was not identified.

@@ -1,1 +1,1 @@
-"""Pictures of results, one file per subject."""
+"""Pictures of results, with one module per subject."""

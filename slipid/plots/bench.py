@@ -1,4 +1,4 @@
-"""Picture of a motor on a bench: measured and fitted signals, and residuals."""
+"""Picture of a fit to bench logs of a motor: measured and fitted signals, and residuals."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from slipid.infer.bench.windows import BenchWindows
 from slipid.plots.drawing import BLUE, INK, ORANGE, SHADE, figure, plain, save
 
 MOST = 4000
-"""Largest number of points of a curve."""
+"""Approximate largest number of points of a curve; longer signals are thinned."""
 
 
 def bench_plots(fit: BenchFit, out: Path) -> list[Path]:
@@ -24,7 +24,7 @@ def bench_plots(fit: BenchFit, out: Path) -> list[Path]:
 
 
 def bench_figure(fit: MotorFit) -> Figure:
-    """Draw voltage and current, measured and fitted, and residuals over time, speed and current."""
+    """Draw each measured and fitted signal, and residuals over time, speed and current."""
     count = len(fit.equations)
     which = f"motor {fit.label}: " if fit.label else ""
     made = figure(
@@ -38,7 +38,7 @@ def bench_figure(fit: MotorFit) -> Figure:
 
 
 def _clock(w: BenchWindows) -> np.ndarray:
-    """Return the time of windows, with the records one after the other [s]."""
+    """Return the time of windows, where each record begins at the end of the previous one [s]."""
     ends = [float(w.time[w.record == k].max(initial=0.0)) for k in range(int(w.record.max()) + 1)]
     return np.asarray(w.time + np.concatenate([[0.0], np.cumsum(ends)])[w.record])
 
@@ -56,7 +56,7 @@ def _signals(axes: Axes, equation: Equation) -> None:
 
 
 def _residuals(panels: list[Axes], equation: Equation) -> None:
-    """Draw residuals, point by point, and their means in bins."""
+    """Draw residuals and their means in bins, over time, speed and current."""
     w, s = equation.windows, equation.sums
     both, residual = w.both, (s.even.residual + s.odd.residual) / 2
     weight = s.even.weight + s.odd.weight + 1e-9

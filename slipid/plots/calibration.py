@@ -1,4 +1,4 @@
-"""Pictures of a calibrated camera: coverage by corners, and residuals of points on the floor."""
+"""Pictures of a camera calibration: coverage by corners, and residuals of points on the floor."""
 
 from pathlib import Path
 
@@ -14,13 +14,13 @@ from slipid.camera.overhead import OverheadCamera
 from slipid.plots.drawing import BLUE, GREEN, INK, ORANGE, figure, save
 
 LONGEST = 0.06
-"""Length at which the larger residuals are drawn, as a part of the picture's width."""
+"""Largest length at which the 95 % quantile of residuals is drawn, as a share of picture width."""
 STEPS = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0])
-"""Possible distances between the drawn lines of the floor [m]."""
+"""Possible distances between grid lines drawn on the floor [m]."""
 
 
 def coverage_picture(quality: Quality, path: Path) -> Path:
-    """Write a picture of the corners of a lens fit, their residuals, and cells without any."""
+    """Write a picture of a lens fit: corners with residuals, and image cells without corners."""
     fit, covered = quality.fit, quality.coverage
     width, height = fit.lens.image_px
     title = (
@@ -45,7 +45,10 @@ def coverage_picture(quality: Quality, path: Path) -> Path:
 
 
 def floor_picture(fit: FloorFit, path: Path) -> Path:
-    """Write a picture of the floor's axes and lines as the camera sees them, with residuals."""
+    """Write a picture of the floor's axes and grid as the camera sees them, with residuals.
+
+    Residuals are those of the points by which the camera's pose was fitted.
+    """
     width, height = fit.camera.lens.image_px
     title = f"The floor from {fit.camera.height:.3f} m; rms error of points {fit.rms_px:.2f} px"
     drawing, axes = _frame(title, width, height)
@@ -62,7 +65,7 @@ def floor_picture(fit: FloorFit, path: Path) -> Path:
 
 
 def _frame(title: str, width: int, height: int) -> tuple[Figure, Axes]:
-    """Return axes over a picture, its first row at the top, with room for a legend below."""
+    """Return a figure and axes in pixels of the image, with the first row at the top."""
     drawing = figure(9.0, 8.3 * height / width + 1.2, title)
     axes = drawing.add_subplot()
     axes.set_xlim(-0.5, width - 0.5)
@@ -83,7 +86,7 @@ def _arrows(
     residuals: Float[np.ndarray, "point 2"],
     width: int,
 ) -> None:
-    """Draw points with their residuals, enlarged by a round number to be visible."""
+    """Draw points with their residuals [pixel], enlarged by a round factor to be visible."""
     largest = float(np.quantile(np.hypot(*residuals.T), 0.95))
     wanted = LONGEST * width / max(largest, 1e-6)
     times = 10 ** np.floor(np.log10(wanted))
@@ -100,7 +103,7 @@ def _arrows(
 
 
 def _floor_lines(axes: Axes, camera: OverheadCamera) -> float:
-    """Draw lines of equal x and of equal y, and return their distance [m]."""
+    """Draw lines of constant x and of constant y on the floor, and return their distance [m]."""
     width, height = camera.lens.image_px
     edge = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
     farthest = 4 * camera.height

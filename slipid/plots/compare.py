@@ -1,4 +1,4 @@
-"""Pictures of slip models side by side: their errors and the best model on every floor."""
+"""Pictures that compare slip models: their errors, and the best model on every floor."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -37,18 +37,18 @@ WORDS = {
 
 
 def compare_plot(found: Content, out: Path) -> Path:
-    """Write a picture of the ranking by the first question of comparison.json."""
+    """Write a picture of the ranking under the first kind of held-out runs in comparison.json."""
     question, answer = next(iter(found["questions"].items()))
     made = compare_figure(answer["floors"], SHOWN.get(question, question))
     return drawing.save(made, out / "comparison.png")
 
 
 def compare_figure(floors: Content, which: str) -> Figure:
-    """Draw the predictive density less the best model's and the end-point error, by floor.
+    """Draw two panels per floor: log predictive density less the best model's, end-point errors.
 
     Args:
-        floors: floors of one question of comparison.json.
-        which: held-out runs in words.
+        floors: content of comparison.json by floor, for one kind of held-out runs.
+        which: description of the held-out runs.
     """
     models = list(next(iter(floors.values()))["models"])
     made = drawing.figure(
@@ -101,7 +101,7 @@ def validation_figure(found: Content, which: str) -> Figure:
 
     Args:
         found: content of the file.
-        which: its runs in words.
+        which: description of its runs.
     """
     floors = found["summary"]
     models = list(next(iter(floors.values())))
@@ -119,22 +119,22 @@ def validation_figure(found: Content, which: str) -> Figure:
 
 
 def _readable(models: Sequence[str]) -> list[str]:
-    """Return the names of models for people."""
+    """Return the names of models as a reader should see them."""
     return [WORDS.get(model, model.replace("_", " ")) for model in models]
 
 
 def _set_title(ax: Axes, floor: str, runs: int) -> None:
-    """Title a panel with its floor and the number of runs."""
+    """Set the title of a panel: floor, load set-up and number of runs."""
     ax.set_title(f"{floor.replace('@', ', load ')}\n{runs} runs", fontsize=10)
 
 
 def _colour_of(model: str) -> str:
-    """Return the colour of a model; only the identified one stands out."""
+    """Return the colour of a model: gray, except for the identified one."""
     return drawing.BLUE if model == "identified" else "#a8a8a8"
 
 
 def _bars(ax: Axes, error: Mapping[str, float], half: Sequence[float] | None = None) -> None:
-    """Draw a bar per model with its number; `half` is half the length of each error bar."""
+    """Draw a bar per model, labelled with its error; `half` is half the length of error bars."""
     drawing.plain(ax)
     ax.grid(False, axis="y")
     values, colours = list(error.values()), [_colour_of(model) for model in error]

@@ -1,4 +1,4 @@
-"""Picture of proposed runs: their commands, and the uncertainty over the number of runs."""
+"""Picture of a design: commands of the proposed runs, and uncertainty over the number of runs."""
 
 import math
 from collections import Counter
@@ -21,7 +21,10 @@ CURVES = (
 
 
 def design_figure(found: Design) -> Figure:
-    """Draw proposed and driven runs by floor and load (left), and uncertainty over runs (right)."""
+    """Draw proposed and driven runs by floor and load (left), and the uncertainty (right).
+
+    The uncertainty is drawn over the number of runs.
+    """
     setups = list(dict.fromkeys((d.surface, d.load) for d in found.runs))
     columns = min(len(setups), 2 if len(setups) < 5 else 3)
     rows = math.ceil(len(setups) / columns)
@@ -61,7 +64,15 @@ def _commands(
     mine: Counter[PlannedRun],
     order: dict[PlannedRun, int],
 ) -> None:
-    """Draw the commanded velocities of one floor and load."""
+    """Draw the commanded velocities on one floor with one load set-up.
+
+    Args:
+        ax: axes to draw on.
+        found: the design.
+        setup: floor and load set-up.
+        mine: number of repetitions of each proposed run.
+        order: position of each run in the proposed order, from 1.
+    """
     floor, load = setup
     driven = found.validity[floor]
     reach = 1.4 * max(d.speed or abs(d.turn) * found.base_radius for d in mine)
@@ -81,10 +92,10 @@ def _commands(
 
 
 def _arrow(ax: Axes, d: PlannedRun, base: float, beyond: float) -> tuple[float, float]:
-    """Draw an arrow to the commanded velocity, bent for a turn, an arc for a turn on the spot.
+    """Draw the command of a run as an arrow, and return the position of its label.
 
-    Returns:
-        the position of its label, `beyond` [m/s] the tip.
+    The arrow ends at the commanded velocity [m/s]. It is bent if the run turns, and an arc for a
+    turn on the spot. The label is `beyond` [m/s] further out than the tip.
     """
     colour, sign = _colour(d), float(np.sign(d.turn))
     style = {"arrowstyle": "-|>", "color": colour, "lw": 1.5, "shrinkA": 0, "shrinkB": 0}
@@ -110,7 +121,7 @@ def _colour(d: PlannedRun) -> str:
 
 
 def _falling(ax: Axes, saved: Content) -> None:
-    """Draw the uncertainty over the number of runs, without earlier data."""
+    """Draw each curve of the uncertainty over the number of runs, without earlier data."""
     for key, colour, style, label in CURVES:
         curve = saved["curves"][key]
         std = np.sqrt(curve["criterion"])

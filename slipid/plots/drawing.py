@@ -1,4 +1,4 @@
-"""Parts shared by all pictures: figures without a display, colours, atomic files."""
+"""Functions and colours shared by all pictures; figures need no display."""
 
 import io
 import math
@@ -14,13 +14,13 @@ from slipid.support.files import write_bytes
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 INK, SHADE = "#222222", "#888888"
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, "#56B4E9", "#E69F00")
-"""Okabe and Ito's colours, distinct for any colour vision."""
+"""Colours of series, from Okabe and Ito, which people with any colour vision can distinguish."""
 STYLES = tuple(zip(SERIES, ("o", "^", "s", "D", "v", "P"), strict=True))
 """Colour and marker of each series."""
 
 
 def figure(width: float, height: float, title: str) -> Figure:
-    """Return an empty figure [inch] with a title that states its message."""
+    """Return an empty figure of this size [inch], with a title that states its message."""
     made = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(made)
     made.suptitle(title, fontsize=13, x=0.01, ha="left", color=INK)
@@ -28,16 +28,16 @@ def figure(width: float, height: float, title: str) -> Figure:
 
 
 def add_warning(made: Figure, text: str) -> None:
-    """Put a warning above the title of a figure, in its colour."""
+    """Put a warning above the title of a figure; both turn orange."""
     title = made.get_suptitle()
     made.suptitle(f"{text}\n{title}", fontsize=13, x=0.01, ha="left", color=ORANGE)
 
 
 def panels(count: int, width: float, height: float, title: str) -> tuple[Figure, list[Axes]]:
-    """Return a figure with `count` plain panels of one size [inch], in rows of at most four."""
+    """Return a figure with `count` panels of the same size [inch], in rows of at most four."""
     columns = min(count, 4 if count != 5 else 3)
     rows = math.ceil(count / columns)
-    # a single panel leaves room for the title
+    # the figure is wide enough for the title even with a single panel
     made = figure(max(width * columns, 8.8), height * rows + 0.6, title)
     axes = list(made.subplots(rows, columns, squeeze=False).flat)
     for spare in axes[count:]:
@@ -48,7 +48,7 @@ def panels(count: int, width: float, height: float, title: str) -> tuple[Figure,
 
 
 def plain(axes: Axes) -> None:
-    """Give axes a light grid and no box."""
+    """Give axes a light grid, and remove their top and right edges."""
     axes.grid(color="#dddddd", lw=0.6)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
@@ -56,7 +56,7 @@ def plain(axes: Axes) -> None:
 
 
 def png(made: Figure) -> bytes:
-    """Return the content of a PNG file of the figure."""
+    """Return the figure as the bytes of a PNG file."""
     buffer = io.BytesIO()
     made.savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()
@@ -69,5 +69,5 @@ def save(made: Figure, path: Path) -> Path:
 
 
 def save_all(figures: Mapping[str, Figure | None], out: Path) -> list[Path]:
-    """Write figures under their names with `.png`, except missing ones; return the files."""
+    """Write each figure that is not None to `out/NAME.png`; return the files."""
     return [save(made, out / f"{name}.png") for name, made in figures.items() if made is not None]

@@ -1,4 +1,4 @@
-"""Pictures of logs before a fit and of its result: raw signals, load shares, files of all."""
+"""Pictures of logs before a fit, and of the results of a fit and of a validation."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ from slipid.predict.validation import Validation
 
 
 def raw_plots(data: Runs, out: Path) -> list[Path]:
-    """Write the picture `plot_runs` of each floor and load set-up; return the files."""
+    """Write a picture of the logged signals for each floor and load set-up; return the files."""
     return [
         save(plot_runs(data, runs, f"{floor}, {load}"), out / f"raw_{floor}_{load}.png")
         for (floor, load), runs in sorted(runs_by_setup(data).items())
@@ -32,8 +32,8 @@ def plot_runs(data: Runs, runs: Sequence[int] | None = None, title: str = "as lo
 
     Args:
         data: all runs.
-        runs: numbers of the runs that are drawn, all by default.
-        title: title of the picture.
+        runs: indices of the runs that are drawn; None for all.
+        title: beginning of the picture's title.
     """
     runs = range(len(data)) if runs is None else runs
     wheels = data.wheel_angle.shape[1]
@@ -61,7 +61,11 @@ def plot_runs(data: Runs, runs: Sequence[int] | None = None, title: str = "as lo
 
 
 def load_figure(fit: Fit) -> Figure | None:
-    """Draw the share of the weight on each wheel by load set-up; return None if all are fixed."""
+    """Draw the share of the weight on each wheel, one panel per load set-up.
+
+    Returns:
+        None if the shares of all load set-ups are fixed.
+    """
     loads = fit.robot.body.loads
     found = [fit.parameters[f"robot.load_share@{load}"] for load in loads]
     if all(e.interval90 is None for e in found):
@@ -76,7 +80,7 @@ def load_figure(fit: Fit) -> Figure | None:
 
 
 def _robot(ax: Axes, fit: Fit, estimate: Estimate) -> None:
-    """Draw one robot from above, with x up and y to the left."""
+    """Draw the robot from above with its shares of the weight; x is up and y to the left."""
     shape = fit.robot.geometry
     base, radius = float(shape.base_radius), float(shape.wheel_radius)
     place = np.asarray(shape.place) * base
@@ -109,7 +113,7 @@ def _robot(ax: Axes, fit: Fit, estimate: Estimate) -> None:
 
 
 def _up(p: np.ndarray | Sequence[float]) -> tuple[float, float]:
-    """Return a body position x, y on a page with x up and y to the left."""
+    """Return the position on the page of a body position (x, y); x is up and y to the left."""
     return -float(p[1]), float(p[0])
 
 
@@ -133,13 +137,13 @@ PICTURES: dict[str, Callable[[Fit, Runs, MeasuredWindows], Figure | None]] = {
     "current_by_traction": lambda fit, data, measured: current_figure(measured),
     "load_share": lambda fit, data, measured: load_figure(fit),
 }
-"""Pictures of a fit by name."""
+"""Functions that draw the pictures of a fit, by name; they return None if data are missing."""
 
 
 def identify_plots(fit: Fit, data: Runs, out: Path, warning: str | None = None) -> list[Path]:
     """Write all `PICTURES` that the runs of the fit have data for; return the files.
 
-    A warning, for a fit that is not to be trusted, is added to the title of each.
+    If the fit cannot be trusted, `warning` is added to the title of each picture.
     """
     measured = measured_windows(fit.robot, data, fit.channels.windows)
     made = {name: draw(fit, data, measured) for name, draw in PICTURES.items()}
@@ -150,7 +154,11 @@ def identify_plots(fit: Fit, data: Runs, out: Path, warning: str | None = None) 
 
 
 def picture(fit: Fit, data: Runs, name: str) -> Figure:
-    """Return one picture by name; raise `ValueError` if it is unknown or the runs lack its data."""
+    """Return the picture with this name.
+
+    Raises:
+        ValueError: there is no such picture, or the runs lack the data for it.
+    """
     if name not in PICTURES:
         raise ValueError(f"no picture '{name}'; there are {', '.join(PICTURES)}")
     made = PICTURES[name](fit, data, measured_windows(fit.robot, data, fit.channels.windows))

@@ -1,4 +1,4 @@
-"""Picture to check a map of the floor by: the photograph with its outlines, beside the map."""
+"""Picture for checking a floor map: the photograph with outlines of patches, beside the map."""
 
 from pathlib import Path
 from textwrap import shorten
@@ -16,7 +16,7 @@ from slipid.data.geojson_map import Patch, VectorMap, covered
 from slipid.plots.drawing import INK, SHADE, figure, save
 
 NAMED = 0.01
-"""Share of the map above which a patch has its name on it."""
+"""Share of the map's area from which a patch is labelled with its name."""
 HATCH = "////"
 
 
@@ -26,12 +26,12 @@ def floor_plot(
     in_view: Bool[np.ndarray, "row column"],
     path: Path,
 ) -> Path:
-    """Write the photograph laid onto the floor, with outlines and names, beside the map in colours.
+    """Write a picture of the rectified photograph with outlines and names, beside the map.
 
     Args:
         vector: the map.
-        photograph: blue, green, red of every cell of the map, the first row at the lowest y.
-        in_view: cells that the camera sees.
+        photograph: blue, green, red of every cell of the map; the first row has the lowest y.
+        in_view: True for cells that the camera sees.
         path: file of the picture.
     """
     known = f"{100 * (1 - vector.unknown):.0f} % of its rectangle known"
@@ -60,14 +60,17 @@ def floor_plot(
 
 
 def _unknown(vector: VectorMap) -> Rectangle:
-    """Return a hatched rectangle to draw below everything."""
+    """Return a hatched rectangle as large as the map, which shows through where it is unknown."""
     size = (vector.high_x - vector.low_x, vector.high_y - vector.low_y)
     corner = (vector.low_x, vector.low_y)
     return Rectangle(corner, *size, facecolor="white", edgecolor=SHADE, hatch=HATCH, lw=0, zorder=0)
 
 
 def _outline(axes: Axes, patch: Patch, colour: str | None) -> None:
-    """Draw a patch with its holes; without a colour only its edge, visible on light and dark."""
+    """Draw a patch with its holes, filled with `colour`.
+
+    Without a colour only the edges are drawn, so as to be visible on light and dark.
+    """
     rings = [np.concatenate([ring, ring[:1]]) for ring in patch.rings]
     shape = Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
     if colour is None:
@@ -78,7 +81,7 @@ def _outline(axes: Axes, patch: Patch, colour: str | None) -> None:
 
 
 def _names(axes: Axes, vector: VectorMap) -> None:
-    """Write the names of the large patches where they have most room."""
+    """Write the name of each large patch where it has most room."""
     whole = (vector.high_x - vector.low_x) * (vector.high_y - vector.low_y)
     for patch in vector.patches:
         if patch.area < NAMED * whole:
@@ -93,7 +96,10 @@ def _names(axes: Axes, vector: VectorMap) -> None:
 
 
 def middle(patch: Patch) -> Float[np.ndarray, "2"]:
-    """Return the place in a patch farthest from its edge [m], to a hundredth of its size."""
+    """Return the point of a patch that is farthest from its edge [m].
+
+    The resolution is a hundredth of the patch's longer side.
+    """
     from scipy.ndimage import distance_transform_edt
 
     low, high = patch.rings[0].min(axis=0), patch.rings[0].max(axis=0)
@@ -106,7 +112,7 @@ def middle(patch: Patch) -> Float[np.ndarray, "2"]:
 
 
 def _swatches(vector: VectorMap) -> list[Swatch]:
-    """Return the entries of the legend: colours, names and areas, and the hatching."""
+    """Return the entries of the legend: surfaces with colours and areas, and the hatching."""
     swatches = []
     for name, colour in vector.colours.items():
         area = sum(patch.area for patch in vector.patches if patch.surface == name)

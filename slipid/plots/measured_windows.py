@@ -1,4 +1,4 @@
-"""Measured and predicted slip, currents and torques of segments of runs, for pictures."""
+"""Measured and predicted slip, currents and torques of segments of runs, as pictures show them."""
 
 from dataclasses import dataclass
 
@@ -16,37 +16,41 @@ from slipid.model.robot import Robot
 from slipid.predict.slip_model import body_twist
 
 STRAIGHT = 0.98
-"""Smallest displacement over path length, by the encoders, of a straight segment."""
+"""Smallest ratio of displacement to path length, by encoders, of a segment that is straight."""
 SHORTEST_PATH = 0.05
-"""Path length of a wheel's rim below which its slip is noise [m]."""
+"""Distance that a wheel's rim turns in a segment up to which its slip is too noisy to use [m]."""
 TURNING = 0.5
-"""Yaw per path length, by the encoders, from which a segment is a turn [rad/m]."""
+"""Yaw per path length, by encoders, from which a segment counts as a turn [rad/m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredWindows:
     """Means over segments of a few seconds, with angles in the body frame.
 
-    Values of a drive are means over its wheels, or sums of their loads and torques.
+    The value of a drive is the mean over its wheels or, for loads and torques, their sum.
 
     Attributes:
-        group: index into `groups` of each segment.
-        groups: (floor, load set-up), from the smallest slip to the largest.
-        speed: commanded speed of the body, else by the encoders, to 0.01 [m/s].
-        heading: direction of travel by the encoders, 0 to 360 [deg].
-        straight: True if the segment has one direction and no turn.
-        slip: 1 - camera's displacement along the encoders' direction over the encoders' [1].
-        drift: sideways angle of the camera's displacement to the encoders' [deg].
-        yaw: yaw by camera less encoders, per encoder path length [deg/m].
+        group: index of each segment's floor and load set-up in `groups`.
+        groups: pairs (floor, load set-up), sorted from the floor with the smallest median slip.
+        speed: commanded speed of the body, or that by encoders without a command, rounded to
+            0.01 m/s [m/s].
+        heading: direction of travel by encoders in the body frame, 0 to 360 [deg].
+        straight: True if the body travels in one direction without a turn.
+        slip: 1 - (camera's displacement along the encoders' direction) / (encoders' displacement)
+            [1].
+        drift: angle of the camera's displacement from that of the encoders, left positive [deg].
+        yaw: yaw by camera less yaw by encoders, divided by the encoders' displacement [deg/m].
         wheel_speed: speed of the wheel [rad/s].
-        wheel_slip: 1 - (speed over the floor) / (rim speed), nan for a wheel that hardly turned.
-        sideways: speed across the wheel over its rim speed [1].
-        share: share of the weight on the wheel in motion.
-        amps: measured current, None if not logged [A].
+        wheel_slip: 1 - (speed over the floor) / (rim speed) [1]; NaN for a wheel that hardly
+            turned.
+        sideways: ratio of the wheel's sideways rolling speed to its rim speed [1].
+        share: share of the weight on the wheel in motion [1].
+        amps: measured current [A]; None if currents were not logged.
         amps_model: predicted current [A].
         torque: predicted traction torque at the wheel [N m].
-        drag_torque: torque of the drag along the drive that the motor bears as well [N m].
-        unsigned: True if only magnitudes of currents were logged.
+        drag_torque: predicted torque of the drag along the drive direction, which the motor bears
+            in addition to traction [N m].
+        unsigned: True if currents were logged as magnitudes.
     """
 
     group: np.ndarray
@@ -69,7 +73,10 @@ class MeasuredWindows:
 
 
 def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWindows:
-    """Return segments of at most `per_segment` windows of 1.5 s, beside what the robot predicts."""
+    """Return measured and predicted means over segments of at most `per_segment` windows.
+
+    A window lasts at most 1.5 s; predictions are those of `robot`.
+    """
     radius, lag = float(robot.geometry.wheel_radius), float(robot.camera.lag)
     w = windows(data, radius, lag, per_segment=per_segment, longest=1.5)
     b, dt = lk.batch(w, robot), w.dt[..., None]
@@ -127,7 +134,7 @@ def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWind
 def by_heading(
     robot: Robot, surface: str, load: str, speed: float, heading: Float[np.ndarray, " heading"]
 ) -> Float[np.ndarray, "heading 3"]:
-    """Return predicted slip [1], sideways angle [deg] and yaw [deg/m] of straight commands.
+    """Return predicted slip [1], drift [deg] and yaw [deg/m] for commands of straight motion.
 
     Args:
         robot: robot with its contact law.
@@ -150,7 +157,7 @@ def by_heading(
 
 @jax.jit
 def _borne(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
-    """Return predicted currents [A], and torques of the drag along the drive [N m]."""
+    """Return predicted currents [A], and torques of the drag along the drive direction [N m]."""
     motor_force = lk.predict(robot, b).motor_force
     force = robot.surfaces.friction[b.surface] * robot.body.mass * model.GRAVITY
     drag = robot.motor.rolling_drag * motor_force[..., 1]

@@ -1,4 +1,4 @@
-"""Pictures of motion: slip and drift over heading, and predicted beside measured paths."""
+"""Pictures of motion: slip and drift over heading, and predicted and measured paths."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -25,16 +25,16 @@ ROWS = (
 MOST_SPEEDS = 4
 """Largest number of speeds that are drawn."""
 RAYS, LOOPS = 16, 3
-"""Number of straight runs, and of other runs, in a panel of paths."""
+"""Largest number of runs in a panel of paths, if all runs are straight, and otherwise."""
 LEAST_OCTANTS = 5
-"""Number of octants with runs on a floor for which it is drawn over heading."""
+"""Smallest number of octants of headings with straight segments for a panel over heading."""
 
 
 def heading_figure(robot: Robot, measured: MeasuredWindows) -> Figure | None:
     """Draw slip and drift over the direction of travel, a column per floor and load set-up.
 
     Returns:
-        None if no floor has straight runs in most directions.
+        None if no floor has straight segments in most directions.
     """
     octant = (measured.heading // 45.0).astype(int)
     driven = (
@@ -64,7 +64,7 @@ def heading_figure(robot: Robot, measured: MeasuredWindows) -> Figure | None:
 
 
 def _speeds(measured: MeasuredWindows) -> list[float]:
-    """Return at most `MOST_SPEEDS` driven speeds, each a tenth away from the next."""
+    """Return the most frequent speeds that differ by more than a tenth, at most `MOST_SPEEDS`."""
     found: list[float] = []
     values, counts = np.unique(measured.speed[measured.straight], return_counts=True)
     for v in values[np.argsort(-counts)]:
@@ -97,13 +97,13 @@ def _headings(
 
 
 def named(surface: str, load: str, groups: Sequence[tuple[str, str]]) -> str:
-    """Return the title of a panel, with the load set-up if there are several."""
+    """Return the title of a panel: the surface, and the load set-up if `groups` has several."""
     several = len({other for _, other in groups}) > 1
     return f"{surface}, load {load}" if several else surface
 
 
 def runs_by_setup(data: Runs) -> dict[tuple[str, str], list[int]]:
-    """Return the numbers of the runs of each floor and load set-up."""
+    """Return the indices of the runs of each (floor, load set-up)."""
     groups: dict[tuple[str, str], list[int]] = {}
     for k, log in enumerate(data.logs):
         groups.setdefault((log.surface or "unknown", log.load), []).append(k)
@@ -113,13 +113,15 @@ def runs_by_setup(data: Runs) -> dict[tuple[str, str], list[int]]:
 def path_figure(
     model: ForceBalance, data: Runs, order: Sequence[tuple[str, str]], title: str
 ) -> Figure:
-    """Draw some runs per floor and load, from one start with the robot facing right.
+    """Draw measured and predicted paths of some runs, one panel per floor and load set-up.
+
+    All paths start at the origin with the robot facing right.
 
     Args:
-        model: slip model that predicts, with shared effects as in the table of errors.
+        model: force balance that predicts, with shared effects as in the table of errors.
         data: the runs.
-        order: order of the panels, (floor, load set-up).
-        title: title that names the set of runs.
+        order: (floor, load set-up) of the panels in order.
+        title: title of the picture, which names the set of runs.
     """
     groups = runs_by_setup(data)
     names = [name for name in order if name in groups]
@@ -146,7 +148,11 @@ def path_figure(
 
 
 def _spread(data: Runs, runs: list[int]) -> list[int]:
-    """Return some runs, evenly over headings and of the most common speed if they have headings."""
+    """Return the indices of some of the runs.
+
+    If all runs have headings, they are runs of the most frequent speed, evenly spread over
+    headings.
+    """
     heading, speed, most = data.heading[runs], data.speed[runs], LOOPS
     if np.isfinite(heading).all():
         values, counts = np.unique(np.round(speed, 3), return_counts=True)
@@ -160,7 +166,7 @@ def _spread(data: Runs, runs: list[int]) -> list[int]:
 
 
 class _Paths(NamedTuple):
-    """Paths (edge, 2) of a run from the origin, starting along x."""
+    """Paths (edge, 2) of a run that start at the origin, with the robot facing along x [m]."""
 
     measured: np.ndarray
     predicted: np.ndarray
@@ -168,7 +174,7 @@ class _Paths(NamedTuple):
 
 
 def _paths(model: ForceBalance, data: Runs) -> dict[int, _Paths]:
-    """Return the paths of every run by its number."""
+    """Return the paths of every run, by its index."""
     out: dict[int, _Paths] = {}
     robot = model.robot
     for w in replay.replay_windows(data, robot):
@@ -187,7 +193,7 @@ def _paths(model: ForceBalance, data: Runs) -> dict[int, _Paths]:
 
 
 def _errors(paths: Sequence[_Paths]) -> str:
-    """Return a text with the mean end-point errors over displacement, of model and encoders."""
+    """Return a text with mean end-point errors relative to displacement, of model and encoders."""
     ends = np.array([[p[-1] for p in run] for run in paths])
     chord = np.maximum(np.linalg.norm(ends[:, 0], axis=1), 1e-9)
     error = np.linalg.norm(ends[:, 1:] - ends[:, :1], axis=2) / chord[:, None]

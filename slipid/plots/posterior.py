@@ -1,4 +1,7 @@
-"""Pictures of uncertainty: draws and profile likelihoods beside the curvature at the fit."""
+"""Pictures of uncertainty: posterior draws and profile likelihoods beside Gaussian approximations.
+
+The Gaussian approximation of the posterior has the curvature of the loss at the fit.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,16 +15,19 @@ from slipid.infer.verdicts.profile import RISE, Profile
 from slipid.plots import drawing
 
 PANELS = 6
-"""Largest number of pairs of numbers that are drawn."""
+"""Largest number of pairs of parameters that are drawn."""
 
 
 def posterior_plots(found: Posterior, out: Path) -> list[Path]:
-    """Write all `PICTURES`; return the files."""
+    """Write all `PICTURES` of a posterior; return the files."""
     return drawing.save_all({f"posterior_{k}": draw(found) for k, draw in PICTURES.items()}, out)
 
 
 def interval_figure(found: Posterior) -> Figure:
-    """Draw 90 % intervals of draws and of the fit's curvature, in prior standard deviations."""
+    """Draw 90 % intervals of parameters, from posterior draws and from the fit's covariance.
+
+    They are drawn in prior standard deviations from the prior mean.
+    """
     fit, z = found.fit, found.flat
     chosen = np.flatnonzero(fit.space.where(lambda e: e.session is None)).tolist()
     mean, std = fit.verdict_space.prior_mean[chosen], fit.verdict_space.prior_std[chosen]
@@ -52,7 +58,7 @@ def interval_figure(found: Posterior) -> Figure:
 
 
 def pair_figure(found: Posterior) -> Figure:
-    """Draw the pairs of numbers whose draws are furthest from an ellipse."""
+    """Draw the pairs of parameters whose posterior draws deviate most from an ellipse."""
     fit, z = found.fit, found.flat
     pairs = curved_pairs(z)
     made, axes = drawing.panels(
@@ -72,19 +78,20 @@ def pair_figure(found: Posterior) -> Figure:
 
 
 PICTURES = {"intervals": interval_figure, "pairs": pair_figure}
-"""Pictures of a posterior by name."""
+"""Functions that draw the pictures of a posterior, by name."""
 
 
 def curved_pairs(z: np.ndarray) -> list[tuple[int, int]]:
-    """Return pairs of coordinates, those first where a square of one explains most of the other.
+    """Return pairs of coordinates of draws that depend on each other most strongly in a curve.
 
-    Each coordinate appears once.
+    In the first pair, the square of one coordinate explains most of the other. Each coordinate is
+    in at most one pair.
     """
     t = (z - z.mean(axis=0)) / (z.std(axis=0) + 1e-300)
     linear = t.T @ t / len(t)
     square = t**2 - 1
     cubic = (t**3).mean(axis=0)
-    square = square - t * cubic  # the part of the square orthogonal to the line
+    square = square - t * cubic  # part of the square that is not correlated with the coordinate
     square /= square.std(axis=0) + 1e-300
     strength = np.abs(square.T @ t / len(t)) * (1 - np.eye(len(linear)))
     found: list[tuple[int, int]] = []
@@ -103,7 +110,10 @@ def _ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray) -> None:
 
 
 def profile_figure(found: Sequence[Profile]) -> Figure:
-    """Draw a panel per number: the rise of the loss when the number is held elsewhere."""
+    """Draw a panel per profile: the rise of the loss over the value at which a parameter is fixed.
+
+    All other parameters are fitted again at each value.
+    """
     made, axes = drawing.panels(
         len(found),
         5.4,

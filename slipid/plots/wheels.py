@@ -1,4 +1,4 @@
-"""Pictures of single wheels: slip over torque, and current over predicted traction."""
+"""Pictures of single wheels: slip over torque, and motor current over predicted traction."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,15 +15,19 @@ from slipid.plots.measured_windows import MeasuredWindows
 from slipid.plots.motion import named
 
 SIDEWAYS_COLOUR = "#35B779"
-"""Colour of a wheel that rolls sideways as fast as it turns, as in the colour scale of the dots."""
+"""Colour of the curve of a wheel whose sideways speed equals its rim speed; dots use it too."""
 STANDING = 0.05
-"""Speed over that of the fastest wheel below which a wheel counts as standing."""
+"""Ratio of a wheel's speed to that of the fastest wheel up to which it counts as at rest."""
 ROLLING = 0.3
-"""Speed over that of the fastest wheel below which a wheel's slip is too uncertain to draw."""
+"""Ratio of a wheel's speed to that of the fastest wheel up to which its slip is not drawn, since it
+would be too uncertain."""
 
 
 def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:
-    """Draw slip over torque of every floor with its 90 % band, over the slip of every wheel."""
+    """Draw the fitted curve of slip over torque on every floor, with its 90 % band.
+
+    Dots are the measured slips of all wheels.
+    """
     floors = list(dict.fromkeys(floor for floor, _ in measured.groups))
     title = "A wheel that pushes harder slips more, and more still when it rolls sideways"
     made, axes = drawing.panels(len(floors), 3.7, 3.9, title)
@@ -46,7 +50,11 @@ def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:
 
 
 def _cloud(ax: Axes, robot: Robot, measured: MeasuredWindows, floor: str) -> PathCollection | None:
-    """Draw the measured slip of every driven wheel over its torque, scaled to an even load."""
+    """Draw the measured slip of every turning wheel over its torque, scaled to an even load.
+
+    Returns:
+        None if no wheel turns on this floor.
+    """
     mine = np.array([measured.groups[g][0] == floor for g in measured.group])
     fastest = np.abs(measured.wheel_speed).max(axis=1, keepdims=True)
     turns = (np.abs(measured.wheel_speed) > ROLLING * fastest) & mine[:, None]
@@ -61,10 +69,10 @@ def _cloud(ax: Axes, robot: Robot, measured: MeasuredWindows, floor: str) -> Pat
 
 
 def driving_torque(robot: Robot, measured: MeasuredWindows) -> np.ndarray:
-    """Return the torque along a wheel's turning [N m], from the current or else predicted.
+    """Return the traction torque of each drive per wheel, positive along the wheel's motion [N m].
 
-    Wheels that share a drive share its torque. The sign of a current that is logged as a magnitude
-    comes from the prediction.
+    It comes from the measured current or, without one, from the prediction. The sign of a current
+    that is logged as a magnitude is that of the prediction.
     """
     turning, wheels = np.sign(measured.wheel_speed), robot.geometry.wheels / robot.geometry.drives
     if measured.amps is None:
@@ -82,7 +90,10 @@ def driving_torque(robot: Robot, measured: MeasuredWindows) -> np.ndarray:
 
 
 def _curve(ax: Axes, fit: Fit, floor: str) -> None:
-    """Draw the curve and its band, dashed beyond measured torques, and that of a sideways wheel."""
+    """Draw the slip curve of a floor with its band, and the curve of a wheel that rolls sideways.
+
+    Curves are dashed beyond the largest torque of the runs.
+    """
     curve = fit.curves[floor]
     speed, share = curve.wheel_speed, curve.load_share
     slip = np.linspace(0.0, 1.0, 201)
@@ -106,13 +117,13 @@ def wheel_curve(
     wheel_speed: float,
     share: float,
 ) -> Float[np.ndarray, " slip"]:
-    """Return the torque [N m] of a wheel that slips while it also rolls sideways.
+    """Return the torque of a wheel at given slips, while it also rolls sideways [N m].
 
     Args:
         robot: robot with its contact law.
         floor: name of the floor.
         slip: slip of the wheel along its drive direction [1].
-        sideways: speed across the wheel over its rim speed [1].
+        sideways: ratio of the wheel's sideways speed to its rim speed [1].
         wheel_speed: speed of the wheel [rad/s].
         share: share of the weight on the wheel.
 
@@ -135,7 +146,11 @@ def wheel_curve(
 
 
 def current_figure(measured: MeasuredWindows) -> Figure | None:
-    """Draw measured current over predicted traction, by wheel and by floor and load."""
+    """Draw measured current over predicted traction, by wheel and by floor and load set-up.
+
+    Returns:
+        None if currents were not logged.
+    """
     if measured.amps is None:
         return None
     wheels, groups = measured.amps.shape[1], measured.groups
@@ -170,7 +185,7 @@ def _amps(
     ax: Axes, measured: MeasuredWindows, mine: np.ndarray, wheel: int, top: float
 ) -> PathCollection:
     assert measured.amps is not None
-    # a wheel at rest is held by its gear, which the motor model does not describe
+    # wheels at rest are left out: their gear holds them, which the motor model does not describe
     speed, fastest = measured.wheel_speed[:, wheel], np.abs(measured.wheel_speed).max(axis=1)
     mine = mine & (np.abs(speed) > STANDING * fastest)
     speed = speed[mine]

@@ -148,7 +148,7 @@ def largest_shift(
 def contradiction(
     found: Mapping[str, FloorErrors], moved: LargestShift, by_map: float, as_if: Mapping[str, float]
 ) -> str | None:
-    """Return why runs over several floors are not used, None where they agree with the others.
+    """Return the reason to reject runs over several floors, None if they agree with the others.
 
     Args:
         found: errors of the runs on one floor each, by floor.

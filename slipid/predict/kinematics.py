@@ -144,7 +144,7 @@ def corrected(rolling: Twists, numbers: Float[np.ndarray, " number"]) -> Twists:
 HARMONICS = 6
 """Number of harmonics of the Fourier series over directions of travel."""
 RIDGES = (1e-5, 1e-3, 1e-1, 10.0)
-"""Weights of the ridge that the benchmark tries."""
+"""Weights of the ridge among which the benchmark selects."""
 WEIGHTS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Weights of the ridge from which `HeadingLookup` selects by its own cross-validation."""
 Together = Int[np.ndarray, " run"]

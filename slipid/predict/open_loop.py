@@ -24,7 +24,7 @@ from slipid.predict.slip_model import turned, turned_left
 from slipid.search_space import Space
 
 STEP = 0.5
-"""Longest step of a replay [s]."""
+"""Longest step in which the path of a run is predicted [s]."""
 Numbers = Array | np.ndarray
 TOGETHER = 32
 """Number of runs that are predicted in one compiled call."""

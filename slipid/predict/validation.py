@@ -66,7 +66,7 @@ def plain_values(values: Iterable[tuple[str, object]]) -> Content:
 
 @dataclass(frozen=True)
 class FloorSummary:
-    """Scores of a model over the runs on a floor; attributes as in `Score`."""
+    """Mean or median scores of a model over the runs on a floor; single scores are in `Score`."""
 
     endpoint_error_mean: float
     endpoint_error_median: float

@@ -1,1 +1,1 @@
-"""Text for people: tables of results, and the sentences around them."""
+"""Text for people: tables of results, with sentences that explain them."""

@@ -1,4 +1,4 @@
-"""Tables of comparisons of slip models, proposed runs, exports and trials of controllers."""
+"""Text about comparisons of slip models, proposed runs, exports and trials of controllers."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from slipid.deploy.export import Exported
 
 SHOWN = 3
-"""Largest number of goals of a design with a column of their own."""
+"""Largest number of goals of a design that have a column in the table of runs."""
 
 
 def show_comparison(page: Page, found: Content) -> None:
-    """Write comparison.json: a row per model, a column per floor, and sentences."""
+    """Write the content of comparison.json: tables with a row per model, and sentences."""
     for question, answer in found["questions"].items():
         page.line(
             f"{question} left out: log density less the best's ± clustered standard error (nats "
@@ -51,7 +51,7 @@ def show_comparison(page: Page, found: Content) -> None:
 
 
 def _ranking(answer: Content) -> Table:
-    """Return the table of one question."""
+    """Return the ranking under one kind of held-out runs, a row per model, a column per floor."""
     floors = answer["floors"]
     made = table(())
     made.add_column("model", no_wrap=True)
@@ -65,7 +65,11 @@ def _ranking(answer: Content) -> Table:
 
 
 def _ranked(m: Content) -> str:
-    """Return a cell: log density less the best's, end-point error and coverage [%]."""
+    """Return a table cell about a model on a floor.
+
+    It has the log density less the best model's [nats per run], the end-point error [%] and the
+    coverage of the 90 % region [%].
+    """
     colour = {"best": "bold green", "tied": "green"}.get(m["verdict"], "default")
     se = m["se_clustered"]
     if m["verdict"] == "best":
@@ -77,14 +81,14 @@ def _ranked(m: Content) -> str:
 
 
 def _numbers(count: dict[str, int]) -> str:
-    """Return the count of fitted numbers per floor, and of those shared by all floors."""
+    """Return, as text, how many parameters are fitted per floor, and for all floors together."""
     floors = sorted({n for floor, n in count.items() if floor != "shared"})
     own = f"{floors[0]}" if len(floors) == 1 else f"{floors[0]}-{floors[-1]}"
     return f"{own} + {count['shared']}" if count["shared"] else own
 
 
 def show_design(page: Page, found: Content) -> None:
-    """Write design.json: runs to drive next, expected stds, and savings over grids."""
+    """Write the content of design.json: runs to drive next, expected stds, savings over grids."""
     if found["runs"]:
         page.table(_runs(found))
         rest = len([g for g in found["goals"] if g["reachable"]]) - SHOWN
@@ -96,7 +100,7 @@ def show_design(page: Page, found: Content) -> None:
 
 
 def _runs(found: Content) -> Table:
-    """Return the table of proposed runs."""
+    """Return the table of proposed runs, with the expected std of each goal after each run."""
     goals = [g for g in found["goals"] if g["reachable"]][:SHOWN]
     names = ("run", "floor", "load", "heading", "m/s", "turn", "m", "seconds")
     made = table(names, right=[n for n in names if n not in ("floor", "load")])
@@ -123,7 +127,7 @@ def _uncertain(std: float, unit: str) -> str:
 
 
 def _saving(s: Content) -> str:
-    """Return a sentence on runs saved."""
+    """Return a sentence about how many chosen runs are worth as much as a grid of runs."""
     grid, count = f"{s['name']} ({s['grid_runs']} runs)", s["greedy_runs"]
     if count is None:
         return f"without earlier data: no fewer chosen runs are worth {grid}"
@@ -135,13 +139,16 @@ def _saving(s: Content) -> str:
 
 
 def show_export(page: Page, done: Exported) -> None:
-    """Write the files in a folder for a robot, and warnings about its numbers."""
+    """Write the names of the exported files, and warnings about the robot's parameters."""
     page.line(f"in {done.folder}: README.md, robot.json, {', '.join(f'{x}/' for x in done.forms)}")
     page.notes(done.warnings)
 
 
 def show_trial(page: Page, found: Content, out: Path) -> None:
-    """Write the errors of every controller, medians over the starts."""
+    """Write a table of every controller's errors, as medians over the starts.
+
+    `out` is the folder of trial.json, which the text names.
+    """
     errors = ("cross-track", "first side", "heading")
     numbers = ("closure", "of encoders'", "worse", "finished", *errors)
     made = table(("controller", *numbers), right=numbers)

@@ -1,4 +1,4 @@
-"""Tables of numbers: before a fit, after it, and beside the truth or the camera."""
+"""Tables of parameters before and after a fit and beside the truth, and of prediction errors."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from slipid.infer.verdicts.profile import Profile
 
 RECOVERED = {"yes": "green", "roughly": "yellow", "no": "red", "wrong": "magenta"}
-"""Colours of the verdicts of a self-test."""
+"""Colours of a self test's verdicts on how a parameter was recovered."""
 OPEN_RATIOS = "\nratios of numbers that the logs may not determine one by one"
 """Title of the table of ratios."""
 
 
 def estimates(items: "Iterable[Estimate]", title: str) -> Table:
-    """Return a table of estimates without numbers of single sessions and defaults."""
+    """Return a table of estimates, without marker yaws of sessions and default values."""
     columns = ("parameter", "value", "unit", "90 % interval", "verdict", "from")
     made = table(columns, title, right=("value",))
     for e in items:
@@ -40,7 +40,7 @@ def estimates(items: "Iterable[Estimate]", title: str) -> Table:
 
 
 def rows_of(e: "Estimate") -> list[tuple[str, float, tuple[float, float] | None]]:
-    """Return label, value and interval of a scalar, or of each entry of a vector."""
+    """Return label, value and 90 % interval of a scalar (no label), or of each vector entry."""
     if not e.labels:
         return [("", e.value, e.interval90)]
     intervals = e.interval90 or [None] * len(e.labels)
@@ -50,7 +50,14 @@ def rows_of(e: "Estimate") -> list[tuple[str, float, tuple[float, float] | None]
 def show_sample(
     page: Page, numbers: "Iterable[Estimate]", about: Content, messages: Iterable[str]
 ) -> None:
-    """Write the numbers of a posterior, and the convergence of its chains from sample.json."""
+    """Write the parameters of a posterior, and the convergence of its chains.
+
+    Args:
+        page: page to write to.
+        numbers: estimates of the parameters.
+        about: part of sample.json about the chains.
+        messages: warnings.
+    """
     worst = about["worst"]
     page.table(estimates(numbers, f"{about['draws']} draws"))
     page.notes(messages)
@@ -69,14 +76,14 @@ def show_sample(
 
 
 def show_posterior(page: Page, found: "Posterior") -> None:
-    """Write the numbers of a posterior, and whether its chains agree."""
+    """Write the parameters of a posterior, and whether its chains have converged."""
     page.table(estimates(found.parameters.values(), f"{found.log_prob.size} draws"))
     state = "converged" if found.converged else "NOT converged, do not trust the intervals"
     page.line(f"{state}: {found.reason}")
 
 
 def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None:
-    """Write the numbers of a fit, their profiles, its warnings and how it ended."""
+    """Write the parameters of a fit, their profiles, its warnings and how it ended."""
     page.table(estimates(fit.parameters.values(), f"{len(fit.runs)} runs, {fit.rounds} rounds"))
     if fit.derived:
         page.table(estimates(fit.derived.values(), OPEN_RATIOS))
@@ -87,7 +94,7 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
 
 
 def show_trust(page: Page, found: "TrustReport") -> None:
-    """Write the open-loop errors of the fit on its own runs, and the trust in it."""
+    """Write the open-loop errors of the fit on its own runs, and whether it can be trusted."""
     if found.floors:
         made = table(("surface", "end / path", "encoders alone"))
         for name, e in found.floors.items():
@@ -98,11 +105,11 @@ def show_trust(page: Page, found: "TrustReport") -> None:
 
 
 LARGEST_DRIFT = 3e-4
-"""Difference of the rates of two clocks above that of any quartz [1]."""
+"""Relative difference of the rates of two clocks that is larger than quartz clocks can have [1]."""
 
 
 def _clocks(clocks: Mapping[str, Content]) -> str:
-    """Return a sentence on the offsets of pose clocks and their intervals."""
+    """Return a sentence about the clock offsets of poses, their intervals, and the drift."""
     offsets = [clock["offset_s"] for clock in clocks.values()]
     wide = [0.5 * (high - low) for low, high in (c["offset_interval90_s"] for c in clocks.values())]
     rate = max((clock["drift"] for clock in clocks.values()), key=abs)
@@ -116,7 +123,7 @@ def _clocks(clocks: Mapping[str, Content]) -> str:
 
 
 def show_check(page: Page, found: Content) -> None:
-    """Write check.json, with its findings first."""
+    """Write the content of check.json, with its findings first."""
     page.findings(found["findings"])
     commanded = ("commanded headings", r"and speeds \[m/s]")
     groups = table(("surface", "load", "session", "runs", "minutes", *commanded))
@@ -127,7 +134,7 @@ def show_check(page: Page, found: Content) -> None:
             Text(row["session"]),
             str(row["runs"]),
             f"{row['seconds'] / 60:.1f}",
-            str(row["headings"] or ""),  # 0 without commands, or for turns on the spot
+            str(row["headings"] or ""),  # there are 0 without commands, or for turns on the spot
             " ".join(f"{v:g}" for v in row["speeds"]),
         )
     page.table(groups)
@@ -145,11 +152,12 @@ def show_check(page: Page, found: Content) -> None:
 
 
 def _expected(numbers: Mapping[str, Content], title: str) -> Table:
-    """Return the table of the expected posterior over prior std of numbers."""
+    """Return the table of the ratios of expected posterior std to prior std of parameters."""
     made = table(("parameter", "unit", "std after / before", "verdict"), title)
     for path, e in numbers.items():
         if e["ratio"] is not None and "session_yaw" not in path:
-            # above 1 where the motion's uncertainty widens the prior of an electric number
+            # the ratio of an electric parameter may exceed 1, since the uncertainty of the motion
+            # adds to its prior
             ratio = f"{min(e['ratio'], 1.0):.3f}"
             made.add_row(Text(path), e["unit"], ratio, verdict(e["verdict"]))
     return made
@@ -161,7 +169,7 @@ _ERRORS = (
     "endpoint_error_over_path_mean",
     "length_error_mean",
 )
-"""Errors of a validation file that are shown, in order of columns."""
+"""Errors of a validation file that are shown, in the order of the columns."""
 
 
 def show_validation(page: Page, found: Content) -> None:
@@ -179,7 +187,17 @@ def show_validation(page: Page, found: Content) -> None:
 
 @dataclass(frozen=True)
 class TruthRow:
-    """True and estimated value of one number."""
+    """True and estimated value of one parameter, or of one entry of a vector.
+
+    Attributes:
+        path: path of the parameter.
+        label: label of the entry; empty for a scalar.
+        unit: unit of the values.
+        truth: true value [unit].
+        value: estimated value [unit].
+        interval: 90 % interval of the estimate [unit].
+        verdict: verdict of the fit.
+    """
 
     path: str
     label: str
@@ -196,7 +214,7 @@ class TruthRow:
 
 
 def compared(fit: "Fit", truth: Content) -> list[TruthRow]:
-    """Return every fitted number beside its truth, if truth.json has one."""
+    """Return true and estimated value of every fitted parameter that truth.json has a truth for."""
     rows = []
     for e in fit.parameters.values():
         if e.verdict == "fixed" or e.path not in truth:
@@ -210,7 +228,7 @@ def compared(fit: "Fit", truth: Content) -> list[TruthRow]:
 
 
 def show_truth(page: Page, fit: "Fit", truth: Content) -> None:
-    """Write `compared`, and the count of intervals that contain the truth."""
+    """Write estimates beside true values, and how many intervals contain the truth."""
     rows = compared(fit, truth)
     columns = ("parameter", "truth", "identified", "unit", "90 % interval", "truth in it", "")
     made = table(columns, right=("truth", "identified"))
@@ -233,7 +251,7 @@ def show_truth(page: Page, fit: "Fit", truth: Content) -> None:
 
 
 def show_selftest(page: Page, found: Content) -> None:
-    """Write selftest.json."""
+    """Write the content of selftest.json: recovery of parameters, slip curves and predictions."""
     numbers = table(
         ("parameter", "unit", "error", "of truth", "z rms", "in 90 %", "verdict", "recovered"),
         f"{found['replicates']} simulated experiments like this one ({found['runs']} runs), "
@@ -273,7 +291,10 @@ def show_selftest(page: Page, found: Content) -> None:
 
 
 def show_bench(page: Page, fit: BenchFit, taken: Sequence[str] = ()) -> None:
-    """Write the numbers of motors, their warnings and how the fits ended."""
+    """Write the fitted parameters of motors on a bench, warnings, and how the fits ended.
+
+    `taken` has sentences about which columns of the log were used.
+    """
     if taken:
         page.line(f"columns: {'; '.join(taken)}")
     rows = sum(len(r.time) for f in fit.fits for r in f.records)
@@ -288,7 +309,7 @@ def show_bench(page: Page, fit: BenchFit, taken: Sequence[str] = ()) -> None:
 
 
 def show_bench_check(page: Page, found: Content) -> None:
-    """Write check.json of motors."""
+    """Write the content of check.json of bench logs: ranges of signals, expected information."""
     channels = (r"voltage \[V]", r"current \[A]", r"speed \[rad/s]")
     made = table(("log", "rows", "seconds", "rows/s", *channels))
     for row in found["logs"]:

@@ -1,4 +1,4 @@
-"""A page of text for people, with the common style of its tables."""
+"""A page of text for people, and the common style of its tables."""
 
 from collections.abc import Callable, Iterable, Sequence
 from io import StringIO
@@ -20,22 +20,22 @@ COLOUR = {
 }
 
 SEVERITY = {"wrong": "bold red", "suspicious": "yellow", "note": "dim"}
-"""Colours of findings of a check."""
+"""Colours of a check's findings, by severity."""
 WIDTH = 140
-"""Width of text outside a terminal [character]."""
+"""Width of text that is not written to a terminal [characters]."""
 Shown = TypeVar("Shown")
 
 
 class Page:
-    """Text for people, printed or kept: tables, and sentences without line breaks.
+    """Text of tables and unbroken sentences, which is printed or kept in memory.
 
     Args:
-        kept: True to keep the text for `text` instead of printing it.
+        kept: True to keep the text, for the property `text`, instead of printing it.
     """
 
     def __init__(self, kept: bool = False) -> None:
         self._console = Console(highlight=False)
-        if kept:  # rich takes a notebook for a terminal with colours, and would print there
+        if kept:  # without these options, rich would print to a notebook, with colours
             self._console = Console(
                 highlight=False,
                 width=WIDTH,
@@ -48,7 +48,7 @@ class Page:
 
     @property
     def text(self) -> str:
-        """Text of a page that keeps it; lines end without blanks."""
+        """The kept text, without blanks at the ends of lines; empty if the page prints."""
         written = self._console.file
         lines = written.getvalue().splitlines() if isinstance(written, StringIO) else []
         return "\n".join(line.rstrip() for line in lines)
@@ -60,12 +60,12 @@ class Page:
         self._console.print(text, markup=False, soft_wrap=True)
 
     def notes(self, sentences: Iterable[str]) -> None:
-        """Write warnings."""
+        """Write each sentence as a note on its own line."""
         for sentence in sentences:
             self.line(f"note: {sentence}")
 
     def findings(self, found: Iterable[Content]) -> None:
-        """Write findings of a check with their remedies, in the colour of their severity."""
+        """Write findings of a check with their remedies; colours show the severity."""
         for one in found:
             remedy = f"\n    {one['remedy']}" if one["remedy"] else ""
             where = f" (in {listed(one['runs'])})" if one["runs"] else ""
@@ -81,7 +81,7 @@ def text_of(show: Callable[[Page, Shown], None], found: Shown) -> str:
 
 
 def table(columns: Sequence[str], title: str | None = None, right: Sequence[str] = ()) -> Table:
-    """Return an empty table without lines; the columns named in `right` are right-aligned."""
+    """Return an empty table without rules; the columns named in `right` are right-aligned."""
     made = Table(title=title, title_justify="left", show_edge=False, pad_edge=False, box=None)
     for name in columns:
         made.add_column(name, justify="right" if name in right else "left")
@@ -89,11 +89,11 @@ def table(columns: Sequence[str], title: str | None = None, right: Sequence[str]
 
 
 def verdict(word: str, colour: dict[str, str] = COLOUR) -> str:
-    """Return a verdict in its colour."""
+    """Return a verdict with rich's markup for its colour."""
     shade = colour.get(word, "dim")
     return f"[{shade}]{word.replace('_', ' ')}[/{shade}]"
 
 
 def percent(x: float | None) -> str:
-    """Return a share in percent with two places, "" if it is unknown."""
+    """Return a share as text in percent with two decimal places; empty for None."""
     return "" if x is None else f"{100 * x:.2f} %"

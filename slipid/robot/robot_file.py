@@ -1,6 +1,6 @@
 """Reading and writing of robot.json: a write is complete or changes nothing, errors are explained.
 
-`typed` turns JSON values into dataclasses. `robot.schema.json` beside this package describes the
+`typed` turns JSON values into dataclasses. `robot.schema.json` in this folder describes the
 file for other programs.
 """
 

@@ -1,7 +1,7 @@
 """The twin: the identified robot itself as a plant, on which closed-loop runs are rehearsed.
 
 Commands reach the wheels after a delay, a slew limit and a lag. Wheels on several floors move the
-body by the contact model, and the model's errors are drawn anew for every run, with effects as in
+body by the contact model, and the model's errors are drawn again for every run, with effects as in
 `slipid.robot.filter.effects`:
 
     set <- set + clip(command(t - delay) - set, slew h),   w <- w + (1 - exp(-h / lag)) (set - w)
@@ -94,7 +94,7 @@ class ActuatorModel:
         since = -np.arange(RING)[None, :] * PERIOD
         both = np.minimum(begin + h, since + PERIOD) - np.maximum(begin, since)
         share = np.clip(both, 0.0, None) / h
-        share[:, -1] += 1.0 - share.sum(axis=1)  # the oldest one stands for all older commands
+        share[:, -1] += 1.0 - share.sum(axis=1)  # the oldest one replaces older commands
         return share
 
 

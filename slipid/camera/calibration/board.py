@@ -1,4 +1,4 @@
-"""A printed ChArUco board, its corners in pictures, and the views of it that are usable."""
+"""A printed ChArUco board, its corners in pictures, and the selection of usable views."""
 
 import glob
 from collections.abc import Sequence
@@ -13,19 +13,22 @@ from slipid.camera.opencv import marker_count, marker_dictionary, opencv, size_o
 from slipid.support.errors import DataError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-"""Suffixes of pictures in a folder; a file that is named itself may have any."""
+"""Suffixes by which pictures in a folder are recognised; a file named directly may have any."""
 LARGEST_M = 1.0
 """Largest edge of a square [m]; a larger number was probably meant in millimetres."""
 LEAST_CORNERS = 6
 """Smallest number of corners in a view: a pose has six numbers, and each corner gives two."""
 SEARCHED = 3
-"""Number of pictures searched for another board: a few suffice, and there are many dictionaries."""
+"""Number of pictures that are searched for other boards if the given board is not detected. It is
+small because every dictionary is tried on each picture."""
 ENOUGH = 4
-"""Number of markers that are hardly detected by chance."""
+"""Smallest number of detected markers or corners that is taken as proof of a board: so many are
+hardly detected by chance."""
 LEAST_VIEWS = 6
-"""Smallest number of usable views that differ."""
+"""Smallest number of usable views, and of those that differ from each other."""
 SAME = 0.08
-"""Difference, relative to the board's size in the picture, below which two views are the same."""
+"""Difference of corner places, relative to the board's size in the picture, below which two views
+count as the same [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +80,7 @@ class Board:
 
     Attributes:
         columns, rows: number of squares along x and along y.
-        square_m, marker_m: edges of a square and of a marker [m].
+        square_m, marker_m: edge length of a square and of a marker [m].
         dictionary: dictionary of its markers, such as `4X4_50`.
         legacy: whether it was drawn by OpenCV before 4.6, which began boards of an even number of
             rows with a white square.
@@ -136,13 +139,14 @@ class Board:
     def on_floor(
         self, board_m: Float[np.ndarray, "corner 2"], height_m: float
     ) -> Float[np.ndarray, "corner 3"]:
-        """Return places of corners in a world whose origin is the floor below the board's middle.
+        """Return places of corners in a world whose origin is below the board's middle [m].
 
-        x runs along its columns, to the right, y up its rows, z up from the floor.
+        The origin is on the floor. With the board seen from above, x points to its right, y to its
+        upper edge, and z up.
 
         Args:
             board_m: corners in the board's own axes [m].
-            height_m: height of its printed face above the floor.
+            height_m: height of the board's printed face above the floor [m].
         """
         middle = 0.5 * self.square_m * np.array([self.columns, self.rows])
         x, y = ((board_m - middle) * [1, -1]).T
@@ -155,8 +159,8 @@ class View:
 
     Attributes:
         name: name of the picture.
-        pixels: their places in the picture.
-        board_m: their places on the board [m].
+        pixels: places of the corners in the picture [pixel].
+        board_m: places of the corners on the board [m].
     """
 
     name: str
@@ -164,7 +168,7 @@ class View:
     board_m: Float[np.ndarray, "corner 2"]
 
     def only(self, kept: np.ndarray) -> "View":
-        """Return a view of some of the corners, by a mask or by indices."""
+        """Return a view with only some of the corners, chosen by a mask or by indices."""
         return View(self.name, self.pixels[kept], self.board_m[kept])
 
     @property
@@ -178,10 +182,10 @@ class View:
 
 
 def board_of(size: str, square_m: float, marker_m: float, dictionary: str, legacy: bool) -> Board:
-    """Return a board whose size is written as `7x5`: columns and rows of squares.
+    """Return a board whose size is given as text such as `7x5`: columns and rows of squares.
 
     Raises:
-        DataError: the size is not written so, or no such board is possible.
+        DataError: the size is not such a text, or no such board is possible.
     """
     columns, by, rows = size.lower().partition("x")
     if not (by and columns.strip().isdecimal() and rows.strip().isdecimal()):
@@ -190,7 +194,7 @@ def board_of(size: str, square_m: float, marker_m: float, dictionary: str, legac
 
 
 def view_of(board: Board, picture: Picture) -> View:
-    """Return the corners of the board in a picture; none where it is not detected."""
+    """Return the corners of the board in a picture; the view is empty if it is not detected."""
     detector = opencv().aruco.CharucoDetector(board.pattern)
     pixels, numbers = detector.detectBoard(picture.image)[:2]
     if numbers is None:
@@ -201,7 +205,7 @@ def view_of(board: Board, picture: Picture) -> View:
 
 @dataclass(frozen=True, eq=False)
 class UsableViews:
-    """Usable views of a board, all of one size [pixel], and sentences about the others."""
+    """Usable views of a board in pictures of one size [pixel], and sentences about the others."""
 
     image_px: tuple[int, int]
     views: list[View]
@@ -212,7 +216,7 @@ def usable(board: Board, pictures: Sequence[Picture]) -> UsableViews:
     """Return the usable views of a board in pictures.
 
     Raises:
-        DataError: the pictures differ in size, or none shows the board, or too few.
+        DataError: the pictures differ in size, or the board is detected in too few of them.
     """
     for other in pictures[1:]:
         if other.image_px != pictures[0].image_px:
@@ -240,7 +244,7 @@ def check_enough(views: Sequence[View]) -> None:
     """Check that there are enough views that differ.
 
     Raises:
-        DataError: there are too few, or too many of them are the same.
+        DataError: there are too few views, or too few that differ.
     """
     if len(views) < LEAST_VIEWS:
         raise DataError(
@@ -260,7 +264,11 @@ def check_enough(views: Sequence[View]) -> None:
 
 
 def _difference(view: View, other: View) -> float:
-    """Return the distance of common corners in two views, relative to that from their middle."""
+    """Return the difference of two views: the distance between common corners in the pictures [1].
+
+    It is relative to the distance of the corners from their middle, and infinite if two views have
+    too few common corners.
+    """
     first, second = (
         {tuple(np.round(b, 6)): p for b, p in zip(v.board_m, v.pixels, strict=True)}
         for v in (view, other)
@@ -273,7 +281,7 @@ def _difference(view: View, other: View) -> float:
 
 
 def not_detected(board: Board, pictures: Sequence[Picture]) -> DataError:
-    """Return the error to raise where no picture shows the board; it says what they show."""
+    """Return the error to raise if no picture shows the board; its message says what they show."""
     if len(pictures) == 1:
         where = f"{pictures[0].path}: the board is not found in it"
     else:
@@ -282,7 +290,7 @@ def not_detected(board: Board, pictures: Sequence[Picture]) -> DataError:
 
 
 def _instead(board: Board, pictures: Sequence[Picture]) -> str:
-    """Return what pictures show instead of the board, and what to do."""
+    """Return a sentence that says what pictures show instead of the board, and what to do."""
     if other := _other_board(board, board.dictionary, pictures):
         return other
     markers = visible_markers([picture.image for picture in pictures])
@@ -306,7 +314,10 @@ def _instead(board: Board, pictures: Sequence[Picture]) -> str:
 
 
 def _other_board(board: Board, dictionary: str, pictures: Sequence[Picture]) -> str | None:
-    """Return advice where pictures show a board that is easily mistaken for this one, else None."""
+    """Return advice if pictures show a similar board, else None.
+
+    Similar boards have rows and columns swapped, the other legacy pattern, or this dictionary.
+    """
     if marker_count(dictionary) < board.columns * board.rows // 2:
         return None
     swapped = replace(board, columns=board.rows, rows=board.columns)

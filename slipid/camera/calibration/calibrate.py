@@ -1,4 +1,4 @@
-"""A calibration from end to end: pictures and points in, a camera and its report out."""
+"""Camera calibration from pictures and points to a camera with its report."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,13 +29,13 @@ from slipid.support.errors import DataError
 
 @dataclass(frozen=True, eq=False)
 class CalibratedLens:
-    """A lens, fitted or read, and the report that goes with it.
+    """A lens, fitted or read from a file, with the report of its calibration.
 
     Attributes:
         lens: the lens.
         report: report of its calibration.
-        covariance: covariance of its parameters; None where it is not known.
-        quality: its fit and the quality of it; None where the lens was read from a file.
+        covariance: covariance of its parameters, in the order of `NAMES`; None if it is not known.
+        quality: the fit of the lens and its quality; None if the lens was read from a file.
     """
 
     lens: Lens
@@ -49,10 +49,10 @@ class CalibratedLens:
 
 
 def lens_from_pictures(words: Sequence[str], board: Board, k3: bool) -> CalibratedLens:
-    """Return a lens calibrated by pictures of a board.
+    """Return a lens calibrated with pictures of a board.
 
     Args:
-        words: files, folders and globs of pictures.
+        words: files, folders and glob patterns of pictures.
         board: the board.
         k3: whether the distortion parameter k3 is fitted too.
 
@@ -67,10 +67,10 @@ def lens_from_pictures(words: Sequence[str], board: Board, k3: bool) -> Calibrat
 
 
 def lens_from_file(path: Path) -> CalibratedLens:
-    """Return the lens of a camera file, with its covariance where it was calibrated.
+    """Return the lens in a camera file, with its covariance if the file contains one.
 
     Raises:
-        DataError: absent or no camera file.
+        DataError: the file is absent or not a camera file.
     """
     content = read_camera(path)
     lens = content.report.get("lens")
@@ -81,7 +81,10 @@ def lens_from_file(path: Path) -> CalibratedLens:
 
 
 def _covariance(lens: Content, count: int) -> Float[np.ndarray, "parameter parameter"] | None:
-    """Return the covariance in a lens report, or None; another program may have written it."""
+    """Return the covariance in a lens report, or None if it is absent or invalid.
+
+    Another program may have written the report.
+    """
     try:
         covariance = np.array(lens.get("covariance"), float)
     except (TypeError, ValueError):
@@ -97,10 +100,10 @@ def on_board(lens: CalibratedLens, board: Board, picture: Path, height_m: float)
         lens: the camera's lens.
         board: the board.
         picture: file of the picture that shows it.
-        height_m: height of its printed face above the floor.
+        height_m: height of the board's printed face above the floor [m].
 
     Raises:
-        DataError: the picture is of another size than the lens, or shows no board, or too little.
+        DataError: the picture's size differs from the lens's, or too few corners are detected.
     """
     taken = Picture(picture, read_picture(picture))
     lens.lens.check_size(taken.image_px, picture)
@@ -119,13 +122,13 @@ def on_board(lens: CalibratedLens, board: Board, picture: Path, height_m: float)
 def floor_from_board(
     lens: CalibratedLens, board: Board, picture: Path, height_m: float, size_std: float
 ) -> FloorFit:
-    """Return a camera's place by a board on the floor.
+    """Return a camera's place, fitted to a board that lies on the floor.
 
     Args:
         lens: the camera's lens.
         board: the board.
         picture: file of the picture that shows it.
-        height_m: height of its printed face above the floor.
+        height_m: height of the board's printed face above the floor [m].
         size_std: relative std of the board's size [1].
     """
     fit = fit_place(str(picture), lens.lens, on_board(lens, board, picture, height_m))
@@ -133,7 +136,10 @@ def floor_from_board(
 
 
 def floor_from_points(lens: CalibratedLens, path: Path, size_std: float) -> FloorFit:
-    """Return a camera's place by measured points, where the tape has a relative std [1]."""
+    """Return a camera's place, fitted to the measured points in a file.
+
+    `size_std` is the relative std of lengths by the tape with which they were measured [1].
+    """
     fit = fit_place_robustly(str(path), lens.lens, read_points(path, lens.lens.image_px))
     return _reported(lens, fit, f"points of {path.name}", size_std)
 
@@ -141,7 +147,11 @@ def floor_from_points(lens: CalibratedLens, path: Path, size_std: float) -> Floo
 def straight_camera(
     picture: Path, metres_per_pixel: float, height_m: float, turn_deg: float, size_std: float | None
 ) -> OverheadCamera:
-    """Return an uncalibrated camera that looks straight down, with the size of a picture."""
+    """Return an uncalibrated camera that looks straight down, for pictures of this one's size.
+
+    Other arguments are those of `OverheadCamera.straight_down`; `size_std` is the relative std of
+    lengths on the floor [1], None if it is not known.
+    """
     image_px = size_of(read_picture(picture))
     camera = OverheadCamera.straight_down(image_px, metres_per_pixel, height_m, turn_deg)
     report = {"floor": straight_report(camera), "poor": []}
@@ -149,7 +159,7 @@ def straight_camera(
 
 
 def _reported(lens: CalibratedLens, fit: FloorFit, source: str, size_std: float) -> FloorFit:
-    """Return a fit whose camera has the report of lens and floor."""
+    """Return the fit with the report of lens and floor, and the std of lengths, in its camera."""
     spread = uncertainty(fit, lens.covariance)
     floor = floor_report(source, fit, spread, size_std)
     report = {**lens.report, "floor": floor, "poor": lens.report.get("poor", []) + floor["poor"]}

@@ -1,6 +1,6 @@
 """The lens fitted to views of the board, with the covariance of its parameters.
 
-Views and corners that do not fit the others are left out and named.
+Views and corners that do not fit the others are excluded and listed.
 """
 
 from collections.abc import Sequence
@@ -15,21 +15,23 @@ from slipid.camera.overhead import Lens
 from slipid.support.errors import DataError
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-"""Parameters of a lens, in the order of its covariance; k3 only where it is fitted."""
+"""Parameters of a lens, in the order of its covariance; k3 is present only if it is fitted."""
 ROUNDS = 30
 WORSE = 3.0
-"""Ratio to the usual residual above which a view is left out."""
+"""Ratio of a view's median residual to that of all views above which the view is excluded [1]."""
 FAR = 6.0
-"""Ratio to the usual residual above which a corner is left out: by noise alone, one in 10^7."""
+"""Ratio of a corner's residual to the median one above which it is excluded [1]. Noise alone
+exceeds it for one corner in 10^7."""
 LEAST_PX = 0.3
-"""Residual below which nothing is left out: it does no harm [pixel]."""
+"""Residual below which no view or corner is excluded, since it is harmless [pixel]."""
 MOST = 0.25
-"""Part of the views that may be left out; beyond it, it is not clear which are right."""
+"""Largest share of the views that may be excluded; if more do not fit, it is not clear which ones
+are right [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Pose of an object in the camera's axes: x right, y down, z away.
+    """Pose of an object in the camera's axes: x right, y down, z away from the camera.
 
     Attributes:
         turn: rotation vector [rad].
@@ -41,18 +43,18 @@ class Pose:
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """Its rotation as a matrix."""
+        """Rotation matrix of the pose, from the object's axes to the camera's."""
         return np.asarray(opencv().Rodrigues(self.turn)[0])
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Pixels of points, and their derivatives.
+    """Pixels at which points appear, and their derivatives.
 
     Attributes:
-        pixels: pixels of the points.
-        by_pose: derivatives by turn and shift.
-        by_lens: derivatives by the parameters of the lens.
+        pixels: u, v of each point [pixel].
+        by_pose: derivatives by turn [pixel/rad] and shift [pixel/m] of the pose.
+        by_lens: derivatives by the parameters of the lens, in the order of NAMES.
     """
 
     pixels: Float[np.ndarray, "point 2"]
@@ -67,10 +69,10 @@ class LensFit:
     Attributes:
         lens: the lens.
         covariance: covariance of its parameters, in the order of NAMES.
-        views: the corners it was fitted to.
+        views: views with the corners that it was fitted to.
         poses: pose of the board in each view.
-        residuals: measured less computed, by view [pixel].
-        left_out: sentences about views and corners that were left out.
+        residuals: measured less computed places of the corners, by view [pixel].
+        left_out: sentences about views and corners that were excluded.
     """
 
     lens: Lens
@@ -92,7 +94,7 @@ class LensFit:
 
     @property
     def std(self) -> Float[np.ndarray, " parameter"]:
-        """Standard deviation of each parameter."""
+        """Standard deviation of each parameter, in the order of NAMES."""
         return np.sqrt(np.diag(self.covariance))
 
 
@@ -103,13 +105,13 @@ def parameters_of(lens: Lens) -> Float[np.ndarray, " parameter"]:
 
 
 def lens_of(lens: Lens, parameters: Float[np.ndarray, " parameter"]) -> Lens:
-    """Return a lens like another with other parameters."""
+    """Return a lens with new parameters, in the order of NAMES, and the image size of another."""
     fx, fy, cx, cy = parameters[:4]
     return Lens(lens.image_px, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), parameters[4:])
 
 
 def rms(residuals: Float[np.ndarray, "point 2"]) -> float:
-    """Return the root mean square of the residuals' lengths."""
+    """Return the root mean square of the residuals' lengths, in the residuals' unit."""
     return float(np.sqrt((residuals**2).sum(1).mean()))
 
 
@@ -122,10 +124,10 @@ def project(lens: Lens, pose: Pose, points: Float[np.ndarray, "point 3"]) -> Pro
 
 
 def fit_lens(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> LensFit:
-    """Return the lens that explains views best, by least squares.
+    """Return the lens fitted to views by least squares.
 
     Raises:
-        DataError: they do not determine one.
+        DataError: the views do not determine a lens.
     """
     cv2 = opencv()
     points = [solid(view).astype(np.float32).reshape(-1, 1, 3) for view in views]
@@ -145,7 +147,7 @@ def fit_lens(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> Lens
 
 
 def indeterminate(problem: str) -> DataError:
-    """Return the error to raise where views do not determine a lens."""
+    """Return the error to raise if views do not determine a lens."""
     return DataError(
         f"{problem}: these views do not determine the lens, most often because the board lies "
         "parallel to the sensor in all of them; expected some that are tilted by 20 to 40 degrees "
@@ -154,12 +156,15 @@ def indeterminate(problem: str) -> DataError:
 
 
 def solid(view: View) -> Float[np.ndarray, "corner 3"]:
-    """Return the corners on the board with z = 0 [m]."""
+    """Return the corners of a view in the board's axes, with z = 0 [m]."""
     return np.concatenate([view.board_m, np.zeros((len(view.board_m), 1))], axis=1)
 
 
 def _with_covariance(lens: Lens, views: list[View], poses: list[Pose]) -> LensFit:
-    """Return a fit with the covariance of its lens; poses are eliminated view by view."""
+    """Return a fit with the covariance of its lens.
+
+    The board's pose is eliminated from the normal equations view by view.
+    """
     information, residuals = np.zeros((len(parameters_of(lens)),) * 2), []
     for view, pose in zip(views, poses, strict=True):
         now = project(lens, pose, solid(view))
@@ -191,10 +196,10 @@ def pose_of(lens: Lens, view: View) -> Pose:
 def fit_robustly(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> LensFit:
     """Return a lens fitted without the views and corners that do not fit the others.
 
-    The fit is repeated until nothing more is left out.
+    The fit is repeated until nothing more is excluded.
 
     Raises:
-        DataError: more would be left out than may, or too few views remain.
+        DataError: too many views do not fit the others, or too few views remain.
     """
     now, left_out, first = list(views), [], len(views)
     for _ in range(ROUNDS):
@@ -217,7 +222,7 @@ def fit_robustly(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> 
                 )
             check_enough(now)
             continue
-        # only the corner that is off most: it may have drawn others with it
+        # exclude only the worst corner of a view: the others may be off because of it
         limit = max(FAR * level, LEAST_PX)
         bad = [(one > limit) & (one == one.max()) for one in off]
         if not any(b.any() for b in bad):

@@ -14,22 +14,23 @@ from slipid.support.errors import DataError
 
 FLAT_M = 1e-9
 AGREES = 0.3
-"""Part of the residual that remains without a point, below which that point was the only bad."""
+"""Ratio of the error without a point to the error with it, below which that point is bad [1]."""
 LEAST_BAD_PX = 1.5
 LEAST_TO_DROP = 6
 LEAST_TO_TEST = 5
-"""Number of points below which it cannot be determined which of them is bad."""
+"""Number of points below which the fit cannot show which of them is bad."""
 MOST = 0.25
-"""Part of the points that may be left out."""
+"""Largest share of the points that may be excluded [1]."""
 TWIN_RATIO = 2.0
-"""Ratio of the errors of two poses below which the points hardly distinguish them."""
+"""Ratio of the errors of two poses below which the points hardly distinguish the two [1]."""
 LEAST_PX = 0.03
-"""Smallest residual assumed [pixel]: few points may fit by chance better than any corner can."""
+"""Smallest std assumed for the error of a point [pixel], since few points may by chance fit better
+than corners can be detected."""
 STEP = 0.01
-"""Step of numerical derivatives, in standard deviations."""
+"""Step of numerical derivatives, in stds of the variable [1]."""
 GRID = 5
 INSIDE = 0.8
-"""Part of the picture's width and height over which lengths on the floor are compared."""
+"""Share of the picture's width and height in which lengths on the floor are compared [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +38,15 @@ class FloorFit:
     """A camera's place, and the points that it was fitted to.
 
     Attributes:
-        camera: the lens in its place.
+        camera: the lens at its fitted place.
         pose: pose of the world in the camera's axes.
-        points: points to which it was fitted.
-        residuals: measured less computed [pixel].
-        off_mm: the same on the floor: measured less true place, x and y [mm].
-        twin_px: error of another pose that looks down as well; None where there is none.
+        points: points that the place was fitted to.
+        residuals: measured less computed places in the picture [pixel].
+        off_mm: measured less true places at the points' heights, x and y [mm].
+        twin_px: root mean square error of the next best pose that also looks down [pixel]; None if
+            there is none.
         left_out: sentences about points that do not fit.
-        disputed: whether points that do not fit are still among those it was fitted to.
+        disputed: whether some points that do not fit could not be excluded from the fit.
     """
 
     camera: OverheadCamera
@@ -63,13 +65,13 @@ class FloorFit:
 
 
 def camera_of(lens: Lens, pose: Pose) -> OverheadCamera:
-    """Return the camera with a lens, given the pose of the world in its axes."""
+    """Return the camera with this lens, given the pose of the world in the camera's axes."""
     rotation = pose.rotation
     return OverheadCamera(lens, rotation, -rotation.T @ pose.shift)
 
 
 def fit_place(source: str, lens: Lens, points: FloorPoints) -> FloorFit:
-    """Return the place of the camera by all points.
+    """Return the place of the camera, fitted to all points.
 
     Raises:
         DataError: no place of a camera above the floor explains the points.
@@ -85,10 +87,10 @@ def fit_place(source: str, lens: Lens, points: FloorPoints) -> FloorFit:
 
 
 def fit_place_robustly(source: str, lens: Lens, points: FloorPoints) -> FloorFit:
-    """Return the place of the camera, without points that clearly contradict the others.
+    """Return the place of the camera, fitted without points that clearly contradict the others.
 
     Raises:
-        DataError: no camera above the floor sees the points so.
+        DataError: no place of a camera above the floor explains the points.
     """
     left_out: tuple[str, ...] = ()
     first = len(points.names)
@@ -127,14 +129,14 @@ class _BadPoint:
 
 
 def _bad_point(lens: Lens, points: FloorPoints) -> _BadPoint | None:
-    """Return the point without which the others agree far better; None where there is none."""
+    """Return the point without which the others agree far better; None if there is none."""
     fit = _fitted(lens, points)
     without = [_fitted(lens, points.without(k)) for k in range(len(points.names))]
     agreed = [(rest.rms_px, k, rest) for k, rest in enumerate(without) if rest is not None]
     if not agreed:
         return None
     error, index, rest = min(agreed, key=lambda one: one[:2])
-    # one bad point may be so far off that no camera at all sees the points so
+    # one bad point may be so far off that no place of a camera explains all points
     limit = LEAST_BAD_PX if fit is None else AGREES * fit.rms_px
     one = points.only([index])
     off_px = float(np.hypot(*(one.pixels - rest.camera.pixels(one.places))[0]))
@@ -149,12 +151,12 @@ def _bad_point(lens: Lens, points: FloorPoints) -> _BadPoint | None:
 
 
 def _fitted(lens: Lens, points: FloorPoints) -> FloorFit | None:
-    """Return the best place above the floor; None where there is none that explains the points."""
+    """Return the best place above the floor; None if no such place explains the points."""
     poses = sorted(_candidates(lens, points), key=lambda p: _error(lens, p, points))
     above = [pose for pose in poses if _looks_down(camera_of(lens, pose))]
     if not above:
         return None
-    # among twins of nearly one error the place decides, but it makes no bad fit a good one
+    # of two poses with similar errors the one above the floor is taken, if its error is acceptable
     best, bearable = above[0], max(TWIN_RATIO * _error(lens, poses[0], points), LEAST_BAD_PX)
     if _error(lens, best, points) > bearable:
         return None
@@ -166,10 +168,10 @@ def _fitted(lens: Lens, points: FloorPoints) -> FloorFit | None:
 
 
 def _candidates(lens: Lens, points: FloorPoints) -> list[Pose]:
-    """Return poses that explain the points at least locally; of points in a plane, two do."""
+    """Return poses that are local minima of the error; points in a plane have two of them."""
     cv2 = opencv()
     middle = points.places.mean(0)
-    # OpenCV recognises a plane only where its z is 0, and numbers near 0 are most precise
+    # OpenCV recognises points in a plane only if their z is 0; centred numbers are most precise
     places = np.ascontiguousarray(points.places - middle).reshape(-1, 1, 3)
     pixels = np.ascontiguousarray(points.pixels).reshape(-1, 1, 2)
     given = (places, pixels, lens.matrix, lens.distortion)
@@ -192,13 +194,13 @@ def _looks_down(camera: OverheadCamera) -> bool:
 
 
 def _differ(pose: Pose, other: Pose) -> bool:
-    """Return whether two poses are turned against each other by more than a degree."""
+    """Return whether the rotations of two poses differ by more than a degree."""
     cosine = 0.5 * (np.trace(pose.rotation.T @ other.rotation) - 1)
     return bool(np.degrees(np.arccos(np.clip(cosine, -1, 1))) > 1)
 
 
 def _off_mm(camera: OverheadCamera, points: FloorPoints) -> Float[np.ndarray, "point 2"]:
-    """Return the measured less the true places of points at their heights [mm]."""
+    """Return measured less true x and y of points, at the points' heights [mm]."""
     off = [
         camera.on_plane(pixel, float(place[2])) - place[:2]
         for pixel, place in zip(points.pixels, points.places, strict=True)
@@ -211,10 +213,10 @@ class PlaceUncertainty:
     """Uncertainty of a camera's place.
 
     Attributes:
-        pose: covariance of turn [rad] and shift [m], with the contribution of the lens.
-        place_std_m: std of the lens' place in the world.
-        tilt_std_deg: std of the angle between its axis and straight down.
-        scale_std: relative std of lengths on the floor [1], without that of the board's size.
+        pose: covariance of turn [rad] and shift [m], including the lens's uncertainty.
+        place_std_m: std of the lens's place in the world [m].
+        tilt_std_deg: std of the angle between the lens's axis and straight down [deg].
+        scale_std: relative std of lengths on the floor, without that of the board's size [1].
     """
 
     pose: Float[np.ndarray, "6 6"]
@@ -224,7 +226,7 @@ class PlaceUncertainty:
 
 
 def tilt_deg(camera: OverheadCamera) -> float:
-    """Return the angle between a camera's axis and straight down."""
+    """Return the angle between a camera's axis and straight down [deg]."""
     return float(np.degrees(np.arccos(min(-camera.rotation[2, 2], 1.0))))
 
 
@@ -234,8 +236,8 @@ def uncertainty(
     """Return the uncertainty of a camera's place.
 
     Args:
-        fit: the fit of the place; its residuals give the noise.
-        of_lens: covariance of the lens, None where it is not known.
+        fit: the fit of the place; the variance of the points' errors is that of its residuals.
+        of_lens: covariance of the lens's parameters; None if it is not known.
     """
     lens = fit.camera.lens
     at = np.concatenate([fit.pose.turn, fit.pose.shift, parameters_of(lens)])
@@ -245,7 +247,7 @@ def uncertainty(
         return camera_of(lens_of(lens, values[6:]), Pose(values[:3], values[3:6]))
 
     place = _propagated(lambda v: camera(v).place, at, joint)
-    # of the axis itself: the angle has a kink at straight down
+    # covariance of the axis's direction, since the angle is not differentiable at straight down
     axis = _propagated(lambda v: camera(v).rotation[2, :2], at, joint)
     scale = _propagated(lambda v: np.array([_log_length(camera(v))]), at, joint)
     return PlaceUncertainty(
@@ -259,7 +261,10 @@ def uncertainty(
 def _joint(
     fit: FloorFit, of_lens: Float[np.ndarray, "parameter parameter"] | None
 ) -> Float[np.ndarray, "all all"]:
-    """Return the covariance of pose and lens: an error of the lens moves the pose fitted by it."""
+    """Return the joint covariance of pose and lens.
+
+    They are correlated, since an error of the lens changes the pose that is fitted with it.
+    """
     now = project(fit.camera.lens, fit.pose, fit.points.places)
     free = max(fit.residuals.size - 6, 1)
     variance = max((fit.residuals**2).sum() / free, LEAST_PX**2)
@@ -276,7 +281,10 @@ def _propagated(
     at: Float[np.ndarray, " all"],
     joint: Float[np.ndarray, "all all"],
 ) -> np.ndarray:
-    """Return the covariance of a function of uncertain values, to first order."""
+    """Return the covariance of a function's result, to first order.
+
+    `at` are its uncertain arguments, and `joint` is their covariance.
+    """
     slope = []
     for k, std in enumerate(np.sqrt(np.diag(joint))):
         step = np.zeros(len(at))
@@ -287,7 +295,7 @@ def _propagated(
 
 
 def _log_length(camera: OverheadCamera) -> float:
-    """Return the mean log length on the floor between neighbours of a grid in the picture."""
+    """Return the mean logarithm of the floor lengths [m] between neighbours in a grid of pixels."""
     width, height = camera.lens.image_px
     part = np.linspace(0.5 - 0.5 * INSIDE, 0.5 + 0.5 * INSIDE, GRID)
     grid = np.stack(np.meshgrid(part * (width - 1), part * (height - 1)), axis=-1)

@@ -1,4 +1,4 @@
-"""Measured points on the floor: a CSV file of their places in the world and in the picture."""
+"""Measured points on the floor, read from a CSV file of their places in world and picture."""
 
 import csv
 import io
@@ -14,7 +14,8 @@ from slipid.support.errors import DataError, bad_data, did_you_mean
 COLUMNS = ("u", "v", "x", "y")
 LEAST_POINTS = 4
 LINE = 0.02
-"""Ratio of the spread across to that along, below which points lie on one line."""
+"""Ratio of the points' spread across their main direction to that along it, below which they count
+as lying on one line [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +26,8 @@ class FloorPoints:
 
     Attributes:
         names: name of each point.
-        pixels: their places in the picture.
-        places: x, y, z in the world [m].
+        pixels: places of the points in the picture [pixel].
+        places: x, y, z of the points in the world [m].
     """
 
     names: tuple[str, ...]
@@ -34,16 +35,16 @@ class FloorPoints:
     places: Float[np.ndarray, "point 3"]
 
     def without(self, index: int) -> "FloorPoints":
-        """Return all points but one."""
+        """Return all points except the one with this index."""
         return self.only([k for k in range(len(self.names)) if k != index])
 
     def only(self, kept: list[int]) -> "FloorPoints":
-        """Return some of the points, by their indices."""
+        """Return only the points with these indices."""
         return FloorPoints(tuple(self.names[k] for k in kept), self.pixels[kept], self.places[kept])
 
 
 def read_points(path: Path, image_px: tuple[int, int]) -> FloorPoints:
-    """Return the points of a CSV file with columns u, v [pixel], x, y and perhaps z [m].
+    """Return the points in a CSV file with columns u, v [pixel], x, y and optionally z [m].
 
     Raises:
         DataError: the file is absent, lacks a column, has a cell that is not a number or a pixel
@@ -69,10 +70,10 @@ def read_points(path: Path, image_px: tuple[int, int]) -> FloorPoints:
 
 
 def check_spread(source: Path, points: FloorPoints) -> None:
-    """Check that points determine a place.
+    """Raise `DataError` unless points determine a camera's place.
 
     Raises:
-        DataError: they are too few, or lie on one line.
+        DataError: the points are too few, or lie on one line.
     """
     if len(points.names) < LEAST_POINTS:
         raise DataError(
@@ -89,7 +90,7 @@ def check_spread(source: Path, points: FloorPoints) -> None:
 
 
 def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the names of the columns, and the rows with the numbers of their lines."""
+    """Return the names of the columns, and the rows, each with its line number in the file."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -107,7 +108,7 @@ def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
 
 
 def _number(path: Path, line: int, row: list[str], name: str, header: list[str]) -> float:
-    """Return the number in one cell; DataError where there is none."""
+    """Return the number in one cell; raise `DataError` if it is not a finite number."""
     index = header.index(name)
     text = row[index] if index < len(row) else ""
     try:
@@ -123,7 +124,7 @@ def _number(path: Path, line: int, row: list[str], name: str, header: list[str])
 def _inside(
     path: Path, lines: list[int], pixels: Float[np.ndarray, "point 2"], image_px: tuple[int, int]
 ) -> None:
-    """Check that pixels lie inside the picture."""
+    """Raise `DataError` unless all pixels lie inside the picture."""
     for line, (u, v) in zip(lines, pixels, strict=True):
         if not (-1 <= u <= image_px[0] and -1 <= v <= image_px[1]):
             raise bad_data(

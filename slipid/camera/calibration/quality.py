@@ -20,29 +20,31 @@ from slipid.support.errors import DataError
 
 FOLDS = 5
 TILTED_DEG = 12.0
-"""Tilt above which a view separates the focal length from the distance [degrees]."""
+"""Tilt of the board above which a view separates focal length and distance [deg]."""
 LEAST_TILTED = 3
 ACROSS, DOWN = 8, 6
-"""Number of cells into which the picture is divided, to count those with corners."""
+"""Numbers of cells across and down into which the picture is divided, to measure coverage."""
 REFUSED_SHARE, POOR_SHARE = 0.35, 0.6
-"""Part of these cells with corners below which a lens is refused, or poor."""
+"""Share of the cells with corners below which a lens is refused, and below which it is reported as
+poor [1]."""
 POOR_REACH = 0.6
 REFUSED_FOCAL, POOR_FOCAL = 0.02, 0.005
-"""Relative std of the focal lengths above which a lens is refused, or poor."""
+"""Relative std of the focal lengths above which a lens is refused, and above which it is reported
+as poor [1]."""
 POOR_RMS_PX = 1.0
 POOR_RATIO = 2.0
-"""Ratio of the held-out error to the fitted one above which a lens is poor."""
+"""Ratio of the held-out error to the fit's error above which a lens is reported as poor [1]."""
 POOR_VIEWS = 10
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Part of the picture that has corners.
+    """Coverage of the picture by corners of the board.
 
     Attributes:
-        visited: cells with corners, from the upper left.
-        reach: distance of corners from the middle towards the picture's four corners, the least of
-            the four [1].
+        visited: cells of the picture that contain corners, beginning at the upper left.
+        reach: how near board corners come to each of the picture's four corners, as a share of the
+            distance from the picture's middle; the smallest of the four values [1].
     """
 
     visited: Bool[np.ndarray, "down across"]
@@ -50,18 +52,18 @@ class Coverage:
 
     @property
     def share(self) -> float:
-        """Part of the cells that have corners [1]."""
+        """Share of the picture's cells that contain corners [1]."""
         return float(self.visited.mean())
 
 
 def coverage(pixels: Float[np.ndarray, "corner 2"], image_px: tuple[int, int]) -> Coverage:
-    """Return which part of a picture corners cover."""
+    """Return the coverage of a picture by corners."""
     size = np.array(image_px)
     cells = np.clip((pixels + 0.5) / size * [ACROSS, DOWN], 0, [ACROSS - 1, DOWN - 1]).astype(int)
     visited = np.zeros((DOWN, ACROSS), bool)
     visited[cells[:, 1], cells[:, 0]] = True
     from_middle = (pixels - (size - 1) / 2) / (size / 2)
-    # as far as the nearer of both edges: a corner at the middle of an edge reaches no corner
+    # the smaller of the shares in x and y counts: the middle of an edge is near no picture corner
     directions = ([1, 1], [1, -1], [-1, 1], [-1, -1])
     reach = min(float((from_middle * one).min(1).max()) for one in directions)
     return Coverage(visited, max(reach, 0.0))
@@ -72,11 +74,11 @@ class Quality:
     """A fitted lens and its quality.
 
     Attributes:
-        fit: the fit.
+        fit: the fit of the lens.
         held_out_px: root mean square error on views that the lens was not fitted to [pixel].
         coverage: coverage of the picture.
-        tilts_deg: tilt of the board against the sensor, by view.
-        poor: sentences about shortcomings, with the remedy.
+        tilts_deg: angle between board and sensor in each view [deg].
+        poor: sentences about shortcomings and their remedies.
     """
 
     fit: LensFit
@@ -90,7 +92,7 @@ def quality_of(fit: LensFit, k3: bool) -> Quality:
     """Return the quality of a fit.
 
     Raises:
-        DataError: the lens is so bad that it is of no use.
+        DataError: the lens is too bad to be used.
     """
     covered = coverage(np.concatenate([v.pixels for v in fit.views]), fit.lens.image_px)
     cosines = np.array([abs(pose.rotation[2, 2]) for pose in fit.poses])
@@ -101,10 +103,10 @@ def quality_of(fit: LensFit, k3: bool) -> Quality:
 
 
 def check_usable(fit: LensFit, covered: Coverage, tilts: Float[np.ndarray, " view"]) -> None:
-    """Check that the views of a fit can determine a lens.
+    """Raise `DataError` unless the views of a fit can determine a lens.
 
     Raises:
-        DataError: they cannot; the message says what is missing and what to do.
+        DataError: the views do not suffice; the message says what is missing and what to do.
     """
     tilted = int((tilts > TILTED_DEG).sum())
     if tilted < LEAST_TILTED:
@@ -126,8 +128,8 @@ def check_usable(fit: LensFit, covered: Coverage, tilts: Float[np.ndarray, " vie
 def held_out_px(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> float:
     """Return the root mean square error on views that the lens was not fitted to [pixel].
 
-    Each view's own pose is fitted to it with the lens fixed. Its six parameters reduce the error,
-    which is scaled up accordingly.
+    The board's pose in each of these views is fitted with the lens fixed. Its six parameters reduce
+    the error, which is scaled up to compensate.
     """
     squares, count = 0.0, 0
     for fold in range(FOLDS):
@@ -141,7 +143,7 @@ def held_out_px(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> f
 
 
 def _focal_std(fit: LensFit) -> float:
-    """Return the larger relative std of both focal lengths."""
+    """Return the larger of the relative stds of the two focal lengths [1]."""
     return float((fit.std[:2] / fit.parameters[:2]).max())
 
 

@@ -1,4 +1,4 @@
-"""The report of a calibration: plain values for the camera file, and lines of text for people."""
+"""Report of a camera calibration: plain values for the camera file, and text for people."""
 
 import math
 from collections.abc import Iterator
@@ -13,9 +13,10 @@ from slipid.support.content import Content
 
 POOR_SCALE = 0.005
 POOR_FLOOR_PX = 1.5
-"""Relative std of lengths, and error of points [pixel], above which a camera is poor."""
+"""Relative std of lengths on the floor [1], and error of points on the floor [pixel], above which a
+camera is reported as poor."""
 SHOWN = 12
-"""Number of points that are listed, those that are furthest off; the file has all."""
+"""Number of points, those with the largest errors, that the text lists; the file lists all."""
 UNITS = {"fx": " px", "fy": " px", "cx": " px", "cy": " px"}
 
 
@@ -50,9 +51,9 @@ def floor_report(source: str, fit: FloorFit, spread: PlaceUncertainty, size_std:
     """Return the report of a camera's place above the floor, with lengths to check by tape.
 
     Args:
-        source: description of the points.
+        source: description of where the points come from.
         fit: the fit of the place.
-        spread: its uncertainty.
+        spread: uncertainty of the place.
         size_std: relative std of the board's or tape's size [1].
     """
     keys = ("name", "pixel", "place_m", "off_px", "off_mm")
@@ -91,19 +92,19 @@ def straight_report(camera: OverheadCamera) -> Content:
 
 
 def scale_std(spread: PlaceUncertainty, size_std: float) -> float:
-    """Return the relative std of lengths on the floor: by the pose and by the known size [1]."""
+    """Return the relative std of lengths on the floor, from the pose and from `size_std` [1]."""
     return float(np.hypot(spread.scale_std, size_std))
 
 
 def mm_per_pixel(camera: OverheadCamera) -> float:
-    """Return the size of a pixel on the floor where the lens' axis meets it [mm]."""
+    """Return the width of a pixel on the floor where the lens's axis meets it [mm]."""
     u, v = camera.lens.matrix[:2, 2]
     ends = camera.on_plane(np.array([[u - 0.5, v], [u + 0.5, v]]), 0.0)
     return float(1000 * np.linalg.norm(ends[1] - ends[0]))
 
 
 def marker_height(height_m: float) -> str:
-    """Return a sentence on the effect of a marker's height on lengths, for a camera at a height."""
+    """Return a sentence on the effect of a marker's height, for a camera at `height_m` [m]."""
     marker = 0.25 if height_m >= 1.5 else round(0.1 * height_m, 3)
     factor = height_m / (height_m - marker)
     return (
@@ -136,7 +137,7 @@ def _poor(fit: FloorFit, scale: float) -> list[str]:
 
 
 def report_lines(report: Content, lens_too: bool = True) -> list[str]:
-    """Return a camera file's report as lines of text, with that of the lens only on request."""
+    """Return a camera file's report as lines of text, without the lens if not `lens_too`."""
     lens, floor, poor = report.get("lens"), report.get("floor"), report.get("poor", [])
     lines = list(_lens(lens)) if lens and lens_too else []
     lines += _floor(floor) if floor else []
@@ -147,7 +148,7 @@ def report_lines(report: Content, lens_too: bool = True) -> list[str]:
 
 
 def _lens(lens: Content) -> Iterator[str]:
-    """Yield the report of a lens line by line."""
+    """Yield the lines of a lens's report."""
     views, covered = lens["views"], lens["coverage"]
     corners = sum(view["corners"] for view in views)
     tilts = [view["tilt_deg"] for view in views]
@@ -173,7 +174,7 @@ def _lens(lens: Content) -> Iterator[str]:
 
 
 def _floor(floor: Content) -> Iterator[str]:
-    """Yield the report of a camera's place line by line."""
+    """Yield the lines of the report of a camera's place."""
     yield f"place above the floor: {floor['source']}"
     points = floor.get("points", [])
     shown = sorted(points, key=lambda p: -math.hypot(*p["off_px"]))[:SHOWN]

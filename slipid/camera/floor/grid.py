@@ -1,4 +1,4 @@
-"""The floor in square cells, the picture laid onto it by the camera, and robots that hide it."""
+"""The floor as square cells, the picture projected onto them, and robots that hide the floor."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +11,10 @@ from slipid.camera.overhead import OverheadCamera
 from slipid.support.errors import DataError
 
 LEAST_CELLS, MOST_CELLS = 400, 4_000_000
-"""Limits of the number of cells of one map."""
+"""Smallest and largest number of cells of a map."""
 FARTHEST = 3.0
-"""Distance from the point below the lens up to which the floor is mapped [heights of the lens]."""
+"""Distance from the point below the lens up to which the floor is mapped, in heights of the lens
+above the floor [1]."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Grid:
 
     Attributes:
         low_x, low_y: the corner with the lowest coordinates [m].
-        cell: edge of a cell [m].
+        cell: edge length of a cell [m].
         rows, columns: number of cells along y and along x.
     """
 
@@ -44,7 +45,7 @@ class Grid:
 
     @property
     def extent(self) -> Extent:
-        """The rectangle that the cells cover."""
+        """Rectangle that the cells cover."""
         x, y = self.low_x + self.columns * self.cell, self.low_y + self.rows * self.cell
         return Extent(self.low_x, self.low_y, x, y)
 
@@ -55,7 +56,7 @@ class Grid:
         return np.stack(np.meshgrid(x, y), axis=-1)
 
     def steps(self, xy: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Return column and row of places [m], not rounded; 0, 0 is the first cell's middle."""
+        """Return column and row of places [m] without rounding; 0, 0 is the first cell's middle."""
         return (xy - np.array([self.low_x, self.low_y])) / self.cell - 0.5
 
     def places(self, corners: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
@@ -63,19 +64,19 @@ class Grid:
         return np.array([self.low_x, self.low_y]) + corners * self.cell
 
     def inside(self, polygon: Float[np.ndarray, "corner 2"]) -> Mask:
-        """Return the cells whose middle lies in a polygon [m]."""
+        """Return the cells whose middle lies in a polygon with these corners [m]."""
         return filled(self.steps(polygon), self.rows, self.columns)
 
 
 @dataclass(frozen=True, eq=False)
 class Rectified:
-    """A picture laid onto the floor.
+    """A picture projected onto the floor.
 
     Attributes:
         grid: cells of the floor.
-        colour: blue, green, red of each cell, 0 to 255; 0 where the camera does not see it.
+        colour: blue, green, red of each cell, 0 to 255; 0 where the camera does not see the cell.
         in_view: cells that the camera sees.
-        pixels: place of the middle of each cell in the picture [pixel].
+        pixels: place in the picture of the middle of each cell [pixel].
     """
 
     grid: Grid
@@ -84,17 +85,17 @@ class Rectified:
     pixels: Float[np.ndarray, "row column 2"]
 
     def of_picture(self, mask: Bool[np.ndarray, "y x"]) -> Mask:
-        """Return the cells whose pixel is set in a mask of the picture."""
+        """Return the cells in view whose pixel is set in a mask of the picture."""
         across, down = (np.nan_to_num(np.rint(self.pixels[..., k])).astype(int) for k in (0, 1))
         height, width = mask.shape
         return mask[down.clip(0, height - 1), across.clip(0, width - 1)] & self.in_view
 
 
 def filled(polygon: Float[np.ndarray, "corner 2"], rows: int, columns: int) -> Mask:
-    """Return the points of a grid that lie in a polygon of columns and rows."""
+    """Return the points of a grid that lie in a polygon, whose corners are columns and rows."""
     cv2 = opencv()
     mask = np.zeros((rows, columns), np.uint8)
-    parts = 16  # a sixteenth of a step is as fine as OpenCV draws
+    parts = 16  # OpenCV draws to a sixteenth of a step, set by the last argument below
     corners = np.rint(np.clip(polygon, -1e6, 1e6) * parts).astype(np.int32)
     cv2.fillPoly(mask, [corners.reshape(-1, 1, 2)], 1, cv2.LINE_8, 4)
     return mask.astype(bool)
@@ -104,7 +105,7 @@ def view_of(camera: OverheadCamera) -> Extent:
     """Return the rectangle around the part of the floor that a camera sees.
 
     Raises:
-        DataError: it sees none of it.
+        DataError: the camera sees no floor nearby.
     """
     floor = camera.on_plane(_pixel_grid(camera, -0.5), 0.0).reshape(-1, 2)
     floor = floor[np.linalg.norm(floor - camera.place[:2], axis=1) <= FARTHEST * camera.height]
@@ -115,7 +116,10 @@ def view_of(camera: OverheadCamera) -> Extent:
 
 
 def _pixel_grid(camera: OverheadCamera, edge: float) -> Float[np.ndarray, "65 65 2"]:
-    """Return pixels that cover a picture evenly, from `edge` to its width or height less one."""
+    """Return pixels that cover a picture evenly, at a distance `edge` from its outermost pixels.
+
+    At -0.5 they reach its outer edge.
+    """
     width, height = camera.lens.image_px
     across = np.linspace(edge, width - 1 - edge, 65)
     down = np.linspace(edge, height - 1 - edge, 65)
@@ -123,7 +127,7 @@ def _pixel_grid(camera: OverheadCamera, edge: float) -> Float[np.ndarray, "65 65
 
 
 def pixel_size(camera: OverheadCamera) -> float:
-    """Return the edge of a pixel on the floor at the middle of the view [m]."""
+    """Return the edge length of a pixel on the floor in the middle of the view [m]."""
     view = view_of(camera)
     middle = np.array([(view.low_x + view.high_x) / 2, (view.low_y + view.high_y) / 2, 0.0])
     at = camera.pixels(middle + 1e-3 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]))
@@ -135,7 +139,7 @@ def grid_over(extent: Extent, cell: float, picture: Path) -> Grid:
 
     Args:
         extent: the rectangle.
-        cell: edge of a cell [m].
+        cell: edge length of a cell [m].
         picture: file of the picture, for messages.
 
     Raises:
@@ -154,7 +158,7 @@ def grid_over(extent: Extent, cell: float, picture: Path) -> Grid:
 
 
 def rectified(picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, grid: Grid) -> Rectified:
-    """Return the picture laid onto the floor; cells out of view are black."""
+    """Return the picture projected onto the floor; cells out of view are black."""
     cv2 = opencv()
     centres = grid.centres()
     points = np.concatenate([centres, np.zeros((*centres.shape[:2], 1))], axis=-1)
@@ -166,7 +170,7 @@ def rectified(picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, grid:
         inside = (pixels > -0.5).all(axis=-1) & (pixels < [width - 0.5, height - 0.5]).all(axis=-1)
     in_view = inside & ahead
     ratio = grid.cell / pixel_size(camera)
-    if ratio > 1.5:  # else a cell would show a single pixel of the many that lie in it
+    if ratio > 1.5:  # otherwise a cell would have the colour of one of its many pixels
         picture = cv2.GaussianBlur(picture, (0, 0), 0.4 * ratio)
     maps = [np.nan_to_num(pixels[..., k], nan=-9.0).astype(np.float32) for k in (0, 1)]
     colour = cv2.remap(picture, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -175,9 +179,10 @@ def rectified(picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, grid:
 
 
 def _before_lens(camera: OverheadCamera, points: Float[np.ndarray, "row column 3"]) -> Mask:
-    """Return which places lie before the lens, and within the angle that its picture covers.
+    """Return which points lie in front of the lens, within the angle that its picture covers.
 
-    The distortion of a lens is a polynomial: far outside the picture it folds back into it.
+    Other points must be excluded, since the distortion of a lens is a polynomial that would map
+    points far outside the picture back into it.
     """
     ideal = camera.lens.ideal(_pixel_grid(camera, 0.0))
     widest = 1.02 * np.linalg.norm(ideal, axis=-1).max()
@@ -189,7 +194,7 @@ def _before_lens(camera: OverheadCamera, points: Float[np.ndarray, "row column 3
 
 @dataclass(frozen=True)
 class RobotShape:
-    """An upright cylinder with a marker above its middle, as high as the cylinder.
+    """Shape of a robot: an upright cylinder with a marker in the middle of its top.
 
     Attributes:
         dictionary: dictionary of its marker, such as `4X4_50`.
@@ -207,7 +212,7 @@ class DetectedRobot:
 
     Attributes:
         marker: number of its marker in the dictionary.
-        x, y: its middle on the floor [m].
+        x, y: place of the robot's middle on the floor [m].
     """
 
     marker: int
@@ -218,7 +223,7 @@ class DetectedRobot:
 def detected_robots(
     picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, shape: RobotShape
 ) -> tuple[DetectedRobot, ...]:
-    """Return every robot whose marker is detected."""
+    """Return all robots whose markers are detected in a picture."""
     detector = opencv().aruco.ArucoDetector(marker_dictionary(shape.dictionary))
     corners, numbers, _ = detector.detectMarkers(picture)
     robots = []
@@ -233,7 +238,7 @@ def detected_robots(
 def hidden_by(
     robot: DetectedRobot, shape: RobotShape, camera: OverheadCamera
 ) -> Bool[np.ndarray, "y x"]:
-    """Return the pixels that show a robot's lid or side instead of the floor."""
+    """Return the pixels that show a robot's top or side instead of the floor."""
     around = np.linspace(0, 2 * np.pi, 72, endpoint=False)
     ring = shape.radius * np.stack([np.cos(around), np.sin(around)], axis=-1) + [robot.x, robot.y]
     levels = np.linspace(0, shape.height, 5)

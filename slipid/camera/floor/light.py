@@ -1,9 +1,10 @@
-"""Colours of a picture, and how the floor in it is lit.
+"""Colours of a picture, and the illumination of the floor in it.
 
-Colours have two forms here: linear RGB, in which light adds up, and CIELAB, whose distances are the
-differences that people notice. A surface of colour c appears at a place x as gain(x) c + veil(x) in
-linear RGB. The gain is shading and the darker edge of a lens; the veil is light that the floor
-mirrors or the lens scatters. Both change slowly over the floor.
+Colours have two forms here: linear RGB, in which light is additive, and CIELAB, in which distances
+correspond to differences that people perceive. A surface of colour c appears at a place x as
+gain(x) c + veil(x) in linear RGB. The gain is due to shading and to the lens, whose picture is
+darker at the edges; the veil is light that the floor mirrors or the lens scatters. Both change
+slowly over the floor.
 """
 
 from dataclasses import dataclass, replace
@@ -14,13 +15,14 @@ from jaxtyping import Float, Int, UInt8
 from slipid.camera.opencv import opencv
 
 ORDER = 4
-"""Highest sum of the powers of x and y in a gain or a veil."""
+"""Highest sum of the degrees in x and y of the polynomials in a gain or a veil."""
 STIFF_GAIN, STIFF_VEIL = 3e-4, 1e-3
-"""Penalties that hold a gain at 1 and a veil at 0, for a mean square relative misfit of 1."""
+"""Weights of the penalties that pull the gain to 1 and the veil to 0, relative to the weighted mean
+square misfit of colours [1]."""
 ROUNDS = 6
-"""Number of times that illumination and colours are fitted in turn."""
+"""Number of iterations in which illumination and colours are fitted alternately."""
 GRAY = 0.03
-"""Linear light up to which noise is about constant; above it, noise grows with the light."""
+"""Linear RGB value up to which noise is about constant; above it noise grows with the value [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +30,8 @@ class Features:
     """Features of every cell by which surfaces are distinguished.
 
     Attributes:
-        appearance: lightness L, a and b of CIELAB, and texture; each surface has its own spread of
-            them.
+        appearance: lightness L, a and b of CIELAB, and texture (see `texture`); the spreads of the
+            four within a surface differ from surface to surface.
         rgb: linear red, green and blue, 0 to 1.
     """
 
@@ -41,8 +43,8 @@ def features_of(colour: UInt8[np.ndarray, "row column 3"], smooth: float = 1.0) 
     """Return the features of a picture in blue, green, red.
 
     Args:
-        colour: the picture.
-        smooth: std of the Gaussian that smooths its noise [cells].
+        colour: colours of the cells.
+        smooth: std of the Gaussian that smooths their noise [cells].
     """
     cv2 = opencv()
     fine = colour.astype(np.float32) / 255
@@ -55,7 +57,8 @@ def features_of(colour: UInt8[np.ndarray, "row column 3"], smooth: float = 1.0) 
 def texture(lightness: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row column"]:
     """Return log(1 + v), where v is the variation of the lightness within a few cells.
 
-    The median over a window ignores edges between surfaces, which are thin lines in it.
+    v is a median over a window, so that edges between surfaces, thin lines in the window, do not
+    affect it.
     """
     cv2 = opencv()
     change = np.abs(lightness - cv2.GaussianBlur(lightness, (0, 0), 2.5))
@@ -65,14 +68,14 @@ def texture(lightness: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "ro
 
 
 def to_linear(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """Return the linear RGB of sRGB values from 0 to 1."""
+    """Return the linear RGB values of sRGB values, both from 0 to 1."""
     low = rgb / np.asarray(12.92, rgb.dtype)
     high = ((np.maximum(rgb, 0) + 0.055) / 1.055) ** 2.4
     return np.where(rgb <= 0.04045, low, high).astype(rgb.dtype)
 
 
 def to_srgb(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """Return the sRGB values from 0 to 1 of linear RGB."""
+    """Return the sRGB values of linear RGB values, both from 0 to 1."""
     inside = np.clip(rgb, 0, 1)
     low, high = 12.92 * inside, 1.055 * inside ** (1 / 2.4) - 0.055
     return np.where(inside <= 0.0031308, low, high)
@@ -100,7 +103,7 @@ def code_of_linear(rgb: Float[np.ndarray, "3"]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Illumination:
-    """Gain and veil over the floor, as coefficients of the functions of `basis_at`.
+    """Gain and veil over the floor, as coefficients of the functions in `basis_at`.
 
     Attributes:
         gain: coefficients of the gain less 1.
@@ -112,14 +115,14 @@ class Illumination:
 
     @classmethod
     def uniform(cls) -> "Illumination":
-        """Return light that is the same everywhere: a gain of 1 and no veil."""
+        """Return the illumination that is the same everywhere: a gain of 1 and no veil."""
         count = len(_powers()) - 1
         return cls(np.zeros(count), np.zeros((count, 3)))
 
     def rgb_of(
         self, colours: Float[np.ndarray, "surface 3"], at: Float[np.ndarray, "place 2"]
     ) -> Float[np.ndarray, "surface place 3"]:
-        """Return the linear RGB of surfaces at places, whose x and y go from -1 to 1."""
+        """Return the linear RGB in which surfaces appear at places, x and y from -1 to 1."""
         basis = basis_at(at)
         gain, veil = 1 + basis @ self.gain, basis @ self.veil
         return np.maximum(gain[:, None] * colours[:, None, :] + veil, 1e-4)
@@ -127,7 +130,7 @@ class Illumination:
     def true_colours(
         self, rgb: Float[np.ndarray, "place 3"], at: Float[np.ndarray, "place 2"]
     ) -> Float[np.ndarray, "place 3"]:
-        """Return the surface colours that appear as `rgb` at places: the inverse of the above."""
+        """Return the surface colours that appear as `rgb` at places: the inverse of `rgb_of`."""
         basis = basis_at(at)
         gain = np.maximum(1 + basis @ self.gain, 0.1)
         return np.clip((rgb - basis @ self.veil) / gain[:, None], 1e-4, 1)
@@ -135,10 +138,10 @@ class Illumination:
 
 @dataclass(frozen=True, eq=False)
 class ColourSamples:
-    """Places whose surface is taken as known.
+    """Colours in the picture at places whose surface is taken as known.
 
     Attributes:
-        at: x and y of each place, from -1 to 1.
+        at: x and y of each place, from -1 to 1 over the picture.
         rgb: linear RGB measured there.
         surface: number of the surface.
         weight: weight of the sample in the fit.
@@ -152,16 +155,16 @@ class ColourSamples:
 
 @dataclass(frozen=True, eq=False)
 class LitColours:
-    """Colours of surfaces [linear RGB] and the illumination that they are under."""
+    """Colours of surfaces [linear RGB], and the illumination of the floor."""
 
     illumination: Illumination
     colours: Float[np.ndarray, "surface 3"]
 
 
 def fit_illumination(samples: ColourSamples, start: LitColours) -> LitColours:
-    """Return the illumination and colours that explain the samples best, by a robust fit.
+    """Return the illumination and the surface colours fitted robustly to samples.
 
-    A surface without a sample keeps its colour of `start`.
+    A surface without a sample keeps its colour in `start`.
     """
     fit = start
     basis = basis_at(samples.at)
@@ -186,7 +189,7 @@ def _powers() -> list[tuple[int, int]]:
 def _weights(samples: ColourSamples, fit: LitColours) -> Float[np.ndarray, "place 3"]:
     """Return the weight of each sample and channel.
 
-    Noise grows with the light, and samples that fit badly count little.
+    Weights are lower for bright colours, whose noise is larger, and for samples that fit badly.
     """
     expected = fit.illumination.rgb_of(fit.colours, samples.at)
     own = expected[samples.surface, np.arange(len(samples.surface))]
@@ -203,7 +206,7 @@ def _illumination(
     colours: Float[np.ndarray, "surface 3"],
     weights: Float[np.ndarray, "place 3"],
 ) -> Illumination:
-    """Return gain and veil for given colours: one least-squares problem of all three channels."""
+    """Return gain and veil for given colours, from one least-squares problem for all channels."""
     count = basis.shape[1]
     own = colours[samples.surface]
     rough = np.array([(i + j) ** 2.0 for i, j in _powers()[1:]])
@@ -226,7 +229,7 @@ def _colours(
     fit: LitColours,
     weights: Float[np.ndarray, "place 3"],
 ) -> Float[np.ndarray, "surface 3"]:
-    """Return the colours for a given illumination."""
+    """Return the surface colours for a given illumination, by weighted least squares."""
     gain = (1 + basis @ fit.illumination.gain)[:, None]
     without_veil = samples.rgb - basis @ fit.illumination.veil
     colours = fit.colours.copy()

@@ -1,4 +1,4 @@
-"""Patches of cells as polygons; two neighbouring patches have the same line as their border."""
+"""Conversion of patches of cells to polygons; neighbouring patches share the line between them."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from slipid.camera.opencv import Labels, Mask, opencv
 
 FITTED = 6
-"""Number of steps from which on a part of a border gets a fitted line."""
+"""Smallest number of steps of a border part to which a line is fitted; a step is a cell's edge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,8 +19,9 @@ class PatchOutline:
     Attributes:
         label: label of its cells.
         cells: mask of its cells.
-        rings: corners as columns and rows of cell corners; the first ring runs around the patch,
-            others around holes in it. The last corner of a ring does not repeat the first.
+        rings: polygons, whose corners are columns and rows of cell corners. The first ring runs
+            around the patch, the others around holes in it. A ring's last corner does not repeat
+            its first.
     """
 
     label: int
@@ -33,7 +34,8 @@ def outlines_of(labels: Labels, tolerance: float) -> tuple[PatchOutline, ...]:
 
     Args:
         labels: label of each cell.
-        tolerance: largest distance of a line from the cell edges it stands for [cells].
+        tolerance: largest distance of a polygon's line from the cell edges that it replaces
+            [cells].
     """
     cv2 = opencv()
     fixed = _junctions(labels)
@@ -58,8 +60,9 @@ def signed_area(ring: Float[np.ndarray, "corner 2"]) -> float:
 def _rings(cells: Mask) -> list[Int[np.ndarray, "_ 2"]]:
     """Return the cell corners along each edge of a connected patch, the outer edge first.
 
-    Corners are one step apart. OpenCV's contours run through the middles of pixels. On a grid twice
-    as fine, where a cell covers three by three points, they run along the edges of cells.
+    Corners are one step apart. OpenCV's contours run through the middles of pixels; here they are
+    computed on a grid twice as fine, on which a cell covers three by three points, so that they run
+    along the edges of cells.
     """
     cv2 = opencv()
     rows, columns = np.nonzero(cells)
@@ -76,7 +79,7 @@ def _rings(cells: Mask) -> list[Int[np.ndarray, "_ 2"]]:
 def _corners(fine: Int[np.ndarray, "point 2"]) -> Int[np.ndarray, "corner 2"]:
     """Return the cell corners along a contour of the finer grid.
 
-    The contour cuts a corner where the edge turns inwards; such corners are put back.
+    The contour cuts off a corner where the edge turns inwards; such corners are restored.
     """
     after = np.roll(fine, -1, axis=0)
     diagonal = (fine != after).all(axis=1)
@@ -87,7 +90,7 @@ def _corners(fine: Int[np.ndarray, "point 2"]) -> Int[np.ndarray, "corner 2"]:
 
 
 def _junctions(labels: Labels) -> Bool[np.ndarray, "row1 column1"]:
-    """Return the cell corners that stay fixed: where borders meet, and the corners of the map."""
+    """Return the cell corners that stay fixed: junctions of borders, and corners of the map."""
     wide = np.pad(labels, 1, constant_values=-2)
     a, b, c, d = wide[:-1, :-1], wide[:-1, 1:], wide[1:, 1:], wide[1:, :-1]
     changes = sum((one != other).astype(int) for one, other in ((a, b), (b, c), (c, d), (d, a)))
@@ -99,12 +102,13 @@ def _junctions(labels: Labels) -> Bool[np.ndarray, "row1 column1"]:
 def _simplified(
     ring: Int[np.ndarray, "step 2"], fixed: Mask, tolerance: float
 ) -> Float[np.ndarray, "corner 2"]:
-    """Return a ring of few corners.
+    """Return a ring simplified to few corners.
 
-    Each part between two junctions is simplified alone, hence alike for the patches on both sides.
+    Each part between two junctions is simplified separately, so that the patches on both sides get
+    the same line.
     """
     ends = np.flatnonzero(fixed[ring[:, 1], ring[:, 0]])
-    if not len(ends):  # no junction: begin at the lowest corner, which both patches find
+    if not len(ends):  # no junction: begin at the lowest corner, the same for both patches
         ends = np.array([np.lexsort((ring[:, 1], ring[:, 0]))[0]])
     turned = np.roll(ring, -ends[0], axis=0)
     closed = np.concatenate([turned, turned[:1]]).astype(float)
@@ -114,7 +118,10 @@ def _simplified(
 
 
 def _line(path: Float[np.ndarray, "step 2"], tolerance: float) -> Float[np.ndarray, "corner 2"]:
-    """Return the few corners of a border between two junctions, the same from either end."""
+    """Return a border between two junctions, simplified to few corners.
+
+    The result does not depend on the direction of the border.
+    """
     cv2 = opencv()
     if (path[0] == path[-1]).all():  # a loop: its farthest corner splits it in two
         distance = ((path - path[0]) ** 2).sum(axis=1)
@@ -123,7 +130,7 @@ def _line(path: Float[np.ndarray, "step 2"], tolerance: float) -> Float[np.ndarr
         return np.concatenate([halves[0][:-1], halves[1]])
     reverse = tuple(path[::-1].ravel()) < tuple(path.ravel())
     path = path[::-1] if reverse else path
-    # a step's ends lie half a step to either side of a slanted border, its middle on it
+    # the ends of a step lie half a step beside a slanted border, its middle lies on the border
     middles = np.concatenate([path[:1], (path[1:] + path[:-1]) / 2, path[-1:]])
     twice = np.rint(2 * middles).astype(np.int32)
     few = cv2.approxPolyDP(twice.reshape(-1, 1, 2), 2 * tolerance, False).reshape(-1, 2)
@@ -132,7 +139,7 @@ def _line(path: Float[np.ndarray, "step 2"], tolerance: float) -> Float[np.ndarr
 
 
 def _indices(path: Int[np.ndarray, "step 2"], few: Int[np.ndarray, "corner 2"]) -> list[int]:
-    """Return the index in a path of each of some of its points, in order."""
+    """Return the indices in a path of `few` of its points, which are in the path's order."""
     index = [0]
     for corner in few[1:]:
         rest = path[index[-1] + 1 :]
@@ -149,13 +156,13 @@ def _fitted(
     for k in range(1, len(index) - 1):
         (p, along), (q, other) = lines[k - 1], lines[k]
         cross = along[0] * other[1] - along[1] * other[0]
-        if abs(cross) > 0.1:  # else they are nearly one line
+        if abs(cross) > 0.1:  # otherwise the two lines are nearly parallel
             off = q - p
             meet = p + along * (off[0] * other[1] - off[1] * other[0]) / cross
         else:
             feet = [on + d * float((out[k] - on) @ d) for on, d in lines[k - 1 : k + 1]]
             meet = (feet[0] + feet[1]) / 2
-        # the middles cut a corner by up to half a step
+        # the middles of steps cut off a corner by up to half a step
         if np.linalg.norm(meet - out[k]) <= tolerance + 0.5:
             out[k] = meet
     return out
@@ -164,9 +171,12 @@ def _fitted(
 def _through(
     steps: Float[np.ndarray, "step 2"],
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Return a point and a direction of the line through steps, or from end to end of few."""
+    """Return a point and the direction of the line fitted to steps.
+
+    For few steps it is the line from the first to the last one.
+    """
     if len(steps) < FITTED:
         return steps[0], (steps[-1] - steps[0]) / np.linalg.norm(steps[-1] - steps[0])
-    inner = steps[1:-1]  # a step at a corner may be of the next line
+    inner = steps[1:-1]  # the steps at the ends may belong to the neighbouring lines
     middle = inner.mean(axis=0)
     return middle, np.linalg.svd(inner - middle, full_matrices=False)[2][0]

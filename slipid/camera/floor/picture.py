@@ -1,4 +1,4 @@
-"""A map of the floor from one picture from above."""
+"""A map of the floor made from one picture taken from above."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -44,10 +44,10 @@ class MapOptions:
     """Options of a map.
 
     Attributes:
-        config: file of a palette; None proposes surfaces by the picture.
-        surfaces: number of surfaces to propose; None chooses it.
+        config: file of a palette; None to propose surfaces from the picture.
+        surfaces: number of surfaces to propose; None to choose it from the picture.
         robot: shape of robots in the picture, which are masked.
-        cell: edge of a cell [m]; None takes that of a pixel.
+        cell: edge length of a cell [m]; None for that of a pixel on the floor.
     """
 
     config: Path | None = None
@@ -60,7 +60,8 @@ def map_of(path: Path, camera: OverheadCamera, options: MapOptions, report: Repo
     """Return the map of a picture.
 
     Raises:
-        DataError: no picture, another resolution than the camera's, or a config that does not fit.
+        DataError: the file is not a picture, its resolution is not the camera's, or the config does
+            not fit the picture.
     """
     report.stage("laying the picture onto the floor")
     picture = still(path)
@@ -101,9 +102,12 @@ def _segmented(features: Features, region: FloorRegion, seeds: Seeds) -> Segment
 
 
 def _with_matches(seeds: Seeds, features: Features, region: FloorRegion) -> Seeds:
-    """Return seeds with cells on matching patches for surfaces with at most one marked point."""
+    """Return seeds with more marked cells for surfaces that have at most one marked point.
+
+    These cells are on patches whose colour matches the surface.
+    """
     count = np.bincount(seeds.marked.surface, minlength=len(seeds.colours))
-    few = count <= (AROUND + 1) ** 2  # cells around a point
+    few = count <= (AROUND + 1) ** 2  # number of cells around one point
     if not few.any():
         return seeds
     match = matched(features, region.visible, seeds.colours)
@@ -112,7 +116,7 @@ def _with_matches(seeds: Seeds, features: Features, region: FloorRegion) -> Seed
 
 
 def _seeds_around(points: MarkedCells, features: Features, region: FloorRegion) -> Seeds:
-    """Return the cells around proposed points as marked cells, with their colours."""
+    """Return the cells around proposed points as marked cells, and their surfaces' colours."""
     cells = points.surroundings(region.visible)
     rgb, own = features.rgb[cells.row, cells.column], cells.surface
     colours = [np.median(rgb[own == k], axis=0) for k in range(own.max() + 1)]
@@ -120,7 +124,7 @@ def _seeds_around(points: MarkedCells, features: Features, region: FloorRegion) 
 
 
 def check_all_present(source: FloorPicture, names: tuple[str, ...], labels: Labels) -> None:
-    """Raise `DataError` where no cell has one of the surfaces of a config."""
+    """Raise `DataError` if a surface of a config has no cell."""
     absent = [name for k, name in enumerate(names) if not (labels == k).any()]
     if absent:
         raise DataError(
@@ -130,7 +134,7 @@ def check_all_present(source: FloorPicture, names: tuple[str, ...], labels: Labe
 
 
 def _config_of(path: Path, palette: Palette, result: PictureMap, points: MarkedCells) -> str:
-    """Return a config that marks the proposed surfaces by points in pixels."""
+    """Return the text of a config that marks the proposed surfaces by points in pixels."""
     pixels = result.floor.pixels[points.row, points.column]
     surfaces = []
     for k, (name, colour) in enumerate(result.vector.colours.items()):

@@ -1,10 +1,11 @@
-"""Points on surfaces, proposed by patches of uniform appearance.
+"""Proposal of points on surfaces, from patches of uniform appearance.
 
-A patch is followed across slow changes of the light to its edges. Without a config, patches far
-apart are compared after removing the illumination estimated from those recognised as similar so
-far, and similar ones become one surface. With a config that names surfaces by colour alone, patches
-are matched with those colours: colours alone are a poor start, for light changes them by more than
-they differ, but patches that match a colour well show how the floor is lit, and then more match.
+A patch extends over slow changes of the light up to its edges. Without a config, distant patches
+are compared after removing the illumination, which is estimated from the patches recognised as
+similar so far; similar patches become one surface. With a config that specifies surfaces by colour
+alone, patches are matched with those colours. The colours alone do not suffice, since light changes
+them by more than they differ, but patches that match a colour well show the illumination, and with
+it more patches match.
 """
 
 from collections.abc import Sequence
@@ -27,35 +28,37 @@ from slipid.camera.opencv import Labels, Mask, opencv
 from slipid.support.errors import DataError
 
 JOIN = (5.0, 7.0, 8.0, 8.0, 8.0)
-"""Distance up to which patches count as one surface, round by round [L, a, b]."""
+"""Distance of colours up to which patches count as one surface, in each round [units of CIELAB]."""
 SEPARATE = 7.0
-"""Distance from which on patches are proposed as two surfaces [L, a, b]. Two proposed surfaces are
-more easily joined by one name than one is split."""
+"""Distance of colours from which on patches are proposed as two surfaces [units of CIELAB]. It is
+small, since users can easily give two proposed surfaces one name, but hardly split one."""
 LEAST_PART = 0.002
-"""Part of the floor below which a patch proposes no surface."""
+"""Share of the floor below which a patch is too small to propose a surface [1]."""
 LIGHTNESS = 0.8
-"""Weight of a difference of lightness beside one of hue: shading changes lightness."""
+"""Weight of a difference of lightness relative to one of a or b [1]; it is below 1 since shading
+changes lightness."""
 TEXTURE = 10.0
-"""Weight of a difference of 1 in texture, the logarithm of roughness [L, a, b]."""
+"""Distance of colours that a difference of 1 in texture equals [units of CIELAB]."""
 SAMPLES = 4000
-"""Number of cells in which the light is compared."""
+"""Approximate number of cells to which the illumination is fitted."""
 POINTS = 4
 """Largest number of points that mark a surface."""
 MATCH = (8.0, 10.0, 12.0, 14.0, 16.0, 16.0)
-"""Distance up to which a patch matches a colour, round by round [L, a, b]."""
+"""Distance of colours up to which a patch matches a given one, in each round [units of CIELAB]."""
 CLEARER = 0.7
-"""Largest ratio of the distances to the nearest colour and to the next for a match."""
+"""Largest ratio of a patch's distance to the nearest colour and to the second nearest colour with
+which it still matches the nearest one [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Patches of uniform appearance in the thinned picture.
+    """Patches of uniform appearance, found in a picture of lower resolution (see `thinned`).
 
     Attributes:
         appearance: L, a, b and texture of each patch.
-        row, column: cell of the whole picture farthest from the patch's edge.
-        cells: number of cells of the whole picture in each patch.
-        samples: samples of the light in all patches; `surface` is the number of the patch.
+        row, column: cell of the full picture that is farthest from the patch's edge.
+        cells: number of cells of the full picture in each patch.
+        samples: colours in all patches; their `surface` is the number of the patch.
     """
 
     appearance: Float[np.ndarray, "patch 4"]
@@ -66,12 +69,12 @@ class Patches:
 
 
 def proposed(features: Features, visible: Mask, count: int | None) -> MarkedCells:
-    """Return points on surfaces proposed without a config, the largest surface first.
+    """Return points on surfaces proposed without a config, numbered from the largest surface on.
 
     Args:
         features: features of every cell.
         visible: cells that show the floor.
-        count: number of surfaces; None separates all patches that are not clearly similar.
+        count: number of surfaces; None to separate all patches that are not clearly similar.
 
     Raises:
         DataError: there are fewer patches than surfaces.
@@ -94,7 +97,7 @@ def proposed(features: Features, visible: Mask, count: int | None) -> MarkedCell
 
 
 def patches_of(features: Features, visible: Mask) -> Patches:
-    """Return patches of connected cells between which the appearance changes slowly."""
+    """Return patches of connected cells within which the appearance changes slowly."""
     cv2 = opencv()
     step = max(1, round(np.sqrt(visible.size / (2 * COARSE))))
     few, some = thinned(features, step), visible[step // 2 :: step, step // 2 :: step]
@@ -121,7 +124,7 @@ def patches_of(features: Features, visible: Mask) -> Patches:
 
 
 def _samples(few: Features, parts: Labels, kept: Sequence[int]) -> ColourSamples:
-    """Return samples spread evenly over every kept patch."""
+    """Return colour samples spread evenly over every kept patch."""
     own = np.full(parts.max() + 1, -1)
     own[list(kept)] = np.arange(len(kept))
     patch = own[parts].ravel()
@@ -139,10 +142,10 @@ def _means(samples: ColourSamples) -> Float[np.ndarray, "surface 3"]:
 
 
 def _clusters(patches: Patches, count: int | None) -> Int[np.ndarray, " patch"]:
-    """Return the surface of each patch, by hierarchical clustering of their colours.
+    """Return the surface of each patch, by hierarchical clustering of the patches' colours.
 
-    At first each patch is a surface of its own: the change of light within patches is enough to
-    compare them, and those recognised as similar then give a better estimate of the light.
+    At first each patch is a surface of its own, and the illumination is estimated from its changes
+    within patches. Patches recognised as similar then give a better estimate of it.
     """
     from scipy.cluster.hierarchy import fcluster, linkage
 
@@ -163,14 +166,17 @@ def _clusters(patches: Patches, count: int | None) -> Int[np.ndarray, " patch"]:
 
 
 def _evenly(lab: Float[np.ndarray, "place 3"]) -> Float[np.ndarray, "place 3"]:
-    """Return CIELAB with the chroma of strong colours compressed, as people perceive it."""
+    """Return CIELAB with compressed chroma, so that distances of strong colours match perception.
+
+    Lightness is multiplied by `LIGHTNESS`.
+    """
     chroma = np.linalg.norm(lab[:, 1:], axis=1, keepdims=True)
     drawn = np.log1p(0.045 * chroma) / (0.045 * np.maximum(chroma, 1e-6))
     return np.concatenate([LIGHTNESS * lab[:, :1], drawn * lab[:, 1:]], axis=1)
 
 
 def _relit(illumination: Illumination, samples: ColourSamples) -> Float[np.ndarray, "place 3"]:
-    """Return the linear RGB that the samples would have at the place with the least glare."""
+    """Return the linear RGB that the samples would have at the place with the smallest veil."""
     plain = illumination.true_colours(samples.rgb, samples.at)
     veil = basis_at(samples.at) @ illumination.veil
     clearest = samples.at[[int(np.argmin(veil.sum(axis=1)))]]
@@ -180,7 +186,7 @@ def _relit(illumination: Illumination, samples: ColourSamples) -> Float[np.ndarr
 def matched(
     features: Features, visible: Mask, colours: Float[np.ndarray, "surface 3"]
 ) -> MarkedCells:
-    """Return the middles of patches that match one of some colours best [linear RGB]."""
+    """Return the middles of patches that match one of the given colours [linear RGB]."""
     patches = patches_of(features, visible)
     count = len(patches.row)
     own = np.full(count, -1)
@@ -191,7 +197,7 @@ def matched(
     for near in MATCH:
         expected = _exposed(colours, fit.colours[: len(colours)], np.unique(own[own >= 0]))
         own = _nearest(patches, fit.illumination.rgb_of(expected, samples.at), near)
-        # a patch without a match still shows, by its own colour, how the light changes within it
+        # a patch without a match counts as a surface of its own: it shows how the light changes
         each = np.where(own >= 0, own, len(colours) + np.arange(count))
         fit = fit_illumination(replace(samples, surface=each[samples.surface]), fit)
     kept = own >= 0
@@ -203,7 +209,10 @@ def _exposed(
     fitted: Float[np.ndarray, "surface 3"],
     matched: Int[np.ndarray, " match"],
 ) -> Float[np.ndarray, "surface 3"]:
-    """Return the fitted colours of matched surfaces, and given ones of equal brightness else."""
+    """Return the fitted colours of matched surfaces, and the given colours of all others.
+
+    Given colours are scaled by the median ratio of fitted to given brightness.
+    """
     if not len(matched):
         return given
     brighter = np.median(fitted[matched].sum(axis=1) / given[matched].sum(axis=1))
@@ -215,7 +224,10 @@ def _exposed(
 def _nearest(
     patches: Patches, expected: Float[np.ndarray, "surface sample 3"], near: float
 ) -> Int[np.ndarray, " patch"]:
-    """Return the matching colour of each patch; -1 where none is near or two are."""
+    """Return the matching colour of each patch, or -1.
+
+    A patch has no match if no colour is near or if two colours are about equally near.
+    """
     samples = patches.samples
     scale = np.array([LIGHTNESS, 1, 1])
     off = np.linalg.norm((lab_of(expected) - lab_of(samples.rgb)) * scale, axis=-1)

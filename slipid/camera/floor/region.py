@@ -1,6 +1,7 @@
-"""The config of a map, and the part of the floor that it requests, as cells.
+"""The config of a map, and the cells of the part of the floor that it requests.
 
-A config names surfaces by colour or by marked points, and may limit the map by a region and masks.
+A config specifies surfaces by colour or by marked points, and may limit the map by a region and
+masks.
 """
 
 from collections.abc import Sequence
@@ -35,14 +36,15 @@ from slipid.support.errors import DataError
 from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
 ABSENT = 30.0
-"""Distance from every cell above which a colour is not in the picture [L, a, b]."""
+"""Distance to the nearest cells' colours above which a colour counts as absent from the picture
+[units of CIELAB]."""
 SCHEMA: Literal["slipid.palette/1"] = "slipid.palette/1"
 Points = Annotated[list[Point], Field(min_length=1)]
 Name = Annotated[str, Field(min_length=1, max_length=60)]
 
 
 class Places(Section):
-    """Places in pixels of the picture or in metres of the floor."""
+    """Places given either in the picture [pixel] or on the floor [m]."""
 
     at_px: Points | None = None
     at_m: Points | None = None
@@ -55,7 +57,7 @@ class Places(Section):
 
 
 class Polygon(Places):
-    """A polygon, by its corners."""
+    """A polygon, given by its corners."""
 
     @model_validator(mode="after")
     def _corners(self) -> "Polygon":
@@ -65,13 +67,13 @@ class Polygon(Places):
 
 
 class Marked(Places):
-    """Points on a surface."""
+    """Points that mark a surface."""
 
     surface: Name
 
 
 class Palette(Section):
-    """The user's knowledge of a floor: colours or points of its surfaces, region and masks."""
+    """Config of a map: colours or points of the floor's surfaces, a region and masks."""
 
     schema_: Literal["slipid.palette/1"] = Field(alias="schema")
     palette: dict[Name, Colour] = Field(default_factory=dict)
@@ -86,10 +88,11 @@ class Palette(Section):
 
 
 def read_palette(path: Path) -> Palette:
-    """Return the config in a TOML file, checked.
+    """Return the checked config in a TOML file.
 
     Raises:
-        DataError: unreadable, unknown or missing keys, wrong values, two surfaces of one colour.
+        DataError: the file is unreadable, keys are unknown or missing, values are wrong, or two
+            surfaces have the same colour.
     """
     palette = checked(path, mapping_of(path, text_of(path, "a palette of surfaces")), Palette)
     first: dict[str, str] = {}
@@ -104,10 +107,10 @@ def read_palette(path: Path) -> Palette:
 
 
 def palette_text(surfaces: Sequence[str], image: str, before: Palette) -> str:
-    """Return a config that finds the same surfaces again, to be edited.
+    """Return the text of a config that specifies the proposed surfaces and that users can edit.
 
     Args:
-        surfaces: tables of the proposed surfaces, see `points_text`.
+        surfaces: TOML tables of the proposed surfaces, see `points_text`.
         image: name of the picture.
         before: config without surfaces, whose region and masks are kept.
     """
@@ -126,13 +129,13 @@ def palette_text(surfaces: Sequence[str], image: str, before: Palette) -> str:
 
 
 def points_text(name: str, colour: str, share: float, pixels: Float[np.ndarray, "point 2"]) -> str:
-    """Return the table of a surface that is marked by points.
+    """Return the TOML table of a surface that is marked by points.
 
     Args:
-        name: name for the surface.
+        name: name of the surface.
         colour: its colour `#rrggbb`, for a comment.
-        share: part of the mapped floor that it covers [1], for a comment.
-        pixels: points on it.
+        share: share of the mapped floor that it covers [1], for a comment.
+        pixels: points on the surface in the picture [pixel].
     """
     points = ", ".join(f"[{x:.0f}, {y:.0f}]" for x, y in pixels.tolist())
     return (
@@ -178,9 +181,9 @@ class FloorRegion:
     """The part of the floor to be mapped.
 
     Attributes:
-        floor: the picture laid onto the floor.
+        floor: the picture projected onto the floor.
         requested: cells of the region that lie in the camera's view.
-        visible: those of them that show the floor, without masks and robots.
+        visible: requested cells that show the floor, not a mask or a robot.
         robots: robots detected in the picture.
     """
 
@@ -199,10 +202,10 @@ def requested_region(
         source: the picture and its camera.
         palette: the config, with its region and masks.
         robot: shape of robots that may hide the floor.
-        cell: edge of a cell [m]; None takes that of a pixel.
+        cell: edge length of a cell [m]; None for that of a pixel on the floor.
 
     Raises:
-        DataError: another resolution than the camera's, or a region without visible floor.
+        DataError: the picture's resolution is not the camera's, or the region has no visible floor.
     """
     picture, camera = source.picture, source.camera
     camera.lens.check_size(size_of(picture), source.path)
@@ -231,7 +234,7 @@ def requested_region(
 
 
 def _extent(source: FloorPicture, region: Polygon | None) -> Extent:
-    """Return the rectangle around a region within the view, or around the whole view."""
+    """Return the rectangle around the visible part of a region, or around the whole view."""
     view = view_of(source.camera)
     if region is None:
         return view
@@ -263,10 +266,10 @@ def _cells(source: FloorPicture, floor: Rectified, polygon: Polygon) -> Mask:
 def seeds_of(
     source: FloorPicture, features: Features, region: FloorRegion, palette: Palette
 ) -> Seeds:
-    """Return colours and marked cells of the surfaces that a config names.
+    """Return colours and marked cells of the surfaces that a config specifies.
 
     Raises:
-        DataError: a marked point shows no floor, or a colour is not in the picture.
+        DataError: a marked point does not show the floor, or a colour is absent from the picture.
     """
     names = palette.names
     marked = MarkedCells(*np.zeros((3, 0), int))
@@ -321,7 +324,7 @@ def _refuse(
 def _check_present(
     source: FloorPicture, name: str, palette: Palette, lab: Float[np.ndarray, "cell 3"]
 ) -> None:
-    """Raise `DataError` where no cell has nearly the colour of a surface."""
+    """Raise `DataError` if no cell has nearly the colour of the surface `name`."""
     colour = palette.palette[name]
     off = np.linalg.norm(lab - lab_of(linear_of_code(colour)[None])[0], axis=1)
     if (nearest := float(np.percentile(off, 0.5))) > ABSENT:

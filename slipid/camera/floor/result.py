@@ -1,4 +1,4 @@
-"""The map made from a picture: outlines in metres, colours, and how far it can be trusted."""
+"""The map made from a picture: outlines in metres, colours, and warnings about its quality."""
 
 import hashlib
 from dataclasses import dataclass
@@ -18,23 +18,24 @@ from slipid.support.content import Content
 from slipid.support.errors import DataError
 
 HARDLY, NOT = 5.0, 3.5
-"""Difference of appearance below which surfaces are hardly, or not, distinguishable [spreads].
+"""Differences of appearance below which two surfaces are hardly distinguishable, and below which
+they are indistinguishable [spreads within a surface].
 
-One surface under two names comes out at about 3.2: each name takes one side of its noise.
+If one surface is given two names, the two differ by about 3.2: each takes one half of the noise.
 """
 MOST_UNKNOWN = 1 / 3
-"""Largest part of the requested floor that may be unknown in a good map."""
+"""Largest share of the requested floor that may be unknown in a good map [1]."""
 MOST_NAMED = 3
-"""Number of weak patches that are reported one by one, the largest first."""
+"""Number of patches of low confidence that are reported one by one, the largest first."""
 WEAK = 1.0
-"""Confidence below which a patch is reported [spreads]."""
+"""Confidence below which a patch is reported [spreads within a surface], see `_patch`."""
 TOLERANCE = 0.6
-"""Largest distance of an outline from the edges of cells [cells]."""
+"""Largest distance of an outline from the cell edges that it replaces [cells]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """Surface of each cell, the cost of every surface in each cell, and their appearance."""
+    """Surface of each cell, cost of every surface in each cell, and appearance of the surfaces."""
 
     labels: Labels
     costs: Costs
@@ -47,12 +48,12 @@ class PictureMap:
 
     Attributes:
         vector: the map as polygons.
-        floor: the picture laid onto the floor.
+        floor: the picture projected onto the floor.
         labels: surface of each cell, in the order of the colours of `vector`; -1 is unknown.
         robots: robots that hid a part of the floor.
-        warnings: sentences about what makes the map less certain.
-        poor: sentences about what makes it bad.
-        proposal: a config that finds the same surfaces; None where one was given.
+        warnings: sentences about reasons for which the map is less certain.
+        poor: sentences about reasons for which the map is bad.
+        proposal: text of a config that specifies the same surfaces; None if a config was given.
     """
 
     vector: VectorMap
@@ -64,7 +65,7 @@ class PictureMap:
     proposal: str | None
 
     def share(self, k: int) -> float:
-        """Return the part of the known floor that surface `k` covers [1]."""
+        """Return the share of the known floor that surface number `k` covers [1]."""
         return float((self.labels == k).sum() / max(1, int((self.labels >= 0).sum())))
 
     def to_json(self) -> Content:
@@ -119,7 +120,7 @@ def map_from(
         raise DataError(f"{source.path}: no cell looks like a surface; expected a floor")
     number = np.full(len(names) + 1, UNKNOWN)
     number[present] = np.arange(len(present))
-    labels = number[segmentation.labels]  # UNKNOWN is the last
+    labels = number[segmentation.labels]  # label UNKNOWN, -1, picks the last entry
     kept = tuple(names[k] for k in present)
     colours = {
         name: palette.palette.get(
@@ -139,7 +140,7 @@ def map_from(
             f"{100 * MOST_UNKNOWN:.0f} %: a region that holds nothing but floor, and points on "
             "every surface"
         )
-    if not region.robots and is_picture(source.path):  # a video's median does not show it
+    if not region.robots and is_picture(source.path):  # the median of a video shows no moving robot
         warnings.append(
             "no marker of a robot was detected, so none is masked; where one stands, mask it in "
             "the config, or name the --dictionary of its marker"
@@ -155,7 +156,7 @@ def _similar(
 ) -> list[str]:
     """Return sentences about pairs of surfaces whose appearances differ by `low` to `high` spreads.
 
-    The difference is the median over the picture.
+    The difference is the median over the picture, relative to the spread within a surface.
     """
     appearances = surfaces.appearances((24, 24)).reshape(len(names), -1, 4)
     sentences = []
@@ -174,15 +175,16 @@ def _similar(
 
 
 def _unknown_share(labels: Labels, requested: Mask) -> float:
-    """Return the part of the requested cells whose surface is unknown."""
+    """Return the share of the requested cells whose surface is unknown [1]."""
     return float((labels[requested] < 0).mean())
 
 
 def _patch(one: PatchOutline, region: FloorRegion, names: tuple[str, ...], costs: Costs) -> Patch:
     """Return a patch in metres, the outer ring anticlockwise and holes clockwise.
 
-    Its confidence is by how much worse the next best surface explains it than its own, as the
-    median over its cells of the difference of distances [spreads]; None where there is no other.
+    A cell's appearance has a distance to each surface [spreads within the surface]. The patch's
+    confidence is the median over its cells of the distance to the next best surface less that to
+    its own surface; it is None if there is no other surface.
     """
     rings = []
     for k, ring in enumerate(one.rings):
@@ -203,7 +205,7 @@ def _vector(
     patches: tuple[Patch, ...],
     colours: dict[str, str],
 ) -> VectorMap:
-    """Return the map as its file has it."""
+    """Return the map in the form of its file."""
     extent = region.floor.grid.extent
     most = int(np.argmax(np.bincount(labels[labels >= 0])))
     unknown, notes = float((labels < 0).mean()), []
@@ -213,7 +215,7 @@ def _vector(
             f"{100 * unknown:.1f} % of the map's rectangle is unknown ({100 * requested:.1f} % of "
             "the requested floor): read as a floor map it has the nearest surface there"
         )
-    with source.path.open("rb") as file:  # a video may be larger than memory
+    with source.path.open("rb") as file:  # not read at once: a video may exceed memory
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     return VectorMap(
         patches,
@@ -228,7 +230,7 @@ def _vector(
 
 
 def _weak_patches(vector: VectorMap) -> list[str]:
-    """Return sentences about patches that resemble another surface almost as much."""
+    """Return sentences about patches that resemble another surface almost as well as their own."""
     weak = [p for p in vector.patches if p.confidence is not None and p.confidence < WEAK]
     sentences = []
     for patch in weak[:MOST_NAMED]:

@@ -1,8 +1,9 @@
 """Appearance of each surface, learnt with the illumination from a few marked cells or colours.
 
-In turn, every cell gets the surface that it resembles most under the illumination so far, and the
-cells that are clear give better colours, spreads and illumination. A cell's neighbours count as
-well, so that surfaces form patches with clean edges.
+Two steps alternate: every cell is assigned the surface that it resembles most under the present
+illumination, and from cells that clearly belong to their surface, colours, spreads and illumination
+are estimated again. The assignment also depends on a cell's neighbours, so that surfaces form
+patches with clean edges.
 """
 
 from dataclasses import dataclass
@@ -22,24 +23,26 @@ from slipid.camera.opencv import Labels, Mask, opencv
 
 ROUNDS = 10
 STEADY = 3e-4
-"""Share of cells that change their surface in a round, below which learning ends."""
+"""Share of cells that change their surface in a round below which learning ends [1]."""
 COARSE = 25_000
-"""Approximate number of cells of the thinned picture from which surfaces are learnt."""
+"""Approximate number of cells of the low resolution picture from which surfaces are learnt."""
 SAMPLES = 5_000
 """Largest number of cells to which illumination and colours are fitted."""
 LEAST_SPREAD = np.array([2.0, 1.5, 1.5, 0.25])
 MOST_SPREAD = np.array([6.0, 4.0, 4.0, 0.7])
-"""Limits of the spread of L, a, b and texture within a surface."""
+"""Smallest and largest spread of L, a, b [units of CIELAB] and texture [1] within a surface."""
 OUTLIER = 60.0
-"""Cost above which a cell belongs to none of the surfaces [squared spreads]."""
+"""Cost of a cell above which it belongs to none of the surfaces [squared spreads]."""
 CLEAR = 16.0
-"""Cost below which a cell clearly belongs to its surface [squared spreads]."""
+"""Cost of a cell below which it clearly belongs to its surface [squared spreads]."""
 Costs = Float32[np.ndarray, "surface row column"]
-"""Cost of every surface in every cell [squared spreads]."""
+"""Cost of assigning each surface to each cell: the squared difference of their appearances, in
+squared spreads within the surface [1]."""
 UNKNOWN = -1
 """Label of cells without a surface."""
 COUPLING = 3.0
-"""Cost of a cell whose neighbours all have another surface [squared spreads]."""
+"""Additional cost of a surface in a cell whose neighbours all have another surface [squared
+spreads]."""
 REACH = 1.5
 """Std of the Gaussian that weights a cell's neighbours [cells]."""
 FIELD_ROUNDS = 5
@@ -47,23 +50,23 @@ FIELD_ROUNDS = 5
 SMALL = 150
 """Number of cells below which a patch is merged with its surroundings."""
 AROUND = 4
-"""Distance around a marked point over which its surface is taken to reach [cells]."""
+"""Distance around a marked point within which cells are taken to have its surface [cells]."""
 
 
 @dataclass(frozen=True, eq=False)
 class MarkedCells:
-    """Cells by row and column, and the number of the surface of each."""
+    """Cells, given by row and column, and the number of the surface of each."""
 
     row: Int[np.ndarray, " cell"]
     column: Int[np.ndarray, " cell"]
     surface: Int[np.ndarray, " cell"]
 
     def only(self, kept: np.ndarray) -> "MarkedCells":
-        """Return some of the cells, by a mask or by indices."""
+        """Return only some of the cells, chosen by a mask or by indices."""
         return MarkedCells(self.row[kept], self.column[kept], self.surface[kept])
 
     def joined(self, other: "MarkedCells") -> "MarkedCells":
-        """Return these cells followed by others."""
+        """Return these cells followed by the cells of `other`."""
         return MarkedCells(
             np.concatenate([self.row, other.row]),
             np.concatenate([self.column, other.column]),
@@ -71,7 +74,7 @@ class MarkedCells:
         )
 
     def surroundings(self, visible: Mask) -> "MarkedCells":
-        """Return the visible cells around each of these, with its surface."""
+        """Return visible cells around each of these cells, marked with its surface."""
         steps = np.arange(-AROUND, AROUND + 1, 2)
         down, across = (step.ravel() for step in np.meshgrid(steps, steps))
         row = (self.row[:, None] + down).ravel()
@@ -84,7 +87,7 @@ class MarkedCells:
 
 @dataclass(frozen=True, eq=False)
 class Seeds:
-    """Prior knowledge of the surfaces: a colour of each [linear RGB], and marked cells."""
+    """Prior knowledge of the surfaces: the colour of each [linear RGB], and marked cells."""
 
     colours: Float[np.ndarray, "surface 3"]
     marked: MarkedCells
@@ -95,8 +98,8 @@ class Surfaces:
     """Learnt appearance of every surface.
 
     Attributes:
-        lit: colours and the illumination.
-        texture: texture of each surface.
+        lit: colours of the surfaces, and the illumination.
+        texture: texture of each surface, see `slipid.camera.floor.light.texture`.
         spread: spread of L, a, b and texture within each surface.
     """
 
@@ -118,28 +121,29 @@ class Surfaces:
         return out
 
     def costs(self, appearance: Float[np.ndarray, "row column 4"]) -> Costs:
-        """Return how badly each surface explains each cell [squared spreads], limited above.
+        """Return the cost of each surface in each cell [squared spreads], limited above.
 
-        A wide spread costs as well: a surface that may have any appearance explains nothing.
+        A wide spread adds to the cost, since otherwise a surface with any appearance would fit all
+        cells.
         """
         out = np.empty((len(self.spread), *appearance.shape[:2]), np.float32)
         for k, expected in enumerate(self.appearances(appearance.shape[:2])):
             off = (appearance - expected) / self.spread[k].astype(np.float32)
             wide = 2 * np.log(self.spread[k] / LEAST_SPREAD).sum()
-            rough = np.minimum(off[..., 3] ** 2, 6.0)  # edges and dirt are rough as well
+            rough = np.minimum(off[..., 3] ** 2, 6.0)  # limited: edges and dirt are rough, too
             out[k] = (off[..., :3] ** 2).sum(axis=-1) + rough + wide
         return np.minimum(out, 1.5 * OUTLIER)
 
 
 def positions(shape: tuple[int, int]) -> Float[np.ndarray, "place 2"]:
-    """Return x and y of all cells, row by row, from -1 to 1."""
+    """Return x and y of all cells, row by row, scaled to -1 to 1 over the grid."""
     y, x = np.mgrid[: shape[0], : shape[1]]
     size = np.maximum(np.array([shape[1], shape[0]]) - 1, 1)
     return 2 * np.stack([x.ravel(), y.ravel()], axis=-1) / size - 1
 
 
 def learnt(features: Features, visible: Mask, seeds: Seeds) -> Surfaces:
-    """Return the appearance of the surfaces in a picture."""
+    """Return the appearance of the surfaces in a picture, learnt from seeds."""
     step = max(1, round(np.sqrt(visible.size / COARSE)))
     few, some = thinned(features, step), visible[step // 2 :: step, step // 2 :: step]
     shape = few.appearance.shape[:2]
@@ -162,7 +166,7 @@ def learnt(features: Features, visible: Mask, seeds: Seeds) -> Surfaces:
 
 
 def thinned(features: Features, step: int) -> Features:
-    """Return the features of every `step`-th cell, smoothed over that many."""
+    """Return the features of every `step`-th cell along both axes, smoothed over `step` cells."""
     if step == 1:
         return features
     cv2 = opencv()
@@ -175,7 +179,7 @@ def thinned(features: Features, step: int) -> Features:
 
 
 def _flat(appearance: Float[np.ndarray, "row column 4"]) -> Mask:
-    """Return cells whose neighbours look about the same; colours along edges are mixed."""
+    """Return cells whose neighbours look about the same; others lie on edges and mix colours."""
     cv2 = opencv()
     lab = np.ascontiguousarray(appearance[..., :3])
     kernel = np.ones((3, 3), np.uint8)
@@ -184,11 +188,11 @@ def _flat(appearance: Float[np.ndarray, "row column 4"]) -> Mask:
 
 
 def _start(few: Features, marked: Int[np.ndarray, " seed"], seeds: Seeds) -> Surfaces:
-    """Return the appearance of the surfaces by the seeds alone."""
+    """Return the appearance of the surfaces, from the seeds alone."""
     start = LitColours(Illumination.uniform(), seeds.colours)
     texture = np.full(len(seeds.colours), float(np.median(few.appearance[..., 3])))
     spread = np.tile(MOST_SPREAD, (len(seeds.colours), 1))
-    spread[:, 3] = 100.0  # a colour alone says nothing about texture
+    spread[:, 3] = 100.0  # a colour alone does not determine the texture
     if not len(marked):
         return Surfaces(start, texture, spread)
     rgb, rough = (
@@ -209,7 +213,7 @@ def _updated(
     marked: Int[np.ndarray, " seed"],
     seeds: Seeds,
 ) -> Surfaces:
-    """Return the appearance of the surfaces by the labelled cells and by the marked ones."""
+    """Return the appearance of the surfaces, estimated from labelled cells and marked cells."""
     cells = np.flatnonzero(labels >= 0)
     cells = cells[:: 1 + len(cells) // SAMPLES]
     if not len(cells):
@@ -227,7 +231,7 @@ def _updated(
     samples = ColourSamples(at, few.rgb.reshape(-1, 3)[cells].astype(float), own, weight)
     fit = fit_illumination(samples, surfaces.lit)
     texture, spread = surfaces.texture.copy(), surfaces.spread.copy()
-    for k in np.unique(own):  # robustly, around the expected appearance
+    for k in np.unique(own):  # robust spread about the expected appearance
         mine = own == k
         texture[k] = np.median(appearance[mine, 3])
         expected = lab_of(fit.illumination.rgb_of(fit.colours[k : k + 1], at[mine])[0])
@@ -239,16 +243,17 @@ def _updated(
 
 
 def labelled(costs: Costs, visible: Mask) -> Labels:
-    """Return the surface of each cell; a number above the last marks cells that fit none."""
+    """Return the surface of each cell; the number of surfaces marks cells that fit none of them."""
     outlier = np.full((1, *visible.shape), OUTLIER, np.float32)
     return smoothed(np.concatenate([costs, outlier]), visible)
 
 
 def smoothed(costs: Costs, visible: Mask) -> Labels:
-    """Return labels of low cost that agree with their neighbours.
+    """Return labels of low cost that agree with those of neighbouring cells.
 
-    Mean field of a Potts model: each cell holds a share of every surface and is drawn towards the
-    shares of its neighbours. Cells that are not visible take no part and are `UNKNOWN`.
+    The method is the mean field of a Potts model: each cell has a share of every surface, and the
+    shares of its neighbours reduce the costs of their surfaces. Cells that are not visible do not
+    affect others and get the label `UNKNOWN`.
     """
     cv2 = opencv()
     weight = visible.astype(np.float32)
@@ -263,9 +268,10 @@ def smoothed(costs: Costs, visible: Mask) -> Labels:
 
 
 def without_small_patches(labels: Labels, visible: Mask, width: int) -> Labels:
-    """Return labels in which small or narrow patches became part of the nearest other patch.
+    """Return labels with small or narrow patches merged into the nearest other patches.
 
-    Along an edge of two surfaces their mixed colour may look like a third: a narrow line of it.
+    Narrow patches arise along the edge of two surfaces, where the mixed colour may resemble a third
+    surface.
 
     Args:
         labels: surface of each cell.
@@ -278,7 +284,7 @@ def without_small_patches(labels: Labels, visible: Mask, width: int) -> Labels:
     kept = np.zeros(labels.shape, bool)
     for surface in np.unique(labels):
         mine = (labels == surface).astype(np.uint8)
-        # a hidden cell may be any surface, so the edge of the picture narrows nothing
+        # a hidden cell may have any surface, so patches at hidden cells do not count as narrow
         opened = cv2.morphologyEx(mine | (~visible).astype(np.uint8), cv2.MORPH_OPEN, disc)
         kept |= (opened > 0) & (mine > 0)
     labels = np.where(visible, _nearest(labels, kept & visible), UNKNOWN)
@@ -287,13 +293,13 @@ def without_small_patches(labels: Labels, visible: Mask, width: int) -> Labels:
         mine = (labels == surface).astype(np.uint8)
         _, parts, stats, _ = cv2.connectedComponentsWithStats(mine, connectivity=4)
         big = stats[:, cv2.CC_STAT_AREA] >= SMALL
-        big[0] = False  # the background
+        big[0] = False  # component 0 is the background
         large |= big[parts]
     return np.where(visible, _nearest(labels, large & visible), UNKNOWN)
 
 
 def _nearest(labels: Labels, kept: Mask) -> Labels:
-    """Return, in every cell, the label of the nearest kept cell; unchanged where none is kept."""
+    """Return labels with that of the nearest kept cell in every cell; no change if none is kept."""
     from scipy.ndimage import distance_transform_edt
 
     if kept.all() or not kept.any():

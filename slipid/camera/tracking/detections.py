@@ -1,4 +1,4 @@
-"""Detections of markers throughout a video, kept in a checkpoint so that a job can resume."""
+"""Detections of markers throughout a video, with a checkpoint from which a job can resume."""
 
 import time as clock
 from collections import Counter
@@ -19,9 +19,9 @@ from slipid.support.progress import Reporter
 KEPT_S = 10.0
 """Time between two checkpoints [s]."""
 PART = "sightings"
-"""Name of the detections in a checkpoint."""
+"""Name under which a checkpoint stores the detections."""
 FIRST_FRAMES = 100
-"""Number of frames without any wanted marker after which a message says what is visible instead."""
+"""Number of frames without any wanted marker after which a message lists the visible markers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +30,10 @@ class Detections:
 
     Attributes:
         frame, time: number and time [s] of every frame.
-        repeated: frames whose picture is identical to the one before.
+        repeated: whether a frame's picture is identical to that of the frame before.
         row: frame of each detection, as an index into `frame`.
-        id: number of the marker.
-        corners: x, y [pixel] in OpenCV's order.
+        id: number of the detected marker.
+        corners: x, y of its corners in OpenCV's order [pixel].
     """
 
     frame: Int[np.ndarray, " frame"]
@@ -44,12 +44,12 @@ class Detections:
     corners: Float[np.ndarray, "detection 4 2"]
 
     def counts(self, ids: Sequence[int]) -> Int[np.ndarray, "frame marker"]:
-        """Return how often each marker was detected in each frame."""
+        """Return the number of detections of each marker in each frame."""
         rows = [self.row[self.id == number] for number in ids]
         return np.stack([np.bincount(row, minlength=len(self.frame)) for row in rows], axis=1)
 
     def corners_of(self, ids: Sequence[int]) -> Float[np.ndarray, "frame marker 4 2"]:
-        """Return the corners of markers, NaN where one was not detected exactly once."""
+        """Return the corners of markers [pixel], NaN if a marker was not detected exactly once."""
         corners = np.full((len(self.frame), len(ids), 4, 2), np.nan)
         for k, number in enumerate(ids):
             own = self.id == number
@@ -70,7 +70,7 @@ class _DetectionLog:
     corners: list[Float[np.ndarray, "4 2"]] = field(default_factory=list)
 
     def add(self, frame: Frame, repeated: bool, tracker: MarkerTracker) -> None:
-        """Add a frame and the markers in it; a repeated frame is not searched."""
+        """Add a frame and the markers in it; a repeated frame is not searched for markers."""
         for detection in [] if repeated else tracker.detect(frame.grey, frame.index):
             self.row.append(len(self.frame))
             self.id.append(detection.id)
@@ -91,7 +91,7 @@ class _DetectionLog:
 
     @classmethod
     def resumed(cls, checkpoint: Checkpoint) -> "_DetectionLog":
-        """Return the log that a checkpoint holds, or an empty one."""
+        """Return the log stored in a checkpoint, or an empty one."""
         if (kept := checkpoint.load(PART)) is None:
             return cls()
         plain = {name: kept[name].tolist() for name in vars(cls()) if name != "corners"}
@@ -101,10 +101,10 @@ class _DetectionLog:
 def detect_all(
     source: FrameSource, tracker: MarkerTracker, checkpoint: Checkpoint, report: Reporter
 ) -> Detections:
-    """Return the detections in every frame; after an interrupt, go on from the checkpoint.
+    """Return the detections in every frame, continuing from a checkpoint if there is one.
 
     Raises:
-        DataError: no frame shows any wanted marker; the message says what is visible instead.
+        DataError: no frame shows any wanted marker; the message lists the visible markers.
     """
     log = _DetectionLog.resumed(checkpoint)
     if log.frame:
@@ -112,7 +112,7 @@ def detect_all(
     report.stage("tracking")
     before: Grey | None = None
     known, saved = len(log.frame), clock.monotonic()
-    # the last known frame is read again, to know whether the next one repeats it
+    # the last frame of the checkpoint is read again, to check whether the next one repeats it
     with closing(read_ahead(source.frames(max(0, known - 1)))) as frames:
         try:
             for frame in frames:
@@ -141,7 +141,7 @@ def detect_all(
 
 
 def _others(grey: Grey, tracker: MarkerTracker) -> str | None:
-    """Return advice where a picture shows markers, but none that is wanted; None otherwise."""
+    """Return advice if a picture shows markers, but none of the wanted ones; None otherwise."""
     wanted = ", ".join(map(str, sorted(tracker.ids)))
     visible = {d.id for d in tracker.detector.detect(grey, tracker.region)}
     if others := sorted(visible - tracker.ids):
@@ -163,10 +163,10 @@ def _numbers(ids: Sequence[int]) -> str:
 
 
 def only_marker(source: FrameSource, detector: MarkerDetector, region: Region | None = None) -> int:
-    """Return the number of the one marker that a video, or a region of it, shows at its beginning.
+    """Return the number of the only marker in the first frames of a video, or in a region of them.
 
     Raises:
-        DataError: it shows none, or several.
+        DataError: these frames show no marker, or several.
     """
     counts: Counter[int] = Counter()
     last: Grey | None = None

@@ -1,16 +1,16 @@
-"""Markers in frames: detected near their last place, and in the whole frame now and then.
+"""Detection of markers in frames, near their last place and periodically in the whole frame.
 
-OpenCV searches a whole frame in tens of milliseconds and the surroundings of a marker in one. Where
+OpenCV searches a whole frame in tens of milliseconds and the surroundings of a marker in one. If
 every wanted marker was detected in the last frame and is detected again near its expected place,
-the rest of the frame is skipped, except in every `WHOLE`-th frame, in which a second marker of the
-same number shows.
+the rest of the frame is skipped. Every `WHOLE`-th frame is searched completely, so that a second
+marker of the same number is detected.
 
-Corners are refined below a pixel as intersections of straight lines through the four edges. A
-corner alone says little where a marker is small: the window around it is full of the pattern
-inside, and all four corners are drawn the same way, as if the marker were turned. An edge is
-visible over its whole length. Across it, from the black border to the white margin, brightness
-rises from one level to another, and the area below that rise gives the place of its middle, however
-blurred it is by the lens or by motion.
+Corners are refined to less than a pixel as intersections of straight lines fitted to the four
+edges. Refining each corner by itself is inaccurate for a small marker: the window around the corner
+contains the marker's inner pattern, which shifts all four corners in a way that looks like a
+rotation of the marker. An edge is visible over its whole length. Across it, from the black border
+to the white margin, brightness rises from one level to another, and the area below that profile
+gives the place of the edge, whatever the blur by the lens or by motion.
 """
 
 from dataclasses import dataclass, field
@@ -23,34 +23,37 @@ from slipid.camera.opencv import Grey, marker_dictionary, opencv, size_of
 WHOLE = 30
 """Interval, in frames, at which the whole frame is searched."""
 AROUND = 0.7
-"""Margin around the expected place, as a part of the marker's size in the picture."""
+"""Margin of the search region around a marker's expected place, relative to the marker's size in
+the picture [1]."""
 LEAST_AROUND = 12.0
-"""Smallest margin [pixel]: the detector ignores markers that touch the border."""
+"""Smallest margin of the search region [pixel]: the detector ignores markers at its border."""
 ROUNDS = 3
-"""Number of times edges are sampled: the first starts from corners that are off by a pixel."""
+"""Number of times that edges are sampled and corners refined; the first time starts from corners
+with errors of about a pixel."""
 ALONG, ACROSS = 20, 11
-"""Number of places along an edge, and of samples across it at each."""
+"""Number of places along an edge, and number of brightness samples across it at each place."""
 ENDS = 0.12
-"""Part of an edge left out at both ends, where the next edge is near."""
+"""Share of an edge's length that is left out at each end, where the next edge is near [1]."""
 REACH = 0.6
-"""Reach of the samples to both sides, in squares of the marker: beyond it lies the pattern."""
+"""Distance up to which brightness is sampled on both sides of an edge, in squares of the marker
+[1]; beyond one square lies the inner pattern."""
 MOST_REACH = 6.0
-"""Largest reach [pixel]; more would only take up noise."""
+"""Largest distance up to which brightness is sampled [pixel]; more would only add noise."""
 LEVELS = 3
-"""Number of outermost samples on each side that give the dark and the bright level."""
+"""Number of outermost samples on each side whose median is the dark or the bright level."""
 LEAST_CONTRAST = 12.0
-"""Difference of these levels below which there is no edge [grey levels]."""
+"""Difference of the bright and the dark level below which there is no edge [grey levels]."""
 OFF = 0.15
-"""Smallest distance from its line at which a point may be left out [pixel]."""
+"""Distance from the fitted line below which a point of an edge is never left out [pixel]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """A marker in a frame.
+    """A marker detected in a frame.
 
     Attributes:
-        id: its number.
-        corners: x, y [pixel] of top left, top right, bottom right, bottom left.
+        id: number of the marker.
+        corners: x, y of top left, top right, bottom right and bottom left corner [pixel].
     """
 
     id: int
@@ -58,13 +61,13 @@ class Detection:
 
     @property
     def middle(self) -> Float[np.ndarray, "2"]:
-        """Mean of the corners [pixel]."""
+        """Mean place of the corners [pixel]."""
         return np.asarray(self.corners.mean(axis=0))
 
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle of the picture, without its right column and its bottom row [pixel]."""
+    """A rectangle of pixels; column `right` and row `bottom` are just outside of it."""
 
     left: int
     top: int
@@ -79,12 +82,12 @@ class Region:
 
     @property
     def empty(self) -> bool:
-        """Whether no pixel is in it."""
+        """Whether the region contains no pixel."""
         return self.right <= self.left or self.bottom <= self.top
 
 
 def cut(grey: Grey, region: Region | None) -> UInt8[np.ndarray, "down across"]:
-    """Return the part of a picture within a region, or all of it where that is None."""
+    """Return the part of a picture within a region, or the whole picture if the region is None."""
     if region is None:
         return grey
     part = region.within(Region(0, 0, *size_of(grey)))
@@ -92,10 +95,10 @@ def cut(grey: Grey, region: Region | None) -> UInt8[np.ndarray, "down across"]:
 
 
 class MarkerDetector:
-    """OpenCV's detector of the markers of a dictionary, with corners refined below a pixel.
+    """OpenCV's detector for markers of a dictionary, with corners refined to less than a pixel.
 
     Raises:
-        DataError: no dictionary of that name, or no OpenCV.
+        DataError: no dictionary has that name, or OpenCV is not installed.
     """
 
     def __init__(self, dictionary: str):
@@ -104,7 +107,7 @@ class MarkerDetector:
         self._detector = opencv().aruco.ArucoDetector(book)
 
     def detect(self, grey: Grey, region: Region | None = None) -> list[Detection]:
-        """Return every marker in a frame, or in a region of it."""
+        """Return all markers in a frame, or in a region of it."""
         part = cut(grey, region)
         corners, ids, _ = self._detector.detectMarkers(part) if part.size else (None, None, None)
         if ids is None or not len(ids):
@@ -119,17 +122,17 @@ class MarkerDetector:
 
 @dataclass(eq=False)
 class MarkerTracker:
-    """Follows markers from frame to frame.
+    """Detector that follows markers from frame to frame.
 
     Attributes:
         detector: detector of the markers.
         ids: numbers of the wanted markers.
         region: region of the picture to which detections are limited.
         last: last detection of each wanted marker.
-        speed: motion of each marker's middle since the frame before [pixel].
-        whole: number of frames that were searched as a whole.
-        twice: whether a marker was detected twice in the frame before; the next frame is then
-            searched as a whole, so that the tracker does not follow the wrong one.
+        speed: motion of each marker's middle between the last two frames [pixel].
+        whole: number of frames so far that were searched completely.
+        twice: whether a marker was detected twice in the last frame; the next frame is then
+            searched completely, so that the tracker does not follow the wrong one.
     """
 
     detector: MarkerDetector
@@ -141,7 +144,7 @@ class MarkerTracker:
     twice: bool = False
 
     def detect(self, grey: Grey, number: int) -> list[Detection]:
-        """Return all detections of the wanted markers in the frame of this number."""
+        """Return all detections of the wanted markers in frame number `number`."""
         if self.ids == self.last.keys() and not self.twice and number % WHOLE:
             near = [d for d in self.detector.detect(grey, self._around()) if d.id in self.ids]
             if self.ids == {d.id for d in near}:
@@ -152,7 +155,7 @@ class MarkerTracker:
         )
 
     def _around(self) -> Region:
-        """Return the region in which the markers of the last frame are expected."""
+        """Return the region in which the markers of the last frame are expected now."""
         low, high = np.full(2, np.inf), np.full(2, -np.inf)
         for number, detection in self.last.items():
             speed = self.speed.get(number, np.zeros(2))
@@ -166,7 +169,7 @@ class MarkerTracker:
         return around if self.region is None else around.within(self.region)
 
     def _followed(self, detections: list[Detection]) -> list[Detection]:
-        """Return the same detections, and remember them for the next frame."""
+        """Store detections for the next frame, and return them."""
         now = {one.id: one for one in detections}
         self.twice = len(now) < len(detections)
         self.speed = {
@@ -180,13 +183,13 @@ class MarkerTracker:
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """The edges between neighbouring corners, in their order.
+    """Edges between neighbouring corners of markers, in the order of the corners.
 
     Attributes:
         start: x, y of the start of each edge [pixel].
-        along: vector from its start to its end [pixel].
-        outward: unit vector at a right angle to it, outwards.
-        reach: reach of the samples to both sides [pixel].
+        along: vector from the start of the edge to its end [pixel].
+        outward: unit vector perpendicular to the edge, pointing out of the marker.
+        reach: distance up to which brightness is sampled on both sides of the edge [pixel].
     """
 
     start: Float[np.ndarray, "marker 4 2"]
@@ -205,14 +208,14 @@ class _Edges:
 def refined(
     grey: Grey, corners: Float[np.ndarray, "marker 4 2"], squares: int
 ) -> Float[np.ndarray, "marker 4 2"]:
-    """Return corners as intersections of lines through the edges.
+    """Return corners refined to intersections of lines fitted to the markers' edges [pixel].
 
-    Corners of a marker without clear edges, or that would move too far, stay as they were.
+    Corners of a marker without clear edges, or that would move too far, are returned unchanged.
 
     Args:
         grey: the frame.
-        corners: x, y [pixel], clockwise, off by a pixel or so.
-        squares: number of squares along an edge of the marker, with its border.
+        corners: x, y of the corners, clockwise, with errors of about a pixel [pixel].
+        squares: number of squares along an edge of a marker, including its border.
     """
     result = corners
     for _ in range(ROUNDS):
@@ -226,7 +229,7 @@ def refined(
 
 
 def _profiles(grey: Grey, edges: _Edges) -> Float[np.ndarray, "marker 4 along across"]:
-    """Return the brightness from inside to outside, at places along each edge."""
+    """Return the brightness across each edge, from inside to outside, at places along the edge."""
     along, across = np.linspace(ENDS, 1 - ENDS, ALONG), np.linspace(-1, 1, ACROSS)
     aside = edges.reach[..., None] * across
     places = (
@@ -245,9 +248,9 @@ def _profiles(grey: Grey, edges: _Edges) -> Float[np.ndarray, "marker 4 along ac
 def _offsets(
     edges: _Edges, profiles: Float[np.ndarray, "marker 4 along across"]
 ) -> Float[np.ndarray, "marker 4 2"]:
-    """Return the distance of each edge's fitted line outwards from its start and its end [pixel].
+    """Return the outward offset of each edge's fitted line from the edge's start and end [pixel].
 
-    It is NaN where black and white do not differ.
+    It is NaN if the two sides of the edge do not differ in brightness.
     """
     dark = np.median(profiles[..., :LEVELS], axis=(-1, -2))
     bright = np.median(profiles[..., -LEVELS:], axis=(-1, -2))
@@ -272,7 +275,7 @@ def _offsets(
 def _intersections(
     edges: _Edges, offsets: Float[np.ndarray, "marker 4 2"]
 ) -> Float[np.ndarray, "marker 4 2"]:
-    """Return the intersection of each edge's line with that of the edge before: its start."""
+    """Return the start of each edge: the intersection of its line with the line before [pixel]."""
     start = edges.start + edges.outward * offsets[..., :1]
     along = edges.start + edges.along + edges.outward * offsets[..., 1:] - start
     other, other_along = np.roll(start, 1, axis=1), np.roll(along, 1, axis=1)

@@ -1,9 +1,10 @@
-"""A file of tracked poses beside a log, and a picture of one frame to check them by eye.
+"""Output of tracked poses as a file that belongs to a log, and as a picture to check them by eye.
 
 The file is CSV or Parquet, with a row for each frame. Columns: frame; time [s]; x, y [m],
-heading [rad], empty where the frame has no pose; their covariance (var_x, var_y, var_heading,
-cov_xy, cov_x_heading, cov_y_heading) [m, rad]; size, the apparent over the true size of the markers
-[1]; rejected_x, rejected_y, rejected_heading, a fitted but rejected pose; and flag, a word.
+heading [rad], empty if the frame has no pose; their covariance (var_x, var_y, var_heading,
+cov_xy, cov_x_heading, cov_y_heading) in products of [m, m, rad]; size, the apparent size of the
+markers divided by the true size [1]; rejected_x, rejected_y [m], rejected_heading [rad], a fitted
+but rejected pose; and flag, the name of a `slipid.camera.tracking.track.Flag`.
 """
 
 import io
@@ -26,15 +27,16 @@ _FORMATS = {
     "size": "%.5f",
     **dict.fromkeys(("rejected_x", "rejected_y", "rejected_heading"), "%.6f"),
 }
-"""Format in CSV of each column of numbers."""
+"""Number format in CSV of each column except frame and flag."""
 _HEAD = ",".join(["frame", *_FORMATS, "flag"])
 
 
 def check_writable(path: Path) -> None:
-    """Check that poses can be written to a file.
+    """Raise `DataError` unless poses can be written to a file.
 
     Raises:
-        DataError: they cannot, or it is Parquet without pyarrow.
+        DataError: the file cannot be written, would replace a file of another kind, or is Parquet
+            and pyarrow is not installed.
     """
     suffix = path.suffix.lower()
     if path.is_dir():
@@ -55,17 +57,17 @@ def check_writable(path: Path) -> None:
 
 
 def write_poses(path: Path, track: TrackedPoses) -> None:
-    """Write tracked poses: Parquet where the name ends in .parquet, otherwise CSV.
+    """Write tracked poses as Parquet if the name ends in .parquet, otherwise as CSV.
 
     Raises:
-        DataError: nothing can be written there, or Parquet without pyarrow.
+        DataError: the file cannot be written, or is Parquet and pyarrow is not installed.
     """
     parquet = path.suffix.lower() == ".parquet"
     write_bytes(path, _parquet(track) if parquet else _csv(track).encode())
 
 
 def _columns(track: TrackedPoses) -> dict[str, np.ndarray]:
-    """Return the columns of numbers, NaN where a cell is empty."""
+    """Return the columns of `_FORMATS` by name, with NaN for empty cells."""
     p, c, r = track.pose, track.covariance, track.rejected
     values = (
         *(track.time, p[:, 0], p[:, 1], p[:, 2]),
@@ -112,15 +114,16 @@ def _parquet(track: TrackedPoses) -> bytes:
 
 
 GRID = 0.25
-"""Distance between the lines drawn on the floor [m]."""
+"""Distance between neighbouring lines of the grid drawn on the floor [m]."""
 FLOOR, EDGE, AHEAD, LEFT = (190, 190, 60), (0, 170, 255), (40, 40, 230), (60, 190, 60)
-"""Colours of the floor, the markers' edges and the bodies' axes, in blue, green, red."""
+"""Colours, as blue, green, red, of the grid on the floor, the edges of markers, and the axes of a
+body that point ahead and to the left."""
 
 
 def write_preview(
     path: Path, grey: Grey, camera: OverheadCamera, tracks: tuple[TrackedPoses, ...], row: int
 ) -> None:
-    """Write a frame with a grid on the floor, the markers' edges and the bodies' axes.
+    """Write a picture of a frame with a grid on the floor, the markers' edges and bodies' axes.
 
     Args:
         path: the PNG or JPEG file to write.
@@ -130,7 +133,7 @@ def write_preview(
         row: row of the frame in the tracks.
 
     Raises:
-        DataError: the suffix is not of a picture, or nothing can be written there.
+        DataError: the suffix is not that of a picture, or the file cannot be written.
     """
     cv2 = opencv()
     drawn = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
@@ -142,10 +145,10 @@ def write_preview(
 
 
 def check_drawable(path: Path) -> None:
-    """Check that a picture can be written to a file.
+    """Raise `DataError` unless a picture can be written to a file.
 
     Raises:
-        DataError: it cannot, or the suffix is not of a picture.
+        DataError: the file cannot be written, or the suffix is not that of a picture.
     """
     _encoded(path, np.zeros((8, 8, 3), np.uint8))
     writable(path.parent)
@@ -169,7 +172,7 @@ def _line(
     colour: tuple[int, int, int],
     width: int,
 ) -> None:
-    """Draw a line through places in the world, unless it lies far outside of the picture."""
+    """Draw a line through points in the world [m], unless it lies far outside the picture."""
     cv2 = opencv()
     pixels = camera.pixels(points)
     if np.isfinite(pixels).all() and (np.abs(pixels) < 1e5).all():
@@ -178,7 +181,7 @@ def _line(
 
 
 def _grid(drawn: np.ndarray, camera: OverheadCamera) -> None:
-    """Draw lines on the visible floor, and write their distance."""
+    """Draw a grid on the visible floor, and write the distance between its lines."""
     cv2 = opencv()
     width, height = camera.lens.image_px
     frame = np.stack(np.meshgrid(np.linspace(0, width, 9), np.linspace(0, height, 9)), -1)
@@ -202,7 +205,7 @@ def _grid(drawn: np.ndarray, camera: OverheadCamera) -> None:
 def _label(
     drawn: np.ndarray, camera: OverheadCamera, place: Float[np.ndarray, "3"], text: str
 ) -> None:
-    """Write text beside a place on the floor, where the picture shows it."""
+    """Write text beside a place on the floor [m], if the place lies in the picture."""
     cv2 = opencv()
     x, y = camera.pixels(place[None])[0].tolist()
     width, height = camera.lens.image_px
@@ -214,7 +217,7 @@ def _label(
 def _body(
     drawn: np.ndarray, camera: OverheadCamera, track: TrackedPoses, pose: Float[np.ndarray, "3"]
 ) -> None:
-    """Draw the expected edges of the markers, and the body's axes, x red and y green."""
+    """Draw the markers' edges expected at a pose, and the body's axes, x red and y green."""
     cv2 = opencv()
     c, s = np.cos(pose[2]), np.sin(pose[2])
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

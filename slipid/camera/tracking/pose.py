@@ -1,17 +1,19 @@
 """The pose of a body on the floor, with its covariance, from the corners of its markers.
 
-Every corner is a ray that meets the plane at the corner's height. There the corners of a body at
-x, y with heading theta, whose markers look s times as large as they are, lie at
+The pixel of every corner determines a ray that meets the plane at the corner's height. There the
+corners i of a body at x, y [m] with heading theta [rad], whose markers appear s times as large as
+they are, lie at
 
     place_i = (x, y) + R(theta) (middle_i + s own_i)                                         (1)
 
-with the middle of the corner's marker on the body and the vector from there to the corner. The fit
-minimises the residuals in pixels, converted by the local derivative of the ray's place. The factor
-s is fitted because the edge between black and white is detected slightly inside or outside its true
-place, in all corners alike: s absorbs that, and reveals a wrong height of the markers. It does not
-stretch the vector from the body's origin to a marker, which was measured with a ruler. If corners
-err by sigma pixels each, independently, the covariance of (x, y, theta) is that part of
-sigma^2 (J^T J)^-1.
+where middle_i is the middle of the corner's marker on the body, own_i the vector from there to the
+corner [m], and R(theta) the rotation by theta. The fit minimises residuals in pixels, into which
+residuals on the plane are converted by the local derivative of the ray's place. The factor s is
+fitted because the edge between black and white is detected slightly inside or outside its true
+place, equally at all corners. s absorbs that error, and reveals a wrong height of the markers. It
+does not scale the vector from the body's origin to a marker, which was measured with a ruler. If
+the errors of corners are independent, with a std of sigma [pixel], the covariance of
+(x, y, theta, s) is sigma^2 (J^T J)^-1, with J the derivative of the residuals [pixel].
 """
 
 from dataclasses import dataclass
@@ -23,22 +25,23 @@ from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.target import Target
 
 ROUNDS = 3
-"""Number of Gauss-Newton steps: the start is exact except for the tilt of the camera."""
+"""Number of Gauss-Newton steps; few suffice, since the start is exact except for the effect of the
+camera's tilt."""
 STEP = 0.5
-"""Step of the derivative of a ray's place [pixel]."""
+"""Step of the numerical derivative of a ray's place by the pixel [pixel]."""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedPoses:
-    """Poses of a body, NaN where too few of its corners were detected.
+    """Poses of a body in all frames, NaN where too few of its corners were detected.
 
     Attributes:
         pose: x, y [m], heading [rad] between -pi and pi.
-        unit_covariance: covariance of the pose where corners err by one pixel
-            [m, rad per pixel, squared].
-        size: apparent over true size of the markers, at their height [1].
+        unit_covariance: covariance of the pose if the std of corners is one pixel, in products of
+            [m/pixel, m/pixel, rad/pixel].
+        size: apparent size of the markers divided by their true size [1].
         squares: sum of the squared residuals [pixel^2].
-        free: degrees of freedom of that sum: two for each corner, less four.
+        free: degrees of freedom of that sum: two for each detected corner, less four.
     """
 
     pose: Float[np.ndarray, "frame 3"]
@@ -53,9 +56,9 @@ class _Corners:
     """All corners of a target.
 
     Attributes:
-        middle: middle of the corner's marker, ahead and left on the body [m].
-        own: vector from there to the corner [m].
-        height: height above the floor [m].
+        middle: middle of the corner's marker on the body, x ahead and y left [m].
+        own: vector from that middle to the corner [m].
+        height: height of the corner above the floor [m].
     """
 
     middle: Float[np.ndarray, "corner 2"]
@@ -73,12 +76,12 @@ class _Corners:
 def poses_of(
     camera: OverheadCamera, target: Target, corners: Float[np.ndarray, "frame marker 4 2"]
 ) -> FittedPoses:
-    """Return the poses of a body by the detected corners of its markers.
+    """Return the poses of a body, fitted to the detected corners of its markers.
 
     Args:
         camera: camera with its place above the floor.
-        target: the body; its markers in the order of `corners`.
-        corners: x, y [pixel], NaN where a marker was not detected.
+        target: the body, with its markers in the order of `corners`.
+        corners: x, y of the corners [pixel], NaN where a marker was not detected.
     """
     frames = len(corners)
     body = _Corners.of(target)
@@ -88,7 +91,7 @@ def poses_of(
     valid &= valid.sum(axis=1, keepdims=True) >= 3
     some = valid.any(axis=1)
     out = FittedPoses(*(np.full((frames, *shape), np.nan) for shape in ((3,), (3, 3), (), (), ())))
-    if not some.any():  # another body than those in view
+    if not some.any():  # the body appears in no frame
         return out
     place, per_pixel, used = place[some], per_pixel[some], valid[some]
     place = np.where(used[..., None], place, 0.0)
@@ -113,7 +116,7 @@ def _on_planes(
     pixels: Float[np.ndarray, "frame corner 2"],
     heights: Float[np.ndarray, " corner"],
 ) -> tuple[Float[np.ndarray, "frame corner 2"], Float[np.ndarray, "frame corner 2 2"]]:
-    """Return places [m] of corners at their heights, and their derivative by pixels [m/pixel]."""
+    """Return places of corners at their heights [m], and their derivatives by pixels [m/pixel]."""
     place = np.full(pixels.shape, np.nan)
     slope = np.full((*pixels.shape, 2), np.nan)
     for height in np.unique(heights):
@@ -133,7 +136,10 @@ def _similarity(
     body: Float[np.ndarray, "corner 2"],
     used: Bool[np.ndarray, "frame corner"],
 ) -> Float[np.ndarray, "frame 4"]:
-    """Return x, y, heading and size by least squares in metres, in closed form."""
+    """Return x, y [m], heading [rad] and size [1] by least squares in metres, in closed form.
+
+    Unlike in equation (1), the size scales the whole body.
+    """
     weight = used / used.sum(axis=1, keepdims=True)
     z, c = place[..., 0] + 1j * place[..., 1], body[:, 0] + 1j * body[:, 1]
     middle, own = (weight * z).sum(axis=1), (weight * c).sum(axis=1)
@@ -151,9 +157,9 @@ def _residuals(
     body: _Corners,
     used: Bool[np.ndarray, "frame corner"],
 ) -> tuple[Float[np.ndarray, "frame number"], Float[np.ndarray, "frame number 4"]]:
-    """Return equation (1) less the measured places [pixel], and its derivative.
+    """Return the residuals, places by equation (1) less measured ones [pixel], and derivatives.
 
-    The derivative is by x, y, heading and size; unused corners have zeros in both.
+    Derivatives are by x, y, heading and size; both results are 0 for unused corners.
     """
     own, size = _turned(body.own, fitted[:, 2]), fitted[:, 3, None, None]
     turned = _turned(body.middle, fitted[:, 2]) + size * own

@@ -1,8 +1,8 @@
-"""Targets to track: bodies and the markers fixed to them, by dictionary, number, size and place.
+"""Targets to track: bodies with markers, specified by dictionary, number, size and place.
 
-A single marker lies in the middle of the body with its top edge ahead: the heading is the direction
-from its bottom edge to its top edge as the dictionary draws it. A file places several markers, or
-boards of markers, anywhere on a body:
+A single marker without a file of targets lies in the middle of the body with its top edge ahead, so
+that the heading is the direction from its bottom edge to its top edge as the dictionary defines
+them. A file of targets can place several markers, or boards of markers, anywhere on a body:
 
     [[target]]
     name = "robot"
@@ -45,10 +45,10 @@ class Marker:
     """One marker on a body.
 
     Attributes:
-        id: its number in the dictionary.
-        size: length of an edge of its black square [m].
-        corners: x ahead, y left and height above the floor [m] of its corners in OpenCV's order:
-            top left, top right, bottom right, bottom left.
+        id: number of the marker in its dictionary.
+        size: edge length of its black square [m].
+        corners: x ahead, y left on the body and height above the floor of its corners [m], in
+            OpenCV's order: top left, top right, bottom right, bottom left.
     """
 
     id: int
@@ -64,7 +64,15 @@ class Marker:
         place: tuple[float, float] = (0.0, 0.0),
         yaw: float = 0.0,
     ) -> "Marker":
-        """Return a marker at a place on the body [m], its top edge turned by a yaw [rad]."""
+        """Return a marker on a body.
+
+        Args:
+            id: number of the marker in its dictionary.
+            size: edge length of its black square [m].
+            height: height above the floor [m].
+            place: its middle on the body, x ahead and y left [m].
+            yaw: direction of its top edge, counter-clockwise from ahead [rad].
+        """
         ahead_left = 0.5 * size * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
         c, s = np.cos(yaw), np.sin(yaw)
         flat = ahead_left @ np.array([[c, s], [-s, c]]) + np.asarray(place)
@@ -81,16 +89,16 @@ class Target:
 
     @property
     def ids(self) -> frozenset[int]:
-        """Numbers of its markers."""
+        """Numbers of the body's markers."""
         return frozenset(marker.id for marker in self.markers)
 
     @property
     def height(self) -> float:
-        """Mean height of its markers above the floor [m]."""
+        """Mean height of the body's markers above the floor [m]."""
         return float(np.mean([marker.corners[:, 2] for marker in self.markers]))
 
     def below(self, camera_m: float) -> None:
-        """Check that the camera, at a height `camera_m` [m], can see the markers.
+        """Raise `DataError` unless all markers are below the camera, at a height `camera_m` [m].
 
         Raises:
             DataError: a marker is as high as the camera, or higher.
@@ -119,7 +127,7 @@ class _Single(_Placed):
 
 
 class _Board(_Placed):
-    """A grid of markers around its place, its first row ahead."""
+    """A grid of markers whose middle is at `place_m` and whose first row is ahead."""
 
     first_id: Id
     columns: Annotated[int, Field(ge=1, le=100)]
@@ -127,7 +135,7 @@ class _Board(_Placed):
     gap_m: Positive
 
     def markers(self) -> list[Marker]:
-        """Return its markers row by row, beginning with the one ahead on the left."""
+        """Return the board's markers row by row, beginning ahead on the left."""
         pitch, yaw = self.size_m + self.gap_m, np.radians(self.yaw_deg)
         c, s = np.cos(yaw), np.sin(yaw)
         out = []
@@ -150,7 +158,7 @@ class _Target(Section):
 
 
 class _TargetsFile(Section):
-    """A file of targets as it stands."""
+    """Keys of a file of targets."""
 
     schema_: Literal["slipid.targets/1"] = Field("slipid.targets/1", alias="schema")
     target: list[_Target] = Field(min_length=1)
@@ -160,7 +168,8 @@ def read_targets(path: Path) -> tuple[Target, ...]:
     """Return the targets in a TOML file.
 
     Raises:
-        DataError: unreadable or wrong; no marker, or one number or name twice.
+        DataError: the file is unreadable or wrong, a target has no marker, a number or a name
+            occurs twice, or dictionaries differ.
     """
     given = checked(path, mapping_of(path, text_of(path, "targets to track")), _TargetsFile)
     targets = tuple(_target(one, f"{path}: target '{one.name}'") for one in given.target)
@@ -186,7 +195,7 @@ def _target(given: _Target, where: str) -> Target:
 
 
 def _check_distinct(targets: Sequence[Target], where: str) -> None:
-    """Raise `DataError` where a number or a name occurs twice, or dictionaries differ."""
+    """Raise `DataError` if a number or a name occurs twice, or dictionaries differ."""
     if len({target.name for target in targets}) < len(targets):
         raise DataError(f"{where}: two targets with one name; expected names of their own")
     if len({target.dictionary for target in targets}) > 1:

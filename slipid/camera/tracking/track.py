@@ -1,10 +1,11 @@
-"""Tracked poses of a body, each with its covariance, or a rejected frame with the reason.
+"""Tracked poses of a body, each with its covariance, and rejected frames with the reason.
 
-A pose that no body can drive through is an outlier. A body has inertia: from its place and speed it
-gets only so far in a short time. A track is cut wherever it turns more sharply than that allows. Of
-the segments, those are kept that can be driven one after the other and have most poses together.
-A rejected pose was not measured but mistaken: a reflection, a torn frame or a frame out of order,
-for one frame or for many.
+A pose that no body can drive through is an outlier. Since a body has inertia, its place and speed
+limit where it can be a short time later. A track is cut into segments wherever it turns more
+sharply than that allows. The chain of segments that a body can drive one after the other, and that
+has the largest number of poses, is kept. The poses of all other segments are rejected as false
+detections, such as a reflection, a torn frame or frames out of order; they may last for one frame
+or for many.
 """
 
 from dataclasses import dataclass
@@ -19,24 +20,24 @@ from slipid.camera.tracking.pose import poses_of
 from slipid.camera.tracking.target import Target
 
 ACCELERATION = np.array([3.0, 3.0, 30.0])
-"""Acceleration beyond that of a wheeled robot: x, y [m/s^2], heading [rad/s^2]."""
+"""Largest acceleration accepted, more than a wheeled robot has: x, y [m/s^2], heading [rad/s^2]."""
 SUDDEN = np.array([0.1, 0.1, 2.0])
-"""Sudden change of its speed, as in a collision: x, y [m/s], heading [rad/s]."""
+"""Largest sudden change of speed accepted, as in a collision: x, y [m/s], heading [rad/s]."""
 SPEED = np.array([5.0, 5.0, 15.0])
-"""Speed beyond that of a wheeled robot: x, y [m/s], heading [rad/s]."""
+"""Largest speed accepted, more than a wheeled robot has: x, y [m/s], heading [rad/s]."""
 STDS = 6.0
-"""Deviation below which nothing is an outlier [std of the noise]."""
+"""Deviation below which no pose is an outlier, in stds of the noise [1]."""
 BEHIND = 2
-"""Number of frames over which the speed at the end of a segment is taken."""
+"""Number of poses over which the speed at an end of a segment is computed."""
 SEGMENTS = 60
-"""Number of segments before another among which its predecessor is searched."""
+"""Number of earlier segments among which the predecessor of a segment in the chain is searched."""
 FEWEST = 5
-"""Number of poses below which no outlier can be recognised."""
+"""Number of poses below which outliers cannot be recognised."""
 
 
 @dataclass(frozen=True, eq=False)
 class _NoisyPoses:
-    """Poses that exist: time [s], x, y [m], heading [rad], and the std of their noise."""
+    """Poses without missing ones: time [s], x, y [m] and heading [rad], and stds of their noise."""
 
     time: Float[np.ndarray, " pose"]
     pose: Float[np.ndarray, "pose 3"]
@@ -48,12 +49,14 @@ def jumps(
     pose: Float[np.ndarray, "frame 3"],
     std: Float[np.ndarray, "frame 3"],
 ) -> Bool[np.ndarray, " frame"]:
-    """Return the frames whose pose no body can drive through; False where there is no pose.
+    """Return a mask of the frames whose pose no body can drive through.
+
+    Frames without a pose are not among them.
 
     Args:
         time: increasing time [s].
         pose: x, y [m], heading [rad] with or without wrap-around; NaN where there is none.
-        std: std of the noise of each.
+        std: std of the noise of each component [m, m, rad].
     """
     present = np.isfinite(pose).all(axis=1)
     bad = np.zeros(len(time), bool)
@@ -70,9 +73,9 @@ def jumps(
 
 
 def _segments(poses: _NoisyPoses) -> Int[np.ndarray, " segment"]:
-    """Return the first pose of each segment.
+    """Return the index of the first pose of each segment.
 
-    A pose that does not fit between its neighbours is a segment of its own.
+    A pose that does not fit between its neighbours becomes a segment of its own.
     """
     t, p, s = poses.time, poses.pose, poses.std
     since, until = (t[1:-1] - t[:-2])[:, None], (t[2:] - t[1:-1])[:, None]
@@ -90,7 +93,11 @@ def _segments(poses: _NoisyPoses) -> Int[np.ndarray, " segment"]:
 def _longest_path(
     poses: _NoisyPoses, first: Int[np.ndarray, " segment"], last: Int[np.ndarray, " segment"]
 ) -> list[int]:
-    """Return segments that can be driven one after the other, with most poses together."""
+    """Return the chain of segments with the largest number of poses, in reverse order of time.
+
+    A body can drive its segments one after the other. `first` and `last` are the indices of the
+    first and the last pose of each segment.
+    """
     total = last - first + 1
     before = np.full(len(first), -1)
     base = np.where(last > first, np.maximum(first, last - BEHIND), -1)
@@ -121,13 +128,17 @@ def _sharpness(
     base: Int[np.ndarray, " path"],
     to: Int[np.ndarray, " path"],
 ) -> Float[np.ndarray, " path"]:
-    """Return how sharply paths turn from a pose to another, relative to the limits of a body [1].
+    """Return the change of motion from a pose to another, relative to the limits of a body [1].
+
+    A body can drive a path where the result is at most 1.
 
     Args:
         poses: all poses.
-        at: pose that each path has reached.
-        base: pose that it came from, which gives its speed; negative where there is none.
-        to: pose that it goes to; before `at` in time where the path is followed backwards.
+        at: index of the pose that each path has reached.
+        base: index of an earlier pose of the path, from which its speed is computed; negative if
+            there is none.
+        to: index of the pose that follows on the path; it is before `at` in time if the path is
+            followed backwards.
     """
     t, p, s = poses.time, poses.pose, poses.std
     after = np.abs(t[to] - t[at])[:, None]
@@ -144,21 +155,21 @@ def _sharpness(
 
 
 def _wrapped(change: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-    """Return a change of pose with its heading between -pi and pi."""
+    """Return a change of pose with the change of heading wrapped to -pi ... pi."""
     heading = np.angle(np.exp(1j * change[..., 2:]))
     return np.concatenate([change[..., :2], heading], axis=-1)
 
 
 class Flag(IntEnum):
-    """Whether a frame has a pose, or the reason why it was rejected.
+    """State of a frame: it has a pose, or was rejected for some reason.
 
     Attributes:
-        OK: it has a pose.
-        MISSING: no marker was detected.
+        OK: the frame has a pose.
+        MISSING: none of the body's markers was detected.
         AMBIGUOUS: a marker was detected twice.
-        REPEATED: its picture is identical to that of the frame before.
-        SHAPE: the corners are not those of a marker of this size.
-        JUMP: the pose does not fit those of the frames around.
+        REPEATED: the picture is identical to that of the frame before.
+        SHAPE: the corners do not have the shape of a marker of the given size.
+        JUMP: the pose does not fit the poses of other frames.
     """
 
     OK = 0
@@ -170,25 +181,28 @@ class Flag(IntEnum):
 
     @property
     def word(self) -> str:
-        """Its name in files and messages."""
+        """Name of the flag in files and messages."""
         return self.name.lower()
 
 
 LEAST_NOISE = 0.05
-"""Smallest std of a corner [pixel]; a smaller estimate is not credible."""
+"""Smallest std assumed for the error of a corner [pixel]; a smaller estimate is not credible."""
 SHARED = 0.05
-"""Std of the error that all corners of a frame share [pixel]; residuals do not show it."""
+"""Std of the error that all corners of a frame share, which residuals do not show [pixel]."""
 ODD_SQUARES = 25.0
-"""Mean squared residual, relative to its median, above which corners are not a marker's."""
+"""Mean squared residual of a frame, relative to the median over frames, above which its corners do
+not have the shape of a marker [1]."""
 ODD_LEAST = 1.0
-"""Root mean square residual [pixel] below which corners are a marker's whatever the median is: an
-edge along the pixels' rows is located better than a slanted one, so residuals vary with heading."""
+"""Root mean square residual of a frame below which its corners are accepted whatever the median is
+[pixel]. Residuals vary with heading, since an edge along the pixels' rows is located better than a
+slanted one."""
 ODD_SIZE = 0.05
-"""Part by which a marker's size in a frame may differ from its median."""
+"""Largest relative difference of the markers' size in a frame from its median over frames [1]."""
 WRONG_SIZE = 0.02
-"""Part by which the median size may differ from the stated one: more is a wrong height or size."""
+"""Largest relative difference of the median apparent size from the true one; a larger one shows a
+wrong height or size of the markers [1]."""
 LEAST_TRACKED = 0.5
-"""Part of the frames that should have a pose."""
+"""Share of frames with a pose below which a result is doubtful [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,13 +213,13 @@ class TrackedPoses:
         target: the body.
         frame, time: number and time [s] of every frame.
         pose: x, y [m], heading [rad] without wrap-around; NaN where the flag is not `OK`.
-        covariance: covariance of the pose [m, rad]; NaN likewise.
-        rejected: the fitted pose of a rejected frame, else NaN.
-        flag: number of a `Flag`.
-        size: apparent over true size of the markers [1].
-        corner_std: std of the error of a corner [pixel], from the residuals.
-        apparent_height: height of the markers above the floor that their size in the picture
-            implies [m].
+        covariance: covariance of the pose in products of [m, m, rad]; NaN where there is no pose.
+        rejected: the fitted pose of a rejected frame [m, m, rad], else NaN.
+        flag: state of the frame, the number of a `Flag`.
+        size: apparent size of the markers divided by their true size [1].
+        corner_std: std of the error of a corner, from the residuals [pixel].
+        apparent_height: height of the markers above the floor that follows from their size in the
+            picture [m].
     """
 
     target: Target
@@ -221,17 +235,17 @@ class TrackedPoses:
 
     @property
     def good(self) -> Bool[np.ndarray, " frame"]:
-        """Frames that have a pose."""
+        """Mask of the frames that have a pose."""
         return np.asarray(self.flag == Flag.OK)
 
     @property
     def share(self) -> float:
-        """Part of the frames that have a pose [1]."""
+        """Share of the frames that have a pose [1]."""
         return float(self.good.mean()) if len(self.flag) else 0.0
 
     @property
     def median_size(self) -> float:
-        """Median of the apparent over the true size [1]; NaN where no frame has a pose."""
+        """Median over frames of apparent divided by true size [1]; NaN if no frame has a pose."""
         return float(np.median(self.size[self.good])) if self.good.any() else float("nan")
 
     def count(self, flag: Flag) -> int:
@@ -239,7 +253,7 @@ class TrackedPoses:
         return int((self.flag == flag).sum())
 
     def doubts(self) -> list[str]:
-        """Return sentences on why the poses should not be used as they are; none if all is well."""
+        """Return sentences about reasons not to use the poses as they are; empty for good poses."""
         name, out = self.target.name, []
         if self.share < LEAST_TRACKED:
             out.append(
@@ -276,7 +290,7 @@ class TrackedPoses:
 
 
 def track_of(camera: OverheadCamera, target: Target, detections: Detections) -> TrackedPoses:
-    """Return the tracked poses of a body by the detections of its markers."""
+    """Return the tracked poses of a body, from the detections of its markers."""
     ids = [marker.id for marker in target.markers]
     twice = (detections.counts(ids) > 1).any(axis=1)
     fit = poses_of(camera, target, detections.corners_of(ids))
@@ -315,7 +329,7 @@ def _odd(
     size: Float[np.ndarray, " frame"],
     present: Bool[np.ndarray, " frame"],
 ) -> Bool[np.ndarray, " frame"]:
-    """Return the frames whose residuals are too large, or whose marker has another size."""
+    """Return a mask of the frames with too large residuals or an unusual size of the markers."""
     odd = np.zeros(len(size), bool)
     if present.any():
         usual = max(float(np.median(mean_square[present])), LEAST_NOISE**2)
@@ -325,5 +339,5 @@ def _odd(
 
 
 def _corner_std(mean_square: Float[np.ndarray, " frame"]) -> float:
-    """Return the std of a corner [pixel] by the mean squared residuals of good frames."""
+    """Return the std of a corner [pixel], from mean squared residuals of good frames [pixel^2]."""
     return max(LEAST_NOISE, float(np.sqrt(mean_square.mean()))) if len(mean_square) else LEAST_NOISE

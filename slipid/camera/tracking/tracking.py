@@ -35,9 +35,9 @@ class TrackingResult:
     Attributes:
         source: the frames.
         tracks: tracked poses of every body.
-        notes: sentences that the user should know.
-        doubts: sentences on why the poses should not be used as they are; none if all is well.
-        checkpoint: the detections, kept until the poses are written.
+        notes: sentences for the user about frame times and the poses.
+        doubts: sentences about reasons not to use the poses as they are; empty for good poses.
+        checkpoint: checkpoint with the detections, kept until the poses are written.
     """
 
     source: FrameSource
@@ -47,7 +47,10 @@ class TrackingResult:
     checkpoint: Checkpoint
 
     def write(self, path: Path) -> list[Path]:
-        """Write the poses: one body to this file, several to one file each with its name added."""
+        """Write the poses to a file and return the files written.
+
+        Each of several bodies has a file of its own, with the body's name added to the file name.
+        """
         names = [path]
         if len(self.tracks) > 1:
             names = [path.with_stem(f"{path.stem}_{t.target.name}") for t in self.tracks]
@@ -57,7 +60,7 @@ class TrackingResult:
         return names
 
     def to_json(self) -> Content:
-        """Return the results for programs; the poses themselves are in files of their own."""
+        """Return a summary of the results for programs; the poses are in files of their own."""
         return {
             "schema": SCHEMA,
             "source": self.source.name,
@@ -100,8 +103,8 @@ def track(
         region: region of the picture to which detections are limited.
 
     Raises:
-        DataError: frames of another size than the camera was calibrated at, no marker in any frame,
-            times that do not increase.
+        DataError: frames do not have the size at which the camera was calibrated, no frame shows a
+            wanted marker, or times do not increase.
     """
     camera.lens.check_size(source.image_px, source.name)
     for target in targets:
@@ -133,11 +136,11 @@ def track(
 
 
 def check_outputs(source: FrameSource, out: Path, preview: Path | None) -> None:
-    """Check, before the long work, that its results can be written.
+    """Raise `DataError`, before the tracking starts, unless its results can be written.
 
     Raises:
-        DataError: nothing can be written there, or a preview of a device is requested, whose frames
-            are gone by then.
+        DataError: a file cannot be written, or a preview of a device is requested, whose frames
+            cannot be read again.
     """
     check_writable(out)
     if preview is not None:
@@ -151,14 +154,14 @@ def check_outputs(source: FrameSource, out: Path, preview: Path | None) -> None:
 
 @dataclass(frozen=True)
 class LoneMarker:
-    """One marker in the middle of a body.
+    """A single marker in the middle of a body.
 
     Attributes:
-        size: edge of its black square [m].
-        height: height above the floor [m].
-        id: its number; None for the only one that is in view.
-        dictionary: its dictionary.
-        yaw: angle of its top edge, counter-clockwise from ahead [rad].
+        size: edge length of its black square [m].
+        height: height of the marker above the floor [m].
+        id: number of the marker; None for the only one in view.
+        dictionary: name of its dictionary.
+        yaw: direction of its top edge, counter-clockwise from ahead [rad].
     """
 
     size: float
@@ -181,10 +184,10 @@ class LoneMarker:
             raise DataError(f"--id {self.id}; expected 0 to {most} in {self.dictionary}")
 
     def target(self, source: FrameSource, region: Region | None = None) -> Target:
-        """Return the body; a marker without a number is searched in a region of the picture.
+        """Return the body; a marker without a number is searched in the frames, or in a region.
 
         Raises:
-            DataError: no marker in view, or several.
+            DataError: no marker is in view, or several are.
         """
         number = self.id
         if number is None:
@@ -203,7 +206,7 @@ def preview(path: Path, result: TrackingResult, camera: OverheadCamera, number: 
         number: number of the frame; by default the first in which every body has a pose.
 
     Raises:
-        DataError: there is no frame of that number, or nothing can be written there.
+        DataError: there is no frame of that number, or the file cannot be written.
     """
     tracks = result.tracks
     if number is None:

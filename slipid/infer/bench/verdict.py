@@ -106,7 +106,7 @@ def _mean(
     length = max(fit.correlation_time, cell_length([w]))
     away = celled((sum_ - weight * off)[:, None], w, length)
     square = away[:, 0] ** 2
-    # too few cells of time for an estimate, or one that outweighs the others
+    # no std can be estimated from too few cells of time, or if one cell outweighs all others
     if np.count_nonzero(square) < FEWEST or square.max() > square.sum() / 2:
         return 0.0, 0.0
     return off, abs(off) * total / float(np.sqrt(square.sum()))
@@ -142,8 +142,7 @@ _REMEDIES = (
     (("motor.brush_drop",), "let small and large currents flow, both ways"),
     (("motor.viscous_friction",), "turn faster: at these speeds it has little effect"),
 )
-"""Remedies for flat directions: the first one whose quantities all occur in the direction is used.
-"""
+"""Remedies for flat directions: the first whose quantities all occur in the direction is used."""
 
 
 @dataclass(frozen=True, eq=False)

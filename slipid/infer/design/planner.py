@@ -107,7 +107,7 @@ class Planner:
         return first.joined(*others)
 
     def _rows(self, runs: Sequence[PlannedRun]) -> RunJacobians:
-        # padded to a fixed count, so that one compiled function serves
+        # runs are padded to a fixed count, so that the function is compiled for one shape only
         filled = [*runs, *[runs[-1]] * (_TOGETHER - len(runs))]
         windows = self._windows(filled)
         this = self._problem.of(windows)

@@ -58,7 +58,7 @@ def _numbers(name: str, text: str | None, least: float = -np.inf) -> tuple[float
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """Candidate runs: floors and loads of the fit, limited by the options.
+    """Goals and candidate runs of a proposal: floors and loads of the fit, limited by the options.
 
     Raises:
         DataError: the fit lacks a floor or load, a list has no numbers, or no run is drivable.

@@ -1,1 +1,1 @@
-"""Sampling of the posterior, several emcee ensembles in learnt coordinates."""
+"""Sampling of the posterior with several emcee ensembles, in coordinates learnt from draws."""

@@ -1,4 +1,4 @@
-"""Log density and plan of a sampler, and blocks of its chain with their arrays in files."""
+"""Log density and settings of a sampler, and blocks of its chain with their arrays in files."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,16 +22,16 @@ Chain = Float[np.ndarray, "ensemble step walker size"]
 
 @dataclass(frozen=True, eq=False)
 class LogDensity:
-    """A log density with a Gaussian (Laplace) approximation of it.
+    """A log density that is a sum of terms, with its Gaussian (Laplace) approximation.
 
     Attributes:
-        terms: function from vectors (walker, size) to terms (walker, group + 1), the shared one
-            last.
-        slope: gradient of the sum of the terms.
-        group: group of each coordinate, -1 for one that groups share.
+        terms: function from vectors (walker, size) to the terms of the log density (walker,
+            group + 1), one per group and last the term of the shared coordinates.
+        slope: function from vectors to the gradient of the sum of the terms.
+        group: group of each coordinate, -1 for coordinates that groups share.
         centre: mean of the Gaussian.
         covariance: covariance of the Gaussian.
-        map: map of the coordinates that the density is given in; None for x itself.
+        map: map to the coordinates u in which `terms` and `slope` are given; None for x itself.
     """
 
     terms: Callable[[Matrix], Matrix]
@@ -42,7 +42,7 @@ class LogDensity:
     map: Transport | None = None
 
     def log_prob(self, x: Matrix) -> Matrix:
-        """Return the log density followed by its terms, which emcee keeps as blobs."""
+        """Return the log density (first column) and its terms, which emcee keeps as blobs."""
         terms = self.terms(x)
         return np.concatenate([terms.sum(axis=1, keepdims=True), terms], axis=1)
 
@@ -51,7 +51,10 @@ class LogDensity:
         return gaussian(self.centre, self.covariance, self.group)
 
     def in_coordinates(self, map: Transport) -> "LogDensity":
-        """Return the distribution in mapped coordinates; centre and covariance stay those of x."""
+        """Return the same distribution as a density of mapped coordinates u.
+
+        Centre and covariance remain those of x.
+        """
         count = int(self.group.max()) + 1
         onto = np.eye(count + 1)[np.where(self.group < 0, count, self.group)]
 
@@ -103,14 +106,15 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class ChainBlock:
-    """Some steps of all ensembles, with the state that the next block starts from.
+    """Consecutive steps of all ensembles, with the state from which the next block starts.
 
     Attributes:
-        number: number of the block; the first is 0.
+        number: index of the block, from 0.
         chain: positions of all walkers.
         log_prob: log density at these positions.
-        random: Mersenne twister keys, and (position, has Gaussian, Gaussian) of each.
-        accepted: share of the moves that changed a coordinate, for each ensemble.
+        random: state of each ensemble's Mersenne twister after the block: its key, and (position,
+            has_gauss, cached Gaussian) as in NumPy.
+        accepted: fraction of the moves that changed a coordinate, for each ensemble.
         map: map to the coordinates of the next block.
         angle: step of the Hamiltonian moves of every family in the next block [rad].
     """
@@ -126,12 +130,13 @@ class ChainBlock:
 
 @dataclass(frozen=True)
 class BlockStore:
-    """Storage of blocks, by default none.
+    """Functions that store and restore blocks; by default nothing is stored.
 
     Attributes:
-        done: function that returns the stored blocks of a part.
+        done: function that returns the stored blocks of a part of the posterior.
         keep: function that stores a block of a part.
-        progress: function that is called with the part and the number of steps of its block.
+        progress: function that is called with the part and the number of finished steps of its
+            current block.
     """
 
     done: Callable[[str], Sequence[ChainBlock]] = lambda part: ()

@@ -1,4 +1,4 @@
-"""Coordinates of a density, and the data and fitted values that it is anchored at."""
+"""Coordinates of a density, and the data and fitted values from which it is computed."""
 
 from dataclasses import dataclass
 
@@ -17,20 +17,20 @@ from slipid.infer.result import Fit, required
 from slipid.model.robot import Robot
 
 MOTION, ELECTRIC, EVERYTHING = "motion", "electric", "everything"
-"""Parts of a posterior that a density can be of."""
+"""Parts of a posterior that have a density: motion, electric numbers given motion, all numbers."""
 _TURNS = 3
-"""Alternations between weights of runs and shared effects at the fit."""
+"""Number of alternations between weights of runs and shared effects at the fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """End of a fit.
+    """Fitted values around which a posterior is sampled.
 
     Attributes:
         z: search vector.
         log_variance: log variances in the order of the problem's components.
         covariance: Laplace covariance with shared effects marginalised; if currents were logged,
-            that of p(electric | motion, data) p(motion | motion data).
+            the covariance of p(electric | motion, data) p(motion | motion data).
     """
 
     z: np.ndarray
@@ -39,19 +39,20 @@ class Fitted:
 
     @classmethod
     def of(cls, fit: Fit) -> "Fitted":
-        """Return the end of a fit, with the variances in the order of its problem."""
+        """Return the fitted values, with the variances in the order of the fit's problem."""
         names = required(fit.problem).noise.names
         return cls(fit.z, np.log([fit.variance[name] for name in names]), fit.covariance)
 
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """Coordinates of a density.
+    """Coordinates of a density, a part of those of the search vector.
 
     Attributes:
         names: name of each coordinate.
         structure: index of each coordinate in the search vector.
-        group: floor of each coordinate, -1 for one that several floors share.
+        group: index of the only floor whose residuals depend on the coordinate, -1 if there are
+            several.
     """
 
     names: tuple[str, ...]
@@ -60,7 +61,10 @@ class Coordinates:
 
     @staticmethod
     def of(problem: Problem, fitted: Fitted, part: str) -> "Coordinates":
-        """Return the coordinates of a part; the fit's Jacobian shows which floors each affects."""
+        """Return the coordinates of a part of the posterior.
+
+        The Jacobian at the fit shows which floors each coordinate affects.
+        """
         _, jacobian = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
         blocks = {
             MOTION: ["motion"],
@@ -82,13 +86,16 @@ class Coordinates:
 
 
 def _groups(touched: Bool[np.ndarray, "size floor"]) -> Int[np.ndarray, " size"]:
-    """Return the one floor that a coordinate affects, else -1; a single floor is one group."""
+    """Return the floor that each coordinate affects, -1 if it affects several or none.
+
+    If there is only one floor, all coordinates are in its group.
+    """
     alone = (touched.sum(axis=1) == 1) | (touched.shape[1] == 1)
     return np.where(alone, touched.argmax(axis=1), -1)
 
 
 def effects_at(problem: Problem, residual: Blocks, log_v: Vector) -> Float[np.ndarray, "segment 3"]:
-    """Return the shared effects at a fit, alternating with the weights of runs given them."""
+    """Return the shared effects at a fit, estimated by turns with the weights of runs."""
     keep = np.ones(len(problem.windows))
     effect = np.zeros((len(keep), 3))
     for _ in range(_TURNS):
@@ -99,20 +106,20 @@ def effects_at(problem: Problem, residual: Blocks, log_v: Vector) -> Float[np.nd
 
 
 class Anchor(eqx.Module):
-    """Windows and fitted values that a density is anchored at; an argument of compiled functions.
+    """Windows and fitted values that stay fixed in a density; an argument of compiled functions.
 
     Attributes:
         batch: the windows.
         z: search vector of the fit.
         prior_std: prior std of every coordinate.
-        root: whitening matrices of every block, by the noise of the fit.
-        scale: root of the weight of each segment, small for an outlier.
+        root: whitening matrices of every block, for the noise variances of the fit.
+        scale: square root of the weight of each segment, small for an outlier.
         log_det: log determinant of each segment's noise covariance.
         shared: shared effects by floor.
-        tied: posterior of shared effects given residuals whitened by root and scale.
+        tied: posterior of the shared effects, given residuals whitened by root and scale.
         twist: twist of every window at the fit.
-        twist_slope: its derivative by the search vector.
-        electric: noise of the voltage prediction, at the fitted resistance.
+        twist_slope: derivative of the twists by the search vector.
+        electric: noise that predictions of voltages depend on, with the fitted resistance.
     """
 
     batch: lk.Batch
@@ -129,10 +136,11 @@ class Anchor(eqx.Module):
 
     @staticmethod
     def at(problem: Problem, fitted: Fitted) -> "Anchor":
-        """Return the anchor at a fit.
+        """Return the anchor for the fitted values.
 
-        Weights are those at the fit, times the information of a Student t on its centre over that
-        of a Gaussian, so that the information equals that of the Laplace covariance.
+        Weights are those at the fit times `expected`, the ratio of a Student t's information about
+        its centre to a Gaussian's, so that the density has the information of the Laplace
+        covariance.
         """
         log_v, keep = jnp.asarray(fitted.log_variance), np.ones(len(problem.windows))
         electric = problem.electric(fitted.z, log_v)
@@ -159,7 +167,10 @@ class Anchor(eqx.Module):
         )
 
     def predict(self, robot: Robot, z: Array) -> lk.Predicted:
-        """Return a robot's prediction, solved from the fit's twists or, if that fails, anew."""
+        """Return a robot's prediction, with the root finder started near the fit's twists.
+
+        If it does not converge from there, it is started without them.
+        """
         b = self.batch
         start = self.twist + self.twist_slope @ (z - self.z)
         p = lk.predict(robot, b, jax.lax.stop_gradient(start))
@@ -167,7 +178,7 @@ class Anchor(eqx.Module):
         return jax.lax.cond(arrived, lambda: p, lambda: lk.predict(robot, b))
 
     def noise(self, robot: Robot) -> lk.ElectricNoise:
-        """Return the noise of the voltage prediction at a robot's resistance."""
+        """Return the noise that predictions of voltages depend on, with a robot's resistance."""
         held = self.electric
         return lk.ElectricNoise(held.voltage_std, held.scatter, robot.motor.resistance)
 

@@ -1,4 +1,4 @@
-"""Log posterior of many walkers at a time, for samplers: the objective of the fit as a density.
+"""Log posterior of many walkers at once for samplers, with the same objective as the fit.
 
 A coordinate is a free number of the search space. Variances and the weights of runs keep their
 fitted values, and shared effects are marginalised, so that the density is that of nonlinear least
@@ -6,18 +6,19 @@ squares,
 
     log p(x | data) = -1/2 |y(x)|^2 - 1/2 |(x - mean) / std|^2 + f log |d residuals / d data|
 
-with y from `slipid.fitting.shared_effects.marginal_residuals`, and f the information of a Student t
-on its centre over that of a Gaussian, as in y. Floors share some coordinates and have others of
-their own, so that the log posterior is a sum
+with y from `slipid.fitting.shared_effects.marginal_residuals`, and f the ratio of a Student t's
+information about its centre to a Gaussian's, which the weights in y contain, too. Floors share some
+coordinates and have others of their own, so that the log posterior is a sum
 
     log p(x | data) = sum_floor l_floor(x_shared, x_floor) + l_shared(x_shared)
 
-and numbers of several floors can be moved, and accepted or not, in one evaluation.
+and moves of the numbers of several floors can be proposed in one evaluation and accepted floor by
+floor.
 
 Electric numbers are drawn for every draw of the motion. Gauss-Newton steps find their most likely
 values given the motion, and proposals come from a Student t around them, whose tails cover those
-of a skewed density. Each is accepted or not by the exact density (Metropolis-Hastings with
-independent proposals; Tierney 1994, Annals of Statistics 22(4)).
+of a skewed density. Each proposal is accepted or rejected by the exact density (Metropolis-Hastings
+with independent proposals; Tierney 1994, Annals of Statistics 22(4)).
 """
 
 from collections.abc import Callable
@@ -41,11 +42,11 @@ Result = TypeVar("Result")
 
 
 class HeldMotion(NamedTuple):
-    """Motion of each walker that its electric numbers are conditioned on.
+    """Motion of each walker, given which its electric numbers are drawn.
 
     Attributes:
-        z: search vector.
-        motor_force: contact forces that the motors bear.
+        z: search vector with the walker's numbers of the motion.
+        motor_force: contact forces that the motors work against [mu m g].
     """
 
     z: Float[Array, "*walker free"]
@@ -60,10 +61,10 @@ class _Residuals(NamedTuple):
 
 
 class Density:
-    """Log posterior of a part of a problem's numbers around a fit, with the others held.
+    """Log posterior of a part of a problem's numbers, with the other numbers as fitted.
 
-    If currents do not inform the motion, the part EVERYTHING has the likelihoods of all residuals,
-    but is no posterior.
+    If currents are logged, the part EVERYTHING has the likelihoods of all residuals but is not the
+    posterior, in which currents do not change the numbers of the motion.
     """
 
     def __init__(self, problem: Problem, fitted: Fitted, part: str):
@@ -71,7 +72,7 @@ class Density:
         self.floors = problem.robot.surfaces.labels
         self.coordinates = Coordinates.of(problem, fitted, part)
         self.anchor = Anchor.at(problem, fitted)
-        # the first of its form compiles for all
+        # the first density with these coordinates compiles the functions for all others
         form = part, self.coordinates.names, self.coordinates.group.tobytes()
         self._each: dict[Callable[..., object], Callable[..., Any]] = {}
         self._form: Density = problem.compiled.setdefault(form, self)
@@ -88,24 +89,27 @@ class Density:
         return len(self.names)
 
     def full(self, anchor: Anchor, x: Array) -> Array:
-        """Return the search vector with chain coordinates x and all others as fitted."""
+        """Return the search vector with the coordinates x of the density and all others fitted."""
         return anchor.z.at[self.coordinates.structure].set(x)
 
     def of_all(
         self, of: Callable[..., Result], x: np.ndarray | Array, held: HeldMotion | None = None
     ) -> Result:
-        """Apply a method for one vector to many, compiled once for all densities of this form."""
+        """Return the results of a method for one vector, for many vectors.
+
+        It is compiled once for all densities with the same coordinates.
+        """
         return self.mapped(of, (jnp.asarray(x), held))
 
     def mapped(self, of: Callable[..., Result], many: tuple[Any, ...]) -> Result:
-        """Apply a function of the density, its anchor and one element to every element of many."""
+        """Return the results of a function of (density, anchor, element) for many elements."""
         form = self._form
         if of not in form._each:
 
             def each(anchor: Anchor, many: tuple[Any, ...]) -> Result:
                 return jax.lax.map(lambda one: of(form, anchor, *one), many)
 
-            # kept by the density: in JAX's own cache of arguments it would never be freed
+            # stored here since JAX's own cache of compiled functions would never free it
             form._each[of] = jax.jit(each)
         compiled: Callable[..., Result] = form._each[of]
         return compiled(self.anchor, many)
@@ -113,9 +117,9 @@ class Density:
     def terms(
         self, x: Float[np.ndarray, "walker size"], held: HeldMotion | None = None
     ) -> Float[np.ndarray, "walker term"]:
-        """Return terms of the log posterior of every walker: one per floor, then the shared one.
+        """Return the terms of every walker's log posterior: one per floor, then the shared term.
 
-        The electric part needs the motion of each walker, as `hold` returns it.
+        The electric part needs the motion of each walker, as returned by `hold`.
         """
         out = np.array(self.of_all(Density.sums, x, held))
         out[~np.isfinite(out)] = -np.inf
@@ -131,13 +135,13 @@ class Density:
         return jax.grad(lambda x: jnp.sum(self.sums(anchor, x, held)))(x)
 
     def sums(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
-        """Return the terms of one vector."""
+        """Return the terms of the log posterior for one vector x."""
         found, count, b = self._residuals(anchor, x, held), len(self.floors), anchor.batch
         out = jnp.zeros(count + 1)
         camera, spread = lk.log_jacobians(found.robot, b, anchor.noise(found.robot))
         for k, r in found.residuals.items():
             white, more = anchor.white(k, r), jnp.zeros(len(r))
-            less = expected(r.shape[-1])  # the factor of the residuals, or the mode would move
+            less = expected(r.shape[-1])  # f, so that the mode is that of the fit
             if k == "motion":
                 more = less * camera
                 for floor, posterior in enumerate(anchor.tied):
@@ -150,7 +154,7 @@ class Density:
         return out.at[np.where(at.group < 0, count, at.group)].add(-0.5 * pull**2)
 
     def whitened(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
-        """Return whitened residuals of the electric part and of the prior, for one vector."""
+        """Return whitened residuals of data and prior of the electric part, for one vector."""
         found, at = self._residuals(anchor, x, held), self.coordinates.structure
         pull = (x - self.problem.space.prior_mean[at]) / anchor.prior_std[at]
         return jnp.concatenate(
@@ -172,7 +176,7 @@ class Density:
         return out
 
     def residuals(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
-        """Return residuals without shared effects, for many vectors (draw, segment, m)."""
+        """Return residuals less the mean shared effects, for many vectors (draw, segment, m)."""
         return self.of_all(Density._residual_blocks, x)
 
     def _residual_blocks(
@@ -206,11 +210,11 @@ class Density:
         out = {"motion": lk.motion_residual(robot, b, p)}
         if self.part == EVERYTHING:
             out |= lk.electric_residuals(robot, b, p.motor_force, anchor.noise(robot))
-        # without the barrier XLA repeats the root finder for every consumer
+        # without the barrier XLA repeats the root finder for every use of the residuals
         return _Residuals(jax.lax.optimization_barrier(out), robot)
 
     def hold(self, x: Float[np.ndarray, "walker size"]) -> HeldMotion:
-        """Return the motion of walkers of the motion part, for the electric part."""
+        """Return the motion of the walkers of a motion density, for use with the electric part."""
         return self.of_all(Density._held, x)
 
     def _held(self, anchor: Anchor, x: Array, _: None) -> HeldMotion:
@@ -219,18 +223,18 @@ class Density:
 
 
 def _explained(posterior: EffectPosterior, white: Float[Array, "segment m"]) -> Array:
-    """Return by how much a floor's shared effects reduce the sum of squared residuals."""
+    """Return the reduction of the sum of squared residuals by a floor's shared effects."""
     projected = jnp.einsum("nma,nm->an", posterior.span, white[posterior.segments])
     along = jnp.einsum("anq,an->aq", posterior.root, projected).ravel()
     return jnp.sum(solve_triangular(posterior.factor, along, lower=True) ** 2)
 
 
 _STEPS, _PROPOSALS = 4, 16
-"""Numbers of Gauss-Newton steps and of proposals for every draw."""
+"""Numbers of Gauss-Newton steps and of proposals for every draw of the motion."""
 _DEGREES = 5.0
-"""Degrees of freedom of proposals."""
+"""Degrees of freedom of the Student t from which electric numbers are proposed."""
 _WIDER = 1.15
-"""Scale of proposals over that of the Gaussian at the most likely values."""
+"""Ratio of the proposals' scale to that of the Gaussian around the most likely values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,9 +242,9 @@ class ElectricDraws:
     """Electric numbers for every draw of the motion.
 
     Attributes:
-        x: the draws.
-        accepted: share of the proposals that were accepted.
-        still: share of the draws without any accepted proposal.
+        x: draws of the electric numbers.
+        accepted: fraction of the proposals that were accepted.
+        still: fraction of the draws without any accepted proposal.
     """
 
     x: Float[np.ndarray, "ensemble draw size"]
@@ -255,7 +259,7 @@ def electric_given_motion(
     x: Float[np.ndarray, "ensemble draw size"],
     seed: int,
 ) -> ElectricDraws:
-    """Draw electric numbers from the second density for every draw of the first.
+    """Return draws of the electric numbers, one for every draw of the motion.
 
     Args:
         first: density of the motion.
@@ -288,7 +292,11 @@ def electric_given_motion(
 def _draw(
     density: Density, anchor: Anchor, held: HeldMotion, start: Array, student: Array, chance: Array
 ) -> tuple[Array, Array]:
-    """Return the last accepted proposal, and which proposals were accepted."""
+    """Return the last accepted proposal, and a mask of the accepted proposals.
+
+    `start` is where Gauss-Newton steps begin, `student` are standard draws of a Student t, and
+    `chance` log uniform numbers.
+    """
 
     def log_prob(x: Array) -> Array:
         return jnp.sum(density.sums(anchor, x, held))
@@ -301,7 +309,7 @@ def _draw(
         return x + jnp.linalg.solve(information(x), jax.grad(log_prob)(x)), None
 
     found, _ = jax.lax.scan(step, start, None, length=_STEPS)
-    # divergent steps end in nan; proposals around the start are poor, which `still` shows
+    # divergent steps end in nan; proposals are then made around the start, where few are accepted
     centre = jnp.where(jnp.all(jnp.isfinite(found)), found, start)
     root = jnp.linalg.cholesky(jnp.linalg.inv(information(centre)))
     at = centre + _WIDER * student @ root.T

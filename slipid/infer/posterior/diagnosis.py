@@ -1,6 +1,7 @@
 """Draws of a posterior, the estimates from them, and the convergence of its chains.
 
-The module needs no sampler; modules that show, deploy or write a posterior are loaded by methods.
+The module does not import the sampler; modules that show, deploy or write a posterior are loaded by
+the methods that need them.
 """
 
 from dataclasses import dataclass, replace
@@ -31,16 +32,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Convergence of chains, per coordinate.
+    """Convergence of chains, by coordinate and overall.
 
     Attributes:
         r_hat: rank-normalised split R-hat over ensembles (Vehtari et al. 2021).
         tau: integrated autocorrelation time [step].
-        ess: effective draws, the smaller of bulk and tails.
-        steps: steps of every walker after the warm-up.
+        ess: effective number of draws, the smaller of those for the bulk and for the tails.
+        steps: number of steps of every walker after the warm-up.
         converged: True if every coordinate meets the criteria of the plan.
-        worst: index of the coordinate that is furthest from the criteria.
-        reason: its figure in words.
+        worst: index of the coordinate that is furthest from meeting a criterion.
+        reason: value of that criterion for this coordinate, as text.
     """
 
     r_hat: Float[np.ndarray, " size"]
@@ -60,12 +61,14 @@ class Posterior:
         fit: fit that the chains started around.
         z: draws of the search vector.
         log_variance: draws of the log variances.
-        log_prob: log density of the numbers that are sampled first.
-        names: names of these numbers.
-        diagnosis: convergence of their chains.
-        accepted: share of accepted moves, by part.
-        converged: True if the chains converged and the electric draws moved.
-        reason: worst criterion in words.
+        log_prob: log density of the numbers that were sampled by chains: all of them, or those of
+            the motion if currents were logged.
+        names: names of the numbers that were sampled by chains.
+        diagnosis: convergence of the chains.
+        accepted: fraction of accepted moves, by part.
+        converged: True if the chains converged and nearly all electric draws had an accepted
+            proposal.
+        reason: value of the criterion that is furthest from being met, as text.
     """
 
     fit: Fit
@@ -200,8 +203,8 @@ def estimates(
 ) -> dict[str, verdicts.Estimate]:
     """Return every number with mean, interval and verdict from the draws of a posterior.
 
-    Means are taken in the search space, so that shares sum to one and positive numbers have their
-    geometric mean. Flat directions of the fit stay flat.
+    Means are taken in the search space, so that shares sum to one and means of positive numbers are
+    geometric. Flat directions are those of the fit.
     """
     every, flat = draws.reshape(-1, fit.space.size), members(fit.flat)
     out, prior_std = dict(fit.parameters), fit.verdict_space.prior_std
@@ -246,7 +249,7 @@ def identified(found: Posterior) -> Content:
 
 
 def _drawn(ratio: verdicts.Estimate, fit: Fit, flat: np.ndarray) -> verdicts.Estimate:
-    """Return a quotient with the interval and the std of its draws."""
+    """Return a ratio of numbers with the interval and the std of its draws."""
     over, under = (fit.space.slices[path] for path in ratio.path.rsplit("/", 1))
     draws = np.exp(flat[:, over] - flat[:, under])
     low, high = np.quantile(draws, [0.05, 0.95]).tolist()

@@ -22,20 +22,20 @@ from slipid.infer.posterior.proposals import QUARTER_TURN, Hamiltonian, families
 from slipid.infer.posterior.transport_map import Transport, learnt
 
 RandomState = tuple[str, np.ndarray, int, int, float]
-"""State of a Mersenne twister as numpy gives it."""
+"""State of a Mersenne twister in NumPy's form."""
 
 ACCEPTED = 0.8
-"""Target share of accepted Hamiltonian moves; their step is adapted in the warm-up."""
+"""Target fraction of accepted Hamiltonian moves, to which their step is adapted in the warm-up."""
 FIRST_ANGLE, LEAST_ANGLE = 0.3, 0.03
 """First and smallest step of Hamiltonian moves [rad]."""
 DRAWS_PER_EFFECTIVE = 20.0
-"""Approximate number of warm-up draws that are worth one independent draw."""
+"""Approximate number of warm-up draws with the information of one independent draw."""
 
 
 def extended(target: LogDensity, plan: Plan, part: str, store: BlockStore) -> list[ChainBlock]:
-    """Sample blocks of a part until `diagnose` finds convergence or the plan's limit is reached.
+    """Return the blocks of a part, sampled until convergence or the plan's limit of blocks.
 
-    Sampling continues after the blocks in the store, which keeps each new block.
+    Sampling continues after the blocks in the store, in which each new block is stored.
     """
     blocks = list(store.done(part))
     while not _ended(blocks, plan):
@@ -49,7 +49,7 @@ def _ended(blocks: list[ChainBlock], plan: Plan) -> bool:
     after = len(blocks) - plan.warm_up[-1]
     if len(blocks) >= plan.most:
         return True
-    # the check takes time as well: every fourth block at first, then less often
+    # the check takes time: it is done for every fourth block at first, then less often
     if after < 4 or after % max(4, 2 ** int(np.log2(after) - 3)):
         return False
     return diagnosis.diagnose(chain(blocks, plan), plan).converged
@@ -97,7 +97,7 @@ def _block(
         try:
             found = list(pool.map(ensemble, range(plan.ensembles)))
         finally:
-            stop.set()  # after an interrupt of the caller the others end at their next step
+            stop.set()  # after an interrupt, all ensembles stop at their next step
     ends = [f[2] for f in found]
     places = np.stack([f[0] for f in found])
     x, log = map.placed(places.reshape(-1, places.shape[-1]))
@@ -134,7 +134,11 @@ def _begin(
 
 
 def _start(target: LogDensity, plan: Plan, ensemble: int) -> tuple[np.ndarray, RandomState]:
-    """Return walkers spread wider than the fit's uncertainty, where the density is positive."""
+    """Return start positions of an ensemble's walkers, and the state of its random numbers.
+
+    Walkers are spread more widely than the fit's uncertainty (`Plan.spread`), at positions where
+    the log density is finite.
+    """
     root = np.linalg.cholesky(target.covariance)
     wide = plan.spread * np.geomspace(0.25, 1.0, plan.walkers)[:, None]
     seeds = np.random.SeedSequence((plan.seed, ensemble))
@@ -142,7 +146,7 @@ def _start(target: LogDensity, plan: Plan, ensemble: int) -> tuple[np.ndarray, R
     x = np.empty((plan.walkers, len(root)))
     lost = np.ones(plan.walkers, bool)
     for shrink in 0.7 ** np.arange(30):
-        # all walkers are drawn each time, so that one compiled shape serves
+        # all walkers are drawn each time, so that the density is compiled for one shape only
         tried = target.centre + shrink * wide * random.standard_normal(x.shape) @ root.T
         found = np.isfinite(target.terms(tried)).all(axis=1)
         x[lost & found] = tried[lost & found]
@@ -161,7 +165,10 @@ def _with_learnt(
     blocks: list[ChainBlock],
     turns: list[list[float]],
 ) -> ChainBlock:
-    """Return the block with the map and angles that the warm-up has learnt for the next one."""
+    """Return the block with the map and the angles for the next one, adapted during the warm-up.
+
+    `turns` holds the fractions of accepted Hamiltonian moves, by family.
+    """
     count = block.number + 1
     if count > plan.warm_up[-1]:
         return block

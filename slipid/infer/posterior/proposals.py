@@ -1,11 +1,12 @@
 """Moves of an ensemble of walkers in coordinates in which its target is nearly Gaussian.
 
-A target's log density is a sum of one term per group of coordinates, given those that groups share,
-and a term of the shared ones. In the coordinates of `transport_map`, independence moves and
-differential evolution change all groups in one evaluation, each accepted or not by its own term,
-or the shared coordinates, with the groups fixed relative to them. Hamiltonian moves do the same,
-and go far along the gradient where the map is not exact; walks along single coordinates cross
-plateaus of the density.
+A target's log density is a sum of one term per group of coordinates, given the coordinates that
+groups share, and a term of the shared coordinates. Moves are made in the coordinates of
+`transport_map`. A move changes either all groups in one evaluation, each of which is accepted or
+rejected by its own term, or the shared coordinates, with the groups fixed relative to them.
+Independence moves and differential evolution are efficient where the map is accurate, Hamiltonian
+moves along the gradient also where it is not; walks along single coordinates cross plateaus of the
+density.
 """
 
 from dataclasses import dataclass
@@ -22,33 +23,36 @@ from slipid.infer.posterior.blocks import LogDensity
 from slipid.infer.posterior.transport_map import Matrix
 
 STUDENT = 0.2
-"""Share of independent draws from a Student t, which cover the tails."""
+"""Fraction of independence moves drawn from a Student t instead of a Gaussian, for the tails."""
 DEGREES = 8.0
-"""Degrees of freedom of that Student t."""
+"""Degrees of freedom of the Student t of independence moves."""
 QUARTER_TURN = 0.5 * np.pi
-"""Length of a Hamiltonian move [rad]; for a Gaussian it ends at an independent draw."""
+"""Length of a Hamiltonian move [rad], after which a Gaussian target gives an independent draw."""
 MOST_STEPS, SHORTEST = 12, 0.2
-"""Largest number of steps of a Hamiltonian move, and ratio of its shortest to its longest step."""
+"""Largest number of steps of a Hamiltonian move, and ratio of the shortest to the longest step."""
 ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 1.2, 0.1, 0.8
-"""Relative frequencies of the kinds of moves.
+"""Relative frequencies of coordinate walks, independence, differential and Hamiltonian moves.
 
 A Hamiltonian move takes six times longer, but it moves walkers away from where the map is wrong.
 """
 ALONE = 0.5
-"""Share of coordinate walks that leave all other coordinates of x unchanged."""
+"""Fraction of coordinate walks that leave all other coordinates of x unchanged."""
 _FINITE = 1e100
-"""Bound of slopes, so that their squares stay finite."""
+"""Bound of slopes, so that their squares are finite."""
 STEEPEST = 50.0
-"""Bound of a kick over its step, which keeps walkers in the tails from being thrown out."""
+"""Largest change of momentum in a Hamiltonian step.
+
+It keeps walkers in steep tails from being carried far away.
+"""
 
 
 @dataclass(frozen=True)
 class Family:
-    """Coordinates that are moved together.
+    """Coordinates that one move changes together.
 
     Attributes:
         places: indices of the coordinates, one array per group.
-        groups: groups that they belong to, None for the coordinates that groups share.
+        groups: group of each array, None for the coordinates that groups share.
     """
 
     places: tuple[Int[np.ndarray, " _"], ...]
@@ -56,7 +60,7 @@ class Family:
 
 
 def families(target: LogDensity) -> list[Family]:
-    """Return the family of all groups, and that of the coordinates that they share."""
+    """Return the family of all groups, then that of the shared coordinates, if there are any."""
     groups = tuple(int(g) for g in np.unique(target.group) if g >= 0)
     places = tuple(np.flatnonzero(target.group == g) for g in groups)
     shared = np.flatnonzero(target.group < 0)
@@ -65,14 +69,14 @@ def families(target: LogDensity) -> list[Family]:
 
 
 Jump = tuple[Matrix, Float[np.ndarray, " walker"]]
-"""New coordinates, and log q(old | new) - log q(new | old)."""
+"""New coordinates, and log q(old | new) - log q(new | old) with q the density of proposals."""
 
 
 class FamilyMove(Move):
     """Metropolis-Hastings move of a family of coordinates."""
 
     halves = 1
-    """Number of subsets moved in turn; 2 if a proposal needs walkers that stay fixed."""
+    """Number of subsets of walkers moved in turn; 2 if a proposal uses walkers that are fixed."""
 
     def __init__(self, family: Family):
         self.family = family
@@ -114,7 +118,7 @@ class FamilyMove(Move):
 
 
 class Independence(FamilyMove):
-    """Draws that do not depend on a walker's position: Gaussian, or Student t."""
+    """Proposals that do not depend on a walker's position: a mixture of Gaussian and Student t."""
 
     def jump(self, old: Matrix, still: Matrix, random: RandomState) -> Jump:
         count = len(old)
@@ -125,7 +129,7 @@ class Independence(FamilyMove):
 
 
 def _log_density(u: Matrix) -> Float[np.ndarray, " walker"]:
-    """Return the log density of the mixture of independence moves, up to a constant."""
+    """Return the log density of independence proposals, up to a constant."""
     size, q = u.shape[1], (u**2).sum(axis=1)
     of_t = gammaln(0.5 * (DEGREES + size)) - gammaln(0.5 * DEGREES)
     of_t -= 0.5 * size * np.log(DEGREES / 2)  # less the Gaussian's 2 pi
@@ -134,9 +138,10 @@ def _log_density(u: Matrix) -> Float[np.ndarray, " walker"]:
 
 
 class DifferentialEvolution(FamilyMove):
-    """Differential evolution: steps along scaled, at times whole, differences of fixed walkers.
+    """Differential evolution: steps along scaled differences of two fixed walkers.
 
-    Source: ter Braak 2006, Statistics and Computing 16; whole differences lead from mode to mode.
+    The fraction `whole` of the steps is a whole difference, which can lead from one mode to
+    another. Source: ter Braak 2006, Statistics and Computing 16.
     """
 
     halves = 2
@@ -153,11 +158,11 @@ class DifferentialEvolution(FamilyMove):
 
 
 class CoordinateWalk(FamilyMove):
-    """Random walk of one coordinate of x in each group, or of a shared one.
+    """Random walk of one coordinate of x in each group, or of one shared coordinate.
 
-    If data only show that a number is small, the density of its logarithm has a plateau, which no
-    map of all coordinates straightens, but which this walk crosses. Either the other coordinates
-    of u are held, so that those of x follow by the map, or the other coordinates of x.
+    If data only show that a number is small, the density of its logarithm has a plateau. No map
+    makes it Gaussian, but this walk crosses it. The coordinates that stay fixed are the other ones
+    of x, or the other ones of u, in which case those of x change by the map.
     """
 
     def __init__(self, target: LogDensity, groups: tuple[int, ...] | None):
@@ -185,15 +190,16 @@ class CoordinateWalk(FamilyMove):
 
 
 class Hamiltonian(FamilyMove):
-    """Rotations of position and momentum, exact for a Gaussian, with kicks by the remainder.
+    """Hamiltonian moves whose steps are exact for a standard Gaussian.
 
-    With momentum p and the log density l, steps of
+    A step rotates position u and momentum p, and changes p by the rest of the gradient of the log
+    density l:
 
         turn (u, p) by h/2;    p += h (dl/du + u);    turn (u, p) by h/2
 
-    Groups are independent while the shared coordinates are held, so that each has a trajectory of
-    its own, accepted or not by itself. A walker with a non-finite slope on its trajectory stays at
-    its start with all groups, as any of them may be the cause.
+    Groups are independent while the shared coordinates are fixed, so that each has a trajectory of
+    its own, which is accepted or rejected by itself. If a slope on a walker's trajectory is not
+    finite, all its groups return to the start, as any of them may be the cause.
 
     Source: Beskos et al. 2011, Stochastic Processes and their Applications 121, section 4.
     """
@@ -205,7 +211,7 @@ class Hamiltonian(FamilyMove):
 
     def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
         count, places = len(x), self.family.places
-        # sometimes shorter and more steps, for walkers where the density is steep
+        # at times there are more and shorter steps, for walkers where the density is steep
         h = self.angle * SHORTEST ** (random.uniform() ** 3)
         steps = int(np.clip(random.uniform(0.7, 1.3) * QUARTER_TURN / h + 0.5, 1, MOST_STEPS))
         h *= random.uniform(0.8, 1.0, (count, 1))
@@ -230,7 +236,7 @@ class Hamiltonian(FamilyMove):
 
 
 def _bounded(kick: Matrix) -> Matrix:
-    """Return kicks of one group's coordinates with bounded length."""
+    """Return changes of momentum of one group, reduced to a length of at most `STEEPEST`."""
     most = np.linalg.norm(np.clip(kick, -_FINITE, _FINITE), axis=1, keepdims=True) / STEEPEST
     return kick / np.maximum(most, 1.0)
 

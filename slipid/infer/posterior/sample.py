@@ -1,9 +1,10 @@
 """Posterior of a fit by sampling, and its file posterior.nc in the layout of ArviZ.
 
-Where currents were logged the posterior is p(motion | motion data) p(electric | motion, data). No
-single density describes it, since the normaliser of the second factor depends on the motion. So the
-motion is sampled first. Given the motion the electric numbers are nearly linear with Gaussian
-noise, so that Metropolis-Hastings steps with proposals around their most likely values draw them.
+Where currents were logged the posterior is p(motion | motion data) p(electric | motion, data). Its
+density cannot be evaluated, since the normalising constant of the second factor depends on the
+motion. Therefore the motion is sampled first. Given the motion, the residuals are nearly linear in
+the electric numbers, which are drawn by Metropolis-Hastings steps with proposals around their most
+likely values.
 """
 
 import importlib
@@ -43,18 +44,18 @@ from slipid.support.files import write_bytes
 from slipid.support.progress import Reporter
 
 for _module in ("arviz_base", "arviz_stats", "h5netcdf"):
-    importlib.import_module(_module)  # used after hours of sampling: missing ones must show now
+    importlib.import_module(_module)  # a missing package must fail here, not after hours
 
 STILL = 0.01
-"""Largest share of draws whose electric numbers never moved."""
+"""Largest fraction of draws whose electric numbers have no accepted proposal."""
 
 
 def sampled(
     fit: Fit, plan: Plan, draws: int, checkpoint: Checkpoint | None, report: Reporter
 ) -> Posterior:
-    """Sample the posterior of a fit with progress, and store its blocks in a checkpoint.
+    """Return the posterior of a fit, sampled with progress reports and checkpoints.
 
-    Sampling continues after the blocks that an earlier call has stored.
+    Sampling continues after the blocks that an earlier call has stored in the checkpoint.
     """
 
     def done(part: str) -> list[ChainBlock]:
@@ -79,7 +80,7 @@ def sampled(
 
 
 def _show_progress(block: ChainBlock, plan: Plan, report: Reporter) -> None:
-    """Show the progress of a chain; the time left is that of the plan's limit."""
+    """Show the progress of a chain; the remaining time is that to the plan's limit of blocks."""
     count = block.number + 1
     warm = "warm-up, " if count <= plan.warm_up[-1] else ""
     what = (
@@ -91,7 +92,7 @@ def _show_progress(block: ChainBlock, plan: Plan, report: Reporter) -> None:
 
 
 def sample(fit: Fit, plan: Plan, draws: int = 400, store: BlockStore | None = None) -> Posterior:
-    """Sample the posterior around a fit, with `draws` draws from each ensemble."""
+    """Return the posterior sampled around a fit, with `draws` draws from each ensemble."""
     problem, fitted = required(fit.problem), Fitted.of(fit)
     assert problem.multi_floor is None, "runs on one floor each"
     store = store or BlockStore()
@@ -135,7 +136,10 @@ def sample(fit: Fit, plan: Plan, draws: int = 400, store: BlockStore | None = No
 def thinned(
     chain: Chain, blocks: Sequence[ChainBlock], draws: int
 ) -> tuple[Float[np.ndarray, "ensemble draw size"], Float[np.ndarray, "ensemble draw"]]:
-    """Return draws spread evenly over steps and walkers; they repeat if there are too few."""
+    """Return positions and log densities of draws spread evenly over steps and walkers.
+
+    Draws are repeated if the chain has fewer steps than draws.
+    """
     log_prob = np.concatenate([b.log_prob for b in blocks], axis=1)
     _, steps, walkers, _ = chain.shape
     step = ((np.arange(draws) + 0.5) / draws * steps).astype(int)
@@ -146,10 +150,10 @@ def thinned(
 def drawn_variances(
     problem: Problem, fitted: Fitted, shape: tuple[int, int], seed: int
 ) -> Float[np.ndarray, "ensemble draw variance"]:
-    """Return draws of log variances from the Gaussian with their information at the fit.
+    """Return draws of log variances from the Gaussian with their expected information at the fit.
 
-    They hardly depend on the numbers of the model, so that the chains hold them fixed. The variance
-    of the floors' load biases, which are few, is drawn from its likelihood on a grid.
+    They hardly depend on the numbers of the model, so that they are fixed in the chains. The
+    variance of the load biases, of which there are few, is drawn from its posterior on a grid.
     """
     log_v, keep = fitted.log_variance, np.ones(len(problem.windows))
     electric = problem.electric(fitted.z, log_v)
@@ -173,12 +177,12 @@ def drawn_variances(
 
 SCHEMA = "slipid.posterior/1"
 REPLICATES = 50
-"""Number of replicated data sets of each ensemble."""
+"""Number of replicated data sets (posterior predictive draws) from each ensemble."""
 _AXES = ("x", "y", "yaw")
 
 
 def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
-    """Return all groups of the file, with further attributes of the file in `about`."""
+    """Return the content of posterior.nc; `about` holds further attributes of the file."""
     fit, problem = found.fit, required(found.fit.problem)
     w, robot, runs = problem.windows, problem.robot, [name for name, _ in fit.runs]
     values, dims, units = _numbers(problem.space, found)
@@ -228,7 +232,7 @@ def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
 
 
 def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
-    """Return the draws of every leaf with a free number, its dimensions and units."""
+    """Return draws of every quantity with a free number, and its dimensions and unit, by name."""
     shape = found.z.shape[:2]
     robots = jax.vmap(space.tree)(jnp.asarray(found.z.reshape(-1, space.size)))
     values, dims, units = {}, {}, {}
@@ -243,7 +247,10 @@ def _numbers(space: Space, found: Posterior) -> tuple[dict, dict, dict]:
 
 
 def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
-    """Return the draws of every noise component's std, floors side by side, and dimensions."""
+    """Return draws of every noise component's std, and their dimensions, by name.
+
+    Components of floors are joined to one array with the dimension `surface`.
+    """
     rows = np.moveaxis(np.exp(0.5 * found.log_variance), -1, 0)
     labels = problem.robot.surfaces.labels
     stds: dict[str, np.ndarray] = {}
@@ -253,7 +260,7 @@ def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
         if component.floor is None:
             stds[name], dims[name] = std, []
             continue
-        # a floor with runs of a single session has no component of sessions
+        # a floor with a single session has no session component: its std is zero
         whole = stds.setdefault(name, np.zeros((*std.shape, len(labels))))
         whole[..., labels.index(component.floor)], dims[name] = std, ["surface"]
     return stds, dims
@@ -262,10 +269,10 @@ def _noise(problem: Problem, found: Posterior) -> tuple[dict, dict]:
 def _data(
     problem: Problem, found: Posterior, new: dict[str, np.ndarray]
 ) -> tuple[dict, dict, dict]:
-    """Return the measurements of every window, their replicates, and dimensions.
+    """Return the measurements of every window, their replicates, and their dimensions, by name.
 
-    The replicates `new` are given less the measurements. Marker increments are in metres corrected
-    by the fitted camera.
+    `new` holds replicates less measurements. Marker increments are in metres corrected by the
+    fitted camera.
     """
     w = problem.windows
     middle = problem.space.tree(jnp.asarray(found.z.mean(axis=(0, 1))))
@@ -285,7 +292,7 @@ def _data(
 
 
 def write(made: DataTree, path: Path) -> None:
-    """Write the file atomically."""
+    """Write the tree to a NetCDF file, completely or not at all."""
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / path.name
         made.to_netcdf(whole, engine="h5netcdf")
@@ -297,9 +304,9 @@ def _replicates(
     x: Float[np.ndarray, "ensemble draw size"],
     log_variance: Float[np.ndarray, "ensemble draw variance"],
 ) -> dict[str, Float[np.ndarray, "ensemble replicate segment m"]]:
-    """Return replicated less measured data of every segment, from some draws of each ensemble.
+    """Return replicated less measured data of every segment, for `REPLICATES` draws per ensemble.
 
-    They are predicted less measured data, plus noise with the draw's own variances.
+    They are predicted less measured data, plus noise with the variances of the same draw.
     """
     picked = np.linspace(0, x.shape[1] - 1, REPLICATES).astype(int)
     some, noise = x[:, picked], log_variance[:, picked].reshape(-1, log_variance.shape[-1])

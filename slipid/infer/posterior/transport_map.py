@@ -1,19 +1,20 @@
 """Transport map: coordinates in which a posterior is nearly a standard Gaussian, learnt from draws.
 
-It is a triangular map (Knothe-Rosenblatt) from coordinates x to u:
+It is a triangular map (Knothe-Rosenblatt) from coordinates x to u, through v:
 
-    shared ones       v = L^-1 (x - m)
-    those of a group  w = L^-1 (x - m - B s), widest first
-                      v_i = (w_i - a_i(w_1 .. w_i-1)) exp(-b_i(w_1 .. w_i-1))
+    shared coordinates      v = L^-1 (x - m)
+    coordinates of a group  w = L^-1 (x - m - B s), those with the largest variance first
+                            v_i = (w_i - a_i(w_1 .. w_i-1)) exp(-b_i(w_1 .. w_i-1))
 
-with polynomials a and b, s the shared x - m, and a sinh-arcsinh map (Jones and Pewsey 2009,
-Biometrika 96, eq. 2) of every coordinate from v to u,
+with the mean m, Cholesky factors L of (conditional) covariances, regression coefficients B on the
+shared coordinates, s the shared part of x - m, and polynomials a and b. A sinh-arcsinh map (Jones
+and Pewsey 2009, Biometrika 96, eq. 2) leads from v to u, coordinate by coordinate:
 
     sinh(tail arcsinh((v - place) / scale) - skew)
 
-Groups depend on the shared coordinates and on their own polynomials, so that groups that are
-independent given the shared coordinates stay so. It is one of the maps of Marzouk et al. 2016
-(Sampling via measure transport, section 3).
+The map of a group depends on the shared coordinates and on the group itself only, so that groups
+that are independent given the shared coordinates remain independent. It is one of the maps of
+Marzouk et al. 2016 (Sampling via measure transport, section 3).
 """
 
 from collections.abc import Callable
@@ -31,19 +32,20 @@ from scipy.optimize import minimize
 Matrix = Float[np.ndarray, "_ _"]
 Vector = Float[np.ndarray, " _"]
 Leaf = Array | np.ndarray
-"""A numpy array while a map is learnt, a jax array in the inverse map."""
+"""A NumPy array while a map is learnt, a JAX array in the inverse map."""
 A = TypeVar("A", Array, np.ndarray)
 """Either kind of array; the result has the kind of the argument."""
 FAR = 4.0
-"""Distance beyond which polynomials stay constant [std]."""
+"""Size of a whitened coordinate w beyond which polynomials are constant [std]."""
 SQUARED = 5
-"""Number of the widest coordinates of a group whose squares and products are monomials."""
+"""Number of coordinates of a group, with the largest variances, whose squares and products are
+monomials."""
 CUBED = 3
-"""Number of the widest coordinates of a group whose cubes are monomials."""
+"""Number of coordinates of a group, with the largest variances, whose cubes are monomials."""
 WORTH = 3.0
 """Smallest gain in log likelihood for which a monomial is included [nat]."""
 MOST_MONOMIALS = 12
-"""Largest number of monomials in the mean and in the log std of a coordinate."""
+"""Largest number of monomials added for a coordinate, in its mean and log std together."""
 
 
 @jax.tree_util.register_dataclass
@@ -64,12 +66,12 @@ class Warp:
     tail: Leaf
 
     def forward(self, v: Matrix) -> Matrix:
-        """Return u of v."""
+        """Return the coordinates u of v."""
         inner = self.tail * np.arcsinh((v - self.place) / self.scale)
         return np.asarray(np.sinh(inner - self.skew))
 
     def back(self, u: Leaf) -> Array:
-        """Return v of u."""
+        """Return the coordinates v of u."""
         inner = (jnp.arcsinh(u) + self.skew) / self.tail
         return jnp.asarray(self.place + self.scale * jnp.sinh(inner))
 
@@ -88,7 +90,7 @@ class Warp:
 
     @staticmethod
     def learnt(draws: Matrix) -> "Warp":
-        """Return the map of maximum likelihood, column by column."""
+        """Return the map fitted to draws by (slightly penalised) likelihood, column by column."""
         return Warp(*np.array([_sinh_arcsinh(column) for column in draws.T]).T)
 
 
@@ -113,8 +115,8 @@ class Polynomials:
     """Polynomials a and b of a group's coordinates.
 
     Attributes:
-        factors: columns of (w, 1) whose product each monomial is.
-        shift: coefficients of a.
+        factors: indices of the three columns of (w, 1) whose product is the monomial.
+        shift: coefficients of a, by coordinate and monomial.
         scale: coefficients of b.
     """
 
@@ -128,7 +130,7 @@ class Polynomials:
         return np.asarray(columns[:, self.factors].prod(axis=2))
 
     def forward(self, w: Matrix) -> Matrix:
-        """Return v of w."""
+        """Return the coordinates v of w."""
         f = self.monomials(w)
         return np.asarray((w - f @ self.shift.T) * np.exp(-f @ self.scale.T))
 
@@ -145,7 +147,7 @@ class Polynomials:
 
     @staticmethod
     def learnt(w: Matrix, effective: float) -> "Polynomials":
-        """Return polynomials learnt from draws that are worth `effective` independent ones."""
+        """Return polynomials fitted to draws that count as `effective` independent ones."""
         size = w.shape[1]
         bend = Polynomials.none(size)
         f = bend.monomials(w)
@@ -157,10 +159,10 @@ class Polynomials:
 
 
 def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]:
-    """Return coefficients of the mean and of the log std of a Gaussian, most of them zero.
+    """Return coefficients of the mean and of the log std of w given monomials f, most of them zero.
 
-    Monomials are included one by one, the one with the largest score statistic first, as long as
-    it gains more than `WORTH` nats for the effective number of independent rows.
+    Monomials are included one by one, in order of their score statistics, as long as the next one
+    gains more than `WORTH` nats for `effective` independent rows.
     """
     shift, scale, means, spreads = np.zeros(f.shape[1]), np.zeros(f.shape[1]), [0], [0]
     share = effective / len(w)
@@ -185,7 +187,11 @@ def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]
 
 
 def _scores(f: Matrix, taken: list[int], residual: Vector) -> Vector:
-    """Return the squared residual along each column, orthogonal to the columns taken."""
+    """Return the squared projection of the residual on each column of f.
+
+    The part of a column that is orthogonal to the columns `taken` is used; a dependent column has
+    the score zero.
+    """
     others = f - f[:, taken] @ np.linalg.lstsq(f[:, taken], f, rcond=None)[0]
     square = (others**2).sum(axis=0)
     dependent = square < 1e-6 * (f**2).sum(axis=0)
@@ -198,12 +204,12 @@ MOST_DRAWS = 4000
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """Map of some coordinates given others.
+    """Map of the shared coordinates, or of a group's coordinates given the shared ones.
 
     Attributes:
         own: indices of the mapped coordinates.
         given: indices of the coordinates that they depend on.
-        slope: derivative of the own by the given coordinates.
+        slope: B, regression coefficients of the mapped coordinates on the given ones.
         root: Cholesky factor of the conditional covariance.
         bend: polynomials of the whitened residuals, None for shared coordinates.
     """
@@ -215,7 +221,7 @@ class Stage:
     bend: Polynomials | None
 
     def whitened(self, about: Matrix) -> Matrix:
-        """Return w, the whitened residuals of own coordinates, from all of x - m."""
+        """Return the whitened coordinates w of this stage, from all coordinates of x - m."""
         residual = about[:, self.own] - about[:, self.given] @ self.slope
         return np.asarray(np.linalg.solve(self.root, residual.T).T)
 
@@ -225,8 +231,8 @@ class Transport:
     """Map of vectors x (row, size) to u (row, size), and its inverse.
 
     Attributes:
-        mean: m.
-        stages: maps from x to v, each coordinate in one of them.
+        mean: m, mean of x.
+        stages: maps from x to v; each coordinate is in one of them.
         last: map from v to u.
     """
 
@@ -235,7 +241,7 @@ class Transport:
     last: Warp
 
     def forward(self, x: Matrix) -> Matrix:
-        """Return u of x."""
+        """Return the coordinates u of x."""
         about = x - self.mean
         v = np.empty_like(about)
         for s in self.stages:
@@ -244,7 +250,7 @@ class Transport:
         return self.last.forward(v)
 
     def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
-        """Return x of u, and the summands of log |dx/du| by coordinate (row, size)."""
+        """Return the coordinates x of u, and log |dx/du| as a sum over coordinates (row, size)."""
         x, log = _placed(self._back, u)
         return np.array(x), np.array(log)
 
@@ -254,7 +260,7 @@ class Transport:
 
     @cached_property
     def _back(self) -> "InverseSteps":
-        with jax.ensure_compile_time_eval():  # the property is cached, so it must hold no tracer
+        with jax.ensure_compile_time_eval():  # a cached property must not contain tracers
             return _steps(self)
 
 
@@ -263,18 +269,19 @@ class Transport:
 class InverseSteps:
     """Inverse map from u to x, one coordinate per step, in arrays of fixed shapes.
 
-    So XLA compiles it once, although stages and monomials change with every map learnt. With
-    columns of all w and of all x - m, zeros until their step, and of ones:
+    Because of the fixed shapes XLA compiles it once, although stages and monomials differ between
+    maps. Steps work on a matrix with the columns of all w, of all x - m, which are zero until their
+    step, and a column of ones:
 
         w_i = f_i . shift_i + exp(f_i . scale_i) v_i,   x_i - m_i = columns . slope_i
 
     Attributes:
-        mean: m.
+        mean: m, mean of x.
         last: map from v to u.
-        order: coordinate of each step.
+        order: index of each step's coordinate.
         slope: weights of the columns in x_i - m_i.
-        root: log dx/dw of each step.
-        factors: columns whose product each monomial is (step, term, 3).
+        root: log dx_i / dw_i of each step.
+        factors: columns whose product is each monomial (step, term, 3).
         shift: coefficients of the mean of w_i.
         scale: coefficients of the log std of w_i.
     """
@@ -313,7 +320,7 @@ def _steps(map: Transport) -> InverseSteps:
 
 
 _Step = tuple[Array, Array, Array, Array, Array, Array]
-"""A row of `InverseSteps`: place, slope, root, factors, shift, scale."""
+"""One step of `InverseSteps`: order, slope, root, factors, shift, scale."""
 
 
 @jax.jit
@@ -344,15 +351,15 @@ def _pulled(map: InverseSteps, u: Array, slope: Array) -> Array:
 
 
 def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray) -> Transport:
-    """Return the map of a Gaussian; `group` is each coordinate's group, -1 for a shared one."""
+    """Return the linear map of a Gaussian; `group` holds each coordinate's group, -1 if shared."""
     return Transport(mean, _stages(covariance, group, covariance), Warp.none(len(mean)))
 
 
 def _stages(covariance: Matrix, group: np.ndarray, at_mode: Matrix) -> tuple[Stage, ...]:
     """Return the stages of a Gaussian, shared coordinates first, then group by group.
 
-    Coordinates that are widest at the mode come first in a stage: the direction of a curved valley
-    shows at the mode, whereas draws are wide across it as well.
+    Coordinates with the largest conditional variance at the mode come first in a stage: at the mode
+    these are the ones along a curved valley, whereas draws have large variances across it as well.
     """
     stages, shared = [], np.flatnonzero(group < 0)
     for g in range(-1, int(group.max()) + 1):
@@ -374,9 +381,10 @@ def _given(covariance: Matrix, own: np.ndarray, given: np.ndarray) -> tuple[Matr
 
 
 def learnt(draws: Matrix, effective: float, covariance: Matrix, group: np.ndarray) -> Transport:
-    """Return the map learnt from draws (draw, size) worth about `effective` independent ones.
+    """Return the map learnt from draws (draw, size), which count as `effective` independent ones.
 
-    The Laplace covariance has the weight of as many draws as there are coordinates.
+    The Laplace covariance is averaged in, with the weight of as many draws as there are
+    coordinates.
     """
     some = draws[:: max(1, len(draws) // MOST_DRAWS)]
     size, mean = some.shape[1], some.mean(axis=0)

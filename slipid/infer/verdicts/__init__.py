@@ -1,1 +1,1 @@
-"""Verdicts: identified numbers, flat directions, disputes and trust in a fit."""
+"""Verdicts on fits: identified numbers, flat directions, disputed loads, and trust in a fit."""

@@ -1,14 +1,15 @@
 """Overall judgement of a fit: floors that disagree about the wheel loads, and trust in the fit.
 
 Each floor has load biases of its own (`slipid.model.contact_law`). Their prior is estimated from
-all floors and keeps them near zero, and the intervals of the loads include it. The test for real
-disagreement removes it. With L the precision of the fit, P0 the part of it from this prior, and P1
-the precision of a prior so wide that it is uninformative, the biases z change by
+all floors and keeps them near zero; the intervals of the loads take this prior into account. The
+test for disagreement removes it. With L the precision of the fit, P0 the part of L from this prior,
+and P1 the precision of an uninformative prior, the search vector z, relative to its prior mean,
+changes by
 
     d = (L + P1 - P0)^-1 (P0 - P1) z
 
-and the squared difference of two floors' biases over its covariance is a chi-square variable if the
-contact law holds for both.
+and the difference of two floors' biases, squared and divided by its covariance, is a chi-square
+variable if the contact law holds for both.
 
 A fit is trusted if it converged, predicts its runs, and has the numbers of a physical robot.
 """
@@ -35,7 +36,12 @@ _WIDE = 1.0
 
 @dataclass(frozen=True)
 class Dispute:
-    """Two floors, and the distance of their load estimates [standard error]."""
+    """Disagreement of two floors about the loads on the wheels.
+
+    Attributes:
+        floors: names of the floors.
+        sigma: difference of their load estimates [standard error].
+    """
 
     floors: tuple[str, str]
     sigma: float
@@ -50,9 +56,9 @@ class Dispute:
 
 
 def disputes(space: Space, z: Search, covariance: Square) -> tuple[Dispute, ...]:
-    """Return pairs of floors whose load biases differ by more than noise, the worst first.
+    """Return pairs of floors whose load biases differ by more than noise, largest difference first.
 
-    The prior of the biases in the space has the fitted std (`Space.with_pooled`).
+    The prior of the biases in `space` must have the fitted std (`Space.with_pooled`).
     """
     bias = {e.surface: space.slices[e.path] for e in space.free if e.declaration.deviation}
     if len(bias) < 2:
@@ -74,7 +80,7 @@ def disputes(space: Space, z: Search, covariance: Square) -> tuple[Dispute, ...]
 
 
 def marked(numbers: Mapping[str, Estimate], found: Sequence[Dispute]) -> dict[str, Estimate]:
-    """Return the numbers with identified loads marked as disputed if floors disagree."""
+    """Return the numbers; identified load shares have the verdict `disputed` if floors disagree."""
     return {
         path: replace(e, verdict="disputed")
         if found and path.startswith("robot.load_share@") and e.verdict == "identified"
@@ -86,13 +92,13 @@ def marked(numbers: Mapping[str, Estimate], found: Sequence[Dispute]) -> dict[st
 Word = Literal["trusted", "doubtful", "not to be trusted"]
 WORDS: tuple[Word, ...] = ("trusted", "doubtful", "not to be trusted")
 WORSE, MUCH_WORSE = 1.1, 1.5
-"""Ratios of the model's error to that of encoders above which a fit is doubtful, or useless."""
+"""Ratios of the model's to the encoders' error above which a fit is doubtful, not to be trusted."""
 SMALL = 0.005
-"""Difference of the two errors below which neither model is better."""
+"""Difference of model's and encoders' end-point errors over path length that does not count."""
 ABSURD = 0.5
-"""End-point error over path length above which no model is useful."""
+"""End-point error over path length above which a model is useless."""
 MANY_AT_BOUNDS = 3
-"""Count of numbers at their bounds from which a fit is not to be trusted."""
+"""Smallest count of numbers at their bounds for which a fit is not to be trusted."""
 PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "motor.resistance": (1e-3, 1e3),
     "motor.back_emf": (1e-4, 10.0),
@@ -107,7 +113,12 @@ PLAUSIBLE: Mapping[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class EndPoints:
-    """Mean open-loop end-point errors over path length on a floor, of model and encoders."""
+    """Mean open-loop end-point errors on a floor, divided by the path length.
+
+    Attributes:
+        model: error of the fitted model.
+        encoders: error of encoders without slip.
+    """
 
     model: float
     encoders: float
@@ -135,10 +146,10 @@ class _Reason:
 def verdict_of_trust(
     floors: Mapping[str, EndPoints], converged: bool, parameters: Iterable[Estimate]
 ) -> Trust:
-    """Return the trust in a fit: the worst of its errors, its convergence and its numbers.
+    """Return the trust in a fit, by its worst aspect: errors, convergence or fitted numbers.
 
     Args:
-        floors: errors by name of the floor, of held-out runs where there are any.
+        floors: errors by floor, of held-out runs where there are any.
         converged: True if the fit converged.
         parameters: every number of the fit.
     """
@@ -155,7 +166,7 @@ def verdict_of_trust(
 
 
 def _of_errors(floors: Mapping[str, EndPoints]) -> Iterator[_Reason]:
-    """Yield reasons from open-loop errors, floor by floor."""
+    """Yield reasons against a fit from its open-loop errors, floor by floor."""
     for name, e in floors.items():
         both = f"{100 * e.model:.1f} % of the path, encoders alone by {100 * e.encoders:.1f} %"
         if not isfinite(e.model):
@@ -168,7 +179,7 @@ def _of_errors(floors: Mapping[str, EndPoints]) -> Iterator[_Reason]:
 
 
 def _of_numbers(numbers: list[Estimate]) -> Iterator[_Reason]:
-    """Yield reasons from numbers that are implausible or at their bounds."""
+    """Yield reasons against a fit from numbers that are implausible or at their bounds."""
     for e in numbers:
         for pattern, (low, high) in PLAUSIBLE.items():
             value = np.atleast_1d(np.asarray(e.value, float))

@@ -1,6 +1,6 @@
 """Intervals and verdicts of every number and of ratios of numbers.
 
-They come from the expected information before a fit, and from the Laplace posterior after it.
+Before a fit they are computed from the expected information, after it from the Laplace posterior.
 """
 
 from collections.abc import Collection, Sequence
@@ -16,26 +16,36 @@ from slipid.parameter import Declaration, Entry
 from slipid.search_space import Choice, Space
 
 IDENTIFIED, WEAK = 0.3, 0.8
-"""Largest std(posterior) / std(prior) of these verdicts, in the search space."""
+"""Largest std(posterior) / std(prior), in the search space, for `identified` and for `weak`."""
 FROM_ZERO = 3.0
-"""Smallest distance of an identified positive number from 0, in stds of the number itself: the
-likelihood of a small number is flat towards 0, however narrow the interval of its logarithm is."""
+"""Smallest ratio of an identified positive number to its std.
+
+The likelihood of a number closer to 0 is flat towards 0, even if its logarithm has a narrow
+interval.
+"""
 TAIL, SMALL = 4.0, 0.05
-"""A positive number counts as 0 if it is this many prior stds below its prior mean and below this
-fraction of it; the second condition excludes a tight prior that the data contradict."""
+"""Limits for a positive number that counts as being at its bound 0.
+
+It is more than `TAIL` prior stds below its prior mean and less than `SMALL` times that mean. The
+second condition excludes numbers with a narrow prior that the data contradict.
+"""
 NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
-"""Numbers whose scale only a voltage determines; priors of other numbers must not lend them one."""
+"""Numbers that are not identified without voltages.
+
+Without voltages their scale is determined by priors of other numbers only.
+"""
 Z95 = 1.6448536269514722
 """The 95 % quantile of a standard Gaussian."""
 LARGEST = 600.0
-"""Largest exponent at an end of an interval, which would overflow for an unknown number."""
+"""Largest logarithm at an end of an interval; exp of larger ones would overflow."""
 
 
 class ParameterRatio(NamedTuple):
     """Quotient of two positive numbers that may be identified where neither of them is.
 
     Attributes:
-        over: quantity of the numerator, on every floor if floors have their own.
+        over: quantity of the numerator; if floors have values of their own, there is a quotient for
+            every floor.
         under: path of the denominator.
         unit: unit of the quotient.
         doc: meaning of the quotient.
@@ -62,11 +72,11 @@ RATIOS = (
         "camera.scale", "robot.wheel_radius", "1/m", "all that motion without slip determines"
     ),
 )
-"""Quotients with a verdict of their own, if both numbers are free.
+"""Quotients that have a verdict of their own, if both numbers are free.
 
-The resistance enters only the voltage equation: contact forces determine the motion of the body,
-and currents follow from them with the torque constant. So without a voltage not even R / C_e is
-identified, unlike in models that read slip from R I^2 + C_e I wm.
+The resistance occurs in the voltage equation only: contact forces determine the motion of the body,
+and with the torque constant they determine the currents. Without voltages not even R / C_e is
+identified, in contrast to models that compute slip from R I^2 + C_e I wm.
 """
 
 
@@ -83,11 +93,13 @@ class Estimate:
         std: a float, or one per label, None for a fixed number [unit].
         interval90: equal-tailed interval (low, high), or one such pair per label [unit].
         verdict: identified, weak, disputed, not_identified, at_bound or fixed; a vector has the
-            verdict of its worst direction.
-        provenance: measured (the data decide), borrowed (a prior decides) or override (a choice
-            fixed it: the user's, or slipid's if all runs have one speed).
-        ratio: std(posterior) / std(prior) in the search space, None for a fixed number.
-        pull: (estimate - prior mean) / std(prior), the largest of a vector, None if fixed.
+            verdict of its least determined direction.
+        provenance: measured (determined by data), borrowed (by a prior or a default) or override
+            (fixed by a choice: the user's, or slipid's if all runs have one speed).
+        ratio: std(posterior) / std(prior) in the search space, the largest over the directions of a
+            vector, None for a fixed number.
+        pull: (estimate - prior mean) / std(prior), the largest in magnitude of a vector, None for a
+            fixed number.
         prior_mean: mean of the prior, None for a fixed number [unit].
         prior_std: std of the prior, None for a fixed number [unit].
         source: `laplace` or `posterior`.
@@ -123,7 +135,7 @@ def estimates(
         space: free and fixed numbers.
         choices: user's choices.
         z: search vector of the estimate.
-        covariance: its covariance.
+        covariance: covariance of the search vector.
         has_voltage: True if voltages were logged.
         flat: paths of the numbers that change along flat directions.
     """
@@ -223,13 +235,13 @@ def _at_bound(d: Declaration, value: np.ndarray, pull: np.ndarray, prior_std: np
 
 
 def from_zero(declaration: Declaration, std_z: Float[np.ndarray, " coordinate"]) -> float:
-    """Return the distance of a positive number from 0 [std], infinity for any other number."""
+    """Return the ratio of a positive number to its std, infinity for any other number."""
     positive = np.isfinite(declaration.lower) and not np.isfinite(declaration.upper)
     return float(1 / std_z.max()) if positive and not declaration.shares else np.inf
 
 
 def by_ratio(ratio: float, from_zero: float = np.inf) -> str:
-    """Return the verdict for a ratio of stds and a positive number's distance from 0 [std]."""
+    """Return the verdict for std(posterior) / std(prior) and a number's distance from 0 [std]."""
     if ratio < IDENTIFIED and from_zero >= FROM_ZERO:
         return "identified"
     return "weak" if ratio < WEAK else "not_identified"
@@ -240,14 +252,14 @@ def verdict_of(
 ) -> tuple[str, str]:
     """Return verdict and provenance of a number, after a fit or after sampling.
 
-    Below a ratio of 1/sqrt(2) the data hold more information than the prior. A number that changes
-    along a flat direction is identified only as part of a ratio at most: however narrow its
-    interval is, another number's prior determines its scale.
+    At a ratio below 1/sqrt(2) the data have more information than the prior. A number that changes
+    along a flat direction is at most identified in a ratio with others: its scale, however narrow
+    its interval, is determined by another number's prior.
 
     Args:
         ratio: std(posterior) / std(prior).
         from_zero: distance of a positive number from 0 [std].
-        forced: verdict that holds whatever the interval is.
+        forced: verdict that replaces the one by `ratio`, None for none.
         is_flat: True if the number changes along a flat direction.
     """
     verdict = forced or by_ratio(ratio, from_zero)
@@ -258,10 +270,10 @@ def verdict_of(
 
 
 def derived(space: Space, z: Search, covariance: Square, has_voltage: bool) -> tuple[Estimate, ...]:
-    """Return `RATIOS` with interval and verdict: the log of each is a difference of coordinates.
+    """Return the quotients `RATIOS` with intervals and verdicts.
 
-    The verdict compares its posterior std, sqrt(c^T C c) with c = (.., 1, .., -1, ..), with that
-    of the prior.
+    The logarithm of a quotient is a difference of two coordinates. Its verdict follows from the
+    ratio of its posterior std, sqrt(c^T C c) with c = (.., 1, .., -1, ..), to its prior std.
     """
     return tuple(
         _quotient(space, wanted, over.path, z, covariance, has_voltage)

@@ -1,15 +1,16 @@
-"""Profile likelihood of one number: the rise of the loss when the number is held elsewhere.
+"""Profile likelihood of one number: the loss as a function of the number, the others refitted.
 
-With -log posterior f and the other numbers eta,
+With f minus the log posterior, theta the number and eta all others,
 
     F(theta) = min over eta of f(theta, eta),    D(theta) = F(theta) - F at its minimum
 
-D is half a squared distance in stds if the Laplace approximation holds. The 90 % interval of the
-likelihood is the range where D without the term of the number's own prior stays below
-chi2_1(0.9) / 2 = 1.353.
+D is half the squared distance from the estimate in stds if the Laplace approximation holds. The
+90 % interval of the likelihood is the range in which D, without the term of the number's own prior,
+is below chi2_1(0.9) / 2 = 1.353. A profile that remains level shows that the number is not
+identifiable.
 
 Source: Venzon and Moolgavkar 1988 (Applied Statistics 37(1)); Raue et al. 2009 (Bioinformatics
-25(15)): a profile that stays level shows that a number is not identifiable.
+25(15)).
 """
 
 from collections.abc import Callable
@@ -32,13 +33,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RISE = float(chi2.ppf(0.9, 1)) / 2
-"""Rise of minus log likelihood at the ends of the 90 % interval."""
+"""Rise of minus log likelihood, above its minimum, at the ends of the 90 % interval."""
 _ENOUGH, _TOO_FAR = 1.5 * RISE, 3 * RISE
-"""Rise at which a side is complete, and rise above which a step jumped over the interval's end."""
+"""Rise at which one side of a profile is complete, and rise above which the last step was too long
+if the point before it lies within the interval."""
 _FAR = 3.0
-"""Distance from the prior mean at which a side ends: values beyond are implausible [prior std]."""
+"""Largest distance from the prior mean to which a side is followed [prior std]."""
 _LEAST, _MOST = 0.1, 24
-"""Shortest step that is halved [Laplace std], and largest number of points on a side."""
+"""Shortest step that is still halved [Laplace std], and largest number of points on a side."""
 
 
 @dataclass(frozen=True)
@@ -48,15 +50,16 @@ class Profile:
     Attributes:
         path: name of the number.
         unit: unit of the number.
-        value: values at which the number was held, rising [unit].
+        value: values at which the number was fixed, in rising order [unit].
         posterior: D at each value, with the number's own prior.
         likelihood: D at each value without that prior, 0 at its minimum.
-        laplace: parabola of the Laplace posterior in the search space, conditional on `given`.
+        laplace: D at each value by the Laplace approximation, conditional on `given`.
         estimate: value of the fit [unit].
-        interval90: interval of the likelihood, None on an open side [unit].
-        ends: for each side `closed`, `open` (level as far as the prior reaches) or `at_bound`
-            (level up to the number's bound, which then ends the interval).
-        given: numbers that were held at the fit's values, in words; empty if all were refitted.
+        interval90: 90 % interval of the likelihood, None for the end of an open side [unit].
+        ends: kind of each side: `closed`, `open` (the likelihood does not fall to the end of the
+            interval within the range followed) or `at_bound` (the same, but the number's bound ends
+            the interval).
+        given: numbers that were fixed at the fit's values, as text; empty if all were refitted.
         settled: True if every refit converged.
         sentence: result in one sentence for people.
     """
@@ -78,14 +81,14 @@ class Profile:
         return self.sentence
 
     def plot(self) -> "Figure":
-        """Draw the rise of the loss when the number is held elsewhere."""
+        """Draw the rise of the loss over the values of the number."""
         from slipid.plots.posterior import profile_figure
 
         return profile_figure([self])
 
 
 def profiled(space: Space, path: str) -> Entry:
-    """Return the free scalar of a path.
+    """Return the declared number of a path, which must be free and a scalar.
 
     Raises:
         ValueError: the number does not exist, is fixed or a vector; the message lists the choices.
@@ -107,10 +110,10 @@ def profile(
 ) -> Profile:
     """Return the profile of a number around a fit, all other numbers refitted at each point.
 
-    The variances stay as fitted. Where currents were logged, an electric number is profiled given
-    the motion, and a number of the motion by the motion's likelihood; the Laplace parabola beside
-    it is conditional on the same. `progress` is called after every point with the count of points
-    and the rise there.
+    The variances are those of the fit. Where currents were logged, an electric number is profiled
+    with the motion as fitted, and a number of the motion with the likelihood of motion data only;
+    so is the Laplace approximation that is returned for comparison. `progress` is called after
+    every point with the count of points and the rise there.
     """
     entry = profiled(problem.space, path)
     at = problem.space.slices[path].start
@@ -177,7 +180,7 @@ class _Refits:
         self.lowest = self.loss(optimum.state)
 
     def loss(self, state: FitState) -> float:
-        """Return minus the log posterior at fixed noise, of the motion alone for its numbers."""
+        """Return minus the log posterior at fixed noise; without currents for a motion number."""
         problem, log_v = self.problem, state.log_variance
         blocks, _ = problem.linear(jnp.asarray(state.z), self.electric)
         if self.of_motion:
@@ -189,7 +192,10 @@ class _Refits:
         return problem.loss(state.z, log_v, keep, seen, self.electric)
 
     def side(self, sign: float) -> list[tuple[float, float]]:
-        """Return points from the estimate outward, until the loss or the prior ends the side."""
+        """Return points (coordinate, loss) from the estimate outward, downward for sign -1.
+
+        A side ends where the loss has risen by `_ENOUGH`, or `_FAR` from the prior mean.
+        """
         points: list[tuple[float, float]] = []
         state, step, before = self.state, 0.5 * self.std, 0.0
         mean, wide = self.problem.space.prior_mean[self.at], self.problem.space.prior_std[self.at]
@@ -223,7 +229,10 @@ class _Refits:
 
 
 def _crossing(z: np.ndarray, rise: np.ndarray) -> float | None:
-    """Return where the rise first reaches `RISE` going outward, by monotone cubic interpolation."""
+    """Return the first value, going outward, at which the rise is `RISE`, None if it stays below.
+
+    The rise is interpolated by a monotone cubic.
+    """
     above = np.flatnonzero(rise >= RISE)
     if not above.size:
         return None

@@ -1,13 +1,13 @@
-"""Flat directions of the parameter space, as formulas for people with the data that would help.
+"""Flat directions of the parameter space, with formulas and remedies as texts for people.
 
-In coordinates scaled by the prior's stds the information P = S C^-1 S of prior and data has the
-eigenvalue 1 where the data are uninformative. A direction u is flat if u^T P u < 1 / 0.8^2: a step
-of one prior std along it hardly changes the likelihood, even with all other numbers known. The
-directions that change few numbers are sought: a sparse basis, found by leaving out numbers one by
-one.
+In coordinates scaled by the prior stds S, the information P = S C^-1 S of prior and data has the
+eigenvalue 1 where the data are uninformative (C: covariance of the fit). A direction u is flat if
+u^T P u < 1 / 0.8^2: a step of one prior std along it hardly changes the likelihood, even if all
+other numbers are known. The result is a sparse basis of the flat directions, so that each changes
+few numbers; it is found by leaving out numbers one by one.
 
-Where currents were logged, a direction of the motion's numbers alone is judged by the information
-of the motion, as if the electric numbers were unknown.
+Where currents were logged, a direction of motion numbers only is judged by the information about
+the motion, as if the electric numbers were unknown.
 """
 
 from collections.abc import Iterable, Mapping
@@ -24,18 +24,21 @@ from slipid.parameter import Entry
 from slipid.search_space import Space
 
 NOTICED = 1 / WEAK**2
-"""Information along a direction from which it is not flat; that of the prior is 1."""
+"""Information along a unit direction at which it is no longer flat; that of the prior is 1."""
 TORQUE_SCALE = (
     "motor.back_emf",
     "motor.coulomb_friction",
     "motor.viscous_friction",
     "surface.friction",
 )
-"""Numbers that a common factor scales without any change of the currents."""
+"""Quantities that can be multiplied by a common factor without any change of the currents."""
 _NO_EFFECT = 1.02
-"""Information of uninformative data: such directions come first, with exact powers."""
+"""Information along a direction below which the data are uninformative about it.
+
+Such directions are searched first.
+"""
 _PART = 0.3
-"""Smallest prior-scaled step, or power, of a named number relative to the largest one."""
+"""Smallest prior-scaled step, or power, of a number named in a formula, relative to the largest."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,13 @@ class FlatDirection:
 
 
 class _Precision:
-    """Information P in prior-scaled coordinates, with that of the motion alone beside it."""
+    """Information P in prior-scaled coordinates.
+
+    Attributes:
+        given: information P of all numbers.
+        electric: mask of the electric numbers, None without currents.
+        motion: information about the motion numbers with the electric ones marginalised.
+    """
 
     def __init__(self, given: Square, electric: np.ndarray | None = None):
         self.given, self.electric = given, electric
@@ -81,7 +90,7 @@ class _Precision:
         return float(u @ self.of(picked) @ u)
 
     def flattest(self, picked: list[int]) -> tuple[float, np.ndarray]:
-        """Return the least information along a unit vector of these coordinates, and the vector."""
+        """Return the smallest information along a unit vector of coordinates, and that vector."""
         values, vectors = np.linalg.eigh(self.of(picked))
         return float(values[0]), vectors[:, 0]
 
@@ -94,17 +103,18 @@ def flat_directions(
     validity: Mapping[str, Validity] | None = None,
     sideways: bool = True,
 ) -> tuple[FlatDirection, ...]:
-    """Return directions in which the data narrow the prior by less than a fifth.
+    """Return directions in which the data reduce the std of the prior by less than a fifth.
 
-    Numbers without information come first, each by itself, since they would mix into the
-    directions of others. The yaws of single sessions and deviations of floors are taken as known.
+    Numbers about which the data have no information come first, each by itself, since they would
+    otherwise be part of other directions. Marker yaws of single sessions and load biases of floors
+    are taken as known.
 
     Args:
         space: free numbers and their priors.
         covariance: Laplace covariance of the search vector.
         has_current: True if currents were logged.
         has_voltage: True if voltages were logged.
-        validity: driven ranges by floor, for definite remedies.
+        validity: ranges that the runs on each floor cover, from which remedies are derived.
         sideways: True if the robot can drive in any direction.
     """
     axes = [axis for e in space.free for axis in axes_of(e)]
@@ -157,12 +167,18 @@ def sentences(found: Iterable[FlatDirection]) -> tuple[str, ...]:
 def _sparse(
     precision: _Precision, among: list[int], symmetry: list[int], move: Search
 ) -> list[tuple[list[int], Float[np.ndarray, " some"]]]:
-    """Return a basis of the flat directions, each a unit vector that needs all its coordinates.
+    """Return a basis of the flat directions, as pairs of coordinates and a unit vector on them.
 
-    After each direction its largest coordinate (the first of equal ones) counts as known, as in
-    Gaussian elimination, so that the next direction differs. The symmetry, if these data have it,
-    comes first and as a whole, since the search would find parts of it. `move` is the prior-scaled
-    step of each coordinate in it.
+    No coordinate of a direction can be left out without making it informative. After each direction
+    its largest coordinate (the first of equal ones) counts as known, as in Gaussian elimination, so
+    that directions are independent.
+
+    Args:
+        precision: the information.
+        among: indices of the coordinates that are searched.
+        symmetry: indices of coordinates that a common factor may scale. This direction comes first
+            and complete if it is flat, since the search would only find parts of it.
+        move: prior-scaled step of each coordinate when its number is multiplied by a factor.
     """
     alone = [k for k in among if precision.of([k])[0, 0] < NOTICED]
     found = [([k], np.ones(1)) for k in alone]
@@ -189,7 +205,7 @@ def _sparse(
 def _without_one(
     precision: _Precision, picked: list[int], u: np.ndarray, limit: float
 ) -> tuple[list[int], np.ndarray] | None:
-    """Return a flat direction with one coordinate less, None if every one is needed."""
+    """Return a flat direction with one coordinate less, None if there is none."""
     for drop in np.argsort(np.abs(u)):
         fewer = [k for j, k in enumerate(picked) if j != drop]
         if fewer:
@@ -204,9 +220,9 @@ def _named(
 ) -> np.ndarray:
     """Return a mask of the numbers of a direction that its formula names.
 
-    These have a good share of the step. Without any information in the data, numbers with a large
-    power are named as well: a wide prior makes the step of a number small whose scale is as open
-    as that of the others.
+    These are the numbers with large prior-scaled steps (`_PART`). If the data have no information
+    along the direction, numbers with large powers are named as well: a number with a wide prior has
+    a small prior-scaled step even if its scale is as uncertain as that of the others.
     """
     main = np.abs(u) >= _PART * np.abs(u).max()
     if precision.along(picked, u) < _NO_EFFECT and len({axis.is_log for axis in axes}) == 1:
@@ -218,7 +234,11 @@ def _named(
 def _rounded(
     precision: _Precision, picked: list[int], u: np.ndarray, std: np.ndarray, main: np.ndarray
 ) -> np.ndarray:
-    """Return the step of one prior std, with named powers rounded to halves if it stays flat."""
+    """Return the step along a direction; powers of named numbers are rounded to multiples of 1/2.
+
+    They are not rounded if the rounded direction is not flat. The step has unit length in prior
+    stds.
+    """
     step = u * std
     top = float(np.abs(step[main]).max())
     halves = np.where(main, np.round(2 * step / top) / 2 * top, step)

@@ -1,4 +1,4 @@
-"""Texts on flat directions: a formula in words, and the logs or runs that would resolve it."""
+"""Texts on flat directions: a formula in words, and the logs or runs that would determine it."""
 
 from collections.abc import Mapping, Sequence, Set
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from slipid.model.robot import Validity
 from slipid.parameter import Entry
 
 _LARGE = 10.0
-"""Ratio of powers above which a product formula would not be readable."""
+"""Ratio of powers from which a product formula is not used, as it would be hard to read."""
 _SAME = 0.05
 """Difference below which two powers count as equal."""
 
@@ -25,7 +25,7 @@ class Axis(NamedTuple):
         entry: number that the coordinate belongs to.
         label: name for people.
         unit: unit of a step along the coordinate.
-        is_log: True if a step multiplies the number.
+        is_log: True if a step along the coordinate multiplies the number by a factor.
     """
 
     entry: Entry
@@ -35,7 +35,7 @@ class Axis(NamedTuple):
 
 
 def axes_of(entry: Entry) -> list[Axis]:
-    """Return the coordinates of a free number; those of shares are log ratios."""
+    """Return the coordinates of a free number; those of load shares are log ratios."""
     d = entry.declaration
     unit = "log-odds" if np.isfinite(d.upper) else d.unit
     is_log = bool(np.isfinite(d.lower) and not np.isfinite(d.upper))
@@ -51,7 +51,13 @@ def axes_of(entry: Entry) -> list[Axis]:
 
 
 def formula(axes: list[Axis], power: np.ndarray, step: np.ndarray) -> str:
-    """Return a direction in words, from powers relative to the largest or one prior std's step."""
+    """Return a flat direction in words.
+
+    Args:
+        axes: the coordinates that change.
+        power: their powers or multiples, relative to the largest one.
+        step: their changes for a step of one prior std along the direction.
+    """
     names = [axis.label for axis in axes]
     if len(axes) == 1:
         return NOTHING + names[0]
@@ -90,7 +96,10 @@ def _product(axes: list[Axis], power: np.ndarray) -> str:
 
 
 def _pair(names: list[str], power: np.ndarray) -> tuple[str, str, float]:
-    """Return two names, and the power of the second over the first, ordered so that |k| >= 1."""
+    """Return two names, and k, the power of the second over that of the first.
+
+    The names are ordered so that |k| >= 1.
+    """
     k = float(power[1] / power[0])
     return (names[0], names[1], k) if abs(k) >= 1 else (names[1], names[0], 1 / k)
 
@@ -112,7 +121,7 @@ def _sum(names: list[str], weight: np.ndarray) -> str:
 
 
 def _short(axes: list[Axis]) -> list[str]:
-    """Return the names, with one pattern in place of the frictions of several floors."""
+    """Return the names of coordinates, with one pattern for the frictions of several floors."""
     others = [axis.label for axis in axes if axis.entry.quantity != "surface.friction"]
     several = len(axes) - len(others) > 1
     return [*others, "surface.*.friction"] if several else [axis.label for axis in axes]
@@ -143,15 +152,18 @@ _CAMERA = (
     (("camera.scale",), "measure a length in the camera's picture"),
     (("robot.wheel_radius",), "measure the wheel radius"),
 )
-"""Quantities that must all occur (any of a floor), and their remedy; the first match counts."""
+"""Remedies for flat directions: the first whose quantities all occur in the direction is used.
+
+`_FLOOR` stands for any quantity of a floor.
+"""
 FEW_HEADINGS = 4
-"""Number of headings, opposite ones counted as two, below which the remedy asks for more."""
+"""Number of headings below which the remedy asks for more; opposite ones count as two."""
 TURNING = 0.05
-"""Yaw rate by the encoders from which a run is a curve [rad/s]."""
+"""Yaw rate by the encoders above which a run counts as a curve [rad/s]."""
 LITTLE_SLIP = 0.03
-"""Slip below which a floor hardly affects the motion."""
+"""Slip below which the parameters of a floor hardly affect the motion."""
 SPEEDS_DIFFER = 1.3
-"""Factor between two speeds from which they count as two."""
+"""Ratio of two speeds above which they count as different."""
 
 
 def remedy(
@@ -167,7 +179,7 @@ def remedy(
         found: numbers of the direction.
         has_current: True if currents were logged.
         has_voltage: True if voltages were logged.
-        validity: driven ranges by floor.
+        validity: ranges that the runs on each floor cover.
         sideways: True if the robot can drive in any direction.
     """
     quantities = {e.quantity for e in found}
@@ -222,7 +234,7 @@ def _runs(found: Sequence[Entry], validity: Mapping[str, Validity], sideways: bo
 
 
 def listed(parts: Sequence[str]) -> str:
-    """Return the parts as a list within a sentence."""
+    """Return the parts joined by commas and a final "and"."""
     return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]
 
 

@@ -78,7 +78,7 @@ class Split:
 
 
 def base_of(floor: str) -> str:
-    """Return the name of a floor without that of the load set-up that follows it."""
+    """Return the name of a floor without a load set-up, which may follow after `@`."""
     return floor.partition("@")[0]
 
 

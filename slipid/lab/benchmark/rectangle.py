@@ -36,7 +36,7 @@ STARTS = 8
 
 @dataclass(frozen=True)
 class RectangleTask:
-    """Identification of the test site's robot, and its closed-loop runs.
+    """Task that identifies the test site's robot and drives it in closed-loop runs.
 
     Attributes:
         options: options of the benchmark.

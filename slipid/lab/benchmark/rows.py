@@ -38,7 +38,7 @@ def _every() -> list[SlipModel]:
 
 
 ROWS = tuple(method.name for method in _every())
-"""Names of all rows."""
+"""Names of the rows of all published systems."""
 
 
 def rows(spec: RobotSpec) -> list[SlipModel]:

@@ -103,7 +103,8 @@ def _windows(
     dt = np.diff(np.concatenate([[0.0], np.cumsum(run.signals.dt)])[edges])[:, None]
     true = body_increments(run.pose[edges]) / dt * spec.size
     estimate = body_increments(predicted.path[edges]) / dt * spec.size
-    # integrated like the paths, so that the path of encoders has a slip score of exactly 0
+    # the rolling twist is integrated in the same way as predicted paths, so that the predicted path
+    # of encoders has a slip score of exactly 0
     by_wheels = path_of(run.signals.rolling(spec), run.signals.dt)
     rolling = body_increments(by_wheels[edges]) / dt * spec.size
     size = np.linalg.norm(rolling, axis=1)

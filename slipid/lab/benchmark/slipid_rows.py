@@ -76,7 +76,7 @@ class SlipidFit:
 
     @cached_property
     def deployed(self) -> DeployedRobot:
-        """The deployed robot on all floors of the data set."""
+        """The fitted robot in its deployed form, with all floors of the data set."""
         signed = self.job.dataset.current_is_signed
         return robot_of_force_balance(
             self.contact, self.highest_speed, self.trend, LogSensors(signed)

@@ -25,7 +25,7 @@ Weights = Float[np.ndarray, "draw run"]
 
 
 class MeanInterval(NamedTuple):
-    """A mean and its 90 % interval by resampling."""
+    """A mean and the ends of its 90 % bootstrap interval."""
 
     value: float
     low: float

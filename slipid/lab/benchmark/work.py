@@ -37,9 +37,9 @@ OF_FITS = (
 OF_ROWS = ("lab/systems", "lab/paper2021", "lab/benchmark", "robot", "deploy")
 """Packages that the scores of all rows depend on in addition to `OF_FITS`."""
 QUICK_RUNS = 60
-"""Number of runs of each data set in a quick benchmark."""
+"""Largest number of runs of each data set in a quick benchmark."""
 QUICK_KIND = "headings"
-"""Kind of split in a quick benchmark."""
+"""The only kind of split in a quick benchmark."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def problem_of(options: BenchmarkOptions, source: str) -> Problem:
 
 
 def split_of(task: FoldTask) -> Split:
-    """Return the fold of a task."""
+    """Return the split of runs of a task's fold."""
     found = splits(data_of(task.options, task.source).facts, task.kind)
     return next(split for split in found if split.fold == task.fold)
 
@@ -246,7 +246,7 @@ def channels_of(runs: Sequence[Run], spec: RobotSpec) -> frozenset[Channel]:
 def _published(
     data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], method: SlipModel
 ) -> FoldScore:
-    """Return the score of a published method."""
+    """Return the score of a published method: tuned, fitted and applied to the held-out runs."""
     spec = data.data.spec
     training = [run.with_floor(protocol.floor_known) for run in data.training]
     began = time.perf_counter()

@@ -164,7 +164,7 @@ class PaperSvr(WheelSlip):
     def learn(self, w: TrainingWindows, spec: RobotSpec) -> "PaperSvr":
         samples = recipe_samples(w, spec)
         if len(np.unique(samples.torque.round(9))) <= self.degree:
-            # too few samples for a curve: their mean slip, or none
+            # with too few samples for a curve, the slip is their mean, or 0 without samples
             level = float(samples.slip.mean()) if len(samples) else 0.0
             return replace(self, coefficients=np.array([level] + [0.0] * self.degree))
         curve = insensitive_curve(samples.torque, samples.slip, self.degree, self.c, self.tube)

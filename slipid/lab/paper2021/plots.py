@@ -20,7 +20,7 @@ _AXIS = {"current": "motor current I / A", "torque": "torque variable M at the m
 
 
 def run(data_dir: Path, out: Path) -> list[Path]:
-    """Regenerate the paper: write `paper.json` and one PNG per figure, each file atomically.
+    """Reproduce the paper: write `paper.json` and one PNG per figure, and return the files.
 
     Args:
         data_dir: folder that holds robotino2021 (and robotino2022), or robotino2021 itself.
@@ -49,7 +49,7 @@ def runs_2022(folder: Path) -> tuple[Log, ...] | None:
 
 
 def figure2(field: MotorTable) -> Figure:
-    """Return slip against current of motor 1 over the whole site, with both fitted lines."""
+    """Return figure 2: slip over current of motor 1 on the whole site, with both fitted lines."""
     points = field.samples
     made = drawing.figure(
         7.2, 4.8, f"Figure 2: whole site, motor 1, {len(points)} half-second means"
@@ -70,7 +70,7 @@ def figure2(field: MotorTable) -> Figure:
 
 
 def figure3(motors: dict[int, MotorTable]) -> Figure:
-    """Return slip against current and against torque, per surface, one column per motor."""
+    """Return figure 3: slip over current and over torque, by surface, one column per motor."""
     made = drawing.figure(
         11.5,
         7.0,
@@ -99,7 +99,7 @@ def figure3(motors: dict[int, MotorTable]) -> Figure:
 
 
 def figure4(table: MotorTable) -> Figure:
-    """Return slip of motor 1 against the torque variable, with linear and quadratic models."""
+    """Return figure 4: slip of motor 1 over the torque variable, with its fitted models."""
     made = drawing.figure(7.2, 4.8, f"Figure 4: motor 1, {len(table.samples)} half-second means")
     axes = made.subplots()
     for surface, part in table.by_surface.items():
@@ -122,7 +122,7 @@ def figure4(table: MotorTable) -> Figure:
 
 
 def figure7(tracks: tuple[SquareTrack, ...]) -> Figure:
-    """Return camera tracks around the commanded rectangle, with headings and closure errors."""
+    """Return figure 7: camera tracks on the commanded rectangle, headings and closure errors."""
     made = drawing.figure(
         12.0, 5.7, "Figure 7: the same commanded rectangle, three ways to follow it"
     )
@@ -144,7 +144,7 @@ def _draw_track(axes: Axes, track: SquareTrack) -> None:
     axes.plot(*xy.T, color=colour, lw=2)
     side = xy[: track.file.side_frames]
     axes.plot(*side.T, color=colour, lw=6, alpha=0.4, label="first side")
-    # an arrow every 160 mm of path, since they would overlap where the robot stands
+    # arrows are 160 mm of path apart: at equal times, they would overlap where the robot stands
     travel = np.cumsum(np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T))
     every = np.searchsorted(travel, np.arange(80.0, travel[-1], 160.0))
     # logged headings are 90 deg ahead of right-handed ones on the floor

@@ -1,4 +1,4 @@
-"""One thread for scikit-learn: threads that wait for each other are many times slower than one."""
+"""A single thread for scikit-learn, whose threads spend most time waiting for each other here."""
 
 from contextlib import AbstractContextManager
 

@@ -2,21 +2,24 @@
 
 The engine simulates rigid bodies, passive rollers that turn and yield on their mounts, contacts of
 every roller with a soft floor, Coulomb friction with an elliptic cone, and rolling friction. Slip
-is nowhere prescribed. A wheel sinks in, several rollers share its load, each shears the floor while
-it passes and slides when that is too much; the rollers' drag follows from there.
+is not prescribed anywhere. A wheel sinks in and several rollers share its load. Each roller shears
+the floor as it passes, and slides when the shear force exceeds friction; the drag of the rollers
+follows from this.
 
-Much of the slip is the engine's own contact law: sliding, spinning and rolling share one friction
-cone, so a roller that rolls against its rolling friction creeps under any force along its axle, in
-proportion to how fast it rolls. On `soft` the robot loses 36 % of its path length (mean of six
-directions, no unevenness); 31 % if the floor does not yield under shear, 28 % if also nothing but
-contact resists, 11 % if friction is ten times as large as well. This slip is a ratio of speeds, as
-the model's creep is, with another formula. Sinkage comes from the engine's springs, which it scales
-with the robot: the same `softness_m` is as deep beneath a heavier robot of the same build.
+Much of the slip comes from the engine's own contact law: sliding, spinning and rolling share one
+friction cone, so a roller that rolls against its rolling friction creeps under any force along its
+axle, in proportion to its rolling speed. On the surface `soft` the robot loses 36 % of its path
+length (mean of six directions, no unevenness). The loss is 31 % if the floor does not yield under
+shear, 28 % if in addition there is no resistance but that of contacts, and 11 % if in addition
+friction is ten times as large. This slip is a ratio of speeds, like the creep in `slipid.model`,
+but has another formula. Sinkage comes from the engine's contact springs, whose stiffness the engine
+scales with the mass of the robot: with the same `softness_m`, a heavier robot of the same build
+sinks in equally deep.
 
-Effects added to the engine have other forms than those of `slipid.model`: a floor that yields under
-shear is a spring of the roller's mount whose stiffness is the floor's; compaction ahead of a sunk
-wheel is a force that grows with a power of the sinkage; the floor drags on the body.
+Effects added to the engine have other forms than those of `slipid.model`. A floor that yields under
+shear is modelled by a softer spring of the roller's mount; compaction ahead of a sunk wheel is a
+force that grows with a power of the sinkage; a drag force acts on the body.
 
-Missing effects: bulldozing (no heap ahead of a wheel), memory (a rut is gone when the wheel has
-left), the height of a carpet's edge, pile direction, and water.
+Effects that are not simulated: bulldozing (no heap ahead of a wheel), memory (a rut vanishes when
+the wheel has left it), the height of a carpet's edge, pile direction, and water.
 """

@@ -22,7 +22,7 @@ from slipid.support.errors import DataError
 from slipid.support.toml_file import checked, mapping_of
 
 RESERVED = ("one_surface", "two_surfaces", "wheel_load")
-"""Folder names of the 2022 layout, which no load set-up may have."""
+"""Folder names of the 2022 data set, which are not allowed as names of load set-ups."""
 _IDENTIFY_CONFIG = """\
 # Identifies the robot of these logs:
 #   slipid identify {name} --data logs --out result
@@ -66,10 +66,10 @@ class SimulationPlan:
 
     Attributes:
         hash: hash of the config and of the map files it names.
-        content: the config.
+        content: content of the config.
         site: robot, sensors and surfaces.
-        maps: floors with several surfaces, by name.
-        runs: name and run of each.
+        maps: maps of floors with several surfaces, by name.
+        runs: name and program of each run.
         filmed: names of the runs that are filmed.
     """
 
@@ -82,10 +82,14 @@ class SimulationPlan:
 
 
 def plan(path: Path, text: str) -> SimulationPlan:
-    """Return the plan in a config text; the path is for messages, and map files lie beside it.
+    """Return the plan that a config describes.
+
+    Args:
+        path: path of the config, for error messages; map files are in the same folder.
+        text: content of the config.
 
     Raises:
-        DataError: mistakes in the text or in a map it names, each on a line.
+        DataError: the text or a map that it names has mistakes; the message lists them by line.
     """
     mapping = mapping_of(path, text)
     surfaces = mapping.get("surfaces", {})
@@ -126,7 +130,7 @@ def plan(path: Path, text: str) -> SimulationPlan:
 def _check(
     path: Path, content: SimulationContent, site: Site, maps: Mapping[str, terrain.FloorMap]
 ) -> None:
-    """Raise `DataError` where parts of a config contradict each other."""
+    """Raise `DataError` if parts of a config contradict each other."""
     for load in site.robot.centres_m:
         if not re.fullmatch("[A-Za-z0-9_-]+", load) or load in RESERVED:
             raise DataError(
@@ -159,7 +163,7 @@ def _check(
 
 
 def _hash(content: SimulationContent, site: Site, maps: Mapping[str, terrain.FloorMap]) -> str:
-    """Return a hash of everything that decides what is driven and logged; videos are left out."""
+    """Return a hash of everything that determines runs and logs, not of the settings of videos."""
     config = content.model_dump(mode="json", exclude={"video", "camera"})
     floors = {
         name: [f.surfaces, f.corner, f.cell, f.cells.shape, sha256(f.cells.tobytes()).hexdigest()]
@@ -183,7 +187,7 @@ def _refuse_unknown(path: Path, where: str, name: str, choices: Collection[str])
 
 @contextmanager
 def _naming(what: str) -> Iterator[None]:
-    """Name the part of the config in errors that lack it."""
+    """Context that turns a `ValueError` into a `DataError` which names this part of the config."""
     try:
         yield
     except DataError:
@@ -193,9 +197,9 @@ def _naming(what: str) -> Iterator[None]:
 
 
 def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
-    """Return a config text for `slipid identify` that fits the logs in slipid's own columns.
+    """Return the text of a config with which `slipid identify` fits the logs in slipid's format.
 
-    With `by_video` the poses are those tracked in the videos, and not those in the logs.
+    With `by_video`, poses are those tracked in the videos instead of those in the logs.
     """
     robot, sensors = plan.site.robot, plan.site.sensors
     measured = 0.0015 * float(np.random.default_rng([plan.content.seed, 2]).normal())
@@ -232,9 +236,11 @@ def identify_config(plan: SimulationPlan, by_video: bool = False) -> str:
 
 
 def _map_sets(plan: SimulationPlan) -> list[tuple[str, str]]:
-    """Return load and map of runs over several floors that also have runs on each floor alone.
+    """Return (load set-up, map) of the runs on maps that a fit can use.
 
-    Whatever steered them, the camera logs their poses in the frame of the map.
+    These are the maps whose surfaces all have runs of their own, and the load set-ups that have
+    such runs. Poses of runs on maps are logged in the frame of the map, whichever pose steered
+    them.
     """
     one = [run for _, run in plan.runs if run.surface is not None]
     floors, loads = {run.surface for run in one}, {run.load for run in one}
@@ -247,7 +253,7 @@ def _map_sets(plan: SimulationPlan) -> list[tuple[str, str]]:
 
 
 def all_filmed(plan: SimulationPlan) -> bool:
-    """Return True where every run that `slipid identify` reads has a video."""
+    """Return True if every run that `slipid identify` reads is filmed."""
     mapped = {f"{load}/{name}/" for load, name in _map_sets(plan)}
     read = [
         n for n, r in plan.runs if r.surface is not None or n.rpartition("/")[0] + "/" in mapped
@@ -256,7 +262,7 @@ def all_filmed(plan: SimulationPlan) -> bool:
 
 
 def _inline(value: object) -> str:
-    """Return a value as TOML."""
+    """Return a value as TOML text on one line."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{k} = {_inline(v)}" for k, v in value.items()) + " }"
     if isinstance(value, list):
@@ -265,5 +271,5 @@ def _inline(value: object) -> str:
 
 
 def can_identify(plan: SimulationPlan) -> bool:
-    """Return True where logs in slipid's own columns have runs on one surface for a fit."""
+    """Return True if logs are written in slipid's format and some runs are on a single surface."""
     return "slipid" in plan.content.formats and any(r.surface is not None for _, r in plan.runs)

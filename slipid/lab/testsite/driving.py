@@ -1,4 +1,4 @@
-"""Drive a robot by timed twists or way-points, and record its true motion."""
+"""Runs of the simulated robot by timed twists or way-points, and records of its true motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,17 +16,21 @@ PERIOD = 0.05
 REACHED_M = 0.02
 """Distance at which a way-point counts as reached [m]."""
 BodyTwist = tuple[float, float, float]
-"""Speed ahead and to the left [m/s], and turn rate [rad/s]."""
+"""Forward and leftward speed [m/s], and turn rate [rad/s]."""
 
 
 @dataclass(frozen=True)
 class TimedTwists:
-    """Twists one after the other, each for some seconds, without any feedback."""
+    """Open-loop program: twists that are commanded one after the other.
+
+    Attributes:
+        legs: each twist with its duration [s].
+    """
 
     legs: tuple[tuple[BodyTwist, float], ...]
 
     def command(self, time: float) -> BodyTwist | None:
-        """Return the twist at a time; None after the last."""
+        """Return the twist at a time since the start [s]; None after the end of the last leg."""
         for twist, seconds in self.legs:
             if time < seconds - 1e-9:
                 return twist
@@ -36,12 +40,13 @@ class TimedTwists:
 
 @dataclass(frozen=True)
 class Waypoints:
-    """Places to reach one after the other, without turning, by a fed-back pose.
+    """Closed-loop program: positions to reach one after the other, without turning.
 
     Attributes:
         places: x, y [m] in the frame of the pose.
-        speed: speed between them [m/s].
-        by: the fed-back pose: `encoders` counts from the start, `camera` is the true one.
+        speed: speed between the positions [m/s].
+        by: pose that is fed back: `encoders` is dead reckoning from the start, `camera` the true
+            pose.
     """
 
     places: tuple[tuple[float, float], ...]
@@ -54,12 +59,12 @@ class SiteRun:
     """One run on the test site.
 
     Attributes:
-        surface: surface named in its log; None where a fit must find out.
+        surface: surface that its log names; None if the floor has several.
         load: name of the load set-up.
         program: `TimedTwists` or `Waypoints`.
-        start: x, y [m], heading [rad].
-        floor: map of the floor; None for `surface` everywhere.
-        place: name of the floor in file names.
+        start: start pose: x, y [m], heading [rad].
+        floor: map of the floor; None if `surface` is everywhere.
+        place: name of the floor in file names; empty to use the surface's.
     """
 
     surface: str | None
@@ -71,7 +76,7 @@ class SiteRun:
 
     @property
     def folder(self) -> str:
-        """Folder of its log: the surface, or the floor's name."""
+        """Name of the folder of its log: that of the floor or, without one, of the surface."""
         return self.place or str(self.surface)
 
     @property
@@ -83,12 +88,15 @@ class SiteRun:
 def straight(
     surface: str, load: str, heading: float, speed: float, distance: float, turn: float = 0.0
 ) -> SiteRun:
-    """Return a run at a constant command whose middle is the origin if there is no slip.
+    """Return a run with a constant command, which without slip has its middle at the origin.
 
     Args:
+        surface: name of the surface.
+        load: name of the load set-up.
         heading: direction of the commanded motion in the body frame [rad].
-        speed: commanded speed [m/s]; 0 turns on the spot.
-        distance: commanded length [m], arc of the rim where it only turns.
+        speed: commanded speed [m/s]; 0 for a turn on the spot.
+        distance: commanded path length; for a turn on the spot, that of a point at 0.125 m from the
+            middle [m].
         turn: commanded turn rate [rad/s].
     """
     seconds = distance / (speed or abs(turn) * 0.125)
@@ -99,7 +107,10 @@ def straight(
 
 
 def named_runs(runs: Sequence[SiteRun], jitter: float, seed: int) -> list[tuple[str, SiteRun]]:
-    """Return runs named `<load>/<folder>/runNNN`, with jittered headings as if placed by hand."""
+    """Return the runs with names `<load>/<folder>/runNNN`, and randomly changed start headings.
+
+    Headings change by at most `jitter` [rad], as if the robot were placed by hand.
+    """
     rng = np.random.default_rng(seed)
     counts: dict[str, int] = {}
     out = []
@@ -114,10 +125,10 @@ def named_runs(runs: Sequence[SiteRun], jitter: float, seed: int) -> list[tuple[
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """True motion of a run, a row per time step.
+    """True motion of a run, with one row per time step.
 
     Attributes:
-        time: time since the end of the settling [s].
+        time: time since the robot had settled on the floor [s].
         pose: pose of the body: x, y [m], heading [rad].
         yaw_rate: yaw rate of the body [rad/s].
         wheel_angle: angle of each wheel [rad].
@@ -144,7 +155,7 @@ class Trace:
 
 
 class RimSpeeds:
-    """Wheel speeds that follow commands with the site's delay and acceleration."""
+    """Target speeds of the wheels, which follow commands with the site's delay and acceleration."""
 
     def __init__(self, site: Site, plant: SimulatedRobot):
         self.plant, self.delay = plant, site.command_delay_s
@@ -157,7 +168,7 @@ class RimSpeeds:
         self._waiting.append((self.plant.time + self.delay, command))
 
     def follow(self) -> Float[np.ndarray, " wheel"]:
-        """Return the wheel speeds to keep over the next time step [rad/s]."""
+        """Return the target speeds of the wheels over the next time step [rad/s]."""
         while self._waiting and self._waiting[0][0] <= self.plant.time + 1e-9:
             self._wanted = self._waiting.pop(0)[1]
         self.speed = self.speed + np.clip(self._wanted - self.speed, -self.slew, self.slew)
@@ -165,7 +176,7 @@ class RimSpeeds:
 
 
 def drive(run: SiteRun, site: Site, seed: int, timestep: float = TIMESTEP) -> Trace:
-    """Drive one run and return its trace; arguments as in `SimulatedRobot`.
+    """Drive one run and return its true motion; site, seed and time step as in `SimulatedRobot`.
 
     Raises:
         DataError: MuJoCo is missing, or the simulation became unstable.
@@ -200,9 +211,10 @@ def drive(run: SiteRun, site: Site, seed: int, timestep: float = TIMESTEP) -> Tr
 def _towards(
     program: Waypoints, goal: int, pose: Float[np.ndarray, "3"], time: float
 ) -> tuple[int, BodyTwist | None]:
-    """Return the number of the next way-point, and the twist towards it in the body frame.
+    """Return the index of the next way-point, and the twist towards it in the body frame.
 
-    The twist is None at the end, or after 10 s and three times the duration without slip.
+    The twist is None if all way-points are reached, or too much time has passed: 10 s and three
+    times the duration without slip.
     """
     while goal < len(program.places):
         offset = np.array(program.places[goal]) - pose[:2]
@@ -210,7 +222,8 @@ def _towards(
         if distance > REACHED_M:
             break
         goal += 1
-    corners = np.array([program.places[-1], *program.places])  # at least as long as the path
+    # the start is not among the way-points; closing the path makes it at least as long
+    corners = np.array([program.places[-1], *program.places])
     longest = 10.0 + 3 * float(np.hypot(*np.diff(corners, axis=0).T).sum()) / program.speed
     if goal == len(program.places) or time > longest:
         return goal, None
@@ -221,14 +234,14 @@ def _towards(
 
 
 def _moved(pose: Float[np.ndarray, "3"], step: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Return the pose after a small displacement in the body frame."""
+    """Return the pose after a small displacement (x, y, turn) in the body frame [m, m, rad]."""
     middle = pose[2] + 0.5 * step[2]
     c, s = np.cos(middle), np.sin(middle)
     return pose + np.array([c * step[0] - s * step[1], s * step[0] + c * step[1], step[2]])
 
 
 class _Recorder:
-    """Collects the engine's state row by row, and turns it into a trace at the end."""
+    """Recorder of the engine's state at every time step, which returns it as a `Trace`."""
 
     def __init__(self, plant: SimulatedRobot):
         self.plant = plant

@@ -1,4 +1,4 @@
-"""The robot on a floor, advanced in milliseconds; MuJoCo does the mechanics."""
+"""The simulated robot on a floor; MuJoCo computes its mechanics in steps of a millisecond."""
 
 from types import ModuleType
 
@@ -14,15 +14,15 @@ from slipid.support.errors import DataError
 TIMESTEP = 1e-3
 """Time step of the engine and of the speed loop [s]."""
 SETTLING = 0.4
-"""Time for which a robot stands still before anything is recorded [s]."""
+"""Time for which the robot settles on the floor before anything is recorded [s]."""
 LOOKUP_STEPS = 5
-"""Time steps between two lookups of the floor beneath the rollers."""
+"""Number of time steps from one lookup of the floor beneath the rollers to the next."""
 CREEP = 0.02
-"""Speed at which an added force has reached 0.7 of its size [m/s]."""
+"""Speed at which compaction and body drag reach 0.7 of their full force [m/s]."""
 
 
 def engine() -> ModuleType:
-    """Return the mujoco module; raise `DataError` where it is not installed."""
+    """Return the mujoco module; raise `DataError` if it is not installed."""
     try:
         import mujoco
     except ImportError:
@@ -33,20 +33,20 @@ def engine() -> ModuleType:
 
 
 def heading_of(quaternion: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
-    """Return the angle about the vertical of a quaternion w, x, y, z [rad]."""
+    """Return the heading of a rotation given as quaternion (w, x, y, z) [rad]."""
     w, x, y, z = np.moveaxis(np.asarray(quaternion), -1, 0)
     return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
 class SimulatedRobot:
-    """A robot standing on a floor.
+    """MuJoCo simulation of the robot on a floor, settled at its start pose.
 
     Args:
         site: the robot's build, its sensors and the surfaces.
         floor: map of surfaces that the site knows.
         load: name of the load set-up.
-        start: x, y [m], heading [rad].
-        seed: seed of the wheels' first angles and of the floor's unevenness.
+        start: start pose: x, y [m], heading [rad].
+        seed: seed of the initial wheel angles and of the floor's unevenness.
         timestep: time step of the engine [s].
     """
 
@@ -61,7 +61,7 @@ class SimulatedRobot:
     ):
         self.robot, self.dt = site.robot, timestep
         mujoco = engine()
-        # warnings are counted by the engine, for `check`; else it writes a file where it runs
+        # by default, MuJoCo writes warnings to a file; `check` uses the engine's own counts
         mujoco.set_mju_user_warning(lambda text: None)
         self._step = mujoco.mj_step
         self.model = mujoco.MjModel.from_xml_string(
@@ -83,7 +83,7 @@ class SimulatedRobot:
 
     @property
     def time(self) -> float:
-        """Time since the end of the settling [s]."""
+        """Time since the robot had settled on the floor [s]."""
         return self._count * self.dt
 
     @property
@@ -94,7 +94,7 @@ class SimulatedRobot:
 
     @property
     def wheel_angle(self) -> Float[np.ndarray, " wheel"]:
-        """Angle of each wheel since the end of the settling [rad]."""
+        """Angle by which each wheel has turned since the robot had settled [rad]."""
         return self.data.qpos[self.wheel_at] - self.angle_at_start
 
     def step(self, wanted: list[float]) -> None:
@@ -110,7 +110,10 @@ class SimulatedRobot:
         self._step(self.model, d)
 
     def check(self) -> None:
-        """Raise `DataError` where the engine became unstable: it resets the robot and goes on."""
+        """Raise `DataError` if the simulation became unstable.
+
+        The engine itself only counts a warning, resets the robot and continues.
+        """
         mujoco = engine()
         kinds = [f"mjWARN_BAD{what}" for what in ("QPOS", "QVEL", "QACC")]
         numbers = [int(getattr(mujoco.mjtWarning, kind)) for kind in kinds]
@@ -139,7 +142,7 @@ class SimulatedRobot:
         m.dof_damping[self.wheel_dof] = motor.viscous_nms
 
     def _lay(self, terrain: Terrain) -> None:
-        """Store the contact parameters of every kind of floor."""
+        """Store the contact parameters of every kind of the terrain."""
         self.terrain = terrain
         kinds = terrain.kinds
         self._friction = np.array([[g.friction, 0.003, f * g.rolling_m] for g, f in kinds])
@@ -152,7 +155,7 @@ class SimulatedRobot:
         self._low = np.full(len(self._roller), -1)
 
     def _place(self, start: Pose, rng: np.random.Generator) -> None:
-        """Put the robot at its start, with every wheel turned at random."""
+        """Put the robot at its start pose, with a random angle of every wheel."""
         q = self.data.qpos
         q[:2] = start[:2]
         q[3], q[6] = np.cos(0.5 * start[2]), np.sin(0.5 * start[2])
@@ -162,7 +165,7 @@ class SimulatedRobot:
     def _look(self) -> None:
         """Give every roller the contact parameters of the floor beneath it.
 
-        The bearings of rollers that are off the floor turn freely: the engine has less to solve.
+        The bearings of rollers above the floor have no friction, which saves computing time.
         """
         place = self.data.geom_xpos[self._roller]
         now, m = self.terrain.at(place[:, :2]), self.model
@@ -180,7 +183,7 @@ class SimulatedRobot:
             m.dof_frictionloss[self._axle_dof] = np.where(low, self.robot.roller_friction_nm, 0.0)
 
     def _resist(self) -> None:
-        """Apply compaction at sunk wheels and drag on the body, as a wrench on the chassis."""
+        """Apply compaction forces on sunk wheels and the body drag as a wrench on the chassis."""
         d = self.data
         vx, vy, _, _, _, turn = d.qvel[:6].tolist()
         x0, y0, z0 = d.qpos[:3].tolist()
@@ -199,5 +202,5 @@ class SimulatedRobot:
         fx, fy = fx - size * vx, fy - size * vy
         heading = self.pose[2]
         c, s = np.cos(heading), np.sin(heading)
-        mx, my = z0 * fy, -z0 * fx  # it acts at the floor, z0 below the axes
+        mx, my = z0 * fy, -z0 * fx  # the force acts at the floor, z0 below the wheel axes
         d.qfrc_applied[:6] = [fx, fy, 0.0, c * mx + s * my, c * my - s * mx, moment]

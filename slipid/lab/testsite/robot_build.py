@@ -1,4 +1,4 @@
-"""Build of the test site's robot: DC motors, wheel speed loop, and its MuJoCo model."""
+"""Properties of the test site's robot: DC motors, wheel speed loop, body, and its MuJoCo model."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field
@@ -21,11 +21,11 @@ class MotorBuild:
         resistance_ohm, inductance_h: resistance and inductance of the winding.
         back_emf_vs: back-EMF constant, equal to the torque constant [V s/rad].
         rotor_inertia_kg_m2: inertia at the motor shaft.
-        coulomb_nm, viscous_nms: friction at the wheel [N m], [N m s].
-        efficiency: efficiency of the gear while the motor drives.
-        supply_v, supply_ohm: voltage and resistance of the battery that all motors share; its
-            voltage never falls below a twentieth.
-        ticks_per_revolution: ticks of the encoder in one turn of the motor shaft.
+        coulomb_nm, viscous_nms: Coulomb and viscous friction at the wheel [N m], [N m s].
+        efficiency: efficiency of the gear while the motor drives the wheel.
+        supply_v, supply_ohm: open-circuit voltage [V] and internal resistance [ohm] of the battery
+            that all motors share; under load its voltage never falls below 5 % of `supply_v`.
+        ticks_per_revolution: encoder ticks per turn of the motor shaft.
     """
 
     resistance_ohm: Positive = 5.5
@@ -42,16 +42,16 @@ class MotorBuild:
 
 @dataclass(frozen=True, config=CLOSED)
 class SpeedLoop:
-    """The built-in controller of wheel speed, at the engine's time step.
+    """The robot's built-in controller of wheel speed, which runs at the engine's time step.
 
     Attributes:
-        kind: `pi`; `feed_forward` (proportional, and the back-EMF of the commanded speed);
-            `cascade` (PI to a current, and a current loop below it).
+        kind: `pi`; `feed_forward` (proportional, plus the back-EMF of the commanded speed);
+            `cascade` (a PI controller commands a current, which an inner loop controls).
         gain: gain of the error in motor speed [V s/rad]; in a cascade [A s/rad].
-        integral: gain of its integral [V/rad]; in a cascade [A/rad].
+        integral: gain of the error's integral [V/rad]; in a cascade [A/rad].
         current_gain: gain of the cascade's inner loop [V/A].
-        current_limit_a: limit of the cascade's current.
-        filter_s: time constant of the measured speed.
+        current_limit_a: limit of the cascade's commanded current [A].
+        filter_s: time constant of the low pass of the measured speed [s].
     """
 
     kind: Literal["pi", "feed_forward", "cascade"] = "pi"
@@ -63,7 +63,10 @@ class SpeedLoop:
 
 
 class WheelDrives:
-    """Currents [A] and voltages [V] of all motors, advanced by steps of `dt` [s]."""
+    """Simulation of all motors with their speed loops and battery, in steps of `dt` [s].
+
+    `current` [A] and `voltage` [V] have a value for each motor; `bus` is the battery's voltage [V].
+    """
 
     def __init__(
         self, motor: MotorBuild, loop: SpeedLoop, gear_ratio: float, wheels: int, dt: float
@@ -84,7 +87,7 @@ class WheelDrives:
 
         Args:
             wanted: commanded wheel speeds [rad/s].
-            angle: angles of the wheels [rad], of which the loop sees whole ticks.
+            angle: angles of the wheels [rad]; the loop only sees whole encoder ticks.
             speed: speeds of the wheels [rad/s], for the back-EMF.
         """
         m = self.motor
@@ -108,7 +111,10 @@ class WheelDrives:
         return out
 
     def _voltage(self, k: int, wanted: float, measured: float) -> float:
-        """Return the loop's voltage within the bus voltage; the integral is held at the limit."""
+        """Return the loop's voltage for motor `k`, limited to the bus voltage [V].
+
+        While a limit is active, the integral keeps its value (anti-windup).
+        """
         loop, m = self.loop, self.motor
         error = wanted - measured
         stored = self._integral[k] + loop.integral * error * self.dt
@@ -136,22 +142,24 @@ class RobotBuild:
     """Dimensions and masses of the robot; by default like a Robotino 2.
 
     Attributes:
-        mass_kg: mass of the whole robot.
-        centres_m: x, y of the centre of mass of every load set-up.
-        centre_height_m: height of the centre of mass above the wheel axes.
-        wheel_azimuths_deg: azimuths of the wheel centres; each drives 90 deg further.
-        base_radius_m: distance from the middle to the wheel centres.
-        wheel_radius_m: radius of the wheels.
+        mass_kg: mass of the whole robot [kg].
+        centres_m: x, y of the centre of mass by load set-up [m].
+        centre_height_m: height of the centre of mass above the wheel axes [m].
+        wheel_azimuths_deg: azimuths of the wheel centres; the drive direction of each wheel is 90
+            deg further [deg].
+        base_radius_m: distance from the middle of the robot to the wheel centres [m].
+        wheel_radius_m: radius of the wheels [m].
         gear_ratio: turns of the motor per turn of the wheel.
-        rollers: number of rollers of one wheel, in two staggered rows; even.
-        roller_radius_m, roller_mass_kg: radius and mass of one roller.
-        row_offset_m: distance of each row from the middle of the wheel.
+        rollers: number of rollers of one wheel, which are in two staggered rows; even.
+        roller_radius_m, roller_mass_kg: radius [m] and mass [kg] of one roller.
+        row_offset_m: distance of each row of rollers from the middle plane of the wheel [m].
         mount_n_m: stiffness of a roller's mount along the wheel's rim [N/m].
-        roller_friction_nm: friction of a roller's bearing.
-        wheel_mass_kg: mass of a wheel without rollers.
-        body_radius_m: radius of the chassis, for pictures.
-        marker_height_m, marker_size_m: height of the camera's marker above the floor, and its edge.
-        marker_yaw_deg: heading of the marker less the body's.
+        roller_friction_nm: friction torque of a roller's bearing [N m].
+        wheel_mass_kg: mass of a wheel without rollers [kg].
+        body_radius_m: radius of the chassis, used in pictures only [m].
+        marker_height_m, marker_size_m: height of the camera's marker above the floor, and its edge
+            length [m].
+        marker_yaw_deg: heading of the marker less that of the body [deg].
     """
 
     mass_kg: Positive = 12.0
@@ -198,7 +206,7 @@ class RobotBuild:
 
     @property
     def own_mass_kg(self) -> float:
-        """Mass of the chassis without wheels."""
+        """Mass of the chassis without wheels [kg]."""
         wheel = self.wheel_mass_kg + self.rollers * self.roller_mass_kg
         return self.mass_kg - len(self.wheel_azimuths_deg) * wheel
 
@@ -210,14 +218,17 @@ class RobotBuild:
 
     @property
     def wheel_from_twist(self) -> Float[np.ndarray, "wheel 3"]:
-        """Matrix from the twist of a body that rolls without slip to wheel speeds [rad/s]."""
+        """Matrix that maps the body twist to wheel speeds without slip [rad/s]."""
         azimuth = np.radians(self.wheel_azimuths_deg)
         ahead = np.stack([-np.sin(azimuth), np.cos(azimuth)], axis=1)
         turn = np.full((len(azimuth), 1), self.base_radius_m)
         return np.concatenate([ahead, turn], axis=1) / self.wheel_radius_m
 
     def load_share(self, load: str) -> Float[np.ndarray, " wheel"]:
-        """Return the share of the weight on each wheel, by statics (least squares beyond three)."""
+        """Return the share of the weight on each wheel, from static equilibrium.
+
+        With more than three wheels it is the solution of smallest norm.
+        """
         count = len(self.wheel_azimuths_deg)
         level = np.concatenate([np.ones((1, count)), self.places.T])
         return np.linalg.lstsq(level, np.array([1.0, *self.centres_m[load]]), rcond=None)[0]
@@ -233,17 +244,19 @@ def mjcf(
 ) -> str:
     """Return MuJoCo's XML of the robot at the origin of a flat floor.
 
-    Rollers carry the contact parameters (they have priority over the floor), so that `plant` can
+    The contact parameters of rollers have priority over those of the floor, so that `plant` can
     give each roller those of the surface beneath it.
 
     Args:
-        load: load set-up, which sets the centre of mass.
-        ribs: x, lowest y, highest y, height of every rib [m].
-        looks: XML of assets, for pictures.
-        floor_looks: XML attributes of the floor's plane.
+        robot: dimensions and masses of the robot.
+        load: name of the load set-up, which determines the centre of mass.
+        timestep: time step of the engine [s].
+        ribs: x, lowest y, highest y, height of every rib on the floor [m].
+        looks: XML of lights, textures and materials for pictures.
+        floor_looks: XML attributes of the floor's plane for pictures.
     """
     m = robot
-    # place the chassis so that chassis and wheels together have the centre of mass
+    # the chassis' centre of mass is such that chassis and wheels together have that of the load
     wheels = (m.mass_kg - m.own_mass_kg) * m.places.mean(axis=0)
     x, y = (m.mass_kg * np.array(m.centres_m[load]) - wheels) / m.own_mass_kg
     inertia = m.own_mass_kg * np.array([0.012, 0.012, 0.016])
@@ -270,7 +283,7 @@ def mjcf(
 
 
 def _body_geoms(m: RobotBuild) -> str:
-    """Return XML of body and marker, for pictures; nothing collides with them."""
+    """Return XML of body and marker, which only appear in pictures and never collide."""
     from_axis = m.marker_height_m - m.wheel_radius_m
     half, edge = 0.5 * m.marker_size_m, 0.62 * m.marker_size_m
     nothing = 'contype="0" conaffinity="0" mass="0"'
@@ -287,11 +300,11 @@ def _body_geoms(m: RobotBuild) -> str:
 
 
 def _wheel(m: RobotBuild, k: int) -> str:
-    """Return XML of a wheel with its rollers."""
+    """Return XML of wheel `k` with its rollers."""
     azimuth = np.radians(m.wheel_azimuths_deg[k])
     x, y = m.places[k]
     ring = m.wheel_radius_m - m.roller_radius_m
-    # half a roller's length: its end is as high as the end of the next row's roller
+    # half of a roller's length, such that rollers of both rows meet at the rim
     step = np.pi / m.rollers
     half = ring * (1 - np.cos(step)) / np.sin(step)
     parts = [

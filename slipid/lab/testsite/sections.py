@@ -1,4 +1,4 @@
-"""Sections of a `slipid simulate` config: floors, runs, and the numbers of the site."""
+"""Sections of a config of `slipid simulate`: floor maps, runs, and parameters of the site."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,11 +18,11 @@ Speed = Annotated[float, Field(gt=0, le=3)]
 Speeds = Annotated[list[Speed], Field(min_length=1)]
 Distance = Annotated[float, Field(gt=0, le=100)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
-"""Name of a surface, load or map, which also names files and folders."""
+"""Name of a surface, load set-up or map, which is also used in names of files and folders."""
 
 
 class FileMap(Section):
-    """Floor map in a file beside the config."""
+    """Floor map that is read from a file in the folder of the config."""
 
     kind: Literal["file"]
     file: str
@@ -32,7 +32,7 @@ class FileMap(Section):
 
 
 class Patchwork(Section):
-    """Random patches, by default smaller than the robot."""
+    """Floor map of random square patches, by default smaller than the robot."""
 
     kind: Literal["patchwork"]
     surfaces: list[str] = Field(min_length=1)
@@ -45,7 +45,7 @@ class Patchwork(Section):
 
 
 class FourZones(Section):
-    """Four surfaces around the middle of the rectangle, as in the 2021 paper's trial."""
+    """Floor map of four surfaces around the middle of the rectangle of the 2021 paper's trial."""
 
     kind: Literal["four_zones"] = "four_zones"
     surfaces: list[str] = Field(min_length=4, max_length=4)
@@ -58,7 +58,7 @@ Map = Annotated[FileMap | Patchwork | FourZones, Field(discriminator="kind")]
 
 
 class SurfaceRuns(Section):
-    """Runs that begin anywhere on a floor of one surface."""
+    """Base class of runs on a floor with a single surface."""
 
     surface: str
     load: str = "as_built"
@@ -68,7 +68,7 @@ class SurfaceRuns(Section):
 
 
 class HeadingRuns(SurfaceRuns):
-    """Straight runs in evenly spread directions."""
+    """Straight runs in evenly spaced directions."""
 
     kind: Literal["headings"] = "headings"
     step_deg: float = Field(15.0, ge=0.1, le=360)
@@ -82,7 +82,7 @@ class HeadingRuns(SurfaceRuns):
 
 
 class CurveRuns(SurfaceRuns):
-    """Arcs, alternately to the left and to the right."""
+    """Runs along arcs, alternately to the left and to the right."""
 
     kind: Literal["curves"] = "curves"
     count: int = Field(4, ge=1, le=10_000)
@@ -99,7 +99,10 @@ class CurveRuns(SurfaceRuns):
 
 
 class PaperGridRuns(SurfaceRuns):
-    """The 2021 paper's grid: x, y, both, and turns on the spot, forwards and backwards."""
+    """The 2021 paper's grid of runs: along x, y and the diagonals, and turns on the spot.
+
+    Each of them is driven in both senses.
+    """
 
     kind: Literal["paper_grid"] = "paper_grid"
     seconds: float = Field(3.0, gt=0, le=3600)
@@ -120,7 +123,7 @@ class PaperGridRuns(SurfaceRuns):
 
 
 class MapRuns(Section):
-    """Runs on a map of the config."""
+    """Base class of runs on a map that the config names."""
 
     map: str
     load: str = "as_built"
@@ -152,9 +155,10 @@ class WanderRuns(MapRuns):
 
 
 class RectangleRuns(MapRuns):
-    """The 2021 paper's 900 x 400 mm rectangle on a map: ahead, right, back, left, without turning.
+    """Runs along the 2021 paper's rectangle of 900 x 400 mm on a map, without turning.
 
-    With `encoders` the corners are in the robot's own frame at the start.
+    The sides are driven forward, right, back, left. With `by = "encoders"` the corners are reached
+    by the robot's dead reckoning.
     """
 
     kind: Literal["rectangle"] = "rectangle"
@@ -181,7 +185,7 @@ Runs = Annotated[
 
 
 class SimulationContent(Section):
-    """The whole file."""
+    """Content of a config of `slipid simulate`."""
 
     seed: int = Field(0, ge=0)
     formats: list[Literal["slipid", "robotino2022"]] = Field(default=["slipid"], min_length=1)

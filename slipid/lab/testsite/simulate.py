@@ -1,6 +1,6 @@
-"""Simulate logs on the virtual test site in parallel, with sensor errors like real ones.
+"""Simulation of logs on the virtual test site, in parallel and with realistic sensor errors.
 
-The truth is written apart from the logs.
+The truth is written to a folder separate from the logs.
 """
 
 import hashlib
@@ -31,7 +31,15 @@ from slipid.support.progress import Reporter
 
 
 def log_of(trace: Trace, site: Site, run: SiteRun, name: str, seed: int) -> Log:
-    """Return the log of a run, by its name and the seed of its noise."""
+    """Return the log of a run: its trace as the site's sensors record it.
+
+    Args:
+        trace: true motion of the run.
+        site: the site, whose sensors have the errors.
+        run: the run.
+        name: name of the run, and of the log file without its ending.
+        seed: seed of the sensor noise.
+    """
     s, rng = site.sensors, np.random.default_rng([seed, 1])
     count = int(trace.time[-1] / s.row_s) + 1
     uneven = s.row_s * (1 + s.row_jitter * rng.uniform(-1, 1, count))
@@ -75,7 +83,7 @@ def log_of(trace: Trace, site: Site, run: SiteRun, name: str, seed: int) -> Log:
 def _averaged(
     x: Float[np.ndarray, "step wheel"], at: np.ndarray, width: int
 ) -> Float[np.ndarray, "row wheel"]:
-    """Return the mean of the last `width` steps at each row."""
+    """Return the mean over the last `width` time steps before each row; `at` has their indices."""
     total = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(x, axis=0)])
     first = np.maximum(at + 1 - width, 0)
     return (total[at + 1] - total[first]) / (at + 1 - first)[:, None]
@@ -84,7 +92,7 @@ def _averaged(
 def _camera(
     trace: Trace, site: Site, rng: np.random.Generator, time: Float[np.ndarray, " row"]
 ) -> tuple[Float[np.ndarray, "row 3"], Bool[np.ndarray, " row"]]:
-    """Return the marker pose in each row, and which rows have a new frame."""
+    """Return the logged marker pose in each row, and True for rows that have a new frame."""
     s = site.sensors
     delay = s.lag_s - 0.5 * s.frame_s
     first = -(s.lag_s + 3 * s.frame_s)  # so that the first row has a frame
@@ -105,14 +113,14 @@ def _camera(
 MANIFEST = "simulate.json"
 SCHEMA = "slipid.simulation/1"
 FOLDERS = {"slipid": "logs", "robotino2022": "robotino2022"}
-"""Folder of every log format, below the output folder."""
+"""Name of the folder of each log format, in the output folder."""
 TRUTH_STEP = 10
-"""Time steps between rows of a stored truth."""
+"""Number of time steps from one row of the stored truth to the next."""
 
 
 @dataclass(frozen=True, eq=False)
 class SiteTask:
-    """One run to be driven by a process of its own."""
+    """Task of driving and writing one run, which may run in a process of its own."""
 
     name: str
     run: SiteRun
@@ -123,10 +131,10 @@ class SiteTask:
 
 
 def simulate(plan: SimulationPlan, out: Path, executor: Executor, report: Reporter) -> Content:
-    """Drive every run of a plan that is not done yet; return the content of simulate.json.
+    """Drive all runs of a plan that are not finished yet; return the content of simulate.json.
 
-    A run's truth is written last: a run that has one is done, and an interrupted simulation
-    continues from there.
+    The truth of a run is written last and marks it as finished, so that a later call continues an
+    interrupted simulation.
 
     Raises:
         DataError: MuJoCo is missing, or the folder holds runs of another config.
@@ -164,19 +172,23 @@ def simulate(plan: SimulationPlan, out: Path, executor: Executor, report: Report
 def _film(
     tasks: Sequence[SiteTask], camera: SiteCamera, executor: Executor, report: Reporter
 ) -> None:
-    """Make the missing videos, with the camera file beside them."""
+    """Make the videos that are missing, and write the camera file to their folder."""
     todo = {task.name: (task, camera) for task in tasks if not _video_path(task).is_file()}
     if not todo:
         return
     write_json(tasks[0].out / "video" / "camera.json", camera.to_json())
     report.stage(f"filming {len(todo)} of {len(tasks)} runs")
-    # never in this process: the drawing backend has to be chosen before MuJoCo is imported
+    # films are made in other processes, since MuJoCo's drawing backend must be chosen before it is
+    # imported
     with Processes(1) if isinstance(executor, InProcess) else nullcontext(executor) as apart:
         results(apart, film_and_write, todo, report)
 
 
 def film_and_write(what: tuple[SiteTask, SiteCamera]) -> None:
-    """Film one run that was driven. The video is written last."""
+    """Make the video of one run that was driven.
+
+    The times of its frames are written first, so that a video marks the task as finished.
+    """
     task, camera = what
     with np.load(_truth_path(task)) as true:
         studio = Studio(task.site, task.run.load, task.run.map, camera, task.seed)
@@ -197,10 +209,10 @@ def _truth_path(task: SiteTask) -> Path:
 
 
 def drive_and_write(task: SiteTask) -> float:
-    """Drive one run, write its log and its truth, and return its duration [s]."""
+    """Drive one run, write its logs and its truth, and return the simulated duration [s]."""
     try:
         trace = drive(task.run, task.site, task.seed)
-    except ValueError as error:  # also from the engine, about a robot that it cannot build
+    except ValueError as error:  # the engine also raises it for a robot that it cannot build
         raise DataError(f"{task.name}: {error}") from error
     site = task.site
     gear, ticks = site.robot.gear_ratio, site.motor.ticks_per_revolution
@@ -214,12 +226,12 @@ def drive_and_write(task: SiteTask) -> float:
 
 
 def _seed(seed: int, k: int) -> int:
-    """Return the seed of a run, which stays the same when runs are added behind it."""
+    """Return the seed of run `k`, which does not change when runs are added after it."""
     return int(np.random.SeedSequence(seed, spawn_key=(k,)).generate_state(1)[0])
 
 
 def _log_path(form: str, task: SiteTask) -> str:
-    """Return the path of a log in the folder of a format."""
+    """Return the path of a run's log relative to the folder of a format."""
     if form == "slipid":
         return f"{task.name}.csv"
     load, folder, number = task.name.split("/")
@@ -230,7 +242,7 @@ def _log_path(form: str, task: SiteTask) -> str:
 
 
 def _truth_arrays(trace: Trace, run: SiteRun, site: Site) -> dict[str, np.ndarray]:
-    """Return true poses, wheels, currents, and the surface under every wheel."""
+    """Return the stored truth of a run: poses, wheels, currents, and the surface at each wheel."""
     t = replace(trace, **{k: getattr(trace, k)[::TRUTH_STEP] for k in vars(trace)})
     c, s = np.cos(t.pose[:, 2]), np.sin(t.pose[:, 2])
     turned = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
@@ -242,7 +254,7 @@ def _truth_arrays(trace: Trace, run: SiteRun, site: Site) -> dict[str, np.ndarra
 
 
 def _write_truth(plan: SimulationPlan, out: Path) -> None:
-    """Write maps, the truth about the robot, and a config that identifies it."""
+    """Write the maps, the true parameters of the robot, and configs that identify it from logs."""
     site = plan.site
     for name, floor in plan.maps.items():
         colours = {s: site.surfaces[s].colour for s in floor.surfaces}
@@ -255,12 +267,12 @@ def _write_truth(plan: SimulationPlan, out: Path) -> None:
         if all_filmed(plan):
             texts[out / "robot_video.toml"] = identify_config(plan, by_video=True)
         for path, text in texts.items():
-            if not path.is_file():  # it may have been edited since
+            if not path.is_file():  # an existing config is kept, since it may have been edited
                 write_bytes(path, text.encode())
 
 
 def truth(site: Site) -> dict[str, Content]:
-    """Return the numbers of the site that a fit has as well, by their path names."""
+    """Return true value and unit of the site's parameters that a fit also has, by path."""
     robot, motor, sensors = site.robot, site.motor, site.sensors
     found: dict[str, tuple[float | list[float], str]] = {
         f"robot.load_share@{load}": (robot.load_share(load).tolist(), "1")

@@ -1,4 +1,4 @@
-"""Everything that stays the same from run to run: robot, sensors, camera, surfaces."""
+"""Description of the test site that is the same for all runs: robot, sensors, camera, surfaces."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, field
@@ -15,7 +15,7 @@ from slipid.support.content import Content
 from slipid.support.toml_file import CLOSED, NotNegative, Part, Positive
 
 Interval = Annotated[float, Field(ge=1e-3, le=1)]
-"""Time between readings [s]."""
+"""Time between successive readings or frames [s]."""
 Tilt = Annotated[float, Field(ge=-10, le=10)]
 """Tilt of the camera about one axis [deg]."""
 
@@ -25,19 +25,21 @@ class SiteSensors:
     """Errors of the logged sensors.
 
     Attributes:
-        row_s, row_jitter: mean time between rows [s], and its spread as part of it.
-        current_step_a, current_noise_a: step of the current's converter, and its noise [A].
-        current_is_signed: whether currents have a sign; most robots log magnitudes.
-        speed_step, speed_gain: quantum of the reported motor speed [rad/s], and its gain error [1].
-        voltage, duty, bus_voltage, gyro: whether these are logged.
-        voltage_step_v, voltage_noise_v: step of the voltage's converter, and its noise [V].
-        gyro_noise, gyro_bias: noise of every row, and std of the bias, drawn for every run [rad/s].
+        row_s, row_jitter: mean time between rows [s], and its largest relative deviation [1].
+        current_step_a, current_noise_a: quantisation step of currents, and std of their noise [A].
+        current_is_signed: True if currents have a sign; most robots log magnitudes.
+        speed_step, speed_gain: quantum of the reported motor speed [rad/s], and reported over true
+            speed [1].
+        voltage, duty, bus_voltage, gyro: True if this channel is logged.
+        voltage_step_v, voltage_noise_v: quantisation step of voltages, and std of their noise [V].
+        gyro_noise, gyro_bias: std of the noise in each row, and of the bias of each run [rad/s].
         average_s: time over which currents and voltages are averaged before they are sampled [s].
-        frame_s, lag_s: time between camera frames, and mean age of the pose in a row [s].
-        camera_scale: true length over logged length; the camera of the 2022 logs has 1.117.
-        camera_noise_m, camera_noise_rad: noise of every frame.
-        dropout: share of the frames that is lost.
-        outlier, outlier_m: share of the frames that is wrong, and std of their error [m].
+        frame_s, lag_s: time between camera frames, and mean age of a new pose when logged [s].
+        camera_scale: true length over logged length; 1.117 for the camera of the 2022 logs.
+        camera_noise_m, camera_noise_rad: std of the noise of position [m] and heading [rad] in each
+            frame.
+        dropout: share of the frames that are lost.
+        outlier, outlier_m: share of the frames with a wrong position, and std of their error [m].
     """
 
     row_s: Interval = 0.031
@@ -87,15 +89,15 @@ class SiteSensors:
 
 @dataclass(frozen=True, config=CLOSED)
 class Site:
-    """Everything that stays the same from run to run.
+    """Description of the test site that is the same for all runs.
 
     Attributes:
         robot: dimensions and masses of the robot.
-        motor: its motors.
-        loop: its controller of wheel speed.
-        sensors: errors of its logs.
-        surfaces: physics of every surface.
-        command_delay_s: delay from a command to the wheels.
+        motor: the robot's motors.
+        loop: the robot's controller of wheel speed.
+        sensors: errors of the logged sensors.
+        surfaces: physics of every surface, by name.
+        command_delay_s: time from a command to the change of the wheels' target speed [s].
         acceleration: acceleration of the wheels' rims towards a new command [m/s^2].
     """
 
@@ -108,34 +110,33 @@ class Site:
     acceleration: float = 1.0
 
     def to_json(self) -> Content:
-        """Return the site as the truth file has it, under the older names of two keys."""
+        """Return the site as in the truth file, which has older names for robot and surfaces."""
         content = asdict(self)
         return {"machine": content.pop("robot"), "grounds": content.pop("surfaces"), **content}
 
     @property
     def tick(self) -> float:
-        """Turn of a wheel from one tick of its encoder to the next [rad]."""
+        """Angle by which a wheel turns from one encoder tick to the next [rad]."""
         return 2 * np.pi / (self.motor.ticks_per_revolution * self.robot.gear_ratio)
 
 
 @dataclass(frozen=True, config=CLOSED)
 class SiteCamera:
-    """A camera that looks down on the floor, its image turned by half a turn from the world's axes.
+    """A camera that looks down on the floor; its image is rotated by 180 deg to the world's axes.
 
     Attributes:
-        height_m: height of the lens above the floor.
+        height_m: height of the lens above the floor [m].
         focal_px: focal length [pixel].
-        width_px, height_px: size of the image.
-        centre_m: x and y of the place above which it hangs.
-        tilt_deg: tilt about the image's x and y axes.
+        width_px, height_px: size of the image [pixel].
+        centre_m: x and y of the lens [m].
+        tilt_deg: tilt about the image's x and y axes [deg].
         distortion: k1, k2, p1, p2 of OpenCV's lens model.
-        blur_px: std of the blur [pixel].
-        noise: std of every pixel [grey levels of 255].
-        flicker: relative change of the light within some seconds.
-        exposure_s: exposure time of a frame; moving things appear twice, at both ends.
-        frame_s: time between frames.
-        early_s: how much earlier than the robot's log it starts, which puts its clock ahead by
-            that.
+        blur_px: std of the Gaussian blur [pixel].
+        noise: std of the noise of a pixel, on a scale from 0 to 255.
+        flicker: relative amplitude of changes of the light over some seconds.
+        exposure_s: exposure time of a frame; moving objects appear twice, at its start and end [s].
+        frame_s: time between frames [s].
+        early_s: time by which the video starts before the robot's log, and its clock is ahead [s].
     """
 
     height_m: Positive = 2.2
@@ -178,7 +179,7 @@ class SiteCamera:
         return np.array([*self.centre_m, self.height_m])
 
     def to_json(self) -> Content:
-        """Return the camera file that `slipid track` reads."""
+        """Return the content of the camera file that `slipid track` reads."""
         return {
             "schema": "slipid.camera/1",
             "image_px": [self.width_px, self.height_px],

@@ -1,7 +1,7 @@
-"""Draw frames of a run with marker, floor, perspective and lens, and write them as a video.
+"""Videos of runs on the test site: frames with marker, floor, perspective and lens distortion.
 
-Drawing needs OpenGL without a screen: EGL, in software where there is no graphics card. Driving
-does not.
+Drawing needs OpenGL without a screen: EGL, which runs in software without a graphics card. Driving
+runs does not need it.
 """
 
 import os
@@ -23,14 +23,22 @@ MARKER = 0
 """Number of the marker in ArUco's dictionary 4X4_50, as on the Robotino of the published frames."""
 
 DRAWN_SHARE = 1.12
-"""Size of the drawing relative to the image: the lens bends some of the outside into view."""
+"""Size of the drawing relative to the image; lens distortion brings some of its margin into view.
+"""
 
 _SHIFT = 97
-"""Number of random shifts of a frame's noise along each edge [pixel]."""
+"""Range of the random shift of the noise pattern from frame to frame, along each edge [pixel]."""
 
 
 class Studio:
-    """Draws frames of a robot on a floor; the seed is for floor pattern, light and noise.
+    """Camera above a robot on a floor, which draws frames.
+
+    Args:
+        site: robot and surfaces.
+        load: name of the load set-up.
+        floor: map of the floor.
+        camera: the camera.
+        seed: seed of floor pattern, light and noise.
 
     Raises:
         DataError: OpenGL or OpenCV is missing.
@@ -85,7 +93,7 @@ class Studio:
 
     @property
     def _size(self) -> tuple[int, int]:
-        """Width and height of the drawing before the lens bends it [pixel]."""
+        """Width and height of the drawing before lens distortion is applied [pixel]."""
         return round(DRAWN_SHARE * self.camera.width_px), round(DRAWN_SHARE * self.camera.height_px)
 
     def close(self) -> None:
@@ -95,7 +103,10 @@ class Studio:
     def frame(
         self, pose: Float[np.ndarray, "3"], wheel_angle: Float[np.ndarray, " wheel"]
     ) -> np.ndarray:
-        """Return a sharp image of the robot through the lens: rows, columns, blue green red."""
+        """Return an image of the robot with lens distortion, without blur and noise.
+
+        Its shape is (row, column, 3), with blue, green and red.
+        """
         q = self.data.qpos
         q[:2], q[3], q[6] = pose[:2], np.cos(0.5 * pose[2]), np.sin(0.5 * pose[2])
         q[self._wheels] = wheel_angle
@@ -110,7 +121,13 @@ class Studio:
         pose_at: Callable[[float], Float[np.ndarray, "3"]],
         wheels_at: Callable[[float], Float[np.ndarray, " wheel"]],
     ) -> np.ndarray:
-        """Return a frame whose exposure is centred on a time, with smear, blur, light and noise."""
+        """Return a frame with motion blur, lens blur, flicker and noise.
+
+        Args:
+            time: middle of the exposure [s].
+            pose_at: function that gives the pose at a time [m, m, rad].
+            wheels_at: function that gives the wheel angles at a time [rad].
+        """
         c = self.camera
         ends = (-0.5, 0.5) if c.exposure_s > 0 else (0.0,)
         images = [
@@ -121,18 +138,19 @@ class Studio:
             image = self._cv2.GaussianBlur(image, (0, 0), c.blur_px)
         fast, slow = np.sin(2 * np.pi * time / np.array([1.7, 7.3]) + self._light)
         image = image * (1 + c.flicker * (0.3 * fast + 0.7 * slow))
-        row, column = self._rng.integers(_SHIFT, size=2)  # one noise, shifted for every frame
+        # all frames have the same noise pattern, shifted at random
+        row, column = self._rng.integers(_SHIFT, size=2)
         image = image + self._grain[row : row + c.height_px, column : column + c.width_px]
         return np.clip(image, 0, 255).astype(np.uint8)
 
     def _lens(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pixel of the drawing that each pixel of the image comes from."""
+        """Return x and y, in the drawing, of the point that each pixel of the image shows."""
         c, cv2 = self.camera, self._cv2
         grid = np.stack(np.meshgrid(np.arange(c.width_px), np.arange(c.height_px)), -1)
         points = grid.reshape(-1, 1, 2).astype(np.float64)
         ideal = cv2.undistortPoints(points, c.matrix, np.array(c.distortion))[:, 0]
         width, height = self._size
-        focal = c.focal_px * height / (DRAWN_SHARE * c.height_px)  # of the drawing
+        focal = c.focal_px * height / (DRAWN_SHARE * c.height_px)  # focal length of the drawing
         x = (focal * ideal[:, 0] + 0.5 * (width - 1)).reshape(c.height_px, c.width_px)
         y = (focal * ideal[:, 1] + 0.5 * (height - 1)).reshape(c.height_px, c.width_px)
         return x.astype(np.float32), y.astype(np.float32)
@@ -141,9 +159,10 @@ class Studio:
 def film(
     studio: Studio, true: Mapping[str, np.ndarray], frames: Float[np.ndarray, " frame"], path: Path
 ) -> None:
-    """Write a video of a run, whole or not at all.
+    """Write a video of a run atomically: an interrupted call leaves no file.
 
     Args:
+        studio: camera that draws the frames.
         true: time [s] (step,), pose (step, 3) and wheel_angle (step, wheel) of the run.
         frames: times of the video's frames [s].
         path: file of the video (.avi, Motion JPEG).
@@ -177,7 +196,7 @@ def film(
 
 
 def _drawing_modules() -> tuple[ModuleType, ModuleType]:
-    """Return the modules mujoco, ready to draw without a screen, and cv2."""
+    """Return the modules mujoco, set up to draw without a screen, and cv2."""
     if os.name == "posix" and "DISPLAY" not in os.environ:
         os.environ.setdefault("MUJOCO_GL", "egl")
     try:
@@ -204,7 +223,7 @@ def _drawing_error(error: Exception) -> DataError:
 def _carpet(
     floor: FloorMap, site: Site, extent: tuple[float, float, float, float], rng: np.random.Generator
 ) -> np.ndarray:
-    """Return a picture of the floor: every surface in its colour, with a grain."""
+    """Return a picture of the floor, every surface in its colour with random grain."""
     step = 0.002
     x = np.arange(extent[0], extent[2], step) + 0.5 * step
     y = np.arange(extent[1], extent[3], step) + 0.5 * step
@@ -216,7 +235,7 @@ def _carpet(
 
 
 def _marker(cv2: ModuleType) -> np.ndarray:
-    """Return a picture of the marker, its top edge ahead: right is the body's front."""
+    """Return a picture of the marker; its top edge is at the right, the body's front."""
     book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     drawn = np.rot90(cv2.aruco.generateImageMarker(book, MARKER, 480), -1)
     return np.repeat(drawn[..., None], 3, axis=2)

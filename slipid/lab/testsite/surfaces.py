@@ -1,4 +1,4 @@
-"""Physics of surfaces, and the uneven floor that a roller meets."""
+"""Physics of surfaces, and the floor as a roller meets it, with random unevenness and ribs."""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -15,14 +15,14 @@ from slipid.support.toml_file import CLOSED, Positive
 GRAVITY = 9.81
 """Gravitational acceleration [m/s^2]."""
 LEVELS = 7
-"""Number of steps of the random unevenness of a floor."""
+"""Number of levels to which the random unevenness of a floor is rounded."""
 ARENA = 1.6
-"""Half of the edge of the square around the start in which one surface is uneven [m]."""
+"""Half the edge length of the square around the start that represents a single surface [m]."""
 GRID = 0.005
-"""Cell size of the floor's lookup grid [m]; larger on the largest floors."""
+"""Cell size of the floor's lookup grid, which is larger on very large floors [m]."""
 
 Pose = tuple[float, float, float]
-"""x, y [m], heading [rad]."""
+"""Pose of the robot: x, y [m], heading [rad]."""
 
 
 @dataclass(frozen=True, config=CLOSED)
@@ -36,10 +36,12 @@ class SurfacePhysics:
             of the robot [m].
         shear_n_m: horizontal stiffness of the floor beneath one roller [N/m].
         compaction: resistance of a sunk wheel per sinkage to the power of 1.5 [N/m^1.5].
-        body_drag_n: resistance of what touches the body, against its motion, not its turning [N].
-        rib_height_m, rib_distance_m: size of ribs along y [m]; by default there are none.
-        unevenness: std of the logarithm of rolling friction and shear stiffness over the floor [1].
-        colour: colour in pictures.
+        body_drag_n: drag force on the body against its translation, such as of a deep pile [N].
+        rib_height_m, rib_distance_m: height of ribs along y, and distance between them [m]; by
+            default there are none.
+        unevenness: std, over the floor, of the logarithm of rolling friction and shear stiffness
+            [1].
+        colour: colour in pictures, as `#rrggbb`.
     """
 
     friction: Annotated[float, Field(gt=0, le=10)] = 0.8
@@ -55,11 +57,11 @@ class SurfacePhysics:
 
     @property
     def settling_s(self) -> float:
-        """Time constant of the engine's contact spring [s]: a wheel sinks in by about 1.9 g t^2."""
+        """Time constant t of the engine's contact spring [s]; a wheel sinks by about 1.9 g t^2."""
         return float((self.softness_m / (1.9 * GRAVITY)) ** 0.5)
 
 
-# friction, rolling_m, softness_m, shear_n_m, compaction, body_drag_n, then as declared
+# positional arguments: friction, rolling_m, softness_m, shear_n_m, compaction, body_drag_n, ...
 SURFACES: dict[str, SurfacePhysics] = {
     "firm": SurfacePhysics(rolling_m=0.0004, unevenness=0.05, colour="#e8e4da"),
     "short": SurfacePhysics(0.75, 0.0008, 0.001, 1.2e4, 2e4, unevenness=0.1, colour="#8a5a35"),
@@ -67,14 +69,14 @@ SURFACES: dict[str, SurfacePhysics] = {
     "soft": SurfacePhysics(0.8, 0.0028, 0.007, 2.2e3, 3e3, 0.5, unevenness=0.15, colour="#1f6b45"),
     "ribbed": SurfacePhysics(0.6, 0.0006, 0.001, 2e4, 0.0, 0.0, 0.0012, 0.02, 0.05, "#3f4a5a"),
 }
-"""Surfaces by name: bare, a short carpet, two deeper ones, and a ribbed mat."""
+"""Surfaces by name: a bare floor, a short carpet, two deeper carpets, and a ribbed mat."""
 
 
 class Terrain:
-    """The floor around a start, divided into kinds: a surface at a level of its random unevenness.
+    """The floor around a start, divided into kinds: surfaces at levels of their random unevenness.
 
     Attributes:
-        kinds: surface of each kind, and the factor of its rolling friction.
+        kinds: surface of each kind, and the factor of its rolling friction and shear compliance.
     """
 
     def __init__(
@@ -96,7 +98,7 @@ class Terrain:
         self._kinds = surface * LEVELS + _random_levels(x, y, rng)
 
     def at(self, xy: Float[np.ndarray, "place 2"]) -> Int[np.ndarray, " place"]:
-        """Return the number of the kind at places [m]."""
+        """Return the index of the kind at each position [m]."""
         column, row = ((xy - self._corner) * (1 / self._cell)).astype(np.intp).T
         rows, columns = self._kinds.shape
         return self._kinds[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
@@ -105,7 +107,10 @@ class Terrain:
 def _random_levels(
     x: Float[np.ndarray, " column"], y: Float[np.ndarray, " row"], rng: np.random.Generator
 ) -> np.ndarray:
-    """Return levels (row, column) of a smooth random field: plane waves of a hand's width."""
+    """Return the levels (row, column) of a smooth random field.
+
+    The field is a sum of plane waves with wavelengths of 8 to 30 cm.
+    """
     waves = 6
     angle = rng.uniform(0, 2 * np.pi, waves)
     number = 2 * np.pi / rng.uniform(0.08, 0.3, waves)
@@ -119,7 +124,10 @@ def _random_levels(
 
 
 def arena(floor: FloorMap, start: Pose) -> tuple[float, float, float, float]:
-    """Return lowest x, y, highest x, y of the floor [m]: a whole map, or a square at the start."""
+    """Return lowest x, lowest y, highest x, highest y of the floor around a start [m].
+
+    It is the whole map, or for a single surface a square around the start.
+    """
     if len(floor.surfaces) > 1:
         return floor.extent
     x, y, _ = start

@@ -1,1 +1,1 @@
-"""Closed-loop trials of controllers, published laws among them."""
+"""Closed-loop trials that compare controllers, among them published control laws."""

@@ -1,4 +1,4 @@
-"""The controllers of a trial, each a row of its table: slipid's own and published laws."""
+"""Controllers of a trial, each a row of its table: slipid's own and published control laws."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -19,11 +19,11 @@ from slipid.robot.twin import ActuatorModel
 from slipid.support.errors import DataError
 
 TUNING_STARTS = ((0.05, 0.0, 0.2), (0.0, 0.05, -0.2), (-0.05, 0.0, 0.2), (0.0, -0.05, -0.2))
-"""Starts beside the path for which gains of published laws are tuned [m, m, rad]."""
+"""Start poses beside the path, relative to its start, for tuning published laws [m, m, rad]."""
 
 
 def _indiveri(robot: DeployedRobot) -> Law:
-    """Return Indiveri's law with the identified wheels and the hand-set gains of the pose loop."""
+    """Return Indiveri's law for the identified wheels, with slipid's hand-set gains."""
     numbers, wheels, gains = robot.record.parameters, robot.record.wheels, Gains()
     matrix = inverse_kinematics(
         np.asarray(robot.places),
@@ -37,9 +37,10 @@ def _indiveri(robot: DeployedRobot) -> Law:
 
 @cache
 def _tuned_gains(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
-    """Return gains tuned on the first two sides of the rectangle [1/s]; the others mirror them.
+    """Return gains of Goswami and Padhy's law, tuned on the first two sides of the rectangle [1/s].
 
-    The ideal robot has the default delay of every twin, so that all robots share these gains.
+    The other two sides mirror these. The tuning uses an ideal robot with the default delay and lag
+    of twins, so that the gains are the same for all robots.
     """
     path, actuators = rectangle(), ActuatorModel()
     times, rows = np.arange(0.0, float(path.marks[1]), PERIOD), np.asarray(path.rows)
@@ -67,14 +68,14 @@ ROWS: Mapping[str, ControllerRow] = {
         "encoder", "law of Indiveri, its limit keeps the direction", law=_indiveri
     ),
 }
-"""Controllers of slipid and of the 2021 paper, then the published laws."""
+"""Controllers by name: those of slipid and of the 2021 paper, then the published laws."""
 
 
 def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
-    """Return the controllers among these that apply to a robot.
+    """Return the controllers among `names` that can drive a robot.
 
     Raises:
-        DataError: none applies.
+        DataError: none of them can.
     """
     kept = tuple(name for name in names if ROWS[name].drives(robot))
     if not kept:
@@ -87,7 +88,7 @@ def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
 
 
 def check_gains(out: Path, robot: DeployedRobot) -> None:
-    """Raise `DataError` if tuned gains are wanted that this robot and load set-up do not have."""
+    """Raise `DataError` if the robot's file, in `out`, has no tuned gains for its load set-up."""
     tuned, path = robot.record.gains, out / "robot.json"
     if tuned is None:
         raise DataError(f"{path}: it has no tuned gains; leave out --tuned-gains")
@@ -99,7 +100,10 @@ def check_gains(out: Path, robot: DeployedRobot) -> None:
 
 
 def unused_gains(robot: DeployedRobot, forced: bool) -> str:
-    """Return which tuned gains of the file are not taken, and why; empty where all are."""
+    """Return a sentence on tuned gains of the robot file that are not used, and why not.
+
+    It is empty if all are used, or there are none. `forced` is the option --tuned-gains.
+    """
     tuned = robot.record.gains
     if tuned is None:
         return ""

@@ -1,44 +1,45 @@
-"""Goswami and Padhy 2018: a tracking law with a Lyapunov function, its gains by particle swarm.
+"""Goswami and Padhy 2018: a tracking law with a Lyapunov function, and gains by particle swarm.
 
-For a robot that drives sideways, with the errors e of its place in its own axes, and of its heading
+For a robot that can drive sideways, with the position error (e_x, e_y) in the robot's own axes, the
+heading error e_th, the path's position p_d and turn rate W_d, and the heading th, the law commands
 
     v = R(th)^T p_d' + (k1 e_x, k2 e_y),   W = W_d + k3 sin e_th
     V = (e_x^2 + e_y^2) / 2 + 1 - cos e_th,   V' = -k1 e_x^2 - k2 e_y^2 - k3 sin^2 e_th
 
-so that V falls for all positive gains, if the robot follows commands at once.
+so that the Lyapunov function V falls for all positive gains, if the robot follows commands at once.
 
-Gains are tuned on an ideal robot with delay and lag: among gains in [0, 5] those with the least
-integral of V over a path that is begun beside it. For a robot that lags as the twin does k1 and k2
-end at the edge, 5, and k3 at 4.67.
+Gains are tuned on an ideal robot with delay and lag: among gains in [0, 5], those that minimise the
+integral of V over a path that starts beside the reference. For a robot with the lag of the twin, k1
+and k2 end at the upper bound, 5, and k3 at 4.67.
 
 - row `goswami_padhy`: by a swarm of 30 particles in 50 iterations, inertia 0.7, c1 = c2 = 1.5.
-- row `goswami_padhy_gradient`: the same integral by its gradient, a quasi-Newton method in a box
-  (L-BFGS-B of scipy), which shows how far the swarm stays from the optimum.
+- row `goswami_padhy_gradient`: the same integral is minimised by a quasi-Newton method with bounds
+  (L-BFGS-B of scipy), which shows how close the swarm comes to the optimum.
 
-In a particle swarm the particles are drawn to the best places found so far:
+In a particle swarm the particles at x are drawn to the best points found so far:
 
     v <- w v + c1 r1 (own best - x) + c2 r2 (best of all - x),   x <- x + v
 
-with r1, r2 uniform in [0, 1], drawn anew for every particle, coordinate and iteration. Its settings
-are those of Goswami and Padhy 2018; nothing is tuned.
+with r1, r2 uniform in [0, 1], drawn anew for every particle, coordinate and iteration. The settings
+of the swarm are those of Goswami and Padhy 2018 and are not tuned.
 
 Liberties:
 
-- The law is the form for robots that drive sideways, as it is quoted; the paper's own text was not
-  at hand.
-- The integrated cost is V, over the path of the trial begun from several places beside it, on a
-  robot without slip whose twist follows commands by the twin's delay and lag. The paper's own
-  robot, path and cost are not reproduced.
-- All wheels follow alike, so that the twist follows as they do; limits of speed, acceleration and
-  voltage are left out, and the pose is known. While gains are tuned the path does not wait.
-- It is steered once in a period, from the pose that the encoders believe in, as all rows are; its
-  commands are held to the limits of all rows.
-- Particles start at rest, and evenly drawn over the box. A coordinate that would leave the box
-stays
-  on its edge, and rests there; its speed is at most half of the box in an iteration.
+- The law is the form for robots that can drive sideways, as other papers quote it; the text of the
+  paper itself was not available.
+- The tuned cost is the integral of V over the path of the trial, from several start poses beside
+  it, for a robot without slip whose twist follows commands with the twin's delay and lag. The
+  paper's own robot, path and cost are not reproduced.
+- In the tuning, all wheels have the same delay and lag, which the twist then has too; limits of
+  speed, acceleration and voltage are left out, the pose is known, and the path does not wait for
+  the robot.
+- As in all rows of the trial, the law is evaluated once per period with the pose by the encoders,
+  and its commands are subject to the same limits.
+- Particles start at rest at uniformly random points of the box. A coordinate that would leave the
+  box stays on its edge with zero velocity; it moves by at most half of the box per iteration.
 
 Source: Goswami and Padhy 2018, a trajectory tracking law for a mobile robot with slip, its gains by
-particle swarm; known here by quotation only. Kennedy and Eberhart 1995, "Particle swarm
+particle swarm; known here only from quotations. Kennedy and Eberhart 1995, "Particle swarm
 optimization", ICNN, with the inertia of Shi and Eberhart 1998.
 """
 
@@ -53,7 +54,7 @@ from jaxtyping import Array, Float
 
 Places = Float[np.ndarray, "particle n"]
 Cost = Callable[[Places], Float[np.ndarray, " particle"]]
-"""Cost of every particle at once; NaN counts as infinite."""
+"""Function that returns the cost of all particles at once; NaN counts as infinite."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,9 @@ class Swarm:
     Attributes:
         particles: number of particles.
         iterations: number of iterations.
-        inertia: part of its speed that a particle keeps.
-        own: weight of the best place of a particle.
-        others: weight of the best place of all particles.
+        inertia: share w of its velocity that a particle keeps.
+        own: weight c1 of a particle's own best point.
+        others: weight c2 of the best point of all particles.
     """
 
     particles: int = 30
@@ -77,14 +78,19 @@ class Swarm:
 
 @dataclass(frozen=True, eq=False)
 class SwarmResult:
-    """The best place of a swarm, and the least cost at its start and after every iteration."""
+    """Result of a swarm.
+
+    Attributes:
+        place: best point found.
+        history: smallest cost found up to the start and up to each iteration.
+    """
 
     place: Float[np.ndarray, " n"]
     history: Float[np.ndarray, " iteration"]
 
     @property
     def cost(self) -> float:
-        """Cost at the best place."""
+        """Cost at the best point."""
         return float(self.history[-1])
 
 
@@ -95,7 +101,7 @@ def minimise(
     swarm: Swarm,
     seed: int = 0,
 ) -> SwarmResult:
-    """Return the least cost that a swarm finds in a box; the same seed finds the same.
+    """Return the best point that a swarm finds in a box; it only depends on the seed.
 
     Args:
         cost: function to minimise.
@@ -127,15 +133,15 @@ def _finite(cost: Float[np.ndarray, " particle"]) -> Float[np.ndarray, " particl
 
 
 Numbers = Array | np.ndarray
-"""Numbers of the law in jax, which drives, or in numpy, where many gains are tried at once."""
+"""Arrays of the law: of jax when it drives a robot, of numpy when many gains are tuned at once."""
 LOW, HIGH = np.zeros(3), np.full(3, 5.0)
 """Bounds of the gains [1/s]."""
 GAIN_STEP = 1e-4
-"""Step of a gain for central differences [1/s]."""
+"""Step of a gain in central differences [1/s]."""
 
 
 class PlaneVector(NamedTuple):
-    """Three numbers of the plane, in any batch: a pose, an error, rates, a twist, or gains."""
+    """Vector of x, y and yaw components: a pose, an error, rates, a twist, or gains."""
 
     x: Numbers
     y: Numbers
@@ -143,20 +149,20 @@ class PlaneVector(NamedTuple):
 
 
 def in_body(v: PlaneVector, heading: Numbers) -> PlaneVector:
-    """Return a vector in world axes in the axes of a body at a heading [rad]."""
+    """Return a vector of world axes transformed to the axes of a body at a heading [rad]."""
     of = heading.__array_namespace__()
     c, s = of.cos(heading), of.sin(heading)
     return PlaneVector(c * v.x + s * v.y, c * v.y - s * v.x, v.yaw)
 
 
 def tracking_error(wanted: PlaneVector, pose: PlaneVector) -> PlaneVector:
-    """Return reference less true pose: place in the axes of the body [m, m], heading [rad]."""
+    """Return reference less actual pose: position in body axes [m, m] and heading [rad]."""
     away = PlaneVector(wanted.x - pose.x, wanted.y - pose.y, wanted.yaw - pose.yaw)
     return in_body(away, pose.yaw)
 
 
 def lyapunov(e: PlaneVector) -> Numbers:
-    """Return the Lyapunov function V of the errors; terms in m^2 and rad have no weights."""
+    """Return the Lyapunov function V of the errors; terms in m^2 and rad are added unweighted."""
     return 0.5 * (e.x * e.x + e.y * e.y) + 1.0 - e.yaw.__array_namespace__().cos(e.yaw)
 
 
@@ -176,7 +182,7 @@ def twist(gains: PlaneVector, e: PlaneVector, rates: PlaneVector, heading: Numbe
 
 
 class GoswamiPadhy(eqx.Module):
-    """The law with its gains k1, k2, k3 [1/s]."""
+    """Goswami and Padhy's control law with its gains k1, k2, k3 [1/s]."""
 
     gains: Float[Array, "3"]
 
@@ -185,7 +191,7 @@ class GoswamiPadhy(eqx.Module):
 
         Args:
             reference: pose and rates of the path in the world [m, m, rad, m/s, m/s, rad/s].
-            pose: believed pose [m, m, rad].
+            pose: estimated pose [m, m, rad].
         """
         wanted, rates, here = (PlaneVector(*x) for x in (reference[:3], reference[3:], pose))
         return jnp.stack(
@@ -195,14 +201,15 @@ class GoswamiPadhy(eqx.Module):
 
 @dataclass(frozen=True, eq=False)
 class TuningTask:
-    """Problem to tune gains on: a path begun beside it, by an ideal robot with delay and lag.
+    """Problem on which gains are tuned: an ideal robot with delay and lag starts beside a path.
 
     Attributes:
-        reference: pose and rates of the path, a row every period.
-        begin: poses from which it is begun [m, m, rad].
+        reference: pose and rates of the path [m, m, rad, m/s, m/s, rad/s], one row per period.
+        begin: start poses of the robot [m, m, rad].
         shares: weights of the last commands, newest first, in the command that arrives in each
-            substep.
-        follow: part of the gap to the arrived command that the twist closes in a substep.
+            substep; they describe the delay.
+        follow: share of the difference to the arrived command by which the twist changes in a
+            substep; it describes the lag.
         period: time between commands [s].
     """
 
@@ -213,7 +220,7 @@ class TuningTask:
     period: float
 
     def integrals(self, gains: Places) -> Float[np.ndarray, " particle"]:
-        """Return the mean over starts of the integral of V over the path [s], for many gains."""
+        """Return the mean over starts of the integral of V over time, for many gains at once."""
         k, h = PlaneVector(*gains.T[..., None]), self.period / len(self.shares)
         pose = np.repeat(self.begin.T[:, None], len(gains), axis=1)
         velocity, total = np.zeros(pose.shape), np.zeros(pose.shape[1:])
@@ -231,7 +238,10 @@ class TuningTask:
         return self.period * total.mean(axis=1)
 
     def slope(self, gains: Float[np.ndarray, "3"]) -> tuple[float, Float[np.ndarray, "3"]]:
-        """Return the integral of V at some gains, and its derivative by central differences."""
+        """Return the mean integral of V, and its derivative with respect to the gains.
+
+        The derivative is by central differences.
+        """
         off = GAIN_STEP * np.eye(3)
         value = self.integrals(gains + np.concatenate([np.zeros((1, 3)), off, -off]))
         return float(value[0]), (value[1:4] - value[4:]) / (2 * GAIN_STEP)
@@ -240,7 +250,7 @@ class TuningTask:
 def _next_pose(
     pose: Float[np.ndarray, "3 *batch"], velocity: Float[np.ndarray, "3 *batch"], h: float
 ) -> Float[np.ndarray, "3 *batch"]:
-    """Return poses after a short time at constant twists, their chord at the heading half-way."""
+    """Return poses after a short time `h` [s] at constant twists, by the midpoint heading."""
     x, y, turn = velocity
     middle = pose[2] + 0.5 * h * turn
     c, s = np.cos(middle), np.sin(middle)
@@ -248,12 +258,12 @@ def _next_pose(
 
 
 def by_swarm(task: TuningTask, seed: int = 0) -> Float[np.ndarray, "3"]:
-    """Return the gains that a swarm finds [1/s]."""
+    """Return the gains that a particle swarm finds [1/s]."""
     return minimise(task.integrals, LOW, HIGH, Swarm(), seed).place
 
 
 def by_gradient(task: TuningTask) -> Float[np.ndarray, "3"]:
-    """Return the gains that the gradient leads to from the middle of the box [1/s]."""
+    """Return the gains that L-BFGS-B finds from the middle of the box [1/s]."""
     from scipy.optimize import minimize
 
     box = list(zip(LOW, HIGH, strict=True))

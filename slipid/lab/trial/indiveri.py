@@ -1,36 +1,38 @@
 """Indiveri 2009: any Swedish wheels, a proportional pose loop, and limits that keep the direction.
 
-A wheel at b drives along the unit vector u; its rollers run freely along a line at the angle gamma
-from u, and n is across that line. Its speed follows from the speed of its centre along n,
+A wheel at the position b, with radius r and speed w, drives along the unit vector u. Its rollers
+run freely along a line at the angle gamma from u; n is the unit vector across that line. The speed
+of the wheel follows from the velocity of its centre along n,
 
     r w (n . u) = n . (v + W z x b),   n . u = sin gamma
 
-a row of w = A xi for every wheel, of any number of wheels (the same as Gfrerrer 2008 derives by
-geometry). The loop commands
+which is one row of w = A xi, for any number of wheels (Gfrerrer 2008 derives the same
+geometrically). With the path's pose (p_d, th_d) and turn rate W_d, and the robot's pose (p, th),
+the pose loop commands the twist xi = (v, W),
 
-    v = R(th)^T (p_d' + k_p (p_d - p)),   W = W_d + k_th (th_d - th),   the turn in (-pi, pi]
+    v = R(th)^T (p_d' + k_p (p_d - p)),   W = W_d + k_th (th_d - th),   th_d - th in (-pi, pi]
     xi <- xi / max(1, max_i |A xi|_i / w_max)
 
-so that a robot whose wheels are too slow moves in the commanded direction, only slower: while the
-path rests, errors fall along the same straight line whatever the limit is.
+so that a robot whose wheels reach their limit w_max still moves in the commanded direction, only
+slower: while the path rests, position errors fall along the same straight line for any limit.
 
-Nothing is tuned: gains are those of the robot's own pose loop set by hand.
+Nothing is tuned: gains are the hand-set ones of slipid's pose loop.
 
 Liberties:
 
-- Implemented from its equations as they are quoted; the paper's own text was not at hand. Its other
-  measures for wheels at their limit, beside one factor for place and heading together, are left
-  out.
-- Gains are not those of a paper. With the same ones the row of the encoders differs by the limit,
-  which all rows have once more after it, and by the sine of the turn: where no wheel is at its
-  limit the two are nearly the same.
-- w_max is the limit of all rows, whatever the robot's own is.
-- The path waits for a robot that lags, and limits of body speed, acceleration of wheels and voltage
-  hold beside w_max, as for all rows.
-- It is steered from the pose that the encoders believe in.
+- The law is implemented from its equations as other papers quote them; the text of the paper itself
+  was not available. Its other treatments of wheels at their limit are left out; here one factor
+  scales translation and turning together.
+- The gains are not those of the paper. The row `encoder` has the same gains. It differs from this
+  one by the sine of the heading error, and by the scaling above, after which the limits of all rows
+  apply once more: while no wheel is at its limit, the two rows are nearly the same.
+- w_max is the limit of all rows, not the robot's own.
+- As in all rows, the path waits for a robot that lags behind, and limits of body speed, wheel
+  acceleration and voltage apply in addition to w_max.
+- The pose is that estimated by the encoders.
 
 Source: Indiveri 2009, "Swedish wheeled omnidirectional mobile robots: kinematics analysis and
-control", IEEE T-RO 25(1), and Gfrerrer 2008, both as they are quoted.
+control", IEEE T-RO 25(1), and Gfrerrer 2008, both as quoted in other papers.
 """
 
 import equinox as eqx
@@ -39,7 +41,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 LEAST_SINE = 0.05
-"""Sine of a roller's angle to the drive direction below which a wheel hardly drives."""
+"""Sine of the angle of rollers to the drive direction below which a wheel cannot drive."""
 
 
 def inverse_kinematics(
@@ -48,7 +50,7 @@ def inverse_kinematics(
     roller_angle: Float[np.ndarray, " wheel"],
     radius: Float[np.ndarray, " wheel"],
 ) -> Float[np.ndarray, "wheel 3"]:
-    """Return A: speed of each wheel without slip [rad/s] from the body's twist [m/s, m/s, rad/s].
+    """Return the matrix A from body twist [m/s, m/s, rad/s] to wheel speeds without slip [rad/s].
 
     Args:
         place: centres of the wheels [m].
@@ -58,8 +60,8 @@ def inverse_kinematics(
         radius: radius of each wheel [m].
 
     Raises:
-        ValueError: rollers that run freely along the drive direction, or wheels that leave a motion
-            of the body free.
+        ValueError: rollers run freely along the drive direction, or the wheels do not determine the
+            motion of the body.
     """
     across = np.sin(roller_angle)
     if np.abs(across).min() < LEAST_SINE:
@@ -83,9 +85,9 @@ def pose_loop(
     """Return the twist that the pose loop commands [m/s, m/s, rad/s].
 
     Args:
-        gains: gains of place and heading [1/s].
+        gains: gains of position and heading [1/s].
         reference: pose and rates of the path in the world [m, m, rad, m/s, m/s, rad/s].
-        pose: believed pose [m, m, rad].
+        pose: estimated pose [m, m, rad].
     """
     vx, vy = reference[3:5] + gains[0] * (reference[:2] - pose[:2])
     off = reference[2] - pose[2]
@@ -97,17 +99,17 @@ def pose_loop(
 def within_limit(
     twist: Float[Array, "3"], matrix: Float[Array, "wheel 3"], limit: Float[Array, ""]
 ) -> Float[Array, "3"]:
-    """Return a twist, scaled down where a wheel would be faster than a limit [rad/s]."""
+    """Return the twist, scaled down if a wheel would be faster than `limit` [rad/s]."""
     over = jnp.max(jnp.abs(matrix @ twist)) / limit
     return twist / jnp.maximum(over, 1.0)
 
 
 class Indiveri(eqx.Module):
-    """The law with its numbers.
+    """Indiveri's control law with its parameters.
 
     Attributes:
-        matrix: matrix of `inverse_kinematics`.
-        gains: gains of place and heading [1/s].
+        matrix: matrix A of `inverse_kinematics`.
+        gains: gains of position and heading [1/s].
         limit: highest speed of the wheels [rad/s].
     """
 

@@ -1,4 +1,4 @@
-"""The virtual test site as the plant of a trial, and robots drawn from a posterior."""
+"""Plants of a trial: the virtual test site, and robots drawn from a posterior."""
 
 from functools import partial
 
@@ -17,7 +17,7 @@ from slipid.support.errors import DataError
 
 
 def refuse_unknown_to_site(floor: FloorMap, load: str, wheels: int) -> None:
-    """Raise `DataError` for wheels, a load set-up or a surface that the test site does not have."""
+    """Raise `DataError` if the test site lacks the number of wheels, load set-up or a surface."""
     robot, other = Site().robot, "With --plant twin the identified model is driven itself"
     has = len(robot.wheel_azimuths_deg)
     if wheels != has:
@@ -33,14 +33,16 @@ def refuse_unknown_to_site(floor: FloorMap, load: str, wheels: int) -> None:
 
 
 class SitePlant:
-    """The virtual test site as a plant of `slipid.robot.closed_loop`, with its delay and slew.
+    """The virtual test site as a plant of `slipid.robot.closed_loop`.
+
+    Commands act with the site's delay and limited acceleration.
 
     Args:
         floor: map of the surfaces.
         load: name of the load set-up.
-        start: x, y [m], heading [rad].
-        seed: seed of unevenness, the wheels' first angles and noise.
-        gyro: whether the robot has one.
+        start: start pose: x, y [m], heading [rad].
+        seed: seed of the floor's unevenness, the initial wheel angles and sensor noise.
+        gyro: True if the robot has a gyro.
     """
 
     def __init__(
@@ -57,12 +59,12 @@ class SitePlant:
 
     @property
     def power(self) -> float:
-        """Electric power of the motors [W]."""
+        """Total electric power of the motors [W]."""
         drive = self.plant.drive
         return float(np.dot(drive.voltage, drive.current))
 
     def reset(self) -> Measurement:
-        """Return the first readings of the robot at rest at its start."""
+        """Put the robot at its start and return its first measurement, at rest."""
         self.plant = self._new()
         self._rims = RimSpeeds(self._site, self.plant)
         self._rng = np.random.default_rng([self._seed, 1])
@@ -70,7 +72,7 @@ class SitePlant:
         return self._read(np.zeros((1, 2 * len(self.plant.wheel_dof))))
 
     def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Measurement:
-        """Return the readings one period later."""
+        """Command wheel speeds [rad/s], advance by one period and return the measurement then."""
         plant, drive, rows = self.plant, self.plant.drive, []
         self._rims.send(np.asarray(wheel_speed, float))
         for _ in range(round(PERIOD / plant.dt)):
@@ -80,7 +82,7 @@ class SitePlant:
         return self._read(np.array(rows[-width:]))
 
     def _read(self, recent: Float[np.ndarray, "step channel"]) -> Measurement:
-        """Return sensor readings from recent currents and voltages and the present wheel angles."""
+        """Return a measurement, with currents and voltages averaged over `recent` time steps."""
         s, rng, tick = self._site.sensors, self._rng, self._site.tick
         amps, volts = np.split(recent.mean(axis=0), 2)
         amps, volts = s.amperes(amps, rng), s.volts(volts, rng)
@@ -94,7 +96,7 @@ class SitePlant:
 
 
 def drawn_robot(robot: DeployedRobot, seed: int) -> DeployedRobot:
-    """Return a robot drawn from the posterior; the robot itself where the file has no draws."""
+    """Return a robot with parameters drawn from the posterior, or unchanged without draws."""
     count = robot.record.drawn
     if count == 0:
         return robot

@@ -1,4 +1,4 @@
-"""Picture of a trial: every controller's paths over the floor, and their errors."""
+"""Picture of a trial: the paths of every controller over the floor, and their errors."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +17,7 @@ from slipid.support.content import Content
 
 Paths = Mapping[str, np.ndarray]
 TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
-"""Colours of floors, in the order of the map."""
+"""Colours of surfaces, in the order of the map's surfaces."""
 OTHERS, MARKED = "#56B4E9", "#D55E00"
 ERRORS = {
     "closure_error_median": "closure error [mm]",
@@ -29,13 +29,16 @@ ERRORS = {
 def trial_plot(
     content: Content, paths: Paths, wanted: np.ndarray, floor: FloorMap, path: Path
 ) -> Path:
-    """Draw the typical start's path over the map, all starts from one corner, and bars of errors.
+    """Write a picture of a trial and return its file.
+
+    For every controller it shows the paths from all starts, moved to one start, with the run from
+    a typical start over the map; bars show medians of errors.
 
     Args:
         content: content of trial.json.
-        paths: true poses (step, 3) by run, `CONTROLLER/startNN`.
-        wanted: places on the path (row, 2) [m].
-        floor: map that was driven on.
+        paths: true poses (step, 3) by name of the run, `CONTROLLER/startNN`.
+        wanted: positions on the reference path (row, 2) [m].
+        floor: map of the floor.
         path: file of the picture.
     """
     names = list(content["summary"])
@@ -55,7 +58,7 @@ def trial_plot(
 
 
 def _verdict(content: Content) -> str:
-    """Return which controller closes best, if the starts can distinguish them."""
+    """Return a text that names the controller with the smallest closure error, if it is clear."""
     best = content["closes_best"]
     if best is None:
         return f"{', '.join(content['not_told_apart'])} are not distinguished"
@@ -64,9 +67,9 @@ def _verdict(content: Content) -> str:
 
 
 def _typical_start(content: Content) -> int:
-    """Return the start whose first controller's run is nearest to the median closure.
+    """Return the index of the start whose closure error is nearest to the median.
 
-    The encoders' run decides where there is one.
+    The runs compared are those of the controller `encoder` or, without it, of the first one.
     """
     first = "encoder" if "encoder" in content["summary"] else next(iter(content["summary"]))
     runs = [r for r in content["runs"] if r["controller"] == first]
@@ -83,7 +86,10 @@ def _paths_panel(
     floor: FloorMap,
     one: int,
 ) -> None:
-    """Draw all starts of a controller laid on one another, the typical one over its floor."""
+    """Draw the paths of a controller from all starts, in the axes of their start poses.
+
+    The path from start `one` is highlighted, over the floor as seen from that start.
+    """
     runs = [r for r in content["runs"] if r["controller"] == name]
     own = [
         (paths[f"{name}/start{k:02d}"][:, :2] - r["start"][:2]) @ _rotation(r["start"][2])
@@ -112,7 +118,7 @@ def _paths_panel(
 
 
 def _legend(drawing: Figure, floor: FloorMap) -> None:
-    """Explain tints and lines."""
+    """Add the legend of floor tints and lines."""
     patches = [
         Patch(facecolor=tint, edgecolor=SHADE, label=name)
         for name, tint in zip(floor.surfaces, TINTS, strict=False)
@@ -128,13 +134,13 @@ def _legend(drawing: Figure, floor: FloorMap) -> None:
 
 
 def _rotation(heading: float) -> np.ndarray:
-    """Return the rotation from the axes of a pose to the site's."""
+    """Return the rotation matrix from body axes at a heading [rad] to world axes."""
     c, s = np.cos(heading), np.sin(heading)
     return np.array([[c, -s], [s, c]])
 
 
 def _bars(axes: Axes, table: Content, key: str, label: str) -> None:
-    """Draw medians with their 90 % intervals."""
+    """Draw a bar with its 90 % interval for the median error `key` of each controller."""
     names = list(table)
     value = np.array([table[n][key] for n in names])
     low, high = np.array([table[n]["interval90"][key] for n in names]).T

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from slipid.robot.closed_loop import PathMetrics
 
 Interval = tuple[float, float]
-"""90 % interval, by bootstrap over starts."""
+"""Lower and upper end of a 90 % interval, by bootstrap over starts."""
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,8 @@ class TrialRun:
         controller: name of the controller.
         start: start pose [m, m, rad].
         seed: seed of all random numbers.
-        metrics: path errors by the true poses.
-        believed_error_mm: error of the believed place at the end.
+        metrics: path errors of the true poses.
+        believed_error_mm: error of the estimated position at the end [mm].
     """
 
     controller: str
@@ -31,14 +31,14 @@ class TrialRun:
     believed_error_mm: float
 
     def to_json(self) -> dict[str, object]:
-        """Return the run as trial.json has it."""
+        """Return the run in the form of trial.json."""
         about = {"controller": self.controller, "start": list(self.start), "seed": self.seed}
         return {**about, **asdict(self.metrics), "believed_error_mm": self.believed_error_mm}
 
 
 @dataclass(frozen=True)
 class MedianRatio:
-    """Ratio of a median to that of the controller `encoder`, and its interval over the starts."""
+    """Ratio of a controller's median error to that of the controller `encoder`, with interval."""
 
     value: float
     interval90: Interval
@@ -46,16 +46,17 @@ class MedianRatio:
 
 @dataclass(frozen=True)
 class ControllerSummary:
-    """One controller over its starts.
+    """Summary of one controller over its starts.
 
     Attributes:
-        median: medians by name, see `columns`; without those that a plant does not measure (the
-            twin's energy).
-        interval90: intervals of the medians by name.
+        median: medians of errors by name, see `columns`; without those that a plant does not
+            measure (the twin's energy).
+        interval90: intervals of the medians, by name.
         runs: number of runs.
-        finished_share: share of the runs that reached the end.
-        worse_share: share of the starts that it closes worse than the controller `encoder`.
-        to_encoder: ratios of medians; None without the controller `encoder`.
+        finished_share: share of the runs that reached the end of the path.
+        worse_share: share of the starts with a larger closure error than the controller `encoder`;
+            None without that controller.
+        to_encoder: ratios of medians to those of `encoder`; None without that controller.
     """
 
     median: Mapping[str, float]
@@ -66,7 +67,7 @@ class ControllerSummary:
     to_encoder: Mapping[str, MedianRatio] | None
 
     def to_json(self) -> dict[str, object]:
-        """Return the summary as trial.json has it."""
+        """Return the summary in the form of trial.json."""
         rest = asdict(self)
         if self.to_encoder is None:
             del rest["to_encoder"], rest["worse_share"]
@@ -77,7 +78,7 @@ Columns = Mapping[str, Float[np.ndarray, " run"]]
 
 
 def summaries(runs: Sequence[TrialRun], draws: int = 2000) -> dict[str, ControllerSummary]:
-    """Return medians over starts of every controller, with 90 % bootstrap intervals."""
+    """Return the summary of every controller, with 90 % bootstrap intervals over starts."""
     names = list(dict.fromkeys(run.controller for run in runs))
     of = {name: [run for run in runs if run.controller == name] for name in names}
     table = {name: columns(of[name]) for name in names}
@@ -104,11 +105,11 @@ def summaries(runs: Sequence[TrialRun], draws: int = 2000) -> dict[str, Controll
 
 
 def best_controllers(runs: Sequence[TrialRun], draws: int = 2000) -> tuple[str, ...]:
-    """Return the controllers that may close best, the one with the lowest median first.
+    """Return the controllers that may have the smallest closure error, the lowest median first.
 
-    The others are those whose errors, start by start, are not clearly larger: the 90 % bootstrap
-    interval of the difference of medians over the shared starts does not lie above 0. A controller
-    that left more runs unfinished than another does not close best.
+    The others are those whose errors are not clearly larger: the 90 % bootstrap interval of the
+    difference of medians, over the same starts, does not lie above 0. Only controllers with the
+    smallest number of unfinished runs are considered.
     """
     names = list(dict.fromkeys(run.controller for run in runs))
     of = {name: [run for run in runs if run.controller == name] for name in names}
@@ -129,8 +130,8 @@ def best_controllers(runs: Sequence[TrialRun], draws: int = 2000) -> tuple[str, 
 def columns(runs: Sequence[TrialRun]) -> Columns:
     """Return the errors of every run by name.
 
-    `first_side_along_track_mm` and `heading_error_deg` are the errors' sizes;
-    `first_side_travelled` is the part of the first side. Of a curve, that is its first quarter.
+    `first_side_along_track_mm` and `heading_error_deg` are magnitudes; `first_side_travelled` is
+    the share of the first side that was travelled. The first side of a curve is its first quarter.
     """
     m = [run.metrics for run in runs]
     side, whole = np.array([(x.along_track_mm[0], x.sides_mm[0]) for x in m]).T

@@ -1,4 +1,4 @@
-"""Trial of controllers on the rectangle of the 2021 paper's figure 7, or on another path."""
+"""Closed-loop trial of controllers on the rectangle of the 2021 paper, or on another path."""
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
@@ -40,13 +40,29 @@ from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.trial/1"
 FOLDER = "trial"
-"""Folder of finished runs, below the result folder."""
+"""Name of the folder of finished runs, in the result folder."""
 PLANTS = ("testsite", "twin")
 
 
 @dataclass(frozen=True, eq=False)
 class TrialTask:
-    """One run of one controller from one start; `known_map` is the map that controllers may use."""
+    """Task of driving one controller from one start.
+
+    Attributes:
+        name: name of the run, `CONTROLLER/startNN`.
+        row: name of the controller.
+        path: reference path, from the origin.
+        start: start pose [m, m, rad].
+        seed: seed of all random numbers.
+        plant: `testsite` or `twin`.
+        floor: map of the floor that is driven on.
+        known_map: map of the floor that controllers are given.
+        robot: identified robot.
+        settings: settings of the estimator.
+        actuators: delay, lag and limits of the twin's wheel speeds.
+        forced: True if tuned gains are used even if they are no better than hand-set ones.
+        kept: checkpoint with the finished runs.
+    """
 
     name: str
     row: str
@@ -68,16 +84,16 @@ class TrialOptions:
     """Options of a trial.
 
     Attributes:
-        plant: `testsite` (MuJoCo) or `twin` (the identified model itself, another draw of its
-            numbers for every start).
-        map: file of a floor map; None for patches of the identified floors.
-        told_map: file of the map given to controllers with a map; None for the true one.
-        controllers: names of `ROWS`.
-        path: name of `trajectory.PATHS`.
-        speed: speed along it [m/s].
+        plant: `testsite` (MuJoCo) or `twin` (the identified model itself, with parameters drawn
+            anew from the posterior for every start).
+        map: file of the floor map that is driven on; None for patches of the identified floors.
+        told_map: file of the map that is given to controllers with a map; None for the true one.
+        controllers: names of controllers, keys of `ROWS`.
+        path: name of the path, a key of `trajectory.PATHS`.
+        speed: speed along the path [m/s].
         starts: number of starts.
         load: name of the load set-up; None for the first.
-        tuned_gains: whether tuned gains are taken that are no better than those set by hand.
+        tuned_gains: True to use tuned gains even if they are no better than hand-set ones.
     """
 
     plant: str = "testsite"
@@ -97,10 +113,10 @@ class TrialResult:
 
     Attributes:
         content: content of trial.json.
-        runs: runs that it summarises.
-        paths: true poses of every run by its name (step, 3).
-        wanted: places on the path from the origin (row, 2) [m].
-        floor: map that was driven on.
+        runs: runs that the content summarises.
+        paths: true poses (step, 3) of every run, by its name.
+        wanted: positions on the reference path, from the origin (row, 2) [m].
+        floor: map of the floor that was driven on.
     """
 
     content: dict[str, Any]
@@ -113,11 +129,12 @@ class TrialResult:
 def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter) -> TrialResult:
     """Drive every controller from every start, and write trial.json.
 
-    Finished runs are kept, and not driven again as long as nothing they depend on changes.
+    Finished runs are saved, and not driven again unless something that they depend on changes.
 
     Raises:
-        DataError: no fit, no such plant, controller, path, load or map, MuJoCo missing, floors that
-            the plant or the fit does not know, or a speed beyond those of the fit.
+        DataError: there is no fit in the folder; the plant, a controller, the path, the load set-up
+            or a map does not exist; MuJoCo is missing; the plant or the fit does not know a floor;
+            or the speed is beyond those of the fit.
     """
     setup_jax(quiet=True)
     tasks = _tasks(out, options)
@@ -164,7 +181,7 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
     floor = twin_floor(robot) if options.map is None else read_map(options.map)
     known_map = floor if options.told_map is None else read_map(options.told_map)
     settings, actuators = Settings.of(robot), actuator_model_of(robot, gyro=False)
-    if options.plant == "testsite":  # its sensors do not depend on those of the logs
+    if options.plant == "testsite":  # the site has its own sensors, whatever the logs had
         refuse_unknown_to_site(floor, robot.load_setup, robot.wheels)
         settings, actuators = replace(settings, current_is_signed=False), ActuatorModel()
     else:
@@ -204,13 +221,13 @@ def _gains(robot: DeployedRobot, forced: bool) -> dict[str, float]:
 
 
 def _finished_run(task: TrialTask) -> tuple[TrialRun, np.ndarray] | None:
-    """Return a run and its true poses; None where it has not been driven yet."""
+    """Return a run with its errors, and its true poses; None if it has not been driven yet."""
     run, path = task.kept.load_json(task.name), task.kept.load(task.name)
     return None if run is None or path is None else (typed(TrialRun, run), path["pose"])
 
 
 def drive(task: TrialTask) -> None:
-    """Drive one run and write its metrics and its path."""
+    """Drive one run and save its errors and its path in the checkpoint."""
     setup_jax(quiet=True)
     row = ROWS[task.row]
     robot = jax.tree.map(jnp.asarray, task.robot)
@@ -234,14 +251,14 @@ def drive(task: TrialTask) -> None:
         metrics=closed_loop.path_metrics(driven),
         believed_error_mm=1000 * float(np.hypot(off[0], off[1])),
     )
-    # the path first, because a run with metrics counts as finished
+    # the path is saved first, because a run with saved errors counts as finished
     poses = {"time": driven.time, "pose": driven.pose, "believed": driven.estimated_pose}
     task.kept.save(task.name, poses)
     task.kept.save_json(task.name, asdict(run))
 
 
 def controller_names(text: str | None) -> tuple[str, ...]:
-    """Return the controllers in a list with commas, all of them by default."""
+    """Return the controllers in a comma-separated list; all controllers for None."""
     if text is None:
         return tuple(ROWS)
     return tuple(dict.fromkeys(t.strip() for t in text.split(",") if t.strip()))

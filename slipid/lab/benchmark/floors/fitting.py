@@ -100,7 +100,7 @@ class Cells:
 
     @classmethod
     def joined(cls, runs: Sequence[FloorSignals]) -> "Cells":
-        """Return the cells of several runs."""
+        """Return the cells of several runs, one run after the other."""
         each = [cls.of(run) for run in runs]
         return cls(*(np.concatenate([getattr(c, f.name) for c in each]) for f in fields(cls)))
 
@@ -116,7 +116,7 @@ class Cells:
 
 
 def scatter_of(runs: Sequence[FloorSignals]) -> float:
-    """Return the std of currents at constant wheel speeds [A]."""
+    """Return the std of currents within cells of at least 5 rows, over all drives [A]."""
     cells = Cells.joined(runs)
     several = cells.rows >= 5
     weight = cells.rows[several, None]
@@ -210,11 +210,11 @@ class _FloorMisfit:
         self.last: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     def residuals(self, logs: np.ndarray) -> np.ndarray:
-        """Return the residuals."""
+        """Return the residuals at logarithms of the floor's parameters."""
         return self._both(logs)[0]
 
     def jacobian(self, logs: np.ndarray) -> np.ndarray:
-        """Return the derivatives of the residuals."""
+        """Return the derivatives of the residuals with respect to the logarithms."""
         return self._both(logs)[1]
 
     def _both(self, logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -53,11 +53,11 @@ NEEDED = COLUMNS[:5]
 LONGEST_S = 0.5
 """Time between two rows above which a file is split into two runs there [s]."""
 FEWEST = 3
-"""Smallest number of rows of a run."""
+"""Smallest number of rows of a run; shorter runs are left out."""
 
 
 def husky() -> Robot:
-    """Return the robot, without floors."""
+    """Return the Husky by its maker's data and measured motor friction, without floors."""
     robot = build(skid_steer(0.256, 0.275, RADIUS, 78.71, drive_of=(0, 1, 0, 1)), ())
     gain = float(robot.motor.gain)
     motor = replace(
@@ -139,7 +139,7 @@ def husky_table(data: Path, quick: bool = False, only: tuple[str, ...] = ()) -> 
 
 
 class HuskyFloorTask(FloorTask):
-    """Table of the Husky on five floors without a pose."""
+    """Task that makes the table of the Husky on five floors without a pose."""
 
     name = "husky_floors"
     folder = FOLDER

@@ -81,7 +81,7 @@ def folds_of(runs: Sequence[FloorSignals], count: int) -> Int[np.ndarray, " run"
 def answers_of(
     method: FloorClassifier, runs: Sequence[FloorSignals], spec: RobotSpec, seconds: Sequence[float]
 ) -> list[Answer]:
-    """Return the answers of a fitted classifier to all stretches of runs."""
+    """Return the answers of a fitted classifier in all stretches of the runs."""
     stretches = [part for run in runs for part in run.segments(max(seconds))]
     beliefs = method.probability(stretches, spec)
     return [
@@ -290,11 +290,11 @@ class FloorTask(abc.ABC):
     @property
     @abc.abstractmethod
     def rows(self) -> Sequence[str]:
-        """Names of its classifiers."""
+        """Names of the classifiers in the table."""
 
     @abc.abstractmethod
     def log_hash(self) -> str:
-        """Return the hash of its logs."""
+        """Return a hash of the logs that the table depends on."""
 
     @abc.abstractmethod
     def make(self) -> ClassifierTable:
@@ -302,7 +302,7 @@ class FloorTask(abc.ABC):
 
     @property
     def is_requested(self) -> bool:
-        """True if its logs are available and any of its rows is requested."""
+        """True if the task's logs are available and at least one of its rows is requested."""
         requested = not self.options.only or bool(set(self.options.only) & set(self.rows))
         return requested and (self.options.data / self.folder).is_dir()
 

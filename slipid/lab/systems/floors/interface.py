@@ -29,7 +29,7 @@ Beliefs = Float[np.ndarray, "row floor"]
 """Probability of each floor after every row."""
 Features = Float[np.ndarray, "row feature"]
 STILL = 0.3
-"""Wheel speed below which a wheel counts as standing [rad/s]."""
+"""Wheel speed up to which a wheel counts as at rest [rad/s]."""
 WINDOWS_S = (0.5, 1.0, 2.0)
 """Lengths of the feature windows [s]."""
 

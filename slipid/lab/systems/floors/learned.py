@@ -245,7 +245,7 @@ class BoostedTreesClassifier(FloorClassifier):
 
     @property
     def numbers(self) -> int:
-        """Largest possible number of leaves of all trees."""
+        """Largest possible number of leaves of all trees, taken as the number of parameters."""
         return len(self.fitted) * self.trees * len(self.labels) * self.leaves
 
     def _ensemble(

@@ -171,7 +171,7 @@ class SlipExamples:
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """Standardisation of columns to mean zero and standard deviation one on the training rows.
+    """Standardisation of columns to mean 0 and standard deviation 1 on the training rows.
 
     Values outside the training range are clipped to it: polynomials and networks do not
     extrapolate sensibly.

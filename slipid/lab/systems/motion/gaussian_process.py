@@ -89,7 +89,7 @@ class Kernel:
 
 @dataclass(frozen=True, eq=False)
 class ProcessRows:
-    """Training rows of a process.
+    """Training data of a Gaussian process.
 
     Attributes:
         x: inputs.

@@ -170,14 +170,14 @@ class PairMoments:
         return cls(np.stack(pair, axis=1), np.moveaxis(gram, -1, 0), moment.T, square)
 
     def solved(self, ridge: float) -> Layer:
-        """Return the neuron of every pair by least squares with a ridge."""
+        """Return the neuron of every pair of inputs, by least squares with a ridge."""
         # the constant has no penalty
         penalty = np.diag([0.0, *[ridge] * 5])
         weight = np.linalg.solve(self.gram + penalty, self.moment[..., None])[..., 0]
         return Layer(self.inputs, weight)
 
     def errors(self, weight: Float[np.ndarray, "pair 6"]) -> Float[np.ndarray, " pair"]:
-        """Return the mean square error of every pair's neuron."""
+        """Return the mean square error of every pair's neuron with these weights."""
         output = np.einsum("pi,pij,pj->p", weight, self.gram, weight)
         error = self.square - 2 * (weight * self.moment).sum(axis=1) + output
         return np.asarray(error.clip(min=0.0))

@@ -226,7 +226,7 @@ class QuannSlip(SlipModel):
 
 
 def slip_inputs(windows: SignalWindows, spec: RobotSpec) -> Inputs:
-    """Return |I| and |w| of each drive, and the direction of travel."""
+    """Return the inputs of the process: |I| and |w| of each drive, and the direction of travel."""
     columns = [windows.amperes(), np.abs(windows.speed()), windows.direction(spec)]
     return np.concatenate(columns, axis=1)
 

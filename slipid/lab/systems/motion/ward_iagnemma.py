@@ -1,9 +1,10 @@
 """Ward and Iagnemma: slip detection by an extended Kalman filter on the robot's dynamics.
 
-The state is the body's twist v, the coefficient rho of the resistive force and the gyro's bias b.
-Wheel speeds are inputs. Let q = (vx, vy, L W), let J_i be the rim speed of drive i per q, let
-N = m g / n be the load of each of n drives, and let M = diag(m, m, m/2), p = (vx, vy) and
-q_t = L W. Then the forces and the equation of motion are
+The state is the body's twist (vx, vy, W), the coefficient rho of the resistive force and the gyro's
+bias b. Wheel speeds w_i are inputs. Let L be the base radius, q = (vx, vy, L W), J_i the row vector
+that maps q to the rim speed of drive i, r the wheel radius, N = m g / n the load of each of n
+drives, M = diag(m, m, m/2), p = (vx, vy) and q_t = L W. Then the forces and the equation of motion
+are
 
     u_i    = r w_i - J_i q                                              sliding speed
     T_i    = N (C1 sgn(u_i) (1 - exp(-A |u_i|)) + C2 u_i)               traction
@@ -12,44 +13,45 @@ q_t = L W. Then the forces and the equation of motion are
     M dq/dt = sum_i J_i^T T_i + F + m W (vy, -vx, 0)
 
 Wheels that do not determine the twist (skid steer) grip sideways, and they slide sideways as soon
-as the robot turns; then p = vx and q_t = (vy, L W). A step is one of backward Euler, solved by
-Newton's method with the analytic Jacobian. The filter measures gyro = W + b, and in
-`ward_iagnemma_current` also n C_e I_i / r = k sgn(w_i) T_i + f of every wheel that drives. A weak
-constraint keeps rho in its range: where rho is below 0, so that the force would push, or above
-C1 / (1 + c |p|), so that no traction could overcome it, a measurement with a tenth of rho's spread
-moves it to that bound.
+as the robot turns; then p = vx and q_t = (vy, L W). Each time step is a step of backward Euler,
+solved by Newton's method with the analytic Jacobian. The measurements are gyro = W + b and, in
+`ward_iagnemma_current`, the motor force n_g C_e I_i / r = k sgn(w_i) T_i + f of every wheel that
+drives, with the gear ratio n_g, the back-EMF constant C_e and the current I_i. A weak constraint
+keeps rho in its range. If rho is below 0, so that the force would push, or above C1 / (1 + c |p|),
+so that no traction could overcome it, a pseudo-measurement at the bound corrects it, whose std is a
+tenth of rho's std between runs.
 
-A robot counts as immobilised where |v| < 0.2 of its wheels' twist, for 0.4 s. The score of
-slipping is 1 - |v| / |v by the wheels|, where turning is weighted by the base radius.
+In the original, a robot counts as immobilised if the norm of its twist is below 0.2 of that of its
+wheels' twist for 0.4 s. The slip score here is 1 - |q| / |q of the rolling wheels|.
 
 The fit uses at most 40 runs. It finds A, rho, rho_t and c by least squares of the twists of windows
-of half a second, each taken as steady motion. The residuals then give the scatter of rho between
-runs, the process noise (white noise of the twist that explains the ends of training runs), the
-noise and bias of the gyro, and k, f and the noise of the currents. Two settings are tuned: whether
-resistance grows with speed (c), and whether rho is a random walk within a run, by half its scatter
-between runs in a second.
+of half a second, each taken as steady motion. The residuals then give the std of rho between runs,
+the process noise (white noise of the twist that explains the end-point errors of training runs),
+the noise and bias of the gyro, and k, f and the noise of the currents. Two settings are tuned:
+whether resistance grows with speed (c), and whether rho is a random walk within a run, whose std
+after a second is half of the std of rho between runs.
 
 Liberties:
-- The original measures acceleration and, where there is one, GPS; neither is logged here. It has
-  one axis of travel and pitch; here the body moves in a plane, and the ground is level.
-- The state is the coefficient of the resistive force, not the force. The force fades out below
-  v_s = 2 cm/s, and may grow with speed (c); turning has a coefficient of its own.
+- The original measures acceleration and, if available, GPS; neither is logged here. It models
+  motion along one axis and pitch; here the body moves in a plane, and the floor is level.
+- The state includes the coefficient of the resistive force, not the force itself. The force fades
+  out below v_s = 2 cm/s and may grow with speed (c); turning has its own coefficient.
 - The original takes parameters from experiments and shows that their values matter little; here
-  they are fitted. Steady motion identifies forces only in ratio to C1, so C1 is 0.6 throughout. C2
-  is 0.1 s/m, since windows cannot separate it from the end of the exponential. A weak prior holds
-  the other parameters where motion does not identify them.
+  they are fitted. Steady motion identifies forces only relative to C1, so C1 is fixed at 0.6. C2 is
+  fixed at 0.1 s/m, since windows cannot separate it from the tail of the exponential. A weak prior
+  determines the other parameters where motion does not identify them.
 - Every drive carries the same load, traction acts along the drive direction only (rollers are
   free), and the inertia is m L^2 / 2.
-- Forces by currents are scaled and offset by least squares (k, f), because gear losses are not
-  known, and often not even the motor. Their errors are mostly the same all along a run, so their
-  noise is that of the mean of a run. They correct rho, and through it the twist, but they do not
-  correct the twist itself: most of its scatter is no sliding, which the steep law would infer from
-  it. Where ammeters have no sign, all driving wheels are taken to push. Currents of wheels below
-  0.3 of the fastest rim speed are not used.
+- Forces from currents have a scale k and an offset f, fitted by least squares, because gear losses
+  are not known, and often not even the motor. Their errors are nearly constant within a run, so
+  their noise is chosen to give the right variance of a run's mean. They correct rho directly, and
+  the twist only through rho: the steep traction law would attribute all scatter of the forces to
+  sliding, which most of it is not. If currents have no sign, all driving wheels are assumed to
+  push. Currents of wheels below 0.3 of the fastest rim speed are not used.
 - A run starts with the twist without slip.
 - The score is the ratio itself, without waiting for 0.4 s.
-- The pose is not corrected by later measurements: the path is that of the filtered twists, and
-  its covariance is of that path (a Kalman filter whose gain for the pose is zero).
+- The pose is not corrected by later measurements: the path is integrated from the filtered twists,
+  and its covariance is that of this path (a Kalman filter whose gain for the pose is zero).
 
 Source: Ward & Iagnemma 2008, "A dynamic-model-based wheel slip detector for mobile robots on
 outdoor terrain", IEEE Transactions on Robotics 24(4).
@@ -76,9 +78,9 @@ from slipid.lab.systems.motion.ward_iagnemma_filter import FilterNoise, SlipFilt
 from slipid.predict.slip_model import PredictedRun, RobotSpec, Run, RunSignals, SlipModel, path_of
 
 _STEADY = 10.0
-"""Time after which speeds count as steady [s]."""
+"""Duration of the backward Euler step whose end counts as steady motion [s]."""
 _FIT_RUNS, _FIT_WINDOWS = 40, 100
-"""Largest numbers of runs, and of windows for the law, in a fit."""
+"""Largest number of runs in a fit, and of windows in the fit of the force law."""
 _BOUNDS = {
     "rise": (0.5, 500.0),
     "rolling": (1e-3, 1.0),
@@ -86,23 +88,25 @@ _BOUNDS = {
     "drag": (0.1, 500.0),
 }
 _GRID = ((0.3, 1.0), (0.3, 6.0), (3.0, 1.0), (3.0, 6.0))
-"""Start values of A and rho, relative to the middles of their bounds."""
+"""Start values of A and rho, as factors of the geometric middles of their bounds."""
 _PRIOR = 1e-3
-"""Relative slip whose cost equals that of a factor e in a parameter."""
+"""Weight of the prior: a parameter a factor e from its middle costs as much as this relative slip
+in every window."""
 _MEDIAN_OF_SQUARES = 0.4549
-"""Median of the square of a standard normal number: a median of squares over it is a variance."""
+"""Median of the square of a standard normal variable; a median of squares divided by it is a robust
+variance."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosedWindows:
-    """Windows of training runs.
+    """Windows of training runs with true speeds.
 
     Attributes:
         run: index of the run of each window.
         rolling: q without slip [m/s].
-        true: q by the pose [m/s].
+        true: q from the poses [m/s].
         rim: rim speed of each drive [m/s].
-        force: force of each motor at the rim by its current [N], NaN where it is unknown.
+        force: force of each motor at the rim from its current [N], NaN where it is unknown.
         gyro: yaw rate by the gyro less the true one [rad/s]; NaN without a gyro.
         dt: duration of each window [s].
     """
@@ -134,18 +138,21 @@ class PosedWindows:
         )
 
     def thinned(self, most: int) -> "PosedWindows":
-        """Return at most so many of the windows, evenly spaced."""
+        """Return at most `most` of the windows, evenly spaced."""
         every = slice(None, None, -(-len(self.dt) // most))
         return replace(self, **{f.name: getattr(self, f.name)[every] for f in fields(self)})
 
     def steady(self, dynamics: Dynamics) -> DynamicsStep:
-        """Return the steady speeds at the inputs of every window."""
+        """Return the steady speeds that the dynamics give for the rim speeds of every window."""
         rolling = np.full(len(self.dt), dynamics.law.rolling)
         return dynamics.step(self.rolling, rolling, self.rim, np.full(len(self.dt), _STEADY))
 
 
 def fitted_law(windows: PosedWindows, spec: RobotSpec, with_drag: bool) -> ForceLaw:
-    """Return the law with the least error of steady speeds, relative to those of the wheels."""
+    """Return the force law that fits the true speeds of windows best, as steady speeds.
+
+    Errors are relative to the speeds of the rolling wheels; `with_drag` also fits c.
+    """
     from scipy.optimize import least_squares
 
     names = [name for name in _BOUNDS if with_drag or name != "drag"]
@@ -177,7 +184,7 @@ def fitted_law(windows: PosedWindows, spec: RobotSpec, with_drag: bool) -> Force
 
 
 def fitted_noise(windows: PosedWindows, dynamics: Dynamics, mass: float) -> FilterNoise:
-    """Return the noise by the residuals of the law in the windows."""
+    """Return the noise of process and measurements, from the dynamics' residuals in windows."""
     step = windows.steady(dynamics)
     gap = windows.true - step.speeds
     at = np.unique(windows.run, return_index=True)[1]
@@ -198,7 +205,7 @@ def fitted_noise(windows: PosedWindows, dynamics: Dynamics, mass: float) -> Filt
 
 
 def with_gyro(noise: FilterNoise, windows: PosedWindows) -> FilterNoise:
-    """Return the noise with that of the gyro and of its bias, if there is a gyro."""
+    """Return `noise` with stds of the gyro and its bias filled in, if there is a gyro."""
     known = np.isfinite(windows.gyro)
     if not known.any():
         return noise
@@ -210,7 +217,10 @@ def with_gyro(noise: FilterNoise, windows: PosedWindows) -> FilterNoise:
 
 
 def with_currents(noise: FilterNoise, windows: PosedWindows, force: Drives) -> FilterNoise:
-    """Return the noise with scale, offset and noise of the forces by currents, if there are any."""
+    """Return `noise` with scale k, offset f and std of forces from currents filled in, if any.
+
+    `force` has the modelled force of each drive along its motion [N].
+    """
     known = np.isfinite(windows.force)
     if not known.any():
         return noise
@@ -221,7 +231,7 @@ def with_currents(noise: FilterNoise, windows: PosedWindows, force: Drives) -> F
     residual = np.where(known, windows.force - offset - gain * force, 0.0)
     at = np.unique(windows.run, return_index=True)[1]
     sums, counts = np.add.reduceat(residual, at), np.add.reduceat(known.astype(float), at)
-    # variance of white noise with the same error of a run's mean
+    # variance of a white noise that would give the residuals' variance of a run's mean
     variance = float((sums**2).sum() / counts.sum())
     return replace(noise, gain=gain, offset=offset, force=max(variance**0.5, 1e-6))
 
@@ -229,11 +239,11 @@ def with_currents(noise: FilterNoise, windows: PosedWindows, force: Drives) -> F
 @final
 @dataclass(frozen=True)
 class WardIagnemma(SlipModel):
-    """The filter, with or without currents.
+    """Slip model by the extended Kalman filter, with or without currents.
 
     Attributes:
-        with_drag: resistance grows with speed.
-        wander: random walk of rho after a second of a run, relative to its scatter between runs.
+        with_drag: True if resistance may grow with speed.
+        wander: std of the random walk of rho after one second, relative to its std between runs.
         law: fitted force law.
         noise: fitted noise.
     """
@@ -246,7 +256,7 @@ class WardIagnemma(SlipModel):
 
     @classmethod
     def with_current(cls) -> "WardIagnemma":
-        """Return the variant that measures traction by the currents."""
+        """Return the variant that also uses currents, as measurements of traction."""
         return cls("ward_iagnemma_current", needs=frozenset({"current"}))
 
     def candidates(self) -> Sequence["WardIagnemma"]:

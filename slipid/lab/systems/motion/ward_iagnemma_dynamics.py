@@ -1,11 +1,11 @@
 """Dynamics of a robot on a floor with a law of traction and resistance, and padded runs.
 
-Speeds are those of q, and forces are divided by the robot's mass. A step solves the equation of
-motion, whose symbols and formulas are at the top of `ward_iagnemma.py`, for many runs at once, and
-returns the derivatives of the speeds after it.
+Symbols and equations are those in the docstring of `ward_iagnemma.py`. Speeds are components of q,
+and forces are divided by the robot's mass. A step solves the equation of motion for many runs at
+once and also returns derivatives of the speeds after it.
 
-Runs of any lengths are padded to one array with the inputs of the filter, which tracks all of them
-at once: speeds of the wheels, the gyro, and the forces by the motors' currents.
+Runs of different lengths are padded to one array with the inputs of the filter, which tracks all of
+them at once: rim speeds, the gyro, and the forces from motor currents.
 """
 
 from collections.abc import Sequence
@@ -18,30 +18,30 @@ from slipid.predict.slip_model import RobotSpec, RunSignals
 
 Drives = Float[np.ndarray, "run drive"]
 Speeds = Float[np.ndarray, "run 3"]
-"""q: body twist times (1, 1, base radius) [m/s]."""
+"""Speeds q of each run: the body twist times (1, 1, base radius) [m/s]."""
 Each = Float[np.ndarray, " run"]
 GRAVITY = 9.81
 REST = 0.02
-"""v_s: speed below which resistance fades out [m/s]."""
+"""Speed v_s below which resistance fades out [m/s]."""
 _OVER_MASS = np.array([1.0, 1.0, 2.0])
-"""m / M: acceleration of q by a force over the mass; the inertia is m L^2 / 2."""
+"""Diagonal of m M^-1: acceleration of q per force divided by mass; the inertia is m L^2 / 2."""
 _MOST_STEPS = 25
-"""Largest number of Newton steps."""
+"""Largest number of Newton steps in a time step."""
 _SOLVED = 1e-7
-"""Largest residual of a solved equation [m/s]."""
+"""Residual below which an equation of a time step counts as solved [m/s]."""
 
 
 @dataclass(frozen=True)
 class ForceLaw:
-    """Forces between wheels and floor, as shares of the weight.
+    """Coefficients of the forces between wheels and floor, which are in proportion to the weight.
 
     Attributes:
-        grip: C1.
-        rise: A [s/m].
-        viscous: C2 [s/m].
-        rolling: rho.
-        turning: rho_t.
-        drag: c [s/m].
+        grip: C1, traction coefficient of a wheel that slides fast [1].
+        rise: A, how fast traction rises with the sliding speed [s/m].
+        viscous: C2, increase of traction per sliding speed [s/m].
+        rolling: rho, coefficient of resistance to travel [1].
+        turning: rho_t, coefficient of resistance to turning [1].
+        drag: c, increase of the resistance to travel with speed [s/m].
     """
 
     grip: float = 0.6
@@ -58,8 +58,8 @@ class Acceleration:
 
     Attributes:
         rate: accelerations [m/s^2].
-        slope: derivatives by the speeds [1/s].
-        by_rolling: derivatives by rho [m/s^2].
+        slope: derivatives with respect to q [1/s].
+        by_rolling: derivatives with respect to rho [m/s^2].
     """
 
     rate: Speeds
@@ -73,8 +73,8 @@ class DynamicsStep:
 
     Attributes:
         speeds: q after the step [m/s].
-        by_speeds: derivatives by the speeds before the step.
-        by_rolling: derivatives by rho [m/s].
+        by_speeds: derivatives with respect to q before the step [1].
+        by_rolling: derivatives with respect to rho [m/s].
     """
 
     speeds: Speeds
@@ -84,12 +84,12 @@ class DynamicsStep:
 
 @dataclass(frozen=True, eq=False)
 class Dynamics:
-    """A robot on a floor.
+    """Equation of motion of a robot on a floor.
 
     Attributes:
         law: force law of the floor.
-        rims: rim speed of each drive per q.
-        turning: 1 for the speeds that count as turning, 0 for those along which the robot rolls.
+        rims: matrix that maps q to the rim speeds of the drives; its rows are J_i.
+        turning: 1 for components of q that belong to q_t (turning), 0 for those of p (travel).
         base_radius: L [m].
     """
 
@@ -106,13 +106,13 @@ class Dynamics:
         return cls(law, rims, turning, float(spec.base_radius))
 
     def traction(self, slide: Drives) -> Drives:
-        """Return traction of each drive over the robot's mass [m/s^2] at sliding speeds [m/s]."""
+        """Return each drive's traction divided by the mass [m/s^2] at sliding speeds [m/s]."""
         law, load = self.law, GRAVITY / len(self.rims)
         rising = -np.expm1(-law.rise * np.abs(slide))
         return np.asarray(load * (law.grip * np.sign(slide) * rising + law.viscous * slide))
 
     def stiffness(self, slide: Drives) -> Drives:
-        """Return the derivative of `traction` [1/s]."""
+        """Return the derivative of `traction` with respect to the sliding speeds [1/s]."""
         law, load = self.law, GRAVITY / len(self.rims)
         rising = law.rise * np.exp(-law.rise * np.abs(slide))
         return np.asarray(load * (law.grip * rising + law.viscous))
@@ -120,7 +120,10 @@ class Dynamics:
     def acceleration(
         self, q: Speeds, rolling: Each, rim: Drives, secant: bool = False
     ) -> Acceleration:
-        """Return accelerations at speeds q; `secant` slopes are chords to points without force."""
+        """Return accelerations at speeds q.
+
+        With `secant`, the slope of each force is that of the chord from its zero, not the tangent.
+        """
         law, slide = self.law, rim - q @ self.rims.T
         traction, stiff = self.traction(slide), self.stiffness(slide)
         if secant:
@@ -141,7 +144,7 @@ class Dynamics:
         slope[:, range(3), range(3)] -= linear
         rate = (traction @ self.rims - linear * q) * _OVER_MASS
         slope *= _OVER_MASS[:, None]
-        # the axes turn with the body: W (vy, -vx)
+        # the term W (vy, -vx), since the axes of q turn with the body
         yaw = q[:, 2] / self.base_radius
         rate[:, 0] += yaw * q[:, 1]
         rate[:, 1] -= yaw * q[:, 0]
@@ -153,7 +156,10 @@ class Dynamics:
         return Acceleration(rate, slope, -GRAVITY * straight * (along + law.drag * q))
 
     def step(self, speeds: Speeds, rolling: Each, rim: Drives, dt: Each) -> DynamicsStep:
-        """Return q' of backward Euler, q' = q + dt a(q'), by Newton's method for each run."""
+        """Return the speeds q' after a time step, q' = q + dt a(q') (backward Euler).
+
+        The equation is solved by Newton's method for each run.
+        """
         solution, todo = speeds.copy(), np.arange(len(speeds))
         for _ in range(_MOST_STEPS):
             args = speeds[todo], rolling[todo], rim[todo], dt[todo]
@@ -170,11 +176,12 @@ class Dynamics:
     def _newton(
         self, q: Speeds, start: Speeds, rolling: Each, rim: Drives, dt: Each
     ) -> tuple[Speeds, Bool[np.ndarray, " run"]]:
-        """Return speeds after one step of Newton's method from q, and the runs that are solved.
+        """Return speeds after one Newton step from q, and True for runs that are solved then.
 
-        Traction and resistance flatten out, so that the step may overshoot. Where the residual does
-        not fall, the secants' step is used instead: apart from the turning axes, the forces have a
-        potential that is concave in squares of speeds, on which the secants' step descends.
+        Traction and resistance saturate, so that the step may overshoot. If the residual does not
+        fall, a step with secants in place of tangents is used. Apart from the term of the turning
+        axes, the forces have a potential that is concave in squares of speeds, and a secant step
+        always descends on it.
         """
         here, wait = self.acceleration(q, rolling, rim), dt[:, None]
         residual = q - start - wait * here.rate
@@ -197,19 +204,19 @@ def solved(
 
 
 _DRIVING = 0.3
-"""Smallest rim speed of a driving wheel, relative to the fastest wheel."""
+"""Smallest rim speed, relative to the fastest wheel's, at which a wheel counts as driving."""
 
 
 @dataclass(frozen=True, eq=False)
 class PaddedRuns:
-    """Runs side by side, padded to the same number of steps with steps of zero duration.
+    """Several runs in one array, padded to the same number of steps with steps of zero duration.
 
     Attributes:
         dt: duration of each step [s], 0 in padding.
         rim: rim speed of each drive [m/s].
         rolling: q without slip [m/s].
         gyro: yaw rate [rad/s], NaN without a gyro.
-        force: force of each motor at the rim by its current [N], NaN where it is unknown.
+        force: force of each motor at the rim from its current [N], NaN where it is unknown.
     """
 
     dt: Float[np.ndarray, "run step"]
@@ -220,7 +227,7 @@ class PaddedRuns:
 
     @classmethod
     def of(cls, runs: Sequence[RunSignals], spec: RobotSpec) -> "PaddedRuns":
-        """Return padded runs of any lengths."""
+        """Return runs of any lengths, padded to the longest."""
         shape, drives = (len(runs), max(len(run) for run in runs)), len(spec.forward)
         padded = cls(
             dt=np.zeros(shape),
@@ -240,7 +247,10 @@ class PaddedRuns:
 
 
 def motor_forces(run: RunSignals, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
-    """Return the force n C_e I / r along each drive's motion [N]; NaN if it does not drive."""
+    """Return the motor force along each drive's motion from its current [N].
+
+    It is the gear ratio times C_e I / r; NaN for wheels that do not drive, or without currents.
+    """
     rim = np.abs(run.speed * spec.wheel_radius)
     if run.current is None:
         return np.full(rim.shape, np.nan)

@@ -1,9 +1,9 @@
-"""Extended Kalman filter over the state of many runs at once.
+"""Extended Kalman filter that tracks the states of many runs at once.
 
-Every step moves the state by the dynamics, corrects it by the gyro and the currents, and keeps the
-coefficient of resistance within its bounds. The measurements are described at the top of
-`ward_iagnemma.py`. The error of the pose is part of the state, so that the end of every path has a
-covariance.
+Every step propagates the state by the dynamics, corrects it by the gyro and the currents, and keeps
+the coefficient of resistance within its bounds. Symbols and measurements are those in the docstring
+of `ward_iagnemma.py`. The error of the pose is part of the state, which gives the covariance of the
+end of every path.
 """
 
 from dataclasses import dataclass
@@ -24,14 +24,15 @@ class FilterNoise:
 
     Attributes:
         rolling: standard deviation of rho between runs.
-        drift: standard deviation of place and turn after a second [m], (ahead, left, turn times L).
-        gyro: standard deviation of the gyro over a window [rad/s]; NaN, and then the gyro is not
-            used, where training runs had none.
+        drift: standard deviation of the displacement after one second, by process noise: forward,
+            left, and turn times L [m].
+        gyro: standard deviation of the gyro over a window [rad/s]; NaN if training runs had no
+            gyro, which is then not used.
         bias: standard deviation of the gyro's bias between runs [rad/s].
-        gain: k.
-        offset: f [N].
-        force: standard deviation of the force by a current over a window [N]; NaN where training
-            runs had no currents.
+        gain: scale k of forces from currents.
+        offset: offset f of forces from currents [N].
+        force: standard deviation of a force from a current over a window [N]; NaN if training runs
+            had no currents.
     """
 
     rolling: float = 0.01
@@ -45,25 +46,32 @@ class FilterNoise:
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """Mean and covariance of q (3), rho, the gyro's bias, and the error of the pose (3).
+    """Mean and covariance of the state: q (3), rho, the gyro's bias, and the pose error (3).
 
-    The pose is not corrected: its error is that of a path of filtered twists. The mean of that
-    error is 0 and left out.
+    The pose error is that of a path integrated from filtered twists, since the pose is not
+    corrected. Its mean is 0 and not stored.
     """
 
     mean: Float[np.ndarray, "run 5"]
     covariance: Covariance
 
     def moved(self, mean: Float[np.ndarray, "run 5"], by: Covariance) -> "FilterState":
-        """Return the state at another mean, its covariance propagated by the derivatives `by`."""
+        """Return the state with a new mean, and the covariance propagated by the Jacobian `by`."""
         return FilterState(mean, by @ self.covariance @ by.transpose(0, 2, 1))
 
     def corrected(
         self, row: Row, innovation: Each, variance: Each, of: slice = slice(5)
     ) -> "FilterState":
-        """Return the state corrected by a measurement with these derivatives, NaN for none.
+        """Return the state corrected by a scalar measurement; a NaN innovation means there is none.
 
-        Joseph's form, right for any gain: P - K h P - P h' K' + K s K' with s = h P h' + variance.
+        The covariance is updated in Joseph's form, which holds for any gain K:
+        P - K h P - P h' K' + K s K' with s = h P h' + variance.
+
+        Args:
+            row: derivatives h of the measurement with respect to the state.
+            innovation: measured less expected value.
+            variance: variance of the measurement noise.
+            of: part of the state that is corrected; the gain of the rest is zero.
         """
         measured = np.isfinite(innovation + variance)
         if not measured.any():
@@ -84,7 +92,7 @@ class FilteredRuns:
 
     Attributes:
         speeds: q in every step [m/s].
-        covariance: covariance of the last pose.
+        covariance: covariance of the pose at the end of the run [m, m, rad].
     """
 
     speeds: Float[np.ndarray, "run step 3"]
@@ -93,14 +101,14 @@ class FilteredRuns:
 
 @dataclass(frozen=True, eq=False)
 class SlipFilter:
-    """The extended Kalman filter.
+    """The extended Kalman filter, with its fitted model.
 
     Attributes:
         dynamics: fitted dynamics.
         noise: fitted noise.
         mass: mass of the robot [kg].
-        uses_current: forces by currents are measurements.
-        wander: standard deviation of the random walk of rho after a second.
+        uses_current: True if forces from currents are used as measurements.
+        wander: standard deviation of the random walk of rho after one second.
     """
 
     dynamics: Dynamics
@@ -128,19 +136,19 @@ class SlipFilter:
         return FilteredRuns(speeds, state.covariance[:, 5:, 5:])
 
     def _predicted(self, state: FilterState, rim: Drives, dt: Each) -> FilterState:
-        """Return the state after a step of the dynamics with process noise."""
+        """Return the state predicted by a step of the dynamics, with process noise."""
         step = self.dynamics.step(state.mean[:, :3], state.mean[:, 3], rim, dt)
         by = np.tile(np.eye(8), (len(dt), 1, 1))
         by[:, :3, :3], by[:, :3, 3] = step.by_speeds, step.by_rolling
         after = state.moved(np.concatenate([step.speeds, state.mean[:, 3:]], axis=1), by)
-        # white noise of the twist whose integral has the variance of the drift
+        # noise of the twist, white over steps, whose integral over a second has the std `drift`
         rate = np.where(dt > 0.0, 1.0 / np.where(dt > 0.0, dt, 1.0), 0.0)[:, None]
         after.covariance[:, range(3), range(3)] += np.square(self.noise.drift) * rate
         after.covariance[:, 3, 3] += self.wander**2 * dt
         return after
 
     def _measured(self, state: FilterState, runs: PaddedRuns, k: int) -> FilterState:
-        """Return the state corrected by the gyro and the currents of a step."""
+        """Return the state corrected by the gyro and the currents of step `k`."""
         longer = WINDOW_S / np.where(runs.dt[:, k] > 0.0, runs.dt[:, k], WINDOW_S)
         radius = self.dynamics.base_radius
         row = np.zeros((len(longer), 8))
@@ -162,7 +170,7 @@ class SlipFilter:
         return state
 
     def _bounded(self, state: FilterState) -> FilterState:
-        """Return the state after the weak constraint on rho."""
+        """Return the state corrected by the weak constraint on rho, where rho is out of range."""
         law, straight = self.dynamics.law, 1.0 - self.dynamics.turning
         speed = np.linalg.norm(state.mean[:, :3] * straight, axis=1)
         rolling = state.mean[:, 3]
@@ -173,13 +181,16 @@ class SlipFilter:
         return state.corrected(row, np.where(beyond == 0.0, np.nan, beyond), variance)
 
     def _with_pose_error(self, state: FilterState, heading: Each, dt: Each) -> FilterState:
-        """Return the state with the pose error after a step; the heading is that at mid-step."""
+        """Return the state with the pose error propagated over a step.
+
+        `heading` is the heading in the middle of the step [rad].
+        """
         radius = self.dynamics.base_radius
         turning = np.stack([np.cos(heading), np.sin(heading)], axis=1)
         aside = turning[:, ::-1] * [-1.0, 1.0]
         x, y, yaw = state.mean[:, 0:1], state.mean[:, 1:2], state.mean[:, 2:3] / radius
         along, across = x * turning + y * aside, x * aside - y * turning
-        # the chord of the step's arc, as of `path_of`, and how it shortens with the turn
+        # chord of the step's arc per speed, as in `path_of`, and how it shortens with the turn
         wait = dt[:, None]
         reach, less = np.sinc(yaw * wait / (2 * np.pi)) * wait, yaw * wait**3 / 12
         by = np.tile(np.eye(8), (len(dt), 1, 1))
