@@ -202,6 +202,8 @@ def main() -> int:
     parser.add_argument("--results", type=Path, default=ROOT / ".cache" / "mutants.json")
     options = parser.parse_args()
     every = read()
+    if unknown := set(options.names) - set(every):
+        parser.error(f"no mutant {sorted(unknown)[0]}; mutants.toml has their names")
     some = [every[name] for name in options.names or every]
     if options.check or options.sound:
         bad = check(some) > 0 or (options.sound and sound(some, options.timeout) != "survived")
