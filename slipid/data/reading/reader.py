@@ -147,11 +147,11 @@ def _bag_runs(known: Identity, layout: BagLayout) -> list[_RawRun]:
     return [
         _RawRun(
             Identity(
-                known.name + run.name_suffix,
+                known.name + run.span.suffix,
                 known.path,
                 run.sha256,
-                run.surface or known.surface,
-                run.load or known.load,
+                run.span.surface or known.surface,
+                run.span.load or known.load,
             ),
             run.signals,
             run.notes,

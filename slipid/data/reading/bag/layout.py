@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AliasChoices, BeforeValidator, Field, StrictBool, StrictFloat, StrictStr
 from pydantic.dataclasses import dataclass
 
-from slipid.data.reading.bag.shape import steps_of
+from slipid.data.reading.bag.shape import check_path
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, TURNS, SensorLayout, several, unknown
 from slipid.data.reading.units import factor
 from slipid.support.errors import DataError
@@ -52,7 +52,7 @@ class TopicChannel:
 
     def __post_init__(self) -> None:
         for path in self.fields:
-            steps_of(path)
+            check_path(path)
         if (self.frame is None) != (self.child is None):
             raise ValueError("one frame only; expected both frame and child, or none of them")
         if len(self.fields) > 1 and len(self.topics) > 1:
@@ -88,7 +88,7 @@ class RunRule:
             raise ValueError("expected one of topic, pause_s and table")
         for path in (self.field, self.surface, self.load):
             if path is not None:
-                steps_of(path)
+                check_path(path)
 
 
 @dataclass(frozen=True, config=CLOSED)

@@ -11,13 +11,12 @@ from jaxtyping import Float, Int
 
 from slipid.data.reading.bag.layout import GROUPS, BagLayout
 from slipid.data.reading.bag.plan import ChannelPlan
-from slipid.data.reading.bag.shape import Edge, JointPick, TransformPick
-from slipid.data.reading.bag.streams import Stream
+from slipid.data.reading.bag.streams import Edge, JointPick, Stream, TransformPick
 from slipid.data.reading.bag.transforms import STATIC, TransformSeries, composed, heading, tilt
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL
 from slipid.data.reading.signal import Signal, SignalSource
 from slipid.data.reading.units import factor
-from slipid.support.errors import DataError, did_you_mean, first_names
+from slipid.support.errors import bad_data, did_you_mean, first_names
 
 APART_NOTED = 0.5
 """Difference between stamps and times of receipt above which there is a note [s]."""
@@ -59,7 +58,7 @@ def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream
         raise stream.error(found, expected, int(jumps[0]))
     if disordered := int((late > 0).sum()):
         notes.append(
-            f"topic {stream.topic}: {disordered} messages out of order by up to "
+            f"topic {stream.topic.name}: {disordered} messages out of order by up to "
             f"{late.max() / 1e9:.3g} s were sorted"
         )
     order = np.argsort(time, kind="stable")
@@ -67,7 +66,7 @@ def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream
     last = np.append(np.diff(time[order]) != 0, True)
     if repeated := int((~last).sum()):
         notes.append(
-            f"topic {stream.topic}: {repeated} messages with the stamp of another left out"
+            f"topic {stream.topic.name}: {repeated} messages with the stamp of another left out"
         )
     return stream.part(order[last])
 
@@ -87,23 +86,24 @@ def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str])
     """
     bare, delays = [], {}
     for stream in streams:
-        if not len(stream.number) or stream.topic.endswith(STATIC):
+        topic = stream.topic.name
+        if not len(stream.number) or topic.endswith(STATIC):
             continue
         if stream.stamp is None:
-            bare.append(stream)
+            bare.append(topic)
         else:
-            delays[stream.topic] = float(np.median(stream.received - stream.stamp)) / 1e9
+            delays[topic] = float(np.median(stream.received - stream.stamp)) / 1e9
     if not bare or not delays or layout.stamp == "received":
         return
     topic, apart = max(delays.items(), key=lambda item: abs(item[1]))
-    others = ", ".join(sorted({stream.topic for stream in bare}))
+    others = ", ".join(sorted({*bare}))
     found = (
         f"stamps of {topic} differ by {apart:.3g} s from the time of receipt, the only time of "
         f"{others}"
     )
     if abs(apart) > APART_REFUSED:
         expected = 'one clock for all: set stamp = "received"'
-        raise DataError(f"{bare[0].path}: {found}; expected {expected}")
+        raise bad_data(streams[0].topic.bag.files.path, found, expected)
     if abs(apart) > APART_NOTED:
         notes.append(found)
 
@@ -113,7 +113,8 @@ def signal_of(stream: Stream, layout: BagLayout) -> Signal:
 
     No unit is converted.
     """
-    source = SignalSource(stream.path, stream.columns, stream.number, stream.topic)
+    topic = stream.topic
+    source = SignalSource(topic.bag.files.path, stream.columns, stream.number, topic.name)
     seconds, nanoseconds = np.divmod(clock(stream, layout), 10**9)
     return Signal(seconds + nanoseconds / 1e9, stream.values, source)
 
@@ -128,7 +129,7 @@ def whole_signal(stream: Stream, layout: BagLayout, notes: list[str]) -> Signal:
     whole = np.all(~stream.absent, axis=1)
     if not whole.all():
         notes.append(
-            f"topic {stream.topic}: {(~whole).sum()} messages without all of "
+            f"topic {stream.topic.name}: {(~whole).sum()} messages without all of "
             f"{', '.join(stream.columns)} left out"
         )
         stream = stream.part(whole)
@@ -221,7 +222,7 @@ def finite(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
         raise stream.error(found, expected, int(rows[0]))
     column = stream.columns[j]
     notes.append(
-        f"topic {stream.topic}: {len(rows)} messages without a number in {column} left out"
+        f"topic {stream.topic.name}: {len(rows)} messages without a number in {column} left out"
     )
     return stream.part(~bad)
 
@@ -240,7 +241,7 @@ def channel_signal(
     Raises:
         DataError: a joint or a number is missing or not finite, or a clock jumps.
     """
-    by_name = isinstance(plan.wanted[0].pick, JointPick)
+    by_name = isinstance(plan.wanted[0][1], JointPick)
     if by_name:
         _check_joints(plan, streams)
     else:
@@ -271,9 +272,9 @@ def checked_stream(stream: Stream) -> Stream:
 
 def _check_joints(plan: ChannelPlan, streams: Sequence[Stream]) -> None:
     """Raise `DataError` if a joint is in no message, or has no number in any."""
-    picks = [wanted.pick for wanted in plan.wanted if isinstance(wanted.pick, JointPick)]
+    picks = [pick for _, pick in plan.wanted if isinstance(pick, JointPick)]
     there = list(dict.fromkeys(name for pick in picks for name in pick.names))
-    for j, joint in enumerate(picks[0].joints):
+    for j, joint in enumerate(picks[0].columns):
         if joint not in there:
             found = f"no joint '{joint}'{did_you_mean(joint, there)}"
             raise streams[0].error(found, f"one of the names that are there: {first_names(there)}")
@@ -347,19 +348,19 @@ def _transformed(
     """Return the signal of x, y and the quaternion of a pose composed of a chain of transforms."""
     moving: dict[Edge, TransformSeries] = {}
     sources: dict[Edge, SignalSource] = {}
-    for stream, wanted in zip(streams, plan.wanted, strict=True):
-        assert isinstance(wanted.pick, TransformPick)
+    for stream, (topic, pick) in zip(streams, plan.wanted, strict=True):
+        assert isinstance(pick, TransformPick)
         # In a plan, topics of changing transforms come first. The static topic repeats constant
         # transforms, of which the last message is used.
-        if wanted.pick.edge not in moving and len(stream.number):
-            if stream.topic.endswith(STATIC):
+        if pick.edge not in moving and len(stream.number):
+            if topic.endswith(STATIC):
                 stream = finite(stream.part(np.array([len(stream.number) - 1])), layout, notes)
             else:
                 stream = in_time_order(finite(stream, layout, notes), layout, notes)
             one = signal_of(stream, layout)
             rotation = _unit(one.values[:, 3:], one.source)
-            moving[wanted.pick.edge] = TransformSeries(one.time, one.values[:, :3], rotation)
-            sources[wanted.pick.edge] = one.source
+            moving[pick.edge] = TransformSeries(one.time, one.values[:, :3], rotation)
+            sources[pick.edge] = one.source
     edge = max(moving, key=lambda edge: len(moving[edge].time))
     source, densest = sources[edge], moving[edge].time
     if len(densest) == 1:

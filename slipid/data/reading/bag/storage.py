@@ -24,7 +24,6 @@ _MAGIC: dict[Storage, bytes] = {
     "mcap": b"\x89MCAP0\r\n",
 }
 _SUFFIX: dict[Storage, str] = {"rosbag1": ".bag", "sqlite3": ".db3", "mcap": ".mcap"}
-_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -112,15 +111,12 @@ def _numbers_in_name(path: Path) -> tuple[tuple[int, str], ...]:
 
 
 def _hash(path: Path) -> str:
-    """Return the SHA-256 hash of a file, which is read block by block."""
-    digest = hashlib.sha256()
+    """Return the SHA-256 hash of a file."""
     try:
         with path.open("rb") as file:
-            while block := file.read(_BLOCK):
-                digest.update(block)
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise bad_data(path, f"cannot be read ({error.strerror})", "a readable bag") from error
-    return digest.hexdigest()
 
 
 _DATA_END, _FOOTER = 0x0F, 0x02

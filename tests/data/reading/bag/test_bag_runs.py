@@ -32,7 +32,7 @@ def speed():
 
 def spans(found, name="wheel_angle"):
     return [
-        (one.name_suffix, *(round(float(t), 2) for t in one.signals[name].time[[0, -1]] - START))
+        (one.span.suffix, *(round(float(t), 2) for t in one.signals[name].time[[0, -1]] - START))
         for one in found
     ]
 
@@ -67,7 +67,7 @@ def test_a_text_may_name_the_floor(tmp_path):
     rule = {"topic": "/run", "surface": "data", "between": ["", "stop"]}
     found = runs(tmp_path, rule, messages)
     assert spans(found) == [("#01", 1.0, 7.98), ("#02", 11.0, 17.98)]
-    assert [(one.surface, one.load) for one in found] == [("gray", None), ("green", None)]
+    assert [(one.span.surface, one.span.load) for one in found] == [("gray", None), ("green", None)]
 
 
 def test_fields_of_a_marker_name_floor_and_load(tmp_path):
@@ -87,7 +87,7 @@ def test_fields_of_a_marker_name_floor_and_load(tmp_path):
     table = {"joints": ["l", "r"], "topics": {"wheel_angle": {"topic": "/joint_states"}}}
     found = read_bag(path, declared_bag_layout({**table, "runs": rule}, "layout"))
     assert spans(found) == [("#01", 1.0, 9.98), ("#02", 10.0, 19.98), ("#03", 20.0, 29.98)]
-    assert [(one.surface, one.load) for one in found] == [
+    assert [(one.span.surface, one.span.load) for one in found] == [
         ("gray", "moved"),
         ("gray", "moved"),
         ("green", "moved"),
@@ -99,7 +99,7 @@ def test_pauses_part_runs(tmp_path, name):
     given = {"gear_ratio": 4.0} if name == "motor_speed" else {}
     topics = {name: {"topic": "/joint_states"}}
     found = runs(tmp_path, {"pause_s": 2.0}, topics=topics, **given)
-    assert [one.name_suffix for one in found] == ["#01", "#02", "#03"]
+    assert [one.span.suffix for one in found] == ["#01", "#02", "#03"]
     for k, (_, first, last) in enumerate(spans(found, name)):
         assert first == pytest.approx(10 * k + 1, abs=0.05)
         assert last == pytest.approx(10 * k + 8, abs=0.05)
@@ -107,7 +107,7 @@ def test_pauses_part_runs(tmp_path, name):
 
 def test_a_longer_pause_parts_nothing(tmp_path):
     found = runs(tmp_path, {"pause_s": 6.0})
-    assert [one.name_suffix for one in found] == [""]
+    assert [one.span.suffix for one in found] == [""]
 
 
 def test_a_table_tells_runs_floors_and_loads(tmp_path):
@@ -116,7 +116,10 @@ def test_a_table_tells_runs_floors_and_loads(tmp_path):
     )
     found = runs(tmp_path, {"table": "runs.csv", "from_start": True})
     assert spans(found) == [("#first", 1.0, 7.98), ("#02", 11.0, 17.98)]
-    assert [(one.surface, one.load) for one in found] == [("gray", None), ("green", "moved")]
+    assert [(one.span.surface, one.span.load) for one in found] == [
+        ("gray", None),
+        ("green", "moved"),
+    ]
 
 
 def test_a_table_of_stamps(tmp_path):

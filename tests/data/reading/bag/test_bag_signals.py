@@ -31,7 +31,7 @@ def test_joint_states_come_back(tmp_path, storage):
         "current": {"topic": "/joint_states", "field": "effort", "unit": "mA"},
     }
     run = read(bag(tmp_path, storage, messages), topics=topics)
-    assert run.name_suffix == ""
+    assert run.span.suffix == ""
     assert run.notes == ()
     for name, values in (
         ("wheel_angle", ANGLE),
@@ -171,24 +171,15 @@ def test_the_hash_is_what_sha256sum_prints(tmp_path):
 
 
 def test_a_big_endian_message(tmp_path):
-    from slipid.data.reading.bag.definitions import (
-        ArrayType,
-        MessageField,
-        MessageType,
-        NumberType,
-        TextType,
-    )
-    from slipid.data.reading.bag.shape import shape_of, steps_of
+    from slipid.data.reading.bag.definitions import TEXT, ArrayType, MessageType
+    from slipid.data.reading.bag.shape import shape_of
 
-    kind = MessageType(
-        "x/msg/Y",
-        (MessageField("s", TextType()), MessageField("v", ArrayType(NumberType("f8"), None))),
-    )
+    kind = MessageType("x/msg/Y", {"s": TEXT, "v": ArrayType("f8", None)})
     text = b"\0\0\0\x03ab\0\0"  # and one byte up to the next length
     raw = b"\0\0\0\0" + text + b"\0\0\0\x01" + b"\0\0\0\0" + np.array([2.5], ">f8").tobytes()
     shape = shape_of(raw, kind, cdr=True)
-    assert shape.texts(steps_of("s")) == ("ab",)
-    (place,) = shape.places(steps_of("v"))
+    assert shape.texts("s") == ("ab",)
+    (place,) = shape.places("v")
     assert place.of(np.frombuffer(raw, np.uint8)[None])[0] == 2.5
 
 
