@@ -193,7 +193,7 @@ def _placed(map: Transport, u: Array) -> tuple[Array, Array]:
     start = jnp.zeros((rows, 2 * size + 1)).at[:, -1].set(1.0)
     _, (about, log) = jax.lax.scan(step, start, map.steps)
     there = jnp.zeros_like(u).at[:, map.order].set(about.T)
-    return map.mean + there, map.last.log_slope(u).at[:, map.order].add(log.T)
+    return jnp.asarray(map.mean) + there, map.last.log_slope(u).at[:, map.order].add(log.T)
 
 
 @jax.jit
