@@ -285,11 +285,9 @@ def errors_by_floor(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Co
         pooled[name] = slip[mine] - line[mine] @ others
         constant[name] = slip[mine] - slip[~mine].mean()
         own[name] = slip[mine] - line[mine] @ alone
-    gaps = {"pooled": pooled, "constant": constant, "per_surface": own}
-    return {name: _error_summary(gap) for name, gap in gaps.items()} | {"count": len(slip)}
-
-
-def _error_summary(gaps: dict[str, np.ndarray]) -> Content:
-    each = {name: float(np.sqrt(np.mean(gap**2))) for name, gap in gaps.items()}
-    rows = float(np.sqrt(np.mean(np.concatenate(list(gaps.values())) ** 2)))
-    return {"rows": rows, "floors": float(np.mean(list(each.values()))), "each": each}
+    out: Content = {}
+    for name, gaps in {"pooled": pooled, "constant": constant, "per_surface": own}.items():
+        each = {floor: float(np.sqrt(np.mean(gap**2))) for floor, gap in gaps.items()}
+        rows = float(np.sqrt(np.mean(np.concatenate(list(gaps.values())) ** 2)))
+        out[name] = {"rows": rows, "floors": float(np.mean(list(each.values()))), "each": each}
+    return out | {"count": len(slip)}

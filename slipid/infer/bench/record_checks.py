@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slipid.infer.bench.moments import scatter, start, sums
+from slipid.infer.bench.moments import equation, scatter, start
 from slipid.infer.bench.motor import REST, VOLTS, BenchRecord, noise
 from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
 from slipid.support.errors import DataError
@@ -96,7 +96,7 @@ def _sure(w: BenchWindows, column: int) -> float:
     """Return a coefficient divided by its std, estimated from one equation without priors."""
     signals = w.signals.shape[-1] - (w.signals.shape[-1] == len(VOLTS))
     found = start(w, signals)
-    s = sums(w, found, signals)
+    s = equation(w, found, signals)
     inverse = np.linalg.pinv(s.tangent[:, :signals], rcond=1e-10)
     std = np.sqrt(np.diag(inverse @ scatter(s.moments, 8) @ inverse.T))
     return float(found[column] / max(std[column], 1e-300))

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from slipid.infer.bench.fit import Equation, MotorFit
-from slipid.infer.bench.moments import cell_length, celled
+from slipid.infer.bench.fit import MotorFit
+from slipid.infer.bench.moments import Equation, cell_length, celled
 from slipid.infer.fit_file import SCHEMA, number_json
 from slipid.infer.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
-from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
+from slipid.infer.verdicts.unidentified import flat_directions, members, sentences
 from slipid.infer.verdicts.wording import VOLTAGE
 from slipid.support.content import Content
 from slipid.support.files import hash_of
@@ -72,11 +72,11 @@ def _mean(
     `even` and `odd` are the windows whose residuals of even and of odd rows are averaged. Cells of
     time as long as the residuals' correlation time count as independent.
     """
-    w, s = equation.windows, equation.sums
+    w = equation.windows
     weight, sum_ = np.zeros(len(w.time)), np.zeros(len(w.time))
     for half, some in enumerate((even, odd)):
-        weight[some] += s.weight[half, some]
-        sum_[some] += s.weight[half, some] * s.residual[half, some]
+        weight[some] += equation.weight[half, some]
+        sum_[some] += equation.weight[half, some] * equation.residual[half, some]
     total = float(weight.sum())
     if total <= 0:
         return 0.0, 0.0
@@ -184,29 +184,19 @@ def bench_fit(fits: Sequence[MotorFit]) -> BenchFit:
     messages: list[str] = []
     found = {f.label: misfits(f) for f in fits}
     for f in fits:
-        flat = _flat(f)
-        slow = _too_slow(f)
-        voltage = f.has_voltage
+        slow, voltage = _too_slow(f), f.has_voltage
+        directions = flat_directions(f.space, f.covariance, has_current=True, has_voltage=voltage)
+        flat = [replace(one, remedy=_remedy(one.paths, voltage)) for one in directions]
         numbers = estimates(f.space, f.choices, f.z, f.covariance, voltage, members(flat))
         misfitted = {path for channel in found[f.label] for path in _OF[channel]}
         quotients = derived(f.space, f.z, f.covariance, voltage)
         for into, estimated in ((parameters, numbers), (ratios, quotients)):
             for e in estimated:
-                path = "/".join(_labelled(p, f.label) for p in e.path.split("/"))
+                path = "/".join(f"{p}@{f.label}" if f.label else p for p in e.path.split("/"))
                 into[path] = replace(_with_verdict(f, e, slow, misfitted), path=path)
         own = [*slow.values(), *sentences(flat), *found[f.label].values(), *_remarks(f)]
         messages += [f"{f.label}: {text}" if f.label else text for text in own]
     return BenchFit(tuple(fits), parameters, ratios, tuple(messages), found)
-
-
-def _labelled(path: str, label: str) -> str:
-    return f"{path}@{label}" if label else path
-
-
-def _flat(f: MotorFit) -> tuple[FlatDirection, ...]:
-    """Return the flat directions, with remedies for a bench."""
-    found = flat_directions(f.space, f.covariance, has_current=True, has_voltage=f.has_voltage)
-    return tuple(replace(one, remedy=_remedy(one.paths, f.has_voltage)) for one in found)
 
 
 def _remedy(paths: Sequence[str], has_voltage: bool) -> str:

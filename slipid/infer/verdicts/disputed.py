@@ -14,7 +14,7 @@ variable if the contact law holds for both.
 A fit is trusted if it converged, predicts its runs, and has the numbers of a physical robot.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import combinations
@@ -34,52 +34,35 @@ _WIDE = 1.0
 """Std of the uninformative prior of load biases."""
 
 
-@dataclass(frozen=True)
-class Dispute:
-    """Disagreement of two floors about the loads on the wheels.
+def disputes(space: Space, z: Search, covariance: Square) -> dict[tuple[str, str], float]:
+    """Return pairs of floors whose load biases differ by more than noise, the largest first.
 
-    Attributes:
-        floors: names of the floors.
-        sigma: difference of their load estimates [standard error].
-    """
-
-    floors: tuple[str, str]
-    sigma: float
-
-    @property
-    def sentence(self) -> str:
-        one, other = self.floors
-        return (
-            f"{one} and {other} disagree about the loads on the wheels by {self.sigma:.1f} "
-            "standard errors of their noise: the contact law lacks something; intervals count it"
-        )
-
-
-def disputes(space: Space, z: Search, covariance: Square) -> tuple[Dispute, ...]:
-    """Return pairs of floors whose load biases differ by more than noise, largest difference first.
+    Their values are the differences of their load estimates [standard error].
 
     The prior of the biases in `space` must have the fitted std (`Space.with_pooled`).
     """
     bias = {e.surface: space.slices[e.path] for e in space.free if e.declaration.deviation}
     if len(bias) < 2:
-        return ()
+        return {}
     at = np.concatenate([np.arange(p.start, p.stop) for p in bias.values()])
     precision, less = np.linalg.inv(covariance), 1 / space.prior_std[at] ** 2 - 1 / _WIDE**2
     precision[at, at] -= less
     wide = np.linalg.inv(precision)
     separate = np.asarray(z) + wide[:, at] @ (less * (np.asarray(z) - space.prior_mean)[at])
-    found = []
+    found = {}
     for one, other in combinations(bias, 2):
         difference = separate[bias[one]] - separate[bias[other]]
         spread = wide[bias[one]] - wide[bias[other]]
         spread = spread[:, bias[one]] - spread[:, bias[other]]
         chance = float(chi2.sf(difference @ np.linalg.solve(spread, difference), len(difference)))
         if chance < CHANCE:
-            found.append(Dispute((str(one), str(other)), float(norm.isf(chance / 2))))
-    return tuple(sorted(found, key=lambda d: -d.sigma))
+            found[str(one), str(other)] = float(norm.isf(chance / 2))
+    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
 
 
-def marked(numbers: Mapping[str, Estimate], found: Sequence[Dispute]) -> dict[str, Estimate]:
+def marked(
+    numbers: Mapping[str, Estimate], found: Mapping[tuple[str, str], float]
+) -> dict[str, Estimate]:
     """Return the numbers; identified load shares have the verdict `disputed` if floors disagree."""
     return {
         path: replace(e, verdict="disputed")
