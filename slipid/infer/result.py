@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 Evidence = TypeVar("Evidence")
 
-CONFLICT = 4.0
+CONFLICT_STDS = 4.0
 """Distance of a number from its prior mean above which a message warns [prior std]."""
 
 
@@ -339,7 +339,7 @@ class Fit:
             f"{e.path} lies {abs(e.pull):.1f} prior stds from its prior: "
             "the prior is wrong, or the model lacks something"
             for e in self.parameters.values()
-            if e.pull is not None and abs(e.pull) > CONFLICT and e.verdict != "at_bound"
+            if e.pull is not None and abs(e.pull) > CONFLICT_STDS and e.verdict != "at_bound"
         ]
         if self.refused is not None:
             found.append(str(self.refused["reason"]))

@@ -202,9 +202,9 @@ class TwistModel(SlipModel, abc.ABC):
     """
 
     learns: ClassVar[bool] = True
-    """Whether the model has fitted numbers."""
+    """True if the model has fitted numbers."""
     by_load: ClassVar[bool] = False
-    """Whether `slipid compare` fits every load set-up of a floor separately."""
+    """True if `slipid compare` fits every load set-up of a floor separately."""
     coefficients: np.ndarray | None = field(default=None, kw_only=True)
 
     @abc.abstractmethod

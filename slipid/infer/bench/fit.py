@@ -48,9 +48,9 @@ from slipid.infer.bench.motor import (
 from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
 from slipid.search_space import Choice, Space
 
-ROUNDS = 30
+MOST_ROUNDS = 30
 """Largest number of updates of weights, scatter and numbers."""
-SETTLED = 0.02
+SETTLED_STDS = 0.02
 """Largest change of a number in the last round of a converged fit [std]."""
 CONSTANT_S = 2e-3
 """Prior std of the electrical time constant L_a / R [s]."""
@@ -149,7 +149,7 @@ def fit_motor(
     chosen = space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in started))
     z = np.where(chosen, space.start, z)
     zero, moved, rounds = 0.0, np.inf, 0
-    while moved >= SETTLED and rounds < ROUNDS:
+    while moved >= SETTLED_STDS and rounds < MOST_ROUNDS:
         motor = space.tree(jnp.asarray(z)).motor
         if abs(float(motor.current_offset) - zero) > 0.02 * BRUSH_CURRENT:
             zero = float(motor.current_offset)
@@ -161,8 +161,8 @@ def fit_motor(
         new, covariance = _solved(space, z, equations, s)
         moved = float(np.max(np.abs(new - z) / np.sqrt(np.diag(covariance)), initial=0.0))
         z, rounds = new, rounds + 1
-    settled = moved < SETTLED and bool(np.isfinite(z).all())
-    reason = f"no number changed by {100 * SETTLED:g} % of its std in round {rounds}"
+    settled = moved < SETTLED_STDS and bool(np.isfinite(z).all())
+    reason = f"no number changed by {100 * SETTLED_STDS:g} % of its std in round {rounds}"
     return MotorFit(
         label=label,
         records=tuple(records),

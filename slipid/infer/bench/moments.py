@@ -32,11 +32,11 @@ from slipid.infer.bench.windows import BenchWindows
 
 DEGREES = 4.0
 """Degrees of freedom of Student's t in the weights."""
-FORGOTTEN = 0.05
+UNCORRELATED = 0.05
 """Autocorrelation below which residuals count as uncorrelated."""
 CELL_S = 0.01
 """Smallest length of the cells of time, over which moments are summed [s]."""
-FEWEST = 12
+FEWEST_TIMES = 12
 """Smallest ratio of a record's length to the estimated correlation time.
 
 Longer correlation times are not looked for, as the covariance could not be estimated from them.
@@ -159,14 +159,14 @@ def cell_length(windows: Sequence[BenchWindows]) -> float:
 
 def correlation_cells(x: Float[np.ndarray, " cell"]) -> int:
     """Return the correlation time of a signal [cell]: 1 + 2 sum of its autocorrelations."""
-    most = len(x) // FEWEST
+    most = len(x) // FEWEST_TIMES
     size = 1 << (2 * len(x)).bit_length()
     power = np.abs(np.fft.rfft(x - x.mean(), size)) ** 2
     correlation = np.fft.irfft(power, size)[: most + 1]
     if len(correlation) < 2 or correlation[0] <= 0:
         return 1
     correlation = correlation / correlation[0]
-    low = np.flatnonzero(correlation < FORGOTTEN)
+    low = np.flatnonzero(correlation < UNCORRELATED)
     end = int(low[0]) if len(low) else most + 1
     return int(np.ceil(1 + 2 * correlation[1:end].sum()))
 

@@ -20,13 +20,13 @@ from slipid.support.files import hash_of
 
 BINS = 8
 """Number of bins over speed, current or time, with about equal counts of windows."""
-SURE = 5.0
+MISFIT_STDS = 5.0
 """Smallest mean residual of a bin that is reported as a misfit [std of the mean]."""
-MATTERS = 0.01
+MISFIT_SHARE = 0.01
 """Smallest mean residual that is reported as a misfit, divided by the range of the channel."""
-FEWEST = 5
+FEWEST_CELLS = 5
 """Smallest number of cells of time in a bin from which the std of its mean is estimated."""
-LONG_S = 0.3
+LONG_CORRELATION_S = 0.3
 """Correlation time of residuals above which a message reports it [s]."""
 
 
@@ -41,8 +41,8 @@ def misfits(fit: MotorFit) -> dict[str, str]:
 
 def _worst(fit: MotorFit, equation: Equation) -> str | None:
     """Return a sentence on the most significant misfit of an equation, None if it has none."""
-    w, sentence, largest = equation.windows, None, SURE
-    size = MATTERS * float(np.ptp(w.measured.mean(axis=0)))
+    w, sentence, largest = equation.windows, None, MISFIT_STDS
+    size = MISFIT_SHARE * float(np.ptp(w.measured.mean(axis=0)))
     used = np.flatnonzero(w.usable)
     for over, (even, odd), unit in (
         ("speed", w.speed, "rad/s"),
@@ -85,14 +85,14 @@ def _mean(
     away = celled((sum_ - weight * off)[:, None], w, length)
     square = away[:, 0] ** 2
     # no std can be estimated from too few cells of time, or if one cell outweighs all others
-    if np.count_nonzero(square) < FEWEST or square.max() > square.sum() / 2:
+    if np.count_nonzero(square) < FEWEST_CELLS or square.max() > square.sum() / 2:
         return 0.0, 0.0
     return off, abs(off) * total / float(np.sqrt(square.sum()))
 
 
 ROWS_ELECTRICAL, ROWS_MECHANICAL = 2.0, 6.0
 """Smallest numbers of rows per time constant, L_a / R and J R / C_e^2, that identify L_a and J."""
-_OF = {
+_NUMBERS_OF = {
     "voltage": tuple(
         f"motor.{name}"
         for name in ("resistance", "back_emf", "brush_drop", "inductance", "voltage_offset")
@@ -103,9 +103,9 @@ _OF = {
     ),
 }
 """Paths of the numbers that the equation of each channel determines."""
-ONE_POINT = 0.05
+ONE_SPEED_RATIO = 0.05
 """Ratio of the range of speeds to the largest one below which a log has one operating point."""
-SLOW_S = 1.0
+SLOW_ROWS_S = 1.0
 """Time between rows above which a message asks whether its unit is right [s]."""
 _REMEDIES = (
     (("motor.inductance",), "log faster, several rows in L/R, with steps of the voltage"),
@@ -188,7 +188,7 @@ def bench_fit(fits: Sequence[MotorFit]) -> BenchFit:
         directions = flat_directions(f.space, f.covariance, has_current=True, has_voltage=voltage)
         flat = [replace(one, remedy=_remedy(one.paths, voltage)) for one in directions]
         numbers = estimates(f.space, f.choices, f.z, f.covariance, voltage, members(flat))
-        misfitted = {path for channel in found[f.label] for path in _OF[channel]}
+        misfitted = {path for channel in found[f.label] for path in _NUMBERS_OF[channel]}
         quotients = derived(f.space, f.z, f.covariance, voltage)
         for into, estimated in ((parameters, numbers), (ratios, quotients)):
             for e in estimated:
@@ -230,10 +230,12 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
 
 
 def _one_point(f: MotorFit) -> bool:
-    """Return True if the speed is nearly constant (`ONE_POINT`)."""
+    """Return True if the speed is nearly constant (`ONE_SPEED_RATIO`)."""
     amps = f.equations[-1].windows
     used = amps.speed.mean(axis=0)[amps.usable]
-    return float(np.ptp(np.quantile(used, (0.02, 0.98)))) < ONE_POINT * float(np.abs(used).max())
+    return float(np.ptp(np.quantile(used, (0.02, 0.98)))) < ONE_SPEED_RATIO * float(
+        np.abs(used).max()
+    )
 
 
 def _time(seconds: float) -> str:
@@ -274,12 +276,12 @@ def _remarks(f: MotorFit) -> list[str]:
             "currents are magnitudes: they were given the sign of the speed, windows in which the "
             "motor may brake were left out, and the zero of the ammeter looks like friction"
         )
-    if f.period > SLOW_S:
+    if f.period > SLOW_ROWS_S:
         found.append(
             f"rows are {f.period:.3g} s apart: if the time is in milliseconds, set its unit (t:ms);"
             " inertia and inductance depend on it"
         )
-    if f.correlation_time > LONG_S:
+    if f.correlation_time > LONG_CORRELATION_S:
         found.append(
             f"residuals are correlated over {f.correlation_time:.2g} s: the intervals count "
             f"{f.independent_times:.0f} independent times of that length, not the rows"

@@ -35,16 +35,16 @@ MOST_WINDOWS = 20_000
 """Largest number of windows of one record."""
 WIDER = 4
 """Ratio of the longer window, whose mean gives the sign of a small current, to a window."""
-STRAY = 1.5
+GAP_RATIO = 1.5
 """Ratio of a window's duration to its nominal one above which it spans a gap between rows."""
-JUMP = 6.0
+JUMP_STDS = 6.0
 """Step of the voltage between rows above which it counts as a jump [robust std of steps]."""
 SETTLED_S, SETTLED_ROWS = 5e-3, 4
 """Time after a jump of the voltage until currents are straight lines between rows [s], [row].
 
 The shorter of the two applies.
 """
-BRAKES = 4.0
+BRAKING_STDS = 4.0
 """Deceleration of the shaft above which the motor may be braking [robust std of accelerations]."""
 
 
@@ -133,7 +133,7 @@ class _RecordWindows:
         half, last = self.half, len(r.time) - self.half
         middle = np.arange(half, last, max(half // 2, len(r.time) // MOST_WINDOWS, 1))
         span = r.time[middle + half] - r.time[middle - half]
-        self.middle = middle[(span <= STRAY * 2 * half * r.period) & ~_jumps(r, half, middle)]
+        self.middle = middle[(span <= GAP_RATIO * 2 * half * r.period) & ~_jumps(r, half, middle)]
         self.rows = [self._rows(half, first) for first in (0, 1)]
         self._step = [np.diff(r.time[rows], axis=1) for rows in self.rows]
         self._kernel = [
@@ -179,7 +179,7 @@ class _RecordWindows:
         speed, slope = (of(self.record.speed).sum(axis=0) for of in (self.mean, self.slope))
         faster = slope * np.sign(speed)
         spread = 1.4826 * np.median(np.abs(faster)) if len(faster) else 0.0
-        return np.asarray(faster > -BRAKES * spread)
+        return np.asarray(faster > -BRAKING_STDS * spread)
 
     def places(
         self, number: int
@@ -198,7 +198,7 @@ def _jumps(
     step = np.diff(r.voltage)
     away = np.abs(step - np.median(step))
     # a mostly constant signal has median 0; steps below a thousandth of its range are no jumps
-    jump = away > JUMP * max(1.4826 * float(np.median(away)), 1e-3 * float(np.ptp(r.voltage)))
+    jump = away > JUMP_STDS * max(1.4826 * float(np.median(away)), 1e-3 * float(np.ptp(r.voltage)))
     rows = int(np.clip(round(SETTLED_S / r.period), 1, SETTLED_ROWS))
     count = np.concatenate([[0], np.cumsum(jump)])
     return np.asarray(count[middle + half] > count[np.maximum(middle - half - rows, 0)])

@@ -38,7 +38,7 @@ from slipid.support.progress import Reporter
 for _module in ("arviz_base", "arviz_stats", "h5netcdf"):
     importlib.import_module(_module)  # a missing package must fail here, not after hours
 
-STILL = 0.01
+MOST_STILL = 0.01
 """Largest fraction of draws whose electric numbers have no accepted proposal."""
 
 
@@ -73,7 +73,7 @@ def sampled(
             still = float((~moved.any(axis=1)).mean())
     if not np.isfinite(out).all():
         still, reason = 1.0, "electric draws that are not finite"
-    elif found.converged and still > STILL:
+    elif found.converged and still > MOST_STILL:
         reason = f"{100 * still:.1f} % of the electric draws, which never moved"
     return Posterior(
         fit=fit,
@@ -83,7 +83,7 @@ def sampled(
         names=first.names,
         diagnosis=found,
         accepted=accepted,
-        converged=found.converged and still <= STILL,
+        converged=found.converged and still <= MOST_STILL,
         reason=reason,
     )
 

@@ -28,7 +28,7 @@ from slipid.fitting.variances import Search, Square
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.search_space import Space
 
-CHANCE = 0.01
+LARGEST_P_VALUE = 0.01
 """Largest p-value at which a disagreement is reported."""
 _WIDE = 1.0
 """Std of the uninformative prior of load biases."""
@@ -55,7 +55,7 @@ def disputes(space: Space, z: Search, covariance: Square) -> dict[tuple[str, str
         spread = wide[bias[one]] - wide[bias[other]]
         spread = spread[:, bias[one]] - spread[:, bias[other]]
         chance = float(chi2.sf(difference @ np.linalg.solve(spread, difference), len(difference)))
-        if chance < CHANCE:
+        if chance < LARGEST_P_VALUE:
             found[str(one), str(other)] = float(norm.isf(chance / 2))
     return dict(sorted(found.items(), key=lambda pair: -pair[1]))
 
@@ -76,9 +76,9 @@ Word = Literal["trusted", "doubtful", "not to be trusted"]
 WORDS: tuple[Word, ...] = ("trusted", "doubtful", "not to be trusted")
 WORSE, MUCH_WORSE = 1.1, 1.5
 """Ratios of the model's to the encoders' error above which a fit is doubtful, not to be trusted."""
-SMALL = 0.005
+SMALL_ERROR = 0.005
 """Difference of model's and encoders' end-point errors over path length that does not count."""
-ABSURD = 0.5
+USELESS_ERROR = 0.5
 """End-point error over path length above which a model is useless."""
 MANY_AT_BOUNDS = 3
 """Smallest count of numbers at their bounds for which a fit is not to be trusted."""
@@ -150,10 +150,10 @@ def _of_errors(floors: Mapping[str, EndPoints]) -> Iterator[_Reason]:
         both = f"{100 * e.model:.1f} % of the path, encoders alone by {100 * e.encoders:.1f} %"
         if not isfinite(e.model):
             yield (2, f"on {name} its predictions are not numbers")
-        elif e.model > e.encoders + SMALL and e.model > WORSE * e.encoders:
-            much = e.model > MUCH_WORSE * e.encoders and e.model > e.encoders + 4 * SMALL
+        elif e.model > e.encoders + SMALL_ERROR and e.model > WORSE * e.encoders:
+            much = e.model > MUCH_WORSE * e.encoders and e.model > e.encoders + 4 * SMALL_ERROR
             yield (2 if much else 1, f"on {name} it is off by {both}")
-        elif e.model > ABSURD:
+        elif e.model > USELESS_ERROR:
             yield (1, f"on {name} it is off by {both}: neither is of use there")
 
 

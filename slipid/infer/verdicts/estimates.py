@@ -23,11 +23,11 @@ FROM_ZERO = 3.0
 The likelihood of a number closer to 0 is flat towards 0, even if its logarithm has a narrow
 interval.
 """
-TAIL, SMALL = 4.0, 0.05
+AT_ZERO_STDS, AT_ZERO_RATIO = 4.0, 0.05
 """Limits for a positive number that counts as being at its bound 0.
 
-It is more than `TAIL` prior stds below its prior mean and less than `SMALL` times that mean. The
-second condition excludes numbers with a narrow prior that the data contradict.
+It is more than `AT_ZERO_STDS` prior stds below its prior mean and less than `AT_ZERO_RATIO` times
+that mean. The second condition excludes numbers with a narrow prior that the data contradict.
 """
 NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
 """Numbers that are not identified without voltages.
@@ -36,7 +36,7 @@ Without voltages their scale is determined by priors of other numbers only.
 """
 Z95 = 1.6448536269514722
 """The 95 % quantile of a standard Gaussian."""
-LARGEST = 600.0
+LARGEST_LOG = 600.0
 """Largest logarithm at an end of an interval; exp of larger ones would overflow."""
 
 
@@ -210,7 +210,7 @@ def _judged(
         std = draws.std(axis=0)
         wide = np.full(len(value), prior_std.mean() / len(value))
     else:
-        most = LARGEST if d.logarithmic else np.inf
+        most = LARGEST_LOG if d.logarithmic else np.inf
         ends = (np.minimum(mean + k * std_z, most) for k in (-Z95, Z95))
         low, high = (np.asarray(d.to_si(end)) for end in ends)
         std, wide = d.slope(value) * std_z, d.slope(center) * prior_std
@@ -238,7 +238,7 @@ def _at_bound(d: Declaration, value: np.ndarray, pull: np.ndarray, prior_std: np
     if np.isfinite(d.upper):
         part = (value - d.lower) / (d.upper - d.lower)
         return bool(((part < 0.01) | (part > 0.99)).any())
-    return bool(((pull < -TAIL) & (pull * prior_std < np.log(SMALL))).any())
+    return bool(((pull < -AT_ZERO_STDS) & (pull * prior_std < np.log(AT_ZERO_RATIO))).any())
 
 
 def from_zero(declaration: Declaration, std_z: Float[np.ndarray, " coordinate"]) -> float:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from slipid.fitting.variances import Search, Square
 from slipid.infer.verdicts.estimates import WEAK
-from slipid.infer.verdicts.wording import NOTHING, SMALL, Axis, axes_of, formula, remedy
+from slipid.infer.verdicts.wording import NOTHING, OTHERS_CHANGE, Axis, axes_of, formula, remedy
 from slipid.model.robot import Validity
 from slipid.search_space import Space
 
@@ -135,7 +135,8 @@ def flat_directions(
                 paths=tuple(e.path for e in moving),
                 powers=tuple(round(float(p), 2) for p in power),
                 others=rest,
-                formula=formula(mine, power, step) + (SMALL if rest and len(mine) > 1 else ""),
+                formula=formula(mine, power, step)
+                + (OTHERS_CHANGE if rest and len(mine) > 1 else ""),
                 remedy=remedy(moving, has_current, has_voltage, validity or {}, sideways),
             )
         )
