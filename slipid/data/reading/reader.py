@@ -18,7 +18,7 @@ from slipid.data.reading.bag.topics import read_bag
 from slipid.data.reading.checks import MIN_ROWS, UnusablePose, check_log, check_time
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import preset
-from slipid.data.reading.signal import Signal, SignalSource
+from slipid.data.reading.signal import Signal, SignalSource, heading
 from slipid.data.reading.table import Table, read_table
 from slipid.data.runs import Runs, collect, counted_once, default_session
 from slipid.support.errors import DataError, first_names
@@ -262,7 +262,7 @@ def _run_starts(table: Table, layout: Layout) -> list[int]:
 def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Signal]:
     """Return the signals of a table in SI units by channel, each at the times of its own values.
 
-    Remarks about empty cells are appended to the notes.
+    Quaternions become headings. Remarks about empty cells are appended to the notes.
     """
     time = _time(table, layout)
     check_time(table, layout, time)
@@ -283,6 +283,8 @@ def signals_of(table: Table, layout: Layout, notes: list[str]) -> dict[str, Sign
         values = (cells * channel.scale + channel.offset) * layout.to_si(name)
         signal, there = Signal(time, values, source), ~missing.all(axis=1)
         out[name] = signal if there.all() else signal.part(there)
+    if "pose_quaternion" in out:
+        out["pose_heading"] = heading(out.pop("pose_quaternion"))
     return out
 
 

@@ -77,3 +77,16 @@ def clock_of(signals: Sequence[Signal]) -> Float[np.ndarray, " time"]:
     if all(signal.time is first for signal in signals) and (np.diff(first) > 0).all():
         return first
     return np.unique(np.concatenate([signal.time for signal in signals]))
+
+
+def heading(turned: Signal) -> Signal:
+    """Return the yaw angle [rad] of quaternions x, y, z, w; their length must be 1."""
+    x, y, z, w = turned.values.T
+    size = np.sqrt(x**2 + y**2 + z**2 + w**2)
+    bad = np.flatnonzero(np.abs(size - 1.0) > 0.05)
+    if len(bad):
+        found = f"a quaternion of length {size[bad[0]]:.3g}"
+        expected = "x, y, z, w in this order, of length 1"
+        raise turned.source.error(found, expected, sample=int(bad[0]))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    return Signal(turned.time, yaw[:, None], turned.source)

@@ -279,7 +279,7 @@ def check_units(path: Path, line: str, header: list[str], layout: Layout) -> Non
             written = units[at] if at < len(units) else ""
             if not same_unit(written, channel.unit):
                 found = f"the units row says '{written}'"
-                expected = f"'{channel.unit}' as the layout {layout.name} declares"
+                expected = f"'{channel.unit}' as the layout declares"
                 row = layout.units_row
                 raise bad_data(path, found, expected, row=row, column=str(column))
 
