@@ -46,8 +46,8 @@ def _clock(w: BenchWindows) -> np.ndarray:
 def _signals(axes: Axes, equation: Equation) -> None:
     plain(axes)
     w, s = equation.windows, equation.sums
-    clock, measured = _clock(w), w.both.measured
-    fitted = np.where(w.usable, measured - (s.even.residual + s.odd.residual) / 2, np.nan)
+    clock, measured = _clock(w), w.measured.mean(axis=0)
+    fitted = np.where(w.usable, measured - s.residual.mean(axis=0), np.nan)
     some = slice(None, None, max(1, len(clock) // MOST))
     axes.plot(clock[some], measured[some], color=SHADE, lw=2.2, alpha=0.6, label="measured")
     axes.plot(clock[some], fitted[some], color=BLUE, lw=0.9, label="fitted")
@@ -58,13 +58,13 @@ def _signals(axes: Axes, equation: Equation) -> None:
 def _residuals(panels: list[Axes], equation: Equation) -> None:
     """Draw residuals and their means in bins, over time, speed and current."""
     w, s = equation.windows, equation.sums
-    both, residual = w.both, (s.even.residual + s.odd.residual) / 2
-    weight = s.even.weight + s.odd.weight + 1e-9
+    speed, current, residual = (x.mean(axis=0) for x in (w.speed, w.current, s.residual))
+    weight = s.weight.sum(axis=0) + 1e-9
     used = np.flatnonzero(w.usable)
     some = used[:: max(1, len(used) // MOST)]
     for axes, (x, label) in zip(
         panels,
-        ((_clock(w), "time [s]"), (both.speed, "speed [rad/s]"), (both.current, "current [A]")),
+        ((_clock(w), "time [s]"), (speed, "speed [rad/s]"), (current, "current [A]")),
         strict=True,
     ):
         plain(axes)

@@ -24,7 +24,6 @@ moves, the noise of the poses divided by the small distance would dominate.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -118,41 +117,32 @@ def end_errors(
     return error, distance
 
 
-class LargestShift(NamedTuple):
-    """The fitted number that changed most when runs were added.
-
-    Attributes:
-        name: name of the coordinate.
-        sigma: size of its change, in the standard errors it had before.
-    """
-
-    name: str
-    sigma: float
-
-
 def largest_shift(
     space: Space, before: Search, covariance: Square, after: Search, settled: bool
-) -> LargestShift:
-    """Return the largest shift among numbers estimated from motion, the camera's excepted.
+) -> tuple[str, float]:
+    """Return the number, estimated from motion, that shifted most, and its shift [std before].
 
-    It is infinite if the fit with the added runs did not settle. Added runs that agree with the
-    model change a number by less than the standard error it had without them (Hausman 1978,
-    Econometrica 46(6)).
+    Numbers of the camera are excepted. The shift is infinite if the fit with the added runs did not
+    settle. Added runs that agree with the model change a number by less than the standard error it
+    had without them (Hausman 1978, Econometrica 46(6)).
     """
     known = ~space.electric & ~space.where(lambda e: e.part == "camera")
     sigma = np.where(known, np.abs(after - before) / np.sqrt(np.diag(covariance)), 0.0)
     worst = int(np.argmax(sigma))
-    return LargestShift(space.names[worst], float(sigma[worst]) if settled else np.inf)
+    return space.names[worst], float(sigma[worst]) if settled else np.inf
 
 
 def contradiction(
-    found: Mapping[str, FloorErrors], moved: LargestShift, by_map: float, as_if: Mapping[str, float]
+    found: Mapping[str, FloorErrors],
+    shift: tuple[str, float],
+    by_map: float,
+    as_if: Mapping[str, float],
 ) -> str | None:
     """Return the reason to reject runs over several floors, None if they agree with the others.
 
     Args:
         found: errors of the runs on one floor each, by floor.
-        moved: fitted number that changed most.
+        shift: fitted number that changed most, and its change in standard errors.
         by_map: error of the runs over several floors [m/s], the wheels' floors taken from the map.
         as_if: error as if all wheels had always stood on one floor, by floor [m/s].
     """
@@ -161,13 +151,14 @@ def contradiction(
         for floor, e in found.items()
         if e.is_worse
     )
+    name, sigma = shift
     best = min(as_if, key=lambda floor: as_if[floor])
     if worse:
         reason = f"end-point errors on {worse}"
-    elif not np.isfinite(moved.sigma):
+    elif not np.isfinite(sigma):
         reason = "the fit to all of them did not settle"
-    elif moved.sigma > FAR:
-        reason = f"{moved.name} moves by {moved.sigma:.0f} standard errors"
+    elif sigma > FAR:
+        reason = f"{name} moves by {sigma:.0f} standard errors"
     elif as_if[best] < BETTER * by_map:
         errors = f"{1000 * by_map:.1f} mm/s by their map, {1000 * as_if[best]:.1f} mm/s"
         reason = f"errors of {errors} as if all on {best}"

@@ -94,8 +94,8 @@ class CurveModel(WheelSlip):
 
     def learn(self, w: TrainingWindows, spec: RobotSpec) -> "CurveModel":
         rim = w.steps.signals.speed * spec.wheel_radius
-        rows = w.rows(spec.back @ (rim[..., None] * self.regressors(w.steps, spec)), spec)
-        a, b = rows.parts.reshape(-1, rows.parts.shape[-1]), rows.gap.ravel()
+        parts, gap = w.rows(spec.back @ (rim[..., None] * self.regressors(w.steps, spec)), spec)
+        a, b = parts.reshape(-1, parts.shape[-1]), gap.ravel()
         if self.insensitive:
             return replace(self, coefficients=insensitive(a, b))
         if not self.monotone:

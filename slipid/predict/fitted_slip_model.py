@@ -12,7 +12,9 @@ from scipy.linalg import block_diag
 
 from slipid.data.windows import Windows
 from slipid.fitting import likelihood as lk
+from slipid.fitting.noise import effects
 from slipid.fitting.problem import Problem
+from slipid.fitting.session_effects import LinearModel, by_axis, with_session_effects
 from slipid.fitting.variances import DEGREES, scoring_step
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
@@ -116,11 +118,18 @@ def fit_with_noise(
             log_v = scoring_step(objective, *blocks, log_v, count, None)
         if float(jnp.abs(log_v - last).max()) < SETTLED:
             break
-    plain = replace(plain, variance=by_name(problem, log_v), covariance=covariance)
-    own = len(before)
-    wide = np.zeros_like(covariance)
-    wide[:own, :own], wide[own:, own:] = np.linalg.inv(before), common
-    return plain.with_sessions(problem, (residual, slope), wide, keep)
+    variance, w = by_name(problem, log_v), problem.windows
+    fitted = LinearModel(
+        residual,
+        slope,
+        covariance=covariance,
+        wide=block_diag(np.linalg.inv(before), common),
+        scale=np.asarray(problem.covariance("motion", log_v)),
+        effect=effects(w, robot),
+        run=by_axis(variance, "run", w),
+    )
+    of_sessions, covariance = with_session_effects(fitted, w, np.asarray(keep, float))
+    return replace(plain, variance=variance | of_sessions, covariance=covariance)
 
 
 def _prior_precision(model: FloorModels, w: Windows, robot: Robot) -> np.ndarray:

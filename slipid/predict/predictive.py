@@ -17,9 +17,8 @@ numbers of the simpler models.
 
 import abc
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +31,7 @@ from slipid.fitting import likelihood as lk
 from slipid.fitting.hierarchy import TravelDirections, extrapolation
 from slipid.fitting.noise import SHARED, effects, travel
 from slipid.fitting.problem import FitState, Problem
-from slipid.fitting.session_effects import LinearModel, by_axis, with_session_effects
+from slipid.fitting.session_effects import by_axis
 from slipid.fitting.shared_effects import (
     AXES,
     EffectForecast,
@@ -47,7 +46,6 @@ from slipid.search_space import Space
 
 Residuals = Float[np.ndarray, "segment m"]
 Slopes = Float[np.ndarray, "segment m number"]
-Fitted = TypeVar("Fitted", bound="PredictiveModel")
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,32 +120,6 @@ class PredictiveModel(abc.ABC):
         return log_student(*self.scale(problem)) + np.asarray(
             _camera_log_jacobian(self.robot, problem.batch.pose)
         )
-
-    def with_sessions(
-        self: Fitted,
-        problem: Problem,
-        linear: tuple[Residuals, Slopes],
-        wide: np.ndarray,
-        keep: np.ndarray,
-    ) -> Fitted:
-        """Return the model with session effects in its variances and in its covariance.
-
-        Args:
-            problem: problem to whose segments the model was fitted.
-            linear: residuals of these segments and their derivative.
-            wide: covariance of the numbers before the floor's own runs were used.
-            keep: 1 for fitted segments, else 0.
-        """
-        model = LinearModel(
-            *linear,
-            covariance=self.covariance,
-            wide=wide,
-            scale=np.asarray(problem.covariance("motion", self.log_variance(problem))),
-            effect=effects(problem.windows, problem.robot),
-            run=by_axis(self.variance, "run", problem.windows),
-        )
-        variance, covariance = with_session_effects(model, problem.windows, np.asarray(keep, float))
-        return replace(self, variance={**self.variance, **variance}, covariance=covariance)
 
 
 def log_student(
@@ -253,12 +225,9 @@ class ForceBalance(PredictiveModel):
 
     def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
         tracks, (mean, slope) = self.tracks(w), self._correction(w)
-        shape = *w.dt.shape, 3
-        correction = replay.IncrementCorrection(
-            jnp.asarray(mean.reshape(shape)), jnp.asarray(slope.reshape(*shape, -1))
-        )
+        expected = mean.reshape(*w.dt.shape, 3), slope.reshape(*w.dt.shape, 3, -1)
         b, start = lk.batch(w, self.robot), tracks.predicted[:, 0]
-        by_z = replay.end_jacobian(self.space, self.z, b, start, corrected=correction)
+        by_z = replay.end_jacobian(self.space, self.z, b, start, effects=expected)
         return tracks, np.asarray(by_z)
 
 

@@ -178,28 +178,18 @@ class TrainingWindows:
         """Return the factor from twists to displacements of every window."""
         return self.dt[:, None] * spec.size
 
-    def rows(self, parts: Float[np.ndarray, "step 3 k"], spec: RobotSpec) -> "SlipEquations":
-        """Return linear equations for the coefficients of a slip model.
+    def rows(
+        self, parts: Float[np.ndarray, "step 3 k"], spec: RobotSpec
+    ) -> tuple[Float[np.ndarray, "window 3 k"], Float[np.ndarray, "window 3"]]:
+        """Return linear equations for the coefficients of a slip model, three for each window.
 
-        They equate the encoders' displacement less the measured one to a weighted sum of `parts`:
-        (rolling - twist) dt = sum_k coefficient_k part_k dt, with yaw times the base radius.
+        They equate a weighted sum of `parts` to the encoders' displacement less the measured one:
+        sum_k coefficient_k part_k dt = (rolling - twist) dt, with yaw times the base radius. The
+        results are part_k dt and the right side [m].
         """
         gap = self.means(self.steps.signals.rolling(spec)) - self.twist
         scale = self._scale(spec)
-        return SlipEquations(self.means(parts) * scale[..., None], gap * scale)
-
-
-@dataclass(frozen=True, eq=False)
-class SlipEquations:
-    """Equations that are linear in a model's coefficients, three for each window.
-
-    Attributes:
-        parts: displacement that is subtracted from the encoders' per unit of each coefficient [m].
-        gap: displacement by the encoders less the measured one [m].
-    """
-
-    parts: Float[np.ndarray, "window 3 k"]
-    gap: Float[np.ndarray, "window 3"]
+        return self.means(parts) * scale[..., None], gap * scale
 
 
 def scaled_least_squares(

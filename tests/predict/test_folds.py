@@ -25,7 +25,7 @@ from slipid.infer.design.planned_runs import PlannedRun
 from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.predict import open_loop as replay
 from slipid.predict.fitted_slip_model import fit_with_noise, slopes
-from slipid.predict.folds import folds_of, nested
+from slipid.predict.folds import folds_of, inner_folds
 from slipid.predict.predictive import ForceBalance, by_name, log_student
 from slipid.predict.ranking import ranking, transfer
 from slipid.predict.score import Score, forecast, mean_error
@@ -346,16 +346,16 @@ def test_folds_that_are_left_out_together_leave_some_of_every_floor(logs):
 def test_a_model_that_tunes_itself_leaves_out_gaps_as_wide_as_the_one_it_is_asked_about(logs):
     data = collect(logs)
     sector = folds_of(data, "sectors")
-    inner = nested(data, "sectors", np.flatnonzero(sector == 0))
+    inner = inner_folds(data, "sectors", np.flatnonzero(sector == 0))
     assert set(inner[(sector == 1) | (sector == 5)]) == {-1}
     np.testing.assert_array_equal(
         inner[(sector > 1) & (sector < 5)], sector[(sector > 1) & (sector < 5)]
     )
-    every_second = nested(data, "sectors", np.flatnonzero(sector % 2 == 0))
+    every_second = inner_folds(data, "sectors", np.flatnonzero(sector % 2 == 0))
     np.testing.assert_array_equal(every_second, sector)
     for question in ("speeds", "random"):
         mine = folds_of(data, question)
-        np.testing.assert_array_equal(nested(data, question, np.flatnonzero(mine == 0)), mine)
+        np.testing.assert_array_equal(inner_folds(data, question, np.flatnonzero(mine == 0)), mine)
 
 
 def test_a_fold_is_kept_whole_and_only_for_the_job_it_is_of(tmp_path):

@@ -82,9 +82,9 @@ def test_windows_are_those_of_the_runs(rng):
 def test_rows_are_displacements_with_yaw_at_the_base_radius():
     rolling = np.tile([0.2, 0.1, 0.4], (5, 1))
     run = made_run(rolling, rolling - [0.1, 0.0, 0.2])
-    rows = TrainingWindows.of([run]).rows(rolling[..., None], ROBOTINO)
-    assert np.allclose(rows.gap, [[0.05, 0.0, 0.1 * 0.125]])
-    assert np.allclose(rows.parts[..., 0], [[0.1, 0.05, 0.2 * 0.125]])
+    parts, gap = TrainingWindows.of([run]).rows(rolling[..., None], ROBOTINO)
+    assert np.allclose(gap, [[0.05, 0.0, 0.1 * 0.125]])
+    assert np.allclose(parts[..., 0], [[0.1, 0.05, 0.2 * 0.125]])
 
 
 def test_columns_without_news_get_nothing():

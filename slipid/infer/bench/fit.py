@@ -16,7 +16,7 @@ the spectra of three noises and the voltage between rows. Moments need none of t
 
 import fnmatch
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -44,8 +44,7 @@ from slipid.infer.bench.motor import (
     BenchMotor,
     BenchRecord,
     BenchRoot,
-    SensorNoise,
-    noise_of,
+    noise,
 )
 from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
 from slipid.search_space import Choice, Space
@@ -91,7 +90,6 @@ class MotorFit:
         z: search vector at the optimum.
         covariance: covariance of the search vector.
         equations: the electrical equation, absent without voltage, and the mechanical one.
-        noise: noise of the sensors.
         correlation_time: time over which residuals are correlated [s].
         independent_times: length of the records over the correlation time.
         converged: True if the numbers settled.
@@ -106,7 +104,6 @@ class MotorFit:
     z: Float[np.ndarray, " free"]
     covariance: Float[np.ndarray, "free free"]
     equations: tuple[Equation, ...]
-    noise: SensorNoise
     correlation_time: float
     independent_times: float
     converged: bool
@@ -120,6 +117,16 @@ class MotorFit:
         return found
 
     @property
+    def noise(self) -> dict[str, float | None]:
+        """Std of the white noise of each sensor by channel, None for a channel without a sensor."""
+        volts = [r.voltage for r in self.records if r.voltage is not None]
+        return {
+            "voltage": noise(volts) if volts else None,
+            "current": noise([r.current for r in self.records]),
+            "speed": noise([r.speed for r in self.records]),
+        }
+
+    @property
     def has_voltage(self) -> bool:
         return len(self.equations) > 1
 
@@ -129,42 +136,20 @@ class MotorFit:
         return float(np.median([r.period for r in self.records]))
 
 
-class _EquationSums(eqx.Module):
-    """Sums h (`constant`), G (`slope`) and `tangent` of one equation, as in `MomentSums`.
-
-    They are zero for an equation without windows.
-    """
-
-    constant: Array
-    slope: Array
-    tangent: Array
-
-    @staticmethod
-    def of(s: MomentSums | None, moments: int, columns: int) -> "_EquationSums":
-        if s is None:
-            return _EquationSums(jnp.zeros(moments), *[jnp.zeros((moments, columns))] * 2)
-        return _EquationSums(*map(jnp.asarray, (s.constant, s.slope, s.tangent)))
-
-
 class _Objective(eqx.Module):
     """Arguments of the search for the optimum.
 
     Attributes:
         space: free numbers with their priors.
-        volts: sums of the electrical equation.
-        amps: sums of the mechanical equation.
         root: S^-1/2, which whitens the moments.
+        constant: h of each equation, the mechanical one last.
+        slope: G of each equation.
     """
 
     space: Space
-    volts: _EquationSums
-    amps: _EquationSums
     root: Array
-
-    def tangents(self) -> "_Objective":
-        """Return the objective with tangents in place of slopes, for the covariance."""
-        slopes = self.volts.tangent, self.amps.tangent
-        return eqx.tree_at(lambda h: (h.volts.slope, h.amps.slope), self, slopes)
+    constant: tuple[Array, ...]
+    slope: tuple[Array, ...]
 
 
 def fit_motor(
@@ -184,13 +169,13 @@ def fit_motor(
         if abs(float(motor.current_offset) - zero) > 0.02 * BRUSH_CURRENT:
             zero = float(motor.current_offset)
             volts = electrical(records, zero)
-        v = None if volts is None else sums(volts, np.asarray(motor.volts()), MOMENTS[0])
         a = sums(amps, np.asarray(motor.amps()), MOMENTS[1])
         equations = [Equation("current", "A", amps, a)]
-        if volts is not None and v is not None:
+        if volts is not None:
+            v = sums(volts, np.asarray(motor.volts()), MOMENTS[0])
             equations.insert(0, Equation("voltage", "V", volts, v))
         s, correlation_time, independent_times = _scatter(equations)
-        new, covariance = _solved(space, z, v, a, s)
+        new, covariance = _solved(space, z, [e.sums for e in equations], s)
         moved = float(np.max(np.abs(new - z) / np.sqrt(np.diag(covariance)), initial=0.0))
         z, rounds = new, rounds + 1
     settled = moved < SETTLED and bool(np.isfinite(z).all())
@@ -203,7 +188,6 @@ def fit_motor(
         z=z,
         covariance=covariance,
         equations=tuple(equations),
-        noise=noise_of(records),
         correlation_time=correlation_time,
         independent_times=independent_times,
         converged=settled,
@@ -265,39 +249,46 @@ def _scatter(
     parts = [celled(e.sums.moments, e.windows, length) for e in equations]
     count = max(len(p) for p in parts)
     g = np.concatenate([np.pad(p, ((0, count - len(p)), (0, 0))) for p in parts], axis=1)
-    residuals = [celled(e.sums.residual[:, None], e.windows, length)[:, 0] for e in equations]
+    residuals = [
+        celled(e.sums.weighted_residual[:, None], e.windows, length)[:, 0] for e in equations
+    ]
     lags = 2 * max(correlation_cells(x) for x in residuals) + 2
     groups = np.concatenate([grouped(e.sums, e.windows) for e in equations], axis=1)
     return widened(scatter(g, lags), groups), lags * length / 2, count / lags
 
 
 def _solved(
-    space: Space, z: np.ndarray, v: MomentSums | None, a: MomentSums, s: np.ndarray
+    space: Space, z: np.ndarray, equations: Sequence[MomentSums], s: np.ndarray
 ) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"]]:
     """Return the optimum at fixed weights and scatter, and its covariance."""
     std = np.sqrt(np.maximum(np.diag(s), 1e-300))
     # S is singular for collinear signals, as in a log at one speed, hence the 1e-9
     root = np.linalg.inv(np.linalg.cholesky(s / std / std[:, None] + 1e-9 * np.eye(len(s)))) / std
-    if v is None:
-        root = np.concatenate([np.zeros((len(root), MOMENTS[0])), root], axis=1)
-    volts, amps = _EquationSums.of(v, MOMENTS[0], len(VOLTS)), _EquationSums.of(a, *a.slope.shape)
-    found, tangent = _searched(jnp.asarray(z), _Objective(space, volts, amps, jnp.asarray(root)))
-    jacobian = np.asarray(tangent)
+    constant, slope, tangent = (
+        tuple(jnp.asarray(getattr(e, name)) for e in equations)
+        for name in ("constant", "slope", "tangent")
+    )
+    held = _Objective(space, jnp.asarray(root), constant, slope)
+    found, of_tangents = _searched(jnp.asarray(z), held, replace(held, slope=tangent))
+    jacobian = np.asarray(of_tangents)
     return np.asarray(found), np.linalg.inv(jacobian.T @ jacobian)
 
 
 @eqx.filter_jit
-def _searched(z: Float[Array, " free"], held: _Objective) -> tuple[Array, Array]:
-    """Return the optimum, and the Jacobian of the residuals there."""
+def _searched(
+    z: Float[Array, " free"], held: _Objective, tangents: _Objective
+) -> tuple[Array, Array]:
+    """Return the optimum, and the Jacobian of the residuals with tangents for slopes there."""
     solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
     found = optx.least_squares(_residuals, solver, z, args=held, max_steps=200, throw=False)
-    return found.value, jax.jacfwd(_residuals)(found.value, held.tangents())
+    return found.value, jax.jacfwd(_residuals)(found.value, tangents)
 
 
 def _residuals(z: Float[Array, " free"], held: _Objective) -> Float[Array, " residual"]:
     """Return S^-1/2 g and the residuals of the prior."""
     motor = held.space.tree(z).motor
-    pairs = (held.volts, motor.volts()), (held.amps, motor.amps())
-    g = jnp.concatenate([block.constant - block.slope @ k for block, k in pairs])
+    coefficients = (motor.volts(), motor.amps())[-len(held.slope) :]
+    sums_of = zip(held.constant, held.slope, coefficients, strict=True)
+    g = jnp.concatenate([constant - slope @ k for constant, slope, k in sums_of])
     prior = (z - held.space.prior_mean) / held.space.prior_std
     return jnp.concatenate([held.root @ g, prior])

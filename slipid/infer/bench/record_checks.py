@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from slipid.infer.bench.moments import scatter, start, sums
-from slipid.infer.bench.motor import REST, BenchRecord, noise_of
+from slipid.infer.bench.motor import REST, VOLTS, BenchRecord, noise
 from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
 from slipid.support.errors import DataError
 
@@ -29,7 +29,7 @@ def check_records(records: Sequence[BenchRecord], label: str, unit_known: bool =
     current = np.concatenate([r.current for r in records])
     if float(np.abs(speed).max()) > FAST:
         _fail(where, f"the shaft turns at {np.abs(speed).max():.4g} rad/s", "its unit, rpm perhaps")
-    if float(np.ptp(speed)) < max(6 * noise_of(records).speed, REST):
+    if float(np.ptp(speed)) < max(6 * noise([r.speed for r in records]), REST):
         found = f"the shaft does not turn (speeds within {np.ptp(speed):.3g} rad/s)"
         _fail(where, found, "a log in which the motor turns, both ways and at several speeds")
     if np.ptp(current) == 0:
@@ -94,7 +94,7 @@ def _signs(
 
 def _sure(w: BenchWindows, column: int) -> float:
     """Return a coefficient divided by its std, estimated from one equation without priors."""
-    signals = w.even.signals.shape[1] - (w.even.signals.shape[1] == 6)
+    signals = w.signals.shape[-1] - (w.signals.shape[-1] == len(VOLTS))
     found = start(w, signals)
     s = sums(w, found, signals)
     inverse = np.linalg.pinv(s.tangent[:, :signals], rcond=1e-10)

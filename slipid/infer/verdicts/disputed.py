@@ -135,12 +135,8 @@ class Trust:
         return f"{self.word}: {'; '.join(self.reasons)}" if self.reasons else self.word
 
 
-@dataclass(frozen=True)
-class _Reason:
-    """Reason against a fit: its severity as an index of `WORDS`, and a sentence."""
-
-    level: int
-    sentence: str
+_Reason = tuple[int, str]
+"""Reason against a fit: its severity as an index of `WORDS`, and a sentence."""
 
 
 def verdict_of_trust(
@@ -156,13 +152,13 @@ def verdict_of_trust(
     numbers = list(parameters)
     reasons = [*_of_errors(floors), *_of_numbers(numbers)]
     if not converged:
-        reasons.append(_Reason(1, "the fit did not converge"))
+        reasons.append((1, "the fit did not converge"))
     verdicts = {e.verdict for e in numbers} - {"fixed"}
     if verdicts and not verdicts & {"identified", "weak", "disputed"}:
-        reasons.append(_Reason(1, "the logs determine none of its numbers"))
-    reasons.sort(key=lambda r: -r.level)
-    level = max((r.level for r in reasons), default=0)
-    return Trust(WORDS[level], tuple(r.sentence for r in reasons))
+        reasons.append((1, "the logs determine none of its numbers"))
+    reasons.sort(key=lambda reason: -reason[0])
+    level = max((level for level, _ in reasons), default=0)
+    return Trust(WORDS[level], tuple(sentence for _, sentence in reasons))
 
 
 def _of_errors(floors: Mapping[str, EndPoints]) -> Iterator[_Reason]:
@@ -170,12 +166,12 @@ def _of_errors(floors: Mapping[str, EndPoints]) -> Iterator[_Reason]:
     for name, e in floors.items():
         both = f"{100 * e.model:.1f} % of the path, encoders alone by {100 * e.encoders:.1f} %"
         if not isfinite(e.model):
-            yield _Reason(2, f"on {name} its predictions are not numbers")
+            yield (2, f"on {name} its predictions are not numbers")
         elif e.model > e.encoders + SMALL and e.model > WORSE * e.encoders:
             much = e.model > MUCH_WORSE * e.encoders and e.model > e.encoders + 4 * SMALL
-            yield _Reason(2 if much else 1, f"on {name} it is off by {both}")
+            yield (2 if much else 1, f"on {name} it is off by {both}")
         elif e.model > ABSURD:
-            yield _Reason(1, f"on {name} it is off by {both}: neither is of use there")
+            yield (1, f"on {name} it is off by {both}: neither is of use there")
 
 
 def _of_numbers(numbers: list[Estimate]) -> Iterator[_Reason]:
@@ -185,11 +181,9 @@ def _of_numbers(numbers: list[Estimate]) -> Iterator[_Reason]:
             value = np.atleast_1d(np.asarray(e.value, float))
             if fnmatchcase(e.path, pattern) and not ((value >= low) & (value <= high)).all():
                 worst = float(value[np.argmax(np.abs(value))])
-                yield _Reason(
-                    2, f"{e.path} = {worst:.3g} {e.unit}; plausible are {low:g} to {high:g}"
-                )
+                yield (2, f"{e.path} = {worst:.3g} {e.unit}; plausible are {low:g} to {high:g}")
     bounds = [e.path for e in numbers if e.verdict == "at_bound"]
     if bounds:
         level = 2 if len(bounds) >= MANY_AT_BOUNDS else 1
         verb = "is at its bound" if len(bounds) == 1 else "are at their bounds"
-        yield _Reason(level, f"{', '.join(bounds)} {verb}")
+        yield (level, f"{', '.join(bounds)} {verb}")
