@@ -198,7 +198,7 @@ def _signals(bag: OpenBag, layout: BagLayout, notes: list[str]) -> dict[str, Sig
     picks: dict[str, list[Pick]] = {}
     for topic, pick in (wanted for one in plans for wanted in one.wanted):
         picks.setdefault(topic, []).append(pick)
-    streams = collected(bag, picks)
+    streams = collected(bag, picks, layout.stamp)
     signals: dict[str, Signal] = {}
     for one in plans:
         own = [streams[pick] for _, pick in one.wanted]
