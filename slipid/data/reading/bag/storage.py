@@ -165,23 +165,33 @@ def repaired(path: Path) -> RepairedMcap | None:
     return RepairedMcap(path, end) if records > 1 else None
 
 
-class _RepairedBytes(io.FileIO):
+class _RepairedBytes(io.RawIOBase):
     """Stream of the bytes of a file up to a position, followed by the end of an MCAP file."""
 
     def __init__(self, path: Path, end: int) -> None:
-        super().__init__(path)
-        self._end = end
+        super().__init__()
+        self._file, self._end = path.open("rb"), end
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
         if whence == io.SEEK_END:
             offset, whence = offset + self._end + len(_END), io.SEEK_SET
-        return super().seek(offset, whence)
+        return self._file.seek(offset, whence)
 
     def readinto(self, buffer: "WriteableBuffer") -> int:
-        view, at = memoryview(buffer), self.tell()
+        view, at = memoryview(buffer), self._file.tell()
         if at < self._end:
-            return super().readinto(view[: self._end - at]) or 0
+            return self._file.readinto(view[: self._end - at])
         data = _END[at - self._end :][: len(view)]
         view[: len(data)] = data
-        self.seek(at + len(data))
+        self._file.seek(at + len(data))
         return len(data)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
