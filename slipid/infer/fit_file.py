@@ -208,7 +208,7 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
             windows=settings["windows_per_piece"],
         ),
         curves={
-            floor: SlipCurve(*(np.asarray(c[name], float) for name in _CURVE), **c["at"])
+            floor: SlipCurve(**{k: np.asarray(c[k], float) for k in _CURVE} | c["at"])
             for floor, c in content["curves"].items()
         },
         validity={floor: Validity(**_tuples(v)) for floor, v in content["validity"].items()},
