@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
-from importlib.resources import files
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +13,7 @@ from slipid.exports.c99.function import Argument, Function, function, traced
 from slipid.exports.c99.text import TYPES, WIDTH, folded, table
 from slipid.exports.description import header
 from slipid.exports.fields import Struct
-from slipid.exports.text import identifiers, listed, wrapped
+from slipid.exports.text import filled, identifiers, listed, template, wrapped
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.filter.hypotheses import hypotheses_of
@@ -183,7 +181,7 @@ class Code:
             "STRUCTS": "\n".join(line for s in self.structs for line in _struct(s)),
             "FUNCTIONS": "\n".join(declared),
         }
-        return filled("slipid.h", values)
+        return filled("c99/slipid.h", values)
 
     @property
     def _names_of_functions(self) -> list[str]:
@@ -198,11 +196,11 @@ class Code:
         tables = [m for m in self._names.tables.values() if m.name in reads]
         values = {
             "HEAD": "\n".join(_comment(*header(self.robot))),
-            "PRELUDE": template("prelude.c"),
+            "PRELUDE": template("c99/prelude.c"),
             "TABLES": "\n".join(line for m in tables for line in table(m)),
             "FUNCTIONS": "\n".join(line for f in self.functions for line in f.text),
         }
-        return filled("slipid.c", values)
+        return filled("c99/slipid.c", values)
 
 
 def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
@@ -226,16 +224,6 @@ def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
     rows = hypotheses_of(robot).under.tolist()
     each = "; ".join(f"{k}: {' '.join(map(str, row))}" for k, row in enumerate(rows))
     yield f"Hypotheses of the floors, as rows count them, with the floor under each wheel: {each}."
-
-
-def template(name: str) -> str:
-    """Return the text of a file in this folder's templates."""
-    return (files(__package__) / "templates" / name).read_text()
-
-
-def filled(name: str, values: dict[str, str]) -> str:
-    """Return the text of a template with every @NAME@ replaced by its value."""
-    return re.sub(r"@([A-Z]+)@", lambda match: values[match.group(1)], template(name))
 
 
 def _comment(*parts: str) -> list[str]:

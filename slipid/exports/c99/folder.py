@@ -8,11 +8,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from slipid.exports.c99.code import Code, filled, template
+from slipid.exports.c99.code import Code
 from slipid.exports.c99.text import wrapped
 from slipid.exports.description import facts, made_with, warned
 from slipid.exports.fields import Struct
 from slipid.exports.golden import golden
+from slipid.exports.text import filled, template
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.trajectory import Path
@@ -146,18 +147,18 @@ def c_files(
         "src/slipid.h": code.header(),
         "src/slipid.c": code.source(),
         "test/golden.h": golden_header(code),
-        "test/check.c": template("check.c"),
-        "examples/drive/drive.c": template("drive.c"),
-        "examples/Slipid/Slipid.ino": filled("Slipid.ino", {"STACK": _kib(code.scratch)}),
-        "CMakeLists.txt": template("CMakeLists.txt"),
-        "library.json": filled("library.json", release),
-        "library.properties": filled("library.properties", release),
+        "test/check.c": template("c99/check.c"),
+        "examples/drive/drive.c": template("c99/drive.c"),
+        "examples/Slipid/Slipid.ino": filled("c99/Slipid.ino", {"STACK": _kib(code.scratch)}),
+        "CMakeLists.txt": template("c99/CMakeLists.txt"),
+        "library.json": filled("c99/library.json", release),
+        "library.properties": filled("c99/library.properties", release),
     }
     example = ""
     if recording is not None:
         files["examples/drive/readings.txt"] = recording.readings
         files["examples/drive/commands.txt"] = recording.commands
-        example = filled("recording.md", {"PLANT": recording.plant})
+        example = filled("c99/recording.md", {"PLANT": recording.plant})
     values = {
         "WARNINGS": "\n".join(warned(robot)),
         "HEAD": "\n".join(facts(robot)),
@@ -168,5 +169,5 @@ def c_files(
         "STACK": _kib(code.scratch),
         "PATH": _path(path),
     }
-    files["README.md"] = filled("README.md", values)
+    files["README.md"] = filled("c99/README.md", values)
     return files
