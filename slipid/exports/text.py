@@ -6,7 +6,7 @@ names.
 
 import re
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 
 WIDTH = 96
@@ -46,9 +46,10 @@ def template(name: str) -> str:
     return (files(__package__) / "templates" / name).read_text()
 
 
-def filled(name: str, values: Mapping[str, str]) -> str:
-    """Return the text of a template with every @NAME@ replaced by its value."""
-    return re.sub(r"@([A-Z]+)@", lambda match: values[match.group(1)], template(name))
+def filled(name: str, values: Mapping[str, str | Iterable[str]]) -> str:
+    """Return the text of a template with every @NAME@ replaced by its value, a text or lines."""
+    texts = {k: v if isinstance(v, str) else "\n".join(v) for k, v in values.items()}
+    return re.sub(r"@([A-Z]+)@", lambda match: texts[match.group(1)], template(name))
 
 
 def listed(names: Sequence[str]) -> str:

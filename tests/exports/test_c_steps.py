@@ -111,7 +111,7 @@ def test_a_clock_that_has_run_for_days_goes_on_in_float(tmp_path):
 
 @pytest.mark.slow
 def test_every_field_has_a_unit():
-    plain = {f.name for s in code("contact").structs for f in s.fields if f.comment.endswith("[1]")}
+    plain = {f.name for s in code("contact").structs for f in s.fields if f.about.endswith("[1]")}
     assert plain == {
         *("floors_belief", "floors_expected", "place_toward", "begun", "slip"),
         *("surface_probability", "stale", "immobilised", "out_of_range"),

@@ -71,7 +71,7 @@ def _reading_out(struct: Struct) -> list[str]:
     place = 0
     for field in filter(lambda field: field.size, struct.fields):
         member = f"estimate->{field.name}{'[k]' if field.shape else ''}"
-        value = f"{member} ? 1.0 : 0.0" if field.kind == "bool" else f"(double){member}"
+        value = f"{member} ? 1.0 : 0.0" if field.numbers == "bool" else f"(double){member}"
         loop = f"for (int k = 0; k < {field.size}; ++k) out[{place} + k]"
         lines.append(f"  {loop if field.shape else f'out[{place}]'} = {value};")
         place += field.size
@@ -160,8 +160,8 @@ def c_files(
         files["examples/drive/commands.txt"] = recording.commands
         example = filled("c99/recording.md", {"PLANT": recording.plant})
     values = {
-        "WARNINGS": "\n".join(warned(robot)),
-        "HEAD": "\n".join(facts(robot)),
+        "WARNINGS": warned(robot),
+        "HEAD": facts(robot),
         "RECORDING": example,
         "FLOORS": ", ".join(f"`{name}` ({k})" for k, name in enumerate(robot.labels)),
         "WHEELS": str(robot.wheels),

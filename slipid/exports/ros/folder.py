@@ -127,23 +127,22 @@ def _readme(
     uses: Mapping[str, str],
 ) -> str:
     """Return the text of README.md; `uses` is the use of each file by its path."""
-    uses_of_files = [(f"`{name}`", use) for name, use in uses.items()]
-    parts = {
+    values = {
         "HEAD": in_markdown(robot),
-        "FILES": table(("file", "use"), uses_of_files),
-        "CONTROLLER": [_NO_DRIVE] if drive is None else _controller(drive),
+        "FILES": table(("file", "use"), [(f"`{name}`", use) for name, use in uses.items()]),
+        "CONTROLLER": _NO_DRIVE if drive is None else _controller(drive),
         "WHEELS": _wheels(robot, drive),
         "ODOMETRY": _odometry(robot, errors),
-        "SPEED": [short(top_speed(robot))],
-        "PERIOD": [short(PERIOD_S)],
-        "DISTANCE": [short(DISTANCE_M)],
-        "GAINS": [gains_origin(robot)],
+        "SPEED": short(top_speed(robot)),
+        "PERIOD": short(PERIOD_S),
+        "DISTANCE": short(DISTANCE_M),
+        "GAINS": gains_origin(robot),
         "NAMES": _names(robot),
         "NUMBERS": _numbers(robot),
         "VERDICTS": [f"- *{v.replace('_', ' ')}*: {text}." for v, text in VERDICTS.items()],
         "PROVENANCES": [f"- *{p}*: {text}." for p, text in PROVENANCES.items()],
     }
-    return filled("ros2.md", {name: "\n".join(lines) for name, lines in parts.items()})
+    return filled("ros2.md", values)
 
 
 def _controller(drive: DriveController) -> list[str]:

@@ -53,9 +53,7 @@ def _numbers(robot: DeployedRobot) -> Iterator[Parameter]:
         elif e.load is not None:
             group, name = e.quantity, loads[e.load]
         number = robot.record.parameters[e.path]
-        parameter = Parameter(
-            f"{group}.{name}", number.value, _about(e, number), tuple(_checks(e))
-        )
+        parameter = Parameter(f"{group}.{name}", number.value, _about(e, number), tuple(_checks(e)))
         groups.setdefault(group, []).append(parameter)
     for parameters in groups.values():
         yield from parameters
