@@ -37,6 +37,7 @@ from slipid.exports.c99.moves import MOVES, SOURCES, moved
 from slipid.exports.c99.sources import along, rearranged
 from slipid.exports.c99.sums import REDUCED
 from slipid.exports.fields import DTYPES
+from slipid.support.errors import DataError
 
 RULES: dict[str, Rule] = {
     **{name: elementwise.unary(name) for name in UNARY},
@@ -64,7 +65,7 @@ _TYPES = frozenset(map(np.dtype, ("float64", "int64", "int32", "bool")))
 """Types of numbers that have a counterpart in C."""
 
 
-class UnsupportedError(Exception):
+class UnsupportedError(DataError):
     """Error for a function that cannot be turned into C.
 
     The message names the primitive and the line of Python code that it comes from.
