@@ -139,7 +139,7 @@ def function(
         store(builder, value, memory)
     body = FunctionBody(builder)
     unused = _unused(arguments, body.reads)
-    lines = (*unused, *body.lines())
+    lines = (*unused, *body.lines)
     return Function(name, about, tuple(arguments), lines, body.reads, body.scratch)
 
 
