@@ -192,9 +192,9 @@ def read_map(path: Path) -> FloorMap:
         DataError: the file is unreadable, has unknown or missing keys, or wrong values.
     """
     if path.suffix.lower() == ".geojson":
-        from slipid.data.geojson_map import in_cells, read_vector_map
+        from slipid.data.geojson_map import read_polygons
 
-        return in_cells(path, read_vector_map(path))
+        return read_polygons(path)
     mapping = mapping_of(path, text_of(path, "a floor map"))
     try:
         if "picture" in mapping:

@@ -8,16 +8,15 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from pydantic import Field, FiniteFloat
 
 from slipid.data.floor_map import MOST_CELLS, Colour, FloorMap
 from slipid.support.content import Content
-from slipid.support.errors import DataError
+from slipid.support.errors import bad_data
 from slipid.support.files import read_json, write_json
 from slipid.support.toml_file import Section, checked
 
-SCHEMA = "slipid.map/2"
 WHAT = "a floor map (slipid.map/2) that `slipid map` wrote"
 DIGITS = 5
 """Decimal places of the written coordinates [m]: they are rounded to 0.01 mm."""
@@ -44,32 +43,36 @@ class Patch:
     confidence: float | None
 
 
-@dataclass(frozen=True, eq=False)
-class VectorMap:
-    """Patches of surfaces on a region of the floor.
+class MapRegion(Section):
+    """The object `slipid` of a map file: everything but the patches.
 
     Attributes:
-        patches: the patches.
-        colours: colour `#rrggbb` of each surface, in the order of the floor map.
-        low_x, low_y, high_x, high_y: bounds of the region [m].
-        cell: edge length of the cells in which patches were detected [m].
+        schema_: schema of the file.
+        extent_m: lowest x, lowest y, highest x and highest y of the region [m].
+        cell_m: edge length of the cells in which patches were detected [m].
         base: the surface that covers most of the floor.
+        colours: colour `#rrggbb` of each surface, in the order of the floor map.
         picture_sha256: SHA-256 hash of the picture file in which the patches were detected.
-        unknown: share of the region that no patch covers [1].
+        unknown_share: share of the region that no patch covers [1].
         notes: remarks for the reader of the file, one sentence each.
     """
 
-    patches: tuple[Patch, ...]
-    colours: dict[str, str]
-    low_x: float
-    low_y: float
-    high_x: float
-    high_y: float
-    cell: float
+    schema_: Literal["slipid.map/2"] = Field(default="slipid.map/2", alias="schema")
+    extent_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+    cell_m: float = Field(gt=0, le=1)
     base: str
+    colours: dict[str, Colour] = Field(min_length=1)
     picture_sha256: str
-    unknown: float
-    notes: tuple[str, ...]
+    unknown_share: float = Field(ge=0, le=1)
+    notes: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class VectorMap:
+    """Patches of surfaces on a region of the floor."""
+
+    patches: tuple[Patch, ...]
+    region: MapRegion
 
     def save(self, path: Path) -> None:
         """Write the map as a GeoJSON file; raise `DataError` where it cannot be written."""
@@ -77,20 +80,10 @@ class VectorMap:
 
     def to_json(self) -> Content:
         """Return a GeoJSON FeatureCollection of the patches, all else under the key `slipid`."""
-        about = {
-            "schema": SCHEMA,
-            "extent_m": [
-                round(v, DIGITS) for v in (self.low_x, self.low_y, self.high_x, self.high_y)
-            ],
-            "cell_m": self.cell,
-            "base": self.base,
-            "colours": self.colours,
-            "picture_sha256": self.picture_sha256,
-            "unknown_share": self.unknown,
-            "notes": list(self.notes),
-        }
+        region = self.region.model_dump(mode="json", by_alias=True)
+        region["extent_m"] = [round(bound, DIGITS) for bound in self.region.extent_m]
         features = [self._feature(patch) for patch in self.patches]
-        return {"type": "FeatureCollection", "slipid": about, "features": features}
+        return {"type": "FeatureCollection", "slipid": region, "features": features}
 
     def _feature(self, patch: Patch) -> Content:
         closed = [np.concatenate([ring, ring[:1]]).round(DIGITS) for ring in patch.rings]
@@ -99,7 +92,7 @@ class VectorMap:
             "properties": {
                 "surface": patch.surface,
                 "area_m2": patch.area,
-                "colour": self.colours[patch.surface],
+                "colour": self.region.colours[patch.surface],
                 "confidence": patch.confidence,
             },
             "geometry": {"type": "Polygon", "coordinates": [ring.tolist() for ring in closed]},
@@ -124,90 +117,49 @@ class _Feature(Section):
     geometry: _Geometry
 
 
-class _About(Section):
-    schema_: Literal["slipid.map/2"] = Field(alias="schema")
-    extent_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
-    cell_m: float = Field(gt=0, le=1)
-    base: str
-    colours: dict[str, Colour] = Field(min_length=1)
-    picture_sha256: str
-    unknown_share: float = Field(ge=0, le=1)
-    notes: list[str]
-
-
 class _GeojsonFile(Section):
     """Content of a GeoJSON map file, as it is checked when read."""
 
     type: Literal["FeatureCollection"]
-    slipid: _About
+    slipid: MapRegion
     features: list[_Feature] = Field(min_length=1)
 
 
-def read_vector_map(path: Path) -> VectorMap:
-    """Return the map of polygons in a GeoJSON file.
+def read_polygons(path: Path) -> FloorMap:
+    """Return the map in a GeoJSON file as cells; unknown cells get the nearest surface.
 
     Raises:
-        DataError: the file is absent, is not a map that `slipid map` wrote, or has wrong values.
-    """
-    given = checked(path, read_json(path, WHAT), _GeojsonFile)
-    about = given.slipid
-    low_x, low_y, high_x, high_y = about.extent_m
-    if not (low_x < high_x and low_y < high_y):
-        raise DataError(
-            f"{path}: extent_m {about.extent_m}; expected lowest x, y, then highest x, y"
-        )
-    surfaces = {f.properties.surface for f in given.features} | {about.base}
-    if missing := sorted(surfaces - set(about.colours)):
-        where = "the key 'colours' of its object 'slipid'"
-        raise DataError(f"{path}: no colour of {', '.join(missing)}; expected it in {where}")
-    patches = tuple(
-        Patch(
-            feature.properties.surface,
-            tuple(np.array(ring, float)[:-1] for ring in feature.geometry.coordinates),
-            feature.properties.area_m2,
-            feature.properties.confidence,
-        )
-        for feature in given.features
-    )
-    return VectorMap(
-        patches,
-        about.colours,
-        *about.extent_m,
-        about.cell_m,
-        about.base,
-        about.picture_sha256,
-        about.unknown_share,
-        tuple(about.notes),
-    )
-
-
-def in_cells(path: Path, vector_map: VectorMap) -> FloorMap:
-    """Return a map of polygons as a map of cells; unknown cells get the nearest surface.
-
-    Args:
-        path: file of the map, which errors name.
-
-    Raises:
-        DataError: the map has too many cells, or no patch covers any cell.
+        DataError: the file is absent, is not a map that `slipid map` wrote, or has wrong values;
+            the map has too many cells, or no patch covers any cell.
     """
     from scipy.ndimage import distance_transform_edt
 
-    rows = max(1, round((vector_map.high_y - vector_map.low_y) / vector_map.cell))
-    columns = max(1, round((vector_map.high_x - vector_map.low_x) / vector_map.cell))
+    given = checked(path, read_json(path, WHAT), _GeojsonFile)
+    region = given.slipid
+    low_x, low_y, high_x, high_y = region.extent_m
+    if not (low_x < high_x and low_y < high_y):
+        expected = "lowest x, y, then highest x, y"
+        raise bad_data(path, f"extent_m {region.extent_m}", expected)
+    names = tuple(region.colours)
+    surfaces = {feature.properties.surface for feature in given.features} | {region.base}
+    if missing := sorted(surfaces - {*names}):
+        where = "the key 'colours' of its object 'slipid'"
+        raise bad_data(path, f"no colour of {', '.join(missing)}", f"it in {where}")
+    rows = max(1, round((high_y - low_y) / region.cell_m))
+    columns = max(1, round((high_x - low_x) / region.cell_m))
     if rows * columns > MOST_CELLS:
-        raise DataError(f"{path}: {rows * columns} cells; expected at most {MOST_CELLS}")
-    names = tuple(vector_map.colours)
-    corner = (vector_map.low_x, vector_map.low_y)
+        raise bad_data(path, f"{rows * columns} cells", f"at most {MOST_CELLS}")
     cells = np.full((rows, columns), -1, np.intp)
-    for patch in vector_map.patches:
-        rings = [(ring - corner) / vector_map.cell for ring in patch.rings]
-        cells[covered(rings, rows, columns)] = names.index(patch.surface)
+    for feature in given.features:
+        corners = (np.array(ring, float)[:-1] for ring in feature.geometry.coordinates)
+        rings = [(ring - (low_x, low_y)) / region.cell_m for ring in corners]
+        cells[covered(rings, rows, columns)] = names.index(feature.properties.surface)
     if (cells < 0).all():
-        raise DataError(f"{path}: no polygon lies within extent_m; expected coordinates in metres")
+        raise bad_data(path, "no polygon lies within extent_m", "coordinates in metres")
     if (cells < 0).any():
         near = distance_transform_edt(cells < 0, return_distances=False, return_indices=True)
         cells = cells[near[0], near[1]]
-    return FloorMap(names, cells, corner, vector_map.cell)
+    return FloorMap(names, cells, (low_x, low_y), region.cell_m)
 
 
 def covered(
@@ -221,15 +173,10 @@ def covered(
     turns = np.zeros((rows, columns + 1), np.intp)
     for ring in rings:
         for (x, y), (x2, y2) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-            row = _rows_between(float(y), float(y2), rows)
-            if len(row):
+            # The edge crosses rows whose centre lies at or above its lower end and below its upper.
+            first, last = np.clip(np.ceil(np.sort([y, y2]) - 0.5), 0, rows).astype(int)
+            if first < last:
+                row = np.arange(first, last)
                 cross = x + (row + 0.5 - y) * (x2 - x) / (y2 - y)
                 turns[row, np.ceil(cross - 0.5).clip(0, columns).astype(np.intp)] += 1
     return np.asarray(np.cumsum(turns[:, :-1], axis=1) % 2 == 1)
-
-
-def _rows_between(y: float, y2: float, rows: int) -> Int[np.ndarray, " row"]:
-    """Return the rows whose centre lies at or above the lower and below the higher of two y."""
-    low, high = sorted((y, y2))
-    first, last = np.clip([np.ceil(low - 0.5), np.ceil(high - 0.5)], 0, rows)
-    return np.arange(int(first), int(last))

@@ -1,7 +1,6 @@
 """Curves of slip over torque on every floor with 90 % bands, and the ranges that the runs cover."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,7 @@ from slipid.model.contact_law import ContactSurface
 from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.search_space import Space
 
-POINTS = 41
+CURVE_POINTS = 41
 """Number of points of a curve."""
 _STEADY = 0.1
 """Largest deviation of a steady command from the run's median command, relative to the latter."""
@@ -117,7 +116,7 @@ def curves(
     out = {}
     for k, label in enumerate(labels):
         top = min(float(np.quantile(torque[floor == k], 0.98)), 0.999 * float(best[k].max()))
-        grid = np.linspace(0.0, top, POINTS)
+        grid = np.linspace(0.0, top, CURVE_POINTS)
         each = np.stack([np.interp(grid, row, _SLIP) for row in band[:, k]])
         low, high = np.quantile(each, [0.05, 0.95], axis=0)
         slip = np.interp(grid, best[k], _SLIP)
@@ -146,11 +145,7 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
         mine = floor == k
         most = [float(np.abs(x[mine]).max()) for x in (speed, torque, slip, yaw)]
         if 2 * sum(has_steady_command(data.logs[i]) for i in runs) > len(runs):
-            driven = DrivenRange(
-                distinct(np.degrees(data.heading[runs]), 1),
-                distinct(data.speed[runs], 3),
-                distinct(data.turn[runs], 2),
-            )
+            driven = np.degrees(data.heading[runs]), data.speed[runs], data.turn[runs]
         else:
             driven = by_encoders(twist[mine].reshape(-1, 3))
         out[label] = Validity(
@@ -160,24 +155,12 @@ def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
             torque_nm=(0.0, most[1]),
             slip=(0.0, most[2]),
             yaw_rate=(0.0, most[3]),
-            **driven._asdict(),
+            headings_deg=distinct(driven[0], 1),
+            speeds=distinct(driven[1], 3),
+            turn_rates=distinct(driven[2], 2),
             distance=round(float(length[mine].sum()) / max(len(runs), 1), 3),
         )
     return out
-
-
-class DrivenRange(NamedTuple):
-    """Distinct driven motions, in rising order.
-
-    Attributes:
-        headings_deg: directions of travel in the body frame [deg].
-        speeds: speeds [m/s].
-        turn_rates: yaw rates [rad/s].
-    """
-
-    headings_deg: tuple[float, ...]
-    speeds: tuple[float, ...]
-    turn_rates: tuple[float, ...]
 
 
 def has_steady_command(log: Log) -> bool:
@@ -189,10 +172,15 @@ def has_steady_command(log: Log) -> bool:
     return usual > 0.0 and float((gap < _STEADY * usual).mean()) > 0.5
 
 
-def by_encoders(twist: Float[np.ndarray, "window 3"]) -> DrivenRange:
+def by_encoders(
+    twist: Float[np.ndarray, "window 3"],
+) -> tuple[
+    Float[np.ndarray, " heading"], Float[np.ndarray, " speed"], Float[np.ndarray, " yaw_rate"]
+]:
     """Return approximate driven motions from encoder twists.
 
-    They are the frequent headings, and the 10, 50 and 90 % quantiles of speeds and yaw rates.
+    They are the frequent headings [deg], and the 10, 50 and 90 % quantiles of speeds [m/s] and yaw
+    rates [rad/s].
     """
     speed = np.linalg.norm(twist[:, :2], axis=1)
     ahead = speed > _MOVED * speed.max(initial=0.0)
@@ -205,7 +193,7 @@ def by_encoders(twist: Float[np.ndarray, "window 3"]) -> DrivenRange:
     parts = (0.1, 0.5, 0.9)
     speeds = np.quantile(speed[ahead], parts) if ahead.any() else np.zeros(0)
     rates = np.quantile(twist[on, 2], parts) if on.any() else np.zeros(0)
-    return DrivenRange(distinct(signed, 1), distinct(speeds, 3), distinct(rates, 2))
+    return signed, speeds, rates
 
 
 def distinct(x: np.ndarray, digits: int) -> tuple[float, ...]:

@@ -34,14 +34,14 @@ def floor_plot(
         in_view: True for cells that the camera sees.
         path: file of the picture.
     """
-    known = f"{100 * (1 - vector.unknown):.0f} % of its rectangle known"
-    title = (
-        f"Map of the floor: {len(vector.colours)} surfaces, {len(vector.patches)} patches, {known}"
-    )
-    tall = (vector.high_y - vector.low_y) / (vector.high_x - vector.low_x)
+    known = f"{100 * (1 - vector.region.unknown_share):.0f} % of its rectangle known"
+    surfaces, patches = len(vector.region.colours), len(vector.patches)
+    title = f"Map of the floor: {surfaces} surfaces, {patches} patches, {known}"
+    low_x, low_y, high_x, high_y = vector.region.extent_m
+    tall = (high_y - low_y) / (high_x - low_x)
     made = figure(13.0, float(np.clip(6.2 * tall, 3.0, 12.0)) + 1.4, title)
     left, right = made.subplots(1, 2, sharex=True, sharey=True)
-    extent = (vector.low_x, vector.high_x, vector.low_y, vector.high_y)
+    extent = (low_x, high_x, low_y, high_y)
     shown = np.dstack([photograph[..., ::-1], np.where(in_view, 255, 0)]).astype(np.uint8)
     step = max(1, max(shown.shape[:2]) // 1200)
     for axes, name in ((left, "photograph, laid onto the floor"), (right, "map")):
@@ -52,7 +52,7 @@ def floor_plot(
     left.imshow(shown[::step, ::step], origin="lower", extent=extent, interpolation="antialiased")
     for patch in vector.patches:
         _outline(left, patch, None)
-        _outline(right, patch, vector.colours[patch.surface])
+        _outline(right, patch, vector.region.colours[patch.surface])
     for axes in (left, right):
         _names(axes, vector)
     made.legend(handles=_swatches(vector), loc="outside lower center", ncols=5, fontsize=8)
@@ -61,8 +61,8 @@ def floor_plot(
 
 def _unknown(vector: VectorMap) -> Rectangle:
     """Return a hatched rectangle as large as the map, which shows through where it is unknown."""
-    size = (vector.high_x - vector.low_x, vector.high_y - vector.low_y)
-    corner = (vector.low_x, vector.low_y)
+    low_x, low_y, high_x, high_y = vector.region.extent_m
+    corner, size = (low_x, low_y), (high_x - low_x, high_y - low_y)
     return Rectangle(corner, *size, facecolor="white", edgecolor=SHADE, hatch=HATCH, lw=0, zorder=0)
 
 
@@ -82,12 +82,13 @@ def _outline(axes: Axes, patch: Patch, colour: str | None) -> None:
 
 def _names(axes: Axes, vector: VectorMap) -> None:
     """Write the name of each large patch where it has most room."""
-    whole = (vector.high_x - vector.low_x) * (vector.high_y - vector.low_y)
+    low_x, low_y, high_x, high_y = vector.region.extent_m
+    whole = (high_x - low_x) * (high_y - low_y)
     for patch in vector.patches:
         if patch.area < NAMED * whole:
             continue
         x, y = middle(patch)
-        dark = np.dot(to_rgb(vector.colours[patch.surface]), [0.3, 0.6, 0.1]) < 0.5
+        dark = np.dot(to_rgb(vector.region.colours[patch.surface]), [0.3, 0.6, 0.1]) < 0.5
         ink, around = ("white", INK) if dark else (INK, "white")
         text = axes.text(x, y, shorten(patch.surface, 16, placeholder="…"), fontsize=7, color=ink)
         text.set(
@@ -114,7 +115,7 @@ def middle(patch: Patch) -> Float[np.ndarray, "2"]:
 def _swatches(vector: VectorMap) -> list[Swatch]:
     """Return the entries of the legend: surfaces with colours and areas, and the hatching."""
     swatches = []
-    for name, colour in vector.colours.items():
+    for name, colour in vector.region.colours.items():
         area = sum(patch.area for patch in vector.patches if patch.surface == name)
         swatches.append(Swatch(facecolor=colour, edgecolor=INK, label=f"{name} ({area:.2f} m²)"))
     return [*swatches, Swatch(facecolor="white", edgecolor=SHADE, hatch=HATCH, label="unknown")]

@@ -26,7 +26,7 @@ Regressor = Callable[[RunSignals, RobotSpec], Slips]
 """Function that returns the argument x of each wheel's slip curve in every step."""
 Features = Callable[[np.ndarray], np.ndarray]
 """Function from the regressor (...,) to features (..., k); slip is their weighted sum."""
-HELD = 1e12
+BOUND_PRECISION = 1e12
 """Precision assigned to a coefficient at its bound, which is thereby treated as fixed."""
 RIDGE = 1e-6
 """Ridge on each coefficient of a monotone curve, relative to the norm of its column.
@@ -94,8 +94,8 @@ class CurveModel(WheelSlip):
 
     def learn(self, w: TrainingWindows, spec: RobotSpec) -> "CurveModel":
         rim = w.steps.signals.speed * spec.wheel_radius
-        rows = w.rows(spec.back @ (rim[..., None] * self.regressors(w.steps, spec)), spec)
-        a, b = rows.parts.reshape(-1, rows.parts.shape[-1]), rows.gap.ravel()
+        parts, gap = w.rows(spec.back @ (rim[..., None] * self.regressors(w.steps, spec)), spec)
+        a, b = parts.reshape(-1, parts.shape[-1]), gap.ravel()
         if self.insensitive:
             return replace(self, coefficients=insensitive(a, b))
         if not self.monotone:
@@ -117,9 +117,9 @@ class CurveModel(WheelSlip):
         return np.einsum("sdk,de->sdek", phi, np.eye(phi.shape[1])).reshape(*phi.shape[:2], -1)
 
     def stiffness(self, w: TrainingWindows, spec: RobotSpec) -> Float[np.ndarray, "k k"]:
-        """Return precision `HELD` for coefficients at their bound of zero, and zero for others."""
+        """Return `BOUND_PRECISION` for coefficients at their bound of zero, and zero for others."""
         held = self.monotone & (np.arange(self.numbers) > 0) & (self.known <= 0)
-        return np.diag(held * HELD)
+        return np.diag(held * BOUND_PRECISION)
 
 
 def insensitive(a: np.ndarray, b: np.ndarray) -> np.ndarray:

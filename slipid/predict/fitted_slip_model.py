@@ -12,7 +12,9 @@ from scipy.linalg import block_diag
 
 from slipid.data.windows import Windows
 from slipid.fitting import likelihood as lk
+from slipid.fitting.noise import effects
 from slipid.fitting.problem import Problem
+from slipid.fitting.session_effects import LinearModel, by_axis, with_session_effects
 from slipid.fitting.variances import DEGREES, scoring_step
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
@@ -27,13 +29,13 @@ from slipid.predict.predictive import (
 from slipid.predict.slip_models import FloorModels
 from slipid.search_space import Space
 
-MOST_TURNS, SCORING, SETTLED = 15, 4, 0.02
+MOST_TURNS, SCORING, SETTLED_CHANGE = 15, 4, 0.02
 """Limits of the fit of variances: largest number of rounds, scoring steps per round, and the change
 of every log variance below which rounds stop.
 
 The covariance of the model's numbers is computed once per round.
 """
-VAGUE = 1e-2
+VAGUE_PRECISION = 1e-2
 """Prior precision of a model's numbers: a std of 10 is uninformative for slips below one."""
 STEP = 1e-4
 """Step of the difference quotients with which a model is differentiated by its numbers."""
@@ -114,19 +116,28 @@ def fit_with_noise(
         blocks = {"motion": jnp.asarray(residual)}, {"motion": spread}
         for _ in range(SCORING):
             log_v = scoring_step(objective, *blocks, log_v, count, None)
-        if float(jnp.abs(log_v - last).max()) < SETTLED:
+        if float(jnp.abs(log_v - last).max()) < SETTLED_CHANGE:
             break
-    plain = replace(plain, variance=by_name(problem, log_v), covariance=covariance)
-    own = len(before)
-    wide = np.zeros_like(covariance)
-    wide[:own, :own], wide[own:, own:] = np.linalg.inv(before), common
-    return plain.with_sessions(problem, (residual, slope), wide, keep)
+    variance, w = by_name(problem, log_v), problem.windows
+    fitted = LinearModel(
+        residual,
+        slope,
+        covariance=covariance,
+        wide=block_diag(np.linalg.inv(before), common),
+        scale=np.asarray(problem.covariance("motion", log_v)),
+        effect=effects(w, robot),
+        run=by_axis(variance, "run", w),
+    )
+    of_sessions, covariance = with_session_effects(fitted, w, np.asarray(keep, float))
+    return replace(plain, variance=variance | of_sessions, covariance=covariance)
 
 
 def _prior_precision(model: FloorModels, w: Windows, robot: Robot) -> np.ndarray:
-    """Return the prior precision of a model's numbers: `VAGUE`, plus ridges and active bounds."""
+    """Return the prior precision of a model's numbers, with ridges and active bounds."""
     held = model.stiffness(w, robot)
-    parts = [VAGUE * np.eye(v.size) + held.get(key, 0.0) for key, v in model.state.items()]
+    parts = [
+        VAGUE_PRECISION * np.eye(v.size) + held.get(key, 0.0) for key, v in model.state.items()
+    ]
     return np.asarray(block_diag(np.zeros((0, 0)), *parts))
 
 

@@ -106,7 +106,7 @@ headings.
 """
 
 
-def nested(data: Runs, question: str, judged: np.ndarray) -> Fold:
+def inner_folds(data: Runs, question: str, judged: np.ndarray) -> Fold:
     """Return the folds of a model's inner cross-validation, with which it selects its settings.
 
     They hold out runs as the question does. A sector next to a judged one is not held out (fold -1)
@@ -164,7 +164,7 @@ class FoldResult:
         rows: scores of every run.
         seconds: time to `fit` and to `predict` [s], by model.
         numbers: count of fitted numbers, by model and floor.
-        converged: whether the fit of the force balance converged.
+        converged: True if the fit of the force balance converged.
         reason: why that fit stopped.
     """
 
@@ -215,7 +215,7 @@ def fit_fold(
     contact = force_balance_of(problem, optimum.state, optimum.covariance, keep)
     models: list[PredictiveModel] = [contact]
     seconds = {contact.name: time.perf_counter() - began}
-    together, shape = nested(data, question, judged), problem.robot.geometry
+    together, shape = inner_folds(data, question, judged), problem.robot.geometry
     for model in slip_models(shape, problem.windows.has_current, together):
         began = time.perf_counter()
         models.append(fit_with_noise(model, contact, problem, keep))

@@ -114,18 +114,6 @@ def tracks_from_increments(
     return Tracks(w.run, path, pose)
 
 
-class IncrementCorrection(eqx.Module):
-    """Expected shared effects, to be subtracted from predicted increments.
-
-    Attributes:
-        moved: increments to subtract [m, m, rad].
-        by_number: derivative of these increments by the search vector.
-    """
-
-    moved: Float[Array, "segment window 3"]
-    by_number: Float[Array, "segment window 3 free"]
-
-
 @eqx.filter_jit
 def end_jacobian(
     space: Space,
@@ -133,24 +121,25 @@ def end_jacobian(
     b: lk.Batch,
     start: Numbers,
     twist: Numbers | None = None,
-    corrected: IncrementCorrection | None = None,
+    effects: tuple[Numbers, Numbers] | None = None,
 ) -> Float[Array, "segment 2 free"]:
     """Return the derivative of the end points by the search vector, from given start poses.
 
-    The path is that of the contact equilibrium less `corrected`, or that of given body twists
-    (segment, window, 3).
+    The path is that of given body twists (segment, window, 3), or else that of the contact
+    equilibrium less the increments by expected shared `effects` (segment, window, 3) [m, m, rad],
+    which are given with their derivative by the search vector.
     """
 
     def end(x: Array) -> Array:
         robot = space.tree(x)
-        if twist is None:
+        if twist is not None:
+            step = lk.marker_increments(robot, jnp.asarray(twist), b.dt, b.session)
+        else:
             step = contact_increments(robot, b)
-            if corrected is not None:
-                step -= corrected.moved + corrected.by_number @ (x - jnp.asarray(z))
-            return chain(start, step)[:, -1, :2]
-        return chain(start, lk.marker_increments(robot, jnp.asarray(twist), b.dt, b.session))[
-            :, -1, :2
-        ]
+        if effects is not None:
+            mean, slope = effects
+            step -= mean + slope @ (x - jnp.asarray(z))
+        return chain(start, step)[:, -1, :2]
 
     return jax.jacfwd(end)(z)
 

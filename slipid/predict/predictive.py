@@ -17,9 +17,8 @@ numbers of the simpler models.
 
 import abc
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +31,7 @@ from slipid.fitting import likelihood as lk
 from slipid.fitting.hierarchy import TravelDirections, extrapolation
 from slipid.fitting.noise import SHARED, effects, travel
 from slipid.fitting.problem import FitState, Problem
-from slipid.fitting.session_effects import LinearModel, by_axis, with_session_effects
+from slipid.fitting.session_effects import by_axis
 from slipid.fitting.shared_effects import (
     AXES,
     EffectForecast,
@@ -40,14 +39,21 @@ from slipid.fitting.shared_effects import (
     TravelConditions,
     forecast_effects,
 )
-from slipid.fitting.variances import DEGREES, Search, Square, Vector, expected_posteriors, whitened
+from slipid.fitting.variances import (
+    DEGREES,
+    Blocks,
+    Search,
+    Square,
+    Vector,
+    expected_posteriors,
+    whitened,
+)
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.search_space import Space
 
 Residuals = Float[np.ndarray, "segment m"]
 Slopes = Float[np.ndarray, "segment m number"]
-Fitted = TypeVar("Fitted", bound="PredictiveModel")
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,32 +128,6 @@ class PredictiveModel(abc.ABC):
         return log_student(*self.scale(problem)) + np.asarray(
             _camera_log_jacobian(self.robot, problem.batch.pose)
         )
-
-    def with_sessions(
-        self: Fitted,
-        problem: Problem,
-        linear: tuple[Residuals, Slopes],
-        wide: np.ndarray,
-        keep: np.ndarray,
-    ) -> Fitted:
-        """Return the model with session effects in its variances and in its covariance.
-
-        Args:
-            problem: problem to whose segments the model was fitted.
-            linear: residuals of these segments and their derivative.
-            wide: covariance of the numbers before the floor's own runs were used.
-            keep: 1 for fitted segments, else 0.
-        """
-        model = LinearModel(
-            *linear,
-            covariance=self.covariance,
-            wide=wide,
-            scale=np.asarray(problem.covariance("motion", self.log_variance(problem))),
-            effect=effects(problem.windows, problem.robot),
-            run=by_axis(self.variance, "run", problem.windows),
-        )
-        variance, covariance = with_session_effects(model, problem.windows, np.asarray(keep, float))
-        return replace(self, variance={**self.variance, **variance}, covariance=covariance)
 
 
 def log_student(
@@ -253,12 +233,9 @@ class ForceBalance(PredictiveModel):
 
     def tracks_and_slopes(self, w: Windows) -> tuple[replay.Tracks, Slopes]:
         tracks, (mean, slope) = self.tracks(w), self._correction(w)
-        shape = *w.dt.shape, 3
-        correction = replay.IncrementCorrection(
-            jnp.asarray(mean.reshape(shape)), jnp.asarray(slope.reshape(*shape, -1))
-        )
+        expected = mean.reshape(*w.dt.shape, 3), slope.reshape(*w.dt.shape, 3, -1)
         b, start = lk.batch(w, self.robot), tracks.predicted[:, 0]
-        by_z = replay.end_jacobian(self.space, self.z, b, start, corrected=correction)
+        by_z = replay.end_jacobian(self.space, self.z, b, start, effects=expected)
         return tracks, np.asarray(by_z)
 
 
@@ -266,31 +243,32 @@ def force_balance_of(
     problem: Problem, state: FitState, covariance: Square, keep: Float[np.ndarray, " segment"]
 ) -> ForceBalance:
     """Return the force balance as fitted to the kept segments, with its shared effects."""
-    robot, variance = problem.space.tree(state.z), by_name(problem, state.log_variance)
-    z, log_v = np.asarray(state.z), np.asarray(state.log_variance)
-    blocks, jacobian = problem.linear(z, problem.electric(z, log_v))
-    motion = blocks["motion"], jacobian["motion"]
-    w = problem.windows
+    z, log_v, w = np.asarray(state.z), np.asarray(state.log_variance), problem.windows
+    residual, jacobian = problem.linear(z, problem.electric(z, log_v))
+    motion = residual["motion"], jacobian["motion"]
     direction = TravelConditions.of(w, problem.robot).direction
     travelled = TravelDirections(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
     grown = extrapolation(problem.objective, motion, keep[: len(w)], covariance, log_v, travelled)
     return ForceBalance(
-        robot,
-        variance,
+        problem.space.tree(state.z),
+        by_name(problem, log_v),
         np.asarray(covariance),
         problem.space,
         z,
-        shared=fitted_effects(problem, state, keep),
+        shared=_fitted_effects(problem, state, keep, residual, jacobian),
         extrapolation=grown,
     )
 
 
-def fitted_effects(
-    problem: Problem, state: FitState, keep: Float[np.ndarray, " segment"]
+def _fitted_effects(
+    problem: Problem,
+    state: FitState,
+    keep: Float[np.ndarray, " segment"],
+    residual: Blocks,
+    jacobian: Blocks,
 ) -> dict[str, FittedEffects]:
     """Return the fitted effects that neighbouring runs share, by floor; `keep` marks the runs."""
     log_v, free = jnp.asarray(state.log_variance), problem.space.size
-    residual, jacobian = problem.linear(state.z, problem.electric(state.z, log_v))
     weighed = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
     white = jnp.einsum("nij,nj->ni", weighed.whitening.root["motion"], residual["motion"])
     half = whitened(problem.objective.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]

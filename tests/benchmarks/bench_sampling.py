@@ -81,19 +81,20 @@ def ess_of(chain):
 def by_slipid(density):
     """Chains (chain, draw, coordinate), seconds of sampling and of the warm-up, the last block."""
     from slipid.infer.posterior import ensemble as sampler
-    from slipid.infer.posterior.blocks import BlockStore, LogDensity, Plan
+    from slipid.infer.posterior.blocks import LogDensity, Plan
     from slipid.infer.posterior.coordinates import MOTION
     from slipid.infer.posterior.diagnosis import diagnose
+    from slipid.support.progress import Reporter
 
     d = density
-    target = LogDensity(d.terms, d.slope, d.coordinates.group, d.centre, d.covariance)
+    target = LogDensity(d.terms, d.slope, d.group, d.centre, d.covariance)
     few = Plan(ensembles=2, walkers=16, block=10, warm_up=(2, 4, 6, 8), most=14)
     plan = quick(Plan(), few)
     x = np.repeat(d.centre[None], plan.walkers, axis=0)
     d.terms(x), d.slope(x)  # compiles
-    times = [time.perf_counter()]
-    store = BlockStore(keep=lambda part, block: times.append(time.perf_counter()))
-    blocks = sampler.extended(target, plan, MOTION, store)
+    times, report = [time.perf_counter()], Reporter(quiet=True)
+    report.advance = lambda *_: times.append(time.perf_counter())
+    blocks = sampler.extended(target, plan, MOTION, None, report)
     warm = plan.warm_up[-1]
     chain = sampler.chain(blocks, plan)
     found = diagnose(chain, plan)
@@ -136,12 +137,12 @@ def nuts(path, seed, out, block=None):
     from slipid.infer.posterior.transport_map import _placed, gaussian
 
     d = density = density_of(problem_of(FLOOR), pickle.loads(Path(path).read_bytes()))
-    map = gaussian(d.centre, d.covariance, d.coordinates.group)
+    map = gaussian(d.centre, d.covariance, d.group)
     if block is not None:
         with np.load(block) as kept:
             map = unpacked(dict(kept)).map
 
-    steps = map._back
+    steps = map._on_device
 
     @jax.jit
     def potential(u):

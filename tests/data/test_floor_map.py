@@ -16,7 +16,7 @@ from slipid.data.floor_map import (
     uniform,
     write_map,
 )
-from slipid.data.geojson_map import Patch, VectorMap, covered
+from slipid.data.geojson_map import MapRegion, Patch, VectorMap, covered
 from slipid.support.errors import DataError
 from tests.helpers.floors import surface_at
 
@@ -186,7 +186,16 @@ def test_a_map_whose_colours_cannot_be_told_apart_is_not_written(tmp_path):
 
 def vector_map(*patches: Patch) -> VectorMap:
     colours = {"table": "#ffffff", "gray": "#808080"}
-    return VectorMap(patches, colours, *UNIT, 0.1, "table", "", 0.0, ("a note",))
+    region = MapRegion(
+        extent_m=UNIT,
+        cell_m=0.1,
+        base="table",
+        colours=colours,
+        picture_sha256="",
+        unknown_share=0.0,
+        notes=["a note"],
+    )
+    return VectorMap(patches, region)
 
 
 def ringed(surface: str, *rings: list) -> Patch:

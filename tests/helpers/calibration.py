@@ -24,6 +24,7 @@ from slipid.infer.posterior.blocks import Plan
 from slipid.infer.result import Channels, Fit
 from slipid.predict.open_loop import chain, corrected
 from slipid.search_space import Choice
+from slipid.support.progress import Reporter
 from tests.helpers.made_windows import made, robot
 
 PLAN = Plan(ensembles=2, walkers=16, block=10, warm_up=(2, 4, 6, 8), most=14)
@@ -129,7 +130,7 @@ def replicate(seed: int, plan: Plan = PLAN) -> Replicate:
     """An experiment and draws of its posterior."""
     fit, truth = experiment(seed)
     space, names = fit.space, problem().noise.names
-    found = posterior.sample(fit, replace(plan, seed=seed), draws=DRAWS)
+    found = posterior.sampled(fit, replace(plan, seed=seed), DRAWS, None, Reporter(quiet=True))
     draws = np.concatenate([found.z, found.log_variance], axis=-1)
     prior_std = np.concatenate([space.prior_std, np.full(len(names), VARIANCE_SPREAD)])
     return Replicate(

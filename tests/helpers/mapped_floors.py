@@ -54,7 +54,7 @@ def mapped(
 
 def truth_of(result: PictureMap, floor: MadeFloor) -> np.ndarray:
     """Return the true surface of each cell, by number of the map; -1 where the robot hides it."""
-    names = list(result.vector.colours)
+    names = list(result.vector.region.colours)
     centres = result.floor.grid.centres()
     number = np.array([names.index(name) for name in floor.truth.surfaces])
     return np.where(floor.hides(centres), -1, number[floor.truth.at(centres)])

@@ -245,7 +245,7 @@ class Posterior:
     """
 
     def __init__(self, density):
-        self.at, self.space = density.coordinates.structure, density.problem.space
+        self.at, self.space = density.structure, density.problem.space
         self.rival, a = Rival(density.problem), density.anchor
         self.start, self.z = numbers(self.space.template), np.asarray(a.z)
         self.twist = np.asarray(a.twist).reshape(-1, 3)

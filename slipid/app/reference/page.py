@@ -139,7 +139,7 @@ def _bags() -> list[str]:
 
 
 def _layouts(_: object) -> str:
-    keys = keys_of(Layout, hidden=("name", "channels"))
+    keys = keys_of(Layout, hidden=("channels",))
     parts = [_LAYOUT, _table_of_keys(keys), "### A channel of `columns`", purpose(Channel)]
     return "\n\n".join([*parts, _table_of_keys(keys_of(Channel)), *_bags()])
 

@@ -137,7 +137,7 @@ def _config_of(path: Path, palette: Palette, result: PictureMap, points: MarkedC
     """Return the text of a config that marks the proposed surfaces by points in pixels."""
     pixels = result.floor.pixels[points.row, points.column]
     surfaces = []
-    for k, (name, colour) in enumerate(result.vector.colours.items()):
+    for k, (name, colour) in enumerate(result.vector.region.colours.items()):
         own = points.surface == int(name.removeprefix("surface_")) - 1
         surfaces.append(points_text(name, colour, result.share(k), pixels[own]))
     return palette_text(surfaces, path.name, palette)

@@ -13,7 +13,7 @@ from slipid.camera.floor.region import FloorPicture, FloorRegion, Palette
 from slipid.camera.floor.surfaces import UNKNOWN, Costs, Surfaces
 from slipid.camera.frame_source import is_picture
 from slipid.camera.opencv import Labels, Mask
-from slipid.data.geojson_map import Patch, VectorMap
+from slipid.data.geojson_map import MapRegion, Patch, VectorMap
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 
@@ -49,7 +49,7 @@ class PictureMap:
     Attributes:
         vector: the map as polygons.
         floor: the picture projected onto the floor.
-        labels: surface of each cell, in the order of the colours of `vector`; -1 is unknown.
+        labels: surface of each cell, in the order of its colours; -1 is unknown.
         robots: robots that hid a part of the floor.
         warnings: sentences about reasons for which the map is less certain.
         poor: sentences about reasons for which the map is bad.
@@ -71,7 +71,7 @@ class PictureMap:
     def to_json(self) -> Content:
         """Return the results for programs, without the polygons."""
         surfaces = []
-        for k, (name, colour) in enumerate(self.vector.colours.items()):
+        for k, (name, colour) in enumerate(self.vector.region.colours.items()):
             own = [patch for patch in self.vector.patches if patch.surface == name]
             confidence = [patch.confidence for patch in own if patch.confidence is not None]
             surfaces.append(
@@ -86,9 +86,9 @@ class PictureMap:
             )
         return {
             "surfaces": surfaces,
-            "filled_share": self.vector.unknown,
+            "filled_share": self.vector.region.unknown_share,
             "robots": [{"marker": r.marker, "place_m": [r.x, r.y]} for r in self.robots],
-            "notes": list(self.vector.notes),
+            "notes": self.vector.region.notes,
             "warnings": list(self.warnings),
             "poor": list(self.poor),
         }
@@ -217,16 +217,16 @@ def _vector(
         )
     with source.path.open("rb") as file:  # not read at once: a video may exceed memory
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    return VectorMap(
-        patches,
-        colours,
-        *(extent.low_x, extent.low_y, extent.high_x, extent.high_y),
-        region.floor.grid.cell,
-        list(colours)[most],
-        sha256,
-        unknown,
-        tuple(notes),
+    map_region = MapRegion(
+        extent_m=(extent.low_x, extent.low_y, extent.high_x, extent.high_y),
+        cell_m=region.floor.grid.cell,
+        base=list(colours)[most],
+        colours=colours,
+        picture_sha256=sha256,
+        unknown_share=unknown,
+        notes=notes,
     )
+    return VectorMap(patches, map_region)
 
 
 def _weak_patches(vector: VectorMap) -> list[str]:

@@ -6,8 +6,7 @@ are marked as not fresh, so that none counts twice.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,41 +16,26 @@ from slipid.data.align.regression import MotionPair
 from slipid.data.log import Log
 from slipid.data.reading.checks import UnusablePose
 from slipid.data.reading.layout import TURNS, SensorLayout
-from slipid.data.reading.signal import Signal, clock_of
+from slipid.data.reading.signal import RawRun, Signal, clock_of
 from slipid.data.wheel_signals import integral, readings
 from slipid.support.errors import bad_data
 
+_POSE = ("pose_x", "pose_y", "pose_heading")
 EPOCH = 1e6
 """Time above which a clock must count from 1970, not from the start of the robot [s]."""
 
 
-@dataclass(frozen=True)
-class Identity:
-    """Name and origin of a run; the attributes are those of `Log`."""
-
-    name: str
-    path: Path
-    sha256: str
-    surface: str | None
-    load: str
-    pose_clock: Clock | None = None
-
-
-def assembled(
-    signals: Mapping[str, Signal],
-    layout: SensorLayout,
-    identity: Identity,
-    notes: tuple[str, ...] = (),
-) -> Log:
-    """Return the log of one run from its signals by channel.
+def assembled(run: RawRun, layout: SensorLayout) -> Log:
+    """Return the log of one run from its signals.
 
     Raises:
         DataError: there is no channel, the wheels were not measured for too long, or a channel has
             no value at all.
     """
+    signals = run.signals
     if not signals:
         found = "no column of anything but the time is known"
-        raise bad_data(identity.path, found, "columns of the wheels and of the pose")
+        raise bad_data(run.identity.path, found, "columns of the wheels and of the pose")
     turns = next((name for name in TURNS if name in signals), None)
     clock = clock_of(list(signals.values()))
     if turns is not None:
@@ -59,23 +43,27 @@ def assembled(
         inside = (clock >= first) & (clock <= last)
         clock = clock if inside.all() else clock[inside]
         _check_gaps(signals[turns], layout)
-    remarks = list(notes)
-    held = {name: _held(signal, clock) for name, signal in signals.items()}
+    remarks = list(run.notes)
+    wheels = _of_wheels(signals, layout)
+    held = {name: _held(signal, clock) for name, signal in wheels.items()}
     angle = _angle(turns, signals, layout, clock, remarks)
     pose, fresh = _pose(signals, clock)
     start = clock[0] if clock[0] > EPOCH else 0.0
+    voltage = held.get("voltage")
+    if voltage is None and {"duty", "bus_voltage"} <= held.keys():
+        voltage = held["duty"] * held["bus_voltage"]
     return Log(
-        **vars(identity),
+        **vars(run.identity),
         time=clock - start,
         wheel_angle=angle,
-        wheel_speed=_at_wheel(held, layout, "speed"),
-        wheel_speed_command=_at_wheel(held, layout, "speed_command"),
+        wheel_speed=held.get("wheel_speed"),
+        wheel_speed_command=held.get("wheel_speed_command"),
         twist_command=_twist(held, len(clock)),
-        current=_current(held, layout),
-        current_fresh=_fresh(signals, clock, ("current", "motor_torque", "wheel_torque")),
+        current=held.get("current"),
+        current_fresh=_fresh(wheels.get("current"), clock),
         current_is_signed=layout.current_is_signed,
-        voltage=_voltage(held),
-        voltage_fresh=_fresh(signals, clock, ("voltage", "duty")),
+        voltage=voltage,
+        voltage_fresh=_fresh(wheels.get("voltage", wheels.get("duty")), clock),
         duty=held.get("duty"),
         bus_voltage=held["bus_voltage"][:, 0] if "bus_voltage" in held else None,
         gyro=held["gyro"][:, 0] if "gyro" in held else None,
@@ -119,17 +107,10 @@ def _held(signal: Signal, clock: Float[np.ndarray, " time"]) -> Float[np.ndarray
 
 
 def _fresh(
-    signals: Mapping[str, Signal], clock: Float[np.ndarray, " time"], names: tuple[str, ...]
+    signal: Signal | None, clock: Float[np.ndarray, " time"]
 ) -> Bool[np.ndarray, "time column"] | None:
-    """Return whether a channel was measured at each time; None if it was at all times.
-
-    The channel is the first available one of `names`; the result is None as well if there is none.
-    """
-    name = next((name for name in names if name in signals), None)
-    if name is None:
-        return None
-    signal = signals[name]
-    if signal.time is clock and not np.isnan(signal.values).any():
+    """Return whether a channel was measured at each time; None if it was at all times, or never."""
+    if signal is None or (signal.time is clock and not np.isnan(signal.values).any()):
         return None
     out = np.zeros((len(clock), signal.values.shape[1]), dtype=bool)
     inside = (signal.time >= clock[0]) & (signal.time <= clock[-1])
@@ -198,33 +179,23 @@ def _ticks(
     return ticks - period * np.concatenate([[0.0], np.cumsum(np.round(steps / period))])
 
 
-def _at_wheel(held: Mapping[str, np.ndarray], layout: SensorLayout, what: str) -> np.ndarray | None:
-    """Return a speed of the wheels, logged at the wheels or at the motors, or None.
+def _of_wheels(signals: Mapping[str, Signal], layout: SensorLayout) -> dict[str, Signal]:
+    """Return the signals, with speeds at the wheels and currents also if others were logged.
 
-    `what` is `speed` (reported) or `speed_command`.
+    Such speeds are those of the motors over the gear ratio; such currents are the reported torques
+    over the torque constant.
     """
-    if f"wheel_{what}" in held:
-        return held[f"wheel_{what}"]
-    if f"motor_{what}" in held:
-        return held[f"motor_{what}"] / layout.gear_ratio
-    return None
-
-
-def _current(held: Mapping[str, np.ndarray], layout: SensorLayout) -> np.ndarray | None:
-    """Return the logged current, else the reported torque over the torque constant, else None."""
-    if "current" in held:
-        return held["current"]
-    for name, ratio in (("motor_torque", 1.0), ("wheel_torque", layout.gear_ratio)):
-        if name in held:
-            return held[name] / (ratio * float(layout.torque_constant or 1.0))
-    return None
-
-
-def _voltage(held: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """Return the logged voltage, else duty cycle times bus voltage if both were logged, or None."""
-    if "voltage" not in held and {"duty", "bus_voltage"} <= held.keys():
-        return held["duty"] * held["bus_voltage"]
-    return held.get("voltage")
+    gear, constant = layout.gear_ratio, float(layout.torque_constant or 1.0)
+    out = dict(signals)
+    for name, logged, ratio in (
+        ("wheel_speed", "motor_speed", gear),
+        ("wheel_speed_command", "motor_speed_command", gear),
+        ("current", "motor_torque", constant),
+        ("current", "wheel_torque", gear * constant),
+    ):
+        if name not in out and logged in signals:
+            out[name] = replace(signals[logged], values=signals[logged].values / ratio)
+    return out
 
 
 def _twist(held: Mapping[str, np.ndarray], rows: int) -> np.ndarray | None:
@@ -241,8 +212,7 @@ def _pose(
     """Return the pose at every time, its heading unwrapped, and whether each row has a new pose."""
     if "pose_x" not in signals:
         return None, None
-    turned = heading(signals)
-    parts = (signals["pose_x"], signals["pose_y"], turned)
+    parts = [signals[name] for name in _POSE]
     times = clock_of(parts)
     samples = np.full((len(times), 3), np.nan)
     for k, part in enumerate(parts):
@@ -263,48 +233,24 @@ def _pose(
     return samples[last.clip(0)], fresh
 
 
-def heading(signals: Mapping[str, Signal]) -> Signal:
-    """Return the logged heading [rad], else the yaw angle of the logged quaternion x, y, z, w."""
-    if "pose_heading" in signals:
-        return signals["pose_heading"]
-    turned = signals["pose_quaternion"]
-    x, y, z, w = turned.values.T
-    size = np.sqrt(x**2 + y**2 + z**2 + w**2)
-    bad = np.flatnonzero(np.abs(size - 1.0) > 0.05)
-    if len(bad):
-        raise turned.source.error(
-            f"a quaternion of length {size[bad[0]]:.3g}",
-            "x, y, z, w in this order, of length 1",
-            sample=int(bad[0]),
-        )
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
-    return Signal(turned.time, yaw[:, None], turned.source)
-
-
-def clock_against(
-    robot: Mapping[str, Signal],
-    layout: SensorLayout,
-    identity: Identity,
-    poses: Mapping[str, Signal],
-) -> Clock:
+def clock_against(run: RawRun, layout: SensorLayout, poses: Mapping[str, Signal]) -> Clock:
     """Return the clock of poses relative to the robot's clock, estimated from the motion.
 
     Args:
-        robot: signals of the robot's own file, by channel.
+        run: run with the signals of the robot's own file.
         layout: layout of that file.
-        identity: name and origin of the run.
         poses: signals of the pose's channels, on their own clock.
 
     Raises:
         UnusablePose: the motion does not determine the offset between the clocks.
     """
-    log = assembled(robot, layout, identity)
-    parts = (poses["pose_x"], poses["pose_y"], heading(poses))
+    log = assembled(run, layout)
+    parts = [poses[name] for name in _POSE]
     time = clock_of(parts)
-    columns = [np.interp(time, part.time, part.values[:, 0]) for part in parts[:2]]
-    turned = np.unwrap(parts[2].values[:, 0])
-    pose = np.column_stack([*columns, np.interp(time, parts[2].time, turned)])
-    clock = best_clock(_motion_pairs(log, time, pose))
+    x, y, turned = (part.values[:, 0] for part in parts)
+    values = (x, y, np.unwrap(turned))
+    columns = [np.interp(time, p.time, v) for p, v in zip(parts, values, strict=True)]
+    clock = best_clock(_motion_pairs(log, time, np.column_stack(columns)))
     if clock is None:
         raise UnusablePose(
             f"{parts[0].source.path}: the motion does not determine its clock against that of "
@@ -312,8 +258,8 @@ def clock_against(
             "and the video's frame rate"
         )
     # If the robot's clock counts from 1970, the times of the log start at zero instead.
-    turns = next(name for name in TURNS if name in robot)
-    start = float(robot[turns].time[0] - log.time[0])
+    turns = next(name for name in TURNS if name in run.signals)
+    start = float(run.signals[turns].time[0] - log.time[0])
     return replace(clock, offset=clock.offset + start)
 
 

@@ -158,7 +158,6 @@ _NAMES = {
     "wheel_speed_command": ("wheel_speed_command", "motor_speed_command"),
     "current": ("current", "motor_torque", "wheel_torque"),
     "voltage": ("voltage", "duty"),
-    "pose_heading": ("pose_heading", "pose_quaternion"),
 }
 """Channels of a file, by the name of the log's channel that may be computed from them."""
 

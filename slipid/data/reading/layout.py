@@ -135,7 +135,6 @@ class Layout(SensorLayout):
     """Layout of one type of log file.
 
     Attributes:
-        name: name in messages.
         channels: columns of each channel.
         delimiter: character between cells; not used for Parquet.
         names_row: line with the column names, counted from 1; 0 where there is none.
@@ -152,7 +151,6 @@ class Layout(SensorLayout):
             `{stem}` stands for the name of the run's own file without its suffix.
     """
 
-    name: str
     channels: Mapping[str, Channel]
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","
     names_row: Count = 1

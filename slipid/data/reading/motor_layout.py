@@ -77,7 +77,6 @@ def motor_layout(format: TableFormat, given: Mapping[str, GivenColumns], signed:
         channels = {k: v for k, v in channels.items() if k not in ("duty", "bus_voltage")}
     _check_whole(format.path, channels, names)
     return Layout(
-        name="motor",
         channels=channels,
         delimiter=format.delimiter or ",",
         names_row=format.names_row,

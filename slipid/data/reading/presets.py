@@ -43,7 +43,6 @@ def _camera(x: str, y: str, angle: str, unit: str = "pixel") -> dict[str, Channe
 # by a factor of about 1.117, which a fit estimates; the reader does not correct it.
 _METRES_PER_PIXEL = (1.8404619693756104e-3, 1.8371639251708984e-3)
 _ROBOTINO = Layout(
-    name="robotino",
     channels={},
     delimiter=";",
     ticks_per_revolution=2000.0,
@@ -74,26 +73,24 @@ _DRIVE_2021 = {
     **_camera("X coordinate, pixels", "Y coodinate, pixels", "Angle, deg"),
 }
 
-_LAYOUTS = (
+PRESETS = {
     # One run per file: a straight drive under the overhead camera.
-    replace(
+    "robotino2022": replace(
         _ROBOTINO_2022,
-        name="robotino2022",
         metres_per_pixel=_METRES_PER_PIXEL,
         channels=_DRIVE_2022 | _camera("xpos", "ypos", "ang"),
     ),
     # The same robot out of sight of the camera, hence without poses.
-    replace(_ROBOTINO_2022, name="robotino2022_blind", channels=_DRIVE_2022),
+    "robotino2022_blind": replace(_ROBOTINO_2022, channels=_DRIVE_2022),
     # Speed steps with the wheels in the air. The tick columns are left out on purpose: they do not
     # accumulate in these files, so the wheel angle is integrated from the reported speed.
-    replace(_ROBOTINO_2022, name="robotino2022_motor", channels=_MOTORS_2022),
+    "robotino2022_motor": replace(_ROBOTINO_2022, channels=_MOTORS_2022),
     # Each row is a mean of 13 samples; a file has 204 runs, at whose start the encoders restart
     # from 0. There is no time column: ticks over reported speed (which is 1.3 % too high) give
     # 0.45 s between rows. Headings near 0 and 360 deg are wrong, since they are means of both; so
     # no jump of the heading is refused.
-    replace(
+    "robotino2021": replace(
         _ROBOTINO,
-        name="robotino2021",
         new_run="ticks_restart",
         row_period=0.45,
         max_heading_jump=3.2,
@@ -103,17 +100,15 @@ _LAYOUTS = (
     # 69 runs over the whole field, with a row every 0.5 s. The gyro is in deg/s and has the sign of
     # the heading. (Columns X_new, Y_new, not used here, are the pixel coordinates shrunk by a
     # factor of 0.895 towards the image centre.)
-    replace(
+    "robotino2021_field": replace(
         _ROBOTINO,
-        name="robotino2021_field",
         new_run="time_restarts",
         metres_per_pixel=_METRES_PER_PIXEL,
         channels=_DRIVE_2021 | {"time": _one("Time, ms", "ms"), "gyro": _one("Z gyro", "deg/s")},
     ),
     # Speeds are at the motor shaft; currents are magnitudes here, too. Where the reference speed
     # steps, two rows have the same time, one before and one after the step.
-    Layout(
-        name="robotino2021_motor",
+    "robotino2021_motor": Layout(
         drop_repeated_time=True,
         gear_ratio=16.0,
         current_is_signed=False,
@@ -126,15 +121,13 @@ _LAYOUTS = (
     ),
     # Only the camera's log: no wheel was logged in these runs. Positions are in mm along the axes
     # of the image.
-    Layout(
-        name="robotino2021_camera",
+    "robotino2021_camera": Layout(
         channels={"time": _one("time_s", "s"), **_camera("x_mm", "y_mm", "angle_deg", "mm")},
     ),
     # The file has no column names. The columns are time, x, y, heading, then the ticks of each
     # wheel since the previous row, with reversed sign. With the sign corrected, the wheels are at
     # azimuths of 300, 60 and 180 deg.
-    Layout(
-        name="omni3_optitrack",
+    "omni3_optitrack": Layout(
         names_row=0,
         first_data_row=1,
         ticks_per_revolution=1024.0,
@@ -149,8 +142,7 @@ _LAYOUTS = (
         },
     ),
     # Files that `slipid track` writes for a video whose recording was started by hand.
-    Layout(
-        name="tracked",
+    "tracked": Layout(
         clock="own",
         channels={
             "time": _one("time", "s"),
@@ -159,11 +151,11 @@ _LAYOUTS = (
             "pose_heading": _one("heading", "rad"),
         },
     ),
-)
+}
+"""Layouts of published log formats, by name."""
 POSES = ("pose_x", "pose_y", "pose_heading", "pose_quaternion")
 """Channels of a camera, which may have a clock of its own."""
-PRESETS = {layout.name: layout for layout in _LAYOUTS}
-_SETTINGS = [f.name for f in fields(Layout) if f.name not in ("name", "channels", "beside")]
+_SETTINGS = [f.name for f in fields(Layout) if f.name not in ("channels", "beside")]
 
 
 def layout(table: Mapping[str, object]) -> Layout:
@@ -215,7 +207,7 @@ def _declared_file(table: Mapping[str, object], where: str) -> Layout:
             raise DataError(f"{where}: {unknown('key', key, known)}")
     if not isinstance(columns, dict):
         raise DataError(f"{where} columns: {columns!r}; expected a table")
-    base = Layout(where, {}) if name is None else PRESETS[str(name)]
+    base = Layout({}) if name is None else PRESETS[str(name)]
     channels = dict(base.channels)
     for channel, spec in columns.items():
         if channel not in CHANNELS:

@@ -1,4 +1,4 @@
-"""Class `Signal`: samples of one channel at its own times, as read from a file or a bag."""
+"""Samples of one channel at its own times, and runs of them, as read from a file or a bag."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from slipid.data.align.clock import Clock
 from slipid.support.errors import DataError, bad_data
 
 
@@ -71,9 +72,49 @@ class Signal:
         return Signal(self.time[which], self.values[which], self.source.part(which))
 
 
+@dataclass(frozen=True)
+class Identity:
+    """Name and origin of a run; the attributes are those of `Log`."""
+
+    name: str
+    path: Path
+    sha256: str
+    surface: str | None
+    load: str
+    pose_clock: Clock | None = None
+
+
+@dataclass(frozen=True)
+class RawRun:
+    """A run whose signals were read, before they are assembled into a log.
+
+    Attributes:
+        identity: name and origin of the run.
+        signals: signals by channel, in the units of `CHANNELS`.
+        notes: repairs and omissions, one sentence each.
+    """
+
+    identity: Identity
+    signals: dict[str, Signal]
+    notes: tuple[str, ...] = ()
+
+
 def clock_of(signals: Sequence[Signal]) -> Float[np.ndarray, " time"]:
     """Return all times at which some of the signals was sampled, increasing, each once [s]."""
     first = signals[0].time
     if all(signal.time is first for signal in signals) and (np.diff(first) > 0).all():
         return first
     return np.unique(np.concatenate([signal.time for signal in signals]))
+
+
+def heading(turned: Signal) -> Signal:
+    """Return the yaw angle [rad] of quaternions x, y, z, w; their length must be 1."""
+    x, y, z, w = turned.values.T
+    size = np.sqrt(x**2 + y**2 + z**2 + w**2)
+    bad = np.flatnonzero(np.abs(size - 1.0) > 0.05)
+    if len(bad):
+        found = f"a quaternion of length {size[bad[0]]:.3g}"
+        expected = "x, y, z, w in this order, of length 1"
+        raise turned.source.error(found, expected, sample=int(bad[0]))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    return Signal(turned.time, yaw[:, None], turned.source)

@@ -16,8 +16,7 @@ the spectra of three noises and the voltage between rows. Moments need none of t
 
 import fnmatch
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -27,14 +26,14 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from slipid.infer.bench.moments import (
-    MomentSums,
+    Equation,
     cell_length,
     celled,
     correlation_cells,
+    equation,
     grouped,
     scatter,
     start,
-    sums,
     widened,
 )
 from slipid.infer.bench.motor import (
@@ -44,15 +43,14 @@ from slipid.infer.bench.motor import (
     BenchMotor,
     BenchRecord,
     BenchRoot,
-    SensorNoise,
-    noise_of,
+    noise,
 )
 from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
 from slipid.search_space import Choice, Space
 
-ROUNDS = 30
+MOST_ROUNDS = 30
 """Largest number of updates of weights, scatter and numbers."""
-SETTLED = 0.02
+SETTLED_STDS = 0.02
 """Largest change of a number in the last round of a converged fit [std]."""
 CONSTANT_S = 2e-3
 """Prior std of the electrical time constant L_a / R [s]."""
@@ -61,22 +59,6 @@ MOMENTS = (len(VOLTS) - 1, len(AMPS))
 
 The last signal, the sign given to unsigned currents, is an instrument in the mechanical one only.
 """
-
-
-class Equation(NamedTuple):
-    """One of the two equations of a motor, at the fitted numbers.
-
-    Attributes:
-        channel: `voltage` or `current`.
-        unit: unit of the channel.
-        windows: windows of the records, with the signals of the equation.
-        sums: moments of the equation, with their weights and residuals.
-    """
-
-    channel: str
-    unit: str
-    windows: BenchWindows
-    sums: MomentSums
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +73,6 @@ class MotorFit:
         z: search vector at the optimum.
         covariance: covariance of the search vector.
         equations: the electrical equation, absent without voltage, and the mechanical one.
-        noise: noise of the sensors.
         correlation_time: time over which residuals are correlated [s].
         independent_times: length of the records over the correlation time.
         converged: True if the numbers settled.
@@ -106,7 +87,6 @@ class MotorFit:
     z: Float[np.ndarray, " free"]
     covariance: Float[np.ndarray, "free free"]
     equations: tuple[Equation, ...]
-    noise: SensorNoise
     correlation_time: float
     independent_times: float
     converged: bool
@@ -120,6 +100,16 @@ class MotorFit:
         return found
 
     @property
+    def noise(self) -> dict[str, float | None]:
+        """Std of the white noise of each sensor by channel, None for a channel without a sensor."""
+        volts = [r.voltage for r in self.records if r.voltage is not None]
+        return {
+            "voltage": noise(volts) if volts else None,
+            "current": noise([r.current for r in self.records]),
+            "speed": noise([r.speed for r in self.records]),
+        }
+
+    @property
     def has_voltage(self) -> bool:
         return len(self.equations) > 1
 
@@ -129,42 +119,20 @@ class MotorFit:
         return float(np.median([r.period for r in self.records]))
 
 
-class _EquationSums(eqx.Module):
-    """Sums h (`constant`), G (`slope`) and `tangent` of one equation, as in `MomentSums`.
-
-    They are zero for an equation without windows.
-    """
-
-    constant: Array
-    slope: Array
-    tangent: Array
-
-    @staticmethod
-    def of(s: MomentSums | None, moments: int, columns: int) -> "_EquationSums":
-        if s is None:
-            return _EquationSums(jnp.zeros(moments), *[jnp.zeros((moments, columns))] * 2)
-        return _EquationSums(*map(jnp.asarray, (s.constant, s.slope, s.tangent)))
-
-
 class _Objective(eqx.Module):
     """Arguments of the search for the optimum.
 
     Attributes:
         space: free numbers with their priors.
-        volts: sums of the electrical equation.
-        amps: sums of the mechanical equation.
         root: S^-1/2, which whitens the moments.
+        constant: h of each equation, the mechanical one last.
+        slope: G of each equation.
     """
 
     space: Space
-    volts: _EquationSums
-    amps: _EquationSums
     root: Array
-
-    def tangents(self) -> "_Objective":
-        """Return the objective with tangents in place of slopes, for the covariance."""
-        slopes = self.volts.tangent, self.amps.tangent
-        return eqx.tree_at(lambda h: (h.volts.slope, h.amps.slope), self, slopes)
+    constant: tuple[Array, ...]
+    slope: tuple[Array, ...]
 
 
 def fit_motor(
@@ -177,24 +145,24 @@ def fit_motor(
     space = Space(BenchRoot(BenchMotor()), scaled)
     z = space.vector(BenchRoot(first))
     # numbers for which the user has given a start value begin there
-    z = np.where(_chosen(space, choices), space.start, z)
+    started = [c.pattern for c in choices if c.start is not None]
+    chosen = space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in started))
+    z = np.where(chosen, space.start, z)
     zero, moved, rounds = 0.0, np.inf, 0
-    while moved >= SETTLED and rounds < ROUNDS:
+    while moved >= SETTLED_STDS and rounds < MOST_ROUNDS:
         motor = space.tree(jnp.asarray(z)).motor
         if abs(float(motor.current_offset) - zero) > 0.02 * BRUSH_CURRENT:
             zero = float(motor.current_offset)
             volts = electrical(records, zero)
-        v = None if volts is None else sums(volts, np.asarray(motor.volts()), MOMENTS[0])
-        a = sums(amps, np.asarray(motor.amps()), MOMENTS[1])
-        equations = [Equation("current", "A", amps, a)]
-        if volts is not None and v is not None:
-            equations.insert(0, Equation("voltage", "V", volts, v))
+        equations = [equation(amps, np.asarray(motor.amps()), MOMENTS[1])]
+        if volts is not None:
+            equations.insert(0, equation(volts, np.asarray(motor.volts()), MOMENTS[0]))
         s, correlation_time, independent_times = _scatter(equations)
-        new, covariance = _solved(space, z, v, a, s)
+        new, covariance = _solved(space, z, equations, s)
         moved = float(np.max(np.abs(new - z) / np.sqrt(np.diag(covariance)), initial=0.0))
         z, rounds = new, rounds + 1
-    settled = moved < SETTLED and bool(np.isfinite(z).all())
-    reason = f"no number changed by {100 * SETTLED:g} % of its std in round {rounds}"
+    settled = moved < SETTLED_STDS and bool(np.isfinite(z).all())
+    reason = f"no number changed by {100 * SETTLED_STDS:g} % of its std in round {rounds}"
     return MotorFit(
         label=label,
         records=tuple(records),
@@ -203,7 +171,6 @@ def fit_motor(
         z=z,
         covariance=covariance,
         equations=tuple(equations),
-        noise=noise_of(records),
         correlation_time=correlation_time,
         independent_times=independent_times,
         converged=settled,
@@ -247,12 +214,6 @@ def _scaled(records: Sequence[BenchRecord], resistance: float) -> list[Choice]:
     return [*chosen, Choice("motor.inductance", prior_mean=0.0, prior_std=slow)]
 
 
-def _chosen(space: Space, choices: Sequence[Choice]) -> np.ndarray:
-    """Return a mask of the coordinates for which the user has given a start value."""
-    wanted = [c.pattern for c in choices if c.start is not None]
-    return space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in wanted))
-
-
 def _scatter(
     equations: Sequence[Equation],
 ) -> tuple[Float[np.ndarray, "moment moment"], float, float]:
@@ -262,42 +223,47 @@ def _scatter(
     the correlation time.
     """
     length = cell_length([e.windows for e in equations])
-    parts = [celled(e.sums.moments, e.windows, length) for e in equations]
+    parts = [celled(e.moments, e.windows, length) for e in equations]
     count = max(len(p) for p in parts)
     g = np.concatenate([np.pad(p, ((0, count - len(p)), (0, 0))) for p in parts], axis=1)
-    residuals = [celled(e.sums.residual[:, None], e.windows, length)[:, 0] for e in equations]
+    residuals = [celled(e.weighted_residual[:, None], e.windows, length)[:, 0] for e in equations]
     lags = 2 * max(correlation_cells(x) for x in residuals) + 2
-    groups = np.concatenate([grouped(e.sums, e.windows) for e in equations], axis=1)
+    groups = np.concatenate([grouped(e) for e in equations], axis=1)
     return widened(scatter(g, lags), groups), lags * length / 2, count / lags
 
 
 def _solved(
-    space: Space, z: np.ndarray, v: MomentSums | None, a: MomentSums, s: np.ndarray
+    space: Space, z: np.ndarray, equations: Sequence[Equation], s: np.ndarray
 ) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"]]:
     """Return the optimum at fixed weights and scatter, and its covariance."""
     std = np.sqrt(np.maximum(np.diag(s), 1e-300))
     # S is singular for collinear signals, as in a log at one speed, hence the 1e-9
     root = np.linalg.inv(np.linalg.cholesky(s / std / std[:, None] + 1e-9 * np.eye(len(s)))) / std
-    if v is None:
-        root = np.concatenate([np.zeros((len(root), MOMENTS[0])), root], axis=1)
-    volts, amps = _EquationSums.of(v, MOMENTS[0], len(VOLTS)), _EquationSums.of(a, *a.slope.shape)
-    found, tangent = _searched(jnp.asarray(z), _Objective(space, volts, amps, jnp.asarray(root)))
-    jacobian = np.asarray(tangent)
+    constant, slope, tangent = (
+        tuple(jnp.asarray(getattr(e, name)) for e in equations)
+        for name in ("constant", "slope", "tangent")
+    )
+    held = _Objective(space, jnp.asarray(root), constant, slope)
+    found, of_tangents = _searched(jnp.asarray(z), held, replace(held, slope=tangent))
+    jacobian = np.asarray(of_tangents)
     return np.asarray(found), np.linalg.inv(jacobian.T @ jacobian)
 
 
 @eqx.filter_jit
-def _searched(z: Float[Array, " free"], held: _Objective) -> tuple[Array, Array]:
-    """Return the optimum, and the Jacobian of the residuals there."""
+def _searched(
+    z: Float[Array, " free"], held: _Objective, tangents: _Objective
+) -> tuple[Array, Array]:
+    """Return the optimum, and the Jacobian of the residuals with tangents for slopes there."""
     solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
     found = optx.least_squares(_residuals, solver, z, args=held, max_steps=200, throw=False)
-    return found.value, jax.jacfwd(_residuals)(found.value, held.tangents())
+    return found.value, jax.jacfwd(_residuals)(found.value, tangents)
 
 
 def _residuals(z: Float[Array, " free"], held: _Objective) -> Float[Array, " residual"]:
     """Return S^-1/2 g and the residuals of the prior."""
     motor = held.space.tree(z).motor
-    pairs = (held.volts, motor.volts()), (held.amps, motor.amps())
-    g = jnp.concatenate([block.constant - block.slope @ k for block, k in pairs])
+    coefficients = (motor.volts(), motor.amps())[-len(held.slope) :]
+    sums_of = zip(held.constant, held.slope, coefficients, strict=True)
+    g = jnp.concatenate([constant - slope @ k for constant, slope, k in sums_of])
     prior = (z - held.space.prior_mean) / held.space.prior_std
     return jnp.concatenate([held.root @ g, prior])

@@ -27,15 +27,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from slipid.infer.bench.windows import BenchWindows, HalfSignals
+from slipid.infer.bench.motor import VOLTS
+from slipid.infer.bench.windows import BenchWindows
 
 DEGREES = 4.0
 """Degrees of freedom of Student's t in the weights."""
-FORGOTTEN = 0.05
+UNCORRELATED = 0.05
 """Autocorrelation below which residuals count as uncorrelated."""
 CELL_S = 0.01
 """Smallest length of the cells of time, over which moments are summed [s]."""
-FEWEST = 12
+FEWEST_TIMES = 12
 """Smallest ratio of a record's length to the estimated correlation time.
 
 Longer correlation times are not looked for, as the covariance could not be estimated from them.
@@ -48,94 +49,94 @@ Square = Float[np.ndarray, "moment moment"]
 
 
 @dataclass(frozen=True, eq=False)
-class HalfMoments:
-    """Moments from the residuals of one half of the rows.
+class Equation:
+    """One of the two equations of a motor at given numbers k: its moments g = h - G k.
 
     Attributes:
-        residual: residual of every window [V] or [A].
-        weight: weight of every residual.
-        moments: summand of every window in g.
-    """
-
-    residual: Float[np.ndarray, " window"]
-    weight: Float[np.ndarray, " window"]
-    moments: Float[np.ndarray, "window moment"]
-
-
-@dataclass(frozen=True, eq=False)
-class MomentSums:
-    """Sums h and G of an equation, g = h - G k, and the moments of its windows.
-
-    Attributes:
+        windows: windows of the records, with the signals of the equation.
         constant: h.
         slope: G.
         tangent: -dg / dk with the change of weights, which determines the uncertainty of k.
-        even: moments from the residuals of even rows.
-        odd: moments from the residuals of odd rows; the sum of both over windows is g.
+        residual: residual of every window [V] or [A], from its even and from its odd rows.
+        weight: weight of every residual.
+        terms: summand of every residual in g.
         scale: robust std of the residuals, averaged over even and odd rows.
     """
 
+    windows: BenchWindows
     constant: Moments
     slope: Float[np.ndarray, "moment column"]
     tangent: Float[np.ndarray, "moment column"]
-    even: HalfMoments
-    odd: HalfMoments
+    residual: Float[np.ndarray, "half window"]
+    weight: Float[np.ndarray, "half window"]
+    terms: Float[np.ndarray, "half window moment"]
     scale: float
 
     @property
-    def moments(self) -> Float[np.ndarray, "window moment"]:
-        return self.even.moments + self.odd.moments
+    def channel(self) -> str:
+        """Channel on the left side of the equation: `voltage` or `current`."""
+        return "voltage" if self.windows.signals.shape[-1] == len(VOLTS) else "current"
 
     @property
-    def residual(self) -> Float[np.ndarray, " window"]:
+    def unit(self) -> str:
+        """Unit of the channel."""
+        return {"voltage": "V", "current": "A"}[self.channel]
+
+    @property
+    def moments(self) -> Float[np.ndarray, "window moment"]:
+        return self.terms.sum(axis=0)
+
+    @property
+    def weighted_residual(self) -> Float[np.ndarray, " window"]:
         """Weighted mean of the residuals of both halves."""
-        return (self.even.weight * self.even.residual + self.odd.weight * self.odd.residual) / 2
+        return (self.weight * self.residual).sum(axis=0) / 2
 
 
-def sums(w: BenchWindows, coefficients: Float[np.ndarray, " column"], signals: int) -> MomentSums:
-    """Return the sums of an equation at given coefficients.
+def equation(w: BenchWindows, coefficients: Float[np.ndarray, " column"], signals: int) -> Equation:
+    """Return an equation at given coefficients.
 
     The first `signals` signals are the instruments, which residuals are multiplied by.
     """
     totals, halves = [], []
-    for mine, other in ((w.even, w.odd), (w.odd, w.even)):
-        residual = mine.measured - mine.signals @ coefficients
-        scale = _scale(residual[w.usable])
+    for half in (0, 1):
+        residual, scale, weight = _weighted(w, half, coefficients)
         square = (residual / scale) ** 2
-        weight = w.usable * (DEGREES + 1) / (DEGREES + square)
-        z = other.signals[:, :signals] * (weight / 2)[:, None]
+        z = w.signals[1 - half, :, :signals] * (weight / 2)[:, None]
         bent = z * ((DEGREES - square) / (DEGREES + square))[:, None]
-        totals.append((z.T @ mine.measured, z.T @ mine.signals, bent.T @ mine.signals, scale / 2))
-        halves.append(HalfMoments(residual, weight, z * residual[:, None]))
+        measured, mine = w.measured[half], w.signals[half]
+        totals.append((z.T @ measured, z.T @ mine, bent.T @ mine, scale / 2))
+        halves.append((residual, weight, z * residual[:, None]))
     constant, slope, tangent, scale = (a + b for a, b in zip(*totals, strict=True))
-    even, odd = halves
-    return MomentSums(constant, slope, tangent, even, odd, scale)
+    residuals, weights, terms = map(np.stack, zip(*halves, strict=True))
+    return Equation(w, constant, slope, tangent, residuals, weights, terms, scale)
 
 
 def start(w: BenchWindows, count: int, rounds: int = 12) -> np.ndarray:
     """Return coefficients at which the first `count` moments vanish; the other ones are 0."""
-    found = np.zeros(w.even.signals.shape[1])
-    weight = [w.usable.astype(float)] * 2
+    found = np.zeros(w.signals.shape[-1])
+    weights = [w.usable.astype(float)] * 2
     for _ in range(rounds):
-        even, odd = w.even.signals[:, :count], w.odd.signals[:, :count]
-        halves = ((w.even, odd, weight[0]), (w.odd, even, weight[1]))
-        slope = sum(z.T @ (k[:, None] * half.signals[:, :count]) for half, z, k in halves)
-        constant = sum(z.T @ (k * half.measured) for half, z, k in halves)
+        slope, constant = np.zeros((count, count)), np.zeros(count)
+        for half, weight in enumerate(weights):
+            z = w.signals[1 - half, :, :count]
+            slope += z.T @ (weight[:, None] * w.signals[half, :, :count])
+            constant += z.T @ (weight * w.measured[half])
         found[:count] = np.linalg.lstsq(slope, constant, rcond=1e-10)[0]
-        weight = [_weights(half, found, w.usable) for half in (w.even, w.odd)]
+        weights = [_weighted(w, half, found)[2] for half in (0, 1)]
     return found
 
 
-def _weights(half: HalfSignals, coefficients: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    residual = half.measured - half.signals @ coefficients
-    return np.asarray(
-        usable * (DEGREES + 1) / (DEGREES + (residual / _scale(residual[usable])) ** 2)
-    )
+def _weighted(
+    w: BenchWindows, half: int, coefficients: Float[np.ndarray, " column"]
+) -> tuple[Float[np.ndarray, " window"], float, Float[np.ndarray, " window"]]:
+    """Return the residuals of one half of the rows, their robust std, and their weights.
 
-
-def _scale(residual: np.ndarray) -> float:
-    """Return a robust std of residuals, at least 1e-9, the rounding errors of sums."""
-    return max(1.4826 * float(np.median(np.abs(residual))) if len(residual) else 1.0, 1e-9)
+    The std is at least 1e-9, the rounding errors of sums.
+    """
+    residual = w.measured[half] - w.signals[half] @ coefficients
+    usable = np.abs(residual[w.usable])
+    scale = max(1.4826 * float(np.median(usable)) if len(usable) else 1.0, 1e-9)
+    return residual, scale, w.usable * (DEGREES + 1) / (DEGREES + (residual / scale) ** 2)
 
 
 def celled(
@@ -158,14 +159,14 @@ def cell_length(windows: Sequence[BenchWindows]) -> float:
 
 def correlation_cells(x: Float[np.ndarray, " cell"]) -> int:
     """Return the correlation time of a signal [cell]: 1 + 2 sum of its autocorrelations."""
-    most = len(x) // FEWEST
+    most = len(x) // FEWEST_TIMES
     size = 1 << (2 * len(x)).bit_length()
     power = np.abs(np.fft.rfft(x - x.mean(), size)) ** 2
     correlation = np.fft.irfft(power, size)[: most + 1]
     if len(correlation) < 2 or correlation[0] <= 0:
         return 1
     correlation = correlation / correlation[0]
-    low = np.flatnonzero(correlation < FORGOTTEN)
+    low = np.flatnonzero(correlation < UNCORRELATED)
     end = int(low[0]) if len(low) else most + 1
     return int(np.ceil(1 + 2 * correlation[1:end].sum()))
 
@@ -195,18 +196,19 @@ def widened(s: Square, groups: Float[np.ndarray, "group moment"]) -> Square:
     return np.asarray(axes * np.maximum(value / chance, 1.0) @ axes.T)
 
 
-def grouped(s: MomentSums, w: BenchWindows) -> Float[np.ndarray, "group moment"]:
+def grouped(equation: Equation) -> Float[np.ndarray, "group moment"]:
     """Return sums of moments over groups of windows with similar speed and similar current.
 
     Groups have about equal sizes. A residual from even rows is grouped by the speed and current of
     odd rows, and vice versa, so that its own noise does not determine its group.
     """
-    total = np.zeros((SPEEDS * CURRENTS, s.even.moments.shape[1]))
-    for half, other in ((s.even, w.odd), (s.odd, w.even)):
+    w, total = equation.windows, np.zeros((SPEEDS * CURRENTS, equation.terms.shape[-1]))
+    for half, terms in enumerate(equation.terms):
+        speed, current = w.speed[1 - half], w.current[1 - half]
         group = np.zeros(len(w.time), int)
-        for k, some in enumerate(np.array_split(np.argsort(other.speed, kind="stable"), SPEEDS)):
-            within = some[np.argsort(other.current[some], kind="stable")]
+        for k, some in enumerate(np.array_split(np.argsort(speed, kind="stable"), SPEEDS)):
+            within = some[np.argsort(current[some], kind="stable")]
             for j, few in enumerate(np.array_split(within, CURRENTS)):
                 group[few] = k * CURRENTS + j
-        np.add.at(total, group, half.moments)
+        np.add.at(total, group, terms)
     return total

@@ -103,31 +103,6 @@ class BenchRecord:
         return float(np.median(np.diff(self.time)))
 
 
-@dataclass(frozen=True)
-class SensorNoise:
-    """Std of the white noise of each sensor, quantisation included.
-
-    Attributes:
-        voltage: noise of the voltmeter, None without one [V].
-        current: noise of the ammeter [A].
-        speed: noise of the speed [rad/s].
-    """
-
-    voltage: float | None
-    current: float
-    speed: float
-
-
-def noise_of(records: Sequence[BenchRecord]) -> SensorNoise:
-    """Return the noise of the sensors over all records of a motor."""
-    volts = [r.voltage for r in records if r.voltage is not None]
-    return SensorNoise(
-        noise(volts) if volts else None,
-        noise([r.current for r in records]),
-        noise([r.speed for r in records]),
-    )
-
-
 def noise(signals: Sequence[Float[np.ndarray, " row"]]) -> float:
     """Return the std of white noise from second differences, at least that of rounding.
 

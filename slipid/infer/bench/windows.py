@@ -15,7 +15,7 @@ before them: the time of the jump between two rows is unknown, and the current i
 line there.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,69 +25,53 @@ from slipid.infer.bench.motor import BRUSH_CURRENT, REST, BenchRecord
 
 ELECTRICAL_S, MECHANICAL_S = 3e-3, 1e-2
 """Half the length of a window of each equation, about a time constant of small motors [s]."""
-LEAST, ENOUGH = 2, 8
+LEAST_ROWS, ENOUGH_ROWS = 2, 8
 """Smallest and desired half length of a window [row].
 
 The smallest one is needed for a slope from odd rows. Windows with fewer than the desired number of
 rows are lengthened to it, but not beyond those of the mechanical equation (`MECHANICAL_S`).
 """
-MOST = 20_000
+MOST_WINDOWS = 20_000
 """Largest number of windows of one record."""
-WIDE = 4
+WIDER = 4
 """Ratio of the longer window, whose mean gives the sign of a small current, to a window."""
-STRAY = 1.5
+GAP_RATIO = 1.5
 """Ratio of a window's duration to its nominal one above which it spans a gap between rows."""
-JUMP = 6.0
+JUMP_STDS = 6.0
 """Step of the voltage between rows above which it counts as a jump [robust std of steps]."""
 SETTLED_S, SETTLED_ROWS = 5e-3, 4
 """Time after a jump of the voltage until currents are straight lines between rows [s], [row].
 
 The shorter of the two applies.
 """
-BRAKES = 4.0
+BRAKING_STDS = 4.0
 """Deceleration of the shaft above which the motor may be braking [robust std of accelerations]."""
-
-
-@dataclass(frozen=True, eq=False)
-class HalfSignals:
-    """Signals of every window from its even, or from its odd, rows.
-
-    Attributes:
-        signals: signals that the coefficients of the equation multiply, `VOLTS` or `AMPS`.
-        measured: left side of the equation, the mean voltage [V] or current [A].
-        speed: mean speed [rad/s].
-        current: mean current [A].
-    """
-
-    signals: Float[np.ndarray, "window column"]
-    measured: Float[np.ndarray, " window"]
-    speed: Float[np.ndarray, " window"]
-    current: Float[np.ndarray, " window"]
 
 
 @dataclass(frozen=True, eq=False)
 class BenchWindows:
     """Windows of one equation, one after the other.
 
+    The axis `half` has two entries: signals from the even rows of each window, and from its odd
+    rows.
+
     Attributes:
-        even: signals from even rows.
-        odd: signals from odd rows.
+        signals: signals that the coefficients of the equation multiply, `VOLTS` or `AMPS`.
+        measured: left side of the equation, the mean voltage [V] or current [A].
+        speed: mean speed [rad/s].
+        current: mean current [A].
         time: middle of each window, from the first row of its record [s].
         record: index of the record of each window.
         usable: False for windows in which the equation may not hold, as at rest.
     """
 
-    even: HalfSignals
-    odd: HalfSignals
+    signals: Float[np.ndarray, "half window column"]
+    measured: Float[np.ndarray, "half window"]
+    speed: Float[np.ndarray, "half window"]
+    current: Float[np.ndarray, "half window"]
     time: Float[np.ndarray, " window"]
     record: Int[np.ndarray, " window"]
     usable: Bool[np.ndarray, " window"]
-
-    @property
-    def both(self) -> HalfSignals:
-        """Means of the signals from even and from odd rows."""
-        pairs = zip(vars(self.even).values(), vars(self.odd).values(), strict=True)
-        return HalfSignals(*((a + b) / 2 for a, b in pairs))
 
 
 def electrical(records: Sequence[BenchRecord], zero: float) -> BenchWindows | None:
@@ -98,20 +82,15 @@ def electrical(records: Sequence[BenchRecord], zero: float) -> BenchWindows | No
     """
     parts = []
     for k, r in enumerate(records):
-        if (voltage := r.voltage) is None:
+        if r.voltage is None:
             return None
-        at = _WindowPlaces(r, ELECTRICAL_S)
-
-        def half(
-            kernel: "_HalfKernel", r: BenchRecord = r, voltage: np.ndarray = voltage
-        ) -> HalfSignals:
-            current, speed = kernel.mean(r.current), kernel.mean(r.speed)
-            along = np.ones(len(speed)) if r.signed else np.sign(kernel.long_mean(r.speed))
-            sign = np.tanh((kernel.long_mean(r.current) - zero * along) / BRUSH_CURRENT)
-            known = current, speed, sign, kernel.slope(r.current), np.ones(len(sign)), along
-            return HalfSignals(np.stack(known, 1), kernel.mean(voltage), speed, current)
-
-        parts.append(_cut(r, k, at, half))
+        at = _RecordWindows(r, ELECTRICAL_S)
+        current, speed = at.mean(r.current), at.mean(r.speed)
+        along = np.ones_like(speed) if r.signed else np.sign(at.long_mean(r.speed))
+        sign = np.tanh((at.long_mean(r.current) - zero * along) / BRUSH_CURRENT)
+        signals = current, speed, sign, at.slope(r.current), np.ones_like(speed), along
+        known = np.stack(signals, 2), at.mean(r.voltage), speed, current
+        parts.append(BenchWindows(*known, *at.places(k), at.driven()))
     return _joined(parts)
 
 
@@ -122,86 +101,92 @@ def mechanical(records: Sequence[BenchRecord]) -> BenchWindows:
     """
     parts = []
     for k, r in enumerate(records):
-        at = _WindowPlaces(r, MECHANICAL_S)
+        at = _RecordWindows(r, MECHANICAL_S)
         rows = r.speed[at.middle[:, None] + np.arange(-at.half, at.half + 1)]
-        moving = np.abs(rows.mean(axis=1)) > 2 * REST
-        along = np.ones(len(rows)) if r.signed else np.sign(rows.mean(axis=1))
-
-        def half(
-            kernel: "_HalfKernel", r: BenchRecord = r, along: np.ndarray = along
-        ) -> HalfSignals:
-            current, speed = kernel.mean(r.current), kernel.mean(r.speed)
-            known = kernel.slope(r.speed), np.tanh(speed / REST), speed, along
-            return HalfSignals(np.stack(known, 1), current, speed, current)
-
-        parts.append(_cut(r, k, at, half, moving))
+        usable = at.driven() & (np.abs(rows.mean(axis=1)) > 2 * REST)
+        current, speed = at.mean(r.current), at.mean(r.speed)
+        along = 1.0 if r.signed else np.sign(rows.mean(axis=1))
+        signals = (
+            at.slope(r.speed),
+            np.tanh(speed / REST),
+            speed,
+            np.broadcast_to(along, speed.shape),
+        )
+        parts.append(
+            BenchWindows(np.stack(signals, 2), current, speed, current, *at.places(k), usable)
+        )
     return _joined(parts)
 
 
-class _WindowPlaces:
-    """Positions of the windows of a record: `middle` row of each, and `half` their length [row]."""
+class _RecordWindows:
+    """Windows of a record, and means and slopes of its signals in them, from even and odd rows.
+
+    Attributes:
+        middle: middle row of each window.
+        half: half the length of a window [row].
+        rows: even, and odd, rows of every window.
+    """
 
     def __init__(self, r: BenchRecord, half_s: float):
-        half_s = max(half_s, min(ENOUGH * r.period, MECHANICAL_S))
-        self.half = half = max(LEAST, 2 * round(half_s / r.period / 2))
-        last = len(r.time) - half
-        middle = np.arange(half, last, max(half // 2, len(r.time) // MOST, 1))
+        half_s = max(half_s, min(ENOUGH_ROWS * r.period, MECHANICAL_S))
+        self.record, self.half = r, max(LEAST_ROWS, 2 * round(half_s / r.period / 2))
+        half, last = self.half, len(r.time) - self.half
+        middle = np.arange(half, last, max(half // 2, len(r.time) // MOST_WINDOWS, 1))
         span = r.time[middle + half] - r.time[middle - half]
-        self.middle = middle[(span <= STRAY * 2 * half * r.period) & ~_jumps(r, half, middle)]
+        self.middle = middle[(span <= GAP_RATIO * 2 * half * r.period) & ~_jumps(r, half, middle)]
+        self.rows = [self._rows(half, first) for first in (0, 1)]
+        self._step = [np.diff(r.time[rows], axis=1) for rows in self.rows]
+        self._kernel = [
+            self._kernel_of(rows, step) for rows, step in zip(self.rows, self._step, strict=True)
+        ]
 
+    def _rows(self, half: int, first: int) -> Int[np.ndarray, "window some"]:
+        """Return every second row of the windows: even ones for `first` 0, odd ones for 1."""
+        return self.middle[:, None] + np.arange(first - half, half - first + 1, 2)
 
-class _HalfKernel:
-    """Kernel c over every second row of the windows: even rows for `first` 0, odd ones for 1."""
+    def _kernel_of(
+        self, rows: Int[np.ndarray, "window some"], step: Float[np.ndarray, "window interval"]
+    ) -> Float[np.ndarray, "window interval"]:
+        """Return the kernel c of every window, of integral 1, between its rows."""
+        time = self.record.time[rows]
+        about = (time[:, 1:] + time[:, :-1]) / 2 - self.record.time[self.middle][:, None]
+        kernel = np.cos(0.5 * np.pi * about / (time[:, -1:] - time[:, :1])) ** 2
+        return np.asarray(kernel / (kernel * step).sum(axis=1, keepdims=True))
 
-    def __init__(self, r: BenchRecord, at: _WindowPlaces, first: int):
-        self.rows = at.middle[:, None] + np.arange(first - at.half, at.half - first + 1, 2)
-        reach = WIDE * at.half
-        wide = at.middle[:, None] + np.arange(first - reach, reach - first + 1, 2)
-        self.wide = np.clip(wide, first, len(r.time) - 1)
-        time = r.time[self.rows]
-        middle = (time[:, 1:] + time[:, :-1]) / 2 - r.time[at.middle][:, None]
-        kernel = np.cos(0.5 * np.pi * middle / (time[:, -1:] - time[:, :1])) ** 2
-        self.step = np.diff(time, axis=1)
-        self.kernel = kernel / (kernel * self.step).sum(axis=1, keepdims=True)
+    def mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, "half window"]:
+        """Return the mean <x> of a signal in every window."""
+        parts = zip(self._kernel, self._step, (signal[rows] for rows in self.rows), strict=True)
+        return np.stack([(c * dt * (x[:, 1:] + x[:, :-1]) / 2).sum(axis=1) for c, dt, x in parts])
 
-    def mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, " window"]:
-        x = signal[self.rows]
-        return np.asarray((self.kernel * self.step * (x[:, 1:] + x[:, :-1]) / 2).sum(axis=1))
+    def slope(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, "half window"]:
+        """Return the mean slope [x] of a signal in every window."""
+        parts = zip(self._kernel, self.rows, strict=True)
+        return np.stack([(c * np.diff(signal[rows], axis=1)).sum(axis=1) for c, rows in parts])
 
-    def long_mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, " window"]:
-        """Return the mean over a longer window of the same rows, whose sign is more reliable."""
-        return np.asarray(signal[self.wide].mean(axis=1))
+    def long_mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, "half window"]:
+        """Return the mean over longer windows of the same rows, whose sign is more reliable."""
+        last = len(signal) - 1
+        wide = [np.clip(self._rows(WIDER * self.half, first), first, last) for first in (0, 1)]
+        return np.stack([signal[rows].mean(axis=1) for rows in wide])
 
-    def slope(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, " window"]:
-        return np.asarray((self.kernel * np.diff(signal[self.rows], axis=1)).sum(axis=1))
+    def driven(self) -> Bool[np.ndarray, " window"]:
+        """Return a mask of the windows in which unsigned currents have the right sign.
 
-
-def _cut(
-    r: BenchRecord,
-    number: int,
-    at: _WindowPlaces,
-    half: Callable[[_HalfKernel], HalfSignals],
-    usable: Bool[np.ndarray, " window"] | None = None,
-) -> BenchWindows:
-    """Return the windows of one record.
-
-    Args:
-        r: the record.
-        number: index of the record.
-        at: positions of the windows.
-        half: function that returns the signals of the windows by one kernel.
-        usable: False for windows in which the equation may not hold, all True by default.
-    """
-    even, odd = halves = _HalfKernel(r, at, 0), _HalfKernel(r, at, 1)
-    usable = np.ones(len(at.middle), bool) if usable is None else usable
-    if not r.signed:
-        # unsigned currents were given the sign of the speed, which is wrong if the motor brakes
-        speed, slope = (sum(getattr(h, k)(r.speed) for h in halves) for k in ("mean", "slope"))
+        They were given the sign of the speed, which is wrong if the motor brakes.
+        """
+        if self.record.signed:
+            return np.ones(len(self.middle), bool)
+        speed, slope = (of(self.record.speed).sum(axis=0) for of in (self.mean, self.slope))
         faster = slope * np.sign(speed)
         spread = 1.4826 * np.median(np.abs(faster)) if len(faster) else 0.0
-        usable = usable & (faster > -BRAKES * spread)
-    time, count = r.time[at.middle] - r.time[0], np.full(len(at.middle), number)
-    return BenchWindows(half(even), half(odd), time, count, usable)
+        return np.asarray(faster > -BRAKING_STDS * spread)
+
+    def places(
+        self, number: int
+    ) -> tuple[Float[np.ndarray, " window"], Int[np.ndarray, " window"]]:
+        """Return the time of every window [s], and the number of its record."""
+        time = self.record.time
+        return time[self.middle] - time[0], np.full(len(self.middle), number)
 
 
 def _jumps(
@@ -213,7 +198,7 @@ def _jumps(
     step = np.diff(r.voltage)
     away = np.abs(step - np.median(step))
     # a mostly constant signal has median 0; steps below a thousandth of its range are no jumps
-    jump = away > JUMP * max(1.4826 * float(np.median(away)), 1e-3 * float(np.ptp(r.voltage)))
+    jump = away > JUMP_STDS * max(1.4826 * float(np.median(away)), 1e-3 * float(np.ptp(r.voltage)))
     rows = int(np.clip(round(SETTLED_S / r.period), 1, SETTLED_ROWS))
     count = np.concatenate([[0], np.cumsum(jump)])
     return np.asarray(count[middle + half] > count[np.maximum(middle - half - rows, 0)])
@@ -221,12 +206,6 @@ def _jumps(
 
 def _joined(parts: Sequence[BenchWindows]) -> BenchWindows:
     """Return the windows of several records, one after the other."""
-
-    def halves(found: Sequence[HalfSignals]) -> HalfSignals:
-        return HalfSignals(
-            *map(np.concatenate, zip(*(vars(h).values() for h in found), strict=True))
-        )
-
-    rest = ([getattr(p, name) for p in parts] for name in ("time", "record", "usable"))
-    even, odd = halves([p.even for p in parts]), halves([p.odd for p in parts])
-    return BenchWindows(even, odd, *map(np.concatenate, rest))
+    fields = zip(*(vars(part).values() for part in parts), strict=True)
+    # windows are the first axis, or the second one behind the halves
+    return BenchWindows(*(np.concatenate(x, axis=min(x[0].ndim, 2) - 1) for x in fields))

@@ -1,21 +1,14 @@
 """Log density and settings of a sampler, and blocks of its chain with their arrays in files."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int, UInt32
 
-from slipid.infer.posterior.transport_map import (
-    Matrix,
-    Polynomials,
-    Stage,
-    Transport,
-    Warp,
-    gaussian,
-)
+from slipid.infer.posterior.transport_map import Matrix, Transport, Warp, gaussian
 
-FORMAT = 5
+FORMAT = 6
 """Version of the block files; it must change with their content or the algorithm."""
 Chain = Float[np.ndarray, "ensemble step walker size"]
 
@@ -128,25 +121,9 @@ class ChainBlock:
     angle: Float[np.ndarray, " family"]
 
 
-@dataclass(frozen=True)
-class BlockStore:
-    """Functions that store and restore blocks; by default nothing is stored.
-
-    Attributes:
-        done: function that returns the stored blocks of a part of the posterior.
-        keep: function that stores a block of a part.
-        progress: function that is called with the part and the number of finished steps of its
-            current block.
-    """
-
-    done: Callable[[str], Sequence[ChainBlock]] = lambda part: ()
-    keep: Callable[[str, ChainBlock], None] = lambda part, block: None
-    progress: Callable[[str, int], None] = lambda part, steps: None
-
-
 def packed(block: ChainBlock) -> dict[str, np.ndarray]:
     """Return the arrays of a block under their names in a file."""
-    out = {
+    return {
         "number": np.asarray(block.number),
         "chain": block.chain,
         "log_prob": block.log_prob,
@@ -154,34 +131,23 @@ def packed(block: ChainBlock) -> dict[str, np.ndarray]:
         "random_rest": block.random[1],
         "accepted": block.accepted,
         "angle": block.angle,
-        "mean": block.map.mean,
         "last": np.stack(list(vars(block.map.last).values())),
+        **{f"map/{name}": np.asarray(getattr(block.map, name)) for name in _MAP_FIELDS},
     }
-    for k, stage in enumerate(block.map.stages):
-        out |= {f"{k}/{name}": getattr(stage, name) for name in _STAGE_FIELDS}
-        if stage.bend:
-            out |= {f"{k}/bend/{name}": value for name, value in vars(stage.bend).items()}
-    return out
 
 
 def unpacked(arrays: Mapping[str, np.ndarray]) -> ChainBlock:
     """Return the block from the arrays that `packed` returned."""
-    stages = []
-    while f"{len(stages)}/own" in arrays:
-        k = len(stages)
-        bend = {n: arrays[f"{k}/bend/{n}"] for n in _POLYNOMIAL_FIELDS if f"{k}/bend/{n}" in arrays}
-        fields = {n: arrays[f"{k}/{n}"] for n in _STAGE_FIELDS}
-        stages.append(Stage(**fields, bend=Polynomials(**bend) if bend else None))
+    fields = {name: arrays[f"map/{name}"] for name in _MAP_FIELDS}
     return ChainBlock(
         number=int(arrays["number"]),
         chain=arrays["chain"],
         log_prob=arrays["log_prob"],
         random=(arrays["random_key"], arrays["random_rest"]),
         accepted=arrays["accepted"],
-        map=Transport(arrays["mean"], tuple(stages), Warp(*arrays["last"])),
+        map=Transport(last=Warp(*arrays["last"]), **fields),
         angle=arrays["angle"],
     )
 
 
-_STAGE_FIELDS = ("own", "given", "slope", "root")
-_POLYNOMIAL_FIELDS = ("factors", "shift", "scale")
+_MAP_FIELDS = ("mean", "order", "slope", "root", "factors", "shift", "scale")

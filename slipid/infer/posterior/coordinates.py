@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from slipid.fitting import likelihood as lk
 from slipid.fitting.problem import Problem, effects_given, twists
@@ -44,54 +44,27 @@ class Fitted:
         return cls(fit.z, np.log([fit.variance[name] for name in names]), fit.covariance)
 
 
-@dataclass(frozen=True, eq=False)
-class Coordinates:
-    """Coordinates of a density, a part of those of the search vector.
+def coordinates(
+    problem: Problem, fitted: Fitted, part: str
+) -> tuple[Int[np.ndarray, " size"], Int[np.ndarray, " size"]]:
+    """Return index in the search vector, and group, of the coordinates of a part of the posterior.
 
-    Attributes:
-        names: name of each coordinate.
-        structure: index of each coordinate in the search vector.
-        group: index of the only floor whose residuals depend on the coordinate, -1 if there are
-            several.
+    The group is the index of the only floor whose residuals depend on the coordinate, -1 if there
+    are several or none; all coordinates are in the group of a single floor. The Jacobian at the
+    fit shows which floors each coordinate affects.
     """
-
-    names: tuple[str, ...]
-    structure: Int[np.ndarray, " size"]
-    group: Int[np.ndarray, " size"]
-
-    @staticmethod
-    def of(problem: Problem, fitted: Fitted, part: str) -> "Coordinates":
-        """Return the coordinates of a part of the posterior.
-
-        The Jacobian at the fit shows which floors each coordinate affects.
-        """
-        _, jacobian = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
-        blocks = {
-            MOTION: ["motion"],
-            ELECTRIC: [k for k in jacobian if k != "motion"],
-            EVERYTHING: list(jacobian),
-        }[part]
-        surface = np.asarray(problem.batch.surface)
-        floors = len(problem.robot.surfaces.labels)
-        touched = np.zeros((problem.space.size, floors), bool)
-        for k in blocks:
-            moved = np.abs(np.asarray(jacobian[k])).sum(axis=1) > 0
-            for floor in range(floors):
+    _, jacobian = problem.linear(fitted.z, problem.electric(fitted.z, fitted.log_variance))
+    surface = np.asarray(problem.batch.surface)
+    touched = np.zeros((problem.space.size, len(problem.robot.surfaces.labels)), bool)
+    for k, block in jacobian.items():
+        if part == EVERYTHING or (part == MOTION) == (k == "motion"):
+            moved = np.abs(np.asarray(block)).sum(axis=1) > 0
+            for floor in range(touched.shape[1]):
                 touched[:, floor] |= moved[surface == floor].any(axis=0)
-        electric = problem.space.electric
-        mine = {MOTION: ~electric, ELECTRIC: electric}
-        structure = np.flatnonzero(mine.get(part, np.ones(problem.space.size, bool)))
-        names = tuple(problem.space.names[k] for k in structure)
-        return Coordinates(names, structure, _groups(touched[structure]))
-
-
-def _groups(touched: Bool[np.ndarray, "size floor"]) -> Int[np.ndarray, " size"]:
-    """Return the floor that each coordinate affects, -1 if it affects several or none.
-
-    If there is only one floor, all coordinates are in its group.
-    """
+    electric = problem.space.electric
+    mine = {MOTION: ~electric, ELECTRIC: electric, EVERYTHING: np.ones_like(electric)}[part]
     alone = (touched.sum(axis=1) == 1) | (touched.shape[1] == 1)
-    return np.where(alone, touched.argmax(axis=1), -1)
+    return np.flatnonzero(mine), np.where(alone, touched.argmax(axis=1), -1)[mine]
 
 
 def effects_at(problem: Problem, residual: Blocks, log_v: Vector) -> Float[np.ndarray, "segment 3"]:

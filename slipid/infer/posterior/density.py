@@ -22,20 +22,19 @@ with independent proposals; Tierney 1994, Annals of Statistics 22(4)).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from slipid.fitting import likelihood as lk
 from slipid.fitting.problem import Problem
 from slipid.fitting.shared_effects import EffectPosterior, mean_effects
 from slipid.fitting.variances import Square, expected
-from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Coordinates, Fitted
+from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, Anchor, Fitted, coordinates
 from slipid.model.robot import Robot
 
 Result = TypeVar("Result")
@@ -65,24 +64,27 @@ class Density:
 
     If currents are logged, the part EVERYTHING has the likelihoods of all residuals but is not the
     posterior, in which currents do not change the numbers of the motion.
+
+    Attributes:
+        structure: index of each coordinate in the search vector.
+        group: index of the only floor whose residuals depend on the coordinate, -1 if there are
+            several.
+        names: name of each coordinate.
+        centre, covariance: mean and covariance of the Laplace approximation.
     """
 
     def __init__(self, problem: Problem, fitted: Fitted, part: str):
         self.problem, self.part = problem, part
         self.floors = problem.robot.surfaces.labels
-        self.coordinates = Coordinates.of(problem, fitted, part)
+        self.structure, self.group = coordinates(problem, fitted, part)
+        self.names = tuple(problem.space.names[k] for k in self.structure)
         self.anchor = Anchor.at(problem, fitted)
         # the first density with these coordinates compiles the functions for all others
-        form = part, self.coordinates.names, self.coordinates.group.tobytes()
+        form = part, self.names, self.group.tobytes()
         self._each: dict[Callable[..., object], Callable[..., Any]] = {}
         self._form: Density = problem.compiled.setdefault(form, self)
-        at = self.coordinates.structure
-        self.centre = fitted.z[at]
-        self.covariance = fitted.covariance[np.ix_(at, at)]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.coordinates.names
+        self.centre = fitted.z[self.structure]
+        self.covariance = fitted.covariance[np.ix_(self.structure, self.structure)]
 
     @property
     def size(self) -> int:
@@ -90,7 +92,7 @@ class Density:
 
     def full(self, anchor: Anchor, x: Array) -> Array:
         """Return the search vector with the coordinates x of the density and all others fitted."""
-        return anchor.z.at[self.coordinates.structure].set(x)
+        return anchor.z.at[self.structure].set(x)
 
     def of_all(
         self, of: Callable[..., Result], x: np.ndarray | Array, held: HeldMotion | None = None
@@ -149,23 +151,24 @@ class Density:
             elif k == "voltage":
                 more = less * spread
             out = out.at[b.surface].add(more - 0.5 * jnp.sum(white**2, axis=1))
-        at = self.coordinates
-        pull = (x - self.problem.space.prior_mean[at.structure]) / anchor.prior_std[at.structure]
-        return out.at[np.where(at.group < 0, count, at.group)].add(-0.5 * pull**2)
+        pull = self._pull(anchor, x)
+        return out.at[np.where(self.group < 0, count, self.group)].add(-0.5 * pull**2)
+
+    def _pull(self, anchor: Anchor, x: Array) -> Float[Array, " size"]:
+        """Return the residuals of the prior for one vector x [prior std]."""
+        at = self.structure
+        return (x - self.problem.space.prior_mean[at]) / anchor.prior_std[at]
 
     def whitened(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
         """Return whitened residuals of data and prior of the electric part, for one vector."""
-        found, at = self._residuals(anchor, x, held), self.coordinates.structure
-        pull = (x - self.problem.space.prior_mean[at]) / anchor.prior_std[at]
-        return jnp.concatenate(
-            [*(anchor.white(k, r).ravel() for k, r in found.residuals.items()), pull]
-        )
+        found = self._residuals(anchor, x, held).residuals
+        data = [anchor.white(k, r).ravel() for k, r in found.items()]
+        return jnp.concatenate([*data, self._pull(anchor, x)])
 
-    def pointwise(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
+    def log_likelihoods(
+        self, anchor: Anchor, x: Array, held: HeldMotion | None
+    ) -> dict[str, Array]:
         """Return log likelihoods of every segment given the shared effects, by residual block."""
-        return self.of_all(Density._pointwise, x)
-
-    def _pointwise(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> dict[str, Array]:
         rest, robot = self.without_effects(anchor, x, held)
         out = {k: anchor.log_student(k, r) for k, r in rest.items()}
         camera, spread = lk.log_jacobians(robot, anchor.batch, anchor.noise(robot))
@@ -175,13 +178,10 @@ class Density:
             out["voltage"] += spread
         return out
 
-    def residuals(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
-        """Return residuals less the mean shared effects, for many vectors (draw, segment, m)."""
-        return self.of_all(Density._residual_blocks, x)
-
-    def _residual_blocks(
+    def residual_blocks(
         self, anchor: Anchor, x: Array, held: HeldMotion | None
     ) -> dict[str, Array]:
+        """Return residuals less the mean shared effects, by block, for one vector x."""
         return self.without_effects(anchor, x, held).residuals
 
     def without_effects(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> _Residuals:
@@ -197,10 +197,10 @@ class Density:
         return _Residuals(found.residuals | {"motion": motion}, found.robot)
 
     def _residuals(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> _Residuals:
-        b, at = anchor.batch, self.coordinates
+        b = anchor.batch
         if self.part == ELECTRIC:
             assert held is not None, "the electric part needs the motion of each walker"
-            robot = self.problem.space.tree(held.z.at[at.structure].set(x))
+            robot = self.problem.space.tree(held.z.at[self.structure].set(x))
             return _Residuals(
                 lk.electric_residuals(robot, b, held.motor_force, anchor.noise(robot)), robot
             )
@@ -237,29 +237,16 @@ _WIDER = 1.15
 """Ratio of the proposals' scale to that of the Gaussian around the most likely values."""
 
 
-@dataclass(frozen=True, eq=False)
-class ElectricDraws:
-    """Electric numbers for every draw of the motion.
-
-    Attributes:
-        x: draws of the electric numbers.
-        accepted: fraction of the proposals that were accepted.
-        still: fraction of the draws without any accepted proposal.
-    """
-
-    x: Float[np.ndarray, "ensemble draw size"]
-    accepted: float
-    still: float
-
-
 def electric_given_motion(
     first: Density,
     second: Density,
     covariance: Square,
     x: Float[np.ndarray, "ensemble draw size"],
     seed: int,
-) -> ElectricDraws:
+) -> tuple[Float[np.ndarray, "ensemble draw size"], Bool[np.ndarray, "draw proposal"]]:
     """Return draws of the electric numbers, one for every draw of the motion.
+
+    The second result is a mask of the accepted proposals.
 
     Args:
         first: density of the motion.
@@ -269,7 +256,7 @@ def electric_given_motion(
         x: draws of the motion.
         seed: seed of the proposals.
     """
-    motion, electric = first.coordinates.structure, second.coordinates.structure
+    motion, electric = first.structure, second.structure
     slope = np.linalg.solve(
         covariance[np.ix_(motion, motion)], covariance[np.ix_(motion, electric)]
     )
@@ -280,13 +267,8 @@ def electric_given_motion(
     student *= np.sqrt(_DEGREES / rng.chisquare(_DEGREES, student.shape[:2]))[..., None]
     chance = np.log(rng.uniform(size=(len(flat), _PROPOSALS)))
     many = (first.hold(flat), *map(jnp.asarray, (start, student, chance)))
-    drawn, moves = second.mapped(_draw, many)
-    moved = np.asarray(moves)
-    return ElectricDraws(
-        x=np.asarray(drawn).reshape(*x.shape[:2], -1),
-        accepted=float(moved.mean()),
-        still=float((~moved.any(axis=1)).mean()),
-    )
+    drawn, moved = second.mapped(_draw, many)
+    return np.asarray(drawn).reshape(*x.shape[:2], -1), np.asarray(moved)
 
 
 def _draw(

@@ -8,7 +8,7 @@ continued chain equals an uninterrupted one.
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -17,14 +17,16 @@ import numpy as np
 from emcee.state import State
 
 from slipid.infer.posterior import diagnosis
-from slipid.infer.posterior.blocks import BlockStore, Chain, ChainBlock, LogDensity, Plan
+from slipid.infer.posterior.blocks import Chain, ChainBlock, LogDensity, Plan, packed, unpacked
 from slipid.infer.posterior.proposals import QUARTER_TURN, Hamiltonian, families, moves
 from slipid.infer.posterior.transport_map import Transport, learnt
+from slipid.support.checkpoint import Checkpoint
+from slipid.support.progress import Reporter
 
 RandomState = tuple[str, np.ndarray, int, int, float]
 """State of a Mersenne twister in NumPy's form."""
 
-ACCEPTED = 0.8
+TARGET_ACCEPTED = 0.8
 """Target fraction of accepted Hamiltonian moves, to which their step is adapted in the warm-up."""
 FIRST_ANGLE, LEAST_ANGLE = 0.3, 0.03
 """First and smallest step of Hamiltonian moves [rad]."""
@@ -32,16 +34,31 @@ DRAWS_PER_EFFECTIVE = 20.0
 """Approximate number of warm-up draws with the information of one independent draw."""
 
 
-def extended(target: LogDensity, plan: Plan, part: str, store: BlockStore) -> list[ChainBlock]:
+def extended(
+    target: LogDensity, plan: Plan, part: str, checkpoint: Checkpoint | None, report: Reporter
+) -> list[ChainBlock]:
     """Return the blocks of a part, sampled until convergence or the plan's limit of blocks.
 
-    Sampling continues after the blocks in the store, in which each new block is stored.
+    Sampling continues after the blocks in the checkpoint, in which each new block is stored.
     """
-    blocks = list(store.done(part))
+    blocks: list[ChainBlock] = []
+    while checkpoint and (arrays := checkpoint.load(f"{part}-{len(blocks):04d}")) is not None:
+        blocks.append(unpacked(arrays))
+    if checkpoint and blocks:
+        report.line(f"going on from block {len(blocks)} ({part}) of {checkpoint.folder}")
+    report.stage(f"sampling {part}")
     while not _ended(blocks, plan):
-        block = _block(target, plan, blocks, lambda steps: store.progress(part, steps))
+        block = _block(target, plan, blocks)
         blocks.append(block)
-        store.keep(part, block)
+        if checkpoint:
+            checkpoint.save(f"{part}-{block.number:04d}", packed(block))
+        warm = "warm-up, " if len(blocks) <= plan.warm_up[-1] else ""
+        what = (
+            f"block {len(blocks)}: {warm}{len(blocks) * plan.block} steps, "
+            f"{100 * block.accepted.mean():.0f} % moved, "
+            f"log density {block.log_prob[:, -1].mean():.1f}"
+        )
+        report.advance(len(blocks), plan.most, what)  # the remaining time is that to the limit
     return blocks
 
 
@@ -60,11 +77,10 @@ def chain(blocks: Sequence[ChainBlock], plan: Plan) -> Chain:
     return np.concatenate([b.chain for b in blocks[plan.warm_up[-1] :]], axis=1)
 
 
-def _block(
-    target: LogDensity, plan: Plan, blocks: list[ChainBlock], progress: Callable[[int], None]
-) -> ChainBlock:
+def _block(target: LogDensity, plan: Plan, blocks: list[ChainBlock]) -> ChainBlock:
+    """Return the next block of a chain, its ensembles sampled in threads side by side."""
     states, map, angle = _begin(target, plan, blocks)
-    stop, steps = threading.Event(), [0] * plan.ensembles
+    stop = threading.Event()
 
     def ensemble(k: int) -> tuple[np.ndarray, np.ndarray, State, float, list[list[float]]]:
         inner = target.in_coordinates(map)
@@ -88,8 +104,6 @@ def _block(
             log_probs.append(state.log_prob.copy())
             moved += float((state.coords != before).any(axis=1).mean()) / plan.block
             before = places[-1]
-            steps[k] += 1
-            progress(min(steps))
         turns = [move.accepted for move, _ in made if isinstance(move, Hamiltonian)]
         return np.stack(places), np.stack(log_probs), state, moved, turns
 
@@ -172,7 +186,7 @@ def _with_learnt(
     count = block.number + 1
     if count > plan.warm_up[-1]:
         return block
-    more = np.array([np.mean(of) - ACCEPTED if of else 0.0 for of in turns])
+    more = np.array([np.mean(of) - TARGET_ACCEPTED if of else 0.0 for of in turns])
     block = replace(block, angle=np.clip(block.angle * np.exp(more), LEAST_ANGLE, QUARTER_TURN))
     if count in plan.warm_up[:-1]:
         recent = [b.chain for b in [*blocks, block][count // 2 :]]

@@ -25,15 +25,7 @@ from slipid.fitting.hierarchy import effect_information, pooled_stds
 from slipid.fitting.problem import Problem, linear
 from slipid.fitting.variances import DEGREES, VARIANCE_SPREAD, information
 from slipid.infer.posterior import diagnosis, ensemble
-from slipid.infer.posterior.blocks import (
-    BlockStore,
-    Chain,
-    ChainBlock,
-    LogDensity,
-    Plan,
-    packed,
-    unpacked,
-)
+from slipid.infer.posterior.blocks import Chain, ChainBlock, LogDensity, Plan
 from slipid.infer.posterior.coordinates import ELECTRIC, EVERYTHING, MOTION, Fitted, effects_at
 from slipid.infer.posterior.density import Density, electric_given_motion
 from slipid.infer.posterior.diagnosis import Posterior
@@ -46,89 +38,52 @@ from slipid.support.progress import Reporter
 for _module in ("arviz_base", "arviz_stats", "h5netcdf"):
     importlib.import_module(_module)  # a missing package must fail here, not after hours
 
-STILL = 0.01
+MOST_STILL = 0.01
 """Largest fraction of draws whose electric numbers have no accepted proposal."""
 
 
 def sampled(
     fit: Fit, plan: Plan, draws: int, checkpoint: Checkpoint | None, report: Reporter
 ) -> Posterior:
-    """Return the posterior of a fit, sampled with progress reports and checkpoints.
+    """Return the posterior sampled around a fit, with `draws` draws from each ensemble.
 
     Sampling continues after the blocks that an earlier call has stored in the checkpoint.
     """
-
-    def done(part: str) -> list[ChainBlock]:
-        blocks: list[ChainBlock] = []
-        if checkpoint is None:
-            return blocks
-        while (arrays := checkpoint.load(f"{part}-{len(blocks):04d}")) is not None:
-            blocks.append(unpacked(arrays))
-        if blocks:
-            report.line(f"going on from block {len(blocks)} ({part}) of {checkpoint.folder}")
-        return blocks
-
-    def keep(part: str, block: ChainBlock) -> None:
-        if checkpoint is not None:
-            checkpoint.save(f"{part}-{block.number:04d}", packed(block))
-        _show_progress(block, plan, report)
-
-    def steps(part: str, count: int) -> None:
-        report.stage(f"sampling {part}")
-
-    return sample(fit, plan, draws, BlockStore(done, keep, steps))
-
-
-def _show_progress(block: ChainBlock, plan: Plan, report: Reporter) -> None:
-    """Show the progress of a chain; the remaining time is that to the plan's limit of blocks."""
-    count = block.number + 1
-    warm = "warm-up, " if count <= plan.warm_up[-1] else ""
-    what = (
-        f"block {count}: {warm}{count * block.chain.shape[1]} steps, "
-        f"{100 * block.accepted.mean():.0f} % moved, "
-        f"log density {block.log_prob[:, -1].mean():.1f}"
-    )
-    report.advance(count, plan.most, what)
-
-
-def sample(fit: Fit, plan: Plan, draws: int = 400, store: BlockStore | None = None) -> Posterior:
-    """Return the posterior sampled around a fit, with `draws` draws from each ensemble."""
     problem, fitted = required(fit.problem), Fitted.of(fit)
     assert problem.multi_floor is None, "runs on one floor each"
-    store = store or BlockStore()
     parts = (EVERYTHING,) if problem.objective.joint else (MOTION, ELECTRIC)
     first = Density(problem, fitted, parts[0])
-    at = first.coordinates
-    target = LogDensity(first.terms, first.slope, at.group, first.centre, first.covariance)
-    blocks = ensemble.extended(target, plan, parts[0], store)
+    target = LogDensity(first.terms, first.slope, first.group, first.centre, first.covariance)
+    blocks = ensemble.extended(target, plan, parts[0], checkpoint, report)
     chain = ensemble.chain(blocks, plan)
     found = diagnosis.diagnose(chain, plan)
     x, log_prob = thinned(chain, blocks[plan.warm_up[-1] :], draws)
     shape = (plan.ensembles, draws)
     out = np.broadcast_to(fitted.z, (*shape, len(fitted.z))).copy()
-    out[..., at.structure] = x
+    out[..., first.structure] = x
     accepted = {parts[0]: float(np.mean([b.accepted for b in blocks]))}
     still, reason = 0.0, f"{found.reason} ({first.names[found.worst]})"
     if len(parts) > 1:
         second = Density(problem, fitted, ELECTRIC)
         if second.size:
-            store.progress(ELECTRIC, 0)
-            later = electric_given_motion(first, second, fitted.covariance, x, plan.seed)
-            out[..., second.coordinates.structure] = later.x
-            accepted[ELECTRIC], still = later.accepted, later.still
+            report.stage(f"sampling {ELECTRIC}")
+            drawn, moved = electric_given_motion(first, second, fitted.covariance, x, plan.seed)
+            out[..., second.structure] = drawn
+            accepted[ELECTRIC] = float(moved.mean())
+            still = float((~moved.any(axis=1)).mean())
     if not np.isfinite(out).all():
         still, reason = 1.0, "electric draws that are not finite"
-    elif found.converged and still > STILL:
+    elif found.converged and still > MOST_STILL:
         reason = f"{100 * still:.1f} % of the electric draws, which never moved"
     return Posterior(
         fit=fit,
         z=out,
         log_variance=drawn_variances(problem, fitted, shape, plan.seed),
         log_prob=log_prob,
-        names=at.names,
+        names=first.names,
         diagnosis=found,
         accepted=accepted,
-        converged=found.converged and still <= STILL,
+        converged=found.converged and still <= MOST_STILL,
         reason=reason,
     )
 
@@ -189,7 +144,7 @@ def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
     noise, noise_dims = _noise(problem, found)
     x = found.z
     density = Density(problem, replace(Fitted.of(fit), z=x.mean(axis=(0, 1))), EVERYTHING)
-    of_segment = density.pointwise(x.reshape(-1, x.shape[-1]))
+    of_segment = density.of_all(Density.log_likelihoods, x.reshape(-1, x.shape[-1]))
     per_segment = {k: np.asarray(v).reshape(*x.shape[:2], -1) for k, v in of_segment.items()}
     run = np.unique(w.run)
     onto = (np.asarray(w.run)[:, None] == run).astype(float)
@@ -312,7 +267,8 @@ def _replicates(
     some, noise = x[:, picked], log_variance[:, picked].reshape(-1, log_variance.shape[-1])
     rng = np.random.default_rng(0)
     flat = some.reshape(-1, x.shape[-1])
-    out = {k: np.array(v) for k, v in density.residuals(flat).items()}
+    residuals = density.of_all(Density.residual_blocks, flat)
+    out = {k: np.array(v) for k, v in residuals.items()}
     for k, r in out.items():
         for one, log_v in zip(r, noise, strict=True):
             root = np.linalg.cholesky(np.asarray(density.problem.covariance(k, log_v)))

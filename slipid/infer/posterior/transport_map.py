@@ -21,7 +21,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations_with_replacement
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -33,19 +32,19 @@ Matrix = Float[np.ndarray, "_ _"]
 Vector = Float[np.ndarray, " _"]
 Leaf = Array | np.ndarray
 """A NumPy array while a map is learnt, a JAX array in the inverse map."""
-A = TypeVar("A", Array, np.ndarray)
-"""Either kind of array; the result has the kind of the argument."""
-FAR = 4.0
+FLAT_FROM = 4.0
 """Size of a whitened coordinate w beyond which polynomials are constant [std]."""
 SQUARED = 5
 """Number of coordinates of a group, with the largest variances, whose squares and products are
 monomials."""
 CUBED = 3
 """Number of coordinates of a group, with the largest variances, whose cubes are monomials."""
-WORTH = 3.0
+WORTH_NATS = 3.0
 """Smallest gain in log likelihood for which a monomial is included [nat]."""
 MOST_MONOMIALS = 12
 """Largest number of monomials added for a coordinate, in its mean and log std together."""
+MOST_DRAWS = 4000
+"""Largest number of draws that a map is learnt from."""
 
 
 @jax.tree_util.register_dataclass
@@ -75,12 +74,11 @@ class Warp:
         inner = (jnp.arcsinh(u) + self.skew) / self.tail
         return jnp.asarray(self.place + self.scale * jnp.sinh(inner))
 
-    def log_slope(self, u: A) -> A:
+    def log_slope(self, u: Leaf) -> Array:
         """Return log dv/du of every coordinate."""
-        xp = u.__array_namespace__()
-        inner = xp.abs((xp.asinh(u) + self.skew) / self.tail)
-        cosh = inner + xp.log1p(xp.exp(-2 * inner)) - np.log(2)  # without overflow
-        return xp.log(self.scale / self.tail) + cosh - 0.5 * xp.log1p(u**2)
+        inner = jnp.abs((jnp.arcsinh(u) + self.skew) / self.tail)
+        cosh = inner + jnp.log1p(jnp.exp(-2 * inner)) - np.log(2)  # without overflow
+        return jnp.log(self.scale / self.tail) + cosh - 0.5 * jnp.log1p(u**2)
 
     @staticmethod
     def none(size: int) -> "Warp":
@@ -110,59 +108,135 @@ def _sinh_arcsinh(x: Vector) -> tuple[float, float, float, float]:
     return middle + width * q[0], width * float(np.exp(q[1])), q[2], float(np.exp(q[3]))
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
-class Polynomials:
-    """Polynomials a and b of a group's coordinates.
+class Transport:
+    """Map of vectors x (row, size) to u (row, size), and its inverse, one coordinate per step.
+
+    Steps of the inverse work on a matrix with the columns of all w, of all x - m, which are zero
+    until their step, and a column of ones:
+
+        w_i = f_i . shift_i + exp(f_i . scale_i) v_i,   x_i - m_i = columns . slope_i
+
+    with monomials f_i. Arrays have fixed shapes, so that XLA compiles the inverse once, although
+    groups and monomials differ between maps.
 
     Attributes:
-        factors: indices of the three columns of (w, 1) whose product is the monomial.
-        shift: coefficients of a, by coordinate and monomial.
-        scale: coefficients of b.
+        mean: m, mean of x.
+        last: map from v to u.
+        order: index of each step's coordinate.
+        slope: weights of the columns in x_i - m_i.
+        root: log dx_i / dw_i of each step.
+        factors: columns whose product is each monomial (step, monomial, 3).
+        shift: coefficients of the mean of w_i.
+        scale: coefficients of the log std of w_i.
     """
 
-    factors: Int[np.ndarray, "monomial 3"]
-    shift: Float[np.ndarray, "coordinate monomial"]
-    scale: Float[np.ndarray, "coordinate monomial"]
+    mean: Leaf
+    last: Warp
+    order: Leaf
+    slope: Leaf
+    root: Leaf
+    factors: Leaf
+    shift: Leaf
+    scale: Leaf
 
-    def monomials(self, w: Matrix) -> Matrix:
-        """Return the values of the monomials (row, monomial)."""
-        columns = np.concatenate([np.clip(w, -FAR, FAR), np.ones((len(w), 1))], axis=1)
-        return np.asarray(columns[:, self.factors].prod(axis=2))
+    @property
+    def steps(self) -> "_Step":
+        """Arrays of the steps: order, slope, root, factors, shift, scale."""
+        return self.order, self.slope, self.root, self.factors, self.shift, self.scale
 
-    def forward(self, w: Matrix) -> Matrix:
-        """Return the coordinates v of w."""
-        f = self.monomials(w)
-        return np.asarray((w - f @ self.shift.T) * np.exp(-f @ self.scale.T))
+    def forward(self, x: Matrix) -> Matrix:
+        """Return the coordinates u of x."""
+        size, v = x.shape[1], np.empty_like(x)
+        columns = np.concatenate([np.zeros_like(x), x - self.mean, np.ones((len(x), 1))], axis=1)
+        for i, slope, root, factors, shift, scale in zip(*self.steps, strict=True):
+            f = np.clip(columns[:, factors], -FLAT_FROM, FLAT_FROM).prod(axis=2)
+            w = (columns[:, size + i] - columns @ slope) * np.exp(-root)
+            v[:, i] = (w - f @ shift) * np.exp(-f @ scale)
+            columns[:, i] = w
+        return self.last.forward(v)
 
-    @staticmethod
-    def none(size: int) -> "Polynomials":
-        """Return polynomials that are zero, with all possible monomials."""
-        one = size  # the column of ones
-        factors = [(one, one, one)] + [(k, one, one) for k in range(size)]
-        squared, cubed = range(min(SQUARED, size - 1)), range(min(CUBED, size - 1))
-        factors += [(*pair, one) for pair in combinations_with_replacement(squared, 2)]
-        factors += [(k, k, k) for k in cubed]
-        nothing = np.zeros((size, len(factors)))
-        return Polynomials(np.array(factors), nothing, nothing.copy())
+    def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
+        """Return the coordinates x of u, and log |dx/du| as a sum over coordinates (row, size)."""
+        x, log = _placed(self._on_device, u)
+        return np.array(x), np.array(log)
 
-    @staticmethod
-    def learnt(w: Matrix, effective: float) -> "Polynomials":
-        """Return polynomials fitted to draws that count as `effective` independent ones."""
-        size = w.shape[1]
-        bend = Polynomials.none(size)
-        f = bend.monomials(w)
-        reach = np.where(bend.factors >= size, -1, bend.factors).max(axis=1)
-        for i in range(size):
-            own = np.flatnonzero(reach < i)
-            bend.shift[i, own], bend.scale[i, own] = _regression(f[:, own], w[:, i], effective)
-        return bend
+    def pulled_back(self, u: Matrix, slope: Callable[[Matrix], Matrix]) -> Matrix:
+        """Return the gradient by u of log |dx/du| + f(x), given the gradient `slope` of f."""
+        return np.array(_pulled(self._on_device, u, slope(self.placed(u)[0])))
+
+    @cached_property
+    def _on_device(self) -> "Transport":
+        """The map with its arrays copied to the device once, not in every call."""
+        with jax.ensure_compile_time_eval():  # a cached property must not contain tracers
+            on_device: Transport = jax.device_put(self)
+            return on_device
+
+
+_Step = tuple[Leaf, Leaf, Leaf, Leaf, Leaf, Leaf]
+
+
+@jax.jit
+def _placed(map: Transport, u: Array) -> tuple[Array, Array]:
+    rows, size = u.shape
+    v = map.last.back(u)
+
+    def step(columns: Array, s: _Step) -> tuple[Array, tuple[Array, Array]]:
+        i, slope, root, factors, shift, scale = s
+        f = jnp.clip(columns[:, factors], -FLAT_FROM, FLAT_FROM).prod(axis=2)
+        spread = f @ scale
+        columns = columns.at[:, i].set(f @ shift + jnp.exp(spread) * v[:, i])
+        about = columns @ slope
+        return columns.at[:, size + i].set(about), (about, spread + root)
+
+    start = jnp.zeros((rows, 2 * size + 1)).at[:, -1].set(1.0)
+    _, (about, log) = jax.lax.scan(step, start, map.steps)
+    there = jnp.zeros_like(u).at[:, map.order].set(about.T)
+    return jnp.asarray(map.mean) + there, map.last.log_slope(u).at[:, map.order].add(log.T)
+
+
+@jax.jit
+def _pulled(map: Transport, u: Array, slope: Array) -> Array:
+    (_, log), back = jax.vjp(lambda u: _placed(map, u), u)
+    (out,) = back((slope, jnp.ones_like(log)))
+    return jnp.asarray(out)
+
+
+def _monomials(
+    w: Matrix, effective: float
+) -> tuple[Int[np.ndarray, "coordinate monomial 3"], Matrix, Matrix]:
+    """Return the polynomials a and b of each coordinate, fitted to draws w of a group.
+
+    They are given by the factors of their monomials, indices of columns of (w, 1), and the
+    coefficients of a and of b. The draws count as `effective` independent ones.
+    """
+    size = w.shape[1]
+    one = size  # the column of ones
+    every = [(one, one, one)] + [(k, one, one) for k in range(size)]
+    squared, cubed = range(min(SQUARED, size - 1)), range(min(CUBED, size - 1))
+    every += [(*pair, one) for pair in combinations_with_replacement(squared, 2)]
+    every += [(k, k, k) for k in cubed]
+    of_each = np.array(every)
+    columns = np.concatenate([np.clip(w, -FLAT_FROM, FLAT_FROM), np.ones((len(w), 1))], axis=1)
+    f = columns[:, of_each].prod(axis=2)
+    reach = np.where(of_each >= size, -1, of_each).max(axis=1)
+    factors = np.full((size, MOST_MONOMIALS + 1, 3), one)
+    shift, scale = np.zeros((2, size, MOST_MONOMIALS + 1))
+    for i in range(size):
+        own = np.flatnonzero(reach < i)
+        a, b = _regression(f[:, own], w[:, i], effective)
+        used = np.flatnonzero((a != 0) | (b != 0))
+        factors[i, : len(used)] = of_each[own[used]]
+        shift[i, : len(used)], scale[i, : len(used)] = a[used], b[used]
+    return factors, shift, scale
 
 
 def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]:
     """Return coefficients of the mean and of the log std of w given monomials f, most of them zero.
 
     Monomials are included one by one, in order of their score statistics, as long as the next one
-    gains more than `WORTH` nats for `effective` independent rows.
+    gains more than `WORTH_NATS` nats for `effective` independent rows.
     """
     shift, scale, means, spreads = np.zeros(f.shape[1]), np.zeros(f.shape[1]), [0], [0]
     share = effective / len(w)
@@ -180,7 +254,7 @@ def _regression(f: Matrix, w: Vector, effective: float) -> tuple[Vector, Vector]
         of_mean = _scores(f * root[:, None], means, root * (w - f @ shift))
         gains = share * np.stack([0.5 * of_mean, 0.25 * _scores(f, spreads, excess)])
         which, best = np.unravel_index(np.argmax(gains), gains.shape)
-        if gains[which, best] < WORTH:
+        if gains[which, best] < WORTH_NATS:
             break
         (means, spreads)[which].append(int(best))
     return shift, scale
@@ -198,179 +272,50 @@ def _scores(f: Matrix, taken: list[int], residual: Vector) -> Vector:
     return np.where(dependent, 0.0, (others.T @ residual) ** 2 / np.where(dependent, 1.0, square))
 
 
-MOST_DRAWS = 4000
-"""Largest number of draws that a map is learnt from."""
+def gaussian(
+    mean: Vector,
+    covariance: Matrix,
+    group: Int[np.ndarray, " _"],
+    at_mode: Matrix | None = None,
+    draws: Matrix | None = None,
+    effective: float = 0.0,
+) -> Transport:
+    """Return the linear map of a Gaussian, or with draws a map with the polynomials learnt from it.
 
+    Shared coordinates come first, then group by group. Coordinates with the largest conditional
+    variance at the mode come first in a group: at the mode these are the ones along a curved
+    valley, whereas draws have large variances across it as well.
 
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """Map of the shared coordinates, or of a group's coordinates given the shared ones.
-
-    Attributes:
-        own: indices of the mapped coordinates.
-        given: indices of the coordinates that they depend on.
-        slope: B, regression coefficients of the mapped coordinates on the given ones.
-        root: Cholesky factor of the conditional covariance.
-        bend: polynomials of the whitened residuals, None for shared coordinates.
+    Args:
+        mean: mean of x.
+        covariance: covariance of x.
+        group: group of each coordinate, -1 if shared.
+        at_mode: covariance at the mode, that of the Gaussian by default.
+        draws: draws from which the polynomials of groups are learnt.
+        effective: number of independent draws that they count as.
     """
-
-    own: Int[np.ndarray, " own"]
-    given: Int[np.ndarray, " given"]
-    slope: Float[np.ndarray, "given own"]
-    root: Float[np.ndarray, "own own"]
-    bend: Polynomials | None
-
-    def whitened(self, about: Matrix) -> Matrix:
-        """Return the whitened coordinates w of this stage, from all coordinates of x - m."""
-        residual = about[:, self.own] - about[:, self.given] @ self.slope
-        return np.asarray(np.linalg.solve(self.root, residual.T).T)
-
-
-@dataclass(frozen=True, eq=False)
-class Transport:
-    """Map of vectors x (row, size) to u (row, size), and its inverse.
-
-    Attributes:
-        mean: m, mean of x.
-        stages: maps from x to v; each coordinate is in one of them.
-        last: map from v to u.
-    """
-
-    mean: Vector
-    stages: tuple[Stage, ...]
-    last: Warp
-
-    def forward(self, x: Matrix) -> Matrix:
-        """Return the coordinates u of x."""
-        about = x - self.mean
-        v = np.empty_like(about)
-        for s in self.stages:
-            w = s.whitened(about)
-            v[:, s.own] = s.bend.forward(w) if s.bend else w
-        return self.last.forward(v)
-
-    def placed(self, u: Matrix) -> tuple[Matrix, Matrix]:
-        """Return the coordinates x of u, and log |dx/du| as a sum over coordinates (row, size)."""
-        x, log = _placed(self._back, u)
-        return np.array(x), np.array(log)
-
-    def pulled_back(self, u: Matrix, slope: Callable[[Matrix], Matrix]) -> Matrix:
-        """Return the gradient by u of log |dx/du| + f(x), given the gradient `slope` of f."""
-        return np.array(_pulled(self._back, u, slope(self.placed(u)[0])))
-
-    @cached_property
-    def _back(self) -> "InverseSteps":
-        with jax.ensure_compile_time_eval():  # a cached property must not contain tracers
-            return _steps(self)
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True, eq=False)
-class InverseSteps:
-    """Inverse map from u to x, one coordinate per step, in arrays of fixed shapes.
-
-    Because of the fixed shapes XLA compiles it once, although stages and monomials differ between
-    maps. Steps work on a matrix with the columns of all w, of all x - m, which are zero until their
-    step, and a column of ones:
-
-        w_i = f_i . shift_i + exp(f_i . scale_i) v_i,   x_i - m_i = columns . slope_i
-
-    Attributes:
-        mean: m, mean of x.
-        last: map from v to u.
-        order: index of each step's coordinate.
-        slope: weights of the columns in x_i - m_i.
-        root: log dx_i / dw_i of each step.
-        factors: columns whose product is each monomial (step, term, 3).
-        shift: coefficients of the mean of w_i.
-        scale: coefficients of the log std of w_i.
-    """
-
-    mean: Array
-    last: Warp
-    order: Array
-    slope: Array
-    root: Array
-    factors: Array
-    shift: Array
-    scale: Array
-
-
-def _steps(map: Transport) -> InverseSteps:
-    size = len(map.mean)
-    slope, root = np.zeros((size, 2 * size + 1)), np.zeros(size)
+    size, shared = len(mean), np.flatnonzero(group < 0)
+    slope, root, order = np.zeros((size, 2 * size + 1)), np.zeros(size), np.zeros(0, int)
     factors = np.full((size, MOST_MONOMIALS + 1, 3), 2 * size)
     shift, scale = np.zeros((2, size, MOST_MONOMIALS + 1))
-    k = 0
-    for s in map.stages:
-        columns = np.append(s.own, 2 * size)
-        for i in range(len(s.own)):
-            slope[k, s.own], slope[k, size + s.given] = s.root[i], s.slope[:, i]
-            root[k] = np.log(s.root[i, i])
-            if s.bend:
-                own = np.flatnonzero((s.bend.shift[i] != 0) | (s.bend.scale[i] != 0))
-                factors[k, : len(own)] = columns[s.bend.factors[own]]
-                shift[k, : len(own)] = s.bend.shift[i, own]
-                scale[k, : len(own)] = s.bend.scale[i, own]
-            k += 1
-    order = np.concatenate([s.own for s in map.stages])
-    # copied to the device once, not in every call
-    arrays = (map.mean, map.last, order, slope, root, factors, shift, scale)
-    return InverseSteps(*jax.device_put(arrays))
-
-
-_Step = tuple[Array, Array, Array, Array, Array, Array]
-"""One step of `InverseSteps`: order, slope, root, factors, shift, scale."""
-
-
-@jax.jit
-def _placed(map: InverseSteps, u: Array) -> tuple[Array, Array]:
-    rows, size = u.shape
-    v = map.last.back(u)
-
-    def step(columns: Array, s: _Step) -> tuple[Array, tuple[Array, Array]]:
-        i, slope, root, factors, shift, scale = s
-        f = jnp.clip(columns[:, factors], -FAR, FAR).prod(axis=2)
-        spread = f @ scale
-        columns = columns.at[:, i].set(f @ shift + jnp.exp(spread) * v[:, i])
-        about = columns @ slope
-        return columns.at[:, size + i].set(about), (about, spread + root)
-
-    start = jnp.zeros((rows, 2 * size + 1)).at[:, -1].set(1.0)
-    steps = (map.order, map.slope, map.root, map.factors, map.shift, map.scale)
-    _, (about, log) = jax.lax.scan(step, start, steps)
-    there = jnp.zeros_like(u).at[:, map.order].set(about.T)
-    return map.mean + there, map.last.log_slope(u).at[:, map.order].add(log.T)
-
-
-@jax.jit
-def _pulled(map: InverseSteps, u: Array, slope: Array) -> Array:
-    (_, log), back = jax.vjp(lambda u: _placed(map, u), u)
-    (out,) = back((slope, jnp.ones_like(log)))
-    return jnp.asarray(out)
-
-
-def gaussian(mean: Vector, covariance: Matrix, group: np.ndarray) -> Transport:
-    """Return the linear map of a Gaussian; `group` holds each coordinate's group, -1 if shared."""
-    return Transport(mean, _stages(covariance, group, covariance), Warp.none(len(mean)))
-
-
-def _stages(covariance: Matrix, group: np.ndarray, at_mode: Matrix) -> tuple[Stage, ...]:
-    """Return the stages of a Gaussian, shared coordinates first, then group by group.
-
-    Coordinates with the largest conditional variance at the mode come first in a stage: at the mode
-    these are the ones along a curved valley, whereas draws have large variances across it as well.
-    """
-    stages, shared = [], np.flatnonzero(group < 0)
     for g in range(-1, int(group.max()) + 1):
         own, given = np.flatnonzero(group == g), shared if g >= 0 else shared[:0]
         if not len(own):
             continue
-        own = own[np.argsort(-np.diag(_given(at_mode, own, given)[1]))]
-        slope, conditional = _given(covariance, own, given)
-        bend = Polynomials.none(len(own)) if g >= 0 else None
-        stages.append(Stage(own, given, slope, np.linalg.cholesky(conditional), bend))
-    return tuple(stages)
+        mode = covariance if at_mode is None else at_mode
+        own = own[np.argsort(-np.diag(_given(mode, own, given)[1]))]
+        by_given, conditional = _given(covariance, own, given)
+        lower = np.linalg.cholesky(conditional)
+        at = np.arange(len(order), len(order) + len(own))
+        order, root[at] = np.append(order, own), np.log(np.diag(lower))
+        slope[np.ix_(at, own)], slope[np.ix_(at, size + given)] = lower, by_given.T
+        if g >= 0 and draws is not None:
+            about = draws - mean
+            residual = about[:, own] - about[:, given] @ by_given
+            w = np.linalg.solve(lower, residual.T).T
+            of_group, shift[at], scale[at] = _monomials(w, effective)
+            factors[at] = np.append(own, 2 * size)[of_group]
+    return Transport(mean, Warp.none(size), order, slope, root, factors, shift, scale)
 
 
 def _given(covariance: Matrix, own: np.ndarray, given: np.ndarray) -> tuple[Matrix, Matrix]:
@@ -388,10 +333,6 @@ def learnt(draws: Matrix, effective: float, covariance: Matrix, group: np.ndarra
     """
     some = draws[:: max(1, len(draws) // MOST_DRAWS)]
     size, mean = some.shape[1], some.mean(axis=0)
-    about, stages = some - mean, []
-    both = (effective * np.cov(about.T) + size * covariance) / (effective + size)
-    for s in _stages(both, group, covariance):
-        bend = Polynomials.learnt(s.whitened(about), effective) if s.bend else None
-        stages.append(replace(s, bend=bend))
-    found = Transport(mean, tuple(stages), Warp.none(size))
+    both = (effective * np.cov((some - mean).T) + size * covariance) / (effective + size)
+    found = gaussian(mean, both, group, covariance, some, effective)
     return replace(found, last=Warp.learnt(found.forward(some)))

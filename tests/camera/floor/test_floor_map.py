@@ -19,12 +19,12 @@ pytestmark = pytest.mark.slow
 def test_points_on_surfaces_are_enough_under_uneven_light(made, by_points):
     true = truth_of(by_points, made)
     known = (true >= 0) & (by_points.labels >= 0)
-    assert set(by_points.vector.colours) == set(COLOURS)
+    assert set(by_points.vector.region.colours) == set(COLOURS)
     assert np.mean(by_points.labels[known] == true[known]) > 0.985
     assert known.mean() > 0.93
     assert not by_points.poor
     for name in COLOURS:
-        k = list(by_points.vector.colours).index(name)
+        k = list(by_points.vector.region.colours).index(name)
         assert np.mean(by_points.labels[known & (true == k)] == k) > 0.95
 
 
@@ -63,9 +63,9 @@ def test_hidden_floor_has_the_nearest_surface_and_a_note_gives_its_share(by_poin
     floor = read_map(tmp_path / "map.geojson")
     hidden = by_points.labels == -1
     assert floor.surfaces[int(np.bincount(floor.cells[hidden]).argmax())] == "wood"
-    assert by_points.vector.unknown == pytest.approx(hidden.mean())
+    assert by_points.vector.region.unknown_share == pytest.approx(hidden.mean())
     assert f"{100 * hidden.mean():.1f} % of the map's rectangle is unknown" in " ".join(
-        by_points.vector.notes
+        by_points.vector.region.notes
     )
 
 
@@ -74,7 +74,7 @@ def test_the_map_comes_back_from_its_file_within_a_cell_along_edges(by_points, t
     by_points.vector.save(path)
     floor = read_map(path)
     labels = by_points.labels
-    assert floor.surfaces == tuple(by_points.vector.colours)
+    assert floor.surfaces == tuple(by_points.vector.region.colours)
     assert floor.cells.shape == labels.shape
     grid = by_points.floor.grid
     assert floor.extent == pytest.approx(
@@ -117,12 +117,12 @@ def test_colours_alone_are_enough_where_light_is_not_too_uneven(tmp_path):
     true = truth_of(result, floor)
     known = (true >= 0) & (result.labels >= 0)
     assert np.mean(result.labels[known] == true[known]) > 0.98
-    assert result.vector.colours == COLOURS
+    assert result.vector.region.colours == COLOURS
 
 
 def test_surfaces_are_proposed_and_their_config_finds_them_again(made, tmp_path):
     result = mapped(made, tmp_path, REGION)
-    names = list(result.vector.colours)
+    names = list(result.vector.region.colours)
     assert names[0] == "surface_1"
     assert 5 <= len(names) <= 7
     centres = result.floor.grid.centres()
@@ -143,7 +143,7 @@ def test_surfaces_are_proposed_and_their_config_finds_them_again(made, tmp_path)
 
 
 def test_as_many_surfaces_are_proposed_as_are_requested(made, tmp_path):
-    assert len(mapped(made, tmp_path, REGION, surfaces=3).vector.colours) == 3
+    assert len(mapped(made, tmp_path, REGION, surfaces=3).vector.region.colours) == 3
 
 
 def test_two_names_of_one_surface_make_the_map_poor(made, tmp_path):

@@ -36,7 +36,7 @@ def test_the_test_site_agrees_with_the_drawing_by_hand(real_data, tmp_path):
     camera = OverheadCamera.straight_down((1062, 1036), 0.0022, 2.3)
     options = MapOptions(config, robot=RobotShape("4X4_50", 0.26, 0.25))
     result = map_of(image, camera, options, Reporter(quiet=True))
-    true, sure = reference(list(result.vector.colours))
+    true, sure = reference(list(result.vector.region.colours))
     labels = result.labels[::-1]
     known = sure & (labels >= 0)
     assert [robot.marker for robot in result.robots] == [0]

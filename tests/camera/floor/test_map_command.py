@@ -14,7 +14,6 @@ from slipid.camera.floor.region import FloorPicture
 from slipid.camera.overhead import OverheadCamera
 from slipid.cli.main import app
 from slipid.data.floor_map import read_map
-from slipid.data.geojson_map import read_vector_map
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 from tests.helpers.made_floors import COLOURS, POINTS, MadeFloor, aslant
@@ -106,9 +105,9 @@ def test_the_command_writes_a_map_that_others_read(made, tmp_path):
     assert not (out / "palette.toml").exists()
     shown = json.loads((out / "j").read_text())
     assert {one["surface"] for one in shown["surfaces"]} == set(COLOURS)
-    vector = read_vector_map(out / "map.geojson")
-    assert vector.base == "wood"
-    assert len(vector.picture_sha256) == 64
+    region = json.loads((out / "map.geojson").read_text())["slipid"]
+    assert region["base"] == "wood"
+    assert len(region["picture_sha256"]) == 64
     assert sum(one["area_m2"] for one in shown["surfaces"]) == pytest.approx(2.2 * 1.8, rel=0.06)
     floor = read_map(out / "map.geojson")
     for name, places in POINTS.items():

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slipid.data.reading.assemble import heading
 from slipid.data.reading.presets import declared_layout
 from slipid.data.reading.reader import read_logs, read_runs
-from slipid.data.reading.signal import Signal, SignalSource
+from slipid.data.reading.signal import Signal, SignalSource, heading
 from slipid.data.wheel_signals import readings, refresh_period
 from slipid.data.windows import UNREAD, windows
 from slipid.support.errors import DataError
@@ -212,7 +211,7 @@ def test_the_heading_of_a_tilted_body_is_where_it_points():
     tilt = np.random.default_rng(0).uniform(-0.4, 0.4, (12, 2))
     turned = Rotation.from_euler("ZYX", np.column_stack([np.linspace(-3.0, 3.0, 12), tilt]))
     source = SignalSource(Path("mocap.csv"), ("qx", "qy", "qz", "qw"), np.arange(12))
-    found = heading({"pose_quaternion": Signal(np.arange(12.0), turned.as_quat(), source)})
+    found = heading(Signal(np.arange(12.0), turned.as_quat(), source))
     ahead = turned.apply([1.0, 0.0, 0.0])
     np.testing.assert_allclose(found.values[:, 0], np.arctan2(*ahead.T[1::-1]), atol=1e-12)
 

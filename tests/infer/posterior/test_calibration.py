@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from slipid.infer.posterior import sample as posterior
-from slipid.infer.posterior.blocks import BlockStore, Plan
+from slipid.infer.posterior.blocks import Plan
 from slipid.infer.posterior.coordinates import MOTION
+from slipid.support.progress import Reporter
 from tests.helpers import calibration
 from tests.helpers.kept import kept
+from tests.helpers.memory import Memory
 
 SEEDS = (4, 7)
+QUIET = Reporter(quiet=True)
 
 
 @pytest.fixture(scope="module")
@@ -46,9 +48,7 @@ def test_a_small_undetermined_variance_is_not_kept_near_the_fit(replicates):
 def test_sampling_continues_from_any_block(whole, count):
     """Electric numbers and variances, drawn after the last block, are the same as well."""
     fit, plan, blocks, found = whole
-    again = posterior.sample(
-        fit, plan, draws=10, store=BlockStore(done=lambda part: blocks[part][:count])
-    )
+    again = posterior.sampled(fit, plan, 10, blocks.first(count), QUIET)
     np.testing.assert_array_equal(again.z, found.z)
     np.testing.assert_array_equal(again.log_variance, found.log_variance)
     assert again.accepted == found.accepted
@@ -59,10 +59,8 @@ def test_electric_numbers_are_drawn_anew_for_a_longer_chain(whole):
     """Electric draws belong to the draws of the motion that they are conditioned on."""
     fit, plan, blocks, found = whole
     longer = replace(plan, most=plan.most + 1)
-    anew = posterior.sample(fit, longer, draws=10)
-    again = posterior.sample(
-        fit, longer, draws=10, store=BlockStore(done=lambda part: blocks[part])
-    )
+    anew = posterior.sampled(fit, longer, 10, None, QUIET)
+    again = posterior.sampled(fit, longer, 10, blocks.first(plan.most), QUIET)
     np.testing.assert_array_equal(again.z, anew.z)
     electric = fit.space.electric
     assert (again.z[..., electric] != found.z[..., electric]).any()
@@ -77,13 +75,15 @@ def test_electric_draws_that_never_moved_prevent_convergence(whole, monkeypatch)
         "diagnose",
         lambda chain, plan: replace(diagnose(chain, plan), converged=True),
     )
-    store = BlockStore(done=lambda part: blocks[part])
-    assert posterior.sample(fit, plan, draws=10, store=store).converged
+    assert posterior.sampled(fit, plan, 10, blocks, QUIET).converged
     drawn = posterior.electric_given_motion
-    monkeypatch.setattr(
-        posterior, "electric_given_motion", lambda *given: replace(drawn(*given), still=0.5)
-    )
-    found = posterior.sample(fit, plan, draws=10, store=store)
+
+    def half_still(*given):
+        x, moved = drawn(*given)
+        return x, np.where(np.arange(len(moved))[:, None] % 2, moved, False)
+
+    monkeypatch.setattr(posterior, "electric_given_motion", half_still)
+    found = posterior.sampled(fit, plan, 10, blocks, QUIET)
     assert not found.converged
     assert found.reason == "50.0 % of the electric draws, which never moved"
 
@@ -94,12 +94,7 @@ def whole():
     fit, _ = calibration.experiment(12)
     # as many walkers as in test_chain.py, for which the densities are compiled
     plan = Plan(ensembles=2, walkers=6, block=5, warm_up=(1, 2), most=4)
-    blocks = defaultdict(list)
-    found = posterior.sample(
-        fit,
-        plan,
-        draws=10,
-        store=BlockStore(keep=lambda part, block: blocks[part].append(block)),
-    )
-    assert {part: len(made) for part, made in blocks.items()} == {MOTION: 4}
+    blocks = Memory()
+    found = posterior.sampled(fit, plan, 10, blocks, QUIET)
+    assert [part for part, _ in blocks.blocks] == [MOTION] * 4
     return fit, plan, blocks, found

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from slipid.infer.posterior import sample as posterior
-from slipid.infer.posterior.blocks import BlockStore, Plan
+from slipid.infer.posterior.blocks import Plan
+from slipid.support.progress import Reporter
 from tests.helpers import calibration
+from tests.helpers.memory import Memory
 
 PLAN = Plan(ensembles=2, walkers=6, block=4, warm_up=(1, 2), most=3)
 
@@ -16,15 +18,10 @@ PLAN = Plan(ensembles=2, walkers=6, block=4, warm_up=(1, 2), most=3)
 def test_a_short_chain(golden):
     """Long chains amplify rounding, these few steps do not."""
     fit, _ = calibration.experiment(3)
-    blocks = []
-    found = posterior.sample(
-        fit,
-        PLAN,
-        draws=10,
-        store=BlockStore(keep=lambda part, block: blocks.append((part, block))),
-    )
+    kept = Memory()
+    found = posterior.sampled(fit, PLAN, 10, kept, Reporter(quiet=True))
     rows = []
-    for part, block in blocks:
+    for part, block in kept.blocks:
         last = np.asarray(block.chain)[:, -1].mean(axis=1)
         for ensemble, mean in enumerate(last):
             rows.append(

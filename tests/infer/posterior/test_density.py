@@ -166,7 +166,7 @@ class Dense:
 
 def prior(problem, d, x):
     """Return the log prior of every coordinate, up to constants."""
-    at, space = d.coordinates.structure, problem.space
+    at, space = d.structure, problem.space
     found = np.exp(0.5 * fitted(problem).log_variance[problem.noise.names.index(POOLED)])
     std = np.where(["load_bias" in name for name in space.names], found, space.prior_std)
     return -0.5 * ((x - space.prior_mean[at]) / std[at]) ** 2
@@ -175,7 +175,7 @@ def prior(problem, d, x):
 def terms_of(problem, d, dense, x):
     """Return the terms of the log density of one vector, by definition."""
     z = np.asarray(d.full(d.anchor, jnp.asarray(x)))
-    of_prior, group = prior(problem, d, x), d.coordinates.group
+    of_prior, group = prior(problem, d, x), d.group
     own = [of_prior[group == g].sum() for g in (0, 1)]
     return np.append(dense.floors(z) + own, of_prior[group < 0].sum())
 
@@ -200,7 +200,8 @@ def test_residuals_are_less_shared_effects(problem):
     """Residuals less the conditional mean of shared effects have Student t likelihoods."""
     d, dense = density(problem, EVERYTHING), Dense(problem, BLOCKS[EVERYTHING])
     x = near(d)
-    found, likelihoods = d.residuals(x), d.pointwise(x)
+    found = d.of_all(Density.residual_blocks, x)
+    likelihoods = d.of_all(Density.log_likelihoods, x)
     assert found.keys() == likelihoods.keys() == set(BLOCKS[EVERYTHING])
     for j, one in enumerate(x):
         z = np.asarray(d.full(d.anchor, jnp.asarray(one)))
@@ -259,7 +260,7 @@ def test_numbers_of_one_floor_change_its_term_only(problem):
     d = density(problem, EVERYTHING)
     x = near(d, 1)[0]
     base = d.terms(x[None])[0]
-    for k, (name, group) in enumerate(zip(d.names, d.coordinates.group, strict=True)):
+    for k, (name, group) in enumerate(zip(d.names, d.group, strict=True)):
         moved = d.terms((x + 0.01 * np.eye(d.size)[k])[None])[0] - base
         changed = set(np.flatnonzero(np.abs(moved) > 1e-9))
         floor = next((f for f in ("firm", "soft") if f".{f}." in name), None)
@@ -287,7 +288,7 @@ def test_a_single_floor_is_a_single_group():
     truth = robot(floors=("firm",), loads=("as_built",), sessions=("one",))
     w = replace(made(truth, std=NOISE), has_current=False, has_voltage=False)
     d = density(Problem(w, truth, [FREE[0], Choice("surface.*.creep", free=True)]), EVERYTHING)
-    assert (d.coordinates.group == 0).all()
+    assert (d.group == 0).all()
     assert d.terms(near(d)).shape == (4, 2)
 
 

@@ -44,7 +44,7 @@ def test_a_map_is_inverted_and_has_correct_slopes(bent):
 def test_maps_that_have_learnt_different_things_are_compiled_once(bent):
     map, x = bent
     other = learnt(np.flip(x, axis=1), 500.0, np.eye(9), np.repeat([-1, 0, 0], 3))
-    assert len(other.stages) != len(map.stages)
+    assert not np.array_equal(other.factors, map.factors)
     u = np.random.default_rng(5).normal(size=(5, 9))
     map.placed(u)
     before = _placed._cache_size()
@@ -61,7 +61,7 @@ def test_a_map_is_stored_exactly(bent, tmp_path):
     np.savez(tmp_path / "block.npz", **packed(block))
     with np.load(tmp_path / "block.npz", allow_pickle=False) as kept:
         again = unpacked(dict(kept))
-    assert any(stage.bend for stage in again.map.stages)
+    assert again.map.shift.any()
     u = np.random.default_rng(4).normal(size=(6, 9))
     for one, other in zip(map.placed(u), again.map.placed(u), strict=True):
         np.testing.assert_array_equal(one, other)

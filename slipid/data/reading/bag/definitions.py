@@ -5,7 +5,7 @@ They come from the bag, else from .msg files, else from the standard types of RO
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Union, cast
 
@@ -15,8 +15,11 @@ if TYPE_CHECKING:
     import rosbags.interfaces
     import rosbags.interfaces.typing
 
-FieldType = Union["NumberType", "TextType", "ArrayType", "MessageType"]
-"""Type of a field: a number, a text, an array, or another message."""
+FieldType = Union[str, "ArrayType", "MessageType"]
+"""Type of a field: a number, by its numpy type without byte order (`f8`); `TEXT`; an array; or
+another message."""
+TEXT = "text"
+"""Type of a text in UTF-8."""
 _DTYPES = {
     **{f"int{8 * size}": f"i{size}" for size in (1, 2, 4, 8)},
     **{f"uint{8 * size}": f"u{size}" for size in (1, 2, 4, 8)},
@@ -27,23 +30,6 @@ _SEPARATOR = "=" * 80 + "\n"
 
 
 @dataclass(frozen=True)
-class NumberType:
-    """Type of a number; `dtype` is its numpy type without byte order, such as `f8`."""
-
-    dtype: str
-
-    @property
-    def size(self) -> int:
-        """Return the number of bytes of the number."""
-        return int(self.dtype[1:])
-
-
-@dataclass(frozen=True)
-class TextType:
-    """Type of a text in UTF-8."""
-
-
-@dataclass(frozen=True)
 class ArrayType:
     """Type of an array of `count` elements; None if the count differs between messages."""
 
@@ -51,29 +37,21 @@ class ArrayType:
     count: int | None
 
 
-@dataclass(frozen=True)
-class MessageField:
-    """A field of a message type: its name and its type."""
-
-    name: str
-    kind: FieldType
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MessageType:
     """A message type.
 
     Attributes:
         name: name of the type, such as `sensor_msgs/msg/Imu`.
-        fields: fields of the type, in their order in a message.
+        fields: type of each field, in their order in a message.
     """
 
     name: str
-    fields: tuple[MessageField, ...]
+    fields: dict[str, FieldType]
 
-    @property
+    @cached_property
     def paths(self) -> dict[str, str]:
-        """Return the type, such as `float64[]` or `text`, of every number and text by its path.
+        """Type, such as `float64[]` or `text`, of every number and text by its path.
 
         A path has the names of nested fields, separated by dots.
         """
@@ -82,72 +60,29 @@ class MessageType:
 
 def _below(kind: FieldType, path: str) -> Iterator[tuple[str, str]]:
     """Yield the path and the type of every number and text in a field."""
-    if isinstance(kind, NumberType):
-        yield path, _NAMES.get(kind.dtype, kind.dtype)
-    elif isinstance(kind, TextType):
-        yield path, "text"
+    if isinstance(kind, str):
+        yield path, _NAMES.get(kind, kind)
     elif isinstance(kind, ArrayType):
         count = "" if kind.count is None else str(kind.count)
         for below, what in _below(kind.element, path):
             # Brackets follow the type of the number, also for arrays inside messages of an array.
             yield below, f"{what}[{count}]"
     else:
-        for field in kind.fields:
-            yield from _below(field.kind, f"{path}.{field.name}" if path else field.name)
+        for name, inner in kind.fields.items():
+            yield from _below(inner, f"{path}.{name}" if path else name)
 
 
 class NoDefinition(ValueError):
     """Error about a message type without definition; its argument is the name of the type."""
 
 
-@dataclass(frozen=True, eq=False)
-class Definitions:
-    """Definitions of a bag's message types.
-
-    Attributes:
-        own: definitions in the bag itself, as rosbags parsed them.
-        folder: folder of .msg files, in which types that `own` lacks are searched, or None.
-    """
-
-    own: "rosbags.interfaces.typing.Typesdict"
-    folder: Path | None
-
-    def message(self, name: str) -> MessageType:
-        """Return a message type with all nested types; raise `NoDefinition` if one is not found."""
-        fields = self.own.get(name) or _from_folder(self.folder, name) or _standard().get(name)
-        if fields is None:
-            raise NoDefinition(name)
-        found = (MessageField(key, self._kind(description)) for key, description in fields[1])
-        return MessageType(name, tuple(found))
-
-    def _kind(self, description: "rosbags.interfaces.typing.FieldDesc") -> FieldType:
-        """Return the type of a field from its description by rosbags."""
-        from rosbags.interfaces import Nodetype
-
-        what = description[0]
-        if what == Nodetype.NAME:
-            return self.message(str(description[1]))
-        if what == Nodetype.BASE:
-            base = str(description[1][0])
-            if base != "string" and base not in _DTYPES:
-                raise NoDefinition(base)
-            return TextType() if base == "string" else NumberType(_DTYPES[base])
-        element, count = cast("tuple[rosbags.interfaces.typing.FieldDesc, int]", description[1])
-        return ArrayType(self._kind(element), count if what == Nodetype.ARRAY else None)
-
-
 def definition_of(
-    path: Path,
-    topic: str,
-    name: str,
-    carried: "rosbags.interfaces.MessageDefinition",
-    folder: Path | None,
+    where: str, name: str, carried: "rosbags.interfaces.MessageDefinition", folder: Path | None
 ) -> MessageType:
     """Return the definition of a topic's message type.
 
     Args:
-        path: the bag, for error messages.
-        topic: the topic, for error messages.
+        where: bag and topic, for error messages.
         name: name of the type, such as `robotino_msgs/msg/MotorReadings`.
         carried: definition in the bag; it may be empty.
         folder: folder of .msg files that are used if the bag has no definition, or None.
@@ -155,19 +90,15 @@ def definition_of(
     Raises:
         DataError: the type is defined nowhere, or its definition cannot be read.
     """
-    where = f"{path} topic '{topic}'"
     try:
-        own = _parsed(name, carried)
-        return Definitions(own, folder).message(name)
+        return _message(name, _parsed(name, carried), folder)
     except NoDefinition as error:
         missing = error.args[0]
         also = "" if missing == name else f", which {name} is made of"
-        asked = (
-            f"{folder} has no {missing.rsplit('/', 1)[-1]}.msg; expected" if folder else "expected"
-        )
+        nor = f"{folder} has no {missing.rsplit('/', 1)[-1]}.msg; " if folder else ""
         raise DataError(
-            f"{where}: no definition of {missing}{also} in the bag; {asked} one: name a folder of "
-            'its .msg files in the layout (definitions = "FOLDER")'
+            f"{where}: no definition of {missing}{also} in the bag; {nor}expected one: name a "
+            'folder of its .msg files in the layout (definitions = "FOLDER")'
         ) from None
     except DataError:
         raise
@@ -175,6 +106,36 @@ def definition_of(
         found = f"the definition of {name} cannot be read ({error})"
         expected = "the text of a .msg file; is the bag damaged?"
         raise bad_data(where, found, expected) from error
+
+
+def _message(
+    name: str, own: "rosbags.interfaces.typing.Typesdict", folder: Path | None
+) -> MessageType:
+    """Return a message type with all nested types; raise `NoDefinition` if one is not found.
+
+    Args:
+        name: name of the type.
+        own: definitions in the bag itself, as rosbags parsed them.
+        folder: folder of .msg files, in which types that `own` lacks are searched, or None.
+    """
+    from rosbags.interfaces import Nodetype
+
+    def field_type(description: "rosbags.interfaces.typing.FieldDesc") -> FieldType:
+        what, detail = description
+        if what == Nodetype.NAME:
+            return _message(str(detail), own, folder)
+        if what == Nodetype.BASE:
+            base = str(detail[0])
+            if base != "string" and base not in _DTYPES:
+                raise NoDefinition(base)
+            return _DTYPES.get(base, TEXT)
+        element, count = cast("tuple[rosbags.interfaces.typing.FieldDesc, int]", detail)
+        return ArrayType(field_type(element), count if what == Nodetype.ARRAY else None)
+
+    found = own.get(name) or _from_folder(folder, name) or _standard().get(name)
+    if found is None:
+        raise NoDefinition(name)
+    return MessageType(name, {key: field_type(description) for key, description in found[1]})
 
 
 def _parsed(
@@ -208,12 +169,8 @@ def _from_folder(
     from rosbags.typesys import get_types_from_msg
 
     package, short = name.split("/", 1)[0], name.rsplit("/", 1)[-1]
-    files = sorted(folder.rglob(f"{short}.msg"))
-    named = [path for path in files if package in path.parts]
-    if not (named or files):
-        return None
-    text = (named or files)[0].read_text(encoding="utf-8")
-    return get_types_from_msg(text, name)[name]
+    files = sorted(folder.rglob(f"{short}.msg"), key=lambda path: package not in path.parts)
+    return get_types_from_msg(files[0].read_text("utf-8"), name)[name] if files else None
 
 
 @lru_cache(maxsize=1)

@@ -1,14 +1,14 @@
 """Layout of a bag: the topic of each channel, and the rule that separates the bag's runs."""
 
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AliasChoices, BeforeValidator, Field, StrictBool, StrictFloat, StrictStr
 from pydantic.dataclasses import dataclass
 
-from slipid.data.reading.bag.shape import steps_of
+from slipid.data.reading.bag.shape import check_path
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, TURNS, SensorLayout, several, unknown
 from slipid.data.reading.units import factor
 from slipid.support.errors import DataError
@@ -52,7 +52,7 @@ class TopicChannel:
 
     def __post_init__(self) -> None:
         for path in self.fields:
-            steps_of(path)
+            check_path(path)
         if (self.frame is None) != (self.child is None):
             raise ValueError("one frame only; expected both frame and child, or none of them")
         if len(self.fields) > 1 and len(self.topics) > 1:
@@ -88,7 +88,7 @@ class RunRule:
             raise ValueError("expected one of topic, pause_s and table")
         for path in (self.field, self.surface, self.load):
             if path is not None:
-                steps_of(path)
+                check_path(path)
 
 
 @dataclass(frozen=True, config=CLOSED)
@@ -96,7 +96,6 @@ class BagLayout(SensorLayout):
     """Layout of the bags of one robot.
 
     Attributes:
-        name: name in messages.
         topics: position of each channel, or group of channels.
         joints: names of the drives' joints, in the order of the drives.
         runs: rule that separates runs; without it a bag is one run.
@@ -107,8 +106,7 @@ class BagLayout(SensorLayout):
         definitions: folder of .msg files, for message types whose definition the bag lacks.
     """
 
-    name: str
-    topics: Mapping[str, TopicChannel]
+    topics: dict[str, TopicChannel]
     joints: tuple[StrictStr, ...] = ()
     runs: RunRule | None = None
     stamp: Literal["header", "received"] = "header"
@@ -122,7 +120,6 @@ class BagLayout(SensorLayout):
         return frozenset(inner for name in self.topics for inner in GROUPS.get(name, (name,)))
 
 
-_SETTINGS = [f.name for f in fields(BagLayout) if f.name not in ("name", "topics")]
 _NAMES = [*GROUPS, *(name for name in CHANNELS if name not in ("time", "pose_quaternion"))]
 
 
@@ -140,24 +137,12 @@ def declared_bag_layout(
         DataError: unknown key, channel or unit, wrong dimension, wrong type.
     """
     given = {key: value for key, value in table.items() if key != "kind"}
-    topics = given.pop("topics", {})
-    for key in given:
-        if key not in _SETTINGS:
-            raise DataError(f"{where}: {unknown('key', key, ['kind', 'topics', *_SETTINGS])}")
-    if not isinstance(topics, dict) or not topics:
-        raise DataError(f"{where} topics: {topics!r}; expected a table of channels")
-    channels = {}
-    for name, spec in topics.items():
-        if name not in _NAMES:
-            raise DataError(f"{where} topics.{name}: {unknown('channel', name, _NAMES)}")
-        channels[name] = checked(f"{where} topics.{name}", spec, TopicChannel)
-        if problem := _channel_problem(name, channels[name]):
-            raise DataError(f"{where} topics.{name}: {problem}")
-    if isinstance(given.get("runs"), dict):
-        given["runs"] = checked(f"{where} runs", given["runs"], RunRule)
-    layout = checked(where, {**given, "name": where, "topics": {}}, BagLayout)
+    layout = checked(where, given, BagLayout)
     definitions = layout.definitions and folder / layout.definitions
-    layout = replace(layout, topics=channels, definitions=definitions)
+    layout = replace(layout, definitions=definitions)
+    for name, channel in layout.topics.items():
+        if problem := _channel_problem(name, channel):
+            raise DataError(f"{where} topics.{name}: {problem}")
     if problem := _problem(layout):
         raise DataError(f"{where}: {problem}")
     return layout
@@ -165,6 +150,8 @@ def declared_bag_layout(
 
 def _channel_problem(name: str, channel: TopicChannel) -> str | None:
     """Return a text about a contradiction in the position of one channel, or None."""
+    if name not in _NAMES:
+        return unknown("channel", name, _NAMES)
     if channel.frame is not None and name != "pose":
         return "frame and child, which belong to a pose; expected neither"
     if name in GROUPS:
@@ -191,6 +178,8 @@ def _problem(layout: BagLayout) -> str | None:
     for group, inner in GROUPS.items():
         if group in have and (twice := have & set(inner)):
             return f"{group} and {min(twice)}; expected one of them"
+    if not have:
+        return "topics: no channel; expected a table of channels"
     if 0 < len(have & set(GROUPS["pose"])) < 3:
         return "a pose in parts; expected pose, or all of pose_x, pose_y and pose_heading"
     if lacking := layout.lacks(have):

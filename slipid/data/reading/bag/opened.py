@@ -5,8 +5,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
+from slipid.data.reading.bag.definitions import MessageType, definition_of
+from slipid.data.reading.bag.shape import MessageShape, shape_of
 from slipid.data.reading.bag.storage import BagFiles, RepairedMcap, files_of, repaired
 from slipid.support.errors import DataError, bad_data
 
@@ -16,7 +18,6 @@ if TYPE_CHECKING:
     import rosbags.rosbag2
 
 Reader: TypeAlias = "rosbags.rosbag1.Reader | rosbags.rosbag2.Reader"
-_BATCH_BYTES = 1 << 20
 _REMEDY = {
     "rosbag1": "run: rosbag reindex {file}",
     "sqlite3": "save what is left with: sqlite3 {file} .recover | sqlite3 whole.db3",
@@ -25,45 +26,63 @@ _REMEDY = {
 _METADATA = "copy the folder again, or run: ros2 bag reindex {file}"
 
 
-class RawMessage(NamedTuple):
-    """A message as stored: its topic, the time at which it was received [ns], and its bytes."""
-
-    topic: str
-    received: int
-    data: bytes
-
-
 @dataclass(frozen=True, eq=False)
-class MessageBatch:
-    """Consecutive messages of one topic.
+class BagTopic:
+    """A topic of an open bag.
 
     Attributes:
-        topic: name of the topic.
-        received: time at which the recorder received each message [ns].
-        data: bytes of each message.
-    """
-
-    topic: str
-    received: list[int]
-    data: list[bytes]
-
-
-@dataclass(frozen=True, eq=False)
-class StoredTopic:
-    """A topic of a bag.
-
-    Attributes:
+        bag: the bag.
         name: name of the topic.
-        type: type of the messages, such as `sensor_msgs/msg/Imu`; if there are several, all of
-            them joined by " and ".
-        count: number of messages.
-        carried: definition of the type in the bag; it may be empty.
+        connections: rosbags' records of its publishers.
     """
 
+    bag: "OpenBag"
     name: str
-    type: str
-    count: int
-    carried: "rosbags.interfaces.MessageDefinition"
+    connections: "tuple[rosbags.interfaces.Connection, ...]"
+
+    @cached_property
+    def type(self) -> str:
+        """Type of the messages, such as `sensor_msgs/msg/Imu`; several are joined by " and "."""
+        return " and ".join(dict.fromkeys(one.msgtype for one in self.connections))
+
+    @cached_property
+    def count(self) -> int:
+        """Number of messages."""
+        return sum(one.msgcount for one in self.connections)
+
+    @cached_property
+    def message(self) -> MessageType:
+        """Definition of the messages' type; raises `DataError` if there is none."""
+        carried = [one.msgdef for one in self.connections]
+        first = next((one for one in carried if one.format.value), carried[0])
+        where = f"{self.bag.files.path} topic '{self.name}'"
+        return definition_of(where, self.type, first, self.bag.definitions)
+
+    def messages(self) -> Iterator[tuple[int, bytes]]:
+        """Yield the time of receipt [ns] and the bytes of each message, as `OpenBag.messages`."""
+        return ((received, data) for _, received, data in self.bag.messages([self.name]))
+
+    def shape(self, data: bytes, number: int) -> MessageShape:
+        """Return the shape of a message; raise `DataError` if it does not match its definition.
+
+        `number` is the number of the message in the topic, from 1.
+        """
+        try:
+            return shape_of(data, self.message, cdr=self.bag.files.storage != "rosbag1")
+        except ValueError as error:
+            found = f"it is no {self.message.name}: {error}"
+            expected = "messages as their definition says; is the bag damaged?"
+            raise self.error(found, expected, number) from error
+
+    def shapes(self) -> Iterator[MessageShape]:
+        """Yield the shape of each message."""
+        for number, (_, data) in enumerate(self.messages(), start=1):
+            yield self.shape(data, number)
+
+    def error(self, found: str, expected: str, number: int | None = None) -> DataError:
+        """Return the error about the topic, or about one of its messages, counted from 1."""
+        where = f"{self.bag.files.path} topic '{self.name}'"
+        return bad_data(where + ("" if number is None else f" message {number}"), found, expected)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,81 +93,39 @@ class OpenBag:
         files: files of the bag.
         readers: readers of the package rosbags, one for each part that is read separately.
         notes: defects of the files that were worked around, one sentence each.
+        definitions: folder of .msg files, for types whose definition the bag lacks, or None.
     """
 
     files: BagFiles
     readers: "tuple[Reader, ...]"
     notes: tuple[str, ...]
-
-    @property
-    def path(self) -> Path:
-        """Return the path of the bag, as error messages name it."""
-        return self.files.path
-
-    @property
-    def cdr(self) -> bool:
-        """Return whether messages are serialised as in ROS 2 (CDR), not as in ROS 1."""
-        return self.files.storage != "rosbag1"
+    definitions: Path | None
 
     @cached_property
-    def topics(self) -> dict[str, StoredTopic]:
-        """Return every topic by name."""
+    def topics(self) -> dict[str, BagTopic]:
+        """Every topic by name."""
         found: dict[str, list[rosbags.interfaces.Connection]] = {}
         for reader in self.readers:
             for connection in reader.connections:
                 found.setdefault(connection.topic, []).append(connection)
-        return {name: _topic(name, same) for name, same in sorted(found.items())}
+        return {name: BagTopic(self, name, tuple(same)) for name, same in sorted(found.items())}
 
-    @property
-    def end(self) -> int:
-        """Return the time at which the last message was received [ns]."""
-        return max(reader.end_time for reader in self.readers)
-
-    def messages(self, topics: Sequence[str], start: int | None = None) -> Iterator[RawMessage]:
-        """Yield messages of some topics in the order in which they were received.
-
-        Args:
-            topics: names of the topics.
-            start: messages received before this time [ns] are left out; None for all messages.
+    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Yield messages of some topics: topic, time of receipt [ns] and bytes.
 
         Raises:
             DataError: the bag is damaged.
         """
-        for connection, received, data in self._stored(topics, start):
-            if data.__class__ is not bytes:
-                error = TypeError(f"a message of type {type(data).__name__}")
-                raise damage_error(self.files, error)
-            yield RawMessage(connection.topic, received, data)
-
-    def _stored(self, topics: Sequence[str], start: int | None) -> Iterator[Any]:
-        """Yield the connection, time of receipt [ns] and bytes of each message, as rosbags does."""
         for reader in self.readers:
-            if wanted := [c for c in reader.connections if c.topic in topics]:
-                try:
-                    yield from _source(reader)(wanted, start)
-                except Exception as error:  # rosbags raises many types of errors on damaged bytes
-                    raise damage_error(self.files, error) from error
-
-    def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
-        """Yield all messages of some topics in batches of one topic, of about a megabyte.
-
-        All work for single messages is in this loop, which takes most of the time for a large bag.
-
-        Raises:
-            DataError: the bag is damaged.
-        """
-        waiting = {topic: MessageBatch(topic, [], []) for topic in topics}
-        room = dict.fromkeys(topics, _BATCH_BYTES)
-        for connection, received, data in self._stored(topics, None):
-            topic = connection.topic
-            batch = waiting[topic]
-            batch.received.append(received)
-            batch.data.append(data)
-            room[topic] -= len(data)
-            if room[topic] < 0:
-                yield batch
-                waiting[topic], room[topic] = MessageBatch(topic, [], []), _BATCH_BYTES
-        yield from (batch for batch in waiting.values() if batch.data)
+            if not (wanted := [c for c in reader.connections if c.topic in topics]):
+                continue
+            try:
+                for connection, received, data in _source(reader)(wanted):
+                    if data.__class__ is not bytes:
+                        raise TypeError(f"a message of type {type(data).__name__}")
+                    yield connection.topic, received, data
+            except Exception as error:  # rosbags raises many types of errors on damaged bytes
+                raise damage_error(self.files, error) from error
 
 
 def _source(reader: "Reader") -> Callable[..., Iterator[Any]]:
@@ -164,8 +141,12 @@ def _source(reader: "Reader") -> Callable[..., Iterator[Any]]:
 
 
 @contextmanager
-def open_bag(path: Path) -> Iterator[OpenBag]:
+def open_bag(path: Path, definitions: Path | None) -> Iterator[OpenBag]:
     """Return a context manager that opens a bag for reading, and closes it at its end.
+
+    Args:
+        path: a .bag, .db3 or .mcap file, the folder of a rosbag2, or the metadata.yaml in it.
+        definitions: folder of .msg files, for types whose definition the bag lacks, or None.
 
     Raises:
         DataError: there is no bag, or it is damaged; the message says how to repair it.
@@ -173,7 +154,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     files = files_of(path)
     with ExitStack() as stack:
         readers, notes = _readers(files, stack)
-        yield OpenBag(files, tuple(readers), tuple(notes))
+        yield OpenBag(files, tuple(readers), tuple(notes), definitions)
 
 
 def _readers(files: BagFiles, stack: ExitStack) -> "tuple[list[Reader], list[str]]":
@@ -229,14 +210,6 @@ def _reader(path: Path | RepairedMcap, files: BagFiles, stack: ExitStack) -> "Re
         return stack.enter_context(rosbag2.Reader(cast(Path, path)))
     except Exception as error:  # rosbags raises many types of errors on damaged bytes
         raise damage_error(files, error) from error
-
-
-def _topic(name: str, same: "list[rosbags.interfaces.Connection]") -> StoredTopic:
-    """Return a topic from its connections, which are rosbags' records of its publishers."""
-    types = dict.fromkeys(connection.msgtype for connection in same)
-    carried = [c.msgdef for c in same if c.msgdef.format.value] or [same[0].msgdef]
-    count = sum(connection.msgcount for connection in same)
-    return StoredTopic(name, " and ".join(types), count, carried[0])
 
 
 def damage_error(files: BagFiles, error: Exception) -> DataError:

@@ -1,8 +1,9 @@
 """Begin and end of the runs in a bag, which a topic, pauses or a table separate."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from math import inf, tau
 from pathlib import Path
 
@@ -11,10 +12,10 @@ from jaxtyping import Float
 
 from slipid.data.log import Log
 from slipid.data.reading.bag.layout import BagLayout, RunRule
-from slipid.data.reading.bag.opened import OpenBag
-from slipid.data.reading.bag.plan import message_of
-from slipid.data.reading.bag.shape import MessageShape, located_with_time, shape_of, steps_of
-from slipid.data.reading.bag.streams import topic_error
+from slipid.data.reading.bag.opened import BagTopic, OpenBag
+from slipid.data.reading.bag.plan import topic_of
+from slipid.data.reading.bag.shape import MessageShape, without_indices
+from slipid.data.reading.bag.streams import Located
 from slipid.data.reading.layout import TURNS
 from slipid.data.reading.signal import Signal
 from slipid.support.errors import bad_data, did_you_mean
@@ -25,7 +26,8 @@ PAUSE_S = 1.0
 """Least pause between runs that `slipid new` proposes for a bag with one long drive [s]."""
 COLUMNS = ("start", "end", "surface", "load", "name", "bag")
 """Columns that a table of runs may have; the first two are required."""
-Value = str | float
+_Mark = tuple[str | float, str | None, str | None]
+"""Value of the field that separates runs, and names of the surface and the load set-up, if any."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,8 @@ def run_spans(
 ) -> tuple[RunSpan, ...]:
     """Return the runs in a bag; without a rule in the layout, the whole bag is one run.
 
-    Runs in which the wheels have fewer than two samples are left out, with a note.
+    Runs in which the wheels have fewer than two samples are left out, with a note. Runs without a
+    name get a number, except a single run.
 
     Raises:
         DataError: there is no run, or the topic or the table of runs is wrong.
@@ -67,14 +70,19 @@ def run_spans(
     elif rule.pause_s is not None:
         found = by_pauses(layout, signals, rule.pause_s)
     else:
-        found = by_table(bag.path, rule, first if rule.from_start else 0.0)
+        found = by_table(bag.files.path, rule, first if rule.from_start else 0.0)
     inside = [one for one in found if _sampled(signals, one)]
     if not inside:
         last = max(float(signal.time[-1]) for signal in signals.values())
-        raise bad_data(bag.path, *_none(rule, found, f"from {first:.3f} to {last:.3f} s"))
+        raise bad_data(bag.files.path, *_none(rule, found, f"from {first:.3f} to {last:.3f} s"))
     if len(inside) < len(found):
         notes.append(f"{len(found) - len(inside)} runs left out that have no samples of the wheels")
-    return _named(inside)
+    width = 0 if len(inside) == 1 else max(2, len(str(len(inside))))
+    numbers = (f"#{k:0{width}d}" if width else "" for k in range(1, len(inside) + 1))
+    return tuple(
+        replace(one, suffix=one.suffix or number)
+        for one, number in zip(inside, numbers, strict=True)
+    )
 
 
 def _sampled(signals: Mapping[str, Signal], span: RunSpan) -> bool:
@@ -93,27 +101,15 @@ def _none(rule: RunRule, found: Sequence[RunSpan], samples: str) -> tuple[str, s
     if rule.pause_s is not None:
         return "no run: no wheel moves", f"a wheel that turns by more than {STILL:g} rad"
     if rule.topic is not None and not found:
-        between = ", ".join(repr(value) for value in rule.between)
-        return (
-            f"no run in topic '{rule.topic}'",
-            f"a value other than those between runs ({between})",
-        )
+        between = ", ".join(map(repr, rule.between))
+        expected = f"a value other than those between runs ({between})"
+        return f"no run in topic '{rule.topic}'", expected
     if rule.topic is not None:
-        found_ = f"no sample in the runs of topic '{rule.topic}' ({times})"
-        return found_, f'runs where the samples are, {samples}; perhaps stamp = "received"'
+        expected = f'runs where the samples are, {samples}; perhaps stamp = "received"'
+        return f"no sample in the runs of topic '{rule.topic}' ({times})", expected
     hint = "" if rule.from_start else "; where times count from the first sample: from_start = true"
     where = f" ({times})" if found else ""
     return f"no run of table {rule.table} lies in the bag{where}", f"times {samples}{hint}"
-
-
-def _named(found: Sequence[RunSpan]) -> tuple[RunSpan, ...]:
-    """Return the runs with suffixes: those without a name get a number, except a single run."""
-    if len(found) == 1:
-        return tuple(found)
-    width = max(2, len(str(len(found))))
-    return tuple(
-        replace(one, suffix=one.suffix or f"#{k:0{width}d}") for k, one in enumerate(found, start=1)
-    )
 
 
 def by_pauses(layout: BagLayout, signals: Mapping[str, Signal], pause_s: float) -> list[RunSpan]:
@@ -218,28 +214,6 @@ def _time(file: Path, row: int, column: str, cell: str | None) -> float:
         raise bad_data(file, found, "a time in seconds", row=row, column=column) from error
 
 
-@dataclass(frozen=True)
-class _TimedValue:
-    """Content of one message of the topic that separates runs.
-
-    Attributes:
-        time: time of the message [s].
-        value: value of the field that separates runs.
-        surface: name of the surface, or None.
-        load: name of the load set-up, or None.
-    """
-
-    time: float
-    value: Value
-    surface: str | None
-    load: str | None
-
-    @property
-    def marked(self) -> tuple[Value, str | None, str | None]:
-        """Return value, surface and load; a run lasts while they stay the same."""
-        return self.value, self.surface, self.load
-
-
 def by_topic(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[RunSpan]:
     """Return a run for each time in which the topic's values stay the same.
 
@@ -248,58 +222,37 @@ def by_topic(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[RunSpan]:
     Raises:
         DataError: the topic or a field is missing.
     """
-    found: list[RunSpan] = []
-    start: _TimedValue | None = None
-    for mark in (*_timed_values(bag, layout, rule), None):
-        if start is not None and mark is not None and mark.marked == start.marked:
-            continue
-        if start is not None and start.value not in rule.between:
-            end = inf if mark is None else mark.time
-            found.append(RunSpan(start.time, end, "", start.surface, start.load))
-        start = mark
-    return found
-
-
-def _timed_values(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[_TimedValue]:
-    """Return the content of every message of the rule's topic, in order of time."""
-    name = str(rule.topic)
-    message = message_of(bag, layout, name, "runs")
+    topic = topic_of(bag, str(rule.topic), "runs")
+    paths = topic.message.paths
     for path in (rule.field, rule.surface, rule.load):
-        plain = ".".join(step.name for step in steps_of(path)) if path else None
-        if plain is not None and plain not in message.paths:
-            found = f"no field '{path}' in {message.name}{did_you_mean(path, message.paths)}"
-            raise topic_error(bag.path, name, found, f"one of {', '.join(message.paths)}")
-    marks = []
-    for number, raw in enumerate(bag.messages((name,)), start=1):
-        block = np.frombuffer(raw.data, np.uint8)[None]
-        try:
-            shape = shape_of(raw.data, message, cdr=bag.cdr)
-            value = _value(shape, block, rule.field)
-        except ValueError as error:
-            expected = "messages as their definition says; is the bag damaged?"
-            raise topic_error(bag.path, name, str(error), expected, number) from error
+        if path is not None and without_indices(path) not in paths:
+            found = f"no field '{path}' in {topic.type}{did_you_mean(path, paths)}"
+            raise topic.error(found, f"one of {', '.join(paths)}")
+    marks = sorted(_marks(topic, layout, rule), key=lambda mark: mark[0])
+    changed = [next(same) for _, same in groupby(marks, key=lambda mark: mark[1])]
+    ends = [*(time for time, _ in changed[1:]), inf]
+    return [
+        RunSpan(start, end, "", surface, load)
+        for (start, (value, surface, load)), end in zip(changed, ends, strict=False)
+        if value not in rule.between
+    ]
+
+
+def _marks(topic: BagTopic, layout: BagLayout, rule: RunRule) -> Iterator[tuple[float, _Mark]]:
+    """Yield the time [s] and the content of every message of the topic that separates runs."""
+    for number, (received, data) in enumerate(topic.messages(), start=1):
+        block = np.frombuffer(data, np.uint8)[None]
+        shape = topic.shape(data, number)
+        texts, places = shape.texts(rule.field), shape.places(rule.field)
+        if not texts and not places:
+            raise topic.error(f"nothing in field '{rule.field}'", "a value in it", number)
+        value = texts[0] if texts else float(places[0].of(block)[0])
         surface, load = (_text(shape, path) for path in (rule.surface, rule.load))
-        stamp = located_with_time(shape, (), ()).stamp(block) if layout.stamp == "header" else None
-        time = raw.received if stamp is None else int(stamp[0])
-        marks.append(_TimedValue(time / 1e9, value, surface, load))
-    return sorted(marks, key=lambda mark: mark.time)
-
-
-def _value(shape: MessageShape, block: np.ndarray, path: str) -> Value:
-    """Return the text or number at a path in a message; raise `ValueError` if there is none.
-
-    `block` has the bytes of the message, in a single row.
-    """
-    steps = steps_of(path)
-    if texts := shape.texts(steps):
-        return texts[0]
-    numbers = shape.places(steps)
-    if not numbers:
-        raise ValueError(f"nothing in field '{path}'")
-    return float(numbers[0].of(block)[0])
+        stamp = Located.of(shape).stamp(block) if layout.stamp == "header" else None
+        time = received if stamp is None else int(stamp[0])
+        yield time / 1e9, (value, surface, load)
 
 
 def _text(shape: MessageShape, path: str | None) -> str | None:
     """Return the text at a path in a message, or None if there is no path or no text."""
-    texts: Sequence[str] = shape.texts(steps_of(path)) if path else ()
-    return (texts[0] or None) if texts else None
+    return next(iter(shape.texts(path) if path else ()), None) or None

@@ -4,33 +4,32 @@ Most messages of a topic have the same shape: equal texts, and arrays of equal l
 message is decoded field by field, and the numbers of all others with the same shape are taken from
 the same byte positions, thousands of messages at a time.
 
-Numbers are picked by paths of fields, by names of joints, or by frames of a transform.
+A path names a field, such as `motors[0].current`; without an index it stands for all elements.
 """
 
+import re
 import struct
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Int, Num, UInt8
 
-from slipid.data.reading.bag.definitions import (
-    ArrayType,
-    FieldType,
-    MessageType,
-    NumberType,
-    TextType,
-)
+from slipid.data.reading.bag.definitions import TEXT, ArrayType, FieldType, MessageType
+
+_PATH = re.compile(r"[^\W\d]\w*(\[\d+\])?(\.[^\W\d]\w*(\[\d+\])?)*")
 
 
-@dataclass(frozen=True)
-class PathStep:
-    """One step of a path: the name of a field, and the index of an element or None for all."""
+def check_path(path: str) -> None:
+    """Raise `ValueError` if a text is not a path of a field."""
+    if not _PATH.fullmatch(path):
+        raise ValueError(f"no path of a field: '{path}'; expected such as motors[0].current")
 
-    name: str
-    index: int | None = None
+
+def without_indices(path: str) -> str:
+    """Return a path without its indices."""
+    return re.sub(r"\[\d+\]", "", path)
 
 
 @dataclass(frozen=True)
@@ -40,18 +39,12 @@ class BytePlace:
     offset: int
     dtype: str
 
-    def of(self, block: UInt8[np.ndarray, "message byte"]) -> Float[np.ndarray, " message"]:
-        """Return the number in each message of a block, all of one shape."""
-        return self._cells(block).astype(float)
-
-    def whole(self, block: UInt8[np.ndarray, "message byte"]) -> Int[np.ndarray, " message"]:
-        """Return the whole number in each message of a block, without rounding."""
-        return self._cells(block).astype(np.int64)
-
-    def _cells(self, block: UInt8[np.ndarray, "message byte"]) -> np.ndarray:
-        """Return the number in each message, with the type that it has in the message."""
+    def of(
+        self, block: UInt8[np.ndarray, "message byte"], kind: type = float
+    ) -> Num[np.ndarray, " message"]:
+        """Return the number in each message of a block, all of one shape, as another type."""
         cells = np.ascontiguousarray(block[:, self.offset : self.offset + int(self.dtype[2:])])
-        return cells.view(self.dtype)[:, 0]
+        return cells.view(self.dtype)[:, 0].astype(kind)
 
 
 @dataclass(frozen=True)
@@ -59,26 +52,26 @@ class MessageLeaf:
     """A number, an array of numbers or a text at one path of a message.
 
     Attributes:
-        path: path in the message.
+        path: path in the message, with the index of every element that is not a number.
         dtype: numpy type of the numbers, with byte order; empty for a text.
         offset: position of the first byte.
         count: number of elements of an array; None for a single number or a text.
         text: content of a text; empty for numbers.
     """
 
-    path: tuple[PathStep, ...]
+    path: str
     dtype: str
     offset: int
     count: int | None = None
     text: str = ""
 
-    def places(self, index: int | None) -> tuple[BytePlace, ...]:
-        """Return the places of all numbers, or only of the one with an index."""
-        size = int(self.dtype[2:])
-        every = range(1 if self.count is None else self.count)
-        if index is not None:
-            every = every[index : index + 1]
-        return tuple(BytePlace(self.offset + k * size, self.dtype) for k in every)
+    def numbers(self) -> Iterator[tuple[str, BytePlace]]:
+        """Yield the path and the place of every number."""
+        if self.count is None:
+            yield self.path, BytePlace(self.offset, self.dtype)
+        for k in range(self.count or 0):
+            place = BytePlace(self.offset + k * int(self.dtype[2:]), self.dtype)
+            yield f"{self.path}[{k}]", place
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,54 +95,36 @@ class MessageShape:
         """Return whether each of some messages, all of this shape's size, has this shape."""
         return np.all(block[:, self.fixed] == self.values, axis=1)
 
-    def places(self, path: Sequence[PathStep]) -> tuple[BytePlace, ...]:
+    def places(self, path: str) -> tuple[BytePlace, ...]:
         """Return the places of the numbers at a path; empty if there are none."""
-        return tuple(p for leaf, index in self._at(path) if leaf.dtype for p in leaf.places(index))
+        leaves = (leaf for leaf in self._near(path) if leaf.dtype)
+        return tuple(p for leaf in leaves for at, p in leaf.numbers() if _within(at, path))
 
-    def texts(self, path: Sequence[PathStep]) -> tuple[str, ...]:
+    def texts(self, path: str) -> tuple[str, ...]:
         """Return the texts at a path."""
-        return tuple(leaf.text for leaf, _ in self._at(path) if not leaf.dtype)
+        leaves = (leaf for leaf in self._near(path) if not leaf.dtype)
+        return tuple(leaf.text for leaf in leaves if _within(leaf.path, path))
 
-    def count(self, path: Sequence[PathStep]) -> int:
-        """Return the number of numbers or texts at a path."""
-        return sum(1 if leaf.count is None else leaf.count for leaf, _ in self._at(path))
+    def count(self, path: str) -> int:
+        """Return the number of numbers or texts at a path without indices."""
+        return sum(1 if leaf.count is None else leaf.count for leaf in self._near(path))
 
-    def _at(self, path: Sequence[PathStep]) -> list[tuple[MessageLeaf, int | None]]:
-        """Return the leaves at a path, each with the index of an array element or None for all."""
-        found = []
-        for leaf in self._by_names.get(tuple(step.name for step in path), ()):
-            ends = zip(leaf.path[:-1], path[:-1], strict=True)
-            inner = all(want.index in (None, have.index) for have, want in ends)
-            own, want = leaf.path[-1].index, path[-1].index
-            if inner and leaf.count is not None:
-                found.append((leaf, want))
-            elif inner and want in (None, own):
-                found.append((leaf, None))
-        return found
+    def _near(self, path: str) -> list[MessageLeaf]:
+        """Return the leaves whose paths differ from a path by indices alone."""
+        return self._by_path.get(without_indices(path), [])
 
     @cached_property
-    def _by_names(self) -> dict[tuple[str, ...], list[MessageLeaf]]:
-        leaves: dict[tuple[str, ...], list[MessageLeaf]] = {}
+    def _by_path(self) -> dict[str, list[MessageLeaf]]:
+        leaves: dict[str, list[MessageLeaf]] = {}
         for leaf in self.leaves:
-            leaves.setdefault(tuple(step.name for step in leaf.path), []).append(leaf)
+            leaves.setdefault(without_indices(leaf.path), []).append(leaf)
         return leaves
 
 
-def steps_of(path: str) -> tuple[PathStep, ...]:
-    """Return the steps of a path such as `motors[0].current`.
-
-    Raises:
-        ValueError: the text is not such a path.
-    """
-    steps = []
-    for part in path.split("."):
-        name, bracket, rest = part.partition("[")
-        index, end, after = rest.partition("]")
-        whole = not bracket or (bool(end) and not after and index.isdecimal())
-        if not (name.isidentifier() and whole):
-            raise ValueError(f"no path of a field: '{path}'; expected such as motors[0].current")
-        steps.append(PathStep(name, int(index) if bracket else None))
-    return tuple(steps)
+def _within(path: str, other: str) -> bool:
+    """Return whether a path has all indices of another path, which has the same fields."""
+    steps = zip(path.split("."), other.split("."), strict=True)
+    return all(want in (have, have.partition("[")[0]) for have, want in steps)
 
 
 def shape_of(raw: bytes, message: MessageType, *, cdr: bool) -> MessageShape:
@@ -164,17 +139,16 @@ def shape_of(raw: bytes, message: MessageType, *, cdr: bool) -> MessageShape:
         ValueError: the bytes are not a message of this type; the text says why.
     """
     walk = _MessageWalk(raw, cdr)
-    walk.through(message, ())
+    leaves = tuple(walk.leaves(message, ""))
     over = len(raw) - walk.at
     if not 0 <= over < (4 if cdr else 1):
         raise ValueError(f"{over} bytes are left over after its last field")
     fixed = np.concatenate([np.arange(0), *(np.arange(a, b) for a, b in walk.fixed)])
-    values = np.frombuffer(raw, np.uint8)[fixed]
-    return MessageShape(len(raw), tuple(walk.leaves), fixed, values)
+    return MessageShape(len(raw), leaves, fixed, np.frombuffer(raw, np.uint8)[fixed])
 
 
 class _MessageWalk:
-    """Decoder that goes through the bytes of one message and collects its leaves.
+    """Decoder that goes through the bytes of one message and finds its leaves.
 
     Attributes:
         raw: bytes of the message.
@@ -182,14 +156,12 @@ class _MessageWalk:
         order: byte order of numbers, `<` or `>`.
         at: position of the next byte.
         origin: position from which alignment counts.
-        leaves: leaves found so far.
         fixed: ranges of bytes of texts and lengths found so far.
     """
 
     def __init__(self, raw: bytes, cdr: bool) -> None:
         self.raw, self.cdr, self.order = raw, cdr, "<"
         self.at = self.origin = 0
-        self.leaves: list[MessageLeaf] = []
         self.fixed: list[tuple[int, int]] = []
         if cdr:
             if raw[:2] not in (b"\x00\x00", b"\x00\x01") or len(raw) < 4:
@@ -198,32 +170,29 @@ class _MessageWalk:
             self.at = self.origin = 4
             self.fixed.append((0, 2))
 
-    def through(self, kind: FieldType, path: tuple[PathStep, ...]) -> None:
-        """Collect the leaves of a field."""
-        if isinstance(kind, NumberType):
-            dtype = self.order + kind.dtype
-            self.leaves.append(MessageLeaf(path, dtype, self.numbers(kind.size, 1)))
-        elif isinstance(kind, TextType):
-            self.leaves.append(MessageLeaf(path, "", self.at, None, self.text()))
+    def leaves(self, kind: FieldType, path: str) -> Iterator[MessageLeaf]:
+        """Yield the leaves of a field, which comes next."""
+        if kind == TEXT:
+            yield MessageLeaf(path, "", self.at, None, self.text())
+        elif isinstance(kind, str):
+            yield MessageLeaf(path, self.order + kind, self.numbers(int(kind[1:]), 1))
         elif isinstance(kind, MessageType):
-            for field in kind.fields:
-                self.through(field.kind, (*path, PathStep(field.name)))
+            for name, inner in kind.fields.items():
+                yield from self.leaves(inner, f"{path}.{name}" if path else name)
         else:
-            self.several(kind, path)
+            yield from self.elements(kind, path)
 
-    def several(self, kind: ArrayType, path: tuple[PathStep, ...]) -> None:
-        """Collect the leaves of an array."""
-        count = self.length() if kind.count is None else kind.count
-        if isinstance(kind.element, NumberType):
-            dtype = self.order + kind.element.dtype
-            at = self.numbers(kind.element.size, count)
-            self.leaves.append(MessageLeaf(path, dtype, at, count))
+    def elements(self, kind: ArrayType, path: str) -> Iterator[MessageLeaf]:
+        """Yield the leaves of an array, which comes next."""
+        count, element = self.length() if kind.count is None else kind.count, kind.element
+        if isinstance(element, str) and element != TEXT:
+            at = self.numbers(int(element[1:]), count)
+            yield MessageLeaf(path, self.order + element, at, count)
             return
         if count > len(self.raw) - self.at:
-            raise ValueError(f"it ends before the {count} elements of '{path[-1].name}'")
-        *before, last = path
+            raise ValueError(f"it ends before the {count} elements of '{path}'")
         for k in range(count):
-            self.through(kind.element, (*before, PathStep(last.name, k)))
+            yield from self.leaves(element, f"{path}[{k}]")
 
     def numbers(self, size: int, count: int) -> int:
         """Skip some numbers, aligned as CDR demands, and return the position of their first byte.
@@ -254,164 +223,3 @@ class _MessageWalk:
         text = self.raw[at : at + size]
         # In CDR a text ends with a zero byte, which its length includes.
         return (text[:-1] if self.cdr else text).decode(errors="replace")
-
-
-_STAMPS = ("header.stamp", "stamp")
-"""Paths at which a message may have its own time."""
-POSITION = ("translation.x", "translation.y", "translation.z")
-ROTATION = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
-
-
-@dataclass(frozen=True)
-class Located:
-    """Places of the picked numbers in messages of one shape.
-
-    Attributes:
-        seconds: place of the seconds of the message's own time, None if it has none.
-        nanoseconds: place of the nanoseconds of the message's own time, None if it has none.
-        numbers: places of the picked numbers in order, None for a number that is not in these
-            messages.
-    """
-
-    seconds: BytePlace | None
-    nanoseconds: BytePlace | None
-    numbers: tuple[BytePlace | None, ...]
-
-    def stamp(self, block: UInt8[np.ndarray, "message byte"]) -> Int[np.ndarray, " message"] | None:
-        """Return the messages' own times [ns], or None if they have none."""
-        if self.seconds is None or self.nanoseconds is None:
-            return None
-        return self.seconds.whole(block) * 10**9 + self.nanoseconds.whole(block)
-
-
-@runtime_checkable
-class Pick(Protocol):
-    """Rule that picks numbers from the messages of a topic.
-
-    A message yields any number of rows: for example none if it lacks the numbers.
-    """
-
-    def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        """Return the places of the numbers of each row in a message of a shape."""
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Return the name of each number in a row; it may be empty before the first message."""
-
-
-@dataclass(eq=False)
-class FieldPick:
-    """Pick of numbers by the paths of their fields; a path to an array picks all its elements.
-
-    Attributes:
-        paths: paths of the fields.
-        names: names of the numbers, set by the first message with numbers.
-    """
-
-    paths: tuple[str, ...]
-    names: tuple[str, ...] = ()
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        return self.names or self.paths
-
-    def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        numbers: list[BytePlace] = []
-        names: list[str] = []
-        for path in self.paths:
-            places = shape.places(steps_of(path))
-            numbers += places
-            names += [path] if len(places) == 1 else [f"{path}[{k}]" for k in range(len(places))]
-        if not numbers:
-            return ()
-        self.names = self.names or tuple(names)
-        return (located_with_time(shape, (), numbers),)
-
-
-@dataclass(eq=False)
-class JointPick:
-    """Pick of numbers by the names of joints, from messages like JointState.
-
-    Attributes:
-        joints: names of the picked joints, in the order of the columns.
-        array: array with the numbers: `position`, `velocity` or `effort`.
-        names: all names of joints that have occurred in some message.
-    """
-
-    joints: tuple[str, ...]
-    array: str
-    names: dict[str, None] = field(default_factory=dict)
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        return self.joints
-
-    def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        names = shape.texts((PathStep("name"),))
-        self.names.update(dict.fromkeys(names))
-        places = shape.places((PathStep(self.array),))
-        # The array may be empty; an array of another length does not match the names.
-        have = dict(zip(names, places, strict=True)) if len(places) == len(names) else {}
-        numbers = [have.get(joint) for joint in self.joints]
-        if not any(numbers):
-            return ()
-        return (located_with_time(shape, (), numbers),)
-
-
-@dataclass(frozen=True)
-class Edge:
-    """Names of the frames of a transform, which is the pose of frame `child` in frame `parent`."""
-
-    parent: str
-    child: str
-
-
-@dataclass(frozen=True, eq=False)
-class TransformPick:
-    """Pick of the translation and rotation of one transform from messages with several of them.
-
-    The message type is TFMessage.
-    """
-
-    edge: Edge
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        return (*POSITION, *ROTATION)
-
-    def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        rows = []
-        for k, edge in enumerate(edges_of(shape)):
-            if edge == self.edge:
-                first = (PathStep("transforms", k),)
-                paths = [(*first, *steps_of(f"transform.{name}")) for name in self.columns]
-                numbers = [place for path in paths for place in shape.places(path)]
-                rows.append(located_with_time(shape, first, numbers))
-        return tuple(rows)
-
-
-def edges_of(shape: MessageShape) -> tuple[Edge, ...]:
-    """Return the frames of every transform in a TFMessage.
-
-    The leading slash that names have in early ROS 1 is removed.
-    """
-    parents = shape.texts(steps_of("transforms.header.frame_id"))
-    children = shape.texts(steps_of("transforms.child_frame_id"))
-    pairs = zip(parents, children, strict=True)
-    return tuple(Edge(parent.lstrip("/"), child.lstrip("/")) for parent, child in pairs)
-
-
-def located_with_time(
-    shape: MessageShape, first: tuple[PathStep, ...], numbers: Sequence[BytePlace | None]
-) -> Located:
-    """Return the places of picked numbers, with that of their time.
-
-    The time is that of the message, or of the part of it at the path `first`.
-    """
-    for stamp in _STAMPS:
-        whole, part = (
-            shape.places((*first, *steps_of(f"{stamp}.{unit}"))) for unit in ("sec", "nanosec")
-        )
-        if len(whole) == len(part) == 1:
-            return Located(whole[0], part[0], tuple(numbers))
-    return Located(None, None, tuple(numbers))

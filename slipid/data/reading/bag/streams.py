@@ -1,26 +1,169 @@
-"""Collection of the picked numbers of a topic's messages, batch by batch, in arrays.
+"""Collection of picked numbers from the messages of a topic, batch by batch, in arrays.
 
-The messages themselves are not kept in memory.
+Numbers are picked by paths of fields, by names of joints, or by frames of a transform. The messages
+themselves are not kept in memory.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from slipid.data.reading.bag.definitions import MessageType
-from slipid.data.reading.bag.opened import MessageBatch
-from slipid.data.reading.bag.shape import Located, MessageShape, Pick, shape_of
-from slipid.support.errors import DataError, bad_data
+from slipid.data.reading.bag.opened import BagTopic, OpenBag
+from slipid.data.reading.bag.shape import BytePlace, MessageShape
+from slipid.support.errors import DataError
 
+BATCH_BYTES = 1 << 20
+"""Size of the messages of one topic that are processed together [byte]."""
 MAX_SHAPES = 256
 """Largest number of known shapes of a topic; when it is reached, all are forgotten, to save memory
 and time."""
 FEW_SHAPES = 16
 """Number of new shapes in a batch with which all its messages are compared; after these, every
 message is decoded on its own."""
+STAMPS = ("header.stamp", "stamp")
+"""Paths at which a message may have its own time."""
+POSITION = ("translation.x", "translation.y", "translation.z")
+ROTATION = ("rotation.x", "rotation.y", "rotation.z", "rotation.w")
+
+
+class Edge(NamedTuple):
+    """Names of the frames of a transform, which is the pose of frame `child` in frame `parent`."""
+
+    parent: str
+    child: str
+
+
+def edges_of(shape: MessageShape) -> tuple[Edge, ...]:
+    """Return the frames of every transform in a TFMessage.
+
+    The leading slash that names have in early ROS 1 is removed.
+    """
+    parents = shape.texts("transforms.header.frame_id")
+    children = shape.texts("transforms.child_frame_id")
+    pairs = zip(parents, children, strict=True)
+    return tuple(Edge(parent.lstrip("/"), child.lstrip("/")) for parent, child in pairs)
+
+
+@dataclass(frozen=True)
+class Located:
+    """Places of the picked numbers in messages of one shape.
+
+    Attributes:
+        time: places of the seconds and nanoseconds of the message's own time; None if it has none.
+        numbers: places of the picked numbers in order, None for a number that is not in these
+            messages.
+    """
+
+    time: tuple[BytePlace, BytePlace] | None
+    numbers: tuple[BytePlace | None, ...]
+
+    @classmethod
+    def of(
+        cls, shape: MessageShape, numbers: Sequence[BytePlace | None] = (), part: str = ""
+    ) -> "Located":
+        """Return the places with that of the time of the message, or of a part of it.
+
+        `part` is the path of the part, followed by a dot.
+        """
+        for stamp in STAMPS:
+            places = [
+                p for unit in ("sec", "nanosec") for p in shape.places(f"{part}{stamp}.{unit}")
+            ]
+            if len(places) == 2:
+                return cls((places[0], places[1]), tuple(numbers))
+        return cls(None, tuple(numbers))
+
+    def stamp(self, block: UInt8[np.ndarray, "message byte"]) -> Int[np.ndarray, " message"] | None:
+        """Return the messages' own times [ns], or None if they have none."""
+        if self.time is None:
+            return None
+        seconds, nanoseconds = (place.of(block, np.int64) for place in self.time)
+        return seconds * 10**9 + nanoseconds
+
+
+@dataclass(eq=False)
+class FieldPick:
+    """Pick of numbers by the paths of their fields; a path to an array picks all its elements.
+
+    Attributes:
+        paths: paths of the fields.
+        columns: names of the numbers; before the first message with numbers, the paths.
+    """
+
+    paths: tuple[str, ...]
+    columns: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.columns = self.paths
+
+    def located(self, shape: MessageShape) -> tuple[Located, ...]:
+        """Return the places of the numbers of each row in a message of a shape."""
+        each = {path: shape.places(path) for path in self.paths}
+        numbers = [place for places in each.values() for place in places]
+        if not numbers:
+            return ()
+        self.columns = tuple(
+            path if len(places) == 1 else f"{path}[{k}]"
+            for path, places in each.items()
+            for k in range(len(places))
+        )
+        return (Located.of(shape, numbers),)
+
+
+@dataclass(frozen=True, eq=False)
+class JointPick:
+    """Pick of numbers by the names of joints, from messages like JointState.
+
+    Attributes:
+        columns: names of the picked joints.
+        array: array with the numbers: `position`, `velocity` or `effort`.
+        names: all names of joints that have occurred in some message.
+    """
+
+    columns: tuple[str, ...]
+    array: str
+    names: dict[str, None] = field(default_factory=dict)
+
+    def located(self, shape: MessageShape) -> tuple[Located, ...]:
+        """Return the places of the numbers of each row in a message of a shape."""
+        names, places = shape.texts("name"), shape.places(self.array)
+        self.names.update(dict.fromkeys(names))
+        # The array may be empty; an array of another length does not match the names.
+        have = dict(zip(names, places, strict=True)) if len(places) == len(names) else {}
+        numbers = [have.get(joint) for joint in self.columns]
+        return (Located.of(shape, numbers),) if any(numbers) else ()
+
+
+@dataclass(frozen=True, eq=False)
+class TransformPick:
+    """Pick of the translation and rotation of one transform from messages with several of them.
+
+    The message type is TFMessage.
+    """
+
+    edge: Edge
+    columns: tuple[str, ...] = (*POSITION, *ROTATION)
+
+    def located(self, shape: MessageShape) -> tuple[Located, ...]:
+        """Return the places of the numbers of each row in a message of a shape."""
+        rows = []
+        for k, edge in enumerate(edges_of(shape)):
+            if edge == self.edge:
+                part = f"transforms[{k}]."
+                paths = (f"{part}transform.{name}" for name in self.columns)
+                numbers = [place for path in paths for place in shape.places(path)]
+                rows.append(Located.of(shape, numbers, part))
+        return tuple(rows)
+
+
+Pick = FieldPick | JointPick | TransformPick
+"""Rule that picks numbers from the messages of a topic. A message yields any number of rows: for
+example none if it lacks the numbers."""
+_Places = list[tuple[Located, ...]]
+"""For each pick, the places of each of its rows of numbers in messages of one shape."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,179 +171,145 @@ class Stream:
     """Rows of numbers from the messages of a topic, in the order of receipt.
 
     Attributes:
-        path: path of the bag.
-        topic: name of the topic.
+        topic: the topic.
         columns: name of each number in a row.
-        stamp: the messages' own times [ns], or None if they have none.
-        received: times at which the recorder received the messages [ns].
+        time: times on the clock that the layout selects [ns].
+        delay: median time from the messages' own stamps to their receipt [s], None without stamps.
         number: number of the row's message in its topic, from 1.
         values: numbers as in the messages, 0 where absent.
         absent: True for numbers that the message does not have, such as those of other joints.
     """
 
-    path: Path
-    topic: str
+    topic: BagTopic
     columns: tuple[str, ...]
-    stamp: Int[np.ndarray, " row"] | None
-    received: Int[np.ndarray, " row"]
+    time: Int[np.ndarray, " row"]
+    delay: float | None
     number: Int[np.ndarray, " row"]
     values: Float[np.ndarray, "row column"]
     absent: Bool[np.ndarray, "row column"]
 
     def error(self, found: str, expected: str, row: int | None = None) -> DataError:
         """Return the error about a row, counted from 0, or (None) about the topic."""
-        message = None if row is None else int(self.number[row])
-        return topic_error(self.path, self.topic, found, expected, message)
+        return self.topic.error(found, expected, None if row is None else int(self.number[row]))
 
     def part(self, which: Int[np.ndarray, " part"] | Bool[np.ndarray, " row"]) -> "Stream":
         """Return the selected rows."""
-        return replace(
-            self,
-            stamp=None if self.stamp is None else self.stamp[which],
-            received=self.received[which],
-            number=self.number[which],
-            values=self.values[which],
-            absent=self.absent[which],
-        )
+        names = ("time", "number", "values", "absent")
+        return replace(self, **{name: getattr(self, name)[which] for name in names})
 
 
-@dataclass(frozen=True, eq=False)
-class _KnownShape:
-    """A shape that has occurred before, and for each pick the places of its rows of numbers."""
+def collected(
+    bag: OpenBag, picks: Mapping[str, Sequence[Pick]], stamp: Literal["header", "received"]
+) -> dict[Pick, Stream]:
+    """Return the numbers of all picks, from one pass over the bag.
 
-    shape: MessageShape
-    places: tuple[tuple[Located, ...], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class _SameShape:
-    """Messages of one shape in a batch.
-
-    Attributes:
-        which: indices of the messages in the batch.
-        block: bytes of the messages.
-        places: for each pick the places of its rows of numbers.
+    Args:
+        bag: the bag.
+        picks: picks by the name of their topic.
+        stamp: clock of the result: that of the messages' own stamps, where they have one, or that
+            of the recorder.
     """
+    topics = {name: _Collector(bag.topics[name], few) for name, few in picks.items()}
+    for name, received, data in bag.messages(tuple(topics)):
+        topics[name].add(received, data)
+    return {
+        pick: one.stream(k, stamp == "header")
+        for one in topics.values()
+        for k, pick in enumerate(one.picks)
+    }
 
-    which: Int[np.ndarray, " message"]
-    block: UInt8[np.ndarray, "message byte"]
-    places: tuple[tuple[Located, ...], ...]
+
+class _Rows(NamedTuple):
+    """Rows of numbers from messages of one shape; `stamp` are the messages' own times [ns]."""
+
+    stamp: Int[np.ndarray, " row"] | None
+    received: Int[np.ndarray, " row"]
+    number: Int[np.ndarray, " row"]
+    values: Float[np.ndarray, "row column"]
+    absent: Bool[np.ndarray, "row column"]
 
 
-class TopicStreams:
+class _Collector:
     """Collector of the picked numbers in the messages of one topic."""
 
-    def __init__(
-        self, path: Path, topic: str, message: MessageType, picks: Sequence[Pick], *, cdr: bool
-    ) -> None:
-        self.path, self.topic, self.message, self.cdr = path, topic, message, cdr
-        self.picks = tuple(picks)
-        self.count = 0
-        self._rows: list[list[Stream]] = [[] for _ in self.picks]
-        self._shapes: dict[int, list[_KnownShape]] = {}
+    def __init__(self, topic: BagTopic, picks: Sequence[Pick]) -> None:
+        self.topic, self.picks = topic, picks
+        self._count = 0
+        self._received: list[int] = []
+        self._data: list[bytes] = []
+        self._room = BATCH_BYTES
+        self._rows: list[list[_Rows]] = [[] for _ in picks]
+        self._shapes: dict[int, list[tuple[MessageShape, _Places]]] = {}
 
-    def add(self, batch: MessageBatch) -> None:
-        """Add the numbers in the next messages of the topic."""
-        if set(map(type, batch.data)) != {bytes}:
-            raise topic_error(self.path, self.topic, "a message that is no bytes", "a whole bag")
-        received = np.array(batch.received, dtype=np.int64)
-        numbers = self.count + 1 + np.arange(len(received))
-        for same in self._by_shape(batch.data):
-            when, number = received[same.which], numbers[same.which]
-            for pick, rows, located in zip(self.picks, self._rows, same.places, strict=True):
-                rows += [self._taken(pick, same.block, when, number, place) for place in located]
-        self.count += len(received)
+    def add(self, received: int, data: bytes) -> None:
+        """Add the next message of the topic."""
+        self._received.append(received)
+        self._data.append(data)
+        self._room -= len(data)
+        if self._room < 0:
+            self._take()
 
-    def stream(self, pick: Pick) -> Stream:
-        """Return all rows collected so far for one of the picks."""
-        parts = self._rows[self.picks.index(pick)]
-        widths = {part.values.shape[1] for part in parts}
-        if len(widths) > 1:
-            first = parts[0]
-            other = next(p for p in parts if p.values.shape[1] != first.values.shape[1])
-            found = f"{other.values.shape[1]} numbers, and {first.values.shape[1]} of them before"
-            expected = "as many in every message; name one by its index, such as [0]?"
-            raise topic_error(self.path, self.topic, found, expected, int(other.number[0]))
-        number = _concatenated([part.number for part in parts], np.zeros(0, dtype=np.int64))
-        stamps = [part.stamp for part in parts if part.stamp is not None]
-        empty = np.zeros((0, len(pick.columns)))
-        stream = Stream(
-            path=self.path,
-            topic=self.topic,
-            columns=pick.columns,
-            stamp=np.concatenate(stamps) if stamps and len(stamps) == len(parts) else None,
-            received=_concatenated([part.received for part in parts], number),
-            number=number,
-            values=_concatenated([part.values for part in parts], empty),
-            absent=_concatenated([part.absent for part in parts], empty.astype(bool)),
-        )
+    def stream(self, pick: int, stamped: bool) -> Stream:
+        """Return all rows of a pick, given by its index, if possible at their stamps."""
+        self._take()
+        columns, none = self.picks[pick].columns, np.zeros(0, dtype=np.int64)
+        empty = np.zeros((0, len(columns)))
+        parts = self._rows[pick] or [_Rows(None, none, none, empty, empty.astype(bool))]
+        width = parts[0].values.shape[1]
+        for part in parts:
+            if part.values.shape[1] != width:
+                found = f"{part.values.shape[1]} numbers, and {width} of them before"
+                expected = "as many in every message; name one by its index, such as [0]?"
+                raise self.topic.error(found, expected, int(part.number[0]))
+        stamps, *columns_of_rows = zip(*parts, strict=True)
+        received, number, values, absent = map(np.concatenate, columns_of_rows)
+        stamp = None if any(one is None for one in stamps) else np.concatenate(stamps)
+        delay = None if stamp is None else float(np.median(received - stamp)) / 1e9
+        time = stamp if stamped and stamp is not None else received
+        stream = Stream(self.topic, columns, time, delay, number, values, absent)
         # Rows were appended shape by shape, and transform by transform, not in order of messages.
         in_order = (np.diff(number) >= 0).all()
         return stream if in_order else stream.part(np.argsort(number, kind="stable"))
 
-    def _by_shape(self, data: Sequence[bytes]) -> Iterator[_SameShape]:
-        """Yield the messages of a batch, grouped by their shape."""
-        lengths = np.fromiter(map(len, data), np.int64, len(data))
+    def _take(self) -> None:
+        """Take the numbers from the messages that wait, and forget these."""
+        received = np.array(self._received, dtype=np.int64)
+        for which, block, places in self._by_shape():
+            number = self._count + 1 + which
+            for rows, each in zip(self._rows, places, strict=True):
+                for one in each:
+                    values = [
+                        np.zeros(len(block)) if p is None else p.of(block) for p in one.numbers
+                    ]
+                    absent = np.tile([place is None for place in one.numbers], (len(block), 1))
+                    when = one.stamp(block), received[which], number
+                    rows.append(_Rows(*when, np.column_stack(values), absent))
+        self._count += len(received)
+        self._received, self._data, self._room = [], [], BATCH_BYTES
+
+    def _by_shape(self) -> Iterator[tuple[np.ndarray, np.ndarray, _Places]]:
+        """Yield the waiting messages of each shape: their indices, their bytes, and the places."""
+        lengths = np.fromiter(map(len, self._data), np.int64, len(self._data))
         for length in np.unique(lengths).tolist():
             rest = np.flatnonzero(lengths == length)
-            joined = b"".join(data if len(rest) == len(data) else [data[int(k)] for k in rest])
+            joined = b"".join(self._data[int(k)] for k in rest)
             block = np.frombuffer(joined, np.uint8).reshape(len(rest), length)
             known, new = list(self._shapes.get(length, ())), 0
             while len(rest):
                 if known:
-                    one = known.pop(0)
+                    shape, places = known.pop(0)
                 else:
-                    row = int(rest[0])
-                    one, new = self._known(data[row], self.count + row + 1), new + 1
-                same = one.shape.fits(block) if new <= FEW_SHAPES else np.arange(len(rest)) == 0
-                if same.all():
-                    yield _SameShape(rest, block, one.places)
-                    break
+                    (shape, places), new = self._known(int(rest[0])), new + 1
+                same = shape.fits(block) if new <= FEW_SHAPES else np.arange(len(rest)) == 0
                 if same.any():
-                    yield _SameShape(rest[same], block[same], one.places)
-                    rest, block = rest[~same], block[~same]
+                    yield rest[same], block[same], places
+                rest, block = rest[~same], block[~same]
 
-    def _known(self, data: bytes, number: int) -> _KnownShape:
-        """Return the shape of a message, and add it to the known shapes.
-
-        `number` is the number of the message in its topic, for errors.
-        """
-        try:
-            shape = shape_of(data, self.message, cdr=self.cdr)
-        except ValueError as error:
-            found = f"it is no {self.message.name}: {error}"
-            expected = "messages as their definition says; is the bag damaged?"
-            raise topic_error(self.path, self.topic, found, expected, number) from error
+    def _known(self, k: int) -> tuple[MessageShape, _Places]:
+        """Return the shape of waiting message k and its places, and remember them."""
+        shape = self.topic.shape(self._data[k], self._count + 1 + k)
         if sum(map(len, self._shapes.values())) >= MAX_SHAPES:
             self._shapes.clear()
-        known = _KnownShape(shape, tuple(pick.located(shape) for pick in self.picks))
+        known = shape, [pick.located(shape) for pick in self.picks]
         self._shapes.setdefault(shape.size, []).append(known)
         return known
-
-    def _taken(
-        self,
-        pick: Pick,
-        block: UInt8[np.ndarray, "message byte"],
-        received: Int[np.ndarray, " message"],
-        number: Int[np.ndarray, " message"],
-        located: Located,
-    ) -> Stream:
-        """Return a row of picked numbers for each of some messages of one shape."""
-        columns = [np.zeros(len(block)) if p is None else p.of(block) for p in located.numbers]
-        absent = np.tile([place is None for place in located.numbers], (len(block), 1))
-        where = (self.path, self.topic, pick.columns)
-        values = np.column_stack(columns)
-        return Stream(*where, located.stamp(block), received, number, values, absent)
-
-
-def _concatenated(parts: Sequence[np.ndarray], none: np.ndarray) -> np.ndarray:
-    """Return arrays end to end, or `none` if there are no arrays."""
-    return np.concatenate(parts) if parts else none
-
-
-def topic_error(
-    path: Path, topic: str, found: str, expected: str, message: int | None = None
-) -> DataError:
-    """Return the error about a topic, or about one of its messages, counted from 1."""
-    where = f"{path} topic '{topic}'" + ("" if message is None else f" message {message}")
-    return bad_data(where, found, expected)

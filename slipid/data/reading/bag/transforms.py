@@ -1,16 +1,14 @@
 """Transforms between frames over time: chains of them, their composition, heading and tilt."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from slipid.data.reading.bag.definitions import MessageType
-from slipid.data.reading.bag.opened import OpenBag
-from slipid.data.reading.bag.shape import Edge, Located, MessageShape, edges_of
-from slipid.data.reading.bag.streams import TopicStreams, topic_error
+from slipid.data.reading.bag.opened import BagTopic
+from slipid.data.reading.bag.streams import Edge, edges_of
 from slipid.support.errors import did_you_mean, first_names
 
 STATIC = "_static"
@@ -106,62 +104,34 @@ def tilt(rotation: Float[np.ndarray, "sample 4"]) -> Float[np.ndarray, " sample"
     return np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))
 
 
-def chain_of(
-    bag: OpenBag, messages: Mapping[str, MessageType], frame: str, child: str
-) -> tuple[ChainLink, ...]:
+def chain_of(topics: Sequence[BagTopic], frame: str, child: str) -> tuple[ChainLink, ...]:
     """Return the chain of transforms that leads from a frame to another.
 
-    The bag is read only until the chain is complete.
+    The topics are read, one after another, only until the chain is complete.
 
     Args:
-        bag: the bag.
-        messages: message type of each topic with transforms.
+        topics: topics with transforms.
         frame: first frame of the chain.
         child: last frame of the chain.
 
     Raises:
         DataError: no chain connects the frames; the message lists the frames in the bag.
     """
-    parents = _FrameParents()
-    streams = {
-        topic: TopicStreams(bag.path, topic, message, [parents], cdr=bag.cdr)
-        for topic, message in messages.items()
-    }
     frame, child = frame.lstrip("/"), child.lstrip("/")
-    for batch in bag.batches(tuple(messages)):
-        streams[batch.topic].add(batch)
-        if links := _links(parents.parent, frame, child):
+    parents: dict[str, str] = {}
+    for shape in (shape for topic in topics for shape in topic.shapes()):
+        for edge in edges_of(shape):
+            parents.setdefault(edge.child, edge.parent)
+        if links := _links(parents, frame, child):
             return links
-    frames = sorted({*parents.parent.keys(), *parents.parent.values()})
-    where = ", ".join(messages)
+    frames = sorted({*parents, *parents.values()})
     for name in (frame, child):
         if name not in frames:
-            found, expected = (
-                f"no frame '{name}'{did_you_mean(name, frames)}",
-                f"one of {first_names(frames)}",
-            )
-            raise topic_error(bag.path, where, found, expected)
+            found = f"no frame '{name}'{did_you_mean(name, frames)}"
+            raise topics[-1].error(found, f"one of {first_names(frames)}")
     found = f"no transforms lead from '{frame}' to '{child}'"
-    pairs = first_names(f"{parent} -> {name}" for name, parent in sorted(parents.parent.items()))
-    raise topic_error(bag.path, where, found, f"two frames of one tree ({pairs})")
-
-
-@dataclass(eq=False)
-class _FrameParents:
-    """Pick that takes no numbers from messages, but collects the parent of every frame.
-
-    Attributes:
-        parent: parent of each frame.
-        columns: names of the picked numbers, of which there are none.
-    """
-
-    parent: dict[str, str] = field(default_factory=dict)
-    columns: tuple[str, ...] = ()
-
-    def located(self, shape: MessageShape) -> tuple[Located, ...]:
-        for edge in edges_of(shape):
-            self.parent.setdefault(edge.child, edge.parent)
-        return ()
+    pairs = first_names(f"{parent} -> {name}" for name, parent in sorted(parents.items()))
+    raise topics[-1].error(found, f"two frames of one tree ({pairs})")
 
 
 def _links(parent: Mapping[str, str], frame: str, child: str) -> tuple[ChainLink, ...]:

@@ -47,7 +47,7 @@ COLUMNS = ("time", "curL", "curR", "velL", "velR", "gyro_z", "accel_std")
 """Columns that are read: time [s], magnitudes of the currents of the left and right motors [A], rim
 speeds left and right [m/s], yaw rate [rad/s], and the std of the vertical acceleration since the
 previous row [m/s^2]."""
-LAYOUT = Layout(FOLDER, {name: Channel(columns=(name,), unit="1") for name in COLUMNS})
+LAYOUT = Layout({name: Channel(columns=(name,), unit="1") for name in COLUMNS})
 NEEDED = COLUMNS[:5]
 """Columns in which a missing value is an error: time, currents and rim speeds."""
 LONGEST_S = 0.5

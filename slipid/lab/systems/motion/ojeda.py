@@ -217,9 +217,9 @@ def true_ends(runs: Sequence[Run]) -> Float[np.ndarray, "run 3"]:
 
 def continuous(steps: FlaggedSteps, w: TrainingWindows, spec: RobotSpec) -> Line:
     """Return k0 and k1 fitted to displacements in windows with flagged slip, for known poses."""
-    rows = w.rows(spec.back @ steps.features(), spec)
-    used = rows.parts.any(axis=(1, 2))
-    return forgetful(rows.parts[used], rows.gap[used], FORGETTING, PRIOR)
+    parts, gap = w.rows(spec.back @ steps.features(), spec)
+    used = parts.any(axis=(1, 2))
+    return forgetful(parts[used], gap[used], FORGETTING, PRIOR)
 
 
 def forgetful(

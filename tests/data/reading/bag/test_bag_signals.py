@@ -31,7 +31,7 @@ def test_joint_states_come_back(tmp_path, storage):
         "current": {"topic": "/joint_states", "field": "effort", "unit": "mA"},
     }
     run = read(bag(tmp_path, storage, messages), topics=topics)
-    assert run.name_suffix == ""
+    assert run.identity.name == ""
     assert run.notes == ()
     for name, values in (
         ("wheel_angle", ANGLE),
@@ -154,7 +154,7 @@ def test_a_bag_is_named_by_its_file_its_folder_or_its_metadata(tmp_path):
         runs = [read(path, topics=topics) for path in (folder, folder / "metadata.yaml", file)]
         for run in runs:
             np.testing.assert_allclose(run.signals["wheel_angle"].values, ANGLE)
-        assert runs[0].sha256 == runs[1].sha256 != runs[2].sha256
+        assert runs[0].identity.sha256 == runs[1].identity.sha256 != runs[2].identity.sha256
 
 
 def test_the_hash_is_what_sha256sum_prints(tmp_path):
@@ -163,32 +163,25 @@ def test_the_hash_is_what_sha256sum_prints(tmp_path):
     messages = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
     topics = {"wheel_angle": {"topic": "/joint_states"}}
     file = write_bag(tmp_path / "bag.bag", "rosbag1", messages)
-    assert read(file, topics=topics).sha256 == hashlib.sha256(file.read_bytes()).hexdigest()
+    assert (
+        read(file, topics=topics).identity.sha256 == hashlib.sha256(file.read_bytes()).hexdigest()
+    )
     folder = write_bag(tmp_path / "bag", "mcap", messages)
     files = sorted(folder.iterdir())
     lines = "".join(f"{hashlib.sha256(f.read_bytes()).hexdigest()}  {f.name}\n" for f in files)
-    assert read(folder, topics=topics).sha256 == hashlib.sha256(lines.encode()).hexdigest()
+    assert read(folder, topics=topics).identity.sha256 == hashlib.sha256(lines.encode()).hexdigest()
 
 
 def test_a_big_endian_message(tmp_path):
-    from slipid.data.reading.bag.definitions import (
-        ArrayType,
-        MessageField,
-        MessageType,
-        NumberType,
-        TextType,
-    )
-    from slipid.data.reading.bag.shape import shape_of, steps_of
+    from slipid.data.reading.bag.definitions import TEXT, ArrayType, MessageType
+    from slipid.data.reading.bag.shape import shape_of
 
-    kind = MessageType(
-        "x/msg/Y",
-        (MessageField("s", TextType()), MessageField("v", ArrayType(NumberType("f8"), None))),
-    )
+    kind = MessageType("x/msg/Y", {"s": TEXT, "v": ArrayType("f8", None)})
     text = b"\0\0\0\x03ab\0\0"  # and one byte up to the next length
     raw = b"\0\0\0\0" + text + b"\0\0\0\x01" + b"\0\0\0\0" + np.array([2.5], ">f8").tobytes()
     shape = shape_of(raw, kind, cdr=True)
-    assert shape.texts(steps_of("s")) == ("ab",)
-    (place,) = shape.places(steps_of("v"))
+    assert shape.texts("s") == ("ab",)
+    (place,) = shape.places("v")
     assert place.of(np.frombuffer(raw, np.uint8)[None])[0] == 2.5
 
 
