@@ -141,7 +141,7 @@ class Density:
             less = expected(r.shape[-1])  # f, so that the mode is that of the fit
             if k == "motion":
                 more = less * camera
-                for floor, posterior in enumerate(anchor.tied):
+                for floor, posterior in enumerate(anchor.effects):
                     out = out.at[floor].add(0.5 * _explained(posterior, white))
             elif k == "voltage":
                 more = less * spread
@@ -185,7 +185,7 @@ class Density:
         if "motion" not in found.residuals:
             return found
         motion = found.residuals["motion"]
-        effect = mean_effects(anchor.tied, anchor.white("motion", motion))
+        effect = mean_effects(anchor.effects, anchor.white("motion", motion))
         for of in anchor.shared:
             off = jnp.einsum("nma,na->nm", of.effect, effect[of.segments])
             motion = motion.at[of.segments].add(-off)
