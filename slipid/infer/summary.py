@@ -17,7 +17,7 @@ from slipid.infer.result import Channels, Fit, draws
 from slipid.predict.predictive import force_balance_of
 from slipid.search_space import Choice
 
-REMAINING = 0.3
+LARGEST_REMAINING = 0.3
 """Largest remaining Gauss-Newton step of a converged fit [posterior std]."""
 
 
@@ -36,7 +36,7 @@ def summarise(
     z, log_v = optimum.state.z, optimum.state.log_variance
     contact = force_balance_of(problem, optimum.state, optimum.covariance, problem.full_weight)
     remaining, name = _remaining(problem, optimum)
-    settled = remaining < REMAINING
+    settled = remaining < LARGEST_REMAINING
     stuck = f"the solver stopped {remaining:.2g} stds of {name} away from where its own step leads"
     windows, robot = problem.windows, contact.robot
     several = draws(z, contact.covariance, 400, seed)

@@ -164,7 +164,7 @@ class FoldResult:
         rows: scores of every run.
         seconds: time to `fit` and to `predict` [s], by model.
         numbers: count of fitted numbers, by model and floor.
-        converged: whether the fit of the force balance converged.
+        converged: True if the fit of the force balance converged.
         reason: why that fit stopped.
     """
 

@@ -12,7 +12,7 @@ from typing import Literal, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from slipid.data.windows import Windows
 from slipid.fitting.likelihood import marker_increments, measured_increments
@@ -205,17 +205,13 @@ class RunSignals:
     def windowed(self, seconds: float = WINDOW_S) -> "RunSignals":
         """Return the same run with neighbouring steps joined to steps of about `seconds` [s]."""
         first = groups(self.dt, seconds)
-        dt = np.add.reduceat(self.dt, first)
 
         def mean(x: np.ndarray | None) -> np.ndarray | None:
-            if x is None:
-                return None
-            weight = self.dt.reshape(-1, *[1] * (x.ndim - 1))
-            return np.asarray(np.add.reduceat(x * weight, first) / dt.reshape(weight[first].shape))
+            return None if x is None else group_means(x, self.dt, first)
 
         return replace(
             self,
-            dt=dt,
+            dt=np.add.reduceat(self.dt, first),
             turn=np.add.reduceat(self.turn, first),
             current=mean(self.current),
             gyro=mean(self.gyro),
@@ -321,6 +317,16 @@ def groups(dt: Float[np.ndarray, " step"], seconds: float) -> np.ndarray:
     count = max(1, round(float(dt.sum()) / seconds))
     number = np.minimum((np.cumsum(dt) - 0.5 * dt) / dt.sum() * count, count - 1).astype(int)
     return np.flatnonzero(np.diff(number, prepend=-1))
+
+
+def group_means(
+    values: Float[np.ndarray, "step *any"],
+    dt: Float[np.ndarray, " step"],
+    first: Int[np.ndarray, " group"],
+) -> Float[np.ndarray, "group *any"]:
+    """Return means over groups of steps, which begin at `first`, weighted by the steps' length."""
+    weight = dt.reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray(np.add.reduceat(values * weight, first) / np.add.reduceat(weight, first))
 
 
 def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, "edge 3"]:

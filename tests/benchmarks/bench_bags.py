@@ -121,21 +121,22 @@ def seconds_of(path: Path) -> dict[str, float]:
     """
     from slipid.data.reading.bag.layout import declared_bag_layout
     from slipid.data.reading.bag.storage import BagFiles, files_of
-    from slipid.data.reading.bag.topics import read_bag, topics_of
+    from slipid.data.reading.bag.topics import topics_of
+    from tests.helpers.one_bag import runs_of
 
     layout = declared_bag_layout(LAYOUT, "layout")
     hashed = BagFiles.sha256
 
     def unhashed():
         BagFiles.sha256 = property(lambda files: "")
-        read_bag(path, layout)
+        runs_of(path, layout)
         BagFiles.sha256 = hashed
 
     jobs = {
         "bare iteration": lambda: bare(path, objects=False),
         "iteration with objects": lambda: bare(path, objects=True),
         "read_bag but the hash": unhashed,
-        "read_bag": lambda: read_bag(path, layout),
+        "read_bag": lambda: runs_of(path, layout),
         "hash alone": lambda: files_of(path).sha256,
         "topics_of": lambda: topics_of(path),
     }
@@ -151,13 +152,14 @@ def seconds_of(path: Path) -> dict[str, float]:
 def memory_of(path: Path) -> tuple[float, float]:
     """By how much reading made this process grow at most, and what of it the signals are [MiB]."""
     from slipid.data.reading.bag.layout import declared_bag_layout
-    from slipid.data.reading.bag.topics import read_bag, topics_of
+    from slipid.data.reading.bag.topics import topics_of
+    from tests.helpers.one_bag import runs_of
 
     layout = declared_bag_layout(LAYOUT, "layout")
     topics_of(path)  # imports what reading imports
     Path("/proc/self/clear_refs").write_text("5")  # forget the peak up to here
     before = peak()
-    (run,) = read_bag(path, layout)
+    (run,) = runs_of(path, layout)
     after = peak()
     arrays = [a for s in run.signals.values() for a in (s.time, s.values, s.source.lines)]
     return after - before, sum(a.nbytes for a in arrays) / 2**20

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from slipid.data.reading.bag.layout import BagLayout, declared_bag_layout
-from slipid.data.reading.bag.topics import BagRun, read_bag
+from slipid.data.reading.bag.topics import read_bag
+from slipid.data.reading.signal import Identity, RawRun
 from tests.helpers.made_bags import SUFFIX, Message, in_order, write_bag
 
 TIME = 1.7e9 + np.arange(0.0, 4.0, 0.01)
@@ -21,8 +22,12 @@ def layout(joints: tuple[str, ...] = ("left", "right"), **given: Any) -> BagLayo
     return declared_bag_layout({"kind": "bag", "joints": list(joints), **given}, "layout")
 
 
-def read(path: Path, **given: Any) -> BagRun:
-    (run,) = read_bag(path, layout(**given))
+def runs_of(path: Path, layout: BagLayout) -> list[RawRun]:
+    return read_bag(Identity("", path, "", None, "as_built"), layout)
+
+
+def read(path: Path, **given: Any) -> RawRun:
+    (run,) = runs_of(path, layout(**given))
     return run
 
 

@@ -203,15 +203,9 @@ def _topic_lines(channels: Sequence[_TopicChannel]) -> Iterator[ConfigLine]:
         if one.topic.type == _TRANSFORMS and one.topic.frames:
             frame, _, child = one.topic.frames[0].partition(" -> ")
             inside += f", frame = {toml(frame)}, child = {toml(child)}"
-        yield ConfigLine(
-            one.channel, f"{{ {inside} }}", _rate(one.topic), one.question, commented_out
-        )
-
-
-def _rate(topic: Topic) -> str:
-    if topic.first is None or topic.last is None or topic.count < 2 or topic.last <= topic.first:
-        return topic.type
-    return f"{topic.type}, {(topic.count - 1) / (topic.last - topic.first):.3g} Hz"
+        rate = "" if one.topic.rate is None else f", {one.topic.rate:.3g} Hz"
+        rated = one.topic.type + rate
+        yield ConfigLine(one.channel, f"{{ {inside} }}", rated, one.question, commented_out)
 
 
 def _layout_lines(

@@ -6,8 +6,7 @@ are marked as not fresh, so that none counts twice.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,7 +16,7 @@ from slipid.data.align.regression import MotionPair
 from slipid.data.log import Log
 from slipid.data.reading.checks import UnusablePose
 from slipid.data.reading.layout import TURNS, SensorLayout
-from slipid.data.reading.signal import Signal, clock_of
+from slipid.data.reading.signal import RawRun, Signal, clock_of
 from slipid.data.wheel_signals import integral, readings
 from slipid.support.errors import bad_data
 
@@ -26,33 +25,17 @@ EPOCH = 1e6
 """Time above which a clock must count from 1970, not from the start of the robot [s]."""
 
 
-@dataclass(frozen=True)
-class Identity:
-    """Name and origin of a run; the attributes are those of `Log`."""
-
-    name: str
-    path: Path
-    sha256: str
-    surface: str | None
-    load: str
-    pose_clock: Clock | None = None
-
-
-def assembled(
-    signals: Mapping[str, Signal],
-    layout: SensorLayout,
-    identity: Identity,
-    notes: tuple[str, ...] = (),
-) -> Log:
-    """Return the log of one run from its signals by channel.
+def assembled(run: RawRun, layout: SensorLayout) -> Log:
+    """Return the log of one run from its signals.
 
     Raises:
         DataError: there is no channel, the wheels were not measured for too long, or a channel has
             no value at all.
     """
+    signals = run.signals
     if not signals:
         found = "no column of anything but the time is known"
-        raise bad_data(identity.path, found, "columns of the wheels and of the pose")
+        raise bad_data(run.identity.path, found, "columns of the wheels and of the pose")
     turns = next((name for name in TURNS if name in signals), None)
     clock = clock_of(list(signals.values()))
     if turns is not None:
@@ -60,7 +43,7 @@ def assembled(
         inside = (clock >= first) & (clock <= last)
         clock = clock if inside.all() else clock[inside]
         _check_gaps(signals[turns], layout)
-    remarks = list(notes)
+    remarks = list(run.notes)
     wheels = _of_wheels(signals, layout)
     held = {name: _held(signal, clock) for name, signal in wheels.items()}
     angle = _angle(turns, signals, layout, clock, remarks)
@@ -70,7 +53,7 @@ def assembled(
     if voltage is None and {"duty", "bus_voltage"} <= held.keys():
         voltage = held["duty"] * held["bus_voltage"]
     return Log(
-        **vars(identity),
+        **vars(run.identity),
         time=clock - start,
         wheel_angle=angle,
         wheel_speed=held.get("wheel_speed"),
@@ -250,24 +233,18 @@ def _pose(
     return samples[last.clip(0)], fresh
 
 
-def clock_against(
-    robot: Mapping[str, Signal],
-    layout: SensorLayout,
-    identity: Identity,
-    poses: Mapping[str, Signal],
-) -> Clock:
+def clock_against(run: RawRun, layout: SensorLayout, poses: Mapping[str, Signal]) -> Clock:
     """Return the clock of poses relative to the robot's clock, estimated from the motion.
 
     Args:
-        robot: signals of the robot's own file, by channel.
+        run: run with the signals of the robot's own file.
         layout: layout of that file.
-        identity: name and origin of the run.
         poses: signals of the pose's channels, on their own clock.
 
     Raises:
         UnusablePose: the motion does not determine the offset between the clocks.
     """
-    log = assembled(robot, layout, identity)
+    log = assembled(run, layout)
     parts = [poses[name] for name in _POSE]
     time = clock_of(parts)
     x, y, turned = (part.values[:, 0] for part in parts)
@@ -281,8 +258,8 @@ def clock_against(
             "and the video's frame rate"
         )
     # If the robot's clock counts from 1970, the times of the log start at zero instead.
-    turns = next(name for name in TURNS if name in robot)
-    start = float(robot[turns].time[0] - log.time[0])
+    turns = next(name for name in TURNS if name in run.signals)
+    start = float(run.signals[turns].time[0] - log.time[0])
     return replace(clock, offset=clock.offset + start)
 
 

@@ -6,19 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from slipid.data.log import Log
-from slipid.data.reading.assemble import Identity, assembled, clock_against
+from slipid.data.reading.assemble import assembled, clock_against
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.topics import read_bag
 from slipid.data.reading.checks import MIN_ROWS, UnusablePose, check_log, check_time
 from slipid.data.reading.layout import Layout
 from slipid.data.reading.presets import preset
-from slipid.data.reading.signal import Signal, SignalSource, heading
+from slipid.data.reading.signal import Identity, RawRun, Signal, SignalSource, heading
 from slipid.data.reading.table import Table, read_table
 from slipid.data.runs import Runs, collect, counted_once, default_session
 from slipid.support.errors import DataError, first_names
@@ -115,18 +115,16 @@ def read_logs(
     known = Identity(path.relative_to(root).as_posix(), path, "", surface, load)
     try:
         raw = (
-            _bag_runs(known, layout)
-            if isinstance(layout, BagLayout)
-            else _table_runs(known, layout)
+            read_bag(known, layout) if isinstance(layout, BagLayout) else _table_runs(known, layout)
         )
     except UnusablePose as error:
         return FileRuns((), (f"set aside: {error}",))
     logs: list[Log] = []
     aside: list[str] = []
-    for identity, signals, notes in raw:
-        log = assembled(signals, layout, identity, notes)
+    for run in raw:
+        log = assembled(run, layout)
         try:
-            check_log(log, signals, layout)
+            check_log(log, run.signals, layout)
         except UnusablePose as error:
             aside.append(f"set aside: {error}")
             continue
@@ -134,33 +132,7 @@ def read_logs(
     return FileRuns(tuple(logs), tuple(aside))
 
 
-class _RawRun(NamedTuple):
-    """A run whose signals were read, before they are assembled into a log."""
-
-    identity: Identity
-    signals: dict[str, Signal]
-    notes: tuple[str, ...]
-
-
-def _bag_runs(known: Identity, layout: BagLayout) -> list[_RawRun]:
-    """Return the runs in a bag; `known` is the identity of its file."""
-    return [
-        _RawRun(
-            Identity(
-                known.name + run.span.suffix,
-                known.path,
-                run.sha256,
-                run.span.surface or known.surface,
-                run.span.load or known.load,
-            ),
-            run.signals,
-            run.notes,
-        )
-        for run in read_bag(known.path, layout)
-    ]
-
-
-def _table_runs(known: Identity, layout: Layout) -> list[_RawRun]:
+def _table_runs(known: Identity, layout: Layout) -> list[RawRun]:
     """Return the runs in a file of rows, with the channels of the files beside it."""
     table = read_table(known.path, layout)
     if layout.drop_repeated_time:
@@ -178,11 +150,11 @@ def _table_runs(known: Identity, layout: Layout) -> list[_RawRun]:
         for pattern, other in beside.items():
             more = signals_of(other, layout.beside[pattern], notes)
             if layout.beside[pattern].clock == "own":
-                clock = clock_against(signals, layout, identity, more)
+                clock = clock_against(RawRun(identity, signals), layout, more)
                 identity = replace(identity, pose_clock=clock)
                 more = {n: replace(s, time=clock.robot_time(s.time)) for n, s in more.items()}
             signals |= more
-        out.append(_RawRun(identity, signals, tuple(dict.fromkeys(notes))))
+        out.append(RawRun(identity, signals, tuple(dict.fromkeys(notes))))
     return out
 
 

@@ -1,4 +1,4 @@
-"""Class `Signal`: samples of one channel at its own times, as read from a file or a bag."""
+"""Samples of one channel at its own times, and runs of them, as read from a file or a bag."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from slipid.data.align.clock import Clock
 from slipid.support.errors import DataError, bad_data
 
 
@@ -69,6 +70,33 @@ class Signal:
     def part(self, which: slice | np.ndarray) -> "Signal":
         """Return the selected samples."""
         return Signal(self.time[which], self.values[which], self.source.part(which))
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Name and origin of a run; the attributes are those of `Log`."""
+
+    name: str
+    path: Path
+    sha256: str
+    surface: str | None
+    load: str
+    pose_clock: Clock | None = None
+
+
+@dataclass(frozen=True)
+class RawRun:
+    """A run whose signals were read, before they are assembled into a log.
+
+    Attributes:
+        identity: name and origin of the run.
+        signals: signals by channel, in the units of `CHANNELS`.
+        notes: repairs and omissions, one sentence each.
+    """
+
+    identity: Identity
+    signals: dict[str, Signal]
+    notes: tuple[str, ...] = ()
 
 
 def clock_of(signals: Sequence[Signal]) -> Float[np.ndarray, " time"]:

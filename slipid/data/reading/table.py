@@ -68,8 +68,13 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     raw = bytes_of(path)
     sha256 = hashlib.sha256(raw).hexdigest()
     if path.suffix == ".parquet":
-        names, values = _parquet(path, raw, layout, all_columns)
-        return Table(path, sha256, names, values, 1 + np.arange(len(values)))
+        header, values, texts = parquet_numbers(path, raw)
+        layout = replace(layout, names_row=layout.names_row or 1)
+        names = wanted_names(path, header, layout, all_columns)
+        where = [header.index(str(name)) for name in names]
+        for at in sorted(texts.intersection(where)):
+            raise bad_data(path, "values of another type", "numbers", column=header[at])
+        return Table(path, sha256, names, values[:, where], 1 + np.arange(len(values)))
     text = text_lines(path, raw)
     header = header_cells(path, text, layout)
     names = wanted_names(path, header, layout, all_columns)
@@ -130,24 +135,23 @@ def parquet_of(path: Path, raw: bytes) -> "ParquetTable":
     return table
 
 
-def _parquet(
-    path: Path, raw: bytes, layout: Layout, all_columns: bool
-) -> tuple[tuple[str | int, ...], Float[np.ndarray, "row column"]]:
-    """Return the names and the numbers of the columns to read from a Parquet file."""
+def parquet_numbers(
+    path: Path, raw: bytes
+) -> tuple[list[str], Float[np.ndarray, "row column"], frozenset[int]]:
+    """Return names and numbers of the columns in a Parquet file, and the positions of the others.
+
+    The numbers are NaN in columns that have none.
+    """
     import pyarrow
 
     table = parquet_of(path, raw)
-    layout = replace(layout, names_row=layout.names_row or 1)
-    names = wanted_names(path, list(table.column_names), layout, all_columns)
-    columns = []
-    for name in names:
-        column = table.column(name)
+    values, texts = np.full((table.num_rows, table.num_columns), np.nan), set()
+    for k, column in enumerate(table.columns):
         try:
-            columns.append(column.cast(pyarrow.float64()).to_numpy())
-        except pyarrow.ArrowException as error:
-            found = f"values of type {column.type}"
-            raise bad_data(path, found, "numbers", column=str(name)) from error
-    return names, np.column_stack(columns)
+            values[:, k] = column.cast(pyarrow.float64()).to_numpy()
+        except pyarrow.ArrowException:
+            texts.add(k)
+    return table.column_names, values, frozenset(texts)
 
 
 def text_lines(path: Path, raw: bytes) -> list[str]:

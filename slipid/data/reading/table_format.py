@@ -17,6 +17,7 @@ from slipid.data.reading.table import (
     cell_numbers,
     cells_of,
     number_in,
+    parquet_numbers,
     parquet_of,
     text_lines,
 )
@@ -117,28 +118,13 @@ def format_of(path: Path, delimiter: str | None = None) -> TableFormat:
 def numbers_of(format: TableFormat) -> TableNumbers:
     """Return the numbers in the first `ROWS` rows of a file."""
     if not format.delimiter:
-        return _parquet_numbers(format)
+        _, numbers, texts = parquet_numbers(format.path, bytes_of(format.path))
+        return TableNumbers(format, numbers[:ROWS], texts)
     lines = _lines(format.path)
     body = [line for line in lines[format.first_data_row - 1 :][:ROWS] if line.strip()]
     values, wrong = cell_numbers(body, format.delimiter, range(len(format.names)))
-    texts = np.flatnonzero(wrong.sum(axis=0) > 0.02 * len(body)).tolist()
-    return TableNumbers(format, values, frozenset(texts))
-
-
-def _parquet_numbers(format: TableFormat) -> TableNumbers:
-    """Return the numbers in the first `ROWS` rows of a Parquet file."""
-    import pyarrow
-
-    table = parquet_of(format.path, bytes_of(format.path))
-    values = np.full((min(table.num_rows, ROWS), table.num_columns), np.nan)
-    texts = set()
-    for k, name in enumerate(table.column_names):
-        try:
-            column = table.column(name).slice(0, ROWS).cast(pyarrow.float64())
-            values[:, k] = column.to_numpy()
-        except pyarrow.ArrowException:
-            texts.add(k)
-    return TableNumbers(format, values, frozenset(texts))
+    texts = frozenset(np.flatnonzero(wrong.sum(axis=0) > 0.02 * len(body)).tolist())
+    return TableNumbers(format, values, texts)
 
 
 def _lines(path: Path, limit: int = -1) -> list[str]:

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCHEMA = "slipid.design/1"
-REACHED = 0.9
+UNREACHABLE_RATIO = 0.9
 """Ratio of a goal's std after unlimited driving to its present std above which it is unreachable.
 """
-ORDERS = 8
+RANDOM_ORDERS = 8
 """Number of random orders of a grid's runs over which the criterion is averaged."""
-POINTS = 40
+CURVE_POINTS = 40
 """Number of counts of runs at which the criterion of a grid is computed."""
 ASSUMPTIONS = (
     "noise and run effects are as fitted, and each run is one observation however long it is",
@@ -176,7 +176,7 @@ def _out_of_reach(
     # without voltages, the scale of these numbers comes from priors of other numbers only
     scaleless = goal.name in NEEDS_VOLTAGE and not fit.channels.voltage
     part = goal.std(last) / goal.std(now)
-    if part < REACHED and not scaleless:
+    if part < UNREACHABLE_RATIO and not scaleless:
         return None
     most = f"driving all {count} {info.ENDLESS:.0f} times would leave {part:.0%} of its std"
     why = next((f.text for f in fit.flat if goal.name in f.paths), most)
@@ -244,8 +244,8 @@ def _against(
     both, runs = rows.joined(of_grid), [*candidates, *grid]
     chosen, found = info.greedy(start, both, goal, len(grid), target)
     count, reached = len(chosen), found[-1] <= target
-    at = sorted({*np.geomspace(1, len(grid), POINTS).round().astype(int).tolist(), count})
-    orders = [np.random.default_rng(k).permutation(len(grid)) for k in range(ORDERS)]
+    at = sorted({*np.geomspace(1, len(grid), CURVE_POINTS).round().astype(int).tolist(), count})
+    orders = [np.random.default_rng(k).permutation(len(grid)) for k in range(RANDOM_ORDERS)]
     random = np.mean(
         [info.criterion_path(start, of_grid, goal, order, at) for order in orders], axis=0
     )

@@ -165,11 +165,10 @@ class Density:
         data = [anchor.white(k, r).ravel() for k, r in found.items()]
         return jnp.concatenate([*data, self._pull(anchor, x)])
 
-    def pointwise(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
+    def log_likelihoods(
+        self, anchor: Anchor, x: Array, held: HeldMotion | None
+    ) -> dict[str, Array]:
         """Return log likelihoods of every segment given the shared effects, by residual block."""
-        return self.of_all(Density._pointwise, x)
-
-    def _pointwise(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> dict[str, Array]:
         rest, robot = self.without_effects(anchor, x, held)
         out = {k: anchor.log_student(k, r) for k, r in rest.items()}
         camera, spread = lk.log_jacobians(robot, anchor.batch, anchor.noise(robot))
@@ -179,13 +178,10 @@ class Density:
             out["voltage"] += spread
         return out
 
-    def residuals(self, x: Float[np.ndarray, "draw size"]) -> dict[str, Array]:
-        """Return residuals less the mean shared effects, for many vectors (draw, segment, m)."""
-        return self.of_all(Density._residual_blocks, x)
-
-    def _residual_blocks(
+    def residual_blocks(
         self, anchor: Anchor, x: Array, held: HeldMotion | None
     ) -> dict[str, Array]:
+        """Return residuals less the mean shared effects, by block, for one vector x."""
         return self.without_effects(anchor, x, held).residuals
 
     def without_effects(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> _Residuals:

@@ -174,7 +174,6 @@ class _Refits:
         self.free[at] = 0.0
         self.std = float(np.sqrt(covariance[at, at]))
         self.start, self.state = float(optimum.state.z[at]), optimum.state
-        self.fitted = optimum.state
         self.count, self.settled = 0, True
         self.electric = problem.electric(optimum.state.z, optimum.state.log_variance)
         self.lowest = self.loss(optimum.state)
@@ -187,7 +186,7 @@ class _Refits:
             blocks = {k: r for k, r in blocks.items() if k in MOTION_BLOCKS}
         keep = problem.full_weight
         moving = problem.objective.joint or self.of_motion
-        effect = (state if moving else self.fitted).shared(len(problem.windows))
+        effect = (state if moving else self.state).shared(len(problem.windows))
         seen = problem.weighed(blocks, log_v, keep, effect)
         return problem.loss(state.z, log_v, keep, seen, self.electric)
 

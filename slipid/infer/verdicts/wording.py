@@ -15,7 +15,7 @@ _SAME = 0.05
 """Difference below which two powers count as equal."""
 
 NOTHING = "the data hardly determine "
-SMALL = ", while others change slightly"
+OTHERS_CHANGE = ", while others change slightly"
 
 
 class Axis(NamedTuple):

@@ -12,7 +12,6 @@ from slipid.app.new.config_text import new_config
 from slipid.app.new.propose import propose
 from slipid.app.new.robot_questions import RobotOptions
 from slipid.data.reading.bag.layout import declared_bag_layout
-from slipid.data.reading.bag.topics import read_bag
 from tests.helpers.made_bags import (
     ROBOTINO,
     Message,
@@ -23,6 +22,7 @@ from tests.helpers.made_bags import (
     vector,
     write_bag,
 )
+from tests.helpers.one_bag import runs_of
 
 TIME = 1.7e9 + np.arange(0.0, 10.0, 0.02)
 JOINTS = ["rear_left_wheel_joint", "front_left_wheel_joint", "front_right_wheel_joint"]
@@ -75,7 +75,7 @@ def test_joints_stand_in_the_order_of_the_wheels_and_the_bag_reads(tmp_path):
     assert layout["joints"] == [f"{where}_wheel_joint" for where in order]
     assert there["logs"][0]["glob"] == "run1/metadata.yaml"
     assert [q.partition(":")[0] for q in config.questions] == ["surface"]
-    (run,) = read_bag(bag, declared_bag_layout(layout, "mine"))
+    (run,) = runs_of(bag, declared_bag_layout(layout, "mine"))
     assert set(run.signals) >= {"wheel_angle", "wheel_speed", "pose_x", "twist_command_x"}
     ends = run.signals["wheel_angle"].values[-1] / run.signals["wheel_angle"].values[-1, 2]
     np.testing.assert_allclose(ends, [2, 3, 1, 4])
@@ -158,7 +158,7 @@ def test_currents_in_messages_of_an_unknown_type_are_proposed_with_a_question(tm
     assert len(said) == 2
     assert all("by the name of the field" in q for q in said)
     assert "motor.resistance" in tomllib.loads(config.text)["parameters"]
-    read = read_bag(bag, declared_bag_layout(layout, "mine"))
+    read = runs_of(bag, declared_bag_layout(layout, "mine"))
     np.testing.assert_allclose(read[0].signals["voltage"].values, 6.0)
 
 
@@ -174,4 +174,4 @@ def test_a_long_drive_with_pauses_is_cut_at_them_in_one_session(tmp_path):
     layout = there["layouts"]["mine"]
     assert layout["runs"] == {"pause_s": 1}
     assert there["logs"][0]["session"] == "file"
-    assert len(read_bag(bag, declared_bag_layout(layout, "mine"))) == 3
+    assert len(runs_of(bag, declared_bag_layout(layout, "mine"))) == 3

@@ -58,9 +58,9 @@ class BagTopic:
         where = f"{self.bag.files.path} topic '{self.name}'"
         return definition_of(where, self.type, first, self.bag.definitions)
 
-    def messages(self, start: int | None = None) -> Iterator[tuple[int, bytes]]:
+    def messages(self) -> Iterator[tuple[int, bytes]]:
         """Yield the time of receipt [ns] and the bytes of each message, as `OpenBag.messages`."""
-        return ((received, data) for _, received, data in self.bag.messages([self.name], start))
+        return ((received, data) for _, received, data in self.bag.messages([self.name]))
 
     def shape(self, data: bytes, number: int) -> MessageShape:
         """Return the shape of a message; raise `DataError` if it does not match its definition.
@@ -110,19 +110,8 @@ class OpenBag:
                 found.setdefault(connection.topic, []).append(connection)
         return {name: BagTopic(self, name, tuple(same)) for name, same in sorted(found.items())}
 
-    @property
-    def end(self) -> int:
-        """Time at which the last message was received [ns]."""
-        return max(reader.end_time for reader in self.readers)
-
-    def messages(
-        self, topics: Sequence[str], start: int | None = None
-    ) -> Iterator[tuple[str, int, bytes]]:
+    def messages(self, topics: Sequence[str]) -> Iterator[tuple[str, int, bytes]]:
         """Yield messages of some topics: topic, time of receipt [ns] and bytes.
-
-        Args:
-            topics: names of the topics.
-            start: messages received before this time [ns] are left out; None for all messages.
 
         Raises:
             DataError: the bag is damaged.
@@ -131,7 +120,7 @@ class OpenBag:
             if not (wanted := [c for c in reader.connections if c.topic in topics]):
                 continue
             try:
-                for connection, received, data in _source(reader)(wanted, start):
+                for connection, received, data in _source(reader)(wanted):
                     if data.__class__ is not bytes:
                         raise TypeError(f"a message of type {type(data).__name__}")
                     yield connection.topic, received, data

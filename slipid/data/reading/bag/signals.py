@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from slipid.data.reading.bag.layout import GROUPS, BagLayout
 from slipid.data.reading.bag.plan import ChannelPlan
@@ -29,23 +29,25 @@ TILT_NOTED = np.radians(20.0)
 _RECEIVED = 'to use the time of receipt set stamp = "received"'
 
 
-def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
-    """Return the rows of a stream in the order of their times, without repeated times.
+def cleaned(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
+    """Return the rows with finite numbers, in the order of their times, without repeated times.
 
     Of several rows with the same time the last one is kept.
 
     Raises:
-        DataError: stamps are zero, or the clock jumps back.
+        DataError: numbers are not finite, stamps are zero, or the clock jumps back.
     """
-    time = clock(stream, layout)
+    stream = finite(stream, layout, notes)
+    time, name = stream.time, stream.topic.name
     zero = np.flatnonzero(time == 0)
-    if len(zero) == len(time):
-        raise stream.error("every time stamp is zero", f"stamps that count; {_RECEIVED}")
     if len(zero):
-        expected = f"a stamp in every message; {_RECEIVED}"
-        raise stream.error("the time stamp is zero", expected, int(zero[0]))
-    steps = np.diff(time)
-    if (steps > 0).all():
+        every = len(zero) == len(time)
+        found = "every time stamp is zero" if every else "the time stamp is zero"
+        expected = (
+            f"stamps that count; {_RECEIVED}" if every else f"a stamp everywhere; {_RECEIVED}"
+        )
+        raise stream.error(found, expected, None if every else int(zero[0]))
+    if (np.diff(time) > 0).all():
         return stream
     late = np.maximum.accumulate(time) - time
     jumps = np.flatnonzero(late > layout.max_disorder * 1e9)
@@ -57,25 +59,13 @@ def in_time_order(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream
         )
         raise stream.error(found, expected, int(jumps[0]))
     if disordered := int((late > 0).sum()):
-        notes.append(
-            f"topic {stream.topic.name}: {disordered} messages out of order by up to "
-            f"{late.max() / 1e9:.3g} s were sorted"
-        )
+        by = f"by up to {late.max() / 1e9:.3g} s"
+        notes.append(f"topic {name}: {disordered} messages out of order {by} were sorted")
     order = np.argsort(time, kind="stable")
-    # Of several messages with the same stamp the last one is kept.
     last = np.append(np.diff(time[order]) != 0, True)
     if repeated := int((~last).sum()):
-        notes.append(
-            f"topic {stream.topic.name}: {repeated} messages with the stamp of another left out"
-        )
+        notes.append(f"topic {name}: {repeated} messages with the stamp of another left out")
     return stream.part(order[last])
-
-
-def clock(stream: Stream, layout: BagLayout) -> Int[np.ndarray, " row"]:
-    """Return the time of each row on the clock that the layout selects [ns]."""
-    if layout.stamp == "header" and stream.stamp is not None:
-        return stream.stamp
-    return stream.received
 
 
 def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str]) -> None:
@@ -84,61 +74,46 @@ def check_clocks(streams: Sequence[Stream], layout: BagLayout, notes: list[str])
     Raises:
         DataError: they differ by more than `APART_REFUSED`.
     """
-    bare, delays = [], {}
-    for stream in streams:
-        topic = stream.topic.name
-        if not len(stream.number) or topic.endswith(STATIC):
-            continue
-        if stream.stamp is None:
-            bare.append(topic)
-        else:
-            delays[topic] = float(np.median(stream.received - stream.stamp)) / 1e9
+    used = [one for one in streams if len(one.number) and not one.topic.name.endswith(STATIC)]
+    bare = sorted({one.topic.name for one in used if one.delay is None})
+    delays = [(one.delay, one.topic.name) for one in used if one.delay is not None]
     if not bare or not delays or layout.stamp == "received":
         return
-    topic, apart = max(delays.items(), key=lambda item: abs(item[1]))
-    others = ", ".join(sorted({*bare}))
+    apart, topic = max(delays, key=lambda item: abs(item[0]))
     found = (
         f"stamps of {topic} differ by {apart:.3g} s from the time of receipt, the only time of "
-        f"{others}"
+        f"{', '.join(bare)}"
     )
     if abs(apart) > APART_REFUSED:
         expected = 'one clock for all: set stamp = "received"'
-        raise bad_data(streams[0].topic.bag.files.path, found, expected)
+        raise bad_data(used[0].topic.bag.files.path, found, expected)
     if abs(apart) > APART_NOTED:
         notes.append(found)
 
 
-def signal_of(stream: Stream, layout: BagLayout) -> Signal:
+def signal_of(stream: Stream) -> Signal:
     """Return the rows of a stream as a signal, with the numbers as in the messages.
 
     No unit is converted.
     """
     topic = stream.topic
     source = SignalSource(topic.bag.files.path, stream.columns, stream.number, topic.name)
-    seconds, nanoseconds = np.divmod(clock(stream, layout), 10**9)
+    seconds, nanoseconds = np.divmod(stream.time, 10**9)
     return Signal(seconds + nanoseconds / 1e9, stream.values, source)
 
 
-def whole_signal(stream: Stream, layout: BagLayout, notes: list[str]) -> Signal:
-    """Return the complete rows of one stream as a signal, in the order of their times.
-
-    Raises:
-        DataError: numbers are not finite, or the clock jumps.
-    """
-    stream = in_time_order(finite(stream, layout, notes), layout, notes)
+def whole_signal(stream: Stream, notes: list[str]) -> Signal:
+    """Return the complete rows of one stream as a signal."""
     whole = np.all(~stream.absent, axis=1)
     if not whole.all():
         notes.append(
             f"topic {stream.topic.name}: {(~whole).sum()} messages without all of "
             f"{', '.join(stream.columns)} left out"
         )
-        stream = stream.part(whole)
-    return signal_of(stream, layout)
+    return signal_of(stream.part(whole))
 
 
-def side_by_side(
-    streams: Sequence[Stream], layout: BagLayout, notes: list[str], *, by_name: bool
-) -> Signal:
+def side_by_side(streams: Sequence[Stream], notes: list[str], *, by_name: bool) -> Signal:
     """Return a signal whose columns come from different messages.
 
     They come from several topics, or from messages that have only some of the columns. The signal
@@ -147,50 +122,38 @@ def side_by_side(
 
     Args:
         streams: streams with the columns.
-        layout: layout of the bag.
         notes: list to which notes are appended.
         by_name: whether all streams have the same columns, so that each column is taken from the
             first stream with numbers in it; else all columns of all streams are used.
 
     Raises:
-        DataError: numbers are not finite, a clock jumps, or the columns share no time.
+        DataError: the columns share no time.
     """
-    ordered = [in_time_order(finite(one, layout, notes), layout, notes) for one in streams]
-    columns = _columns(ordered, layout, by_name)
-    first = columns[0]
-    inside = np.ones(len(first.time), dtype=bool)
-    for other in columns[1:]:
-        inside &= (first.time >= other.time[0]) & (first.time <= other.time[-1])
-    time = first.time[inside]
-    values = [np.interp(time, one.time, one.values[:, 0]) for one in columns]
-    topics = ", ".join(dict.fromkeys(str(one.source.topic) for one in columns))
-    names = tuple(one.source.columns[0] for one in columns)
-    lines = first.source.lines[inside]
-    source = replace(first.source, columns=names, lines=lines, topic=topics)
-    if not len(time):
-        raise source.error("its columns share no time", "columns that were recorded together")
-    gap = max(float(np.diff(one.time).max(initial=0.0)) for one in columns)
-    notes.append(
-        f"topics {topics}: {', '.join(names[1:])} came at other times than {names[0]} and were "
-        f"interpolated to them (longest gap {gap:.3g} s)"
-    )
-    return Signal(time, np.column_stack(values), source)
-
-
-def _columns(streams: Sequence[Stream], layout: BagLayout, by_name: bool) -> list[Signal]:
-    """Return each column as a signal of its own."""
     pairs = [(stream, j) for stream in streams for j in range(len(stream.columns))]
     if by_name:
         # Every stream has a column for every joint, but most of its columns are empty.
         having = [(stream, j) for stream, j in pairs if not stream.absent[:, j].all()]
         owner = {j: stream for stream, j in reversed(having)}
         pairs = [(owner[j], j) for j in sorted(owner)]
-    columns = []
-    for stream, j in pairs:
-        one = signal_of(stream.part(~stream.absent[:, j]), layout)
-        source = replace(one.source, columns=(stream.columns[j],))
-        columns.append(Signal(one.time, one.values[:, [j]], source))
-    return columns
+    names = tuple(stream.columns[j] for stream, j in pairs)
+    signals = [signal_of(stream.part(~stream.absent[:, j])) for stream, j in pairs]
+    first = signals[0]
+    inside = np.ones(len(first.time), dtype=bool)
+    for other in signals[1:]:
+        inside &= (first.time >= other.time[0]) & (first.time <= other.time[-1])
+    time, lines = first.time[inside], first.source.lines[inside]
+    topics = ", ".join(dict.fromkeys(stream.topic.name for stream, _ in pairs))
+    source = SignalSource(first.source.path, names, lines, topics)
+    if not len(time):
+        raise source.error("its columns share no time", "columns that were recorded together")
+    gap = max(float(np.diff(one.time).max(initial=0.0)) for one in signals)
+    notes.append(
+        f"topics {topics}: {', '.join(names[1:])} came at other times than {names[0]} and were "
+        f"interpolated to them (longest gap {gap:.3g} s)"
+    )
+    columns = zip(signals, pairs, strict=True)
+    values = [np.interp(time, one.time, one.values[:, j]) for one, (_, j) in columns]
+    return Signal(time, np.column_stack(values), source)
 
 
 def mostly_whole(stream: Stream) -> bool:
@@ -246,10 +209,11 @@ def channel_signal(
         _check_joints(plan, streams)
     else:
         streams = [checked_stream(stream) for stream in streams]
+    streams = [cleaned(stream, layout, notes) for stream in streams]
     if len(streams) == 1 and mostly_whole(streams[0]):
-        samples = whole_signal(streams[0], layout, notes)
+        samples = whole_signal(streams[0], notes)
     else:
-        samples = side_by_side(streams, layout, notes, by_name=by_name)
+        samples = side_by_side(streams, notes, by_name=by_name)
     columns = samples.values.shape[1]
     scale = np.array(plan.spec.scale)
     if len(scale) not in (1, columns):
@@ -301,28 +265,18 @@ def group_signals(
     if plan.links:
         samples = _transformed(plan, streams, layout, notes)
     else:
-        samples = whole_signal(checked_stream(streams[0]), layout, notes)
-    values = samples.values
-    if plan.channel == "pose":
-        values = _planar(samples, notes)
-    names = GROUPS[plan.channel]
-    # Each signal has a single column; all have the times of the messages.
+        samples = whole_signal(cleaned(checked_stream(streams[0]), layout, notes), notes)
+    values = _planar(samples, notes) if plan.channel == "pose" else samples.values
+    # A heading from a quaternion is named by it; all columns of a composed pose have one name.
+    named = samples.source.columns
+    if len(named) == 1:
+        named *= 3
+    elif len(named) > 3:
+        named = (*named[:2], named[2].rpartition(".")[0])
     return {
-        name: Signal(samples.time, values[:, [j]], _column(samples.source, j))
-        for j, name in enumerate(names)
+        name: Signal(samples.time, values[:, [j]], replace(samples.source, columns=(named[j],)))
+        for j, name in enumerate(GROUPS[plan.channel])
     }
-
-
-def _column(source: SignalSource, j: int) -> SignalSource:
-    """Return the source of column j of a pose or a twist, for messages.
-
-    A heading from a quaternion is named by the quaternion.
-    """
-    names = source.columns
-    name = names[min(j, len(names) - 1)]
-    if j == 2 and len(names) > 3:
-        name = name.rpartition(".")[0]
-    return replace(source, columns=(name,))
 
 
 def _planar(samples: Signal, notes: list[str]) -> Float[np.ndarray, "sample 3"]:
@@ -356,8 +310,8 @@ def _transformed(
             if topic.endswith(STATIC):
                 stream = finite(stream.part(np.array([len(stream.number) - 1])), layout, notes)
             else:
-                stream = in_time_order(finite(stream, layout, notes), layout, notes)
-            one = signal_of(stream, layout)
+                stream = cleaned(stream, layout, notes)
+            one = signal_of(stream)
             rotation = _unit(one.values[:, 3:], one.source)
             moving[pick.edge] = TransformSeries(one.time, one.values[:, :3], rotation)
             sources[pick.edge] = one.source

@@ -136,25 +136,11 @@ class RepairedMcap:
     path: Path
     end: int
 
-    @property
-    def suffix(self) -> str:
-        """Return the suffix of the path."""
-        return self.path.suffix
+    def __getattr__(self, name: str) -> object:
+        """Return an attribute of the path."""
+        return getattr(self.path, name)
 
-    @property
-    def stem(self) -> str:
-        """Return the stem of the path."""
-        return self.path.stem
-
-    def exists(self) -> bool:
-        """Return True, as the file exists."""
-        return True
-
-    def is_dir(self) -> bool:
-        """Return False, as the path is a file."""
-        return False
-
-    def open(self, *_: object, **__: object) -> io.BufferedReader:
+    def open(self, *_: object) -> io.BufferedReader:
         """Return a stream of the complete records, followed by the end of an MCAP file."""
         return io.BufferedReader(_RepairedBytes(self.path, self.end), buffer_size=1 << 16)
 
@@ -184,7 +170,7 @@ class _RepairedBytes(io.RawIOBase):
 
     def __init__(self, path: Path, end: int) -> None:
         super().__init__()
-        self._file, self._end, self._at = path.open("rb"), end, 0
+        self._file, self._end = path.open("rb"), end
 
     def readable(self) -> bool:
         return True
@@ -192,24 +178,18 @@ class _RepairedBytes(io.RawIOBase):
     def seekable(self) -> bool:
         return True
 
-    def tell(self) -> int:
-        return self._at
-
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._end + len(_END)}[whence]
-        self._at = base + offset
-        return self._at
+        if whence == io.SEEK_END:
+            offset, whence = offset + self._end + len(_END), io.SEEK_SET
+        return self._file.seek(offset, whence)
 
     def readinto(self, buffer: "WriteableBuffer") -> int:
-        view = memoryview(buffer)
-        if self._at < self._end:
-            self._file.seek(self._at)
-            data = self._file.read(min(len(view), self._end - self._at))
-        else:
-            first = self._at - self._end
-            data = _END[first : first + len(view)]
+        view, at = memoryview(buffer), self._file.tell()
+        if at < self._end:
+            return self._file.readinto(view[: self._end - at])
+        data = _END[at - self._end :][: len(view)]
         view[: len(data)] = data
-        self._at += len(data)
+        self._file.seek(at + len(data))
         return len(data)
 
     def close(self) -> None:

@@ -6,7 +6,7 @@ themselves are not kept in memory.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -173,8 +173,8 @@ class Stream:
     Attributes:
         topic: the topic.
         columns: name of each number in a row.
-        stamp: the messages' own times [ns], or None if they have none.
-        received: times at which the recorder received the messages [ns].
+        time: times on the clock that the layout selects [ns].
+        delay: median time from the messages' own stamps to their receipt [s], None without stamps.
         number: number of the row's message in its topic, from 1.
         values: numbers as in the messages, 0 where absent.
         absent: True for numbers that the message does not have, such as those of other joints.
@@ -182,8 +182,8 @@ class Stream:
 
     topic: BagTopic
     columns: tuple[str, ...]
-    stamp: Int[np.ndarray, " row"] | None
-    received: Int[np.ndarray, " row"]
+    time: Int[np.ndarray, " row"]
+    delay: float | None
     number: Int[np.ndarray, " row"]
     values: Float[np.ndarray, "row column"]
     absent: Bool[np.ndarray, "row column"]
@@ -194,22 +194,39 @@ class Stream:
 
     def part(self, which: Int[np.ndarray, " part"] | Bool[np.ndarray, " row"]) -> "Stream":
         """Return the selected rows."""
-        return replace(
-            self,
-            stamp=None if self.stamp is None else self.stamp[which],
-            received=self.received[which],
-            number=self.number[which],
-            values=self.values[which],
-            absent=self.absent[which],
-        )
+        names = ("time", "number", "values", "absent")
+        return replace(self, **{name: getattr(self, name)[which] for name in names})
 
 
-def collected(bag: OpenBag, picks: Mapping[str, Sequence[Pick]]) -> dict[Pick, Stream]:
-    """Return the numbers of all picks, by the name of their topic, from one pass over the bag."""
+def collected(
+    bag: OpenBag, picks: Mapping[str, Sequence[Pick]], stamp: Literal["header", "received"]
+) -> dict[Pick, Stream]:
+    """Return the numbers of all picks, from one pass over the bag.
+
+    Args:
+        bag: the bag.
+        picks: picks by the name of their topic.
+        stamp: clock of the result: that of the messages' own stamps, where they have one, or that
+            of the recorder.
+    """
     topics = {name: _Collector(bag.topics[name], few) for name, few in picks.items()}
     for name, received, data in bag.messages(tuple(topics)):
         topics[name].add(received, data)
-    return {pick: one.stream(k) for one in topics.values() for k, pick in enumerate(one.picks)}
+    return {
+        pick: one.stream(k, stamp == "header")
+        for one in topics.values()
+        for k, pick in enumerate(one.picks)
+    }
+
+
+class _Rows(NamedTuple):
+    """Rows of numbers from messages of one shape; `stamp` are the messages' own times [ns]."""
+
+    stamp: Int[np.ndarray, " row"] | None
+    received: Int[np.ndarray, " row"]
+    number: Int[np.ndarray, " row"]
+    values: Float[np.ndarray, "row column"]
+    absent: Bool[np.ndarray, "row column"]
 
 
 class _Collector:
@@ -221,7 +238,7 @@ class _Collector:
         self._received: list[int] = []
         self._data: list[bytes] = []
         self._room = BATCH_BYTES
-        self._rows: list[list[Stream]] = [[] for _ in picks]
+        self._rows: list[list[_Rows]] = [[] for _ in picks]
         self._shapes: dict[int, list[tuple[MessageShape, _Places]]] = {}
 
     def add(self, received: int, data: bytes) -> None:
@@ -232,47 +249,41 @@ class _Collector:
         if self._room < 0:
             self._take()
 
-    def stream(self, pick: int) -> Stream:
-        """Return all rows of a pick, given by its index."""
+    def stream(self, pick: int, stamped: bool) -> Stream:
+        """Return all rows of a pick, given by its index, if possible at their stamps."""
         self._take()
-        parts, columns = self._rows[pick], self.picks[pick].columns
+        columns, none = self.picks[pick].columns, np.zeros(0, dtype=np.int64)
         empty = np.zeros((0, len(columns)))
-        none = np.zeros(0, dtype=np.int64)
-        parts = parts or [Stream(self.topic, columns, None, none, none, empty, empty.astype(bool))]
+        parts = self._rows[pick] or [_Rows(None, none, none, empty, empty.astype(bool))]
         width = parts[0].values.shape[1]
         for part in parts:
             if part.values.shape[1] != width:
                 found = f"{part.values.shape[1]} numbers, and {width} of them before"
                 expected = "as many in every message; name one by its index, such as [0]?"
-                raise part.error(found, expected, 0)
-        stamps = [part.stamp for part in parts if part.stamp is not None]
-        stream = Stream(
-            self.topic,
-            columns,
-            np.concatenate(stamps) if len(stamps) == len(parts) else None,
-            *(
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in ("received", "number", "values", "absent")
-            ),
-        )
+                raise self.topic.error(found, expected, int(part.number[0]))
+        stamps, *columns_of_rows = zip(*parts, strict=True)
+        received, number, values, absent = map(np.concatenate, columns_of_rows)
+        stamp = None if any(one is None for one in stamps) else np.concatenate(stamps)
+        delay = None if stamp is None else float(np.median(received - stamp)) / 1e9
+        time = stamp if stamped and stamp is not None else received
+        stream = Stream(self.topic, columns, time, delay, number, values, absent)
         # Rows were appended shape by shape, and transform by transform, not in order of messages.
-        in_order = (np.diff(stream.number) >= 0).all()
-        return stream if in_order else stream.part(np.argsort(stream.number, kind="stable"))
+        in_order = (np.diff(number) >= 0).all()
+        return stream if in_order else stream.part(np.argsort(number, kind="stable"))
 
     def _take(self) -> None:
         """Take the numbers from the messages that wait, and forget these."""
         received = np.array(self._received, dtype=np.int64)
         for which, block, places in self._by_shape():
             number = self._count + 1 + which
-            for pick, rows, each in zip(self.picks, self._rows, places, strict=True):
+            for rows, each in zip(self._rows, places, strict=True):
                 for one in each:
                     values = [
                         np.zeros(len(block)) if p is None else p.of(block) for p in one.numbers
                     ]
                     absent = np.tile([place is None for place in one.numbers], (len(block), 1))
                     when = one.stamp(block), received[which], number
-                    row = Stream(self.topic, pick.columns, *when, np.column_stack(values), absent)
-                    rows.append(row)
+                    rows.append(_Rows(*when, np.column_stack(values), absent))
         self._count += len(received)
         self._received, self._data, self._room = [], [], BATCH_BYTES
 

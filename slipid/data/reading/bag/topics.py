@@ -18,12 +18,11 @@ from slipid.data.reading.bag.runs import RunSpan, run_spans
 from slipid.data.reading.bag.signals import channel_signal, check_clocks, group_signals
 from slipid.data.reading.bag.streams import Pick, collected, edges_of
 from slipid.data.reading.layout import PER_WHEEL
-from slipid.data.reading.signal import Signal
+from slipid.data.reading.signal import Identity, RawRun, Signal
 from slipid.support.errors import DataError
 
 _FIRST_MESSAGES = 10
 """Number of first messages of a topic that its description is based on."""
-_SECOND = 10**9
 _SELF_EXPLAINED = (
     "pose",
     "twist_command",
@@ -59,8 +58,7 @@ class Topic:
         name: name of the topic.
         type: type of the messages, such as `sensor_msgs/msg/JointState`.
         count: number of messages.
-        first: time of receipt of the first message [s], None if there is none.
-        last: time of receipt of the last message [s], None if there is none.
+        rate: median rate of the first messages [Hz]; None if there are too few to tell.
         fields: fields of the messages; empty if there is no message or they could not be examined.
         joints: names of joints in the first messages of type JointState.
         frames: parent and child of each transform in the first messages, as `map -> base_link`.
@@ -73,8 +71,7 @@ class Topic:
     name: str
     type: str
     count: int
-    first: float | None = None
-    last: float | None = None
+    rate: float | None = None
     fields: tuple[TopicField, ...] = ()
     joints: tuple[str, ...] = ()
     frames: tuple[str, ...] = ()
@@ -102,7 +99,8 @@ def _described(topic: BagTopic) -> Topic:
     known = Topic(topic.name, topic.type, topic.count)
     if not first:
         return known
-    known = replace(known, first=first[0][0] / 1e9, last=_last(topic, first[-1][0]) / 1e9)
+    step = float(np.median(np.diff([received for received, _ in first]))) if first[1:] else 0.0
+    known = replace(known, rate=1e9 / step if step > 0 else None)
     try:
         message = topic.message
         shapes = [topic.shape(data, k) for k, (_, data) in enumerate(first, start=1)]
@@ -125,60 +123,36 @@ def _described(topic: BagTopic) -> Topic:
     )
 
 
-def _last(topic: BagTopic, known: int) -> int:
-    """Return the time of receipt of a topic's last message [ns].
-
-    It is searched backwards from the end of the bag, to time `known` [ns] of an earlier message.
-    """
-    back = _SECOND
-    while (start := topic.bag.end - back) > known:
-        if received := [time for time, _ in topic.messages(start)]:
-            return max(received)
-        back *= 8
-    return max((time for time, _ in topic.messages(known)), default=known)
-
-
-@dataclass(frozen=True, eq=False)
-class BagRun:
-    """One run of a bag.
-
-    Attributes:
-        span: interval of time of the run, its name, surface and load set-up.
-        sha256: SHA-256 hash of the bag's files.
-        signals: signals by channel, in the units of `CHANNELS`; a pose as pose_x, pose_y and
-            pose_heading (without wrap-around), a twist as twist_command_x, _y and _yaw.
-        notes: repairs and omissions, one sentence each.
-    """
-
-    span: RunSpan
-    sha256: str
-    signals: dict[str, Signal]
-    notes: tuple[str, ...]
-
-
-def read_bag(path: Path, layout: BagLayout) -> tuple[BagRun, ...]:
+def read_bag(known: Identity, layout: BagLayout) -> list[RawRun]:
     """Return every run in a bag.
 
+    A pose becomes the channels pose_x, pose_y and pose_heading (without wrap-around), a twist
+    twist_command_x, _y and _yaw.
+
     Args:
-        path: a .bag, .db3 or .mcap file, the folder of a rosbag2, or the metadata.yaml in it.
+        known: name of the bag, its path, and the surface and load set-up that hold where the bag
+            and the table of its runs name none. The path is that of a .bag, .db3 or .mcap file, of
+            the folder of a rosbag2, or of the metadata.yaml in it.
         layout: layout of the bag.
 
     Raises:
         DataError: the bag is damaged, or does not match the layout; the message names the topic,
             what is there, and the next step.
     """
-    with open_bag(path, layout.definitions) as bag, ThreadPoolExecutor(1) as beside:
+    with open_bag(known.path, layout.definitions) as bag, ThreadPoolExecutor(1) as beside:
         # Hashing releases the interpreter lock, so on two cores it runs while the bag is read.
         sha256 = beside.submit(lambda: bag.files.sha256)
         notes = list(bag.notes)
         signals = _signals(bag, layout, notes)
         spans = run_spans(bag, layout, signals, notes)
+        known = replace(known, sha256=sha256.result())
         # If two channels come from one topic, its notes occur twice.
-        unique = tuple(dict.fromkeys(notes))
-        return tuple(_run(signals, span, sha256.result(), unique) for span in spans)
+        return [_run(known, span, signals, tuple(dict.fromkeys(notes))) for span in spans]
 
 
-def _run(signals: dict[str, Signal], span: RunSpan, sha256: str, notes: tuple[str, ...]) -> BagRun:
+def _run(
+    known: Identity, span: RunSpan, signals: dict[str, Signal], notes: tuple[str, ...]
+) -> RawRun:
     """Return the part of all signals that lies in one run."""
     parts, without = {}, []
     for name, signal in signals.items():
@@ -189,7 +163,13 @@ def _run(signals: dict[str, Signal], span: RunSpan, sha256: str, notes: tuple[st
             without.append(name)
     if without:
         notes = (*notes, f"no sample of {', '.join(without)} in this run")
-    return BagRun(span, sha256, parts, notes)
+    identity = replace(
+        known,
+        name=known.name + span.suffix,
+        surface=span.surface or known.surface,
+        load=span.load or known.load,
+    )
+    return RawRun(identity, parts, notes)
 
 
 def _signals(bag: OpenBag, layout: BagLayout, notes: list[str]) -> dict[str, Signal]:
@@ -198,7 +178,7 @@ def _signals(bag: OpenBag, layout: BagLayout, notes: list[str]) -> dict[str, Sig
     picks: dict[str, list[Pick]] = {}
     for topic, pick in (wanted for one in plans for wanted in one.wanted):
         picks.setdefault(topic, []).append(pick)
-    streams = collected(bag, picks)
+    streams = collected(bag, picks, layout.stamp)
     signals: dict[str, Signal] = {}
     for one in plans:
         own = [streams[pick] for _, pick in one.wanted]

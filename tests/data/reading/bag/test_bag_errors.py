@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from slipid.data.reading.bag.layout import declared_bag_layout
-from slipid.data.reading.bag.topics import read_bag
 from slipid.support.errors import DataError
 from tests.helpers.made_bags import (
     Message,
@@ -18,6 +17,7 @@ from tests.helpers.made_bags import (
     without_definitions,
     write_bag,
 )
+from tests.helpers.one_bag import runs_of
 
 START = 1.7e9
 TIME = START + np.arange(0.0, 2.0, 0.01)
@@ -55,7 +55,7 @@ def refused(tmp_path, messages, topics, *words, joints=("wheel_left", "wheel_rig
     path = write_bag(tmp_path / "bag", given.pop("storage", "mcap"), messages, **options)
     layout = declared_bag_layout({"joints": list(joints), "topics": topics, **given}, "layout")
     with pytest.raises(DataError) as caught:
-        read_bag(path, layout)
+        runs_of(path, layout)
     text = str(caught.value)
     assert text.startswith(str(path)), text
     assert "; expected " in text, text
@@ -66,7 +66,7 @@ def accepted(tmp_path, messages, topics, **given):
     path = write_bag(tmp_path / "bag", "mcap", messages)
     joints = ["wheel_left", "wheel_right"]
     layout = declared_bag_layout({"joints": joints, "topics": topics, **given}, "layout")
-    (run,) = read_bag(path, layout)
+    (run,) = runs_of(path, layout)
     return run
 
 
@@ -102,7 +102,7 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
             writer.write(connection, k + 1, store.serialize_ros1(message(store, name, {}), name))
     layout = declared_bag_layout({"topics": {"gyro": {"topic": "/both"}}}, "layout")
     with pytest.raises(DataError, match=f"several types \\({IMU} and {POSE}\\)"):
-        read_bag(tmp_path / "bag.bag", layout)
+        runs_of(tmp_path / "bag.bag", layout)
 
 
 @pytest.mark.parametrize(
@@ -335,14 +335,14 @@ def test_a_definition_that_is_nowhere(tmp_path):
     with pytest.raises(
         DataError, match=r"no definition of my_msgs/msg/Amps in the bag; .*definitions = "
     ):
-        read_bag(path, declared_bag_layout({"topics": topics}, "layout"))
+        runs_of(path, declared_bag_layout({"topics": topics}, "layout"))
     (tmp_path / "Amps.msg").write_text("my_msgs/Inner inner\n")
     given = {"topics": topics, "definitions": str(tmp_path)}
     with pytest.raises(DataError, match=r"Inner, which my_msgs/msg/Amps is made of.* no Inner.msg"):
-        read_bag(path, declared_bag_layout(given, "layout"))
+        runs_of(path, declared_bag_layout(given, "layout"))
     (tmp_path / "Inner.msg").write_text("float64 x\n")
     with pytest.raises(DataError, match=r"topic '/amps' message 1: it is no my_msgs/msg/Amps"):
-        read_bag(path, declared_bag_layout(given, "layout"))
+        runs_of(path, declared_bag_layout(given, "layout"))
     (tmp_path / "Inner.msg").write_text("float32 ; x\n")
     with pytest.raises(DataError, match=r"the definition of my_msgs/msg/Amps cannot be read"):
-        read_bag(path, declared_bag_layout(given, "layout"))
+        runs_of(path, declared_bag_layout(given, "layout"))

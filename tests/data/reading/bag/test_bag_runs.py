@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from slipid.data.reading.bag.layout import declared_bag_layout
-from slipid.data.reading.bag.topics import read_bag
 from slipid.support.errors import DataError
 from tests.helpers.made_bags import STORAGES, SUFFIX, Message, in_order, joint_states, write_bag
+from tests.helpers.one_bag import runs_of
 
 START = 1.7e9
 TIME = START + np.arange(0.0, 30.0, 0.02)
@@ -23,7 +23,7 @@ def runs(tmp_path, rule, *messages, storage="mcap", topics=None, **given):
     wheels = joint_states("/joint_states", TIME, ["l", "r"], position=ANGLE, velocity=speed())
     path = write_bag(tmp_path / f"bag{SUFFIX[storage]}", storage, in_order(wheels, *messages))
     table = {"joints": ["l", "r"], "topics": topics, "runs": rule, **given}
-    return read_bag(path, declared_bag_layout(table, "layout"))
+    return runs_of(path, declared_bag_layout(table, "layout"))
 
 
 def speed():
@@ -32,7 +32,7 @@ def speed():
 
 def spans(found, name="wheel_angle"):
     return [
-        (one.span.suffix, *(round(float(t), 2) for t in one.signals[name].time[[0, -1]] - START))
+        (one.identity.name, *(round(float(t), 2) for t in one.signals[name].time[[0, -1]] - START))
         for one in found
     ]
 
@@ -67,7 +67,10 @@ def test_a_text_may_name_the_floor(tmp_path):
     rule = {"topic": "/run", "surface": "data", "between": ["", "stop"]}
     found = runs(tmp_path, rule, messages)
     assert spans(found) == [("#01", 1.0, 7.98), ("#02", 11.0, 17.98)]
-    assert [(one.span.surface, one.span.load) for one in found] == [("gray", None), ("green", None)]
+    assert [(one.identity.surface, one.identity.load) for one in found] == [
+        ("gray", "as_built"),
+        ("green", "as_built"),
+    ]
 
 
 def test_fields_of_a_marker_name_floor_and_load(tmp_path):
@@ -85,9 +88,9 @@ def test_fields_of_a_marker_name_floor_and_load(tmp_path):
     path = write_bag(tmp_path / "bag", "mcap", in_order(wheels, messages), definitions=text)
     rule = {"topic": "/run", "field": "trial", "surface": "floor", "load": "load"}
     table = {"joints": ["l", "r"], "topics": {"wheel_angle": {"topic": "/joint_states"}}}
-    found = read_bag(path, declared_bag_layout({**table, "runs": rule}, "layout"))
+    found = runs_of(path, declared_bag_layout({**table, "runs": rule}, "layout"))
     assert spans(found) == [("#01", 1.0, 9.98), ("#02", 10.0, 19.98), ("#03", 20.0, 29.98)]
-    assert [(one.span.surface, one.span.load) for one in found] == [
+    assert [(one.identity.surface, one.identity.load) for one in found] == [
         ("gray", "moved"),
         ("gray", "moved"),
         ("green", "moved"),
@@ -99,7 +102,7 @@ def test_pauses_part_runs(tmp_path, name):
     given = {"gear_ratio": 4.0} if name == "motor_speed" else {}
     topics = {name: {"topic": "/joint_states"}}
     found = runs(tmp_path, {"pause_s": 2.0}, topics=topics, **given)
-    assert [one.span.suffix for one in found] == ["#01", "#02", "#03"]
+    assert [one.identity.name for one in found] == ["#01", "#02", "#03"]
     for k, (_, first, last) in enumerate(spans(found, name)):
         assert first == pytest.approx(10 * k + 1, abs=0.05)
         assert last == pytest.approx(10 * k + 8, abs=0.05)
@@ -107,7 +110,7 @@ def test_pauses_part_runs(tmp_path, name):
 
 def test_a_longer_pause_parts_nothing(tmp_path):
     found = runs(tmp_path, {"pause_s": 6.0})
-    assert [one.span.suffix for one in found] == [""]
+    assert [one.identity.name for one in found] == [""]
 
 
 def test_a_table_tells_runs_floors_and_loads(tmp_path):
@@ -116,8 +119,8 @@ def test_a_table_tells_runs_floors_and_loads(tmp_path):
     )
     found = runs(tmp_path, {"table": "runs.csv", "from_start": True})
     assert spans(found) == [("#first", 1.0, 7.98), ("#02", 11.0, 17.98)]
-    assert [(one.span.surface, one.span.load) for one in found] == [
-        ("gray", None),
+    assert [(one.identity.surface, one.identity.load) for one in found] == [
+        ("gray", "as_built"),
         ("green", "moved"),
     ]
 

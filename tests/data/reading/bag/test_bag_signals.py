@@ -31,7 +31,7 @@ def test_joint_states_come_back(tmp_path, storage):
         "current": {"topic": "/joint_states", "field": "effort", "unit": "mA"},
     }
     run = read(bag(tmp_path, storage, messages), topics=topics)
-    assert run.span.suffix == ""
+    assert run.identity.name == ""
     assert run.notes == ()
     for name, values in (
         ("wheel_angle", ANGLE),
@@ -154,7 +154,7 @@ def test_a_bag_is_named_by_its_file_its_folder_or_its_metadata(tmp_path):
         runs = [read(path, topics=topics) for path in (folder, folder / "metadata.yaml", file)]
         for run in runs:
             np.testing.assert_allclose(run.signals["wheel_angle"].values, ANGLE)
-        assert runs[0].sha256 == runs[1].sha256 != runs[2].sha256
+        assert runs[0].identity.sha256 == runs[1].identity.sha256 != runs[2].identity.sha256
 
 
 def test_the_hash_is_what_sha256sum_prints(tmp_path):
@@ -163,11 +163,13 @@ def test_the_hash_is_what_sha256sum_prints(tmp_path):
     messages = joint_states("/joint_states", TIME, ["left", "right"], position=ANGLE)
     topics = {"wheel_angle": {"topic": "/joint_states"}}
     file = write_bag(tmp_path / "bag.bag", "rosbag1", messages)
-    assert read(file, topics=topics).sha256 == hashlib.sha256(file.read_bytes()).hexdigest()
+    assert (
+        read(file, topics=topics).identity.sha256 == hashlib.sha256(file.read_bytes()).hexdigest()
+    )
     folder = write_bag(tmp_path / "bag", "mcap", messages)
     files = sorted(folder.iterdir())
     lines = "".join(f"{hashlib.sha256(f.read_bytes()).hexdigest()}  {f.name}\n" for f in files)
-    assert read(folder, topics=topics).sha256 == hashlib.sha256(lines.encode()).hexdigest()
+    assert read(folder, topics=topics).identity.sha256 == hashlib.sha256(lines.encode()).hexdigest()
 
 
 def test_a_big_endian_message(tmp_path):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from slipid.data.reading.bag.layout import declared_bag_layout
-from slipid.data.reading.bag.topics import read_bag
 from slipid.support.errors import DataError
 from tests.helpers.made_bags import (
     STORAGES,
@@ -19,6 +18,7 @@ from tests.helpers.made_bags import (
     vector,
     write_bag,
 )
+from tests.helpers.one_bag import runs_of
 
 TIME = 100.0 + np.arange(0.0, 5.0, 0.02)
 TF = "tf2_msgs/msg/TFMessage"
@@ -30,7 +30,7 @@ def message(topic, *transforms, received):
 
 def pose_of(path, frame, child, topic="/tf"):
     topics = {"pose": {"topic": topic, "frame": frame, "child": child}}
-    (run,) = read_bag(path, declared_bag_layout({"topics": topics}, "layout"))
+    (run,) = runs_of(path, declared_bag_layout({"topics": topics}, "layout"))
     x, y, heading = (run.signals[f"pose_{name}"] for name in ("x", "y", "heading"))
     return x.time, np.column_stack([x.values, y.values, heading.values]), run
 
@@ -121,4 +121,4 @@ def test_transforms_need_frames(tmp_path, parts):
     path = write_bag(tmp_path / "bag", "mcap", in_order(*parts))
     layout = declared_bag_layout({"topics": {"pose": {"topic": "/tf"}}}, "layout")
     with pytest.raises(DataError, match=r"expected frame and child.*map -> odom"):
-        read_bag(path, layout)
+        runs_of(path, layout)

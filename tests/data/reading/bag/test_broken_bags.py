@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from slipid.data.reading.bag.layout import declared_bag_layout
-from slipid.data.reading.bag.topics import read_bag, topics_of
+from slipid.data.reading.bag.topics import topics_of
 from slipid.support.errors import DataError
 from tests.helpers.kept import kept
 from tests.helpers.made_bags import Message, in_order, joint_states, transform, write_bag
+from tests.helpers.one_bag import runs_of
 
 TIME = 1.7e9 + np.arange(0.0, 3.0, 0.01)
 ANGLE = np.column_stack([TIME - TIME[0], TIME[0] - TIME])
@@ -64,7 +65,7 @@ def filler():
 
 def refused(path, *words):
     with pytest.raises(DataError) as caught:
-        read_bag(path, LAYOUT)
+        runs_of(path, LAYOUT)
     text = str(caught.value)
     assert "expected " in text, text
     assert all(word in text for word in words), text
@@ -121,7 +122,7 @@ def test_a_file_that_was_copied_in_part(tmp_path, whole, storage, remedy):
 
 def test_an_mcap_file_is_read_up_to_its_last_whole_record(tmp_path, whole):
     file = cut(tmp_path, whole["chunks"], 0.7)
-    (run,) = read_bag(file, LAYOUT)
+    (run,) = runs_of(file, LAYOUT)
     np.testing.assert_allclose(run.signals["wheel_angle"].values, ANGLE)
     np.testing.assert_allclose(run.signals["pose_x"].values[:, 0], TIME)
     assert "was cut off" in run.notes[0]
@@ -132,7 +133,7 @@ def test_an_mcap_file_is_read_up_to_its_last_whole_record(tmp_path, whole):
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
 def test_a_folder_without_metadata(tmp_path, whole, storage):
     shutil.copy(whole[storage], tmp_path)
-    (run,) = read_bag(tmp_path, LAYOUT)
+    (run,) = runs_of(tmp_path, LAYOUT)
     np.testing.assert_allclose(run.signals["wheel_angle"].values, ANGLE)
     assert run.notes == ("the folder has no metadata.yaml: the recording was cut off",)
 
@@ -143,7 +144,7 @@ def test_parts_of_a_recording_follow_each_other_by_number(tmp_path):
         folder = write_bag(tmp_path / f"part_{number}", "mcap", half)
         shutil.move(next(folder.glob("*.mcap")), tmp_path)
         shutil.rmtree(folder)
-    (run,) = read_bag(tmp_path, LAYOUT)
+    (run,) = runs_of(tmp_path, LAYOUT)
     np.testing.assert_allclose(run.signals["wheel_angle"].values, ANGLE)
     np.testing.assert_array_equal(run.signals["wheel_angle"].source.lines, 1 + np.arange(len(TIME)))
 
@@ -158,7 +159,7 @@ def test_metadata_that_names_a_missing_file(tmp_path, whole):
 def test_messages_that_wait_in_a_log_beside_the_bag(tmp_path, whole):
     shutil.copy(whole["sqlite3"], tmp_path)
     (tmp_path / (whole["sqlite3"].name + "-wal")).write_bytes(b"x")
-    (run,) = read_bag(tmp_path / whole["sqlite3"].name, LAYOUT)
+    (run,) = runs_of(tmp_path / whole["sqlite3"].name, LAYOUT)
     assert "wal_checkpoint" in run.notes[0]
 
 
@@ -195,7 +196,7 @@ def test_a_bag_with_other_bytes_is_read_or_refused(tmp_path, whole, storage):
 
 def outcome(file):
     """Return `read` or `refused`; anything else is an error without information for the user."""
-    texts = [outcome_of(lambda: read_bag(file, LAYOUT)), outcome_of(lambda: topics_of(file))]
+    texts = [outcome_of(lambda: runs_of(file, LAYOUT)), outcome_of(lambda: topics_of(file))]
     for text in filter(None, texts):
         assert str(file.parent) in text
         assert "expected " in text
