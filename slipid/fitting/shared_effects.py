@@ -162,7 +162,9 @@ class SharedEffects(eqx.Module):
     numbers: Int[Array, "3 3"]
 
     @eqx.filter_jit
-    def root(self, log_v: Float[Array, " variance"]) -> Float[Array, "3 run coef"]:
+    def root(
+        self, log_v: Float[Array, " variance"] | Float[np.ndarray, " variance"]
+    ) -> Float[Array, "3 run coef"]:
         """Return S: effects along, across and in yaw per unit coefficient, e = S u."""
         std = jnp.where(self.numbers < 0, 0.0, jnp.exp(0.5 * log_v)[self.numbers])
         parts = [std[k, :, None, None] * x for k, x in ((1, self.near), (2, self.session[None]))]
