@@ -54,7 +54,7 @@ from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, Run
 
 KEPT = 20
 """Number of neurons of a layer whose outputs are the inputs of the next layer."""
-LEAST = 0.05
+LOWEST_OUTPUT = 0.05
 """Lower limit of the classifier's output for a floor in one window, which may be negative."""
 MEMORY = 0.9
 """Factor by which evidence about the floor fades from window to window."""
@@ -206,7 +206,7 @@ class GmdhClass(SlipModel):
         """
         if self.classifier is None:
             return np.ones((len(inputs), 1))
-        share = self.classifier.predict(inputs).clip(min=LEAST)
+        share = self.classifier.predict(inputs).clip(min=LOWEST_OUTPUT)
         evidence = np.log(share / share.sum(axis=1, keepdims=True))
         # signals of a robot at rest carry no evidence about its floor
         evidence[~windows.moving] = 0.0
