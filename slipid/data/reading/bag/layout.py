@@ -180,9 +180,7 @@ def _problem(layout: BagLayout) -> str | None:
             return f"{group} and {min(twice)}; expected one of them"
     if not have:
         return "topics: no channel; expected a table of channels"
-    if 0 < len(have & set(GROUPS["pose"])) < 3:
-        return "a pose in parts; expected pose, or all of pose_x, pose_y and pose_heading"
-    if lacking := layout.lacks(have):
+    if lacking := layout.lacks(layout.holds):
         return lacking
     if len(set(layout.joints)) < len(layout.joints):
         return f"joints {list(layout.joints)}; expected each once"
