@@ -48,6 +48,11 @@ SEVERAL = {"pose_quaternion": "1"}
 """Channels with a fixed number of columns: x, y, z and w of a quaternion."""
 CHANNELS: dict[str, str] = {**SINGLE, **SEVERAL, **PER_WHEEL}
 """Every channel that a layout may name, with its SI unit."""
+GROUPS = {
+    "pose": ("pose_x", "pose_y", "pose_heading"),
+    "twist_command": ("twist_command_x", "twist_command_y", "twist_command_yaw"),
+}
+"""Groups of channels that one message contains, by the name of the group in the layout of a bag."""
 TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
 """Channels from which the wheels' turns are known; the first available one counts."""
 

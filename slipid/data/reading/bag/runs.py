@@ -4,7 +4,7 @@ import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from math import inf, tau
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from jaxtyping import Float
 from pydantic import FiniteFloat
 
 from slipid.data.log import Log
+from slipid.data.reading.assemble import per_wheel
 from slipid.data.reading.bag.layout import BagLayout, RunRule
 from slipid.data.reading.bag.opened import BagTopic, OpenBag
 from slipid.data.reading.bag.plan import topic_of
@@ -133,14 +134,11 @@ def by_pauses(layout: BagLayout, signals: Mapping[str, Signal], pause_s: float) 
 def _moves(layout: BagLayout, signals: Mapping[str, Signal]) -> Float[np.ndarray, " move"]:
     """Return the times at which some wheel moves [s]."""
     name = next(name for name in TURNS if name in signals)
-    time, values = signals[name].time, signals[name].values
-    if name.startswith("motor_") or name == "wheel_ticks":
-        values = values / layout.gear_ratio
+    time, values = signals[name].time, signals[name].values * per_wheel(name, layout)
     if name.endswith("_speed"):
         return time[(np.abs(values) > STILL).any(axis=1)]
-    if name == "wheel_ticks":
-        values = values * (tau / float(layout.ticks_per_revolution or 1.0))
-        values = np.cumsum(values, axis=0) if layout.ticks_are_increments else values
+    if name == "wheel_ticks" and layout.ticks_are_increments:
+        values = np.cumsum(values, axis=0)
     moved = {row for column in values.T for row in _moved(column)}
     return time[sorted(moved)]
 
