@@ -72,8 +72,8 @@ def fit(
     Source: the contact law of `slipid.model.contact_law`, the likelihood of `slipid.fitting`.
     """
     refuse_misordered(runs.logs)
-    wishes = priors or {}, fixed or {}, start or {}, free
-    task = fit_task_of(runs, robot, *wishes, image_centre, windows_per_piece, seed)
+    chosen = priors or {}, fixed or {}, start or {}, free
+    task = fit_task_of(runs, robot, *chosen, image_centre, windows_per_piece, seed)
     with Reporter(quiet=quiet) as report:
         problem, optimum = optimised(task, task.problem(), None, report)
         return summarised(task, problem, optimum, report)

@@ -49,7 +49,8 @@ def export(
     The folder has a README, and the checksum of every file. With --check nothing is written, and
     exit code 2 says that a byte was changed.
     """
-    from slipid.deploy.export import ExportOptions, robot_at
+    from slipid.deploy.deploy import read_robot
+    from slipid.deploy.export import ExportOptions
     from slipid.deploy.export import export as run
     from slipid.exports.folder import check_folder
     from slipid.lab.trial.controllers import ROWS
@@ -71,7 +72,7 @@ def export(
         raise DataError("no folder to write to; name one with --out DIR")
     with Reporter(quiet=quiet) as report:
         report.stage("reading the robot")
-        robot = robot_at(source, load, _names(floors))
+        robot = read_robot(source, load, _names(floors))
         options = ExportOptions(_names(to), controller, path, speed, map)
         done = run(robot, out, options, report, ROWS)
     content = {

@@ -2,7 +2,7 @@
 
 import glob
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
@@ -141,26 +141,27 @@ def write_robot(out: Path, found: Fit | Posterior) -> tuple[str, ...]:
     return (ROBOT,)
 
 
-def read_robot(out: Path, load: str | None = None) -> DeployedRobot:
-    """Return the robot of a folder, which must be able to drive with a controller.
+def read_robot(source: Path, load: str | None = None, floors: Sequence[str] = ()) -> DeployedRobot:
+    """Return the robot in a file, or in a folder that `slipid identify` wrote.
+
+    Its wheels must be able to drive with a controller. `floors` are those it has, by default all.
 
     Raises:
-        DataError: the folder has no robot, its wheels have no controller, or reading it fails as
-            in `DeployedRobot.load`.
+        DataError: there is no robot, its wheels have no controller, it has no such load set-up or
+            floor, or reading it fails as in `DeployedRobot.load`.
     """
-    path = out / ROBOT
+    path = source if source.suffix == ".json" else source / ROBOT
     if not path.is_file():
         raise DataError(
-            f"{path}: not there; `slipid identify` writes it, so run it with --out {out}"
+            f"{path}: not there; `slipid identify` writes it, so run it with --out {path.parent}"
         )
-    return require_steering(path, DeployedRobot.load(path, load))
-
-
-def require_steering(path: Path, robot: DeployedRobot) -> DeployedRobot:
-    """Return the robot, read from `path`; raise `DataError` if its wheels have no controller."""
+    robot = DeployedRobot.load(path, load)
     if not robot.steers:
         raise DataError(f"{path}: {NO_CONTROLLER}")
-    return robot
+    try:
+        return robot.on(*floors) if floors else robot
+    except ValueError as error:
+        raise DataError(f"{path}: {error}") from error
 
 
 def actuator_model_of(robot: DeployedRobot, gyro: bool) -> ActuatorModel:

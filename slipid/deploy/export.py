@@ -9,11 +9,10 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
 
-from slipid.data.floor_map import FloorMap, read_map
+from slipid.data.floor_map import read_map
 from slipid.deploy.controllers import CONTROLLERS, ControllerRow, control_loop_of
-from slipid.deploy.deploy import ROBOT, actuator_model_of, read_robot, require_steering
+from slipid.deploy.deploy import actuator_model_of
 from slipid.deploy.floors import floor_of
 from slipid.deploy.twin_run import (
     REST_S,
@@ -24,17 +23,16 @@ from slipid.deploy.twin_run import (
     twin_plant,
 )
 from slipid.exports.c99.folder import Recording, c_files
-from slipid.exports.c99.lower import UnsupportedError
 from slipid.exports.description import readme, warnings
 from slipid.exports.folder import check_folder, check_writable, write_folder
 from slipid.exports.ros.folder import ros2_files
 from slipid.exports.stablehlo import load_program, stablehlo_files
 from slipid.exports.table import table_files
 from slipid.robot import trajectory
-from slipid.robot.closed_loop import PERIOD, ControlLoop, Plant, run_closed_loop
+from slipid.robot.closed_loop import PERIOD, ControlLoop, run_closed_loop
 from slipid.robot.deployed import DeployedRobot
-from slipid.robot.interface import Measurement, Readings
 from slipid.robot.robot_file import robot_bytes
+from slipid.robot.twin import TwinPlant
 from slipid.support.errors import DataError, did_you_mean
 from slipid.support.progress import Reporter
 
@@ -79,52 +77,6 @@ class Exported:
     warnings: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class ExampleStart:
-    """Site and start of the example run.
-
-    Attributes:
-        floor: map of the site.
-        true: pose on the map at which the robot starts [m, m, rad].
-        estimated: pose at which its estimator starts [m, m, rad]: the true one with a map, else the
-            origin.
-    """
-
-    floor: FloorMap
-    true: tuple[float, float, float]
-    estimated: tuple[float, float, float]
-
-
-def _example_start(robot: DeployedRobot, path: trajectory.Path, file: Path | None) -> ExampleStart:
-    """Return site and start of the example run.
-
-    The site is made of patches of the robot's floors, or is the map in a file, which must not
-    contain other floors.
-    """
-    floor = twin_floor(robot) if file is None else read_map(file)
-    require_known_surfaces(floor, robot, str(file))
-    pose = starts(20, floor, path)[0]
-    return ExampleStart(floor, pose, (0.0, 0.0, 0.0) if file is None else pose)
-
-
-def robot_at(source: Path, load: str | None, floors: Sequence[str]) -> DeployedRobot:
-    """Return the robot in a file, or in a folder that `slipid identify` wrote.
-
-    Raises:
-        DataError: there is no robot, its file is damaged, or it has no such load set-up or floor.
-    """
-    is_file = source.suffix == ".json"
-    path = source if is_file else source / ROBOT
-    if is_file:
-        robot = require_steering(path, DeployedRobot.load(path, load))
-    else:
-        robot = read_robot(source, load)
-    try:
-        return robot.on(*floors) if floors else robot
-    except ValueError as error:
-        raise DataError(f"{path}: {error}") from error
-
-
 def export(
     robot: DeployedRobot,
     out: Path,
@@ -141,22 +93,27 @@ def export(
     row = _checked_row(options, rows)
     check_writable(out)
     path = path_of(options.path, options.speed, robot)
-    start = _example_start(robot, path, options.map)
-    loop = control_loop_of(robot, row, floor=floor_of(start.floor, robot.labels))
-    path = path.moved(start.estimated).after_rest(REST_S)
+    floor = twin_floor(robot) if options.map is None else read_map(options.map)
+    require_known_surfaces(floor, robot, str(options.map))
+    place = starts(20, floor, path)[0]
+    start = (0.0, 0.0, 0.0) if options.map is None else place
+    loop = control_loop_of(robot, row, floor=floor_of(floor, robot.labels))
+    path = path.moved(start).after_rest(REST_S)
     content: dict[str, bytes] = {"robot.json": robot_bytes(robot.record)}
     forms = tuple(form for form in FORMS if form in options.forms)
     for form in forms:
         report.stage(f"writing {form}")
-        if form == "stablehlo":
+        files: Mapping[str, str | bytes]
+        if form == "c":
+            plant = twin_plant(robot, floor, place, 0, actuator_model_of(robot, gyro=row.gyro))
+            run = record_example(loop, path, plant, start, options.path)
+            files = c_files(robot, loop, path, run)
+        elif form == "stablehlo":
             files = stablehlo_files(loop)
-        elif form == "c":
-            run = record_example(robot, loop, path, options, start, row.gyro)
-            files = _c_files(robot, loop, path, run, options.controller)
         else:
-            text = ros2_files(robot) if form == "ros2" else table_files(robot)
-            files = {name: data.encode() for name, data in text.items()}
-        content |= {f"{form}/{name}": data for name, data in files.items()}
+            files = ros2_files(robot) if form == "ros2" else table_files(robot)
+        for name, data in files.items():
+            content[f"{form}/{name}"] = data if isinstance(data, bytes) else data.encode()
     content["README.md"] = readme(robot, forms, options.controller).encode()
     write_folder(out, content)
     report.stage("checking what was written")
@@ -189,58 +146,27 @@ def _checked_row(options: ExportOptions, rows: Mapping[str, ControllerRow]) -> C
     return row
 
 
-def _c_files(
-    robot: DeployedRobot,
-    loop: ControlLoop[eqx.Module],
-    path: trajectory.Path,
-    run: Recording,
-    controller: str,
-) -> dict[str, bytes]:
-    """Return the content of the C folder; raise `DataError` if a step cannot be turned into C."""
-    try:
-        text = c_files(robot, loop, path, run)
-    except UnsupportedError as error:
-        raise DataError(f"controller {controller}: {error}") from error
-    return {name: data.encode() for name, data in text.items()}
-
-
-class _RecordingPlant:
-    """A plant that records its readings in the list `readings`."""
-
-    def __init__(self, plant: Plant, wheels: int):
-        self._plant, self._wheels = plant, wheels
-        self.readings: list[Readings] = []
-
-    def reset(self) -> Readings:
-        return self._record(self._plant.reset())
-
-    def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Readings:
-        return self._record(self._plant.step(wheel_speed))
-
-    @property
-    def pose(self) -> tuple[float, float, float]:
-        return self._plant.pose
-
-    def _record(self, reading: Measurement | Readings) -> Readings:
-        self.readings.append(reading.filled(self._wheels))
-        return self.readings[-1]
-
-
 def record_example(
-    robot: DeployedRobot,
     loop: ControlLoop[eqx.Module],
     path: trajectory.Path,
-    options: ExportOptions,
-    start: ExampleStart,
-    gyro: bool = False,
+    plant: TwinPlant,
+    start: tuple[float, float, float],
+    name: str,
 ) -> Recording:
-    """Return a closed-loop run on the twin along a path that begins at the estimator's start."""
-    model = actuator_model_of(robot, gyro=gyro)
-    plant = _RecordingPlant(twin_plant(robot, start.floor, start.true, 0, model), robot.wheels)
-    run = run_closed_loop(loop, path, plant, start.estimated)
+    """Return a closed-loop run on the twin, with the readings, which the twin then gives again.
+
+    Args:
+        loop: estimator and controller.
+        path: path that begins at `start`.
+        plant: the twin.
+        start: pose at which the estimator starts [m, m, rad].
+        name: name of the path, for the description.
+    """
+    run = run_closed_loop(loop, path, plant, start)
+    readings = [plant.reset(), *map(plant.step, run.command[:-1])]
     inputs = [
         np.concatenate([[PERIOD], *(np.ravel(x) for x in jax.tree.leaves(reading))])
-        for reading in plant.readings[: len(run.command)]
+        for reading in readings
     ]
-    about = f"the identified model as a plant, with delays and noise, along the path {options.path}"
-    return Recording(about, start.estimated, np.array(inputs), run.command, run.path_time)
+    about = f"the identified model as a plant, with delays and noise, along the path {name}"
+    return Recording(about, start, np.array(inputs), run.command, run.path_time)

@@ -7,7 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
-from slipid.exports.text import listed, one_line, wrapped
+from slipid.exports.text import filled, listed, one_line, wrapped
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.record import Pair, Provenance, Source, Verdict
 from slipid.robot.robot_file import declared_numbers
@@ -27,8 +27,12 @@ PROVENANCES: Mapping[Provenance, str] = {
     "borrowed": "what was assumed before decides: a default, a data sheet, a prior",
     "override": "it was held at a chosen value",
 }
-WARNED_VERDICTS: tuple[Verdict, ...] = ("not_identified", "at_bound", "disputed")
-"""Verdicts about which a user must be warned."""
+WARNINGS: Mapping[Verdict, str] = {
+    "not_identified": "NOT IDENTIFIED, their values are assumed and no measurement",
+    "at_bound": "AT A BOUND, the model or a number that was held fixed may be wrong",
+    "disputed": "DISPUTED, floors disagree about them",
+}
+"""Warning for each verdict about which a user must be warned."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +66,14 @@ class NumberRow:
     @property
     def verdict_markdown(self) -> str:
         """Verdict as Markdown, in bold if users must be warned about it."""
-        warned = self.verdict in map(verdict_text, WARNED_VERDICTS)
+        warned = self.verdict in map(verdict_text, WARNINGS)
         return f"**{self.verdict}**" if warned else self.verdict
 
 
 def verdict_text(verdict: Verdict) -> str:
     """Return a verdict as text for people, in capitals if they must be warned about it."""
     words = verdict.replace("_", " ")
-    return words.upper() if verdict in WARNED_VERDICTS else words
+    return words.upper() if verdict in WARNINGS else words
 
 
 def number_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
@@ -82,12 +86,6 @@ def number_rows(robot: DeployedRobot) -> Iterator[NumberRow]:
             about = (d.symbol, value, d.unit, (ends[k][0], ends[k][1]) if ends else None)
             sure = (verdict_text(number.verdict), number.provenance, d.doc)
             yield NumberRow(group, e.path, entry, *about, *sure)
-
-
-def paths_with_verdict(robot: DeployedRobot, verdict: Verdict) -> tuple[str, ...]:
-    """Return the paths of the numbers with a verdict."""
-    known, numbers = robot.record.parameters, declared_numbers(robot.record)
-    return tuple(e.path for e in numbers if known[e.path].verdict == verdict)
 
 
 LIMITS: Mapping[str, tuple[str, str]] = {
@@ -120,11 +118,6 @@ SOURCES: Mapping[Source, str] = {
     "posterior": "the posterior of a fit to logs",
     "given": "given values, no logs",
 }
-WARNINGS: Mapping[Verdict, str] = {
-    "not_identified": "NOT IDENTIFIED, their values are assumed and no measurement",
-    "at_bound": "AT A BOUND, the model or a number that was held fixed may be wrong",
-    "disputed": "DISPUTED, floors disagree about them",
-}
 
 
 def header(robot: DeployedRobot) -> list[str]:
@@ -154,8 +147,12 @@ def facts(robot: DeployedRobot) -> list[str]:
 
 
 def warnings(robot: DeployedRobot) -> tuple[str, ...]:
-    """Return a warning for each verdict in `WARNED_VERDICTS` that any number of the robot has."""
-    by_verdict = {verdict: paths_with_verdict(robot, verdict) for verdict in WARNED_VERDICTS}
+    """Return a warning for each verdict in `WARNINGS` that any number of the robot has."""
+    known = {e.path: robot.record.parameters[e.path] for e in declared_numbers(robot.record)}
+    by_verdict = {
+        verdict: [path for path, number in known.items() if number.verdict == verdict]
+        for verdict in WARNINGS
+    }
     return tuple(f"{WARNINGS[v]}: {listed(paths)}." for v, paths in by_verdict.items() if paths)
 
 
@@ -194,15 +191,9 @@ ABOUT: Mapping[str, str] = {
 
 def readme(robot: DeployedRobot, forms: Sequence[str], controller: str) -> str:
     """Return the text of README.md."""
-    lines = [
-        "# One identified robot, ready to be taken along",
-        "",
-        *in_markdown(robot),
-        f"Everything here is made of `robot.json`, for the controller `{controller}`.",
-        "",
-        *(f"- `{form}/`: {ABOUT[form]}." for form in forms),
-        "",
-        "`sha256sum -c SHA256SUMS` tells whether a byte was changed; with slipid, "
-        "`slipid export --check` and this folder.",
-    ]
-    return "\n".join(lines) + "\n"
+    values = {
+        "HEAD": in_markdown(robot),
+        "CONTROLLER": controller,
+        "FORMS": [f"- `{form}/`: {ABOUT[form]}." for form in forms],
+    }
+    return filled("README.md", values)

@@ -24,19 +24,19 @@ ONE = "[1]"
 
 @dataclass(frozen=True)
 class Field:
-    """A member of a struct.
+    """An array of numbers, a member of a struct; attributes are keys of step.json.
 
     Attributes:
         name: name in C.
-        kind: kind of its numbers.
+        numbers: kind of its numbers.
         shape: shape of the array; () for a single number.
-        comment: meaning and unit of the field.
+        about: meaning and unit of the field.
     """
 
     name: str
-    kind: Kind
+    numbers: Kind
     shape: tuple[int, ...]
-    comment: str
+    about: str
 
     @property
     def size(self) -> int:
@@ -58,15 +58,6 @@ class Struct:
     about: str
     fields: tuple[Field, ...]
 
-    @classmethod
-    def of(cls, name: str, about: str, tree: object, documented: type | None = None) -> Struct:
-        """Return the struct for a tree of arrays or of modules with documented attributes.
-
-        `documented` is the class whose docstring describes the attributes; by default the class of
-        the tree.
-        """
-        return cls(name, about, tuple(_fields(tree, "", "", documented)))
-
 
 def kind_of(dtype: np.dtype) -> Kind:
     """Return the kind of number for a data type of jax or numpy."""
@@ -76,43 +67,32 @@ def kind_of(dtype: np.dtype) -> Kind:
 
 
 def attribute_docs(kind: type) -> dict[str, str]:
-    """Return the description of every attribute in a class's docstring.
-
-    Several attributes may share a sentence, `place, turn: of its ... [m], [rad].`, or a line,
-    separated by semicolons.
-    """
-    names = [field.name for field in fields(kind)]
-    text = inspect.getdoc(kind) or ""
-    _, _, rest = text.partition("Attributes:")
-    flat = " ".join(rest.split())
-    either = "|".join(re.escape(name) for name in names)
-    head = re.compile(rf"(?:^|(?<=[.;] )|(?<=[.;]))((?:(?:{either})(?:, )?)+): ")
-    heads = list(head.finditer(flat))
-    ends = [*(match.start() for match in heads[1:]), len(flat)][: len(heads)]
-    return {
-        name: flat[match.end() : end].strip().rstrip(";.")
-        for match, end in zip(heads, ends, strict=True)
-        for name in match.group(1).split(", ")
-    }
+    """Return the description of every attribute in a class's docstring."""
+    _, _, text = (inspect.getdoc(kind) or "").partition("Attributes:\n")
+    found = re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", text, re.MULTILINE)
+    return {name: " ".join(about.split()).rstrip(";.") for name, about in found}
 
 
-def _fields(tree: object, prefix: str, above: str, by: type | None = None) -> list[Field]:
-    """Return the fields of a tree.
+def fields_of(
+    tree: object, documented: type | None = None, prefix: str = "", above: str = ""
+) -> tuple[Field, ...]:
+    """Return a field for every leaf of a tree of arrays, or of modules with documented attributes.
 
     Args:
         tree: arrays, in modules that may contain further modules.
+        documented: class whose docstring describes the attributes; by default that of the tree.
         prefix: beginning of the fields' names.
         above: description of the attribute that holds the tree, used where there is no other.
-        by: class whose docstring describes the attributes; by default that of the tree.
     """
     if is_dataclass(tree) and not isinstance(tree, type):
-        docs = attribute_docs(by or type(tree))
-        parts = []
+        docs = attribute_docs(documented or type(tree))
+        parts: list[Field] = []
         for field in fields(tree):
             if not field.metadata.get("static", False):
                 name = f"{prefix}_{field.name}" if prefix else field.name
-                parts += _fields(getattr(tree, field.name), name, docs.get(field.name, above))
-        return parts
+                about = docs.get(field.name, above)
+                parts += fields_of(getattr(tree, field.name), None, name, about)
+        return tuple(parts)
     array = jnp.asarray(tree)
-    comment = above if UNIT.search(above) else f"{above} {ONE}".strip()
-    return [Field(prefix, kind_of(array.dtype), tuple(array.shape), comment)]
+    about = above if UNIT.search(above) else f"{above} {ONE}".strip()
+    return (Field(prefix, kind_of(array.dtype), tuple(array.shape), about),)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from slipid.robot.closed_loop import PERIOD, ControlLoop
 from slipid.robot.controller import ControllerState
-from slipid.robot.interface import Readings, StateEstimate
+from slipid.robot.interface import Measurement, Readings, StateEstimate
 
 STEPS = 48
 
@@ -71,28 +71,23 @@ def _inputs(loop: ControlLoop[eqx.Module]) -> Iterator[tuple[Readings, jax.Array
     Time steps include a short, a long and a zero one; readings include gaps, one of them long.
     """
     robot = loop.controller.robot
-    angle, count = np.zeros(robot.wheels), robot.wheels
+    angle = np.zeros(robot.wheels)
     for step in range(STEPS):
         t = step * PERIOD
         twist = np.array([0.15 * np.cos(2 * t), 0.12 * np.sin(3 * t), 0.4 * np.sin(t)])
         speed = np.asarray(robot.forward) @ twist / float(robot.frame.radius)
         angle = angle + speed * PERIOD
-        z = Readings.nothing(count)
-        if step not in (9, *range(26, 34)):
-            z = eqx.tree_at(lambda z: z.wheel_angle, z, jnp.asarray(angle))
-        if step % 5:
-            amps = 0.4 + 0.1 * np.sin(t + np.arange(count))
-            z = eqx.tree_at(lambda z: z.current, z, jnp.asarray(amps))
-        if step > 40:
-            z = eqx.tree_at(lambda z: z.wheel_angle, z, jnp.full(count, jnp.nan))
-            z = eqx.tree_at(lambda z: z.wheel_speed, z, jnp.asarray(speed))
-        if step > 17:
-            z = eqx.tree_at(lambda z: z.voltage, z, jnp.asarray(0.3 * speed))
-        if 6 <= step < 16:
-            z = eqx.tree_at(lambda z: z.gyro, z, jnp.asarray(twist[2] + 0.01))
-        if step in (12, 20):
-            fix = jnp.asarray([0.05, 0.02, 0.05]), jnp.asarray([0.01, 0.02]), jnp.asarray(0.08)
-            z = eqx.tree_at(lambda z: (z.fix, z.fix_std, z.fix_age), z, fix)
+        has_angle, has_fix = step not in (9, *range(26, 34)) and step <= 40, step in (12, 20)
+        z = Measurement(
+            wheel_angle=angle if has_angle else None,
+            wheel_speed=speed if step > 40 else None,
+            current=0.4 + 0.1 * np.sin(t + np.arange(robot.wheels)) if step % 5 else None,
+            voltage=0.3 * speed if step > 17 else None,
+            gyro=twist[2] + 0.01 if 6 <= step < 16 else None,
+            fix=(0.05, 0.02, 0.05) if has_fix else None,
+            fix_std=(0.01, 0.02) if has_fix else None,
+            fix_age=0.08 if has_fix else None,
+        ).filled(robot.wheels)
         reference = jnp.asarray([0.15 * t, 0.05 * t, 0.1 * t, 0.15, 0.05, 0.1])
         yield z, reference, {5: 0.02, 15: 0.13, 37: 0.0}.get(step, PERIOD)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,9 @@ import numpy as np
 from jax import export
 from jaxtyping import Array
 
-from slipid.exports.fields import Struct
+from slipid.exports.fields import Field, fields_of
 from slipid.exports.golden import Golden, golden, loop_step
+from slipid.exports.text import template
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.interface import Measurement, Readings
 from slipid.robot.robot_file import typed
@@ -35,37 +36,6 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 FILES = ("step.stablehlo", "step_batch.stablehlo", "step.json", "golden.npz")
 
 
-README = """# The step as StableHLO, for programs in JAX
-
-`step.json` lists the arrays that go in (`state`, then `given`) and come out (`state`, then `said`)
-in their order, all of them of 64 bits. `golden.npz` has the state of a robot at rest at 0, 0, 0 as
-`start0`, `start1` and so on, and steps to compare with.
-
-```python
-import jax, numpy as np
-
-jax.config.update("jax_enable_x64", True)
-step = jax.export.deserialize(bytearray(open("step.stablehlo", "rb").read()))
-kept = np.load("golden.npz")
-state = [kept[f"start{k}"] for k in range(sum(name.startswith("start") for name in kept))]
-found = step.call(*state, *given)  # given: reading, reference and dt, as step.json lists them
-state, said = found[: len(state)], found[len(state) :]
-```
-
-`step_batch.stablehlo` does the same for many robots, with an axis for them in front of every array.
-"""
-
-
-@dataclass(frozen=True)
-class Leaf:
-    """An input or output array; `numbers` is `real`, `int` or `bool`."""
-
-    name: str
-    numbers: str
-    shape: tuple[int, ...]
-    about: str
-
-
 @dataclass(frozen=True)
 class Signature:
     """Input and output arrays of a step in their order, as step.json lists them.
@@ -76,9 +46,9 @@ class Signature:
         said: further outputs.
     """
 
-    state: tuple[Leaf, ...]
-    given: tuple[Leaf, ...]
-    said: tuple[Leaf, ...]
+    state: tuple[Field, ...]
+    given: tuple[Field, ...]
+    said: tuple[Field, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,30 +98,34 @@ def stablehlo_files(loop: ControlLoop[eqx.Module]) -> dict[str, bytes]:
         "step_batch.stablehlo": bytes(batch.serialize()),
         "step.json": (json.dumps(about, indent=1) + "\n").encode(),
         "golden.npz": buffer.getvalue(),
-        "README.md": README.encode(),
+        "README.md": template("stablehlo.md").encode(),
     }
 
 
 def _signature(loop: ControlLoop[eqx.Module]) -> Signature:
-    begin = loop.init()
-    wheels = loop.controller.robot.wheels
+    begin, wheels = loop.init(), loop.controller.robot.wheels
     nothing = Readings.nothing(wheels)
     estimate = loop.estimator.step(begin.estimator, nothing, 0.0)[1]
-    others = (
-        Leaf("reference", "real", (6,), "pose and rates in the world [m, m, rad and per s]"),
-        Leaf("dt", "real", (), "since the last step [s]"),
-    )
-    command = Leaf("command", "real", (wheels,), "wheel speeds [rad/s]")
+    reference = "pose and rates in the world [m, m, rad and per s]"
     return Signature(
-        (*_leaves("estimator", begin.estimator), *_leaves("controller", begin.controller)),
-        (*_leaves("reading", nothing, Measurement), *others),
-        (*_leaves("estimate", estimate), command),
+        state=(
+            *_named("estimator", fields_of(begin.estimator)),
+            *_named("controller", fields_of(begin.controller)),
+        ),
+        given=(
+            *_named("reading", fields_of(nothing, Measurement)),
+            Field("reference", "real", (6,), reference),
+            Field("dt", "real", (), "since the last step [s]"),
+        ),
+        said=(
+            *_named("estimate", fields_of(estimate)),
+            Field("command", "real", (wheels,), "wheel speeds [rad/s]"),
+        ),
     )
 
 
-def _leaves(name: str, tree: object, documented: type | None = None) -> list[Leaf]:
-    fields = Struct.of(name, "", tree, documented).fields
-    return [Leaf(f"{name}.{f.name}", f.kind, f.shape, f.comment) for f in fields]
+def _named(name: str, fields: Sequence[Field]) -> list[Field]:
+    return [replace(field, name=f"{name}.{field.name}") for field in fields]
 
 
 def load_program(folder: Path | str) -> Program:
@@ -210,8 +184,7 @@ def _repeated(program: Program, steps: Golden, place: Path) -> None:
                 )
 
 
-def _split(row: np.ndarray, leaves: Sequence[Leaf]) -> list[Array]:
-    sizes = [int(np.prod(leaf.shape)) for leaf in leaves]
-    parts = np.split(row, np.cumsum(sizes)[:-1])
-    pairs = zip(parts, leaves, strict=True)
-    return [jnp.asarray(part.reshape(leaf.shape)) for part, leaf in pairs]
+def _split(row: np.ndarray, fields: Sequence[Field]) -> list[Array]:
+    parts = np.split(row, np.cumsum([field.size for field in fields])[:-1])
+    pairs = zip(parts, fields, strict=True)
+    return [jnp.asarray(part.reshape(field.shape)) for part, field in pairs]

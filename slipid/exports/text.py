@@ -1,4 +1,4 @@
-"""Text for people: words on one line, rounded numbers, Markdown tables.
+"""Text for people: words on one line, rounded numbers, Markdown tables, templates of files.
 
 It also makes names for floors and load set-ups that are valid as ROS parameters, in C++ and in file
 names.
@@ -6,7 +6,8 @@ names.
 
 import re
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib.resources import files
 
 WIDTH = 96
 """Largest length of a comment line, without the comment sign [characters]."""
@@ -38,6 +39,17 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Return the lines of a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return ["| " + " | ".join(map(_cell, line)) + " |" for line in lines]
+
+
+def template(name: str) -> str:
+    """Return the text of a file in this room's templates, such as `c99/README.md`."""
+    return (files(__package__) / "templates" / name).read_text()
+
+
+def filled(name: str, values: Mapping[str, str | Iterable[str]]) -> str:
+    """Return the text of a template with every @NAME@ replaced by its value, a text or lines."""
+    texts = {k: v if isinstance(v, str) else "\n".join(v) for k, v in values.items()}
+    return re.sub(r"@([A-Z]+)@", lambda match: texts[match.group(1)], template(name))
 
 
 def listed(names: Sequence[str]) -> str:

@@ -207,7 +207,10 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
             signed=settings["current_is_signed"],
             windows=settings["windows_per_piece"],
         ),
-        curves={floor: _curve_of(c) for floor, c in content["curves"].items()},
+        curves={
+            floor: SlipCurve(**{k: np.asarray(c[k], float) for k in _CURVE} | c["at"])
+            for floor, c in content["curves"].items()
+        },
         validity={floor: Validity(**_tuples(v)) for floor, v in content["validity"].items()},
         history=tuple(np.inf if x is None else x for x in content["history"]),
         lag=settings["lag"],
@@ -228,11 +231,6 @@ def from_json(content: Content, arrays: Mapping[str, np.ndarray]) -> Fit:
         laplace=arrays["laplace"],
         **{name: content[name] for name in _PLAIN},
     )
-
-
-def _curve_of(content: Content) -> SlipCurve:
-    rows: Content = {name: np.asarray(content[name], float) for name in _CURVE}
-    return SlipCurve(**rows, **content["at"])
 
 
 def _tuples(plain: Content) -> Content:

@@ -20,7 +20,7 @@ from slipid.fitting.problem import Problem
 from slipid.fitting.shared_effects import FittedEffects
 from slipid.fitting.variances import Search, Square
 from slipid.infer.slip_curves import SlipCurve
-from slipid.infer.verdicts.disputed import Dispute, disputes, marked
+from slipid.infer.verdicts.disputed import disputes, marked
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.profile import Profile, profile
 from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 Evidence = TypeVar("Evidence")
 
-CONFLICT = 4.0
+CONFLICT_STDS = 4.0
 """Distance of a number from its prior mean above which a message warns [prior std]."""
 
 
@@ -238,9 +238,9 @@ class Fit:
             DataError: a number does not exist or is fixed.
         """
         from slipid.infer.design import proposal
-        from slipid.infer.design.scope import DesignOptions
+        from slipid.infer.design.scope import Scope
 
-        return proposal.design(self, DesignOptions(parameters=parameters, runs=runs))
+        return proposal.design(Scope(self, parameters=parameters, runs=runs))
 
     def deploy(self) -> "DeployedRobot":
         """Return the model for the robot, with the intervals of the Laplace covariance.
@@ -300,8 +300,8 @@ class Fit:
         return self.space.with_pooled(float(np.sqrt(self.variance[POOLED])))
 
     @cached_property
-    def disputes(self) -> tuple[Dispute, ...]:
-        """Pairs of floors that disagree about the loads on the wheels."""
+    def disputes(self) -> dict[tuple[str, str], float]:
+        """Pairs of floors that disagree about the loads on the wheels, and by how much [std]."""
         return disputes(self.verdict_space, self.z, self.covariance)
 
     @cached_property
@@ -324,7 +324,12 @@ class Fit:
     @property
     def messages(self) -> tuple[str, ...]:
         """Warnings about the numbers, one sentence each."""
-        found = [*sentences(self.flat), *(d.sentence for d in self.disputes)]
+        found = [*sentences(self.flat)]
+        found += [
+            f"{one} and {other} disagree about the loads on the wheels by {sigma:.1f} standard "
+            "errors of their noise: the contact law lacks something; intervals count it"
+            for (one, other), sigma in self.disputes.items()
+        ]
         found += [
             f"{e.path} ended at its bound ({e.value:.3g} {e.unit})"
             for e in self.parameters.values()
@@ -334,7 +339,7 @@ class Fit:
             f"{e.path} lies {abs(e.pull):.1f} prior stds from its prior: "
             "the prior is wrong, or the model lacks something"
             for e in self.parameters.values()
-            if e.pull is not None and abs(e.pull) > CONFLICT and e.verdict != "at_bound"
+            if e.pull is not None and abs(e.pull) > CONFLICT_STDS and e.verdict != "at_bound"
         ]
         if self.refused is not None:
             found.append(str(self.refused["reason"]))

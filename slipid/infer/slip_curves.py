@@ -17,7 +17,7 @@ from slipid.model.contact_law import ContactSurface
 from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.search_space import Space
 
-POINTS = 41
+CURVE_POINTS = 41
 """Number of points of a curve."""
 _STEADY = 0.1
 """Largest deviation of a steady command from the run's median command, relative to the latter."""
@@ -116,7 +116,7 @@ def curves(
     out = {}
     for k, label in enumerate(labels):
         top = min(float(np.quantile(torque[floor == k], 0.98)), 0.999 * float(best[k].max()))
-        grid = np.linspace(0.0, top, POINTS)
+        grid = np.linspace(0.0, top, CURVE_POINTS)
         each = np.stack([np.interp(grid, row, _SLIP) for row in band[:, k]])
         low, high = np.quantile(each, [0.05, 0.95], axis=0)
         slip = np.interp(grid, best[k], _SLIP)

@@ -17,7 +17,7 @@ from slipid.infer.result import Channels, Fit, draws
 from slipid.predict.predictive import force_balance_of
 from slipid.search_space import Choice
 
-REMAINING = 0.3
+LARGEST_REMAINING = 0.3
 """Largest remaining Gauss-Newton step of a converged fit [posterior std]."""
 
 
@@ -36,7 +36,7 @@ def summarise(
     z, log_v = optimum.state.z, optimum.state.log_variance
     contact = force_balance_of(problem, optimum.state, optimum.covariance, problem.full_weight)
     remaining, name = _remaining(problem, optimum)
-    settled = remaining < REMAINING
+    settled = remaining < LARGEST_REMAINING
     stuck = f"the solver stopped {remaining:.2g} stds of {name} away from where its own step leads"
     windows, robot = problem.windows, contact.robot
     several = draws(z, contact.covariance, 400, seed)
@@ -92,8 +92,8 @@ def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
     z, log_v = state.z, state.log_variance
     electric = problem.electric(z, log_v)
     residual, jacobian = problem.linear(z, electric)
-    seen = problem.weighed(residual, log_v, every, state.shared(len(problem.windows)))
-    roots = seen.whitening.root
+    weighed = problem.weighed(residual, log_v, every, state.shared(len(problem.windows)))
+    roots = weighed.whitening.root
     own = problem.space.electric.astype(float)
     prior = np.asarray(problem.objective.prior_std(log_v)) ** -2
     _, slope = log_jacobian(problem.objective, z, electric, every)
@@ -103,7 +103,7 @@ def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
         white = jnp.einsum("nij,nj->ni", root, residual[k])
         half = jnp.einsum("nij,njp->nip", root, jacobian[k])
         if k == "motion":
-            white, half = _freed(seen.effects, white, half)
+            white, half = _without_effects(weighed.effects, white, half)
         flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k in MOTION_BLOCKS else own)
         gradient = gradient + flat.T @ np.asarray(white).ravel()
         info = info + flat.T @ flat
@@ -114,5 +114,8 @@ def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
 
 
 @jax.jit
-def _freed(tied: tuple[EffectPosterior, ...], white: Array, half: Array) -> tuple[Array, Array]:
-    return marginal_residuals(tied, white), marginal_slopes(tied, half)
+def _without_effects(
+    effects: tuple[EffectPosterior, ...], white: Array, half: Array
+) -> tuple[Array, Array]:
+    """Return whitened residuals and their derivative with the shared effects marginalised."""
+    return marginal_residuals(effects, white), marginal_slopes(effects, half)

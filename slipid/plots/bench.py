@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from slipid.infer.bench.fit import Equation, MotorFit
+from slipid.infer.bench.fit import MotorFit
+from slipid.infer.bench.moments import Equation
 from slipid.infer.bench.verdict import BenchFit
 from slipid.infer.bench.windows import BenchWindows
 from slipid.plots.drawing import BLUE, INK, ORANGE, SHADE, figure, plain, save
@@ -45,9 +46,9 @@ def _clock(w: BenchWindows) -> np.ndarray:
 
 def _signals(axes: Axes, equation: Equation) -> None:
     plain(axes)
-    w, s = equation.windows, equation.sums
+    w = equation.windows
     clock, measured = _clock(w), w.measured.mean(axis=0)
-    fitted = np.where(w.usable, measured - s.residual.mean(axis=0), np.nan)
+    fitted = np.where(w.usable, measured - equation.residual.mean(axis=0), np.nan)
     some = slice(None, None, max(1, len(clock) // MOST))
     axes.plot(clock[some], measured[some], color=SHADE, lw=2.2, alpha=0.6, label="measured")
     axes.plot(clock[some], fitted[some], color=BLUE, lw=0.9, label="fitted")
@@ -57,9 +58,9 @@ def _signals(axes: Axes, equation: Equation) -> None:
 
 def _residuals(panels: list[Axes], equation: Equation) -> None:
     """Draw residuals and their means in bins, over time, speed and current."""
-    w, s = equation.windows, equation.sums
-    speed, current, residual = (x.mean(axis=0) for x in (w.speed, w.current, s.residual))
-    weight = s.weight.sum(axis=0) + 1e-9
+    w = equation.windows
+    speed, current, residual = (x.mean(axis=0) for x in (w.speed, w.current, equation.residual))
+    weight = equation.weight.sum(axis=0) + 1e-9
     used = np.flatnonzero(w.usable)
     some = used[:: max(1, len(used) // MOST)]
     for axes, (x, label) in zip(
@@ -73,6 +74,6 @@ def _residuals(panels: list[Axes], equation: Equation) -> None:
         means = [np.average(residual[b], weights=weight[b]) for b in bins if len(b)]
         axes.plot([np.median(x[b]) for b in bins if len(b)], means, "o-", color=ORANGE, ms=3, lw=1)
         axes.axhline(0.0, color=INK, lw=0.6)
-        axes.set(ylim=(-6 * s.scale, 6 * s.scale), xlabel=label)
+        axes.set(ylim=(-6 * equation.scale, 6 * equation.scale), xlabel=label)
     panels[0].set_ylabel(f"residual [{equation.unit}]")
     panels[0].set_title("residuals, and their means (orange)", fontsize=9, loc="left", color=INK)

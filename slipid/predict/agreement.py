@@ -37,23 +37,23 @@ from slipid.fitting.variances import Search, Square
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.predict.kinematics import fourier
-from slipid.predict.predictive import PredictiveModel
+from slipid.predict.predictive import PredictiveModel, setups
 from slipid.predict.score import chords, mean_error
 from slipid.predict.slip_model import body_twist, turned
 from slipid.search_space import Space
 
-WORSE = 1.5
+WORSE_RATIO = 1.5
 """Largest accepted ratio of a floor's end-point errors after a fit to more runs to those before.
 
 With a wrong map the ratio is several.
 """
-FAR = 4.0
+LARGEST_SHIFT = 4.0
 """Largest accepted shift of a number, in its standard errors, when runs over several floors are
 added to those on single floors."""
-BETTER = 0.8
+ONE_FLOOR_RATIO = 0.8
 """Ratio of the error as if all wheels were on one floor to the error with the map, below which the
 map is rejected."""
-SURE = 3.0
+SURE_GROWTH = 3.0
 """Standard errors of paired differences above which a growth of errors is not due to chance."""
 
 
@@ -64,7 +64,7 @@ class FloorErrors:
     Attributes:
         before: error of the fit without runs over several floors.
         after: error of the fit that includes them.
-        is_worse: True if the error grew by more than `WORSE` and by more than chance.
+        is_worse: True if the error grew by more than `WORSE_RATIO` and by more than chance.
     """
 
     before: float
@@ -95,12 +95,12 @@ def compared(
         mine = np.array([floor == name for floor in floors])
         grown = new[mine] - old[mine]
         _, error, _ = mean_error(grown, np.arange(len(grown)))
-        much = new[mine].mean() > WORSE * old[mine].mean()
+        much = new[mine].mean() > WORSE_RATIO * old[mine].mean()
         total = max(float(distance[mine].sum()), 1e-9)  # runs may turn on the spot
         out[name] = FloorErrors(
             float(old[mine].sum() / total),
             float(new[mine].sum() / total),
-            bool(much and grown.mean() > SURE * error),
+            bool(much and grown.mean() > SURE_GROWTH * error),
         )
     return out
 
@@ -157,9 +157,9 @@ def contradiction(
         reason = f"end-point errors on {worse}"
     elif not np.isfinite(sigma):
         reason = "the fit to all of them did not settle"
-    elif sigma > FAR:
+    elif sigma > LARGEST_SHIFT:
         reason = f"{name} moves by {sigma:.0f} standard errors"
-    elif as_if[best] < BETTER * by_map:
+    elif as_if[best] < ONE_FLOOR_RATIO * by_map:
         errors = f"{1000 * by_map:.1f} mm/s by their map, {1000 * as_if[best]:.1f} mm/s"
         reason = f"errors of {errors} as if all on {best}"
     else:
@@ -170,7 +170,7 @@ def contradiction(
     )
 
 
-_TINY = 1e-6
+_RIDGE = 1e-6
 """Ridge relative to the sum of squares of each feature, for floors with too few runs."""
 
 
@@ -218,12 +218,12 @@ def _unpredicted_motion(
     x = np.concatenate([series, turns, late, *swept], axis=-1)
     gap = moved - step
     out = np.empty_like(gap)
-    group = np.array([f"{a}@{b}" for a, b in zip(w.surface, w.load, strict=True)])
+    group = np.array(setups(w))
     for name in np.unique(group):
         mine = np.flatnonzero(group == name)
         square = np.einsum("pki,pkj->pij", x[mine], x[mine])
         product = np.einsum("pki,pka->pia", x[mine], gap[mine])
-        ridge = _TINY * np.diag(np.diagonal(square.sum(axis=0)) + 1e-12)
+        ridge = _RIDGE * np.diag(np.diagonal(square.sum(axis=0)) + 1e-12)
         for run in np.unique(w.run[mine]):
             others = w.run[mine] != run
             solved = np.linalg.solve(

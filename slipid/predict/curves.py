@@ -26,7 +26,7 @@ Regressor = Callable[[RunSignals, RobotSpec], Slips]
 """Function that returns the argument x of each wheel's slip curve in every step."""
 Features = Callable[[np.ndarray], np.ndarray]
 """Function from the regressor (...,) to features (..., k); slip is their weighted sum."""
-HELD = 1e12
+BOUND_PRECISION = 1e12
 """Precision assigned to a coefficient at its bound, which is thereby treated as fixed."""
 RIDGE = 1e-6
 """Ridge on each coefficient of a monotone curve, relative to the norm of its column.
@@ -117,9 +117,9 @@ class CurveModel(WheelSlip):
         return np.einsum("sdk,de->sdek", phi, np.eye(phi.shape[1])).reshape(*phi.shape[:2], -1)
 
     def stiffness(self, w: TrainingWindows, spec: RobotSpec) -> Float[np.ndarray, "k k"]:
-        """Return precision `HELD` for coefficients at their bound of zero, and zero for others."""
+        """Return `BOUND_PRECISION` for coefficients at their bound of zero, and zero for others."""
         held = self.monotone & (np.arange(self.numbers) > 0) & (self.known <= 0)
-        return np.diag(held * HELD)
+        return np.diag(held * BOUND_PRECISION)
 
 
 def insensitive(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -29,13 +29,13 @@ from slipid.predict.predictive import (
 from slipid.predict.slip_models import FloorModels
 from slipid.search_space import Space
 
-MOST_TURNS, SCORING, SETTLED = 15, 4, 0.02
+MOST_TURNS, SCORING, SETTLED_CHANGE = 15, 4, 0.02
 """Limits of the fit of variances: largest number of rounds, scoring steps per round, and the change
 of every log variance below which rounds stop.
 
 The covariance of the model's numbers is computed once per round.
 """
-VAGUE = 1e-2
+VAGUE_PRECISION = 1e-2
 """Prior precision of a model's numbers: a std of 10 is uninformative for slips below one."""
 STEP = 1e-4
 """Step of the difference quotients with which a model is differentiated by its numbers."""
@@ -116,7 +116,7 @@ def fit_with_noise(
         blocks = {"motion": jnp.asarray(residual)}, {"motion": spread}
         for _ in range(SCORING):
             log_v = scoring_step(objective, *blocks, log_v, count, None)
-        if float(jnp.abs(log_v - last).max()) < SETTLED:
+        if float(jnp.abs(log_v - last).max()) < SETTLED_CHANGE:
             break
     variance, w = by_name(problem, log_v), problem.windows
     fitted = LinearModel(
@@ -133,9 +133,11 @@ def fit_with_noise(
 
 
 def _prior_precision(model: FloorModels, w: Windows, robot: Robot) -> np.ndarray:
-    """Return the prior precision of a model's numbers: `VAGUE`, plus ridges and active bounds."""
+    """Return the prior precision of a model's numbers, with ridges and active bounds."""
     held = model.stiffness(w, robot)
-    parts = [VAGUE * np.eye(v.size) + held.get(key, 0.0) for key, v in model.state.items()]
+    parts = [
+        VAGUE_PRECISION * np.eye(v.size) + held.get(key, 0.0) for key, v in model.state.items()
+    ]
     return np.asarray(block_diag(np.zeros((0, 0)), *parts))
 
 

@@ -39,7 +39,15 @@ from slipid.fitting.shared_effects import (
     TravelConditions,
     forecast_effects,
 )
-from slipid.fitting.variances import DEGREES, Search, Square, Vector, expected_posteriors, whitened
+from slipid.fitting.variances import (
+    DEGREES,
+    Blocks,
+    Search,
+    Square,
+    Vector,
+    expected_posteriors,
+    whitened,
+)
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.search_space import Space
@@ -235,31 +243,32 @@ def force_balance_of(
     problem: Problem, state: FitState, covariance: Square, keep: Float[np.ndarray, " segment"]
 ) -> ForceBalance:
     """Return the force balance as fitted to the kept segments, with its shared effects."""
-    robot, variance = problem.space.tree(state.z), by_name(problem, state.log_variance)
-    z, log_v = np.asarray(state.z), np.asarray(state.log_variance)
-    blocks, jacobian = problem.linear(z, problem.electric(z, log_v))
-    motion = blocks["motion"], jacobian["motion"]
-    w = problem.windows
+    z, log_v, w = np.asarray(state.z), np.asarray(state.log_variance), problem.windows
+    residual, jacobian = problem.linear(z, problem.electric(z, log_v))
+    motion = residual["motion"], jacobian["motion"]
     direction = TravelConditions.of(w, problem.robot).direction
     travelled = TravelDirections(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
     grown = extrapolation(problem.objective, motion, keep[: len(w)], covariance, log_v, travelled)
     return ForceBalance(
-        robot,
-        variance,
+        problem.space.tree(state.z),
+        by_name(problem, log_v),
         np.asarray(covariance),
         problem.space,
         z,
-        shared=fitted_effects(problem, state, keep),
+        shared=_fitted_effects(problem, state, keep, residual, jacobian),
         extrapolation=grown,
     )
 
 
-def fitted_effects(
-    problem: Problem, state: FitState, keep: Float[np.ndarray, " segment"]
+def _fitted_effects(
+    problem: Problem,
+    state: FitState,
+    keep: Float[np.ndarray, " segment"],
+    residual: Blocks,
+    jacobian: Blocks,
 ) -> dict[str, FittedEffects]:
     """Return the fitted effects that neighbouring runs share, by floor; `keep` marks the runs."""
     log_v, free = jnp.asarray(state.log_variance), problem.space.size
-    residual, jacobian = problem.linear(state.z, problem.electric(state.z, log_v))
     weighed = problem.weighed(residual, log_v, keep, state.shared(len(problem.windows)))
     white = jnp.einsum("nij,nj->ni", weighed.whitening.root["motion"], residual["motion"])
     half = whitened(problem.objective.blocks, jacobian, log_v, jnp.asarray(keep))["motion"]

@@ -29,7 +29,7 @@ from slipid.support.progress import Reporter
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SURE, SMALL = 2.0, 4.0
+SURE_STDS, SMALL_NATS = 2.0, 4.0
 """Smallest difference of two models that counts: in standard errors, and in nats over all runs.
 
 Below four nats in total, models predict equally well and the standard error of their difference is
@@ -95,7 +95,7 @@ def ranking(runs: Sequence[ScoredRun]) -> dict[str, Ranking]:
 
     The score is the expected log predictive density of a run's logged poses [nats per run], every
     run predicted by a fit without it. A model is tied with the best where the difference is less
-    than `SURE` clustered standard errors or, over all runs, less than `SMALL` nats.
+    than `SURE_STDS` clustered standard errors or, over all runs, less than `SMALL_NATS` nats.
     """
     return {floor: _floor(floor, mine) for floor, mine in by_floor(runs).items()}
 
@@ -131,7 +131,9 @@ def _ranked(
     difference, se, clustered = mean_error(behind, cluster)
     far, _, far_se = mean_error(np.array([s.endpoint_error for s in scores]), cluster)
     level = np.array([s.level for s in scores], float)
-    is_clear = abs(difference) >= SURE * clustered and abs(difference) * len(scores) >= SMALL
+    is_clear = (
+        abs(difference) >= SURE_STDS * clustered and abs(difference) * len(scores) >= SMALL_NATS
+    )
     return RankedModel(
         elpd=float(np.mean([s.log_density for s in scores if s.log_density is not None])),
         difference=difference,
@@ -226,14 +228,14 @@ def compared(
     return Comparison(ranking(rows), question)
 
 
-LEAST = 0.2
+LEAST_SPEED_RATIO = 0.2
 """Smallest ratio of a wheel's speed to that of the fastest wheel with which it gives a row."""
 VARIANTS: dict[str, tuple[float, bool, bool]] = {
-    "all": (LEAST, False, False),
+    "all": (LEAST_SPEED_RATIO, False, False),
     "slower wheels too": (0.1, False, False),
     "fast wheels only": (0.5, False, False),
-    "as built only": (LEAST, True, False),
-    "0 < s <= 1, I > 0.25 A only": (LEAST, False, True),
+    "as built only": (LEAST_SPEED_RATIO, True, False),
+    "0 < s <= 1, I > 0.25 A only": (LEAST_SPEED_RATIO, False, True),
 }
 """Choices of rows for `transfer`, by name: (least relative wheel speed, main load set-up only,
 filter of the 2021 paper).
@@ -285,11 +287,9 @@ def errors_by_floor(slip: np.ndarray, amps: np.ndarray, floor: np.ndarray) -> Co
         pooled[name] = slip[mine] - line[mine] @ others
         constant[name] = slip[mine] - slip[~mine].mean()
         own[name] = slip[mine] - line[mine] @ alone
-    gaps = {"pooled": pooled, "constant": constant, "per_surface": own}
-    return {name: _error_summary(gap) for name, gap in gaps.items()} | {"count": len(slip)}
-
-
-def _error_summary(gaps: dict[str, np.ndarray]) -> Content:
-    each = {name: float(np.sqrt(np.mean(gap**2))) for name, gap in gaps.items()}
-    rows = float(np.sqrt(np.mean(np.concatenate(list(gaps.values())) ** 2)))
-    return {"rows": rows, "floors": float(np.mean(list(each.values()))), "each": each}
+    out: Content = {}
+    for name, gaps in {"pooled": pooled, "constant": constant, "per_surface": own}.items():
+        each = {floor: float(np.sqrt(np.mean(gap**2))) for floor, gap in gaps.items()}
+        rows = float(np.sqrt(np.mean(np.concatenate(list(gaps.values())) ** 2)))
+        out[name] = {"rows": rows, "floors": float(np.mean(list(each.values()))), "each": each}
+    return out | {"count": len(slip)}

@@ -31,7 +31,7 @@ class Score:
         heading_error_deg: error of the final heading, at most 180 [deg].
         level: probability of the predicted region on whose boundary the measured end point lies,
             None for a model without regions.
-        covered90: whether the level is at most 0.9, None for a model without regions.
+        covered90: True if the level is at most 0.9, None for a model without regions.
         energy_score: energy score [m].
         log_density: log density of the logged poses [nats], None where it was not computed.
     """

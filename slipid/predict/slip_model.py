@@ -12,8 +12,9 @@ from typing import Literal, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from slipid.data.wheel_signals import body_steps
 from slipid.data.windows import Windows
 from slipid.fitting.likelihood import marker_increments, measured_increments
 from slipid.model.geometry import Geometry
@@ -205,17 +206,13 @@ class RunSignals:
     def windowed(self, seconds: float = WINDOW_S) -> "RunSignals":
         """Return the same run with neighbouring steps joined to steps of about `seconds` [s]."""
         first = groups(self.dt, seconds)
-        dt = np.add.reduceat(self.dt, first)
 
         def mean(x: np.ndarray | None) -> np.ndarray | None:
-            if x is None:
-                return None
-            weight = self.dt.reshape(-1, *[1] * (x.ndim - 1))
-            return np.asarray(np.add.reduceat(x * weight, first) / dt.reshape(weight[first].shape))
+            return None if x is None else group_means(x, self.dt, first)
 
         return replace(
             self,
-            dt=dt,
+            dt=np.add.reduceat(self.dt, first),
             turn=np.add.reduceat(self.turn, first),
             current=mean(self.current),
             gyro=mean(self.gyro),
@@ -323,6 +320,16 @@ def groups(dt: Float[np.ndarray, " step"], seconds: float) -> np.ndarray:
     return np.flatnonzero(np.diff(number, prepend=-1))
 
 
+def group_means(
+    values: Float[np.ndarray, "step *any"],
+    dt: Float[np.ndarray, " step"],
+    first: Int[np.ndarray, " group"],
+) -> Float[np.ndarray, "group *any"]:
+    """Return means over groups of steps, which begin at `first`, weighted by the steps' length."""
+    weight = dt.reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray(np.add.reduceat(values * weight, first) / np.add.reduceat(weight, first))
+
+
 def path_of(twist: Twists, dt: Float[np.ndarray, " step"]) -> Float[np.ndarray, "edge 3"]:
     """Return the poses of a path from the origin, with a constant twist per step (exact SE(2))."""
     heading = np.concatenate([[0.0], np.cumsum(twist[:, 2] * dt)])
@@ -342,7 +349,6 @@ def relative_to_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "e
 
 def body_increments(pose: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "step 3"]:
     """Return the body twist times the time of each step of a path (SE(2) logarithm) [m, m, rad]."""
-    turn = np.diff(pose[:, 2])
-    middle = 0.5 * (pose[1:, 2] + pose[:-1, 2])
-    arc = turned(-middle, np.diff(pose[:, :2], axis=0)) / np.sinc(turn / (2 * np.pi))[:, None]
-    return np.column_stack([arc, turn])
+    increments = body_steps(pose)
+    increments[:, :2] /= np.sinc(increments[:, 2:] / (2 * np.pi))  # arcs from chords
+    return increments

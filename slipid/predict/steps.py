@@ -16,10 +16,9 @@ from slipid.predict.slip_model import (
     RunSignals,
     SlipModel,
     Twists,
-    body_increments,
+    group_means,
     groups,
     path_of,
-    turned,
 )
 
 
@@ -105,13 +104,7 @@ class Steps:
 
     def ends(self, twist: Twists) -> Float[np.ndarray, "run 3"]:
         """Return the pose at each run's end, relative to its start [m, m, rad], from all twists."""
-        dt = self.signals.dt
-        turn = twist[:, 2] * dt
-        before = np.cumsum(turn) - turn
-        before -= np.repeat(before[self.first], self.length)
-        chord = np.sinc(turn / (2 * np.pi)) * dt
-        step = turned(before + 0.5 * turn, twist[:, :2] * chord[:, None])
-        return np.add.reduceat(np.column_stack([step, turn]), self.first)
+        return np.stack([run.path[-1] for run in self.predicted(twist)])
 
     def _runs(self, values: np.ndarray) -> list[np.ndarray]:
         """Return the values of all steps, run by run."""
@@ -143,15 +136,12 @@ class TrainingWindows:
     def of(cls, runs: Sequence[Run]) -> "TrainingWindows":
         """Return the windows of runs."""
         steps = Steps.of([run.signals for run in runs])
+        joined = [run.windowed() for run in runs]
         begins = [groups(run.signals.dt, WINDOW_S) for run in runs]
-        edges = [
-            np.append(begin, len(run.signals)) for begin, run in zip(begins, runs, strict=True)
-        ]
-        moved = [body_increments(run.pose[edge]) for run, edge in zip(runs, edges, strict=True)]
         first = np.concatenate([s + begin for s, begin in zip(steps.first, begins, strict=True)])
-        dt = np.add.reduceat(steps.signals.dt, first)
+        dt = np.concatenate([run.signals.dt for run in joined])
         run = np.repeat(np.arange(len(runs)), [len(begin) for begin in begins])
-        return cls(steps, first, dt, np.concatenate(moved) / dt[:, None], run)
+        return cls(steps, first, dt, np.concatenate([run.twist for run in joined]), run)
 
     @property
     def signals(self) -> RunSignals:
@@ -163,9 +153,7 @@ class TrainingWindows:
 
     def means(self, values: Float[np.ndarray, "step *any"]) -> Float[np.ndarray, "window *any"]:
         """Return the means of values over the windows, weighted by the length of the steps."""
-        one = [1] * (values.ndim - 1)
-        total = np.add.reduceat(values * self.steps.signals.dt.reshape(-1, *one), self.first)
-        return np.asarray(total / self.dt.reshape(-1, *one))
+        return group_means(values, self.steps.signals.dt, self.first)
 
     def errors(self, twist: Twists, spec: RobotSpec) -> Float[np.ndarray, " row"]:
         """Return the displacement errors of all windows [m], from predicted twists of all steps.
@@ -214,9 +202,9 @@ class TwistModel(SlipModel, abc.ABC):
     """
 
     learns: ClassVar[bool] = True
-    """Whether the model has fitted numbers."""
+    """True if the model has fitted numbers."""
     by_load: ClassVar[bool] = False
-    """Whether `slipid compare` fits every load set-up of a floor separately."""
+    """True if `slipid compare` fits every load set-up of a floor separately."""
     coefficients: np.ndarray | None = field(default=None, kw_only=True)
 
     @abc.abstractmethod

@@ -81,7 +81,7 @@ class FloorSummary:
 
 @dataclass(frozen=True)
 class Validation:
-    """Runs that a fit predicted open loop, model by model; `print` shows the mean errors.
+    """Runs that a fit predicted open loop, model by model; `print` shows them by floor and model.
 
     Attributes:
         runs: runs with the scores of every model.
@@ -92,7 +92,10 @@ class Validation:
     new: int = 0
 
     def __str__(self) -> str:
-        return self.table
+        from slipid.report.estimates import show_validation
+        from slipid.report.page import text_of
+
+        return text_of(show_validation, self.to_json())
 
     @property
     def which(self) -> str:
@@ -120,18 +123,6 @@ class Validation:
         }
         runs = [run.to_json() for run in self.runs]
         return {"schema": SCHEMA, "summary": summary, "runs": runs}
-
-    @property
-    def table(self) -> str:
-        """Mean end-point error in percent, one line per floor, one column per model."""
-        floors = self.summary
-        models = list(next(iter(floors.values())))
-        first = f"{'end-point error, %':18}" + "".join(f"{m:>16}" for m in models)
-        lines = [f"{first}{'runs':>6}"]
-        for floor, by in floors.items():
-            cells = "".join(f"{100 * by[m].endpoint_error_mean:16.2f}" for m in models)
-            lines.append(f"{floor:18}{cells}{by[models[0]].runs:6d}")
-        return "\n".join(lines)
 
 
 def validation(

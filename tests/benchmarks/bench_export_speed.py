@@ -15,9 +15,10 @@ import pytest
 
 from slipid.deploy.controllers import control_loop_of
 from slipid.exports.c99.builder import Names
-from slipid.exports.c99.code import Code, template
+from slipid.exports.c99.code import Code
 from slipid.exports.c99.function import Argument, function, traced
 from slipid.exports.c99.text import table
+from slipid.exports.text import template
 from slipid.lab.trial.controllers import ROWS
 from slipid.model import contact
 from slipid.model.contact_balance import stand
@@ -202,7 +203,7 @@ def settled(folder: Path) -> tuple[int, np.ndarray]:
         "#include <stdbool.h>",
         "#include <stdint.h>",
     ]
-    lines = [*head, "typedef double slipid_real;", template("prelude.c"), f"{made.head};"]
+    lines = [*head, "typedef double slipid_real;", template("c99/prelude.c"), f"{made.head};"]
     lines += [x for m in names.tables.values() if m.name in made.reads for x in table(m)]
     (folder / "settled.c").write_text("\n".join([*lines, *made.text]))
     floor, rows = on.floor, []

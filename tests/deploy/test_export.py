@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from slipid.deploy.controllers import control_loop_of
-from slipid.deploy.export import FORMS, ExportOptions, export, robot_at
+from slipid.deploy.deploy import read_robot
+from slipid.deploy.export import FORMS, ExportOptions, export
 from slipid.deploy.twin_run import REST_S, starts, twin_floor
 from slipid.exports.c99.folder import c_files
 from slipid.exports.folder import check_folder
@@ -159,17 +160,17 @@ def printed(course: closed_loop.ClosedLoopRun) -> list[str]:
 
 def test_a_robot_is_found_in_a_folder_or_a_file_with_some_of_its_floors(tmp_path):
     ROBOT.save(tmp_path / "robot.json")
-    assert robot_at(tmp_path, None, ()).labels == ("firm", "soft")
-    assert robot_at(tmp_path / "robot.json", None, ("soft",)).labels == ("soft",)
+    assert read_robot(tmp_path).labels == ("firm", "soft")
+    assert read_robot(tmp_path / "robot.json", None, ("soft",)).labels == ("soft",)
     with pytest.raises(DataError, match="no floor 'ice'; identified: firm, soft"):
-        robot_at(tmp_path, None, ("ice",))
+        read_robot(tmp_path, None, ("ice",))
     with pytest.raises(DataError, match="no load set-up 'moved'"):
-        robot_at(tmp_path, "moved", ())
+        read_robot(tmp_path, "moved", ())
     content = json.loads((tmp_path / "robot.json").read_text())
     content["schema"] = "slipid.robot/99"
     (tmp_path / "robot.json").write_text(json.dumps(content))
     with pytest.raises(DataError, match="written by a newer slipid"):
-        robot_at(tmp_path, None, ())
+        read_robot(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def test_a_clock_that_has_run_for_days_goes_on_in_float(tmp_path):
 
 @pytest.mark.slow
 def test_every_field_has_a_unit():
-    plain = {f.name for s in code("contact").structs for f in s.fields if f.comment.endswith("[1]")}
+    plain = {f.name for s in code("contact").structs for f in s.fields if f.about.endswith("[1]")}
     assert plain == {
         *("floors_belief", "floors_expected", "place_toward", "begun", "slip"),
         *("surface_probability", "stale", "immobilised", "out_of_range"),
@@ -127,8 +127,9 @@ def test_a_docstring_says_what_each_attribute_is():
 
 @pytest.mark.slow
 def test_the_loop_closes_in_c_as_it_does_in_the_library(tmp_path):
-    from slipid.deploy.export import ExampleStart, ExportOptions, record_example
-    from slipid.deploy.twin_run import starts, twin_floor
+    from slipid.deploy.deploy import actuator_model_of
+    from slipid.deploy.export import record_example
+    from slipid.deploy.twin_run import starts, twin_floor, twin_plant
 
     made = code("contact")
     path = rectangle(length=0.4, width=0.2)
@@ -136,8 +137,9 @@ def test_the_loop_closes_in_c_as_it_does_in_the_library(tmp_path):
     compiled = CompiledC(generated, tmp_path)
     robot = made.robot
     floor = twin_floor(robot)
-    place = ExampleStart(floor, starts(20, floor, path)[0], (0.0, 0.0, 0.0))
-    kept = record_example(robot, made.loop, path, ExportOptions(), place)
+    start, sensors = starts(20, floor, path)[0], actuator_model_of(robot, gyro=False)
+    plant = twin_plant(robot, floor, start, 0, sensors)
+    kept = record_example(made.loop, path, plant, (0.0, 0.0, 0.0), "rectangle")
     compiled.begin((0.0, 0.0, 0.0))
     numbers = [f.size for f in generated.reading.fields]
     for row, command, time in zip(kept.given, kept.command, kept.time, strict=True):

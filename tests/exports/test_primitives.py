@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from slipid.exports.c99.builder import Names
-from slipid.exports.c99.code import template
 from slipid.exports.c99.function import Argument, function, traced
 from slipid.exports.c99.lower import UnsupportedError
 from slipid.exports.c99.text import table
+from slipid.exports.text import template
 from tests.helpers import small_twin
 from tests.helpers.compiled_c import NEEDS_COMPILER, QUICK
 
@@ -250,7 +250,7 @@ def _compiled(names: Names, functions, folder: Path) -> ctypes.CDLL:
         "#include <stdbool.h>",
         "#include <stdint.h>",
     ]
-    text = [*head, "typedef double slipid_real;", template("prelude.c"), *tables]
+    text = [*head, "typedef double slipid_real;", template("c99/prelude.c"), *tables]
     text += [line for f in functions for line in (f"{f.head};", *f.text)]
     (folder / "all.c").write_text("\n".join(text))
     flags = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-shared", "-fPIC")

@@ -57,7 +57,7 @@ class Kinds:
     def of(self, struct: Struct) -> np.dtype:
         """A struct as numpy's."""
         kinds = {"real": self.real, "int": np.int32, "bool": np.bool_}
-        return np.dtype([(f.name, kinds[f.kind], f.shape) for f in struct.fields], align=True)
+        return np.dtype([(f.name, kinds[f.numbers], f.shape) for f in struct.fields], align=True)
 
 
 _LIBRARIES: dict[tuple[str, ...], ctypes.CDLL] = {}

@@ -155,7 +155,7 @@ def test_a_judged_run_comes_back_from_its_file():
 def test_a_clear_winner_is_named_and_a_difference_within_its_error_is_not():
     rng = np.random.default_rng(2)
     base = rng.normal(30.0, 3.0, 36)
-    told = ranking(
+    ranked = ranking(
         rows(
             {
                 "identified": base,
@@ -164,10 +164,10 @@ def test_a_clear_winner_is_named_and_a_difference_within_its_error_is_not():
             }
         )
     )["floor"]
-    verdicts = {name: one.verdict for name, one in told.models.items()}
+    verdicts = {name: one.verdict for name, one in ranked.models.items()}
     assert sorted(verdicts.values()) == ["best", "tied", "worse"]
     assert verdicts["constant"] == "worse"
-    assert "cannot tell contact equilibrium from linear" in told.sentence
+    assert "cannot tell contact equilibrium from linear" in ranked.sentence
     alone = ranking(rows({"identified": base, "constant": base - 4.0}))["floor"]
     assert alone.sentence.startswith("floor: contact equilibrium is best; next constant, 4.0")
 
@@ -235,10 +235,10 @@ def width_of_student(m):
 
 @pytest.mark.slow
 def test_linear_slip_is_told_from_constant_slip():
-    told, models, _, _ = judged(
+    ranked, models, _, _ = judged(
         driven("linear", ([1.0], [3.0]), 3, runs=480), ("encoder", "constant", "linear", "affine")
     )
-    for floor in ranking(told).values():
+    for floor in ranking(ranked).values():
         verdict = {name: one.verdict for name, one in floor.models.items()}
         assert verdict["encoder"] == verdict["constant"] == "worse"
         assert "worse" not in (verdict["linear"], verdict["affine"])  # affine contains linear
@@ -266,10 +266,10 @@ def test_models_that_say_the_same_can_hardly_be_told_apart():
     """What made the runs is never worse; numbers too many cost little, told in a few folds only."""
     others = []
     for seed in (4, 5, 6):
-        told, *_ = judged(
+        ranked, *_ = judged(
             driven("constant", ([0.1], [0.3]), seed), ("constant", "affine", "quadratic")
         )
-        for name, floor in ranking(told).items():
+        for name, floor in ranking(ranked).items():
             verdict = {model: one.verdict for model, one in floor.models.items()}
             assert verdict.pop("constant") in ("best", "tied")
             others += verdict.values()

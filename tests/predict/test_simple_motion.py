@@ -24,8 +24,8 @@ def wild(rng, steps, dt=0.1, **extra):
     rolling, twist = rng.normal(size=(2, steps, 3)) * [0.2, 0.2, 0.5]
     run = made_run(rolling, twist, current=rng.uniform(0, 1, (steps, 3)), dt=dt, **extra)
     uneven = rng.uniform(0.05, 0.2, steps)
-    heard = replace(run.signals, dt=uneven, turn=run.signals.turn / dt * uneven[:, None])
-    return replace(run, signals=heard, pose=path_of(twist, uneven) + np.array([1.0, -2.0, 0.0]))
+    signals = replace(run.signals, dt=uneven, turn=run.signals.turn / dt * uneven[:, None])
+    return replace(run, signals=signals, pose=path_of(twist, uneven) + np.array([1.0, -2.0, 0.0]))
 
 
 # encoders
@@ -34,10 +34,10 @@ def wild(rng, steps, dt=0.1, **extra):
 def test_encoders_say_the_path_of_wheels_that_do_not_slip(rng):
     runs = [made_run(rng.normal(size=(n, 3)) * 0.2) for n in (40, 7, 25)]
     method = Encoder().fit(runs, ROBOTINO)
-    said = method.predict([run.signals for run in runs], ROBOTINO)
+    predicted = method.predict([run.signals for run in runs], ROBOTINO)
     assert method.numbers == 0
     assert method.name == "encoder"
-    for each, run in zip(said, runs, strict=True):
+    for each, run in zip(predicted, runs, strict=True):
         assert np.allclose(each.path, run.pose)
 
 
@@ -140,8 +140,8 @@ def test_the_effective_track_comes_back(rng):
     runs = skid_runs(rng, one_track)
     method = Corrected("effective_track").fit(runs[:3], HUSKY)
     assert method.coefficients == pytest.approx([1.2, 0.6, 0.15])
-    said = method.predict([run.signals for run in runs[3:]], HUSKY)
-    for each, run in zip(said, runs[3:], strict=True):
+    predicted = method.predict([run.signals for run in runs[3:]], HUSKY)
+    for each, run in zip(predicted, runs[3:], strict=True):
         assert np.allclose(each.path, run.pose)
 
 
@@ -165,8 +165,8 @@ def test_instantaneous_centres_come_back_where_sides_differ(rng):
     assert method.coefficients[2] == pytest.approx(0.08)
     plain = Corrected("effective_track").fit(runs[:3], HUSKY)
     for run in runs[3:]:
-        said, less = (m.predict([run.signals], HUSKY)[0] for m in (method, plain))
-        assert np.allclose(said.path, run.pose)
+        predicted, less = (m.predict([run.signals], HUSKY)[0] for m in (method, plain))
+        assert np.allclose(predicted.path, run.pose)
         assert np.abs(less.path - run.pose).max() > 0.05
 
 
@@ -179,8 +179,8 @@ def test_kinematics_are_counted_by_floor(rng):
     ):
         assert method.fit(grass, HUSKY).numbers == numbers
         assert ByFloor.of(method).fit(grass + ice, HUSKY).numbers == 2 * numbers
-        untold = [run.with_floor(False) for run in grass + ice]
-        assert ByFloor.of(method).fit(untold, HUSKY).numbers == numbers
+        of_unknown_floor = [run.with_floor(False) for run in grass + ice]
+        assert ByFloor.of(method).fit(of_unknown_floor, HUSKY).numbers == numbers
         assert method.needs == frozenset()
         with pytest.raises(ValueError, match="not fitted"):
             method.predict([grass[0].signals], HUSKY)
@@ -208,8 +208,8 @@ def test_headings_that_were_not_driven_are_interpolated():
     method = HeadingLookup(ridge=0.0).fit([by_heading(a) for a in HEADINGS], ROBOTINO)
     assert method.numbers == 39
     between = [by_heading(a + 0.1, speed=0.3) for a in HEADINGS]
-    said = method.predict([run.signals for run in between], ROBOTINO)
-    for each, run in zip(said, between, strict=True):
+    predicted = method.predict([run.signals for run in between], ROBOTINO)
+    for each, run in zip(predicted, between, strict=True):
         assert np.allclose(each.path, run.pose, atol=1e-9)
 
 
@@ -240,9 +240,9 @@ def test_a_heavy_ridge_leaves_what_all_headings_share():
 def test_a_robot_that_stands_still_stays_so():
     still = made_run(np.zeros((10, 3)))
     method = HeadingLookup().fit([still], ROBOTINO)
-    said = method.predict([still.signals, made_run(straight(0.3)).signals], ROBOTINO)
-    assert np.allclose(said[0].path, 0.0)
-    assert np.allclose(said[1].path, made_run(straight(0.3)).pose)
+    predicted = method.predict([still.signals, made_run(straight(0.3)).signals], ROBOTINO)
+    assert np.allclose(predicted[0].path, 0.0)
+    assert np.allclose(predicted[1].path, made_run(straight(0.3)).pose)
 
 
 def test_the_table_tries_ridges_and_wants_a_twist():

@@ -47,7 +47,7 @@ def test_a_floor_is_told_only_if_asked():
 
 def test_the_power_is_that_of_the_torque():
     amps = np.full((40, 3), 0.8)
-    heard = made_run(straight(0.5), current=amps).signals
-    shaft = np.abs(16 * heard.speed)
-    mechanical = (heard.torque(ROBOTINO) * shaft).sum(axis=1)
-    assert heard.power(ROBOTINO) == pytest.approx(mechanical, rel=0.05)
+    signals = made_run(straight(0.5), current=amps).signals
+    shaft = np.abs(16 * signals.speed)
+    mechanical = (signals.torque(ROBOTINO) * shaft).sum(axis=1)
+    assert signals.power(ROBOTINO) == pytest.approx(mechanical, rel=0.05)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slipid.api.robot import drive
-from slipid.deploy.deploy import require_steering
+from slipid.deploy.deploy import read_robot
 from slipid.deploy.robot_record import moved_per_metre, spread_of
 from slipid.lab.selftest.logs import SimulatedSensors, simulate_logs
 from slipid.model.robot import build
@@ -128,7 +128,8 @@ def test_the_robot_survives_its_file(driven, tmp_path):
 def test_it_has_no_controller(driven, tmp_path):
     robot, _ = driven
     assert not robot.steers
+    robot.save(tmp_path / "robot.json")
     with pytest.raises(DataError, match=r"it has an estimator .* but no controller"):
-        require_steering(tmp_path, robot)
+        read_robot(tmp_path)
     with pytest.raises(ValueError, match=r"it has an estimator .* but no controller"):
         drive(robot)

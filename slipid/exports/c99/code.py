@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
-from importlib.resources import files
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,8 +12,8 @@ from slipid.exports.c99.builder import Names
 from slipid.exports.c99.function import Argument, Function, function, traced
 from slipid.exports.c99.text import TYPES, WIDTH, folded, table
 from slipid.exports.description import header
-from slipid.exports.fields import Struct
-from slipid.exports.text import identifiers, listed, wrapped
+from slipid.exports.fields import Struct, fields_of
+from slipid.exports.text import filled, identifiers, listed, template, wrapped
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.filter.hypotheses import hypotheses_of
@@ -36,6 +34,7 @@ class Code:
         controller: struct of the controller's state.
         reading: struct of the inputs.
         estimate: struct of the outputs.
+        structs: all structs.
         functions: all generated functions.
     """
 
@@ -49,20 +48,14 @@ class Code:
         """
         self.robot, self.loop, self.path = robot, loop, path
         self._names = Names()
-        begin, nothing = loop.init(), Readings.nothing(robot.wheels)
-        zero = jnp.zeros(())
+        begin, nothing, zero = loop.init(), Readings.nothing(robot.wheels), jnp.zeros(())
         estimate = loop.estimator.step(begin.estimator, nothing, zero)[1]
-        self.estimator = Struct.of("slipid_estimator", "What the estimator keeps.", begin.estimator)
-        self.controller = Struct.of(
-            "slipid_controller", "What the controller keeps.", begin.controller
-        )
-        self.reading = Struct.of(
-            "slipid_reading",
-            "What the sensors give; NaN where there is none.",
-            nothing,
-            Measurement,
-        )
-        self.estimate = Struct.of("slipid_estimate", "What is believed.", estimate)
+        self.estimator = _struct("estimator", "What the estimator keeps.", begin.estimator)
+        self.controller = _struct("controller", "What the controller keeps.", begin.controller)
+        about = "What the sensors give; NaN where there is none."
+        self.reading = _struct("reading", about, nothing, Measurement)
+        self.estimate = _struct("estimate", "What is believed.", estimate)
+        self.structs = self.estimator, self.controller, self.reading, self.estimate
         self.functions = list(self._functions(begin.estimator, begin.controller, nothing, estimate))
 
     def _functions(
@@ -72,26 +65,26 @@ class Code:
         nothing: Readings,
         estimate: eqx.Module,
     ) -> Iterator[Function]:
-        loop, one = self.loop, jnp.zeros(())
-        wheels = loop.controller.robot.wheels
+        """Yield all functions; arguments are examples of states, readings and estimates."""
+        loop, zero, wheels = self.loop, jnp.zeros(()), self.robot.wheels
         pose, dt = Argument.plain("pose", (3,)), Argument.plain("dt", ())
-        fresh = (
-            Argument.of("estimator", self.estimator, False, True),
-            Argument.of("controller", self.controller, False, True),
-        )
         yield function(
             self._names,
             "slipid_begin",
             "Start estimator and controller of a robot that stands at a pose: x, y [m], heading "
             "[rad].",
-            (*fresh, pose),
+            (
+                Argument.of("estimator", self.estimator, read=False, written=True),
+                Argument.of("controller", self.controller, read=False, written=True),
+                pose,
+            ),
             traced(lambda p: (loop.init(p).estimator, loop.init(p).controller), jnp.zeros(3)),
         )
         yield function(
             self._names,
             "slipid_nothing",
             "Make a reading one of no sensor at all; fill in what there is.",
-            (Argument.of("reading", self.reading, False, True),),
+            (Argument.of("reading", self.reading, read=False, written=True),),
             traced(lambda: Readings.nothing(wheels)),
         )
         yield function(
@@ -99,12 +92,12 @@ class Code:
             "slipid_observe",
             "Take in what the sensors give dt after the last call [s]: the estimator's step.",
             (
-                Argument.of("estimator", self.estimator, True, True),
+                Argument.of("estimator", self.estimator, written=True),
                 Argument.of("reading", self.reading),
                 dt,
-                Argument.of("estimate", self.estimate, False, True),
+                Argument.of("estimate", self.estimate, read=False, written=True),
             ),
-            traced(loop.estimator.step, estimator, nothing, one),
+            traced(loop.estimator.step, estimator, nothing, zero),
         )
         yield function(
             self._names,
@@ -112,13 +105,13 @@ class Code:
             "Wheel speeds to command [rad/s] for a reference, x, y [m], heading [rad] and their "
             "rates in the world [m/s, m/s, rad/s]: the controller's step.",
             (
-                Argument.of("controller", self.controller, True, True),
+                Argument.of("controller", self.controller, written=True),
                 Argument.plain("reference", (6,)),
                 Argument.of("estimate", self.estimate),
                 dt,
-                Argument.plain("command", (wheels,), False, True),
+                Argument.plain("command", (wheels,), read=False, written=True),
             ),
-            traced(loop.controller.step, controller, jnp.zeros(6), estimate, one),
+            traced(loop.controller.step, controller, jnp.zeros(6), estimate, zero),
         )
         if self.path is not None:
             yield self._follow(self.path)
@@ -147,11 +140,6 @@ class Code:
         )
 
     @property
-    def structs(self) -> tuple[Struct, ...]:
-        """All generated structs."""
-        return self.estimator, self.controller, self.reading, self.estimate
-
-    @property
     def kept(self) -> int:
         """Count of the numbers in the state of estimator, controller and path."""
         return sum(f.size for s in (self.estimator, self.controller) for f in s.fields) + 1
@@ -165,44 +153,44 @@ class Code:
         """Return the text of slipid.h."""
         robot = self.robot
         names = identifiers(robot.labels, "floor")
-        floors = [f"SLIPID_FLOOR_{name.upper()} {k}" for k, name in enumerate(names)]
-        sizes = [f"SLIPID_WHEELS {robot.wheels}", f"SLIPID_FLOORS {len(robot.labels)}"]
-        defines = [f"#define {d}" for d in (*sizes, *floors, *self._duration())]
-        single = [f"#define {name} {name}_float" for name in self._names_of_functions]
-        declared = [
-            line
-            for f in self.functions
-            for line in (*_comment(f.about), *folded(f"{f.head};", ""), "")
+        defines = [
+            f"SLIPID_WHEELS {robot.wheels}",
+            f"SLIPID_FLOORS {len(robot.labels)}",
+            *(f"SLIPID_FLOOR_{name.upper()} {k}" for k, name in enumerate(names)),
+            *([] if self.path is None else [f"SLIPID_PATH_SECONDS {self.path.duration!r}"]),
         ]
+        public = ["slipid_init", "slipid_step", *(f.name for f in self.functions)]
         values = {
-            "HEAD": "\n".join(_comment(*header(robot))),
+            "HEAD": _comment(*header(robot)),
             "ROBOT": robot.record.numbers,
-            "DEFINES": "\n".join(defines),
-            "ABOUT": "\n".join(line for part in about(self.loop) for line in _comment(part)),
-            "SINGLE": "\n".join(single),
-            "STRUCTS": "\n".join(line for s in self.structs for line in _struct(s)),
-            "FUNCTIONS": "\n".join(declared),
+            "DEFINES": [f"#define {d}" for d in defines],
+            "ABOUT": [line for part in about(self.loop) for line in _comment(part)],
+            "SINGLE": [f"#define {name} {name}_float" for name in public],
+            "STRUCTS": [line for s in self.structs for line in _definition(s)],
+            "FUNCTIONS": [
+                line
+                for f in self.functions
+                for line in (*_comment(f.about), *folded(f"{f.head};", ""), "")
+            ],
         }
-        return filled("slipid.h", values)
-
-    @property
-    def _names_of_functions(self) -> list[str]:
-        return ["slipid_init", "slipid_step", *(f.name for f in self.functions)]
-
-    def _duration(self) -> list[str]:
-        return [] if self.path is None else [f"SLIPID_PATH_SECONDS {self.path.duration!r}"]
+        return filled("c99/slipid.h", values)
 
     def source(self) -> str:
         """Return the text of slipid.c."""
         reads = frozenset[str]().union(*(f.reads for f in self.functions))
         tables = [m for m in self._names.tables.values() if m.name in reads]
         values = {
-            "HEAD": "\n".join(_comment(*header(self.robot))),
-            "PRELUDE": template("prelude.c"),
-            "TABLES": "\n".join(line for m in tables for line in table(m)),
-            "FUNCTIONS": "\n".join(line for f in self.functions for line in f.text),
+            "HEAD": _comment(*header(self.robot)),
+            "PRELUDE": template("c99/prelude.c"),
+            "TABLES": [line for m in tables for line in table(m)],
+            "FUNCTIONS": [line for f in self.functions for line in f.text],
         }
-        return filled("slipid.c", values)
+        return filled("c99/slipid.c", values)
+
+
+def _struct(name: str, about: str, tree: object, documented: type | None = None) -> Struct:
+    """Return the struct of a tree; `documented` is as in `fields_of`."""
+    return Struct(f"slipid_{name}", about, fields_of(tree, documented))
 
 
 def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
@@ -228,16 +216,6 @@ def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
     yield f"Hypotheses of the floors, as rows count them, with the floor under each wheel: {each}."
 
 
-def template(name: str) -> str:
-    """Return the text of a file in this folder's templates."""
-    return (files(__package__) / "templates" / name).read_text()
-
-
-def filled(name: str, values: dict[str, str]) -> str:
-    """Return the text of a template with every @NAME@ replaced by its value."""
-    return re.sub(r"@([A-Z]+)@", lambda match: values[match.group(1)], template(name))
-
-
 def _comment(*parts: str) -> list[str]:
     """Return the lines of a C comment."""
     lines = [line.replace("*/", "* /") for part in parts for line in wrapped(part)]
@@ -248,12 +226,13 @@ def _comment(*parts: str) -> list[str]:
     )
 
 
-def _struct(struct: Struct) -> Sequence[str]:
+def _definition(struct: Struct) -> Sequence[str]:
+    """Return the lines of C that define a struct."""
     lines = [*_comment(struct.about), "typedef struct {"]
     for field in struct.fields:
         size = f"[{field.size}]" if field.shape else ""
         shape = "" if len(field.shape) < 2 else f", {' x '.join(map(str, field.shape))} by rows"
-        declared, comment = f"  {TYPE[field.kind]} {field.name}{size};", f"{field.comment}{shape}"
+        declared, comment = f"  {TYPE[field.numbers]} {field.name}{size};", f"{field.about}{shape}"
         if len(declared) + len(comment) + 7 <= WIDTH:
             lines.append(f"{declared} /* {comment} */")
         else:

@@ -27,9 +27,9 @@ from slipid.exports.fields import Kind, kind_of
 
 Shaped = jax.ShapeDtypeStruct
 Rule = Callable[[Builder, list[Value], Params, Shaped], Value]
-Simpler = Callable[[tuple[Cell, ...]], Cell | None]
-"""Function that returns the cell that the result of an operation equals; None if it must be
-computed by a statement."""
+Simpler = Callable[[Builder, tuple[Cell, ...], int], Cell | None]
+"""Function that returns the cell that the result of an operation equals, given its operands and the
+number of lanes of the result; None if the operation must be computed as it is."""
 
 
 UNARY = {
@@ -76,17 +76,13 @@ NEUTRAL = {"add": (0.0, 0.0), "sub": (None, 0.0), "mul": (1.0, 1.0), "div": (Non
 """Neutral numbers of an operation as its first and as its second operand; None if there is none."""
 
 
-def _never(cells: tuple[Cell, ...]) -> Cell | None:
-    return None
-
-
 def applied(
     builder: Builder,
     template: str,
     kind: Kind,
     values: Sequence[Value],
     shape: tuple[int, ...],
-    simpler: Simpler = _never,
+    simpler: Simpler | None = None,
 ) -> Array:
     """Return the array computed by a C expression from each element of some arrays.
 
@@ -97,7 +93,7 @@ def applied(
     lanes = 0 if axis is None else shape[axis]
     out = []
     for cells in zip(*(row.reshape(-1) for row in rows), strict=True):
-        plain = simpler(cells)
+        plain = simpler(builder, cells, lanes) if simpler else None
         if plain is None:
             count = lanes if any(varies(cell) for cell in cells) else 0
             plain = builder.compute(kind, template, cells, count)
@@ -109,12 +105,6 @@ def _axis(values: Sequence[Value], shape: tuple[int, ...]) -> int | None:
     """Return the axis of the lanes of an element-wise result."""
     axis = next((a for a in map(partial(_lanes, shape), values) if a is not None), None)
     return longest(shape) if axis is None and prod(shape) > UNROLLED else axis
-
-
-def lanes_of(values: Sequence[Value], shape: tuple[int, ...]) -> int:
-    """Return the number of lanes of an element-wise result; 0 for none."""
-    axis = _axis(values, shape)
-    return 0 if axis is None else shape[axis]
 
 
 def _lanes(shape: tuple[int, ...], value: Value) -> int | None:
@@ -138,11 +128,15 @@ def unary(name: str) -> Rule:
 
 
 def binary(name: str) -> Rule:
-    """Return the rule of a function of two numbers."""
+    """Return the rule of a function of two numbers; tanh(a) / b becomes one call."""
     first, second = NEUTRAL.get(name.removesuffix("_any"), (None, None))
 
-    def simpler(cells: tuple[Cell, ...]) -> Cell | None:
+    def simpler(builder: Builder, cells: tuple[Cell, ...], lanes: int) -> Cell | None:
         a, b = cells
+        if name == "div" and isinstance(a, Variable) and a.made_by[0] == UNARY["tanh"]:
+            both = (*a.made_by[1], b)
+            count = lanes if any(varies(cell) for cell in both) else 0
+            return builder.compute("real", "r_tanh_over({0}, {1})", both, count)
         if isinstance(a, Constant) and first is not None and a.value == first:
             return b
         if isinstance(b, Constant) and second is not None and b.value == second:
@@ -150,33 +144,11 @@ def binary(name: str) -> Rule:
         return None
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
-        template = BINARY[name]
-        if name == "div":
-            return divided(builder, values, out, simpler)
-        if kind_of_value(values[0]) == "int":
-            template = OF_INTS.get(name, template)
+        integer = kind_of_value(values[0]) == "int"
+        template = OF_INTS.get(name, BINARY[name]) if integer else BINARY[name]
         return applied(builder, template, kind_of(out.dtype), values, out.shape, simpler)
 
     return rule
-
-
-def divided(
-    builder: Builder,
-    values: list[Value],
-    out: Shaped,
-    simpler: Simpler,
-) -> Value:
-    """Return quotients; tanh(a) / b becomes one call of `r_tanh_over`."""
-
-    def once(cells: tuple[Cell, ...]) -> Cell | None:
-        over, by = cells
-        if not isinstance(over, Variable) or over.made_by[0] != UNARY["tanh"]:
-            return simpler(cells)
-        both = (*over.made_by[1], by)
-        count = lanes_of(values, out.shape) if any(varies(cell) for cell in both) else 0
-        return builder.compute("real", "r_tanh_over({0}, {1})", both, count)
-
-    return applied(builder, BINARY["div"], kind_of(out.dtype), values, out.shape, once)
 
 
 def integer_pow(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
@@ -210,7 +182,7 @@ def converted(builder: Builder, values: list[Value], params: Params, out: Shaped
 def select(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
     """Return the first or second of two numbers, selected by a condition."""
 
-    def simpler(cells: tuple[Cell, ...]) -> Cell | None:
+    def simpler(builder: Builder, cells: tuple[Cell, ...], lanes: int) -> Cell | None:
         which, no, yes = cells
         if no == yes:
             return no

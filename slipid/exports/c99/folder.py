@@ -8,11 +8,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from slipid.exports.c99.code import Code, filled, template
+from slipid.exports.c99.code import Code
 from slipid.exports.c99.text import wrapped
 from slipid.exports.description import facts, made_with, warned
 from slipid.exports.fields import Struct
 from slipid.exports.golden import golden
+from slipid.exports.text import filled, template
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.trajectory import Path
@@ -22,59 +23,43 @@ def golden_header(code: Code) -> str:
     """Return the text of golden.h: the steps as tables, and code that fills and reads structs."""
     steps = golden(code.loop)
     names = [f.name for f in code.estimate.fields for _ in range(f.size)]
-    scale = np.maximum(np.abs(steps.said).max(axis=0), 1e-3)
-    rows = [
-        "#include <math.h>",
-        "",
-        f"#define GOLDEN_STEPS {len(steps.given)}",
-        f"#define GOLDEN_GIVEN {steps.given.shape[1]}",
-        f"#define GOLDEN_SAID {steps.said.shape[1]}",
-        "",
-        *_table("golden_given[GOLDEN_STEPS][GOLDEN_GIVEN]", steps.given),
-        *_table("golden_said[GOLDEN_STEPS][GOLDEN_SAID]", steps.said),
-        *_table("golden_command[GOLDEN_STEPS][SLIPID_WHEELS]", steps.command),
-        *_table("golden_scale[GOLDEN_SAID]", scale),
-        "static const char *const golden_names[GOLDEN_SAID] = {",
-        *wrapped((f'"{name}"' for name in names), "  "),
-        "};",
-        "",
-        *_filling(code.reading),
-        *_reading_out(code.estimate),
-    ]
-    return "\n".join(rows) + "\n"
+    values = {
+        "STEPS": str(len(steps.given)),
+        "INPUTS": str(steps.given.shape[1]),
+        "OUTPUTS": str(steps.said.shape[1]),
+        "GIVEN": _table(steps.given),
+        "SAID": _table(steps.said),
+        "COMMAND": _table(steps.command),
+        "SCALE": _words(np.maximum(np.abs(steps.said).max(axis=0), 1e-3), "  "),
+        "NAMES": wrapped((f'"{name}"' for name in names), "  "),
+        "FILL": _filling(code.reading),
+        "READ": _reading_out(code.estimate),
+    }
+    return filled("c99/golden.h", values)
 
 
-def _table(declared: str, values: np.ndarray) -> list[str]:
-    def word(value: float) -> str:
-        return "NAN" if np.isnan(value) else repr(float(value))
+def _table(rows: np.ndarray) -> list[str]:
+    return [line for row in rows for line in ("  {", *_words(row, "    "), "  },")]
 
-    if values.ndim == 1:
-        lines = wrapped(map(word, values), "  ")
-    else:
-        lines = [x for row in values for x in ("  {", *wrapped(map(word, row), "    "), "  },")]
-    return [f"static const double {declared} = {{", *lines, "};", ""]
+
+def _words(row: np.ndarray, indent: str) -> list[str]:
+    return wrapped(("NAN" if np.isnan(x) else repr(float(x)) for x in row), indent)
 
 
 def _filling(struct: Struct) -> list[str]:
     names = [f"{f.name}[{k}]" if f.shape else f.name for f in struct.fields for k in range(f.size)]
-    return [
-        f"static void golden_reading({struct.name} *reading, const double *row) {{",
-        *(f"  reading->{name} = (slipid_real)row[{k}];" for k, name in enumerate(names)),
-        "}",
-        "",
-    ]
+    return [f"  reading->{name} = (slipid_real)row[{k}];" for k, name in enumerate(names)]
 
 
 def _reading_out(struct: Struct) -> list[str]:
-    lines = [f"static void golden_said_of(const {struct.name} *estimate, double *out) {{"]
-    place = 0
+    lines, place = [], 0
     for field in filter(lambda field: field.size, struct.fields):
         member = f"estimate->{field.name}{'[k]' if field.shape else ''}"
-        value = f"{member} ? 1.0 : 0.0" if field.kind == "bool" else f"(double){member}"
+        value = f"{member} ? 1.0 : 0.0" if field.numbers == "bool" else f"(double){member}"
         loop = f"for (int k = 0; k < {field.size}; ++k) out[{place} + k]"
         lines.append(f"  {loop if field.shape else f'out[{place}]'} = {value};")
         place += field.size
-    return [*lines, "}", ""]
+    return lines
 
 
 @dataclass(frozen=True)
@@ -108,21 +93,6 @@ class Recording:
         return "".join(f"{' '.join(f'{x:.9f}' for x in c)} {t:.9f}\n" for c, t in rows)
 
 
-def _path(path: Path) -> str:
-    """Return a description of a path for people."""
-    corners = [f"({x:.2f}, {y:.2f})" for x, y in np.asarray(path.corners).tolist()]
-    x, y, heading = np.asarray(path.rows)[0, :3].tolist()
-    return (
-        f"from ({x:.2f}, {y:.2f}), heading {heading:.2f} rad, over {', '.join(corners)} [m] in "
-        f"{path.duration:g} s"
-    )
-
-
-def _kib(numbers: int) -> str:
-    """Return the memory that this count of numbers takes as `double`, as text."""
-    return f"{numbers * 8 / 1024:.1f} KiB"
-
-
 def c_files(
     robot: DeployedRobot,
     loop: ControlLoop[eqx.Module],
@@ -140,33 +110,36 @@ def c_files(
     Raises:
         UnsupportedError: a step uses a primitive that has no form in C.
     """
-    code = Code(robot, loop, path)
-    release = {"VERSION": made_with()}
+    code, release = Code(robot, loop, path), {"VERSION": made_with()}
+    state, stack = (f"{numbers * 8 / 1024:.1f} KiB" for numbers in (code.kept, code.scratch))
+    corners = [f"({x:.2f}, {y:.2f})" for x, y in np.asarray(path.corners).tolist()]
+    x, y, heading = np.asarray(path.rows)[0, :3].tolist()
     files = {
         "src/slipid.h": code.header(),
         "src/slipid.c": code.source(),
         "test/golden.h": golden_header(code),
-        "test/check.c": template("check.c"),
-        "examples/drive/drive.c": template("drive.c"),
-        "examples/Slipid/Slipid.ino": filled("Slipid.ino", {"STACK": _kib(code.scratch)}),
-        "CMakeLists.txt": template("CMakeLists.txt"),
-        "library.json": filled("library.json", release),
-        "library.properties": filled("library.properties", release),
+        "test/check.c": template("c99/check.c"),
+        "examples/drive/drive.c": template("c99/drive.c"),
+        "examples/Slipid/Slipid.ino": filled("c99/Slipid.ino", {"STACK": stack}),
+        "CMakeLists.txt": template("c99/CMakeLists.txt"),
+        "library.json": filled("c99/library.json", release),
+        "library.properties": filled("c99/library.properties", release),
     }
     example = ""
     if recording is not None:
         files["examples/drive/readings.txt"] = recording.readings
         files["examples/drive/commands.txt"] = recording.commands
-        example = filled("recording.md", {"PLANT": recording.plant})
+        example = filled("c99/recording.md", {"PLANT": recording.plant})
     values = {
-        "WARNINGS": "\n".join(warned(robot)),
-        "HEAD": "\n".join(facts(robot)),
+        "WARNINGS": warned(robot),
+        "HEAD": facts(robot),
         "RECORDING": example,
         "FLOORS": ", ".join(f"`{name}` ({k})" for k, name in enumerate(robot.labels)),
         "WHEELS": str(robot.wheels),
-        "STATE": _kib(code.kept),
-        "STACK": _kib(code.scratch),
-        "PATH": _path(path),
+        "STATE": state,
+        "STACK": stack,
+        "PATH": f"from ({x:.2f}, {y:.2f}), heading {heading:.2f} rad, over {', '.join(corners)} "
+        f"[m] in {path.duration:g} s",
     }
-    files["README.md"] = filled("README.md", values)
+    files["README.md"] = filled("c99/README.md", values)
     return files

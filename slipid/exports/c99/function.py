@@ -50,12 +50,12 @@ class Argument:
         """Memory of each of its fields."""
         if self.type:
             return [
-                Memory(f"{self.name}->{f.name}", f.kind, f.size, scalar=not f.shape)
+                Memory(f"{self.name}->{f.name}", f.numbers, f.size, scalar=not f.shape)
                 for f in self.fields
             ]
         field = self.fields[0]
         name = f"(*{self.name})" if self.written and not field.shape else self.name
-        return [Memory(name, field.kind, field.size, scalar=not field.shape)]
+        return [Memory(name, field.numbers, field.size, scalar=not field.shape)]
 
     @property
     def declared(self) -> str:
@@ -139,7 +139,7 @@ def function(
         store(builder, value, memory)
     body = FunctionBody(builder)
     unused = _unused(arguments, body.reads)
-    lines = (*unused, *body.lines())
+    lines = (*unused, *body.lines)
     return Function(name, about, tuple(arguments), lines, body.reads, body.scratch)
 
 

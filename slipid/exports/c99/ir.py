@@ -189,6 +189,11 @@ class Array:
     axis: int | None
     cells: Cells
 
+    @property
+    def lanes(self) -> int:
+        """Number of lanes; 0 without lanes."""
+        return 0 if self.axis is None else self.shape[self.axis]
+
 
 Value = Array | np.ndarray
 """An array of cells computed at run time, or a numpy array of constants."""
@@ -221,13 +226,27 @@ def longest(shape: Sequence[int]) -> int | None:
     return max(range(len(shape)), key=lambda axis: (shape[axis], axis))
 
 
+def numbered(shape: Sequence[int]) -> np.ndarray:
+    """Return an array of this shape whose numbers are their own row-major indices."""
+    return np.arange(prod(shape)).reshape(shape)
+
+
+def rows_of(values: np.ndarray, axis: int | None) -> np.ndarray:
+    """Return values with the axis of the lanes last; without lanes, a last axis of length 1."""
+    return values[..., None] if axis is None else np.moveaxis(values, axis, -1)
+
+
+def read_at(memory: Memory, places: np.ndarray, index: Variable | None = None) -> Array:
+    """Return the numbers at evenly spaced places of memory, all of them shifted by an index."""
+    axis = longest(places.shape)
+    rows = rows_of(places, axis)
+    cells = [
+        At(memory, int(row[0]), 0 if axis is None else int(row[1] - row[0]), index)
+        for row in rows.reshape(-1, rows.shape[-1])
+    ]
+    return Array(places.shape, memory.kind, axis, cells_of(rows.shape[:-1], cells))
+
+
 def in_memory(memory: Memory, shape: tuple[int, ...]) -> Array:
     """Return the array of this shape that memory holds in row-major order."""
-    places = np.arange(prod(shape)).reshape(shape)
-    axis = longest(shape)
-    if axis is None:
-        cells: list[Cell] = [At(memory, int(k)) for k in places.reshape(-1)]
-        return Array(shape, memory.kind, None, cells_of(shape, cells))
-    rows = np.moveaxis(places, axis, -1)
-    cells = [At(memory, int(r[0]), int(r[1] - r[0])) for r in rows.reshape(-1, rows.shape[-1])]
-    return Array(shape, memory.kind, axis, cells_of(rows.shape[:-1], cells))
+    return read_at(memory, numbered(shape))

@@ -109,10 +109,10 @@ def source_line(equation: JaxprEqn) -> str:
     """Return file and line of the innermost code of slipid that created an equation, or ""."""
     traceback = equation.source_info.traceback
     for frame in traceback.frames if traceback is not None else ():
-        path = Path(frame.file_name)
-        if "slipid" in path.parts and "exports" not in path.parts:
-            start = len(path.parts) - 1 - path.parts[::-1].index("slipid")
-            return f"{'/'.join(path.parts[start:])}:{frame.line_num}"
+        parts = Path(frame.file_name).parts
+        inner = parts[len(parts) - parts[::-1].index("slipid") :] if "slipid" in parts else ()
+        if inner and inner[0] != "exports":
+            return f"slipid/{'/'.join(inner)}:{frame.line_num}"
     return ""
 
 

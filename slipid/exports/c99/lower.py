@@ -28,6 +28,8 @@ from slipid.exports.c99.ir import (
     in_memory,
     kind_of_value,
     longest,
+    numbered,
+    rows_of,
     varies,
 )
 from slipid.exports.c99.jaxpr import Params, ScanParameters, Traced, branches, called, source_line
@@ -35,6 +37,7 @@ from slipid.exports.c99.moves import MOVES, SOURCES, moved
 from slipid.exports.c99.sources import along, rearranged
 from slipid.exports.c99.sums import REDUCED
 from slipid.exports.fields import DTYPES
+from slipid.support.errors import DataError
 
 RULES: dict[str, Rule] = {
     **{name: elementwise.unary(name) for name in UNARY},
@@ -62,7 +65,7 @@ _TYPES = frozenset(map(np.dtype, ("float64", "int64", "int32", "bool")))
 """Types of numbers that have a counterpart in C."""
 
 
-class UnsupportedError(Exception):
+class UnsupportedError(DataError):
     """Error for a function that cannot be turned into C.
 
     The message names the primitive and the line of Python code that it comes from.
@@ -76,115 +79,106 @@ def lowered(builder: Builder, traced: Traced, values: Sequence[Value]) -> list[V
         UnsupportedError: the function uses a primitive without a rule.
         DataError: this version of JAX represents the function in an unsupported way.
     """
-    return _Lowering(builder).run(traced, values)
+    jaxpr, known = traced.jaxpr, dict[Var, Value]()
+    known.update(zip(jaxpr.constvars, map(np.asarray, traced.constants), strict=True))
+    known.update(zip(jaxpr.invars, values, strict=True))
+
+    def of(atom: Var | JaxLiteral) -> Value:
+        return np.asarray(atom.val) if isinstance(atom, JaxLiteral) else known[atom]
+
+    for equation in jaxpr.eqns:
+        results = _results(builder, equation, [_filled(of(atom)) for atom in equation.invars])
+        known.update(zip(equation.outvars, results, strict=True))
+    return [of(atom) for atom in jaxpr.outvars]
 
 
-class _Lowering:
-    def __init__(self, builder: Builder):
-        self._builder = builder
+def _results(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+    """Return the results of an equation."""
+    name = equation.primitive.name
+    if name in INLINED:
+        return lowered(builder, called(Params(equation)), values)
+    if not any(isinstance(v, Array) for v in values):
+        return _evaluated(equation, values)
+    builder.source = source_line(equation) or builder.source
+    try:
+        return _ruled(builder, equation, values)
+    except NoFormError as error:
+        known = sorted({*RULES, *MOVES, *INLINED, "cond", "scan"})
+        raise UnsupportedError(
+            f"{builder.source}: '{name}' has no form in C ({error}); "
+            f"those that have one: {', '.join(known)}"
+        ) from error
 
-    def run(self, traced: Traced, values: Sequence[Value]) -> list[Value]:
-        """Return the results of a function."""
-        jaxpr, known = traced.jaxpr, dict[Var, Value]()
-        known.update(zip(jaxpr.constvars, map(np.asarray, traced.constants), strict=True))
-        known.update(zip(jaxpr.invars, values, strict=True))
 
-        def of(atom: Var | JaxLiteral) -> Value:
-            return np.asarray(atom.val) if isinstance(atom, JaxLiteral) else known[atom]
+def _ruled(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[Value]:
+    """Return the results of an equation by the rule of its primitive."""
+    primitive, params, name = equation.primitive, Params(equation), equation.primitive.name
+    if name == "cond":
+        return _cond(builder, params, values)
+    if name == "scan":
+        return _scan(builder, params, values)
+    out: Any = equation.outvars[0].aval  # jax's type hides its attributes
+    shaped = Shaped(out.shape, out.dtype)
+    if out.dtype not in _TYPES:
+        raise NoFormError(f"numbers of type {out.dtype}")
+    if name in ("split", "unstack"):
+        parts = primitive.bind(numbered(values[0].shape), **equation.params)
+        return [rearranged(builder, values[:1], np.asarray(part)) for part in parts]
+    variable_index = name in SOURCES and any(isinstance(v, Array) for v in values[1:])
+    if name in MOVES and not variable_index:
+        return [moved(primitive, SOURCES.get(name, 0))(builder, values, params, shaped)]
+    if name not in RULES:
+        raise NoFormError("no rule for it")
+    return [RULES[name](builder, values, params, shaped)]
 
-        for equation in jaxpr.eqns:
-            results = self._equation(equation, [_filled(of(atom)) for atom in equation.invars])
-            known.update(zip(equation.outvars, results, strict=True))
-        return [of(atom) for atom in jaxpr.outvars]
 
-    def _equation(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        name = equation.primitive.name
-        constant = not any(isinstance(v, Array) for v in values)
-        if name in INLINED:
-            return self.run(called(Params(equation)), values)
-        if constant:
-            return _evaluated(equation, values)
-        self._builder.source = source_line(equation) or self._builder.source
-        try:
-            return self._ruled(equation, values)
-        except NoFormError as error:
-            known = sorted({*RULES, *MOVES, *INLINED, "cond", "scan"})
-            raise UnsupportedError(
-                f"{self._builder.source}: '{name}' has no form in C ({error}); "
-                f"those that have one: {', '.join(known)}"
-            ) from error
-
-    def _ruled(self, equation: JaxprEqn, values: list[Value]) -> list[Value]:
-        primitive, params, name = equation.primitive, Params(equation), equation.primitive.name
-        if name == "cond":
-            return self._cond(params, values)
-        if name == "scan":
-            return self._scan(params, values)
-        out: Any = equation.outvars[0].aval  # jax's type hides its attributes
-        shaped = Shaped(out.shape, out.dtype)
-        if out.dtype not in _TYPES:
-            raise NoFormError(f"numbers of type {out.dtype}")
-        where = [v for v in values[1:] if isinstance(v, Array)]
-        if name in ("split", "unstack"):
-            return self._several(equation, values[0])
-        if name in MOVES and not (name in SOURCES and where):
-            return [moved(primitive, SOURCES.get(name, 0))(self._builder, values, params, shaped)]
-        if name not in RULES:
-            raise NoFormError("no rule for it")
-        return [RULES[name](self._builder, values, params, shaped)]
-
-    def _several(self, equation: JaxprEqn, value: Value) -> list[Value]:
-        """Return the results of a primitive that splits an array into several."""
-        places = np.arange(prod(value.shape)).reshape(value.shape)
-        parts = equation.primitive.bind(places, **equation.params)
-        return [rearranged(self._builder, [value], np.asarray(part)) for part in parts]
-
-    def _cond(self, params: Params, values: list[Value]) -> list[Value]:
-        """Return the results of a condition: those of one of two functions."""
-        builder, which, choices = self._builder, values[0], branches(params)
-        if len(choices) != 2:
-            raise NoFormError("more than two branches")
-        if not isinstance(which, Array):
-            return lowered(builder, choices[int(np.clip(which, 0, 1))], values[1:])
-        bodies = [Builder(builder.names, builder) for _ in range(2)]
-        results = [
-            lowered(body, branch, values[1:]) for body, branch in zip(bodies, choices, strict=True)
-        ]
-        when = builder.compute("bool", "{0} != 0", (along(builder, which, (), None).item(),))
-        block = builder.append(nested=Nested(when, 1, bodies[::-1]))
-        out = []
-        for pair in zip(*results, strict=True):
-            memory = self._memory(pair[0], block)
-            for body, value in zip(bodies, pair, strict=True):
-                store(body, value, memory)
-            out.append(in_memory(memory, pair[0].shape))
-        return list(out)
-
-    def _memory(self, like: Value, block: CodeBlock) -> Memory:
-        number = self._builder.names.number()
-        return Memory(f"m{number}", kind_of_value(like), prod(like.shape), block)
-
-    def _scan(self, params: Params, values: list[Value]) -> list[Value]:
-        """Return the results of a function applied to its own result a fixed number of times."""
-        scan = ScanParameters.of(params)
-        carried, consts = scan.carried, scan.constants
-        if len(values) != carried + consts or len(scan.body.jaxpr.outvars) != carried:
-            raise NoFormError("a loop that goes through an array")
-        builder = self._builder
-        body = Builder(builder.names, builder)
-        body.turns = CodeBlock(builder, 0, nested=Nested(None, scan.turns, [body]))
-        begun = values[consts:]
-        memories = [self._memory(value, body.turns) for value in begun]
-        for value, memory in zip(begun, memories, strict=True):
-            store(builder, value, memory)
-        carry = [in_memory(m, v.shape) for m, v in zip(memories, begun, strict=True)]
-        results = lowered(body, scan.body, [*values[:consts], *carry])
-        names = frozenset(memory.name for memory in memories)
-        results = [apart(body, value, names) for value in results]
-        for value, memory in zip(results, memories, strict=True):
+def _cond(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
+    """Return the results of a condition: those of one of two functions."""
+    which, choices = values[0], branches(params)
+    if len(choices) != 2:
+        raise NoFormError("more than two branches")
+    if not isinstance(which, Array):
+        return lowered(builder, choices[int(np.clip(which, 0, 1))], values[1:])
+    bodies = [Builder(builder.names, builder) for _ in range(2)]
+    results = [
+        lowered(body, branch, values[1:]) for body, branch in zip(bodies, choices, strict=True)
+    ]
+    when = builder.compute("bool", "{0} != 0", (along(builder, which, (), None).item(),))
+    block = builder.append(nested=Nested(when, 1, bodies[::-1]))
+    out: list[Value] = []
+    for pair in zip(*results, strict=True):
+        memory = _memory(builder, pair[0], block)
+        for body, value in zip(bodies, pair, strict=True):
             store(body, value, memory)
-        builder.put(body.turns)
-        return list(carry)
+        out.append(in_memory(memory, pair[0].shape))
+    return out
+
+
+def _memory(builder: Builder, like: Value, block: CodeBlock) -> Memory:
+    """Return new memory for a value, which a block fills."""
+    return Memory(f"m{builder.names.number()}", kind_of_value(like), prod(like.shape), block)
+
+
+def _scan(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
+    """Return the results of a function applied to its own result a fixed number of times."""
+    scan = ScanParameters.of(params)
+    carried, consts = scan.carried, scan.constants
+    if len(values) != carried + consts or len(scan.body.jaxpr.outvars) != carried:
+        raise NoFormError("a loop that goes through an array")
+    body = Builder(builder.names, builder)
+    body.turns = CodeBlock(builder, 0, nested=Nested(None, scan.turns, [body]))
+    begun = values[consts:]
+    memories = [_memory(builder, value, body.turns) for value in begun]
+    for value, memory in zip(begun, memories, strict=True):
+        store(builder, value, memory)
+    carry = [in_memory(m, v.shape) for m, v in zip(memories, begun, strict=True)]
+    results = lowered(body, scan.body, [*values[:consts], *carry])
+    names = frozenset(memory.name for memory in memories)
+    results = [apart(body, value, names) for value in results]
+    for value, memory in zip(results, memories, strict=True):
+        store(body, value, memory)
+    builder.put(body.turns)
+    return list(carry)
 
 
 def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
@@ -194,12 +188,11 @@ def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
     """
     if not isinstance(value, Array):
         return value
-    lanes = 0 if value.axis is None else value.shape[value.axis]
 
     def own(cell: Cell) -> Cell:
         if not isinstance(cell, At) or cell.memory.name not in overwritten:
             return cell
-        return builder.compute(cell.kind, "{0}", (cell,), lanes if varies(cell) else 0)
+        return builder.compute(cell.kind, "{0}", (cell,), value.lanes if varies(cell) else 0)
 
     cells = [own(cell) for cell in value.cells.reshape(-1)]
     return Array(value.shape, value.kind, value.axis, cells_of(value.cells.shape, cells))
@@ -210,11 +203,10 @@ def store(builder: Builder, value: Value, memory: Memory) -> None:
     shape = value.shape
     axis = value.axis if isinstance(value, Array) else longest(shape)
     cells = along(builder, value, shape, axis)
-    places = np.arange(prod(shape)).reshape(shape)
     lanes = 0 if axis is None else shape[axis]
-    rows = places.reshape(-1, 1) if axis is None else np.moveaxis(places, axis, -1)
+    rows = rows_of(numbered(shape), axis).reshape(-1, max(lanes, 1))
     end = builder.append(lanes)
-    for row, cell in zip(rows.reshape(-1, max(lanes, 1)), cells.reshape(-1), strict=True):
+    for row, cell in zip(rows, cells.reshape(-1), strict=True):
         stride = int(row[1] - row[0]) if lanes > 1 else 0
         text = f"{_place(memory, int(row[0]), stride)} = {{0}};"
         end.statements.append(Statement(None, text, (cell,), memory, always=True))

@@ -20,7 +20,8 @@ from slipid.exports.c99.ir import (
     Value,
     Variable,
     cells_of,
-    longest,
+    numbered,
+    read_at,
     varies,
 )
 from slipid.exports.c99.jaxpr import Params
@@ -47,10 +48,7 @@ def moved(primitive: Primitive, sources: int) -> Rule:
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
         taken = values[:sources] if sources else values
         starts = np.cumsum([0, *(prod(v.shape) for v in taken)])
-        places = [
-            start + np.arange(prod(v.shape)).reshape(v.shape)
-            for start, v in zip(starts, taken, strict=False)
-        ]
+        places = [start + numbered(v.shape) for start, v in zip(starts, taken, strict=False)]
         moved_places = primitive.bind(*places, *values[len(taken) :], **params)
         return rearranged(builder, taken, np.asarray(moved_places))
 
@@ -60,8 +58,7 @@ def moved(primitive: Primitive, sources: int) -> Rule:
 def scatter(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
     """Return an array with some numbers replaced at constant indices."""
     old, where, new = values
-    fresh = old_size = prod(old.shape)
-    places = _scattered(np.arange(old_size).reshape(old.shape), where, new.shape, params, fresh)
+    places = _scattered(numbered(old.shape), where, new.shape, params, prod(old.shape))
     return rearranged(builder, [old, new], places)
 
 
@@ -91,7 +88,7 @@ def _scattered(
     if isinstance(where, Array):
         raise NoFormError("places that are not known before the robot runs")
     kept = {k: params[k] for k in ("dimension_numbers", "indices_are_sorted", "mode")}
-    new = fresh + np.arange(prod(shape)).reshape(shape)
+    new = fresh + numbered(shape)
     options = {**kept, "unique_indices": False}
     times = lax.scatter_add(np.zeros(old.shape, int), where, np.ones(shape, int), **options)
     if np.max(times, initial=0) > 1:
@@ -104,16 +101,8 @@ def dynamic_slice(builder: Builder, values: list[Value], params: Params, out: Sh
     whole, starts, sizes = values[0], values[1:], params["slice_sizes"]
     memory = contiguous(builder, whole)
     base = _offset(builder, [along(builder, s, (), None).item() for s in starts], whole, sizes)
-    inner = np.arange(prod(whole.shape)).reshape(whole.shape)
-    places = inner[tuple(slice(0, n) for n in sizes)]
-    axis = longest(places.shape)
-    if axis is None:
-        cells: list[Cell] = [At(memory, int(k), index=base) for k in places.reshape(-1)]
-        return Array(places.shape, memory.kind, None, cells_of(places.shape, cells))
-    rows = np.moveaxis(places, axis, -1)
-    flat = rows.reshape(-1, rows.shape[-1])
-    cells = [At(memory, int(r[0]), int(r[1] - r[0]), index=base) for r in flat]
-    return Array(places.shape, memory.kind, axis, cells_of(rows.shape[:-1], cells))
+    places = numbered(whole.shape)[tuple(slice(0, n) for n in sizes)]
+    return read_at(memory, places, base)
 
 
 def _offset(

@@ -22,6 +22,8 @@ from slipid.exports.c99.ir import (
     in_memory,
     kind_of_value,
     longest,
+    numbered,
+    rows_of,
     varies,
 )
 from slipid.exports.fields import kind_of
@@ -111,7 +113,7 @@ class Sources:
             return At(cell.memory, lane)
         assert isinstance(cell, At)
         if cell.table is not None:
-            return At(cell.memory, int(_values(cell.table)[lane]))
+            return At(cell.memory, int(np.frombuffer(cell.table.values, dtype=np.int64)[lane]))
         return At(cell.memory, cell.offset + cell.stride * lane, index=cell.index)
 
     def row(self, row: np.ndarray) -> Cell:
@@ -166,12 +168,12 @@ class Sources:
 
     def _copy(self, memory: Memory, start: int, group: list[Cell]) -> None:
         """Fill memory from index `start` on with a group of evenly spaced numbers, or with one."""
-        first = group[0]
-        if len(group) == 1:
+        first, *rest = group
+        if not rest:
             self._builder.fill(memory, f"{{memory}}[{start}] = {{0}};", first)
             return
+        second = rest[0]
         assert isinstance(first, At)
-        second = group[1]
         assert isinstance(second, At)
         many = At(first.memory, first.offset, second.offset - first.offset, first.index)
         self._builder.fill(memory, f"{{memory}}[{start} + l] = {{0}};", many, len(group))
@@ -188,29 +190,19 @@ def contiguous(builder: Builder, value: Value) -> Memory:
 
 
 def _contiguous(builder: Builder, value: Array) -> Memory:
-    places = np.arange(prod(value.shape))
-    flat = value.cells.reshape(-1)
-    stored = in_memory(flat[0].memory, value.shape) if isinstance(flat[0], At) else None
-    if (
-        stored is not None
-        and stored.axis == value.axis
-        and bool((stored.cells == value.cells).all())
-    ):
-        return flat[0].memory
+    flat = tuple(value.cells.reshape(-1))
+    if isinstance(flat[0], At):
+        stored = in_memory(flat[0].memory, value.shape)
+        if stored.axis == value.axis and bool((stored.cells == value.cells).all()):
+            return flat[0].memory
+    places = numbered(value.shape)
     if value.axis is None:
-        return Sources(builder, [value]).copied(places)
-    lanes = value.shape[value.axis]
+        return Sources(builder, [value]).copied(places.reshape(-1))
     stride = prod(value.shape[value.axis + 1 :])
-    starts = np.take(places.reshape(value.shape), 0, value.axis).reshape(-1)
-    cells = tuple(flat)
-    memory = builder.array(value.kind, len(places), cells, lanes)
-    for start, cell in zip(starts, cells, strict=True):
+    memory = builder.array(value.kind, places.size, flat, value.lanes)
+    for start, cell in zip(np.take(places, 0, value.axis).reshape(-1), flat, strict=True):
         builder.fill(memory, f"{{memory}}[{start} + {stride} * l] = {{0}};", cell)
     return memory
-
-
-def _values(table: Memory) -> np.ndarray:
-    return np.frombuffer(table.values, dtype=np.int64)
 
 
 def _places(cells: Sequence[Cell]) -> np.ndarray | None:
@@ -261,33 +253,26 @@ def rearranged(
         return known.numbers[places]
     if axis == -1:
         axis = known.best_axis(places)
-    if axis is None:
-        cells = [known.one(int(k)) for k in places.reshape(-1)]
-        return Array(places.shape, known.kind, None, cells_of(places.shape, cells))
-    rows = np.moveaxis(places, axis, -1)
-    cells = [known.row(row) for row in rows.reshape(-1, rows.shape[-1])]
+    rows = rows_of(places, axis)
+    flat = rows.reshape(-1, rows.shape[-1])
+    cells = [known.one(int(row[0])) if axis is None else known.row(row) for row in flat]
     return Array(places.shape, known.kind, axis, cells_of(rows.shape[:-1], cells))
 
 
 def along(builder: Builder, value: Value, shape: tuple[int, ...], axis: int | None) -> Cells:
     """Return the cells of a value broadcast to a shape, with lanes along an axis."""
     if not isinstance(value, Array):
-        value = np.broadcast_to(value, shape)
-        if axis is None:
-            flat = [Constant(x, kind_of(value.dtype)) for x in value.reshape(-1).tolist()]
-            return cells_of(shape, flat)
-        rows = np.moveaxis(value, axis, -1)
-        cells = [_table(builder, row) for row in rows.reshape(-1, rows.shape[-1])]
+        rows = rows_of(np.broadcast_to(value, shape), axis)
+        cells = [_row_of_constants(builder, row) for row in rows.reshape(-1, rows.shape[-1])]
         return cells_of(rows.shape[:-1], cells)
     if value.axis == axis and value.shape == shape:
         return value.cells
-    places = np.arange(prod(value.shape)).reshape(value.shape)
-    moved = rearranged(builder, [value], np.broadcast_to(places, shape), axis)
+    moved = rearranged(builder, [value], np.broadcast_to(numbered(value.shape), shape), axis)
     assert isinstance(moved, Array)
     return moved.cells
 
 
-def _table(builder: Builder, row: np.ndarray) -> Cell:
+def _row_of_constants(builder: Builder, row: np.ndarray) -> Cell:
     """Return a row of constants as a cell: a table, or one constant if all are equal."""
     kind = kind_of(row.dtype)
     if row.tobytes() == len(row) * row[:1].tobytes():

@@ -7,7 +7,6 @@ numbers, but infinity and NaN do not propagate through such a product as they wo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import prod
 
 import numpy as np
@@ -30,14 +29,15 @@ from slipid.exports.c99.jaxpr import Params
 from slipid.exports.c99.sources import along
 from slipid.exports.fields import Kind, kind_of
 
-REDUCED = {
-    "reduce_sum": ("{0} + {1}", "R(0.0)"),
-    "reduce_prod": ("{0} * {1}", "R(1.0)"),
-    "reduce_max": ("r_max({0}, {1})", "-R_INFINITY"),
-    "reduce_min": ("r_min({0}, {1})", "R_INFINITY"),
-    "reduce_and": ("{0} & {1}", "true"),
-    "reduce_or": ("{0} | {1}", "false"),
+REDUCED: dict[str, tuple[str, str, str | None]] = {
+    "reduce_sum": ("{0} + {1}", "R(0.0)", "0"),
+    "reduce_prod": ("{0} * {1}", "R(1.0)", "1"),
+    "reduce_max": ("r_max({0}, {1})", "-R_INFINITY", "INT32_MIN"),
+    "reduce_min": ("r_min({0}, {1})", "R_INFINITY", "INT32_MAX"),
+    "reduce_and": ("{0} & {1}", "true", None),
+    "reduce_or": ("{0} | {1}", "false", None),
 }
+"""Template of each reduction, and its initial value for reals or truth values and for integers."""
 
 
 def chained(builder: Builder, template: str, kind: Kind, cells: Cells, lanes: int) -> Cell:
@@ -51,37 +51,29 @@ def chained(builder: Builder, template: str, kind: Kind, cells: Cells, lanes: in
 
 def reduced(name: str) -> Rule:
     """Return the rule of a reduction over some axes."""
-    template, start = REDUCED[name]
+    real_template, start, start_of_ints = REDUCED[name]
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
         value, axes = values[0], params["axes"]
         assert isinstance(value, Array)
-        kind, own = value.kind, template
-        first = _of_ints(start) if kind == "int" else start
+        kind, lanes, template, first = value.kind, value.lanes, real_template, start
         if kind == "int":
-            own = template.replace("r_", "i_")
-        lanes = 0 if value.axis is None else value.shape[value.axis]
+            if start_of_ints is None:
+                raise NoFormError("of whole numbers")
+            template, first = template.replace("r_", "i_"), start_of_ints
         rest = [d for d in range(len(value.shape)) if d != value.axis]
         over = [rest.index(d) for d in axes if d != value.axis]
         moved = np.moveaxis(value.cells, over, range(-len(over), 0)) if over else value.cells
         kept = moved.shape[: moved.ndim - len(over)]
         rows = moved.reshape(prod(kept), -1)
-        cells = [chained(builder, own, kind, row, lanes) for row in rows]
+        cells = [chained(builder, template, kind, row, lanes) for row in rows]
         if value.axis in axes:
-            cells = [over_lanes(builder, own, kind, cell, lanes, first) for cell in cells]
+            cells = [over_lanes(builder, template, kind, cell, lanes, first) for cell in cells]
             return Array(out.shape, kind, None, cells_of(kept, cells))
         axis = None if value.axis is None else value.axis - sum(d < value.axis for d in axes)
         return Array(out.shape, kind, axis, cells_of(kept, cells))
 
     return rule
-
-
-def _of_ints(start: str) -> str:
-    """Return the initial value of a reduction of whole numbers, from that of reals."""
-    known = {"R(0.0)": "0", "R(1.0)": "1", "R_INFINITY": "INT32_MAX", "-R_INFINITY": "INT32_MIN"}
-    if start not in known:
-        raise NoFormError("of whole numbers")
-    return known[start]
 
 
 def over_lanes(
@@ -107,76 +99,62 @@ def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -
 
 def dot(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
     """Return sums of products of two arrays, as `dot_general` of JAX defines them."""
-    (by_left, by_right), (batch_left, batch_right) = params["dimension_numbers"]
-    left, right = values
-    free_left = [d for d in range(len(left.shape)) if d not in (*by_left, *batch_left)]
-    free_right = [d for d in range(len(right.shape)) if d not in (*by_right, *batch_right)]
-    axes = _dot_axes(left, right, (by_left, by_right), (batch_left, batch_right), out.shape)
-    rows = []
-    for value, axis, order in (
-        (left, axes.left, (batch_left, free_left, by_left)),
-        (right, axes.right, (batch_right, free_right, by_right)),
-    ):
-        cells = along(builder, value, value.shape, axis)
-        dims = [d for d in range(len(value.shape)) if d != axis]
-        sizes = [[value.shape[d] for d in part if d != axis] for part in order]
-        turned = np.transpose(cells, [dims.index(d) for part in order for d in part if d != axis])
-        rows.append(turned.reshape([prod(s) for s in sizes]))
-    shape = tuple(n for d, n in enumerate(out.shape) if d != axes.out)
-    cells_out = [
-        _dot_one(builder, a, b, kind_of(out.dtype), axes.lanes, axes.summed)
-        for left_rows, right_rows in zip(*rows, strict=True)
+    summed, batch = params["dimension_numbers"]
+    free = [
+        [d for d in range(len(v.shape)) if d not in (*summed[k], *batch[k])]
+        for k, v in enumerate(values)
+    ]
+    axes = _lane_axes(values, summed, batch, free)
+    lanes = max(0 if a is None else v.shape[a] for v, a in zip(values, axes, strict=True))
+    of_result = [*zip(*batch, strict=True), *((d, None) for d in free[0])]
+    of_result += [(None, d) for d in free[1]]
+    axis = of_result.index(axes) if axes in of_result else None
+    orders = (batch[0], free[0], summed[0]), (batch[1], free[1], summed[1])
+    left, right = (
+        _ordered(along(builder, v, v.shape, a), v.shape, a, order)
+        for v, a, order in zip(values, axes, orders, strict=True)
+    )
+    cells = [
+        _dot_one(builder, a, b, kind_of(out.dtype), lanes, axes[0] in summed[0])
+        for left_rows, right_rows in zip(left, right, strict=True)
         for a in left_rows
         for b in right_rows
     ]
-    return Array(out.shape, kind_of(out.dtype), axes.out, cells_of(shape, cells_out))
+    shape = tuple(n for d, n in enumerate(out.shape) if d != axis)
+    return Array(out.shape, kind_of(out.dtype), axis, cells_of(shape, cells))
 
 
-@dataclass(frozen=True)
-class _DotAxes:
-    """Axes of the lanes in a product of two arrays.
+def _ordered(
+    cells: Cells, shape: tuple[int, ...], axis: int | None, order: Sequence[Sequence[int]]
+) -> Cells:
+    """Return cells with lanes along `axis`, with one axis for each group of axes in `order`."""
+    dims = [d for d in range(len(shape)) if d != axis]
+    groups = [[d for d in part if d != axis] for part in order]
+    turned = np.transpose(cells, [dims.index(d) for group in groups for d in group])
+    return turned.reshape([prod(shape[d] for d in group) for group in groups])
 
-    Attributes:
-        left: axis of the lanes in the left array; None where it has no lanes.
-        right: axis of the lanes in the right array; None where it has no lanes.
-        out: axis of the lanes in the result; None where it has no lanes.
-        lanes: number of lanes.
-        summed: whether the products are summed over the lanes.
+
+def _lane_axes(
+    values: Sequence[Value],
+    summed: Sequence[Sequence[int]],
+    batch: Sequence[Sequence[int]],
+    free: Sequence[Sequence[int]],
+) -> tuple[int | None, int | None]:
+    """Return the axes of the lanes of a product in its left and its right array.
+
+    They are those of an array that has lanes; None where an array does not depend on the lane.
     """
-
-    left: int | None = None
-    right: int | None = None
-    out: int | None = None
-    lanes: int = 0
-    summed: bool = False
-
-
-def _dot_axes(
-    left: Value,
-    right: Value,
-    by: tuple[Sequence[int], Sequence[int]],
-    batch: tuple[Sequence[int], Sequence[int]],
-    shape: tuple[int, ...],
-) -> _DotAxes:
-    free = [
-        [d for d in range(len(v.shape)) if d not in (*by[k], *batch[k])]
-        for k, v in enumerate((left, right))
-    ]
-    laned = [v.axis if isinstance(v, Array) else None for v in (left, right)]
-    start = len(batch[0])
-    for k in (1, 0):
-        axis = laned[k]
-        if axis is not None and axis in free[k]:
-            out = start + (len(free[0]) if k else 0) + free[k].index(axis)
-            return _DotAxes(None if k else axis, axis if k else None, out, shape[out])
-    for dims, summed in ((by, True), (batch, False)):
-        for k, value in enumerate((left, right)):
-            axis = laned[k]
-            if axis is not None and axis in dims[k]:
-                place = list(dims[k]).index(axis)
-                both = dims[0][place], dims[1][place]
-                return _DotAxes(*both, None if summed else place, value.shape[axis], summed)
-    return _DotAxes()
+    left, right = (v.axis if isinstance(v, Array) else None for v in values)
+    if right in free[1]:
+        return None, right
+    if left in free[0]:
+        return left, None
+    for dims in (summed, batch):
+        for axis, own in zip((left, right), dims, strict=True):
+            if axis is not None and axis in own:
+                place = list(own).index(axis)
+                return dims[0][place], dims[1][place]
+    return None, None
 
 
 def _dot_one(

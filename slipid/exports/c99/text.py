@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +23,7 @@ class Usage:
     Attributes:
         live: identities of the statements that are needed.
         read: names of all memory that is read.
-        shared: kind and name of the array on the stack for each memory, by the memory's name.
-        sizes: sizes of all arrays on the stack, by kind and name.
+        shared: array on the stack for each memory, by the memory's name.
     """
 
     def __init__(self, builder: Builder):
@@ -34,9 +34,6 @@ class Usage:
         self._step = 0
         self._scan(builder)
         self.shared = _shared(list(self._lives.values()))
-        self.sizes: dict[tuple[Kind, str], int] = {}
-        for name, array in self.shared.items():
-            self.sizes[array] = self._lives[name].memory.size
 
     def _scan(self, builder: Builder) -> None:
         """Mark the statements and arrays that are used, from the end to the beginning."""
@@ -117,21 +114,29 @@ def _within(memory: Memory, nested: Nested) -> bool:
     return owner is not None
 
 
-def _shared(arrays: list[_Life]) -> dict[str, tuple[Kind, str]]:
-    """Return kind and name of the stack array for each memory, by the memory's name.
+class StackArray(NamedTuple):
+    """An array on the stack: kind and name in C, and count of its numbers."""
+
+    kind: Kind
+    name: str
+    size: int
+
+
+def _shared(arrays: list[_Life]) -> dict[str, StackArray]:
+    """Return the stack array for each memory, by the memory's name.
 
     Memories of one kind and size that are not in use at the same time share an array.
     """
     slots: dict[tuple[Kind, int], list[_Life]] = {}
-    names: dict[str, tuple[Kind, str]] = {}
+    shared: dict[str, StackArray] = {}
     for life in sorted(arrays, key=lambda life: life.first):
         memory = life.memory
         kind: Kind = "real" if memory.lanes and memory.kind == "bool" else memory.kind
         taken = slots.setdefault((kind, memory.size), [])
         free = next((k for k, other in enumerate(taken) if other.last < life.first), len(taken))
         taken[free : free + 1] = [life]
-        names[memory.name] = kind, f"{kind[0]}{memory.size}_{free}"
-    return names
+        shared[memory.name] = StackArray(kind, f"{kind[0]}{memory.size}_{free}", memory.size)
+    return shared
 
 
 TYPES: dict[Kind, str] = {"real": "real_t", "int": "int32_t", "bool": "bool"}
@@ -179,6 +184,7 @@ class FunctionBody:
     """C text of the code of a builder, without unused statements.
 
     Attributes:
+        lines: lines of declarations and statements.
         reads: names of all memory that the code reads.
         scratch: count of the numbers in its arrays on the stack.
     """
@@ -186,15 +192,11 @@ class FunctionBody:
     def __init__(self, builder: Builder):
         self._usage = Usage(builder)
         self._source = ""
-        self._lines = self._text(builder, "  ")
+        arrays = dict.fromkeys(self._usage.shared.values())
+        declared = [f"  {TYPES[array.kind]} {array.name}[{array.size}];" for array in arrays]
+        self.lines = (*declared, *self._text(builder, "  "))
         self.reads = frozenset(self._usage.read)
-        self.scratch = sum(self._usage.sizes.values())
-
-    def lines(self) -> list[str]:
-        """Return the lines of declarations and statements."""
-        sizes = self._usage.sizes
-        arrays = [f"  {TYPES[kind]} {name}[{size}];" for (kind, name), size in sizes.items()]
-        return [*arrays, *self._lines]
+        self.scratch = sum(array.size for array in arrays)
 
     def _text(self, builder: Builder, indent: str) -> list[str]:
         lines: list[str] = []
@@ -285,7 +287,7 @@ class FunctionBody:
     def _name(self, memory: Memory) -> str:
         """Return the name of memory in C: that of its shared stack array, or else its own."""
         shared = self._usage.shared.get(memory.name)
-        return memory.name if shared is None else shared[1]
+        return memory.name if shared is None else shared.name
 
 
 def folded(text: str, indent: str) -> list[str]:

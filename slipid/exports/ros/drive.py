@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from slipid.exports.ros.yaml_text import Parameter
 from slipid.robot.deployed import DeployedRobot
 
-MOST = 0.05
+LARGEST_DIFFERENCE = 0.05
 """Largest difference of kinematics up to which a controller still fits a robot.
 
 It is the error of a rim speed as a share of the body's speed [1], the speed being that of points on
@@ -31,63 +31,39 @@ CORNERS = ("front_left", "front_right", "rear_right", "rear_left")
 
 
 @dataclass(frozen=True)
-class ControllerPlugin:
-    """A drive controller with the names of its parameters and topics.
-
-    Attributes:
-        name: name of the controller.
-        plugin: type of the controller.
-        odometry: topic of its odometry, relative to the controller's name.
-        pose: parameter with the diagonal of the pose's covariance.
-        twist: parameter with the diagonal of the twist's covariance.
-    """
-
-    name: str
-    plugin: str
-    odometry: str
-    pose: str
-    twist: str
-
-
-OMNI = ControllerPlugin(
-    "omni_wheel_drive_controller",
-    "omni_wheel_drive_controller/OmniWheelDriveController",
-    "odom",
-    "diagonal_covariance.pose",
-    "diagonal_covariance.twist",
-)
-MECANUM = ControllerPlugin(
-    "mecanum_drive_controller",
-    "mecanum_drive_controller/MecanumDriveController",
-    "odometry",
-    "pose_covariance_diagonal",
-    "twist_covariance_diagonal",
-)
-
-
-@dataclass(frozen=True)
 class DriveController:
     """A drive controller with its parameters set for a robot.
 
     Attributes:
-        controller: type of the controller and its names.
+        name: name of the controller.
+        odometry: topic of its odometry, relative to the controller's name.
+        covariances: parameters with the diagonals of the covariances of pose and twist.
         wheels: numbers of the robot's wheels in the controller's order.
         turned: for each of these, whether the controller counts its speed with the opposite sign.
         parameters: parameters of the controller.
-        off: largest difference of the controller's kinematics from the robot's, see `MOST` [1].
+        difference: largest difference of the controller's kinematics from the robot's, as in
+            `LARGEST_DIFFERENCE` [1].
     """
 
-    controller: ControllerPlugin
+    name: str
+    odometry: str
+    covariances: tuple[str, str]
     wheels: tuple[int, ...]
     turned: tuple[bool, ...]
     parameters: tuple[Parameter, ...]
-    off: float
+    difference: float
+
+    @property
+    def plugin(self) -> str:
+        """Type of the controller, as the controller manager names it."""
+        return f"{self.name}/{self.name.title().replace('_', '')}"
 
 
 def drive_controller_of(robot: DeployedRobot) -> DriveController | None:
     """Return the controller for a robot; None where no controller has its kinematics."""
-    controller = _mecanum(robot) or _omni(robot)
-    return controller if controller is not None and controller.off <= MOST else None
+    found = (_mecanum(robot), _omni(robot))
+    fitting = (c for c in found if c is not None and c.difference <= LARGEST_DIFFERENCE)
+    return next(fitting, None)
 
 
 def joint(wheel: int) -> str:
@@ -95,45 +71,22 @@ def joint(wheel: int) -> str:
     return f"wheel_{wheel + 1}_joint"
 
 
-@dataclass(frozen=True)
-class _OrderedWheels:
-    """The robot's wheels in a controller's order.
+def _with_signs(
+    robot: DeployedRobot, order: Int[np.ndarray, " wheel"], axis: int, sign: float
+) -> tuple[Float[np.ndarray, "wheel 3"], tuple[bool, ...]]:
+    """Return rows of the robot's kinematics J in a controller's order, with its signs.
 
-    Attributes:
-        order: numbers of the robot's wheels.
-        turned: whether the controller counts the speed of each wheel with the opposite sign.
-        rows: rows of the robot's kinematics J with the controller's signs.
+    Signs are such that column `axis` has `sign`; the second result says which ones were changed.
     """
+    rows = np.asarray(robot.forward)[order]
+    turned = rows[:, axis] * sign < 0
+    return np.where(turned, -1.0, 1.0)[:, None] * rows, tuple(turned.tolist())
 
-    order: Int[np.ndarray, " wheel"]
-    turned: tuple[bool, ...]
-    rows: Float[np.ndarray, "wheel 3"]
 
-    @classmethod
-    def of(
-        cls, robot: DeployedRobot, order: Int[np.ndarray, " wheel"], axis: int, sign: float
-    ) -> "_OrderedWheels":
-        """Return the wheels, their signs such that column `axis` of the kinematics has `sign`."""
-        rows = np.asarray(robot.forward)[order]
-        turned = rows[:, axis] * sign < 0
-        return cls(order, tuple(turned.tolist()), np.where(turned, -1.0, 1.0)[:, None] * rows)
-
-    def drive(
-        self,
-        controller: ControllerPlugin,
-        robot: DeployedRobot,
-        own: Float[np.ndarray, "wheel 3"],
-        parameters: tuple[Parameter, ...],
-    ) -> DriveController:
-        """Return the controller with kinematics `own`, and its difference from the robot's."""
-        scale = np.array([1.0, 1.0, 1.0 / float(robot.frame.base)])
-        return DriveController(
-            controller=controller,
-            wheels=tuple(self.order.tolist()),
-            turned=self.turned,
-            parameters=parameters,
-            off=float(np.abs((own - self.rows) * scale).max()),
-        )
+def _difference(robot: DeployedRobot, kinematics: Float[np.ndarray, "wheel 3"]) -> float:
+    """Return the largest entry of a difference of kinematics, see `LARGEST_DIFFERENCE` [1]."""
+    scale = np.array([1.0, 1.0, 1.0 / float(robot.frame.base)])
+    return float(np.abs(kinematics * scale).max())
 
 
 def _omni(robot: DeployedRobot) -> DriveController | None:
@@ -142,22 +95,31 @@ def _omni(robot: DeployedRobot) -> DriveController | None:
     It is None for fewer than three wheels.
     """
     places, count = np.asarray(robot.places), robot.wheels
+    if count < 3:
+        return None
     azimuth = np.arctan2(places[:, 1], places[:, 0])
     # a wheel whose azimuth is a rounding error below that of the first one counts as being at 0
     order = np.argsort(np.mod(azimuth - azimuth[0] + 1e-6, 2 * np.pi))
-    wheels = _OrderedWheels.of(robot, order, axis=2, sign=-1.0)
+    rows, turned = _with_signs(robot, order, axis=2, sign=-1.0)
     even = 2 * np.pi * np.arange(count) / count
-    beyond = np.arctan2(wheels.rows[:, 0], -wheels.rows[:, 1]) - azimuth[0] - even
+    beyond = np.arctan2(rows[:, 0], -rows[:, 1]) - azimuth[0] - even
     offset = float(azimuth[0] + np.mean(np.mod(beyond + np.pi, 2 * np.pi) - np.pi))
     base, angle = float(robot.frame.base), offset + even
     own = np.stack([np.sin(angle), -np.cos(angle), np.full(count, -base)], axis=-1)
-    parameters = (
-        Parameter("wheel_names", tuple(joint(k) for k in order.tolist()), _JOINTS),
-        Parameter("wheel_offset", offset, _OFFSET),
-        Parameter("robot_radius", base, _BASE),
-        Parameter("wheel_radius", float(robot.frame.radius), _RADIUS),
+    return DriveController(
+        name="omni_wheel_drive_controller",
+        odometry="odom",
+        covariances=("diagonal_covariance.pose", "diagonal_covariance.twist"),
+        wheels=tuple(order.tolist()),
+        turned=turned,
+        parameters=(
+            Parameter("wheel_names", tuple(map(joint, order.tolist())), _JOINTS),
+            Parameter("wheel_offset", offset, _OFFSET),
+            Parameter("robot_radius", base, _BASE),
+            Parameter("wheel_radius", float(robot.frame.radius), _RADIUS),
+        ),
+        difference=_difference(robot, own - rows),
     )
-    return wheels.drive(OMNI, robot, own, parameters) if count >= 3 else None
 
 
 def _mecanum(robot: DeployedRobot) -> DriveController | None:
@@ -169,36 +131,31 @@ def _mecanum(robot: DeployedRobot) -> DriveController | None:
         return None
     corners = ((True, True), (True, False), (False, False), (False, True))
     order = np.array([by_corner[corner] for corner in corners])
-    wheels = _OrderedWheels.of(robot, order, axis=0, sign=1.0)
-    rows = wheels.rows
+    rows, turned = _with_signs(robot, order, axis=0, sign=1.0)
     about = rows[:, 2] - (middle[0] * rows[:, 1] - middle[1] * rows[:, 0])
     turns, aside = np.array([-1.0, 1.0, 1.0, -1.0]), np.array([-1.0, 1.0, -1.0, 1.0])
     reach = float(np.mean(about * turns))
-    yaw = reach * turns + middle[0] * aside - middle[1]
-    own = np.stack([np.ones(4), aside, yaw], axis=-1)
-    parameters = (*_joints(order), *_kinematics(robot, reach, middle))
-    controller = wheels.drive(MECANUM, robot, own, parameters)
-    return controller if controller.off <= MOST else None
-
-
-def _joints(order: Int[np.ndarray, "4"]) -> tuple[Parameter, ...]:
-    names = [
-        (f"{corner}_wheel_command_joint_name", joint(int(k)))
-        for corner, k in zip(CORNERS, order, strict=True)
-    ]
-    return tuple(Parameter(*pair, "" if n else _JOINTS) for n, pair in enumerate(names))
-
-
-def _kinematics(
-    robot: DeployedRobot, reach: float, middle: Float[np.ndarray, "2"]
-) -> tuple[Parameter, ...]:
+    own = np.stack([np.ones(4), aside, reach * turns + middle[0] * aside - middle[1]], axis=-1)
     x, y = (float(-m) if abs(m) > 1e-12 else 0.0 for m in middle)
-    return (
-        Parameter("kinematics.base_frame_offset.x", x, _MIDDLE),
-        Parameter("kinematics.base_frame_offset.y", y),
-        Parameter("kinematics.base_frame_offset.theta", 0.0),
-        Parameter("kinematics.wheels_radius", float(robot.frame.radius), _RADIUS),
-        Parameter("kinematics.sum_of_robot_center_projection_on_X_Y_axis", reach, _REACH),
+    joints = [
+        Parameter(f"{corner}_wheel_command_joint_name", joint(int(k)), "" if n else _JOINTS)
+        for n, (corner, k) in enumerate(zip(CORNERS, order, strict=True))
+    ]
+    return DriveController(
+        name="mecanum_drive_controller",
+        odometry="odometry",
+        covariances=("pose_covariance_diagonal", "twist_covariance_diagonal"),
+        wheels=tuple(order.tolist()),
+        turned=turned,
+        parameters=(
+            *joints,
+            Parameter("kinematics.base_frame_offset.x", x, _MIDDLE),
+            Parameter("kinematics.base_frame_offset.y", y),
+            Parameter("kinematics.base_frame_offset.theta", 0.0),
+            Parameter("kinematics.wheels_radius", float(robot.frame.radius), _RADIUS),
+            Parameter("kinematics.sum_of_robot_center_projection_on_X_Y_axis", reach, _REACH),
+        ),
+        difference=_difference(robot, own - rows),
     )
 
 

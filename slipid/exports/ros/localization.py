@@ -105,9 +105,9 @@ def odometry_errors(robot: DeployedRobot) -> tuple[OdometryErrors, ...]:
     )
 
 
-def worst(errs: tuple[OdometryErrors, ...]) -> OdometryErrors:
+def worst_of(errors: tuple[OdometryErrors, ...]) -> OdometryErrors:
     """Return the errors on the floor with the largest position error after `DISTANCE_M`."""
-    return max(errs, key=lambda e: e.pose(DISTANCE_M)[0])
+    return max(errors, key=lambda e: e.pose(DISTANCE_M)[0])
 
 
 def top_speed(robot: DeployedRobot) -> float:
@@ -156,18 +156,18 @@ it is the default of robot_localization."""
 
 
 def filter_parameters(
-    robot: DeployedRobot, errs: OdometryErrors, odometry: str, whose: str
+    robot: DeployedRobot, errors: OdometryErrors, odometry: str, source: str
 ) -> tuple[Parameter, ...]:
     """Return all parameters of the filter.
 
     Args:
         robot: identified robot.
-        errs: errors of the odometry.
+        errors: errors of the odometry.
         odometry: topic of the odometry.
-        whose: description of the odometry's source, for a comment.
+        source: description of the odometry's source, for a comment.
     """
     about = (
-        f"Odometry of {whose}. Velocities only are fused: its pose is their sum, and would count "
+        f"Odometry of {source}. Velocities only are fused: its pose is their sum, and would count "
         "twice. Order: " + ", ".join(STATE) + "."
     )
     return (
@@ -182,36 +182,33 @@ def filter_parameters(
         Parameter("odom0_differential", False),
         Parameter("odom0_relative", False),
         Parameter("dynamic_process_noise_covariance", False, _DYNAMIC),
-        process_noise(robot, errs),
+        process_noise(robot, errors),
     )
 
 
-def process_noise(robot: DeployedRobot, errs: OdometryErrors) -> Parameter:
-    """Return the process noise on a floor, a 15 x 15 matrix in row-major order."""
-    matrix, most = np.diag(_diagonal(robot, errs)), float(Limits().acceleration)
+def process_noise(robot: DeployedRobot, errors: OdometryErrors) -> Parameter:
+    """Return the process noise on a floor, a 15 x 15 matrix in row-major order.
+
+    Its diagonal is the variance per second of each state. That of the pose is
+    `OdometryErrors.walk`, that of velocities (a T)^2 per period T [s], with a the largest
+    acceleration [m/s^2, rad/s^2].
+    """
+    acceleration = float(Limits().acceleration)
+    change = acceleration * float(robot.frame.radius)
+    speed, turn = change**2 * PERIOD_S, (change / float(robot.frame.base)) ** 2 * PERIOD_S
+    noise = dict(zip(("x", "y", "yaw"), errors.walk(top_speed(robot), DISTANCE_M), strict=True))
+    noise |= {"vx": speed, "vy": speed, "vyaw": turn, "ax": ACCELERATION, "ay": ACCELERATION}
+    matrix = np.diag([noise.get(name, HELD) for name in STATE])
     about = (
-        f"On '{errs.floor}'. Pose: errors that stay the same over the path, and so are no noise "
+        f"On '{errors.floor}'. Pose: errors that stay the same over the path, and so are no noise "
         f"of single velocities, as a random walk with the same error after {short(DISTANCE_M)} m, "
         f"at the highest speed of the fitted runs, {short(top_speed(robot))} m/s. Velocity: the "
-        f"change that the limit of wheel acceleration, {short(most)} rad/s^2, allows within "
-        f"{short(PERIOD_S)} s. Accelerations: the package's default. two_d_mode holds the rest."
+        f"change that the limit of wheel acceleration, {short(acceleration)} rad/s^2, allows "
+        f"within {short(PERIOD_S)} s. Accelerations: the package's default. two_d_mode holds the "
+        "rest."
     )
-    entries = tuple(float(x) for x in matrix.reshape(-1))
+    entries = tuple(matrix.reshape(-1).tolist())
     return Parameter("process_noise_covariance", entries, about, per_line=len(STATE))
-
-
-def _diagonal(robot: DeployedRobot, errs: OdometryErrors) -> Float[np.ndarray, " state"]:
-    """Return the process noise of each state, as variance per second.
-
-    That of the pose is `OdometryErrors.walk`, that of velocities (a T)^2 per period T [s], with a
-    the largest acceleration [m/s^2, rad/s^2].
-    """
-    pose = errs.walk(top_speed(robot), DISTANCE_M)
-    change = float(Limits().acceleration) * float(robot.frame.radius)
-    speed, turn = change**2 * PERIOD_S, (change / float(robot.frame.base)) ** 2 * PERIOD_S
-    known = dict(zip(("x", "y", "yaw"), pose, strict=True))
-    known |= {"vx": speed, "vy": speed, "vyaw": turn, "ax": ACCELERATION, "ay": ACCELERATION}
-    return np.array([known.get(name, HELD) for name in STATE])
 
 
 _TF = (

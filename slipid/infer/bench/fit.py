@@ -17,7 +17,6 @@ the spectra of three noises and the voltage between rows. Moments need none of t
 import fnmatch
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,14 +26,14 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from slipid.infer.bench.moments import (
-    MomentSums,
+    Equation,
     cell_length,
     celled,
     correlation_cells,
+    equation,
     grouped,
     scatter,
     start,
-    sums,
     widened,
 )
 from slipid.infer.bench.motor import (
@@ -49,9 +48,9 @@ from slipid.infer.bench.motor import (
 from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
 from slipid.search_space import Choice, Space
 
-ROUNDS = 30
+MOST_ROUNDS = 30
 """Largest number of updates of weights, scatter and numbers."""
-SETTLED = 0.02
+SETTLED_STDS = 0.02
 """Largest change of a number in the last round of a converged fit [std]."""
 CONSTANT_S = 2e-3
 """Prior std of the electrical time constant L_a / R [s]."""
@@ -60,22 +59,6 @@ MOMENTS = (len(VOLTS) - 1, len(AMPS))
 
 The last signal, the sign given to unsigned currents, is an instrument in the mechanical one only.
 """
-
-
-class Equation(NamedTuple):
-    """One of the two equations of a motor, at the fitted numbers.
-
-    Attributes:
-        channel: `voltage` or `current`.
-        unit: unit of the channel.
-        windows: windows of the records, with the signals of the equation.
-        sums: moments of the equation, with their weights and residuals.
-    """
-
-    channel: str
-    unit: str
-    windows: BenchWindows
-    sums: MomentSums
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,24 +145,24 @@ def fit_motor(
     space = Space(BenchRoot(BenchMotor()), scaled)
     z = space.vector(BenchRoot(first))
     # numbers for which the user has given a start value begin there
-    z = np.where(_chosen(space, choices), space.start, z)
+    started = [c.pattern for c in choices if c.start is not None]
+    chosen = space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in started))
+    z = np.where(chosen, space.start, z)
     zero, moved, rounds = 0.0, np.inf, 0
-    while moved >= SETTLED and rounds < ROUNDS:
+    while moved >= SETTLED_STDS and rounds < MOST_ROUNDS:
         motor = space.tree(jnp.asarray(z)).motor
         if abs(float(motor.current_offset) - zero) > 0.02 * BRUSH_CURRENT:
             zero = float(motor.current_offset)
             volts = electrical(records, zero)
-        a = sums(amps, np.asarray(motor.amps()), MOMENTS[1])
-        equations = [Equation("current", "A", amps, a)]
+        equations = [equation(amps, np.asarray(motor.amps()), MOMENTS[1])]
         if volts is not None:
-            v = sums(volts, np.asarray(motor.volts()), MOMENTS[0])
-            equations.insert(0, Equation("voltage", "V", volts, v))
+            equations.insert(0, equation(volts, np.asarray(motor.volts()), MOMENTS[0]))
         s, correlation_time, independent_times = _scatter(equations)
-        new, covariance = _solved(space, z, [e.sums for e in equations], s)
+        new, covariance = _solved(space, z, equations, s)
         moved = float(np.max(np.abs(new - z) / np.sqrt(np.diag(covariance)), initial=0.0))
         z, rounds = new, rounds + 1
-    settled = moved < SETTLED and bool(np.isfinite(z).all())
-    reason = f"no number changed by {100 * SETTLED:g} % of its std in round {rounds}"
+    settled = moved < SETTLED_STDS and bool(np.isfinite(z).all())
+    reason = f"no number changed by {100 * SETTLED_STDS:g} % of its std in round {rounds}"
     return MotorFit(
         label=label,
         records=tuple(records),
@@ -231,12 +214,6 @@ def _scaled(records: Sequence[BenchRecord], resistance: float) -> list[Choice]:
     return [*chosen, Choice("motor.inductance", prior_mean=0.0, prior_std=slow)]
 
 
-def _chosen(space: Space, choices: Sequence[Choice]) -> np.ndarray:
-    """Return a mask of the coordinates for which the user has given a start value."""
-    wanted = [c.pattern for c in choices if c.start is not None]
-    return space.where(lambda e: any(fnmatch.fnmatchcase(e.path, p) for p in wanted))
-
-
 def _scatter(
     equations: Sequence[Equation],
 ) -> tuple[Float[np.ndarray, "moment moment"], float, float]:
@@ -246,19 +223,17 @@ def _scatter(
     the correlation time.
     """
     length = cell_length([e.windows for e in equations])
-    parts = [celled(e.sums.moments, e.windows, length) for e in equations]
+    parts = [celled(e.moments, e.windows, length) for e in equations]
     count = max(len(p) for p in parts)
     g = np.concatenate([np.pad(p, ((0, count - len(p)), (0, 0))) for p in parts], axis=1)
-    residuals = [
-        celled(e.sums.weighted_residual[:, None], e.windows, length)[:, 0] for e in equations
-    ]
+    residuals = [celled(e.weighted_residual[:, None], e.windows, length)[:, 0] for e in equations]
     lags = 2 * max(correlation_cells(x) for x in residuals) + 2
-    groups = np.concatenate([grouped(e.sums, e.windows) for e in equations], axis=1)
+    groups = np.concatenate([grouped(e) for e in equations], axis=1)
     return widened(scatter(g, lags), groups), lags * length / 2, count / lags
 
 
 def _solved(
-    space: Space, z: np.ndarray, equations: Sequence[MomentSums], s: np.ndarray
+    space: Space, z: np.ndarray, equations: Sequence[Equation], s: np.ndarray
 ) -> tuple[Float[np.ndarray, " free"], Float[np.ndarray, "free free"]]:
     """Return the optimum at fixed weights and scatter, and its covariance."""
     std = np.sqrt(np.maximum(np.diag(s), 1e-300))

@@ -27,15 +27,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from slipid.infer.bench.motor import VOLTS
 from slipid.infer.bench.windows import BenchWindows
 
 DEGREES = 4.0
 """Degrees of freedom of Student's t in the weights."""
-FORGOTTEN = 0.05
+UNCORRELATED = 0.05
 """Autocorrelation below which residuals count as uncorrelated."""
 CELL_S = 0.01
 """Smallest length of the cells of time, over which moments are summed [s]."""
-FEWEST = 12
+FEWEST_TIMES = 12
 """Smallest ratio of a record's length to the estimated correlation time.
 
 Longer correlation times are not looked for, as the covariance could not be estimated from them.
@@ -48,10 +49,11 @@ Square = Float[np.ndarray, "moment moment"]
 
 
 @dataclass(frozen=True, eq=False)
-class MomentSums:
-    """Sums h and G of an equation, g = h - G k, and the moments of its windows.
+class Equation:
+    """One of the two equations of a motor at given numbers k: its moments g = h - G k.
 
     Attributes:
+        windows: windows of the records, with the signals of the equation.
         constant: h.
         slope: G.
         tangent: -dg / dk with the change of weights, which determines the uncertainty of k.
@@ -61,6 +63,7 @@ class MomentSums:
         scale: robust std of the residuals, averaged over even and odd rows.
     """
 
+    windows: BenchWindows
     constant: Moments
     slope: Float[np.ndarray, "moment column"]
     tangent: Float[np.ndarray, "moment column"]
@@ -68,6 +71,16 @@ class MomentSums:
     weight: Float[np.ndarray, "half window"]
     terms: Float[np.ndarray, "half window moment"]
     scale: float
+
+    @property
+    def channel(self) -> str:
+        """Channel on the left side of the equation: `voltage` or `current`."""
+        return "voltage" if self.windows.signals.shape[-1] == len(VOLTS) else "current"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the channel."""
+        return {"voltage": "V", "current": "A"}[self.channel]
 
     @property
     def moments(self) -> Float[np.ndarray, "window moment"]:
@@ -79,8 +92,8 @@ class MomentSums:
         return (self.weight * self.residual).sum(axis=0) / 2
 
 
-def sums(w: BenchWindows, coefficients: Float[np.ndarray, " column"], signals: int) -> MomentSums:
-    """Return the sums of an equation at given coefficients.
+def equation(w: BenchWindows, coefficients: Float[np.ndarray, " column"], signals: int) -> Equation:
+    """Return an equation at given coefficients.
 
     The first `signals` signals are the instruments, which residuals are multiplied by.
     """
@@ -95,7 +108,7 @@ def sums(w: BenchWindows, coefficients: Float[np.ndarray, " column"], signals: i
         halves.append((residual, weight, z * residual[:, None]))
     constant, slope, tangent, scale = (a + b for a, b in zip(*totals, strict=True))
     residuals, weights, terms = map(np.stack, zip(*halves, strict=True))
-    return MomentSums(constant, slope, tangent, residuals, weights, terms, scale)
+    return Equation(w, constant, slope, tangent, residuals, weights, terms, scale)
 
 
 def start(w: BenchWindows, count: int, rounds: int = 12) -> np.ndarray:
@@ -116,15 +129,14 @@ def start(w: BenchWindows, count: int, rounds: int = 12) -> np.ndarray:
 def _weighted(
     w: BenchWindows, half: int, coefficients: Float[np.ndarray, " column"]
 ) -> tuple[Float[np.ndarray, " window"], float, Float[np.ndarray, " window"]]:
-    """Return the residuals of one half of the rows, their robust std, and their weights."""
+    """Return the residuals of one half of the rows, their robust std, and their weights.
+
+    The std is at least 1e-9, the rounding errors of sums.
+    """
     residual = w.measured[half] - w.signals[half] @ coefficients
-    scale = _scale(residual[w.usable])
+    usable = np.abs(residual[w.usable])
+    scale = max(1.4826 * float(np.median(usable)) if len(usable) else 1.0, 1e-9)
     return residual, scale, w.usable * (DEGREES + 1) / (DEGREES + (residual / scale) ** 2)
-
-
-def _scale(residual: np.ndarray) -> float:
-    """Return a robust std of residuals, at least 1e-9, the rounding errors of sums."""
-    return max(1.4826 * float(np.median(np.abs(residual))) if len(residual) else 1.0, 1e-9)
 
 
 def celled(
@@ -147,14 +159,14 @@ def cell_length(windows: Sequence[BenchWindows]) -> float:
 
 def correlation_cells(x: Float[np.ndarray, " cell"]) -> int:
     """Return the correlation time of a signal [cell]: 1 + 2 sum of its autocorrelations."""
-    most = len(x) // FEWEST
+    most = len(x) // FEWEST_TIMES
     size = 1 << (2 * len(x)).bit_length()
     power = np.abs(np.fft.rfft(x - x.mean(), size)) ** 2
     correlation = np.fft.irfft(power, size)[: most + 1]
     if len(correlation) < 2 or correlation[0] <= 0:
         return 1
     correlation = correlation / correlation[0]
-    low = np.flatnonzero(correlation < FORGOTTEN)
+    low = np.flatnonzero(correlation < UNCORRELATED)
     end = int(low[0]) if len(low) else most + 1
     return int(np.ceil(1 + 2 * correlation[1:end].sum()))
 
@@ -184,14 +196,14 @@ def widened(s: Square, groups: Float[np.ndarray, "group moment"]) -> Square:
     return np.asarray(axes * np.maximum(value / chance, 1.0) @ axes.T)
 
 
-def grouped(s: MomentSums, w: BenchWindows) -> Float[np.ndarray, "group moment"]:
+def grouped(equation: Equation) -> Float[np.ndarray, "group moment"]:
     """Return sums of moments over groups of windows with similar speed and similar current.
 
     Groups have about equal sizes. A residual from even rows is grouped by the speed and current of
     odd rows, and vice versa, so that its own noise does not determine its group.
     """
-    total = np.zeros((SPEEDS * CURRENTS, s.terms.shape[-1]))
-    for half, terms in enumerate(s.terms):
+    w, total = equation.windows, np.zeros((SPEEDS * CURRENTS, equation.terms.shape[-1]))
+    for half, terms in enumerate(equation.terms):
         speed, current = w.speed[1 - half], w.current[1 - half]
         group = np.zeros(len(w.time), int)
         for k, some in enumerate(np.array_split(np.argsort(speed, kind="stable"), SPEEDS)):

@@ -4,18 +4,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slipid.infer.bench.moments import scatter, start, sums
+from slipid.infer.bench.moments import equation, scatter, start
 from slipid.infer.bench.motor import REST, VOLTS, BenchRecord, noise
 from slipid.infer.bench.windows import BenchWindows, electrical, mechanical
 from slipid.support.errors import DataError
 
 FEWEST_WINDOWS = 30
 """Smallest number of windows of an equation for a fit."""
-SURE = 5.0
+SURE_STDS = 5.0
 """Size of a coefficient with the wrong sign above which its column is refused [std]."""
-FAST = 3000.0
+FASTEST_SHAFT = 3000.0
 """Shaft speed that no brushed motor reaches [rad/s]."""
-POWER = 2e4
+LARGEST_POWER = 2e4
 """Power U^2 / R at standstill above which the current is assumed to be in milliamperes [W]."""
 
 
@@ -27,7 +27,7 @@ def check_records(records: Sequence[BenchRecord], label: str, unit_known: bool =
     where = records[0].name + (f", motor {label}" if label else "")
     speed = np.concatenate([r.speed for r in records])
     current = np.concatenate([r.current for r in records])
-    if float(np.abs(speed).max()) > FAST:
+    if float(np.abs(speed).max()) > FASTEST_SHAFT:
         _fail(where, f"the shaft turns at {np.abs(speed).max():.4g} rad/s", "its unit, rpm perhaps")
     if float(np.ptp(speed)) < max(6 * noise([r.speed for r in records]), REST):
         found = f"the shaft does not turn (speeds within {np.ptp(speed):.3g} rad/s)"
@@ -75,19 +75,19 @@ def _signs(
     # unsigned currents were given the sign of the speed, which is no evidence of a direction
     inertia = _sure(amps, 0) if all(r.signed for r in records) else 0.0
     if volts is None:
-        if inertia < -SURE:
+        if inertia < -SURE_STDS:
             found = "the shaft speeds up against its current"
             _fail(where, found, "current and speed of one sign (turn one of them: scale -1)")
         return
     along = sum(float(np.sum(r.voltage * r.speed)) for r in records if r.voltage is not None)
     back, through = _sure(volts, 1), _sure(volts, 0)
-    if inertia < -SURE:
+    if inertia < -SURE_STDS:
         column = "current" if along > 0 else "speed"
         found = f"the {column} has the wrong sign: the shaft speeds up against its current"
         _fail(where, found, f"the {column} times -1")
-    if along < 0 and back < -SURE:
+    if along < 0 and back < -SURE_STDS:
         _fail(where, "the voltage has the wrong sign: it opposes the speed", "the voltage times -1")
-    if back < -SURE and through > 0:
+    if back < -SURE_STDS and through > 0:
         found = "the voltage falls with speed: voltage and current look exchanged"
         _fail(where, found, "their columns the other way round")
 
@@ -96,7 +96,7 @@ def _sure(w: BenchWindows, column: int) -> float:
     """Return a coefficient divided by its std, estimated from one equation without priors."""
     signals = w.signals.shape[-1] - (w.signals.shape[-1] == len(VOLTS))
     found = start(w, signals)
-    s = sums(w, found, signals)
+    s = equation(w, found, signals)
     inverse = np.linalg.pinv(s.tangent[:, :signals], rcond=1e-10)
     std = np.sqrt(np.diag(inverse @ scatter(s.moments, 8) @ inverse.T))
     return float(found[column] / max(std[column], 1e-300))
@@ -105,7 +105,7 @@ def _sure(w: BenchWindows, column: int) -> float:
 def _milliamperes(where: str, records: Sequence[BenchRecord], volts: BenchWindows) -> None:
     found = start(volts, 5)
     highest = max(float(np.abs(r.voltage).max()) for r in records if r.voltage is not None)
-    if 0 < found[0] < highest**2 / POWER and _sure(volts, 0) > SURE:
+    if 0 < found[0] < highest**2 / LARGEST_POWER and _sure(volts, 0) > SURE_STDS:
         heat = highest**2 / found[0] / 1e3
         _fail(
             where,

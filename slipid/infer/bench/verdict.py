@@ -9,24 +9,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int
 
-from slipid.infer.bench.fit import Equation, MotorFit
-from slipid.infer.bench.moments import cell_length, celled
+from slipid.infer.bench.fit import MotorFit
+from slipid.infer.bench.moments import Equation, cell_length, celled
 from slipid.infer.fit_file import SCHEMA, number_json
 from slipid.infer.verdicts.estimates import FROM_ZERO, Estimate, derived, estimates
-from slipid.infer.verdicts.unidentified import FlatDirection, flat_directions, members, sentences
+from slipid.infer.verdicts.unidentified import flat_directions, members, sentences
 from slipid.infer.verdicts.wording import VOLTAGE
 from slipid.support.content import Content
 from slipid.support.files import hash_of
 
 BINS = 8
 """Number of bins over speed, current or time, with about equal counts of windows."""
-SURE = 5.0
+MISFIT_STDS = 5.0
 """Smallest mean residual of a bin that is reported as a misfit [std of the mean]."""
-MATTERS = 0.01
+MISFIT_SHARE = 0.01
 """Smallest mean residual that is reported as a misfit, divided by the range of the channel."""
-FEWEST = 5
+FEWEST_CELLS = 5
 """Smallest number of cells of time in a bin from which the std of its mean is estimated."""
-LONG_S = 0.3
+LONG_CORRELATION_S = 0.3
 """Correlation time of residuals above which a message reports it [s]."""
 
 
@@ -41,8 +41,8 @@ def misfits(fit: MotorFit) -> dict[str, str]:
 
 def _worst(fit: MotorFit, equation: Equation) -> str | None:
     """Return a sentence on the most significant misfit of an equation, None if it has none."""
-    w, sentence, largest = equation.windows, None, SURE
-    size = MATTERS * float(np.ptp(w.measured.mean(axis=0)))
+    w, sentence, largest = equation.windows, None, MISFIT_STDS
+    size = MISFIT_SHARE * float(np.ptp(w.measured.mean(axis=0)))
     used = np.flatnonzero(w.usable)
     for over, (even, odd), unit in (
         ("speed", w.speed, "rad/s"),
@@ -72,11 +72,11 @@ def _mean(
     `even` and `odd` are the windows whose residuals of even and of odd rows are averaged. Cells of
     time as long as the residuals' correlation time count as independent.
     """
-    w, s = equation.windows, equation.sums
+    w = equation.windows
     weight, sum_ = np.zeros(len(w.time)), np.zeros(len(w.time))
     for half, some in enumerate((even, odd)):
-        weight[some] += s.weight[half, some]
-        sum_[some] += s.weight[half, some] * s.residual[half, some]
+        weight[some] += equation.weight[half, some]
+        sum_[some] += equation.weight[half, some] * equation.residual[half, some]
     total = float(weight.sum())
     if total <= 0:
         return 0.0, 0.0
@@ -85,14 +85,14 @@ def _mean(
     away = celled((sum_ - weight * off)[:, None], w, length)
     square = away[:, 0] ** 2
     # no std can be estimated from too few cells of time, or if one cell outweighs all others
-    if np.count_nonzero(square) < FEWEST or square.max() > square.sum() / 2:
+    if np.count_nonzero(square) < FEWEST_CELLS or square.max() > square.sum() / 2:
         return 0.0, 0.0
     return off, abs(off) * total / float(np.sqrt(square.sum()))
 
 
 ROWS_ELECTRICAL, ROWS_MECHANICAL = 2.0, 6.0
 """Smallest numbers of rows per time constant, L_a / R and J R / C_e^2, that identify L_a and J."""
-_OF = {
+_NUMBERS_OF = {
     "voltage": tuple(
         f"motor.{name}"
         for name in ("resistance", "back_emf", "brush_drop", "inductance", "voltage_offset")
@@ -103,9 +103,9 @@ _OF = {
     ),
 }
 """Paths of the numbers that the equation of each channel determines."""
-ONE_POINT = 0.05
+ONE_SPEED_RATIO = 0.05
 """Ratio of the range of speeds to the largest one below which a log has one operating point."""
-SLOW_S = 1.0
+SLOW_ROWS_S = 1.0
 """Time between rows above which a message asks whether its unit is right [s]."""
 _REMEDIES = (
     (("motor.inductance",), "log faster, several rows in L/R, with steps of the voltage"),
@@ -184,29 +184,19 @@ def bench_fit(fits: Sequence[MotorFit]) -> BenchFit:
     messages: list[str] = []
     found = {f.label: misfits(f) for f in fits}
     for f in fits:
-        flat = _flat(f)
-        slow = _too_slow(f)
-        voltage = f.has_voltage
+        slow, voltage = _too_slow(f), f.has_voltage
+        directions = flat_directions(f.space, f.covariance, has_current=True, has_voltage=voltage)
+        flat = [replace(one, remedy=_remedy(one.paths, voltage)) for one in directions]
         numbers = estimates(f.space, f.choices, f.z, f.covariance, voltage, members(flat))
-        misfitted = {path for channel in found[f.label] for path in _OF[channel]}
+        misfitted = {path for channel in found[f.label] for path in _NUMBERS_OF[channel]}
         quotients = derived(f.space, f.z, f.covariance, voltage)
         for into, estimated in ((parameters, numbers), (ratios, quotients)):
             for e in estimated:
-                path = "/".join(_labelled(p, f.label) for p in e.path.split("/"))
+                path = "/".join(f"{p}@{f.label}" if f.label else p for p in e.path.split("/"))
                 into[path] = replace(_with_verdict(f, e, slow, misfitted), path=path)
         own = [*slow.values(), *sentences(flat), *found[f.label].values(), *_remarks(f)]
         messages += [f"{f.label}: {text}" if f.label else text for text in own]
     return BenchFit(tuple(fits), parameters, ratios, tuple(messages), found)
-
-
-def _labelled(path: str, label: str) -> str:
-    return f"{path}@{label}" if label else path
-
-
-def _flat(f: MotorFit) -> tuple[FlatDirection, ...]:
-    """Return the flat directions, with remedies for a bench."""
-    found = flat_directions(f.space, f.covariance, has_current=True, has_voltage=f.has_voltage)
-    return tuple(replace(one, remedy=_remedy(one.paths, f.has_voltage)) for one in found)
 
 
 def _remedy(paths: Sequence[str], has_voltage: bool) -> str:
@@ -240,10 +230,12 @@ def _too_slow(f: MotorFit) -> dict[str, str]:
 
 
 def _one_point(f: MotorFit) -> bool:
-    """Return True if the speed is nearly constant (`ONE_POINT`)."""
+    """Return True if the speed is nearly constant (`ONE_SPEED_RATIO`)."""
     amps = f.equations[-1].windows
     used = amps.speed.mean(axis=0)[amps.usable]
-    return float(np.ptp(np.quantile(used, (0.02, 0.98)))) < ONE_POINT * float(np.abs(used).max())
+    return float(np.ptp(np.quantile(used, (0.02, 0.98)))) < ONE_SPEED_RATIO * float(
+        np.abs(used).max()
+    )
 
 
 def _time(seconds: float) -> str:
@@ -284,12 +276,12 @@ def _remarks(f: MotorFit) -> list[str]:
             "currents are magnitudes: they were given the sign of the speed, windows in which the "
             "motor may brake were left out, and the zero of the ammeter looks like friction"
         )
-    if f.period > SLOW_S:
+    if f.period > SLOW_ROWS_S:
         found.append(
             f"rows are {f.period:.3g} s apart: if the time is in milliseconds, set its unit (t:ms);"
             " inertia and inductance depend on it"
         )
-    if f.correlation_time > LONG_S:
+    if f.correlation_time > LONG_CORRELATION_S:
         found.append(
             f"residuals are correlated over {f.correlation_time:.2g} s: the intervals count "
             f"{f.independent_times:.0f} independent times of that length, not the rows"

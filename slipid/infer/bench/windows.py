@@ -25,26 +25,26 @@ from slipid.infer.bench.motor import BRUSH_CURRENT, REST, BenchRecord
 
 ELECTRICAL_S, MECHANICAL_S = 3e-3, 1e-2
 """Half the length of a window of each equation, about a time constant of small motors [s]."""
-LEAST, ENOUGH = 2, 8
+LEAST_ROWS, ENOUGH_ROWS = 2, 8
 """Smallest and desired half length of a window [row].
 
 The smallest one is needed for a slope from odd rows. Windows with fewer than the desired number of
 rows are lengthened to it, but not beyond those of the mechanical equation (`MECHANICAL_S`).
 """
-MOST = 20_000
+MOST_WINDOWS = 20_000
 """Largest number of windows of one record."""
-WIDE = 4
+WIDER = 4
 """Ratio of the longer window, whose mean gives the sign of a small current, to a window."""
-STRAY = 1.5
+GAP_RATIO = 1.5
 """Ratio of a window's duration to its nominal one above which it spans a gap between rows."""
-JUMP = 6.0
+JUMP_STDS = 6.0
 """Step of the voltage between rows above which it counts as a jump [robust std of steps]."""
 SETTLED_S, SETTLED_ROWS = 5e-3, 4
 """Time after a jump of the voltage until currents are straight lines between rows [s], [row].
 
 The shorter of the two applies.
 """
-BRAKES = 4.0
+BRAKING_STDS = 4.0
 """Deceleration of the shaft above which the motor may be braking [robust std of accelerations]."""
 
 
@@ -124,28 +124,50 @@ class _RecordWindows:
     Attributes:
         middle: middle row of each window.
         half: half the length of a window [row].
+        rows: even, and odd, rows of every window.
     """
 
     def __init__(self, r: BenchRecord, half_s: float):
-        half_s = max(half_s, min(ENOUGH * r.period, MECHANICAL_S))
-        self.record, self.half = r, max(LEAST, 2 * round(half_s / r.period / 2))
+        half_s = max(half_s, min(ENOUGH_ROWS * r.period, MECHANICAL_S))
+        self.record, self.half = r, max(LEAST_ROWS, 2 * round(half_s / r.period / 2))
         half, last = self.half, len(r.time) - self.half
-        middle = np.arange(half, last, max(half // 2, len(r.time) // MOST, 1))
+        middle = np.arange(half, last, max(half // 2, len(r.time) // MOST_WINDOWS, 1))
         span = r.time[middle + half] - r.time[middle - half]
-        self.middle = middle[(span <= STRAY * 2 * half * r.period) & ~_jumps(r, half, middle)]
-        self.kernels = _HalfKernel(r, self.middle, half, 0), _HalfKernel(r, self.middle, half, 1)
+        self.middle = middle[(span <= GAP_RATIO * 2 * half * r.period) & ~_jumps(r, half, middle)]
+        self.rows = [self._rows(half, first) for first in (0, 1)]
+        self._step = [np.diff(r.time[rows], axis=1) for rows in self.rows]
+        self._kernel = [
+            self._kernel_of(rows, step) for rows, step in zip(self.rows, self._step, strict=True)
+        ]
+
+    def _rows(self, half: int, first: int) -> Int[np.ndarray, "window some"]:
+        """Return every second row of the windows: even ones for `first` 0, odd ones for 1."""
+        return self.middle[:, None] + np.arange(first - half, half - first + 1, 2)
+
+    def _kernel_of(
+        self, rows: Int[np.ndarray, "window some"], step: Float[np.ndarray, "window interval"]
+    ) -> Float[np.ndarray, "window interval"]:
+        """Return the kernel c of every window, of integral 1, between its rows."""
+        time = self.record.time[rows]
+        about = (time[:, 1:] + time[:, :-1]) / 2 - self.record.time[self.middle][:, None]
+        kernel = np.cos(0.5 * np.pi * about / (time[:, -1:] - time[:, :1])) ** 2
+        return np.asarray(kernel / (kernel * step).sum(axis=1, keepdims=True))
 
     def mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, "half window"]:
         """Return the mean <x> of a signal in every window."""
-        return np.stack([kernel.mean(signal[kernel.rows]) for kernel in self.kernels])
-
-    def long_mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, "half window"]:
-        """Return the mean over longer windows of the same rows, whose sign is more reliable."""
-        return np.stack([signal[kernel.wide].mean(axis=1) for kernel in self.kernels])
+        parts = zip(self._kernel, self._step, (signal[rows] for rows in self.rows), strict=True)
+        return np.stack([(c * dt * (x[:, 1:] + x[:, :-1]) / 2).sum(axis=1) for c, dt, x in parts])
 
     def slope(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, "half window"]:
         """Return the mean slope [x] of a signal in every window."""
-        return np.stack([kernel.slope(signal[kernel.rows]) for kernel in self.kernels])
+        parts = zip(self._kernel, self.rows, strict=True)
+        return np.stack([(c * np.diff(signal[rows], axis=1)).sum(axis=1) for c, rows in parts])
+
+    def long_mean(self, signal: Float[np.ndarray, " row"]) -> Float[np.ndarray, "half window"]:
+        """Return the mean over longer windows of the same rows, whose sign is more reliable."""
+        last = len(signal) - 1
+        wide = [np.clip(self._rows(WIDER * self.half, first), first, last) for first in (0, 1)]
+        return np.stack([signal[rows].mean(axis=1) for rows in wide])
 
     def driven(self) -> Bool[np.ndarray, " window"]:
         """Return a mask of the windows in which unsigned currents have the right sign.
@@ -157,7 +179,7 @@ class _RecordWindows:
         speed, slope = (of(self.record.speed).sum(axis=0) for of in (self.mean, self.slope))
         faster = slope * np.sign(speed)
         spread = 1.4826 * np.median(np.abs(faster)) if len(faster) else 0.0
-        return np.asarray(faster > -BRAKES * spread)
+        return np.asarray(faster > -BRAKING_STDS * spread)
 
     def places(
         self, number: int
@@ -165,26 +187,6 @@ class _RecordWindows:
         """Return the time of every window [s], and the number of its record."""
         time = self.record.time
         return time[self.middle] - time[0], np.full(len(self.middle), number)
-
-
-class _HalfKernel:
-    """Kernel c over every second row of the windows: even rows for `first` 0, odd ones for 1."""
-
-    def __init__(self, r: BenchRecord, middle: Int[np.ndarray, " window"], half: int, first: int):
-        self.rows = middle[:, None] + np.arange(first - half, half - first + 1, 2)
-        wide = middle[:, None] + np.arange(first - WIDE * half, WIDE * half - first + 1, 2)
-        self.wide = np.clip(wide, first, len(r.time) - 1)
-        time = r.time[self.rows]
-        about = (time[:, 1:] + time[:, :-1]) / 2 - r.time[middle][:, None]
-        kernel = np.cos(0.5 * np.pi * about / (time[:, -1:] - time[:, :1])) ** 2
-        self.step = np.diff(time, axis=1)
-        self.kernel = kernel / (kernel * self.step).sum(axis=1, keepdims=True)
-
-    def mean(self, x: Float[np.ndarray, "window some"]) -> Float[np.ndarray, " window"]:
-        return np.asarray((self.kernel * self.step * (x[:, 1:] + x[:, :-1]) / 2).sum(axis=1))
-
-    def slope(self, x: Float[np.ndarray, "window some"]) -> Float[np.ndarray, " window"]:
-        return np.asarray((self.kernel * np.diff(x, axis=1)).sum(axis=1))
 
 
 def _jumps(
@@ -196,7 +198,7 @@ def _jumps(
     step = np.diff(r.voltage)
     away = np.abs(step - np.median(step))
     # a mostly constant signal has median 0; steps below a thousandth of its range are no jumps
-    jump = away > JUMP * max(1.4826 * float(np.median(away)), 1e-3 * float(np.ptp(r.voltage)))
+    jump = away > JUMP_STDS * max(1.4826 * float(np.median(away)), 1e-3 * float(np.ptp(r.voltage)))
     rows = int(np.clip(round(SETTLED_S / r.period), 1, SETTLED_ROWS))
     count = np.concatenate([[0], np.cumsum(jump)])
     return np.asarray(count[middle + half] > count[np.maximum(middle - half - rows, 0)])

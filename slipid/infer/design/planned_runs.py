@@ -19,7 +19,7 @@ SESSION = "next"
 """Name of the session of new runs, for which the marker is mounted anew."""
 HEADINGS = tuple(15.0 * k for k in range(24))
 """Headings of candidate runs and of predictions [deg]."""
-BEND = 0.5
+BEND_RATIO = 0.5
 """Ratio of yaw rate times base radius to speed in curved candidate runs."""
 
 Setup = tuple[str, str]
@@ -78,14 +78,14 @@ def candidates(
         distance: path length by floor [m].
         base_radius: distance of the wheels from the robot's centre [m].
         headings_deg: directions of travel [deg].
-        turns: yaw rates [rad/s]. By default they are zero and, in both senses, `BEND` times the
-            speed over the base radius; turns on the spot have the speed over the base radius.
+        turns: yaw rates [rad/s]. By default they are zero and, in both senses, `BEND_RATIO` times
+            the speed over the base radius; turns on the spot have the speed over the base radius.
     """
     out = []
     for surface, load in setups:
         length = distance[surface]
         for speed in speeds[surface]:
-            bend = BEND * speed / base_radius
+            bend = BEND_RATIO * speed / base_radius
             rates = (0.0, bend, -bend) if turns is None else turns
             if speed > 0:
                 found = product(np.radians(headings_deg), rates)

@@ -10,7 +10,7 @@ import numpy as np
 from slipid.infer.design import fisher as info
 from slipid.infer.design.planned_runs import PlannedRun, drivable, heading_grid, paper_grid
 from slipid.infer.design.planner import Goal, Planner, parameter_goal, prediction_goal, weighed
-from slipid.infer.design.scope import DesignOptions, Scope
+from slipid.infer.design.scope import Scope
 from slipid.infer.result import Fit
 from slipid.infer.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.model.robot import Validity
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCHEMA = "slipid.design/1"
-REACHED = 0.9
+UNREACHABLE_RATIO = 0.9
 """Ratio of a goal's std after unlimited driving to its present std above which it is unreachable.
 """
-ORDERS = 8
+RANDOM_ORDERS = 8
 """Number of random orders of a grid's runs over which the criterion is averaged."""
-POINTS = 40
+CURVE_POINTS = 40
 """Number of counts of runs at which the criterion of a grid is computed."""
 ASSUMPTIONS = (
     "noise and run effects are as fitted, and each run is one observation however long it is",
@@ -69,17 +69,18 @@ class Design:
         return design_figure(self)
 
 
-def design(fit: Fit, options: DesignOptions) -> Design:
+def design(scope: Scope) -> Design:
     """Return the runs that reduce the stds of the goals most, and a comparison with grids of runs.
 
     Raises:
         DataError: the fit lacks a requested parameter, floor, load or prediction.
     """
-    scope, planner = Scope(fit, options), Planner.of(fit)
+    fit = scope.fit
+    planner = Planner.of(fit)
     candidates = scope.candidates()
     rows, now = planner.rows(candidates), planner.after(fit)
     last = now.plus(rows, info.ENDLESS)
-    weights = _goals(fit, options, scope, planner)
+    weights = _goals(scope, planner)
     lost = {g.name: s for g in weights if (s := _out_of_reach(fit, g, now, last, len(candidates)))}
     goals = [g for g in weights if g.name not in lost]
     content: Content = {
@@ -110,7 +111,7 @@ def design(fit: Fit, options: DesignOptions) -> Design:
     chosen: list[int] = []
     if goals:
         goal = weighed(goals, now, [weights[g] for g in goals])
-        chosen, _ = info.greedy(now, rows, goal, options.runs)
+        chosen, _ = info.greedy(now, rows, goal, scope.runs)
         chosen = info.exchanged(now, rows, goal, chosen)
         content["criterion"] = info.criterion_path(now, rows, goal, chosen)
         content["runs_saved"] = _saved(scope, planner, goals, goal, candidates, rows)
@@ -133,23 +134,24 @@ def design(fit: Fit, options: DesignOptions) -> Design:
         )
     content["messages"] = [*lost.values(), *_extrapolated(fit, runs)]
     content["data"] = {"hash": fit.data_hash, "runs": len(fit.runs)}
-    requested = bool(options.parameters or options.predictions)
+    requested = bool(scope.parameters or scope.predictions)
     reachable = bool(goals) and not (requested and lost)
     return Design(content, runs, scope.base, fit.validity, reachable)
 
 
-def _goals(fit: Fit, options: DesignOptions, scope: Scope, planner: Planner) -> dict[Goal, float]:
-    found = [parameter_goal(planner, path) for path in _paths(fit, options.parameters)]
+def _goals(scope: Scope, planner: Planner) -> dict[Goal, float]:
+    """Return the requested goals, or predictions and weakly identified numbers, with weights."""
+    found = [parameter_goal(planner, path) for path in _paths(scope.fit, scope.parameters)]
     found += [
         prediction_goal(planner, f"prediction {text}", scope.predicted(text))
-        for text in dict.fromkeys(options.predictions)
+        for text in dict.fromkeys(scope.predictions)
     ]
     if found:
         return dict.fromkeys(found, 1.0)
     weak = [
         parameter_goal(planner, e.path)
         for e in planner.space.free
-        if e.part != "camera" and fit.parameters[e.path].verdict == "weak"
+        if e.part != "camera" and scope.fit.parameters[e.path].verdict == "weak"
     ]
     ends = prediction_goal(planner, "prediction of every floor", scope.all_predicted())
     return {ends: 1.0} | dict.fromkeys(weak, 1.0 / max(len(weak), 1))
@@ -176,7 +178,7 @@ def _out_of_reach(
     # without voltages, the scale of these numbers comes from priors of other numbers only
     scaleless = goal.name in NEEDS_VOLTAGE and not fit.channels.voltage
     part = goal.std(last) / goal.std(now)
-    if part < REACHED and not scaleless:
+    if part < UNREACHABLE_RATIO and not scaleless:
         return None
     most = f"driving all {count} {info.ENDLESS:.0f} times would leave {part:.0%} of its std"
     why = next((f.text for f in fit.flat if goal.name in f.paths), most)
@@ -244,8 +246,8 @@ def _against(
     both, runs = rows.joined(of_grid), [*candidates, *grid]
     chosen, found = info.greedy(start, both, goal, len(grid), target)
     count, reached = len(chosen), found[-1] <= target
-    at = sorted({*np.geomspace(1, len(grid), POINTS).round().astype(int).tolist(), count})
-    orders = [np.random.default_rng(k).permutation(len(grid)) for k in range(ORDERS)]
+    at = sorted({*np.geomspace(1, len(grid), CURVE_POINTS).round().astype(int).tolist(), count})
+    orders = [np.random.default_rng(k).permutation(len(grid)) for k in range(RANDOM_ORDERS)]
     random = np.mean(
         [info.criterion_path(start, of_grid, goal, order, at) for order in orders], axis=0
     )

@@ -26,7 +26,7 @@ from slipid.support.progress import Reporter
 RandomState = tuple[str, np.ndarray, int, int, float]
 """State of a Mersenne twister in NumPy's form."""
 
-ACCEPTED = 0.8
+TARGET_ACCEPTED = 0.8
 """Target fraction of accepted Hamiltonian moves, to which their step is adapted in the warm-up."""
 FIRST_ANGLE, LEAST_ANGLE = 0.3, 0.03
 """First and smallest step of Hamiltonian moves [rad]."""
@@ -186,7 +186,7 @@ def _with_learnt(
     count = block.number + 1
     if count > plan.warm_up[-1]:
         return block
-    more = np.array([np.mean(of) - ACCEPTED if of else 0.0 for of in turns])
+    more = np.array([np.mean(of) - TARGET_ACCEPTED if of else 0.0 for of in turns])
     block = replace(block, angle=np.clip(block.angle * np.exp(more), LEAST_ANGLE, QUARTER_TURN))
     if count in plan.warm_up[:-1]:
         recent = [b.chain for b in [*blocks, block][count // 2 :]]

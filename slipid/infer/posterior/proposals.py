@@ -35,7 +35,7 @@ ALONG, INDEPENDENT, DIFFERENTIAL, HAMILTONIAN = 0.4, 1.2, 0.1, 0.8
 
 A Hamiltonian move takes six times longer, but it moves walkers away from where the map is wrong.
 """
-ALONE = 0.5
+ALONE_SHARE = 0.5
 """Fraction of coordinate walks that leave all other coordinates of x unchanged."""
 _FINITE = 1e100
 """Bound of slopes, so that their squares are finite."""
@@ -73,13 +73,19 @@ Jump = tuple[Matrix, Float[np.ndarray, " walker"]]
 
 
 class FamilyMove(Move):
-    """Metropolis-Hastings move of a family of coordinates."""
+    """Metropolis-Hastings move of a family of coordinates.
+
+    Attributes:
+        family: the coordinates.
+        accepted: fraction of accepted changes in every step.
+    """
 
     halves = 1
     """Number of subsets of walkers moved in turn; 2 if a proposal uses walkers that are fixed."""
 
     def __init__(self, family: Family):
         self.family = family
+        self.accepted: list[float] = []
 
     def jump(self, old: Matrix, still: Matrix, random: RandomState) -> Jump:
         raise NotImplementedError
@@ -113,7 +119,7 @@ class FamilyMove(Move):
             state.log_prob[mine] = state.blobs[mine].sum(axis=1)
             accepted[mine] = took.any(axis=1)
             taken.append(took.mean())
-        self.taken = float(np.mean(taken))
+        self.accepted.append(float(np.mean(taken)))
         return state, accepted
 
 
@@ -183,7 +189,7 @@ class CoordinateWalk(FamilyMove):
             reach = 10 ** random.uniform(-0.5, 1.0, len(u)) * self.std[which]
             x[rows, which] += reach * random.standard_normal(len(u))
             moved[rows, which] = True
-        moved |= random.uniform(size=(len(u), 1)) < ALONE
+        moved |= random.uniform(size=(len(u), 1)) < ALONE_SHARE
         new = np.where(moved, self.map.forward(x), u)
         change = np.where(moved, before - self.map.placed(new)[1], 0.0)
         return new, np.stack([change[:, own].sum(axis=1) for own in self.family.places], axis=1)
@@ -207,7 +213,6 @@ class Hamiltonian(FamilyMove):
     def __init__(self, target: LogDensity, family: Family, angle: float):
         super().__init__(family)
         self.target, self.angle = target, angle
-        self.accepted: list[float] = []
 
     def proposed(self, x: Matrix, still: Matrix, random: RandomState) -> tuple[Matrix, Matrix]:
         count, places = len(x), self.family.places
@@ -228,11 +233,6 @@ class Hamiltonian(FamilyMove):
             u[:, own], p[:, own] = _turn(u[:, own], p[:, own], h if step < steps - 1 else h / 2)
         factor = np.stack([_energy(start[:, k]) - _energy(p[:, k]) for k in places], axis=1)
         return u, np.where(lost[:, None], -np.inf, factor)
-
-    def propose(self, model: Model, state: State) -> tuple[State, np.ndarray]:
-        state, accepted = super().propose(model, state)
-        self.accepted.append(self.taken)
-        return state, accepted
 
 
 def _bounded(kick: Matrix) -> Matrix:

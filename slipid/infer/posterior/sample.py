@@ -38,7 +38,7 @@ from slipid.support.progress import Reporter
 for _module in ("arviz_base", "arviz_stats", "h5netcdf"):
     importlib.import_module(_module)  # a missing package must fail here, not after hours
 
-STILL = 0.01
+MOST_STILL = 0.01
 """Largest fraction of draws whose electric numbers have no accepted proposal."""
 
 
@@ -73,7 +73,7 @@ def sampled(
             still = float((~moved.any(axis=1)).mean())
     if not np.isfinite(out).all():
         still, reason = 1.0, "electric draws that are not finite"
-    elif found.converged and still > STILL:
+    elif found.converged and still > MOST_STILL:
         reason = f"{100 * still:.1f} % of the electric draws, which never moved"
     return Posterior(
         fit=fit,
@@ -83,7 +83,7 @@ def sampled(
         names=first.names,
         diagnosis=found,
         accepted=accepted,
-        converged=found.converged and still <= STILL,
+        converged=found.converged and still <= MOST_STILL,
         reason=reason,
     )
 
@@ -144,7 +144,7 @@ def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
     noise, noise_dims = _noise(problem, found)
     x = found.z
     density = Density(problem, replace(Fitted.of(fit), z=x.mean(axis=(0, 1))), EVERYTHING)
-    of_segment = density.pointwise(x.reshape(-1, x.shape[-1]))
+    of_segment = density.mapped(Density.log_likelihoods, x.reshape(-1, x.shape[-1]), None)
     per_segment = {k: np.asarray(v).reshape(*x.shape[:2], -1) for k, v in of_segment.items()}
     run = np.unique(w.run)
     onto = (np.asarray(w.run)[:, None] == run).astype(float)
@@ -267,7 +267,8 @@ def _replicates(
     some, noise = x[:, picked], log_variance[:, picked].reshape(-1, log_variance.shape[-1])
     rng = np.random.default_rng(0)
     flat = some.reshape(-1, x.shape[-1])
-    out = {k: np.array(v) for k, v in density.residuals(flat).items()}
+    residuals = density.mapped(Density.residual_blocks, flat, None)
+    out = {k: np.array(v) for k, v in residuals.items()}
     for k, r in out.items():
         for one, log_v in zip(r, noise, strict=True):
             root = np.linalg.cholesky(np.asarray(density.problem.covariance(k, log_v)))

@@ -14,8 +14,8 @@ variable if the contact law holds for both.
 A fit is trusted if it converged, predicts its runs, and has the numbers of a physical robot.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import combinations
 from math import isfinite
@@ -27,59 +27,43 @@ from scipy.stats import chi2, norm
 from slipid.fitting.variances import Search, Square
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.search_space import Space
+from slipid.support.content import Content
 
-CHANCE = 0.01
+LARGEST_P_VALUE = 0.01
 """Largest p-value at which a disagreement is reported."""
 _WIDE = 1.0
 """Std of the uninformative prior of load biases."""
 
 
-@dataclass(frozen=True)
-class Dispute:
-    """Disagreement of two floors about the loads on the wheels.
+def disputes(space: Space, z: Search, covariance: Square) -> dict[tuple[str, str], float]:
+    """Return pairs of floors whose load biases differ by more than noise, the largest first.
 
-    Attributes:
-        floors: names of the floors.
-        sigma: difference of their load estimates [standard error].
-    """
-
-    floors: tuple[str, str]
-    sigma: float
-
-    @property
-    def sentence(self) -> str:
-        one, other = self.floors
-        return (
-            f"{one} and {other} disagree about the loads on the wheels by {self.sigma:.1f} "
-            "standard errors of their noise: the contact law lacks something; intervals count it"
-        )
-
-
-def disputes(space: Space, z: Search, covariance: Square) -> tuple[Dispute, ...]:
-    """Return pairs of floors whose load biases differ by more than noise, largest difference first.
+    Their values are the differences of their load estimates [standard error].
 
     The prior of the biases in `space` must have the fitted std (`Space.with_pooled`).
     """
     bias = {e.surface: space.slices[e.path] for e in space.free if e.declaration.deviation}
     if len(bias) < 2:
-        return ()
+        return {}
     at = np.concatenate([np.arange(p.start, p.stop) for p in bias.values()])
     precision, less = np.linalg.inv(covariance), 1 / space.prior_std[at] ** 2 - 1 / _WIDE**2
     precision[at, at] -= less
     wide = np.linalg.inv(precision)
     separate = np.asarray(z) + wide[:, at] @ (less * (np.asarray(z) - space.prior_mean)[at])
-    found = []
+    found = {}
     for one, other in combinations(bias, 2):
         difference = separate[bias[one]] - separate[bias[other]]
         spread = wide[bias[one]] - wide[bias[other]]
         spread = spread[:, bias[one]] - spread[:, bias[other]]
         chance = float(chi2.sf(difference @ np.linalg.solve(spread, difference), len(difference)))
-        if chance < CHANCE:
-            found.append(Dispute((str(one), str(other)), float(norm.isf(chance / 2))))
-    return tuple(sorted(found, key=lambda d: -d.sigma))
+        if chance < LARGEST_P_VALUE:
+            found[str(one), str(other)] = float(norm.isf(chance / 2))
+    return dict(sorted(found.items(), key=lambda pair: -pair[1]))
 
 
-def marked(numbers: Mapping[str, Estimate], found: Sequence[Dispute]) -> dict[str, Estimate]:
+def marked(
+    numbers: Mapping[str, Estimate], found: Mapping[tuple[str, str], float]
+) -> dict[str, Estimate]:
     """Return the numbers; identified load shares have the verdict `disputed` if floors disagree."""
     return {
         path: replace(e, verdict="disputed")
@@ -93,9 +77,9 @@ Word = Literal["trusted", "doubtful", "not to be trusted"]
 WORDS: tuple[Word, ...] = ("trusted", "doubtful", "not to be trusted")
 WORSE, MUCH_WORSE = 1.1, 1.5
 """Ratios of the model's to the encoders' error above which a fit is doubtful, not to be trusted."""
-SMALL = 0.005
+SMALL_ERROR = 0.005
 """Difference of model's and encoders' end-point errors over path length that does not count."""
-ABSURD = 0.5
+USELESS_ERROR = 0.5
 """End-point error over path length above which a model is useless."""
 MANY_AT_BOUNDS = 3
 """Smallest count of numbers at their bounds for which a fit is not to be trusted."""
@@ -126,13 +110,40 @@ class EndPoints:
 
 @dataclass(frozen=True)
 class Trust:
-    """Level of trust in a fit, and the reasons against it, one sentence each."""
+    """Trust in a fit, with the prediction errors on which it is based.
+
+    Attributes:
+        word: level of trust.
+        reasons: reasons against the fit, one sentence each.
+        floors: errors by floor.
+        runs: number of predicted runs.
+    """
 
     word: Word
     reasons: tuple[str, ...]
+    floors: Mapping[str, EndPoints]
+    runs: int = 0
 
     def __str__(self) -> str:
         return f"{self.word}: {'; '.join(self.reasons)}" if self.reasons else self.word
+
+    @property
+    def is_bad(self) -> bool:
+        """True if the fit must not be used."""
+        return self.word == WORDS[-1]
+
+    @property
+    def warning(self) -> str | None:
+        """Warning that every picture of an unusable fit shows, or None."""
+        return f"THIS FIT IS {self.word.upper()}" if self.is_bad else None
+
+    def to_json(self) -> Content:
+        return {
+            "verdict": self.word,
+            "reasons": list(self.reasons),
+            "runs": self.runs,
+            "endpoint_error_over_path": {name: asdict(e) for name, e in self.floors.items()},
+        }
 
 
 _Reason = tuple[int, str]
@@ -140,7 +151,10 @@ _Reason = tuple[int, str]
 
 
 def verdict_of_trust(
-    floors: Mapping[str, EndPoints], converged: bool, parameters: Iterable[Estimate]
+    floors: Mapping[str, EndPoints],
+    converged: bool,
+    parameters: Iterable[Estimate],
+    runs: int = 0,
 ) -> Trust:
     """Return the trust in a fit, by its worst aspect: errors, convergence or fitted numbers.
 
@@ -148,6 +162,7 @@ def verdict_of_trust(
         floors: errors by floor, of held-out runs where there are any.
         converged: True if the fit converged.
         parameters: every number of the fit.
+        runs: number of predicted runs.
     """
     numbers = list(parameters)
     reasons = [*_of_errors(floors), *_of_numbers(numbers)]
@@ -158,7 +173,7 @@ def verdict_of_trust(
         reasons.append((1, "the logs determine none of its numbers"))
     reasons.sort(key=lambda reason: -reason[0])
     level = max((level for level, _ in reasons), default=0)
-    return Trust(WORDS[level], tuple(sentence for _, sentence in reasons))
+    return Trust(WORDS[level], tuple(sentence for _, sentence in reasons), floors, runs)
 
 
 def _of_errors(floors: Mapping[str, EndPoints]) -> Iterator[_Reason]:
@@ -167,10 +182,10 @@ def _of_errors(floors: Mapping[str, EndPoints]) -> Iterator[_Reason]:
         both = f"{100 * e.model:.1f} % of the path, encoders alone by {100 * e.encoders:.1f} %"
         if not isfinite(e.model):
             yield (2, f"on {name} its predictions are not numbers")
-        elif e.model > e.encoders + SMALL and e.model > WORSE * e.encoders:
-            much = e.model > MUCH_WORSE * e.encoders and e.model > e.encoders + 4 * SMALL
+        elif e.model > e.encoders + SMALL_ERROR and e.model > WORSE * e.encoders:
+            much = e.model > MUCH_WORSE * e.encoders and e.model > e.encoders + 4 * SMALL_ERROR
             yield (2 if much else 1, f"on {name} it is off by {both}")
-        elif e.model > ABSURD:
+        elif e.model > USELESS_ERROR:
             yield (1, f"on {name} it is off by {both}: neither is of use there")
 
 

@@ -3,16 +3,16 @@
 Before a fit they are computed from the expected information, after it from the Laplace posterior.
 """
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from slipid.fitting.variances import Search, Square
-from slipid.parameter import Declaration, Entry
+from slipid.parameter import Declaration
 from slipid.search_space import Choice, Space
 
 IDENTIFIED, WEAK = 0.3, 0.8
@@ -23,11 +23,11 @@ FROM_ZERO = 3.0
 The likelihood of a number closer to 0 is flat towards 0, even if its logarithm has a narrow
 interval.
 """
-TAIL, SMALL = 4.0, 0.05
+AT_ZERO_STDS, AT_ZERO_RATIO = 4.0, 0.05
 """Limits for a positive number that counts as being at its bound 0.
 
-It is more than `TAIL` prior stds below its prior mean and less than `SMALL` times that mean. The
-second condition excludes numbers with a narrow prior that the data contradict.
+It is more than `AT_ZERO_STDS` prior stds below its prior mean and less than `AT_ZERO_RATIO` times
+that mean. The second condition excludes numbers with a narrow prior that the data contradict.
 """
 NEEDS_VOLTAGE = ("motor.resistance", "motor.back_emf")
 """Numbers that are not identified without voltages.
@@ -36,43 +36,29 @@ Without voltages their scale is determined by priors of other numbers only.
 """
 Z95 = 1.6448536269514722
 """The 95 % quantile of a standard Gaussian."""
-LARGEST = 600.0
+LARGEST_LOG = 600.0
 """Largest logarithm at an end of an interval; exp of larger ones would overflow."""
 
 
-class ParameterRatio(NamedTuple):
-    """Quotient of two positive numbers that may be identified where neither of them is.
-
-    Attributes:
-        over: quantity of the numerator; if floors have values of their own, there is a quotient for
-            every floor.
-        under: path of the denominator.
-        unit: unit of the quotient.
-        doc: meaning of the quotient.
-    """
-
-    over: str
-    under: str
-    unit: str
-    doc: str
+def _ratio(unit: str, doc: str) -> Declaration:
+    return Declaration(unit=unit, symbol="", start=1.0, lower=0.0, doc=doc)
 
 
-RATIOS = (
-    ParameterRatio(
-        "motor.resistance", "motor.back_emf", "ohm*rad/(V*s)", "needs the voltage, as both do"
+RATIOS: Mapping[tuple[str, str], Declaration] = {
+    ("motor.resistance", "motor.back_emf"): _ratio(
+        "ohm*rad/(V*s)", "needs the voltage, as both do"
     ),
-    ParameterRatio(
-        "surface.friction", "motor.back_emf", "rad/(V*s)", "the torque scale currents fix"
+    ("surface.friction", "motor.back_emf"): _ratio("rad/(V*s)", "the torque scale currents fix"),
+    ("motor.coulomb_friction", "motor.back_emf"): _ratio("A", "current at crawling speed"),
+    ("motor.viscous_friction", "motor.back_emf"): _ratio("A*s/rad", "current per wheel speed"),
+    ("camera.scale", "robot.wheel_radius"): _ratio(
+        "1/m", "all that motion without slip determines"
     ),
-    ParameterRatio("motor.coulomb_friction", "motor.back_emf", "A", "current at crawling speed"),
-    ParameterRatio(
-        "motor.viscous_friction", "motor.back_emf", "A*s/rad", "current per wheel speed"
-    ),
-    ParameterRatio(
-        "camera.scale", "robot.wheel_radius", "1/m", "all that motion without slip determines"
-    ),
-)
-"""Quotients that have a verdict of their own, if both numbers are free.
+}
+"""Quotients of a quantity and a number, which have a verdict of their own if both are free.
+
+They may be identified where neither of the two is. If floors have values of the quantity of their
+own, there is a quotient for every floor.
 
 The resistance occurs in the voltage equation only: contact forces determine the motion of the body,
 and with the torque constant they determine the currents. Without voltages not even R / C_e is
@@ -112,8 +98,8 @@ class Estimate:
     value: Any
     std: Any = None
     interval90: Any = None
-    verdict: str
-    provenance: str
+    verdict: str = "fixed"
+    provenance: str = "borrowed"
     ratio: float | None = None
     pull: float | None = None
     prior_mean: Any = None
@@ -139,13 +125,24 @@ def estimates(
         has_voltage: True if voltages were logged.
         flat: paths of the numbers that change along flat directions.
     """
-    tree = space.tree(z)
-    return tuple(
-        _free(space, e, tree, z, covariance, has_voltage, e.path in flat)
-        if e.path in space.slices
-        else _fixed(e, tree, choices)
-        for e in space.all
-    )
+    tree, out = space.tree(z), []
+    for e in space.all:
+        d, value = e.declaration, np.atleast_1d(np.asarray(e.get(tree), float))
+        base = Estimate(path=e.path, unit=d.unit, doc=d.doc, labels=e.labels, value=plain(value))
+        if e.path not in space.slices:
+            chosen = [c for c in choices if fnmatchcase(e.path, c.pattern)]
+            is_override = any(c.fixed is not None or c.start is not None for c in chosen)
+            out.append(replace(base, provenance="override") if is_override else base)
+            continue
+        at, forced = space.slices[e.path], None
+        mean, prior = np.asarray(z)[at], (space.prior_mean[at], space.prior_std[at])
+        if e.path in NEEDS_VOLTAGE and not has_voltage:
+            forced = "not_identified"
+        elif _at_bound(d, value, (mean - prior[0]) / prior[1], prior[1]):
+            forced = "at_bound"
+        block, is_flat = covariance[at, at], e.path in flat
+        out.append(judged(base, d, value, mean, block, prior, forced, is_flat))
+    return tuple(out)
 
 
 def plain(x: Any) -> Any:
@@ -154,66 +151,57 @@ def plain(x: Any) -> Any:
     return float(x.reshape(())) if x.size == 1 else tuple(float(v) for v in x)
 
 
-def _fixed(entry: Entry, tree: Any, choices: Sequence[Choice]) -> Estimate:
-    chosen = any(
-        fnmatchcase(entry.path, c.pattern) and (c.fixed is not None or c.start is not None)
-        for c in choices
-    )
-    return Estimate(
-        path=entry.path,
-        unit=entry.declaration.unit,
-        doc=entry.declaration.doc,
-        labels=entry.labels,
-        value=plain(entry.get(tree)),
-        verdict="fixed",
-        provenance="override" if chosen else "borrowed",
-    )
-
-
-def _free(
-    space: Space,
-    entry: Entry,
-    tree: Any,
-    z: np.ndarray,
-    covariance: np.ndarray,
-    has_voltage: bool,
+def judged(
+    base: Estimate,
+    d: Declaration,
+    value: Float[np.ndarray, " number"],
+    mean: Float[np.ndarray, " coordinate"],
+    block: Float[np.ndarray, "coordinate coordinate"],
+    prior: tuple[Float[np.ndarray, " coordinate"], Float[np.ndarray, " coordinate"]],
+    forced: str | None,
     is_flat: bool,
+    drawn: Float[np.ndarray, "draw coordinate"] | None = None,
 ) -> Estimate:
-    at, d = space.slices[entry.path], entry.declaration
-    mean, block = np.asarray(z)[at], covariance[at, at]
-    prior_mean, prior_std = space.prior_mean[at], space.prior_std[at]
-    value = np.atleast_1d(np.asarray(entry.get(tree), float))
-    std_z = np.sqrt(np.diag(block))
-    center = np.asarray(d.to_si(prior_mean))
+    """Return an estimate with its interval and verdict.
+
+    The interval is that of the draws if there are any, else of the Gaussian approximation.
+
+    Args:
+        base: path, unit, meaning and value of the number.
+        d: declaration, which has the map from the search space to SI units.
+        value: value [unit].
+        mean: value in the search space.
+        block: covariance in the search space.
+        prior: mean and std of the prior in the search space.
+        forced: verdict that replaces the one by the ratio of stds, None for none.
+        is_flat: True if the number changes along a flat direction.
+        drawn: draws of a posterior in the search space.
+    """
+    prior_mean, prior_std = prior
+    std_z, center = np.sqrt(np.diag(block)), np.asarray(d.to_si(prior_mean))
+    draws = drawn
     if d.constrained:
-        rng = np.random.default_rng(0)
-        spread = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
-        draws = np.asarray(d.to_si(spread))
-        low, high = np.quantile(draws, [0.05, 0.95], axis=0)
-        std = draws.std(axis=0)
-        wide = np.full(entry.size, prior_std.mean() / entry.size)
+        wide = np.full(len(value), prior_std.mean() / len(value))
+        if draws is None:
+            rng = np.random.default_rng(0)
+            draws = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
     else:
-        most = LARGEST if d.logarithmic else np.inf
+        wide = d.slope(center) * prior_std
+    if draws is None:
+        most = LARGEST_LOG if d.logarithmic else np.inf
         ends = (np.minimum(mean + k * std_z, most) for k in (-Z95, Z95))
         low, high = (np.asarray(d.to_si(end)) for end in ends)
         std = d.slope(value) * std_z
-        wide = d.slope(center) * prior_std
+    else:
+        values = np.asarray(d.to_si(draws))
+        (low, high), std = np.quantile(values, [0.05, 0.95], axis=0), values.std(axis=0)
     scaled = block / prior_std[:, None] / prior_std[None, :]
     ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
     pull = (mean - prior_mean) / prior_std
     pairs = tuple(zip(low.tolist(), high.tolist(), strict=True))
-    forced = None
-    if entry.path in NEEDS_VOLTAGE and not has_voltage:
-        forced = "not_identified"
-    elif _at_bound(d, value, pull, prior_std):
-        forced = "at_bound"
     verdict, provenance = verdict_of(ratio, from_zero(d, std_z), forced, is_flat)
-    return Estimate(
-        path=entry.path,
-        unit=d.unit,
-        doc=d.doc,
-        labels=entry.labels,
-        value=plain(value),
+    return replace(
+        base,
         std=plain(std),
         interval90=pairs[0] if len(pairs) == 1 else pairs,
         verdict=verdict,
@@ -222,6 +210,7 @@ def _free(
         pull=float(pull[np.argmax(np.abs(pull))]),
         prior_mean=plain(center),
         prior_std=plain(wide),
+        source="laplace" if drawn is None else "posterior",
     )
 
 
@@ -231,7 +220,7 @@ def _at_bound(d: Declaration, value: np.ndarray, pull: np.ndarray, prior_std: np
     if np.isfinite(d.upper):
         part = (value - d.lower) / (d.upper - d.lower)
         return bool(((part < 0.01) | (part > 0.99)).any())
-    return bool(((pull < -TAIL) & (pull * prior_std < np.log(SMALL))).any())
+    return bool(((pull < -AT_ZERO_STDS) & (pull * prior_std < np.log(AT_ZERO_RATIO))).any())
 
 
 def from_zero(declaration: Declaration, std_z: Float[np.ndarray, " coordinate"]) -> float:
@@ -269,48 +258,36 @@ def verdict_of(
     return verdict, "measured" if measured else "borrowed"
 
 
-def derived(space: Space, z: Search, covariance: Square, has_voltage: bool) -> tuple[Estimate, ...]:
+def derived(
+    space: Space,
+    z: Search,
+    covariance: Square,
+    has_voltage: bool,
+    draws: Float[np.ndarray, "draw free"] | None = None,
+) -> tuple[Estimate, ...]:
     """Return the quotients `RATIOS` with intervals and verdicts.
 
     The logarithm of a quotient is a difference of two coordinates. Its verdict follows from the
-    ratio of its posterior std, sqrt(c^T C c) with c = (.., 1, .., -1, ..), to its prior std.
+    ratio of its posterior std, sqrt(c^T C c) with c = (.., 1, .., -1, ..), to its prior std. With
+    draws of a posterior, of which z and the covariance are the mean and the covariance, intervals
+    are those of the draws.
     """
-    return tuple(
-        _quotient(space, wanted, over.path, z, covariance, has_voltage)
-        for wanted in RATIOS
+    pairs = [
+        (over.path, under, d)
+        for (quantity, under), d in RATIOS.items()
         for over in space.free
-        if over.quantity == wanted.over and wanted.under in space.slices
-    )
-
-
-def _quotient(
-    space: Space,
-    wanted: ParameterRatio,
-    over: str,
-    z: np.ndarray,
-    covariance: np.ndarray,
-    has_voltage: bool,
-) -> Estimate:
-    c = np.zeros(len(z))
-    c[space.slices[over]], c[space.slices[wanted.under]] = 1.0, -1.0
-    log_value, log_prior = c @ z, c @ space.prior_mean
-    std = float(np.sqrt(c @ covariance @ c))
-    prior_std = float(np.sqrt(np.sum((c * space.prior_std) ** 2)))
-    value, ratio = float(np.exp(log_value)), std / prior_std
-    forced = "not_identified" if over == NEEDS_VOLTAGE[0] and not has_voltage else None
-    verdict, provenance = verdict_of(ratio, 1 / std, forced, is_flat=False)
-    low, high = (float(np.exp(min(log_value + k * std, LARGEST))) for k in (-Z95, Z95))
-    return Estimate(
-        path=f"{over}/{wanted.under}",
-        unit=wanted.unit,
-        doc=wanted.doc,
-        value=value,
-        std=value * std,
-        interval90=(low, high),
-        verdict=verdict,
-        provenance=provenance,
-        ratio=ratio,
-        pull=float((log_value - log_prior) / prior_std),
-        prior_mean=float(np.exp(log_prior)),
-        prior_std=float(np.exp(log_prior)) * prior_std,
-    )
+        if over.quantity == quantity and under in space.slices
+    ]
+    out = []
+    for over, under, d in pairs:
+        c = np.zeros(len(z))
+        c[space.slices[over]], c[space.slices[under]] = 1.0, -1.0
+        mean, block = np.atleast_1d(c @ z), np.atleast_2d(c @ covariance @ c)
+        prior_std = np.atleast_1d(np.sqrt(np.sum((c * space.prior_std) ** 2)))
+        base = Estimate(path=f"{over}/{under}", unit=d.unit, doc=d.doc, value=float(np.exp(c @ z)))
+        forced = "not_identified" if over == NEEDS_VOLTAGE[0] and not has_voltage else None
+        prior, drawn = (np.atleast_1d(c @ space.prior_mean), prior_std), None
+        if draws is not None:
+            drawn = (draws @ c)[:, None]
+        out.append(judged(base, d, np.exp(mean), mean, block, prior, forced, False, drawn))
+    return tuple(out)

@@ -18,9 +18,8 @@ from jaxtyping import Float
 
 from slipid.fitting.variances import Search, Square
 from slipid.infer.verdicts.estimates import WEAK
-from slipid.infer.verdicts.wording import NOTHING, SMALL, Axis, axes_of, formula, remedy
+from slipid.infer.verdicts.wording import NOTHING, OTHERS_CHANGE, Axis, axes_of, formula, remedy
 from slipid.model.robot import Validity
-from slipid.parameter import Entry
 from slipid.search_space import Space
 
 NOTICED = 1 / WEAK**2
@@ -118,7 +117,8 @@ def flat_directions(
         sideways: True if the robot can drive in any direction.
     """
     axes = [axis for e in space.free for axis in axes_of(e)]
-    kept = [k for k, axis in enumerate(axes) if not _known(axis.entry)]
+    known = [axis.entry.session is not None or axis.entry.declaration.deviation for axis in axes]
+    kept = [k for k, is_known in enumerate(known) if not is_known]
     scale = [k for k in kept if axes[k].entry.quantity in TORQUE_SCALE]
     std = space.prior_std
     given = np.linalg.inv(covariance) * (std[:, None] * std)
@@ -135,7 +135,8 @@ def flat_directions(
                 paths=tuple(e.path for e in moving),
                 powers=tuple(round(float(p), 2) for p in power),
                 others=rest,
-                formula=formula(mine, power, step) + (SMALL if rest and len(mine) > 1 else ""),
+                formula=formula(mine, power, step)
+                + (OTHERS_CHANGE if rest and len(mine) > 1 else ""),
                 remedy=remedy(moving, has_current, has_voltage, validity or {}, sideways),
             )
         )
@@ -145,10 +146,6 @@ def flat_directions(
 def members(found: Iterable[FlatDirection]) -> frozenset[str]:
     """Return the paths of the numbers that change along flat directions."""
     return frozenset(path for f in found for path in f.paths)
-
-
-def _known(entry: Entry) -> bool:
-    return entry.session is not None or entry.declaration.deviation
 
 
 def sentences(found: Iterable[FlatDirection]) -> tuple[str, ...]:

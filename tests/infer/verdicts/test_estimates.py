@@ -255,9 +255,8 @@ def test_the_torque_scale_is_open_without_voltage_and_reported_once():
 def test_units_of_ratios_are_those_of_their_numbers():
     units, every = pint.UnitRegistry(), space_of("*").all
     by = {name: e.declaration.unit for e in every for name in (e.quantity, e.path)}
-    for wanted in RATIOS:
-        over = by[wanted.over]
-        quotient = units.parse_units(over) / units.parse_units(by[wanted.under])
+    for (over, under), wanted in RATIOS.items():
+        quotient = units.parse_units(by[over]) / units.parse_units(by[under])
         same = units.Quantity(1.0, wanted.unit) / units.Quantity(1.0, quotient)
         assert float(same.to_base_units().magnitude) == pytest.approx(1.0)
         assert same.dimensionless
