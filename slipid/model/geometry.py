@@ -209,9 +209,9 @@ class WheelFrame(eqx.Module):
 
 @partial(jax.jit, static_argnames=("drive_of", "grips"))
 def _wheel_frame(
-    place: Float[Array, "wheel 2"] | Float[np.ndarray, "wheel 2"],
-    drive_angle: Float[Array, " wheel"] | Float[np.ndarray, " wheel"],
-    roller: Float[Array, " wheel"] | Float[np.ndarray, " wheel"],
+    place: Float[Array, "wheel 2"],
+    drive_angle: Float[Array, " wheel"],
+    roller: Float[Array, " wheel"],
     drive_offset: Float[Array, "*wheel"],
     radius_deviation: Float[Array, "*drive"],
     radius: Float[Array, ""],
