@@ -34,9 +34,9 @@ def kept(folder: Path) -> dict[str, int]:
 def test_one_command_makes_a_table_and_goes_on_from_what_was_kept(tmp_path, monkeypatch):
     data, out = tmp_path / "data", tmp_path / "out"
     data.mkdir()
-    asked = ["benchmark", "--data", str(data), "--out", str(out), "--quick", "--quiet"]
+    requested = ["benchmark", "--data", str(data), "--out", str(out), "--quick", "--quiet"]
     rows = ["--rows", "slipid,encoder,ojeda_gyro"]
-    done = CliRunner().invoke(app, [*asked, *rows, "--json", str(tmp_path / "x.json")])
+    done = CliRunner().invoke(app, [*requested, *rows, "--json", str(tmp_path / "x.json")])
     assert done.exit_code == 0, done.output
     found = json.loads((tmp_path / "x.json").read_text())
     assert found == json.loads((out / "benchmark.json").read_text())
@@ -54,7 +54,7 @@ def test_one_command_makes_a_table_and_goes_on_from_what_was_kept(tmp_path, monk
 
     before = kept(out)
     next(out.rglob("known_floor_encoder.json")).unlink()
-    again = CliRunner().invoke(app, [*asked, *rows])
+    again = CliRunner().invoke(app, [*requested, *rows])
     assert again.exit_code == 0
     after = kept(out)
     assert {name for name in after if after[name] != before[name]} == {"known_floor_encoder.json"}
@@ -138,8 +138,8 @@ def test_an_unknown_row_is_named_with_the_choices(tmp_path):
 
 
 def test_a_missing_folder_is_named(tmp_path):
-    asked = ["benchmark", "--data", str(tmp_path / "gone"), "--out", str(tmp_path / "out")]
-    done = CliRunner().invoke(app, asked)
+    requested = ["benchmark", "--data", str(tmp_path / "gone"), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, requested)
     assert done.exit_code == 2
     assert "gone: no such folder" in done.output
 

@@ -115,7 +115,7 @@ def test_a_file_is_a_run_and_a_gap_makes_two(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("rows", "said"),
+    ("rows", "message"),
     [
         ([row(0), row(0.1), row(0.1)], "row 4, column 'time': does not increase"),
         ([row(0), row(0.1, curL=""), row(0.2)], "row 3, column 'curL': no number"),
@@ -124,11 +124,11 @@ def test_a_file_is_a_run_and_a_gap_makes_two(tmp_path):
         ([row(0)], "1 rows; expected at least 3"),
     ],
 )
-def test_a_bad_file_is_named_with_its_row(tmp_path, rows, said):
+def test_a_bad_file_is_named_with_its_row(tmp_path, rows, message):
     written(tmp_path / "ICE" / "00.csv", rows)
     with pytest.raises(DataError, match=r"00\.csv") as error:
         read_floor_runs(tmp_path, 0.165)
-    assert said in str(error.value)
+    assert message in str(error.value)
 
 
 def test_a_missing_column_and_a_missing_folder_are_named(tmp_path):
@@ -153,14 +153,14 @@ def test_every_run_is_left_out_once_and_floors_are_in_every_fold():
 def test_stretches_have_an_answer_after_each_time_that_they_last():
     runs = made_floor_runs({"grass": 2.0, "snow": 4.0}, rows=20)
     done = Meter().fit(runs, HUSKY)
-    said = answers_of(done, runs[:1], HUSKY, (0.5, 1.0, 2.0))
+    answers = answers_of(done, runs[:1], HUSKY, (0.5, 1.0, 2.0))
     # 20 rows are one stretch of 2 s, 13 rows, and one that ends after 7 rows, 1.08 s
-    assert [a.seconds for a in said] == [0.5, 1.0, 2.0, 0.5, 1.0]
-    assert {a.named for a in said} == {"grass"}
+    assert [a.seconds for a in answers] == [0.5, 1.0, 2.0, 0.5, 1.0]
+    assert {a.named for a in answers} == {"grass"}
     part = runs[0].rows(0, 13)
     beliefs = done.probability([part], HUSKY)[0]
-    assert said[0].probability == pytest.approx(beliefs[2, 0])  # 3 rows are 0.46 s
-    assert said[2].probability == pytest.approx(beliefs[12, 0])
+    assert answers[0].probability == pytest.approx(beliefs[2, 0])  # 3 rows are 0.46 s
+    assert answers[2].probability == pytest.approx(beliefs[12, 0])
 
 
 def test_a_stretch_of_a_robot_at_rest_has_no_answer():
@@ -168,11 +168,11 @@ def test_a_stretch_of_a_robot_at_rest_has_no_answer():
     done = Meter().fit(runs, HUSKY)
     speed = runs[0].speed.copy()
     speed[:9] = 0.0
-    said = answers_of(done, [replace(runs[0], speed=speed)], HUSKY, (0.5, 2.0))
-    assert said == []
+    answers = answers_of(done, [replace(runs[0], speed=speed)], HUSKY, (0.5, 2.0))
+    assert answers == []
     speed[3:9] = 1.0
-    said = answers_of(done, [replace(runs[0], speed=speed)], HUSKY, (0.5, 2.0))
-    assert [a.seconds for a in said] == [2.0]
+    answers = answers_of(done, [replace(runs[0], speed=speed)], HUSKY, (0.5, 2.0))
+    assert [a.seconds for a in answers] == [2.0]
 
 
 def test_settings_are_picked_by_runs_that_the_candidate_was_not_fitted_to():
@@ -253,8 +253,8 @@ def test_stretches_of_one_run_are_no_independent_witnesses():
 
 
 def test_the_confusion_table_is_in_percent():
-    said = [answer("a", 1), answer("a", 0), answer("b", 1, floor="snow")]
-    assert confusion(said, 1.0) == {
+    answers = [answer("a", 1), answer("a", 0), answer("b", 1, floor="snow")]
+    assert confusion(answers, 1.0) == {
         "grass": {"grass": 50.0, "other": 50.0, "snow": 0.0},
         "snow": {"grass": 0.0, "other": 0.0, "snow": 100.0},
     }

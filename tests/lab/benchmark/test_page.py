@@ -65,13 +65,13 @@ def test_the_page_has_every_table_and_picture_and_escapes_its_texts():
     pictures = benchmark_pictures(CONTENT)
     assert list(pictures) == ["carpets"]
     assert pictures["carpets"].startswith(b"\x89PNG")
-    said = page(CONTENT, pictures)
-    assert said.count("<img") == 1
+    written = page(CONTENT, pictures)
+    assert written.count("<img") == 1
     for number, *_ in COLUMNS.values():
         assert number.partition(",")[0].lower() in LEGEND.lower()
-    assert "quann_slip: failed: ValueError: &lt;no&gt; rank" in said
-    assert "<tr class='own'><td>slipid</td>" in said
-    assert said.index("<td>slipid</td>") < said.index("<td>encoder</td>")
+    assert "quann_slip: failed: ValueError: &lt;no&gt; rank" in written
+    assert "<tr class='own'><td>slipid</td>" in written
+    assert written.index("<td>slipid</td>") < written.index("<td>encoder</td>")
 
 
 def test_a_data_set_in_which_nothing_ran_has_no_picture():
@@ -89,17 +89,17 @@ def test_fits_that_did_not_converge_are_reported():
     assert "slipid: fits did not come to rest: 2" in page(content, {})
 
 
-def heard(name, absent=""):
+def classifier_row(name, absent=""):
     after = {"seconds": 1.0, "accuracy": [0.7, 0.6, 0.8], "behind": None}
     return {"name": name, "numbers": 3, "after": [] if absent else [after], "absent": absent}
 
 
 def test_a_failed_classifier_is_reported_above_the_others():
     content = copy.deepcopy(CONTENT)
-    rows = [heard("gaussian"), heard("trees", "ValueError: no leaf")]
+    rows = [classifier_row("gaussian"), classifier_row("trees", "ValueError: no leaf")]
     content["floors"] = {"husky": {"about": "a Husky", "runs": 9, "chance": 0.3, "rows": rows}}
-    for said in (text(content), page(content, {})):
-        flat = " ".join(said.split())
+    for written in (text(content), page(content, {})):
+        flat = " ".join(written.split())
         assert "failed: trees: ValueError: no leaf" in flat
         assert "70 [60, 80]" in flat
 
@@ -107,15 +107,22 @@ def test_a_failed_classifier_is_reported_above_the_others():
 def clean():
     content = copy.deepcopy(CONTENT)
     del content["sets"]["carpets"]["protocols"]["known_floor"]["quann_slip"]
-    felt = {"about": "a Husky", "runs": 9, "chance": 0.3, "rows": [heard("gaussian")]}
-    return {**content, "unread": {}, "floors": {"husky": felt}}
+    floor_table = {
+        "about": "a Husky",
+        "runs": 9,
+        "chance": 0.3,
+        "rows": [classifier_row("gaussian")],
+    }
+    return {**content, "unread": {}, "floors": {"husky": floor_table}}
 
 
 BROKEN = {
     "data set": {"unread": {"carpets": "OSError: disk on fire"}},
     "row": {"sets": CONTENT["sets"]},
     "classifier": {
-        "floors": {"husky": {**clean()["floors"]["husky"], "rows": [heard("trees", "no leaf")]}}
+        "floors": {
+            "husky": {**clean()["floors"]["husky"], "rows": [classifier_row("trees", "no leaf")]}
+        }
     },
     "floors": {"floors": {"husky": {"failed": "no logs"}}},
     "rectangle": {"rectangle": {"failed": "no MuJoCo"}},
@@ -127,8 +134,8 @@ def test_the_exit_code_is_one_if_anything_failed(broken, tmp_path, monkeypatch):
     content = clean() | (BROKEN[broken] if broken else {})
     monkeypatch.setattr("slipid.lab.benchmark.benchmark.benchmark", lambda *_: content)
     monkeypatch.setattr("slipid.lab.benchmark.plots.benchmark_pictures", lambda _: {})
-    asked = ["benchmark", "--data", str(tmp_path), "--out", str(tmp_path / "out"), "--quiet"]
-    done = CliRunner().invoke(app, asked)
+    requested = ["benchmark", "--data", str(tmp_path), "--out", str(tmp_path / "out"), "--quiet"]
+    done = CliRunner().invoke(app, requested)
     assert done.exit_code == (1 if broken else 0), done.output
     assert (tmp_path / "out" / "benchmark.html").is_file()
 
@@ -149,9 +156,9 @@ def test_the_rectangle_is_ranked_by_closure(where):
 
     rows = {"encoder": controller(200.0, 1.0), "contact": controller(110.0, 0.55)}
     content["rectangle"] = {"plant": "testsite", "summary": rows}
-    said = text(content) if where == "terminal" else page(content, {})
-    assert "rectangle on the virtual test site, 8 starts" in said
-    assert said.index("110 [105, 115]") < said.index("200 [195, 205]")
-    assert "55 [40, 70]" in said
+    written = text(content) if where == "terminal" else page(content, {})
+    assert "rectangle on the virtual test site, 8 starts" in written
+    assert written.index("110 [105, 115]") < written.index("200 [195, 205]")
+    assert "55 [40, 70]" in written
     content["rectangle"] = {"failed": "no MuJoCo"}
     assert "failed: no MuJoCo" in (text(content) if where == "terminal" else page(content, {}))

@@ -217,19 +217,19 @@ class Mean(Scaled):
 
 
 def test_a_method_by_floor_has_one_fit_for_all_unknown_floors():
-    told = ByFloor.of(Mean()).fit(runs(slip=0.5), ROBOTINO)
+    fitted = ByFloor.of(Mean()).fit(runs(slip=0.5), ROBOTINO)
     untold = ByFloor.of(Mean()).fit([run.with_floor(False) for run in runs(slip=0.5)], ROBOTINO)
     way = made_run(straight(0.1), name="new")
 
     def far(method, floor):
-        heard = replace(way.signals, floor=floor)
-        return method.predict([heard], ROBOTINO)[0].path[-1, 0] / way.pose[-1, 0]
+        measured = replace(way.signals, floor=floor)
+        return method.predict([measured], ROBOTINO)[0].path[-1, 0] / way.pose[-1, 0]
 
-    assert far(told, "gray") == pytest.approx(1.0)
-    assert far(told, "green") == pytest.approx(0.5)
+    assert far(fitted, "gray") == pytest.approx(1.0)
+    assert far(fitted, "green") == pytest.approx(0.5)
     assert far(untold, None) == pytest.approx(0.75)
     with pytest.raises(ValueError, match="scaled: no floor 'ice'; fitted: gray, green"):
-        far(told, "ice")
+        far(fitted, "ice")
 
 
 def test_a_floor_of_few_runs_has_the_fit_to_all():
@@ -253,9 +253,10 @@ class Powered(Scaled):
         return [replace(self, watts=w) for w in (90.0, 10.0, 3.0)]
 
     def predict(self, runs, spec: RobotSpec):
-        said = super().predict(runs, spec)
+        predicted = super().predict(runs, spec)
         return [
-            replace(s, power=np.full(len(r), self.watts)) for s, r in zip(said, runs, strict=True)
+            replace(s, power=np.full(len(r), self.watts))
+            for s, r in zip(predicted, runs, strict=True)
         ]
 
 

@@ -27,13 +27,13 @@ def slipping_run(**more):
     return made_run(rolling, 0.75 * rolling, current=np.full((40, 3), 0.5), **more)
 
 
-def said(run, twist, **more):
+def predicted(run, twist, **more):
     return PredictedRun(path_of(twist, run.signals.dt), **more)
 
 
 def test_the_endpoint_error_is_over_the_chord():
     run = slipping_run()
-    one = scored(run, said(run, run.signals.rolling(ROBOTINO)), ROBOTINO, "chord")
+    one = scored(run, predicted(run, run.signals.rolling(ROBOTINO)), ROBOTINO, "chord")
     assert one.endpoint_error == pytest.approx(1 / 3)
     assert one.length_error == pytest.approx(1 / 3)
     assert one.heading_error_deg == pytest.approx(0.0, abs=1e-9)
@@ -43,7 +43,7 @@ def test_the_endpoint_error_is_over_the_chord():
 def test_the_endpoint_error_of_a_circle_is_over_its_path_length():
     rolling = np.tile([0.2, 0.0, np.pi / 2], (40, 1))
     run = made_run(rolling)
-    one = scored(run, said(run, 0.5 * rolling), ROBOTINO, "path")
+    one = scored(run, predicted(run, 0.5 * rolling), ROBOTINO, "path")
     assert one.heading_error_deg == pytest.approx(180.0)
     ahead = np.hypot(*path_of(0.5 * rolling, run.signals.dt)[-1, :2])
     assert one.endpoint_error == pytest.approx(ahead / 0.8, rel=2e-3)
@@ -52,10 +52,10 @@ def test_the_endpoint_error_of_a_circle_is_over_its_path_length():
 def test_length_errors_are_of_chord_or_path_and_headings_do_not_wind_up():
     rolling = np.tile([0.2, 0.0, np.pi / 2], (80, 1))  # two whole turns
     run = made_run(rolling)
-    one = scored(run, said(run, 0.5 * rolling), ROBOTINO, "path")
+    one = scored(run, predicted(run, 0.5 * rolling), ROBOTINO, "path")
     assert one.length_error == pytest.approx(0.5, rel=1e-3)
     assert one.heading_error_deg == pytest.approx(0.0, abs=1e-6)
-    turned = said(run, rolling - [0.0, 0.0, np.pi / 3])
+    turned = predicted(run, rolling - [0.0, 0.0, np.pi / 3])
     assert scored(run, turned, ROBOTINO, "path").heading_error_deg == pytest.approx(120.0)
 
 
@@ -63,7 +63,7 @@ def test_the_path_of_encoders_has_no_slip_score():
     rng = np.random.default_rng(0)
     rolling = rng.normal(0.2, 0.1, (40, 3))
     run = made_run(rolling, 0.5 * rolling)
-    one = scored(run, said(run, run.signals.rolling(ROBOTINO)), ROBOTINO, "chord")
+    one = scored(run, predicted(run, run.signals.rolling(ROBOTINO)), ROBOTINO, "chord")
     assert set(one.scores) == {0.0}
     assert all(one.slips)
 
@@ -73,7 +73,8 @@ def test_the_start_may_lie_anywhere():
     c, s = np.cos(2.0), np.sin(2.0)
     moved = run.pose @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [1.0, -3.0, 2.0]
     one, other = (
-        scored(r, said(run, run.twist), ROBOTINO, "chord") for r in (run, replace(run, pose=moved))
+        scored(r, predicted(run, run.twist), ROBOTINO, "chord")
+        for r in (run, replace(run, pose=moved))
     )
     assert other.endpoint_error == pytest.approx(one.endpoint_error, abs=1e-12)
     assert other.endpoint_error < 1e-9
@@ -81,23 +82,23 @@ def test_the_start_may_lie_anywhere():
 
 def test_the_slip_score_is_by_the_twist_unless_a_method_has_its_own():
     run = slipping_run()
-    right = scored(run, said(run, run.twist), ROBOTINO, "chord")
+    right = scored(run, predicted(run, run.twist), ROBOTINO, "chord")
     assert all(right.slips)
     assert right.scores == pytest.approx([0.25] * 8)
-    own = scored(run, said(run, run.twist, slipping=np.full(40, 7.0)), ROBOTINO, "chord")
+    own = scored(run, predicted(run, run.twist, slipping=np.full(40, 7.0)), ROBOTINO, "chord")
     assert own.scores == pytest.approx([7.0] * 8)
     steady = made_run(straight(0.0), 0.85 * straight(0.0))
-    assert not any(scored(steady, said(steady, steady.twist), ROBOTINO, "chord").slips)
+    assert not any(scored(steady, predicted(steady, steady.twist), ROBOTINO, "chord").slips)
 
 
 def test_yaw_rates_count_at_the_base_radius():
     """A yaw rate counts as the speed at the base radius."""
     rolling = straight(0.0) + np.array([0.0, 0.0, 0.4])
     run = made_run(rolling, rolling - np.array([0.0, 0.0, 0.3]))
-    one = scored(run, said(run, run.signals.rolling(ROBOTINO)), ROBOTINO, "chord")
+    one = scored(run, predicted(run, run.signals.rolling(ROBOTINO)), ROBOTINO, "chord")
     assert one.twist_error == pytest.approx(0.3 * ROBOTINO.base_radius, rel=1e-6)
     assert not any(one.slips)  # 0.0375 m/s are less than a fifth of the speed, 0.3 would be more
-    other = scored(run, said(run, run.twist), ROBOTINO, "chord")
+    other = scored(run, predicted(run, run.twist), ROBOTINO, "chord")
     rim = np.hypot(0.2, 0.4 * ROBOTINO.base_radius)
     assert other.scores == pytest.approx([0.3 * ROBOTINO.base_radius / rim] * 8, abs=1e-4)
 
@@ -107,17 +108,19 @@ def test_a_region_covers_what_lies_inside_it():
     gap = 0.2  # of encoders, ahead
     for std, inside in ((gap / 2.1, True), (gap / 2.2, False)):
         cov = np.diag([std**2, 1e-6])
-        told = said(run, run.signals.rolling(ROBOTINO), end_covariance=cov)
-        assert scored(run, told, ROBOTINO, "chord").covered90 is inside
+        given = predicted(run, run.signals.rolling(ROBOTINO), end_covariance=cov)
+        assert scored(run, given, ROBOTINO, "chord").covered90 is inside
 
 
 def test_floors_are_right_for_a_part_of_the_time():
     run = slipping_run(floor="gray@moved")
     gray = np.where(np.arange(40) < 10, 0.2, 0.9)
-    told = said(run, run.twist, floors={"gray": gray, "green": 1 - gray})
-    assert scored(run.with_floor(False), told, ROBOTINO, "chord").floor_right == pytest.approx(0.75)
-    assert scored(run.with_floor(True), told, ROBOTINO, "chord").floor_right is None
-    new = replace(told, floors={"green": 1 - gray, "unknown": gray})
+    given = predicted(run, run.twist, floors={"gray": gray, "green": 1 - gray})
+    assert scored(run.with_floor(False), given, ROBOTINO, "chord").floor_right == pytest.approx(
+        0.75
+    )
+    assert scored(run.with_floor(True), given, ROBOTINO, "chord").floor_right is None
+    new = replace(given, floors={"green": 1 - gray, "unknown": gray})
     assert scored(run.with_floor(False), new, ROBOTINO, "chord").floor_right == pytest.approx(0.75)
 
 
@@ -125,8 +128,8 @@ def test_the_energy_error_is_that_of_the_whole_run():
     run = slipping_run()
     power = run.signals.power(ROBOTINO)
     swung = power * np.where(np.arange(40) % 2, 1.4, 1.0)
-    told = said(run, run.twist, power=swung)
-    assert scored(run, told, ROBOTINO, "chord").energy_error == pytest.approx(0.2)
+    given = predicted(run, run.twist, power=swung)
+    assert scored(run, given, ROBOTINO, "chord").energy_error == pytest.approx(0.2)
 
 
 def test_the_area_is_that_of_scikit_learn():
@@ -139,7 +142,7 @@ def test_the_area_is_that_of_scikit_learn():
 
 def rows(errors, floor="gray"):
     """Return a fold whose runs have these end-point errors."""
-    base = scored(slipping_run(), said(slipping_run(), straight(0.0)), ROBOTINO, "chord")
+    base = scored(slipping_run(), predicted(slipping_run(), straight(0.0)), ROBOTINO, "chord")
     runs = [
         replace(base, name=f"{floor}{k}", floor=floor, cluster=k, endpoint_error=e)
         for k, e in enumerate(errors)

@@ -50,9 +50,9 @@ def fit_of(made, current=True) -> SlipidFit:
 def test_on_a_known_floor_the_region_is_that_of_a_student_t(made):
     one = run_batches(made.runs, made.robot)[0]
     spec = RobotSpec.of(made.robot)
-    said = forecast(fit_of(made, current=False), one, spec)
-    assert len(said) == len(one.runs)
-    for run in said:
+    output = forecast(fit_of(made, current=False), one, spec)
+    assert len(output) == len(one.runs)
+    for run in output:
         assert run.end_covariance is not None
         # a turn to the run's own start leaves both variances, whatever their axes
         found = np.sort(np.linalg.eigvalsh(run.end_covariance))
@@ -66,9 +66,9 @@ def driven(made, monkeypatch):
     """Estimators that were replayed, with the signals of each."""
     calls = []
 
-    def caught(estimator, heard, start):
-        calls.append((estimator, heard))
-        return [PredictedRun(np.zeros((len(one) + 1, 3))) for one in heard]
+    def caught(estimator, measured, start):
+        calls.append((estimator, measured))
+        return [PredictedRun(np.zeros((len(one) + 1, 3))) for one in measured]
 
     monkeypatch.setattr(slipid_rows, "replay", caught)
     return calls
@@ -77,8 +77,8 @@ def driven(made, monkeypatch):
 def labels(floors, made, driven, current=True):
     """Return the floors of each estimator that is replayed on the runs."""
     batches = run_batches(made.runs, made.robot)
-    said = estimator_runs(fit_of(made, current), batches, made.runs, floors)
-    assert len(said) == len(made.runs)
+    output = estimator_runs(fit_of(made, current), batches, made.runs, floors)
+    assert len(output) == len(made.runs)
     return [estimator.robot.labels for estimator, _ in driven]
 
 
@@ -86,8 +86,8 @@ def test_an_estimator_has_the_floors_that_it_may_meet(made, driven):
     assert labels(FloorKnowledge(), made, driven) == [("firm", "soft")]
     driven.clear()
     assert sorted(labels(FloorKnowledge(floor_known=True), made, driven)) == [("firm",), ("soft",)]
-    for estimator, heard in driven:
-        assert {one.name for one in heard} == {
+    for estimator, measured in driven:
+        assert {one.name for one in measured} == {
             log.name for log in made.runs.logs if log.surface == estimator.robot.labels[0]
         }
     driven.clear()
@@ -119,10 +119,10 @@ def test_an_estimator_uses_currents_only_if_it_was_fitted_to_some(made, driven):
 def test_what_is_not_on_a_floor_of_the_robot_is_unknown(made, monkeypatch):
     monkeypatch.setattr(slipid_rows, "RUNS_PER_CALL", 1)
     robot = deployed().with_unseen()
-    heard = run_batches(made.runs, made.robot)[0].runs[0].signals
-    (said,) = replay(Estimator(robot, Settings.of(robot)), [heard], np.zeros((1, 3)))
-    assert said.floors is not None
-    assert list(said.floors) == ["firm", "soft", "unknown"]
-    assert sum(said.floors.values()) == pytest.approx(np.ones(len(heard)))
-    assert (said.floors["unknown"] > 1e-4).all()
-    assert (np.asarray(said.floors["firm"]) > 0).all()
+    measured = run_batches(made.runs, made.robot)[0].runs[0].signals
+    (output,) = replay(Estimator(robot, Settings.of(robot)), [measured], np.zeros((1, 3)))
+    assert output.floors is not None
+    assert list(output.floors) == ["firm", "soft", "unknown"]
+    assert sum(output.floors.values()) == pytest.approx(np.ones(len(measured)))
+    assert (output.floors["unknown"] > 1e-4).all()
+    assert (np.asarray(output.floors["firm"]) > 0).all()

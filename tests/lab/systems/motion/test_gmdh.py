@@ -182,33 +182,33 @@ def classes() -> GmdhClass:
     return GmdhClass().fit(RUNS, ROBOTINO)
 
 
-def error(said, run: Run) -> float:
-    return float(np.hypot(*(said.path - path_of(run.twist, run.signals.dt))[-1, :2]))
+def error(predicted, run: Run) -> float:
+    return float(np.hypot(*(predicted.path - path_of(run.twist, run.signals.dt))[-1, :2]))
 
 
 def test_floors_are_classified_by_currents_and_slip_is_that_of_the_floor(classes):
     for floor in ("gray", "ice"):
         new = slipping(1.1, floor, seed=7).with_floor(False)
-        (said,) = classes.predict([new.signals], ROBOTINO)
-        assert said.floors is not None
-        assert sum(said.floors.values()) == pytest.approx(1.0)
-        assert said.floors[floor][-1] > 0.95
-        assert said.floors[floor][0] < said.floors[floor][-1]
-        assert len(said.floors[floor]) == 40
-        assert error(said, new) < 0.02 * 0.8
+        (predicted,) = classes.predict([new.signals], ROBOTINO)
+        assert predicted.floors is not None
+        assert sum(predicted.floors.values()) == pytest.approx(1.0)
+        assert predicted.floors[floor][-1] > 0.95
+        assert predicted.floors[floor][0] < predicted.floors[floor][-1]
+        assert len(predicted.floors[floor]) == 40
+        assert error(predicted, new) < 0.02 * 0.8
 
 
 def test_a_given_floor_is_used_if_it_was_trained_on(classes):
     new = slipping(1.1, "gray", seed=7)
     wrong = replace(new, signals=replace(new.signals, floor="ice"))
     unseen = replace(new, signals=replace(new.signals, floor="sand"))
-    said = classes.predict([new.signals, wrong.signals, unseen.signals], ROBOTINO)
+    predicted = classes.predict([new.signals, wrong.signals, unseen.signals], ROBOTINO)
     as_on_ice = slipping(1.1, "ice", seed=7)
-    assert error(said[1], as_on_ice) < 0.02 * 0.8
-    assert error(said[0], new) < 0.02 * 0.8
-    assert error(said[2], new) < 0.02 * 0.8
+    assert error(predicted[1], as_on_ice) < 0.02 * 0.8
+    assert error(predicted[0], new) < 0.02 * 0.8
+    assert error(predicted[2], new) < 0.02 * 0.8
     # what it tells of floors is from what it hears, whatever it is told
-    assert said[1].floors["gray"][-1] > 0.95
+    assert predicted[1].floors["gray"][-1] > 0.95
 
 
 def test_floors_are_classified_without_later_signals(classes):
@@ -233,31 +233,31 @@ def test_a_floor_without_training_runs_in_this_load_is_left_out():
 
 def test_a_robot_at_rest_learns_nothing_of_its_floor(classes):
     rest = made_run(np.zeros((40, 3)), current=np.full((40, 3), 0.3)).with_floor(False).signals
-    (said,) = classes.predict([rest], ROBOTINO)
-    assert np.allclose(said.floors["gray"], 0.5)
-    assert np.abs(said.path).max() == 0.0
+    (predicted,) = classes.predict([rest], ROBOTINO)
+    assert np.allclose(predicted.floors["gray"], 0.5)
+    assert np.abs(predicted.path).max() == 0.0
 
 
 def test_a_single_floor_needs_no_classifier():
     runs = [run for run in RUNS if run.floor == "ice"]
     method = GmdhClass().fit(runs, ROBOTINO)
     new = slipping(2.2, "ice", seed=9).with_floor(False)
-    (said,) = method.predict([new.signals], ROBOTINO)
+    (predicted,) = method.predict([new.signals], ROBOTINO)
     assert method.classifier is None
-    assert error(said, new) < 0.02 * 0.8
-    assert np.array_equal(said.floors["ice"], np.ones(40))
+    assert error(predicted, new) < 0.02 * 0.8
+    assert np.array_equal(predicted.floors["ice"], np.ones(40))
     assert 18 <= method.numbers == method.floors["ice"].numbers
 
 
 def test_one_set_of_networks_does_not_ask_for_the_floor(classes):
     method = GmdhOne().fit(RUNS, ROBOTINO)
     new = slipping(1.1, "ice", seed=7)
-    told, not_told = method.predict([new.signals, new.with_floor(False).signals], ROBOTINO)
-    assert np.array_equal(told.path, not_told.path)
-    assert told.floors is None
+    given, not_told = method.predict([new.signals, new.with_floor(False).signals], ROBOTINO)
+    assert np.array_equal(given.path, not_told.path)
+    assert given.floors is None
     assert 0 < method.numbers < classes.numbers
     encoders = path_of(new.signals.rolling(ROBOTINO), new.signals.dt)
-    assert error(told, new) < 0.4 * error(replace(told, path=encoders), new)
+    assert error(given, new) < 0.4 * error(replace(given, path=encoders), new)
 
 
 @pytest.mark.parametrize("method", [GmdhOne(), GmdhClass()], ids=lambda method: method.name)

@@ -27,10 +27,10 @@ SIZES = np.array([1.0, 1.0, 0.125])
 LEARNERS = [BoostedTrees(), NeuralNetwork()]
 
 
-def slipping(angle, ratio, speed=0.2, steps=40, **heard) -> Run:
+def slipping(angle, ratio, speed=0.2, steps=40, **measured) -> Run:
     """Return a straight run with this slip ratio: ahead, to the left, turning."""
     rolling = straight(angle, speed, steps)
-    return made_run(rolling, rolling + speed * np.asarray(ratio) / SIZES, **heard)
+    return made_run(rolling, rolling + speed * np.asarray(ratio) / SIZES, **measured)
 
 
 def test_inputs_of_a_window_are_those_of_its_motion():
@@ -91,11 +91,11 @@ def test_weights_rise_with_the_square_and_then_are_level():
 
 def test_a_path_with_the_slip_that_was_made_is_the_true_one():
     runs = [slipping(0.5, [-0.3, 0.1, 0.25]), slipping(2.0, [0.2, 0.0, -0.1], steps=23)]
-    heard = [run.signals for run in runs]
-    windows = SignalWindows.of(heard, ROBOTINO)
+    measured = [run.signals for run in runs]
+    windows = SignalWindows.of(measured, ROBOTINO)
     ratio = np.array([[-0.3, 0.1, 0.25], [0.2, 0.0, -0.1]])[windows.run]
-    for said, run in zip(with_slip(heard, windows, ratio, ROBOTINO), runs, strict=True):
-        assert np.allclose(said.path, path_of(run.twist, run.signals.dt))
+    for predicted, run in zip(with_slip(measured, windows, ratio, ROBOTINO), runs, strict=True):
+        assert np.allclose(predicted.path, path_of(run.twist, run.signals.dt))
 
 
 def test_values_of_windows_are_those_of_their_steps():
@@ -123,10 +123,10 @@ def test_boosted_trees_come_as_near_to_two_levels_as_their_rate_lets_them():
         slipping(angle, [ratio, 0.0, 0.0]) for angle, ratio in ((0.0, -0.2), (np.pi, 0.4))
     )
     method = BoostedTrees(rate=0.1, leaves=4, trees=20).fit([there] * 8 + [back] * 8, ROBOTINO)
-    said = method.predict([there.signals, back.signals], ROBOTINO)
+    predicted = method.predict([there.signals, back.signals], ROBOTINO)
     # every tree takes a tenth of what is left away from the mean of the two
     left = 0.9**20
-    for of_run, run, ratio in zip(said, (there, back), (-0.2, 0.4), strict=True):
+    for of_run, run, ratio in zip(predicted, (there, back), (-0.2, 0.4), strict=True):
         speed = run.signals.rolling(ROBOTINO)[0, 0] + 0.2 * (ratio * (1 - left) + 0.1 * left)
         assert of_run.path[-1, 0] == pytest.approx(speed * 4.0, rel=1e-6)
     # four leaves and three thresholds of twenty trees for each component
@@ -151,8 +151,8 @@ def test_a_neural_network_learns_how_slip_turns_with_the_direction():
     method = NeuralNetwork().fit([run(angle) for angle in np.linspace(0, 6.2, 60)], ROBOTINO)
     for angle in (0.33, 2.9, 5.0):
         new = run(angle)
-        (said,) = method.predict([new.signals], ROBOTINO)
-        error = said.path[-1] - path_of(new.twist, new.signals.dt)[-1]
+        (predicted,) = method.predict([new.signals], ROBOTINO)
+        error = predicted.path[-1] - path_of(new.twist, new.signals.dt)[-1]
         assert np.hypot(*error[:2]) < 0.02 * 0.8
         assert abs(error[2]) < 0.05
 
@@ -174,8 +174,8 @@ def test_the_output_of_a_network_is_clipped_to_the_training_range():
     runs = [slipping(angle, [0.2 * np.cos(angle), 0.0, 0.0]) for angle in np.linspace(0, 6, 40)]
     method = NeuralNetwork().fit(runs, ROBOTINO)
     fast = made_run(straight(0.0, speed=5.0))
-    (said,) = method.predict([fast.signals], ROBOTINO)
-    ratio = said.path[-1, 0] / 20.0 - 1
+    (predicted,) = method.predict([fast.signals], ROBOTINO)
+    ratio = predicted.path[-1, 0] / 20.0 - 1
     assert abs(ratio) <= 0.2 + 1e-9
 
 
@@ -188,8 +188,8 @@ def test_learned_slip_of_a_skid_steer_without_currents_is_that_of_each_floor(met
         for _ in range(5)
     ]
     fitted = ByFloor.of(method).fit(runs, HUSKY)
-    said = fitted.predict([runs[0].signals, runs[-1].signals], HUSKY)
-    for of_run, run in zip(said, (runs[0], runs[-1]), strict=True):
+    predicted = fitted.predict([runs[0].signals, runs[-1].signals], HUSKY)
+    for of_run, run in zip(predicted, (runs[0], runs[-1]), strict=True):
         assert np.allclose(of_run.path, run.pose, atol=0.02)
 
 

@@ -43,8 +43,8 @@ def two_floors(rng, line, count=12, **extra):
 
 
 def path_error(method, runs, spec=ROBOTINO):
-    said = method.predict([run.signals for run in runs], spec)
-    return max(np.abs(s.path - run.pose).max() for s, run in zip(said, runs, strict=True))
+    predicted = method.predict([run.signals for run in runs], spec)
+    return max(np.abs(s.path - run.pose).max() for s, run in zip(predicted, runs, strict=True))
 
 
 # the two numbers
@@ -138,13 +138,13 @@ def test_slip_is_flagged_three_stds_above_the_hard_floors_mean():
     line = {None: np.array([0.05, 0.0])}
     method = replace(CONTINUOUS, hard=HardFloor(0.3, 0.1), lines=line)
     below, above = with_level(np.full(40, 0.59)), with_level(np.full(40, 0.61))
-    said = method.predict([below, above], ROBOTINO)
-    assert np.allclose(said[0].path, made_run(straight(0.3)).pose)
-    assert np.allclose(said[0].slipping, 2.9)
-    assert np.allclose(said[1].slipping, 3.1)
+    predicted = method.predict([below, above], ROBOTINO)
+    assert np.allclose(predicted[0].path, made_run(straight(0.3)).pose)
+    assert np.allclose(predicted[0].slipping, 2.9)
+    assert np.allclose(predicted[1].slipping, 3.1)
     rim = straight(0.3) @ ROBOTINO.forward.T
     twist = (rim - 0.05 * np.sign(rim)) @ ROBOTINO.back.T
-    assert np.allclose(said[1].path, made_run(straight(0.3), twist).pose)
+    assert np.allclose(predicted[1].path, made_run(straight(0.3), twist).pose)
 
 
 def test_one_wheel_alone_does_not_flag_slip():
@@ -231,11 +231,11 @@ def test_runs_of_all_lengths_are_predicted_as_one_by_one(rng):
     fitted = CONTINUOUS.fit(hard + soft, ROBOTINO)
     short = [run.windowed().signals for run in soft]
     runs = [soft[0].signals, short[1], hard[2].signals]
-    for said, run in zip(fitted.predict(runs, ROBOTINO), runs, strict=True):
+    for predicted, run in zip(fitted.predict(runs, ROBOTINO), runs, strict=True):
         alone = fitted.predict([run], ROBOTINO)[0]
-        assert np.allclose(said.path, alone.path)
-        assert np.allclose(said.slipping, alone.slipping)
-        assert len(said.slipping) == len(run)
+        assert np.allclose(predicted.path, alone.path)
+        assert np.allclose(predicted.slipping, alone.slipping)
+        assert len(predicted.slipping) == len(run)
 
 
 def test_signed_currents_count_along_the_wheels_way(rng):
@@ -244,7 +244,7 @@ def test_signed_currents_count_along_the_wheels_way(rng):
     run = soft[0]
     way = np.sign(run.signals.speed)
     signed = replace(run.signals, current=run.signals.current * way, current_is_signed=True)
-    first, second = (fitted.predict([heard], ROBOTINO)[0] for heard in (run.signals, signed))
+    first, second = (fitted.predict([measured], ROBOTINO)[0] for measured in (run.signals, signed))
     assert np.allclose(first.path, second.path)
     assert np.allclose(Steps.of([signed]).signals.along(ROBOTINO), run.signals.current)
 

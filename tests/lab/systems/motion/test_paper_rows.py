@@ -47,20 +47,20 @@ def slipping(rng, curve, *, angle=None, low=0.2, high=0.8, dt=0.1, spec=ROBOTINO
     return made_run(rolling, twist, current=current, spec=spec, dt=dt)
 
 
-def torque(heard):
-    return heard.torque(ROBOTINO)
+def torque(measured):
+    return measured.torque(ROBOTINO)
 
 
 def path_error(method, runs, spec=ROBOTINO):
-    said = method.predict([run.signals for run in runs], spec)
-    return max(np.abs(s.path - run.pose).max() for s, run in zip(said, runs, strict=True))
+    output = method.predict([run.signals for run in runs], spec)
+    return max(np.abs(s.path - run.pose).max() for s, run in zip(output, runs, strict=True))
 
 
-def said_slip(method, heard, spec=ROBOTINO):
+def said_slip(method, measured, spec=ROBOTINO):
     """Return the slip of each drive in the first step, by the predicted path."""
-    path = method.predict([heard], spec)[0].path
-    run = replace(made_run(straight(0.0)), signals=heard, pose=path)
-    return 1 - run.twist @ spec.forward.T / (heard.speed * spec.wheel_radius)
+    path = method.predict([measured], spec)[0].path
+    run = replace(made_run(straight(0.0)), signals=measured, pose=path)
+    return 1 - run.twist @ spec.forward.T / (measured.speed * spec.wheel_radius)
 
 
 # as printed
@@ -68,12 +68,12 @@ def said_slip(method, heard, spec=ROBOTINO):
 
 def test_the_printed_curve_by_hand():
     amps = np.tile([0.3, 0.5, 0.7], (40, 1))
-    heard = made_run(straight(0.4), current=amps).signals
-    shaft = np.abs(heard.speed[0]) * 16
+    measured = made_run(straight(0.4), current=amps).signals
+    shaft = np.abs(measured.speed[0]) * 16
     m = 0.0501 * amps[0] + 5.3361 * amps[0] ** 2 * shaft / (shaft**2 + SHAFT_W0**2)
     expected = -0.072 + 4.888 * m - 5.456 * m**2
     assert np.all((expected > 0) & (expected < 1))
-    assert said_slip(PaperPrint(), heard) == pytest.approx(np.tile(expected, (40, 1)))
+    assert said_slip(PaperPrint(), measured) == pytest.approx(np.tile(expected, (40, 1)))
 
 
 def test_printed_slip_is_held_between_none_and_all():
@@ -91,7 +91,7 @@ def test_printed_slip_is_held_between_none_and_all():
 
 
 def test_nothing_printed_or_deployed_depends_on_the_runs(rng):
-    run = slipping(rng, lambda heard: 0.3 * heard.current)
+    run = slipping(rng, lambda measured: 0.3 * measured.current)
     for method in (PaperPrint(), PaperCode()):
         fitted = ByFloor.of(method).fit([run], ROBOTINO)
         assert fitted.numbers == 0
@@ -103,30 +103,30 @@ def test_nothing_printed_or_deployed_depends_on_the_runs(rng):
 
 
 def test_the_deployed_lines_by_hand():
-    heard = made_run(straight(0.4), current=np.tile([0.5, 0.6, 0.39], (40, 1))).signals
+    measured = made_run(straight(0.4), current=np.tile([0.5, 0.6, 0.39], (40, 1))).signals
     expected = [1 - (-0.639 * 0.5 + 0.988), 1 - (-0.4559 * 0.6 + 0.9678), 0.0]
-    assert said_slip(PaperCode(), heard) == pytest.approx(np.tile(expected, (40, 1)))
+    assert said_slip(PaperCode(), measured) == pytest.approx(np.tile(expected, (40, 1)))
 
 
 @pytest.mark.parametrize("samples", [1, 3])
 def test_deployed_currents_are_smoothed_over_the_authors_samples(samples):
     current = np.full((40, 3), 1.0)
     current[0] = 0.0
-    heard = made_run(straight(0.4), current=current, dt=0.031 * samples).signals
+    measured = made_run(straight(0.4), current=current, dt=0.031 * samples).signals
     smoothed = 1 - 0.97 ** (samples * np.arange(40))
     expected = np.where(smoothed > 0.4, 1 - (-0.639 * smoothed + 0.988), 0.0)
-    assert said_slip(PaperCode(), heard)[:, 0] == pytest.approx(expected)
+    assert said_slip(PaperCode(), measured)[:, 0] == pytest.approx(expected)
 
 
 def test_four_drives_get_the_mean_of_the_three_motors():
     amps = np.array([0.5, 0.6, 0.7, 0.3])
-    heard = made_run(straight(0.3), current=np.tile(amps, (40, 1)), spec=FOUR).signals
+    measured = made_run(straight(0.3), current=np.tile(amps, (40, 1)), spec=FOUR).signals
     grip = np.mean([-0.639, -0.4559, -0.6294]) * amps + np.mean([0.988, 0.9678, 0.9913])
     slip = np.where(amps > 0.4, 1 - grip, 0.0)
     run = made_run(straight(0.3), spec=FOUR)
     twist = (run.signals.speed * FOUR.wheel_radius * (1 - slip)) @ FOUR.back.T
     expected = made_run(straight(0.3), twist, spec=FOUR).pose
-    assert np.allclose(PaperCode().predict([heard], FOUR)[0].path, expected)
+    assert np.allclose(PaperCode().predict([measured], FOUR)[0].path, expected)
 
 
 # refitted
@@ -135,8 +135,8 @@ def test_four_drives_get_the_mean_of_the_three_motors():
 def test_the_printed_form_comes_back(rng):
     truth = np.array([0.1, 1.5, -2.0])
 
-    def curve(heard):
-        return np.polynomial.polynomial.polyval(torque(heard), truth)
+    def curve(measured):
+        return np.polynomial.polynomial.polyval(torque(measured), truth)
 
     runs = [slipping(rng, curve) for _ in range(20)]
     method = PRINT_REFIT.fit(runs[:10], ROBOTINO)
@@ -147,7 +147,10 @@ def test_the_printed_form_comes_back(rng):
 
 
 def test_the_refit_is_least_squares_in_displacement(rng):
-    runs = [slipping(rng, lambda heard: 0.4 * heard.current, noise=0.05, dt=0.5) for _ in range(12)]
+    runs = [
+        slipping(rng, lambda measured: 0.4 * measured.current, noise=0.05, dt=0.5)
+        for _ in range(12)
+    ]
     rows, gaps = [], []
     for run in runs:
         rim = run.signals.speed * ROBOTINO.wheel_radius
@@ -165,9 +168,9 @@ def test_the_refit_is_least_squares_in_displacement(rng):
 def test_the_deployed_form_comes_back_for_each_motor(rng):
     gain, offset = np.array([0.5, 0.3, 0.7]), np.array([0.02, 0.05, -0.01])
 
-    def curve(heard):
+    def curve(measured):
         memory = 0.97 ** (0.5 / 0.031)
-        x = heard.current.copy()
+        x = measured.current.copy()
         for k in range(1, len(x)):
             x[k] = memory * x[k - 1] + (1 - memory) * x[k]
         return np.where(x > 0.4, gain * x + offset, 0.0)
@@ -180,17 +183,17 @@ def test_the_deployed_form_comes_back_for_each_motor(rng):
 
 
 def test_a_motor_that_never_draws_enough_is_not_corrected(rng):
-    runs = [slipping(rng, lambda heard: 0.0 * heard.current, high=0.39) for _ in range(3)]
+    runs = [slipping(rng, lambda measured: 0.0 * measured.current, high=0.39) for _ in range(3)]
     method = CODE_REFIT.fit(runs, ROBOTINO)
     assert np.array_equal(method.coefficients, np.zeros(6))
     assert path_error(method, runs) < 1e-12
 
 
 def test_a_refit_never_turns_a_wheel_backwards():
-    heard = made_run(straight(0.4), current=np.full((40, 3), 2.0)).signals
+    measured = made_run(straight(0.4), current=np.full((40, 3), 2.0)).signals
     for slip, held in ((3.0, 1.0), (-3.0, -1.0)):
         method = replace(PRINT_REFIT, coefficients=np.array([slip, 0.0, 0.0]))
-        path = method.predict([heard], ROBOTINO)[0].path
+        path = method.predict([measured], ROBOTINO)[0].path
         assert np.allclose(path, (1 - held) * made_run(straight(0.4)).pose)
 
 
@@ -213,7 +216,10 @@ def test_the_recipe_keeps_what_the_authors_kept():
 
 def test_at_most_so_many_samples_are_drawn_and_always_the_same(rng):
     slips = np.linspace(0.1, 0.5, 30)
-    runs = [slipping(rng, lambda heard, s=s: s + 0 * heard.current, dt=0.5, low=0.3) for s in slips]
+    runs = [
+        slipping(rng, lambda measured, s=s: s + 0 * measured.current, dt=0.5, low=0.3)
+        for s in slips
+    ]
     found, again = (
         recipe_samples(TrainingWindows.of(runs), ROBOTINO),
         recipe_samples(TrainingWindows.of(runs), ROBOTINO),
@@ -226,8 +232,8 @@ def test_at_most_so_many_samples_are_drawn_and_always_the_same(rng):
 
 @pytest.mark.parametrize("truth", [(0.1, 1.2), (0.05, 2.0, -1.5)])
 def test_a_curve_that_is_the_truth_comes_back_within_the_tube(rng, truth):
-    def curve(heard):
-        return np.polynomial.polynomial.polyval(torque(heard), truth)
+    def curve(measured):
+        return np.polynomial.polynomial.polyval(torque(measured), truth)
 
     runs = [slipping(rng, curve, low=0.26, angle=0.3) for _ in range(30)]
     name = "paper_linear_svr" if len(truth) == 2 else "paper_quadratic_svr"
@@ -251,7 +257,7 @@ def test_regression_is_that_of_a_linear_kernel(rng, degree):
 
 
 def test_regressions_fall_back_to_encoders_where_the_recipe_leaves_nothing(rng):
-    run = slipping(rng, lambda heard: -0.1 + 0.0 * heard.current)
+    run = slipping(rng, lambda measured: -0.1 + 0.0 * measured.current)
     for degree in (1, 2):
         method = PaperSvr("paper_svr", degree).fit([run], ROBOTINO)
         assert method.coefficients.tolist() == [0.0] * (degree + 1)

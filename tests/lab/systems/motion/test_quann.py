@@ -117,8 +117,8 @@ def test_slip_is_learned_from_currents_and_direction():
     method = QuannSlip().fit(runs, ROBOTINO)
     for k in range(3):
         new = slipping(1.3 + k, 100 + k)
-        (said,) = method.predict([new.signals], ROBOTINO)
-        error = said.path[-1] - path_of(new.twist, new.signals.dt)[-1]
+        (predicted,) = method.predict([new.signals], ROBOTINO)
+        error = predicted.path[-1] - path_of(new.twist, new.signals.dt)[-1]
         assert np.hypot(*error[:2]) < 0.02 * 0.8
     assert method.numbers == 1 + (2 + 9) + 3 * 40 * 8  # runs of eight windows
     assert [each.anisotropic for each in method.candidates()] == [True, False]
@@ -140,12 +140,14 @@ def test_covariances_of_ends_are_as_large_as_errors_of_new_runs():
     angles = np.random.default_rng(4).uniform(0, 6.28, 220)
     runs = [slipping(angle, k, scatter=0.1) for k, angle in enumerate(angles)]
     method = QuannSlip().fit(runs[:100], ROBOTINO)
-    said = method.predict([run.signals for run in runs[100:]], ROBOTINO)
+    predicted = method.predict([run.signals for run in runs[100:]], ROBOTINO)
     errors = [
-        s.path - path_of(r.twist, r.signals.dt) for s, r in zip(said, runs[100:], strict=True)
+        s.path - path_of(r.twist, r.signals.dt) for s, r in zip(predicted, runs[100:], strict=True)
     ]
     ends = np.array([error[-1, :2] for error in errors])
-    square = [e @ np.linalg.solve(s.end_covariance, e) for s, e in zip(said, ends, strict=True)]
+    square = [
+        e @ np.linalg.solve(s.end_covariance, e) for s, e in zip(predicted, ends, strict=True)
+    ]
     assert np.mean(square) == pytest.approx(2.0, rel=0.3)
     # chi-squared with two degrees of freedom
     assert np.mean(np.array(square) < 4.605) == pytest.approx(0.9, abs=0.07)
@@ -155,11 +157,11 @@ def test_a_covariance_is_that_of_the_slip_in_metres_and_radians():
     runs = [slipping(angle, k, scatter=0.1) for k, angle in enumerate(np.linspace(0, 6.2, 16))]
     method = QuannSlip().fit(runs, ROBOTINO)
     new = slipping(1.0, 77).signals
-    (said,) = method.predict([new], ROBOTINO)
+    (predicted,) = method.predict([new], ROBOTINO)
     inputs = slip_inputs(SignalWindows.of([new], ROBOTINO), ROBOTINO)
     std = method.process.predict(method.scale.scaled(inputs), return_std=True)[1][0] * 0.2 / SIZES
-    spread = end_spread(said.path, np.tile(std, (40, 1)), new.dt)
-    assert np.allclose(said.end_covariance, method.inflation * spread + 1e-6 * np.eye(2))
+    spread = end_spread(predicted.path, np.tile(std, (40, 1)), new.dt)
+    assert np.allclose(predicted.end_covariance, method.inflation * spread + 1e-6 * np.eye(2))
 
 
 def test_inflation_is_from_runs_that_the_process_does_not_know():
@@ -182,9 +184,9 @@ def test_a_single_run_is_enough_and_rest_is_certain_to_a_millimetre():
     run = slipping(0.3, 0)
     method = QuannSlip(anisotropic=False).fit([run], ROBOTINO)
     rest = made_run(np.zeros((40, 3)), current=np.zeros((40, 3))).signals
-    (said,) = method.predict([rest], ROBOTINO)
-    assert np.abs(said.path).max() == 0.0
-    assert np.allclose(said.end_covariance, 1e-6 * np.eye(2))
+    (predicted,) = method.predict([rest], ROBOTINO)
+    assert np.abs(predicted.path).max() == 0.0
+    assert np.allclose(predicted.end_covariance, 1e-6 * np.eye(2))
 
 
 LAW = np.array([20.0, 30.0, 80.0, 15.0])
@@ -220,9 +222,9 @@ def test_a_law_of_energy_is_found_and_predicts_power_without_currents():
     assert method.numbers == 4 + 2 + 60 * 8  # runs of eight windows
     for seed in (100, 101, 102):
         new = drawing(moving(seed)).signals
-        (said,) = method.predict([replace(new, current=None)], ROBOTINO)
-        assert said.power == pytest.approx(new.power(ROBOTINO), rel=0.01)
-        assert np.allclose(said.path, path_of(new.rolling(ROBOTINO), new.dt))
+        (predicted,) = method.predict([replace(new, current=None)], ROBOTINO)
+        assert predicted.power == pytest.approx(new.power(ROBOTINO), rel=0.01)
+        assert np.allclose(predicted.path, path_of(new.rolling(ROBOTINO), new.dt))
     (rest,) = method.predict([made_run(np.zeros((40, 3))).signals], ROBOTINO)
     assert rest.power == pytest.approx(np.full(40, 20.0 * 0.02), rel=0.05)
 
@@ -250,8 +252,8 @@ def test_above_the_training_speeds_energy_is_that_of_the_fastest():
     runs = [drawing(straight(0.0, speed)) for speed in np.linspace(0.05, 0.2, 30)]
     method = QuannEnergy().fit(runs, ROBOTINO)
     fast = made_run(straight(0.0, 0.8, 5) + np.array([0.0, 0.0, 0.5])).signals
-    (said,) = method.predict([fast], ROBOTINO)
-    assert said.power == pytest.approx((20.0 + 30.0 * 0.2 + 80.0 * 0.04) * 0.8, rel=0.02)
+    (predicted,) = method.predict([fast], ROBOTINO)
+    assert predicted.power == pytest.approx((20.0 + 30.0 * 0.2 + 80.0 * 0.04) * 0.8, rel=0.02)
 
 
 def test_a_map_knows_places_that_cost_more():
@@ -262,10 +264,10 @@ def test_a_map_knows_places_that_cost_more():
 
     method = QuannEnergy(length=0.2).fit([crossing(v) for v in np.linspace(0.1, 0.3, 15)], ROBOTINO)
     new = crossing(0.17).signals
-    (said,) = method.predict([new], ROBOTINO)
+    (predicted,) = method.predict([new], ROBOTINO)
     true = new.power(ROBOTINO)
-    assert said.power[:20].mean() == pytest.approx(true[:20].mean(), rel=0.1)
-    assert said.power[-20:].mean() == pytest.approx(true[-20:].mean(), rel=0.1)
+    assert predicted.power[:20].mean() == pytest.approx(true[:20].mean(), rel=0.1)
+    assert predicted.power[-20:].mean() == pytest.approx(true[-20:].mean(), rel=0.1)
     assert [each.length for each in method.candidates()] == [0.1, 0.2, 0.5]
 
 

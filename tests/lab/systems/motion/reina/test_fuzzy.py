@@ -17,8 +17,8 @@ def test_two_inputs_with_two_sets_are_bilinear_and_the_last_changes_fastest():
     rng = np.random.default_rng(0)
     a, b, c, d = rng.normal(size=4)
     x, y = rng.random((2, 30))
-    told = Sugeno(2, np.array([a, b, c, d])).infer(np.stack([x, y], axis=1))
-    assert told == pytest.approx((1 - x) * ((1 - y) * a + y * b) + x * ((1 - y) * c + y * d))
+    found = Sugeno(2, np.array([a, b, c, d])).infer(np.stack([x, y], axis=1))
+    assert found == pytest.approx((1 - x) * ((1 - y) * a + y * b) + x * ((1 - y) * c + y * d))
 
 
 def test_three_sets_are_linear_from_peak_to_peak():

@@ -34,20 +34,20 @@ def test_smoothing_of_uneven_steps_weighs_them_by_their_length():
 
 def test_a_wheel_off_the_commanded_shape_raises_the_encoder_indicator():
     run = made_run(np.tile([1.0, 0.0, 0.0], (20, 1)), current=np.ones((20, 2)), spec=HUSKY)
-    heard = replace(run.signals, turn=run.signals.turn * [1.0, 1.4])
-    signals = SmoothedSignals.of(heard, HUSKY, 0.3)
+    measured = replace(run.signals, turn=run.signals.turn * [1.0, 1.4])
+    signals = SmoothedSignals.of(measured, HUSKY, 0.3)
     # of two wheels, the median ratio is in their middle
     assert signals.deviation == pytest.approx(np.full(20, 0.2 / 1.2), rel=1e-5)
-    uncommanded = SmoothedSignals.of(replace(heard, command=None), HUSKY, 0.3)
+    uncommanded = SmoothedSignals.of(replace(measured, command=None), HUSKY, 0.3)
     assert uncommanded.deviation == pytest.approx(np.zeros(20), abs=1e-6)
 
 
 def test_a_slow_wheel_counts_in_units_of_the_fastest():
     run = made_run(straight(0.0, 0.2, 20), current=np.ones((20, 3)))
     rim = run.signals.speed * ROBOTINO.wheel_radius + [0.0, 0.01, 0.0]
-    heard = replace(run.signals, turn=rim / ROBOTINO.wheel_radius * 0.1)
+    measured = replace(run.signals, turn=rim / ROBOTINO.wheel_radius * 0.1)
     fastest = 0.2 * np.cos(np.pi / 6)
-    deviation = SmoothedSignals.of(heard, ROBOTINO, 0.3).deviation
+    deviation = SmoothedSignals.of(measured, ROBOTINO, 0.3).deviation
     assert deviation == pytest.approx(np.full(20, 0.01 / (0.3 * fastest)), rel=1e-4)
 
 

@@ -44,9 +44,9 @@ def test_slip_is_flagged_by_the_gyro_or_by_all_currents_but_not_by_the_encoders(
 def test_slip_is_detected_by_the_currents(method, gyro):
     fitted = method.fit([patchy(k, gyro) for k in range(8)], ROBOTINO)
     tests = [patchy(k, gyro) for k in range(100, 105)]
-    said = fitted.predict([run.signals for run in tests], ROBOTINO)
+    predicted = fitted.predict([run.signals for run in tests], ROBOTINO)
     truth = np.concatenate([slipping(run) for run in tests])
-    score = np.concatenate([one.slipping for one in said if one.slipping is not None])
+    score = np.concatenate([one.slipping for one in predicted if one.slipping is not None])
     assert roc_auc_score(truth, score) > 0.9
 
 
@@ -56,8 +56,8 @@ def test_without_other_signs_the_area_is_that_of_the_currents_themselves():
     steady = [replace(run, signals=replace(run.signals, command=None)) for run in runs]
     method = ReinaDeterministic(smoothing=1e-3).fit(steady, ROBOTINO)
     method = replace(method, limits=replace(method.limits, change=1e9))
-    said = method.predict([run.signals for run in steady], ROBOTINO)
-    score = np.concatenate([one.slipping for one in said if one.slipping is not None])
+    predicted = method.predict([run.signals for run in steady], ROBOTINO)
+    score = np.concatenate([one.slipping for one in predicted if one.slipping is not None])
     truth = np.concatenate([slipping(run) for run in steady])
     amps = np.concatenate([SmoothedSignals.of(r.signals, ROBOTINO, 1e-3).amps for r in steady])
     raised = np.maximum(amps - method.limits.usual, 0.0)
@@ -78,8 +78,8 @@ def test_fuzzy_rules_detect_more_than_thresholds_where_the_gyro_misleads():
     truth = np.concatenate([slipping(run) for run in runs[8:]])
 
     def area(method):
-        said = method.fit(runs[:8], ROBOTINO).predict([r.signals for r in runs[8:]], ROBOTINO)
-        return roc_auc_score(truth, np.concatenate([one.slipping for one in said]))
+        predicted = method.fit(runs[:8], ROBOTINO).predict([r.signals for r in runs[8:]], ROBOTINO)
+        return roc_auc_score(truth, np.concatenate([one.slipping for one in predicted]))
 
     assert area(ReinaFuzzy()) > area(ReinaDeterministic()) + 0.2
 
@@ -90,12 +90,12 @@ def test_what_is_flagged_loses_what_flagged_training_windows_lost(method):
     fitted = replace(method, smoothing=1e-3, quantile=1.0).fit(runs, ROBOTINO)
     assert fitted.slip == pytest.approx(LOST, abs=0.01)
     run = patchy(99, overlap=0.0)
-    said = fitted.predict([run.signals], ROBOTINO)[0]
+    predicted = fitted.predict([run.signals], ROBOTINO)[0]
     kept = np.where(slipping(run), 1.0 - fitted.slip, 1.0)[:, None]
     path = path_of(run.signals.rolling(ROBOTINO) * kept, run.signals.dt)
-    assert said.path == pytest.approx(path, abs=1e-6)
+    assert predicted.path == pytest.approx(path, abs=1e-6)
     rolled = path_of(run.signals.rolling(ROBOTINO), run.signals.dt)
-    assert np.linalg.norm(said.path[-1] - run.pose[-1]) < 0.1 * np.linalg.norm(
+    assert np.linalg.norm(predicted.path[-1] - run.pose[-1]) < 0.1 * np.linalg.norm(
         rolled[-1] - run.pose[-1]
     )
 
@@ -103,9 +103,11 @@ def test_what_is_flagged_loses_what_flagged_training_windows_lost(method):
 @pytest.mark.parametrize("method", BOTH, ids=lambda method: method.name)
 def test_where_nothing_slipped_the_path_is_that_of_the_encoders(method):
     runs = [patchy(k, lost=0.0) for k in range(5)]
-    heard = replace(patchy(7).signals, current=np.full((100, 3), 0.5))
-    said = method.fit(runs, ROBOTINO).predict([heard], ROBOTINO)[0]
-    assert said.path == pytest.approx(path_of(heard.rolling(ROBOTINO), heard.dt), abs=1e-6)
+    measured = replace(patchy(7).signals, current=np.full((100, 3), 0.5))
+    predicted = method.fit(runs, ROBOTINO).predict([measured], ROBOTINO)[0]
+    assert predicted.path == pytest.approx(
+        path_of(measured.rolling(ROBOTINO), measured.dt), abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("method", BOTH, ids=lambda method: method.name)
@@ -116,17 +118,17 @@ def test_where_all_slips_all_is_flagged(method):
         replace(r, signals=replace(r.signals, current=1.0 + 0.1 * rng.random((40, 3))))
         for r in runs
     ]
-    said = method.fit(runs, ROBOTINO).predict([runs[0].signals], ROBOTINO)[0]
-    assert said.path[-1] == pytest.approx(runs[0].pose[-1], abs=0.02)
+    predicted = method.fit(runs, ROBOTINO).predict([runs[0].signals], ROBOTINO)[0]
+    assert predicted.path[-1] == pytest.approx(runs[0].pose[-1], abs=0.02)
 
 
 @pytest.mark.parametrize("method", BOTH, ids=lambda method: method.name)
 def test_a_robot_that_stands_does_not_slip(method):
     still = made_run(np.zeros((40, 3)), current=np.full((40, 3), 3.0))
     fitted = method.fit([*[patchy(k) for k in range(5)], still], ROBOTINO)
-    said = fitted.predict([still.signals], ROBOTINO)[0]
-    assert said.slipping == pytest.approx(np.zeros(40))
-    assert said.path == pytest.approx(np.zeros((41, 3)))
+    predicted = fitted.predict([still.signals], ROBOTINO)[0]
+    assert predicted.slipping == pytest.approx(np.zeros(40))
+    assert predicted.path == pytest.approx(np.zeros((41, 3)))
 
 
 def test_a_gyro_that_some_runs_lack_does_not_count():
@@ -158,9 +160,9 @@ def test_skid_steer_and_floors(method):
         gyro = slow[:, 2]
         runs.append(made_run(rolling, slow, spec=HUSKY, current=amps, gyro=gyro, floor="grass"))
     fitted = ByFloor.of(method).fit(runs, HUSKY)
-    said = fitted.predict([run.signals for run in runs], HUSKY)
-    assert np.isfinite(np.concatenate([one.path for one in said])).all()
-    assert said[0].path[-1, 0] == pytest.approx(runs[0].pose[-1, 0], rel=0.1)
+    predicted = fitted.predict([run.signals for run in runs], HUSKY)
+    assert np.isfinite(np.concatenate([one.path for one in predicted])).all()
+    assert predicted[0].path[-1, 0] == pytest.approx(runs[0].pose[-1, 0], rel=0.1)
 
 
 def test_settings_to_try_and_numbers_fitted():
@@ -181,9 +183,9 @@ def test_windows_that_slip_are_those_of_more_than_a_fifth_with_turning_in_metres
         rolling = np.tile([0.0, 0.0, 1.0], (40, 1))
         run = made_run(rolling, rolling * (1.0 - short), current=np.ones((40, 3)))
         fitted = ReinaFuzzy().fit([run], ROBOTINO)
-        said = fitted.predict([run.signals], ROBOTINO)[0]
-        assert said.slipping is not None
-        assert (np.median(said.slipping) > 0.5) == slips
+        predicted = fitted.predict([run.signals], ROBOTINO)[0]
+        assert predicted.slipping is not None
+        assert (np.median(predicted.slipping) > 0.5) == slips
         assert len(groups(run.signals.dt, 0.5)) == 8
 
 
@@ -193,6 +195,6 @@ def test_fuzzy_answers_flag_slip_from_one_half_on(answer, kept):
         rules=Sugeno(2, np.full(4, answer)), slip=0.3, limits=SlipThresholds(turning=np.inf)
     )
     run = patchy(3)
-    said = method.predict([run.signals], ROBOTINO)[0]
+    predicted = method.predict([run.signals], ROBOTINO)[0]
     path = path_of(kept * run.signals.rolling(ROBOTINO), run.signals.dt)
-    assert said.path == pytest.approx(path)
+    assert predicted.path == pytest.approx(path)

@@ -25,9 +25,9 @@ def test_linear_traction_makes_it_the_linear_kalman_filter():
     noise = FilterNoise(rolling=0.0, drift=(0.0, 0.0, 0.004), gyro=0.03, bias=0.05)
     wheels, gyro, dt, radius = rng.normal(size=40), rng.normal(size=40), 0.1, 0.125
     rolling = np.outer(wheels, [0.0, 0.0, 1.0])
-    heard = made_run(rolling, gyro=gyro, dt=dt).signals
+    measured = made_run(rolling, gyro=gyro, dt=dt).signals
     own = SlipFilter(Dynamics.of(ROBOTINO, law), noise, 10.0, uses_current=False, wander=0.0)
-    speeds, covariance = own.track(PaddedRuns.of([heard], ROBOTINO))
+    speeds, covariance = own.track(PaddedRuns.of([measured], ROBOTINO))
 
     # 2 (N / m) C2 u of three wheels, the 2 by the inertia m L^2 / 2
     slope = 2 * GRAVITY * 0.2
@@ -71,11 +71,11 @@ def test_a_measurement_is_that_of_the_textbook_but_for_the_pose():
     assert one.mean[0] == pytest.approx(mean + 0.7 * gain[:5] * [0, 0, 0, 1, 0])
     two = FilterState(np.tile(mean, (2, 1)), np.tile(spread, (2, 1, 1)))
     for news, variance in ((np.nan, 0.3), (0.7, np.nan)):
-        heard = two.corrected(
+        measured = two.corrected(
             np.tile(row, (2, 1)), np.array([0.7, news]), np.array([0.3, variance])
         )
-        assert heard.mean == pytest.approx(np.stack([after.mean[0], mean]))
-        assert heard.covariance == pytest.approx(np.stack([after.covariance[0], spread]))
+        assert measured.mean == pytest.approx(np.stack([after.mean[0], mean]))
+        assert measured.covariance == pytest.approx(np.stack([after.covariance[0], spread]))
 
 
 def test_resistance_that_pushes_or_exceeds_traction_is_pulled_back():
@@ -89,28 +89,28 @@ def test_resistance_that_pushes_or_exceeds_traction_is_pulled_back():
 
 
 def test_the_force_of_a_current_is_that_of_gear_motor_and_wheel():
-    heard = made_run(straight(0.0), current=np.tile([0.5, 0.2, 0.7], (40, 1))).signals
-    force = motor_forces(heard, ROBOTINO)[0]
+    measured = made_run(straight(0.0), current=np.tile([0.5, 0.2, 0.7], (40, 1))).signals
+    force = motor_forces(measured, ROBOTINO)[0]
     assert force[[0, 2]] == pytest.approx(np.array([0.5, 0.7]) * 16 * 0.05 / 0.04)
     assert np.isnan(force[1])
-    assert np.isnan(motor_forces(replace(heard, current=None), ROBOTINO)).all()
+    assert np.isnan(motor_forces(replace(measured, current=None), ROBOTINO)).all()
 
 
 def test_the_spread_of_the_end_is_that_of_paths_with_other_twists():
     """The end covariance of a fast turn is that by differences in the twists of two steps."""
     noise = FilterNoise(rolling=0.0, drift=(0.01, 0.02, 0.03))
-    heard = made_run(np.tile([0.3, -0.2, 2.0], (2, 1)), dt=0.2).signals
+    measured = made_run(np.tile([0.3, -0.2, 2.0], (2, 1)), dt=0.2).signals
     dynamics = Dynamics.of(ROBOTINO, FLOOR)
     own = SlipFilter(dynamics, noise, 10.0, uses_current=False, wander=0.0)
-    runs = PaddedRuns.of([heard], ROBOTINO)
+    runs = PaddedRuns.of([measured], ROBOTINO)
 
     def end(shaken):
         q, twist = runs.rolling[:, 0], np.zeros((2, 3))
         for k in range(2):
             rho = np.array([FLOOR.rolling])
-            q = dynamics.step(q, rho, runs.rim[:, k], heard.dt[:1]).speeds + shaken[k]
+            q = dynamics.step(q, rho, runs.rim[:, k], measured.dt[:1]).speeds + shaken[k]
             twist[k] = q[0] / ROBOTINO.size
-        return path_of(twist, heard.dt)[-1]
+        return path_of(twist, measured.dt)[-1]
 
     spread = np.zeros((3, 3))
     for k in range(2):

@@ -18,9 +18,9 @@ from tests.helpers.made_runs import HUSKY, ROBOTINO, made_run, straight
 def test_a_robot_that_stands_keeps_standing():
     still = made_run(np.zeros((40, 3)), current=np.full((40, 3), 0.5), gyro=np.full(40, 0.02))
     for method in (WardIagnemma(), WardIagnemma.with_current()):
-        said = method.predict([still.signals], ROBOTINO)[0]
-        assert said.path[:, :2] == pytest.approx(np.zeros((41, 2)), abs=1e-6)
-        assert said.slipping == pytest.approx(np.zeros(40))
+        predicted = method.predict([still.signals], ROBOTINO)[0]
+        assert predicted.path[:, :2] == pytest.approx(np.zeros((41, 2)), abs=1e-6)
+        assert predicted.slipping == pytest.approx(np.zeros(40))
     without = replace(still.signals, gyro=None)
     assert WardIagnemma().predict([without], ROBOTINO)[0].path == pytest.approx(np.zeros((41, 3)))
 
@@ -41,8 +41,8 @@ def test_runs_by_the_law_are_predicted(spec):
     foretold = fitted.predict([run.signals for run in runs[10:]], spec)
     # after the wheels change, the robot's mass needs some steps to follow
     settled = np.r_[10:20, 30:40]
-    for run, said in zip(runs[10:], foretold, strict=True):
-        twist = body_increments(said.path) / run.signals.dt[:, None]
+    for run, predicted in zip(runs[10:], foretold, strict=True):
+        twist = body_increments(predicted.path) / run.signals.dt[:, None]
         off = np.abs((twist - run.twist) * spec.size)[settled]
         slip = np.abs((run.signals.rolling(spec) - run.twist) * spec.size)[settled]
         assert off.max() < 0.05 * slip.max()
@@ -53,11 +53,11 @@ def test_runs_by_the_law_are_predicted(spec):
 def test_nine_ends_of_ten_lie_in_their_regions(gyro):
     runs = scattered(400, gyro)
     method = WardIagnemma(law=FLOOR, noise=TRUE)
-    said = method.predict([run.signals for run in runs], ROBOTINO)
+    predicted = method.predict([run.signals for run in runs], ROBOTINO)
     off = np.array(
-        [one.path[-1, :2] - run.pose[-1, :2] for one, run in zip(said, runs, strict=True)]
+        [one.path[-1, :2] - run.pose[-1, :2] for one, run in zip(predicted, runs, strict=True)]
     )
-    spread = np.array([one.end_covariance for one in said])
+    spread = np.array([one.end_covariance for one in predicted])
     square = np.einsum("ri,rij,rj->r", off, np.linalg.inv(spread), off)
     assert np.mean(square < chi2.ppf(0.9, 2)) == pytest.approx(0.9, abs=0.045)
     assert square.mean() == pytest.approx(2.0, rel=0.2)
@@ -93,12 +93,12 @@ def test_runs_do_not_affect_those_beside_them():
 
 
 def test_rho_that_wanders_makes_the_end_less_sure():
-    heard = made_run(straight(0.2)).signals
+    measured = made_run(straight(0.2)).signals
     noise = FilterNoise(0.02, (1e-4, 1e-4, 1e-4))
     spread = [
         np.trace(
             WardIagnemma(law=FLOOR, noise=noise, wander=w)
-            .predict([heard], ROBOTINO)[0]
+            .predict([measured], ROBOTINO)[0]
             .end_covariance
         )
         for w in (0.0, 0.5)
@@ -109,23 +109,27 @@ def test_rho_that_wanders_makes_the_end_less_sure():
 
 def test_a_skid_steer_that_turns_with_a_gyro_and_by_floor():
     runs = [driven(FLOOR, k, HUSKY) for k in range(8)]
-    heard = [replace(r.signals, gyro=r.twist[:, 2]) for r in runs]
-    runs = [replace(r, signals=h) for r, h in zip(runs, heard, strict=True)]
+    measured = [replace(r.signals, gyro=r.twist[:, 2]) for r in runs]
+    runs = [replace(r, signals=h) for r, h in zip(runs, measured, strict=True)]
     fitted = ByFloor.of(WardIagnemma()).fit(runs, HUSKY)
-    for run, said in zip(runs, fitted.predict(heard, HUSKY), strict=True):
-        assert said.path[-1, 2] == pytest.approx(run.pose[-1, 2], abs=0.02)
-        assert said.path[-1, :2] == pytest.approx(run.pose[-1, :2], abs=0.05)
+    for run, predicted in zip(runs, fitted.predict(measured, HUSKY), strict=True):
+        assert predicted.path[-1, 2] == pytest.approx(run.pose[-1, 2], abs=0.02)
+        assert predicted.path[-1, :2] == pytest.approx(run.pose[-1, :2], abs=0.05)
 
 
 def test_settings_to_try_and_numbers_fitted():
-    method, heard = WardIagnemma(), WardIagnemma.with_current()
+    method, measured = WardIagnemma(), WardIagnemma.with_current()
     assert (method.name, method.needs) == ("ward_iagnemma", frozenset())
-    assert (heard.name, heard.needs) == ("ward_iagnemma_current", {"current"})
-    for one in (method, heard):
+    assert (measured.name, measured.needs) == ("ward_iagnemma_current", {"current"})
+    for one in (method, measured):
         tried = one.candidates()
         assert len({repr(m) for m in tried}) == len(tried) <= TRIES
         assert {(m.name, m.needs) for m in tried} == {(one.name, one.needs)}
-    assert (method.numbers, replace(method, with_drag=False).numbers, heard.numbers) == (8, 7, 11)
+    assert (method.numbers, replace(method, with_drag=False).numbers, measured.numbers) == (
+        8,
+        7,
+        11,
+    )
     run = driven(FLOOR, 0)
     run = replace(run, signals=replace(run.signals, gyro=run.twist[:, 2]))
     assert method.fit([run], ROBOTINO).numbers == 10
