@@ -144,19 +144,18 @@ def load_program(folder: Path | str) -> Program:
     try:
         about = json.loads(content["step.json"])
         schema = about.pop("schema")
-    except (ValueError, KeyError, AttributeError) as error:
-        raise DataError(f"{place / 'step.json'}: damaged; export the robot again") from error
-    if schema != SCHEMA:
-        raise DataError(
-            f"{place / 'step.json'}: written as {schema}, this slipid reads {SCHEMA}; update "
-            "slipid, or export the robot again"
-        )
-    try:
-        arrays = np.load(io.BytesIO(content["golden.npz"]), allow_pickle=False)
+        if schema != SCHEMA:
+            raise DataError(
+                f"{place / 'step.json'}: written as {schema}, this slipid reads {SCHEMA}; update "
+                "slipid, or export the robot again"
+            )
         signature = typed(Signature, about)
+        arrays = np.load(io.BytesIO(content["golden.npz"]), allow_pickle=False)
         start = [jnp.asarray(arrays[f"start{k}"]) for k in range(len(signature.state))]
         programs = [export.deserialize(bytearray(content[name])) for name in FILES[:2]]
         steps = Golden(arrays["given"], arrays["said"], arrays["command"])
+    except DataError:
+        raise
     except Exception as error:  # the parsers of three formats raise many kinds of errors
         raise DataError(f"{place}: damaged ({error}); export the robot again") from error
     program = Program(signature, tuple(start), *programs)
