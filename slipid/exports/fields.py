@@ -18,7 +18,7 @@ import numpy as np
 Kind = Literal["real", "int", "bool"]
 DTYPES: dict[Kind, type] = {"real": np.float64, "int": np.int64, "bool": np.bool_}
 UNIT = re.compile(r"\[[^\]]+\]")
-ONE = "[1]"
+NO_UNIT = "[1]"
 """Unit written for a field whose description has none."""
 
 
@@ -94,5 +94,5 @@ def fields_of(
                 parts += fields_of(getattr(tree, field.name), None, name, about)
         return tuple(parts)
     array = jnp.asarray(tree)
-    about = above if UNIT.search(above) else f"{above} {ONE}".strip()
+    about = above if UNIT.search(above) else f"{above} {NO_UNIT}".strip()
     return (Field(prefix, kind_of(array.dtype), tuple(array.shape), about),)

@@ -28,7 +28,7 @@ from slipid.robot.robot_file import typed
 from slipid.support.errors import DataError
 
 SCHEMA = "slipid.stablehlo/1"
-CLOSE = 1e-9
+TOLERANCE = 1e-9
 """Largest difference between a number that the loaded program computes and the library's result,
 relative to the number's scale [1]."""
 PLATFORMS = ("cpu", "cuda", "tpu")
@@ -176,7 +176,7 @@ def _repeated(program: Program, steps: Golden, place: Path) -> None:
         for outputs in (single[count:], [x[1] for x in both[count:]]):
             numbers = np.concatenate([np.asarray(x, float).reshape(-1) for x in outputs])
             gap = np.abs(numbers - np.concatenate([estimate, command]))
-            if not (gap <= CLOSE * np.concatenate([scale, np.ones(len(command))])).all():
+            if not (gap <= TOLERANCE * np.concatenate([scale, np.ones(len(command))])).all():
                 raise DataError(
                     f"{place}: the program does not repeat what was computed when it was made "
                     f"(off by {gap.max():.1e}); export the robot again"

@@ -34,11 +34,11 @@ def fitted(small) -> Path:
 def agree(out: Path) -> DeployedRobot:
     """The robot of a folder, every number of it that of identified.json."""
     robot = read_robot(out)
-    said = json.loads((out / "identified.json").read_text())["parameters"]
+    fitted = json.loads((out / "identified.json").read_text())["parameters"]
     kept = json.loads((out / "robot.json").read_text())["parameters"]
-    assert {path for path in said if not path.startswith("camera.")} == set(kept)
+    assert {path for path in fitted if not path.startswith("camera.")} == set(kept)
     for path, number in kept.items():
-        assert {key: said[path][key] for key in number} == number
+        assert {key: fitted[path][key] for key in number} == number
     numbers = robot.record.parameters
     assert float(robot.motor.resistance) == numbers["motor.resistance"].value
     assert tuple(robot.rest.tolist()) == numbers["robot.load_share@as_built"].value
@@ -71,17 +71,17 @@ def test_a_fit_writes_its_robot(fitted):
 
 def test_its_effect_table_equals_the_forecasts(fitted):
     robot, contact = read_robot(fitted), load(fitted).contact
-    told = robot.record.loads[0].told
-    for n, speed in enumerate(told.speeds):
+    table = robot.record.loads[0].told
+    for n, speed in enumerate(table.speeds):
         for k in (0, 17, 50):
             pace = (SpeedAndLoad(float(np.log(speed)), robot.load_setup),)
             mirror = contact.robot.geometry.mirror()
-            way = TravelConditions(np.array([2 * np.pi * k / DIRECTIONS]), pace, mirror)
-            known = contact.shared[robot.labels[0]].forecast(way)
-            np.testing.assert_allclose(told.mean[0][n][k], -known.mean[0], rtol=2e-3, atol=1e-6)
+            conditions = TravelConditions(np.array([2 * np.pi * k / DIRECTIONS]), pace, mirror)
+            known = contact.shared[robot.labels[0]].forecast(conditions)
+            np.testing.assert_allclose(table.mean[0][n][k], -known.mean[0], rtol=2e-3, atol=1e-6)
             # the numbers are not known either
             least = np.sqrt(np.diag(known.covariance[0]))
-            assert (np.array(told.left[0][n][k]) > 0.999 * least).all()
+            assert (np.array(table.left[0][n][k]) > 0.999 * least).all()
 
 
 def test_after_sampling_no_two_files_disagree(fitted, sampled):
@@ -90,7 +90,7 @@ def test_after_sampling_no_two_files_disagree(fitted, sampled):
     assert record.source == "posterior"
     assert record.parameters["surface.soft.creep"].source == "posterior"
     assert record.numbers != before.numbers
-    assert any("did not converge" in said for said in record.messages)
+    assert any("did not converge" in message for message in record.messages)
     assert len(set(record.draws["surface.soft.creep"])) > DRAWS // 4
 
 

@@ -66,7 +66,7 @@ def test_its_example_drives_as_the_library_did(folder, tmp_path):
     """With a C compiler and the folder, and nothing else."""
     here = tmp_path / "c"
     shutil.copytree(folder / "c", here)
-    said = subprocess.run(
+    result = subprocess.run(
         "mkdir build && cc -O2 -Isrc -o build/drive examples/drive/drive.c src/slipid.c -lm &&"
         " build/drive < examples/drive/readings.txt | cmp - examples/drive/commands.txt",
         shell=True,
@@ -75,7 +75,7 @@ def test_its_example_drives_as_the_library_did(folder, tmp_path):
         capture_output=True,
         text=True,
     )
-    assert said.returncode == 0, said.stdout + said.stderr
+    assert result.returncode == 0, result.stdout + result.stderr
     lines = (here / "examples/drive/commands.txt").read_text().splitlines()
     assert len(lines) > 300
     assert float(lines[-1].split()[-1]) == pytest.approx(rectangle().duration + REST_S, abs=0.05)
@@ -174,7 +174,7 @@ def test_a_robot_is_found_in_a_folder_or_a_file_with_some_of_its_floors(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("wish", "said"),
+    ("options", "message"),
     [
         (ExportOptions(("c", "ros")), "no form 'ros', did you mean ros2"),
         (ExportOptions(()), "no form"),
@@ -188,9 +188,9 @@ def test_a_robot_is_found_in_a_folder_or_a_file_with_some_of_its_floors(tmp_path
         (ExportOptions(speed=9.0), "speed 9 m/s"),
     ],
 )
-def test_invalid_options_are_refused_before_anything_is_written(tmp_path, wish, said):
-    with pytest.raises(DataError, match=said):
-        export(ROBOT, tmp_path / "out", wish, QUIET)
+def test_invalid_options_are_refused_before_anything_is_written(tmp_path, options, message):
+    with pytest.raises(DataError, match=message):
+        export(ROBOT, tmp_path / "out", options, QUIET)
     assert not (tmp_path / "out").exists()
 
 

@@ -368,7 +368,7 @@ def test_a_primitive_without_a_form_in_c_is_refused_by_name_and_line():
 
 
 @pytest.mark.parametrize(
-    ("run", "said"),
+    ("run", "reason"),
     [
         (lambda x: x.at[np.array([1, 1])].add(1.0), "a place that is written twice"),
         (lambda x: x.at[jnp.argmin(x)].set(1.0), "places that are not known before"),
@@ -383,8 +383,8 @@ def test_a_primitive_without_a_form_in_c_is_refused_by_name_and_line():
         (lambda x: jax.lax.scan(lambda c, y: (c + y, c), 0.0, x)[1], "goes through an array"),
     ],
 )
-def test_operations_with_other_results_in_c_are_refused(run, said):
-    with pytest.raises(UnsupportedError, match=said):
+def test_operations_with_other_results_in_c_are_refused(run, reason):
+    with pytest.raises(UnsupportedError, match=reason):
         function(Names(), "f", "", _arguments(run, [LANES])[0], traced(run, jnp.ones(N)))
 
 

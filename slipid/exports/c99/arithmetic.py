@@ -77,7 +77,7 @@ BINARY = {
     "rem": "r_rem({0}, {1})",
     "sub": "{0} - {1}",
 }
-OF_INTS = {"max": "i_max({0}, {1})", "min": "i_min({0}, {1})", "rem": "{0} % {1}"}
+INTEGER_TEMPLATES = {"max": "i_max({0}, {1})", "min": "i_min({0}, {1})", "rem": "{0} % {1}"}
 """Templates of operations that C writes differently for whole numbers."""
 NEUTRAL = {"add": (0.0, 0.0), "sub": (None, 0.0), "mul": (1.0, 1.0), "div": (None, 1.0)}
 """Neutral numbers of an operation as its first and as its second operand; None if there is none."""
@@ -152,7 +152,7 @@ def binary(name: str) -> Rule:
 
     def rule(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
         integer = kind_of_value(values[0]) == "int"
-        template = OF_INTS.get(name, BINARY[name]) if integer else BINARY[name]
+        template = INTEGER_TEMPLATES.get(name, BINARY[name]) if integer else BINARY[name]
         return applied(builder, template, kind_of(out.dtype), values, out.shape, simpler)
 
     return rule

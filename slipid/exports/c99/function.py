@@ -48,25 +48,26 @@ class Argument:
     @property
     def memories(self) -> list[Memory]:
         """Memory of each of its fields."""
-        if self.type:
-            return [
-                Memory(f"{self.name}->{f.name}", f.numbers, f.size, scalar=not f.shape)
-                for f in self.fields
-            ]
-        field = self.fields[0]
-        name = f"(*{self.name})" if self.written and not field.shape else self.name
-        return [Memory(name, field.numbers, field.size, scalar=not field.shape)]
+        plain = f"(*{self.name})" if self.written and not self.fields[0].shape else self.name
+        return [
+            Memory(
+                f"{self.name}->{f.name}" if self.type else plain,
+                f.numbers,
+                f.size,
+                scalar=not f.shape,
+            )
+            for f in self.fields
+        ]
 
     @property
     def declared(self) -> str:
         """Text of its declaration in the function's head."""
-        const = "" if self.written else "const "
+        const, field = "" if self.written else "const ", self.fields[0]
         if self.type:
             return f"{const}{self.type} *{self.name}"
-        field = self.fields[0]
         if field.shape:
             return f"{const}slipid_real {self.name}[{field.size}]"
-        return f"slipid_real *{self.name}" if self.written else f"slipid_real {self.name}"
+        return f"slipid_real {'*' if self.written else ''}{self.name}"
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,11 @@ def function(
     for memory, value in changed:
         store(builder, value, memory)
     body = FunctionBody(builder)
-    unused = _unused(arguments, body.reads)
+    unused = [
+        f"  (void){a.name};"
+        for a in arguments
+        if not a.written and not any(memory.name in body.reads for memory in a.memories)
+    ]
     lines = (*unused, *body.lines)
     return Function(name, about, tuple(arguments), lines, body.reads, body.scratch)
 
@@ -162,11 +167,3 @@ def _holds(memory: Memory, value: Value) -> bool:
         return False
     like = in_memory(memory, value.shape)
     return value.axis == like.axis and bool((value.cells == like.cells).all())
-
-
-def _unused(arguments: Sequence[Argument], reads: frozenset[str]) -> list[str]:
-    """Return C statements that mark arguments as deliberately unused."""
-    idle = [
-        a.name for a in arguments if not a.written and not any(m.name in reads for m in a.memories)
-    ]
-    return [f"  (void){name};" for name in idle]
