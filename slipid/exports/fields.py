@@ -52,11 +52,13 @@ class Struct:
         name: name of the type.
         about: comment of the struct, one sentence.
         fields: fields in the order of the tree's leaves.
+        example: a tree whose arrays have the shapes of the fields.
     """
 
     name: str
     about: str
     fields: tuple[Field, ...]
+    example: object
 
 
 def kind_of(dtype: np.dtype) -> Kind:

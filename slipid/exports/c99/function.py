@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 
 from slipid.exports.c99.builder import Builder, Names
 from slipid.exports.c99.ir import Array, Memory, Value, in_memory
@@ -23,6 +24,7 @@ class Argument:
         name: name of the argument.
         type: name of the struct that the argument points to; empty for plain numbers.
         fields: fields of the struct; a single one for plain numbers.
+        example: a tree of arrays with the shapes of the fields, as the traced function takes it.
         read: whether the function reads it.
         written: whether the function fills it.
     """
@@ -30,6 +32,7 @@ class Argument:
     name: str
     type: str
     fields: tuple[Field, ...]
+    example: object
     read: bool
     written: bool
 
@@ -38,12 +41,12 @@ class Argument:
         cls, name: str, shape: tuple[int, ...], read: bool = True, written: bool = False
     ) -> Argument:
         """Return an argument that is a number, or an array of numbers."""
-        return cls(name, "", (Field(name, "real", shape, ""),), read, written)
+        return cls(name, "", (Field(name, "real", shape, ""),), jnp.zeros(shape), read, written)
 
     @classmethod
     def of(cls, name: str, struct: Struct, read: bool = True, written: bool = False) -> Argument:
         """Return an argument that is a pointer to a struct."""
-        return cls(name, struct.name, struct.fields, read, written)
+        return cls(name, struct.name, struct.fields, struct.example, read, written)
 
     @property
     def memories(self) -> list[Memory]:
@@ -106,17 +109,17 @@ def function(
     name: str,
     about: str,
     arguments: Sequence[Argument],
-    traced: Traced,
+    run: Callable[..., object],
 ) -> Function:
-    """Return a traced function as a C function.
+    """Return a function of JAX as a C function.
 
     Args:
         names: numbers for names and constant tables of the generated file.
         name: name of the function.
         about: comment of its declaration.
         arguments: arguments in order.
-        traced: function whose inputs are the fields of all arguments that are read and whose
-            results are the fields of all arguments that are written, in the arguments' order.
+        run: function whose inputs are the trees of all arguments that are read and whose results
+            are those of all arguments that are written, in the arguments' order.
 
     Raises:
         UnsupportedError: the function uses a primitive without a rule.
@@ -128,7 +131,8 @@ def function(
         if argument.read
         for memory, field in zip(argument.memories, argument.fields, strict=True)
     ]
-    results = lowered(builder, traced, values)
+    examples = [argument.example for argument in arguments if argument.read]
+    results = lowered(builder, traced(run, *examples), values)
     targets = [memory for a in arguments if a.written for memory in a.memories]
     overwritten = frozenset(memory.name for memory in targets)
     changed = [
