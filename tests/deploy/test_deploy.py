@@ -56,11 +56,8 @@ def test_a_fit_writes_its_robot(fitted):
     assert record.floors[0].seen.runs == len(DRIVES)
     assert record.floors[0].process[0] == pytest.approx(fit.variance["process.soft.along"] ** 0.5)
     assert Settings.of(robot).current_is_signed == fit.channels.signed
-    assert (
-        Settings.of(robot).further_floor_penalty
-        == Settings().further_floor_penalty
-        != MIXED_FLOORS_PENALTY
-    )
+    penalty = Settings().further_floor_penalty
+    assert Settings.of(robot).further_floor_penalty == penalty != MIXED_FLOORS_PENALTY
     free = {path for path in fit.space.slices if not path.startswith("camera.")}
     assert set(record.draws) == free
     again = deploy(fit)
@@ -115,14 +112,8 @@ def test_gains_of_an_older_file_outlive_the_same_numbers_and_are_driven_with(fit
 
 def older_gains() -> dict[str, object]:
     """Tuned gains, as `slipid tune` of earlier versions wrote them into robot.json."""
-    rows = (
-        ("place", "1/s"),
-        ("yaw", "1/s"),
-        ("integral", "1/s^2"),
-        ("ahead", "1"),
-        ("observer", "1"),
-    )
-    units = dict((*rows, ("preview", "s")))
+    units = {"place": "1/s", "yaw": "1/s", "integral": "1/s^2", "ahead": "1", "observer": "1"}
+    units["preview"] = "s"
     values = {
         name: {"value": 1.25 if unit == "1/s" else 0.25, "unit": unit, "spread": 0.1}
         for name, unit in units.items()

@@ -97,16 +97,8 @@ def test_no_heap_and_no_globals(folder, tmp_path):
 def test_parts_for_float_and_for_double_cannot_be_linked(folder, tmp_path):
     made, flags = tmp_path / "slipid.o", ["-std=c99", "-O0", "-DSLIPID_FLOAT"]
     subprocess.run(["cc", *flags, "-c", "-o", made, folder / "src/slipid.c"], check=True)
-    command = [
-        "cc",
-        "-I",
-        folder / "src",
-        "-o",
-        tmp_path / "x",
-        folder / "test/check.c",
-        made,
-        "-lm",
-    ]
+    sources = [folder / "test/check.c", made, "-lm"]
+    command = ["cc", "-I", folder / "src", "-o", tmp_path / "x", *sources]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode != 0
     assert "slipid_init" in done.stderr

@@ -243,12 +243,7 @@ def _library(folder: Path) -> ctypes.CDLL:
 def _compiled(names: Names, functions, folder: Path) -> ctypes.CDLL:
     reads = frozenset().union(*(f.reads for f in functions))
     tables = [line for m in names.tables.values() if m.name in reads for line in table(m)]
-    head = [
-        "#include <float.h>",
-        "#include <math.h>",
-        "#include <stdbool.h>",
-        "#include <stdint.h>",
-    ]
+    head = [f"#include <{name}.h>" for name in ("float", "math", "stdbool", "stdint")]
     text = [*head, "typedef double slipid_real;", template("c99/prelude.c"), *tables]
     text += [line for f in functions for line in (f"{f.head};", *f.text)]
     (folder / "all.c").write_text("\n".join(text))

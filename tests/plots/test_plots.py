@@ -116,14 +116,8 @@ def test_wheel_slip_and_torque_lie_on_the_curve_of_a_wheel():
 
 def test_curve_of_a_straight_wheel_is_the_published_one():
     for floor, curve in fit().curves.items():
-        torque = wheel_curve(
-            fit().robot,
-            floor,
-            curve.slip,
-            0.0,
-            curve.wheel_speed,
-            curve.load_share,
-        )
+        place = (curve.wheel_speed, curve.load_share)
+        torque = wheel_curve(fit().robot, floor, curve.slip, 0.0, *place)
         np.testing.assert_allclose(torque, curve.torque_nm, rtol=0.01, atol=1e-3)
 
 
