@@ -7,7 +7,6 @@ numbers, but infinity and NaN do not propagate through such a product as they wo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from math import prod
 
 import jax
@@ -109,16 +108,15 @@ def applied(
 
 
 def _axis(values: Sequence[Value], shape: tuple[int, ...]) -> int | None:
-    """Return the axis of the lanes of an element-wise result."""
-    axis = next((a for a in map(partial(_lanes, shape), values) if a is not None), None)
-    return longest(shape) if axis is None and prod(shape) > UNROLLED else axis
+    """Return the axis of the lanes of an element-wise result.
 
-
-def _lanes(shape: tuple[int, ...], value: Value) -> int | None:
-    """Return the axis of a value's lanes if the result is equally long along it, else None."""
-    if not isinstance(value, Array) or value.axis is None or len(value.shape) != len(shape):
-        return None
-    return value.axis if value.shape[value.axis] == shape[value.axis] else None
+    It is that of the first value with lanes along which the result is equally long.
+    """
+    for value in values:
+        axis = value.axis if isinstance(value, Array) else None
+        if axis is not None and len(value.shape) == len(shape) and value.shape[axis] == shape[axis]:
+            return axis
+    return longest(shape) if prod(shape) > UNROLLED else None
 
 
 def unary(name: str) -> Rule:
@@ -240,20 +238,13 @@ def reduced(name: str) -> Rule:
         rows = moved.reshape(prod(kept), -1)
         cells = [chained(builder, template, kind, row, lanes) for row in rows]
         if value.axis in axes:
-            cells = [over_lanes(builder, template, kind, cell, lanes, first) for cell in cells]
+            text = template.replace("{0}", "{acc}").replace("{1}", "{0}")
+            cells = [builder.compute(kind, text, (cell,), lanes, first) for cell in cells]
             return Array(out.shape, kind, None, cells_of(kept, cells))
         axis = None if value.axis is None else value.axis - sum(d < value.axis for d in axes)
         return Array(out.shape, kind, axis, cells_of(kept, cells))
 
     return rule
-
-
-def over_lanes(
-    builder: Builder, template: str, kind: Kind, cell: Cell, lanes: int, start: str
-) -> Cell:
-    """Return a cell reduced over its lanes to one number, from the initial value `start`."""
-    text = template.replace("{0}", "{acc}").replace("{1}", "{0}")
-    return builder.compute(kind, text, (cell,), lanes, start)
 
 
 def argmin(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
