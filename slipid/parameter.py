@@ -138,12 +138,17 @@ def parameter(
     """
     declaration = Declaration(unit=unit, symbol=symbol, doc=doc, **declared)
     return eqx.field(
-        converter=lambda x: (
-            jnp.asarray(x, dtype=float) if not isinstance(x, jax.core.Tracer) else x
-        ),
+        converter=as_numbers,
         metadata={"parameter": declaration, "per": per},
-        default_factory=lambda: jnp.asarray(declaration.start, dtype=float),
+        default_factory=lambda: as_numbers(declaration.start),
     )
+
+
+def as_numbers(x: Any) -> Array:
+    """Return an array of floating-point numbers; JAX compiles nothing for what is not one yet."""
+    if isinstance(x, jax.core.Tracer) or (isinstance(x, jax.Array) and x.dtype.kind == "f"):
+        return x
+    return jax.device_put(np.asarray(x, float))
 
 
 _OF = {"labels": "surface", "loads": "load", "sessions": "session"}

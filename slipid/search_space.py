@@ -154,9 +154,8 @@ def with_values(tree: Any, values: Mapping[Entry, Any]) -> Any:
     if not changed:
         return tree
     places, arrays = zip(*changed.values(), strict=True)
-    return eqx.tree_at(
-        lambda t: [e.whole(t) for e in places], tree, [jnp.asarray(a) for a in arrays]
-    )
+    put = [a if isinstance(a, jax.core.Tracer) else jax.device_put(a) for a in arrays]
+    return eqx.tree_at(lambda t: [e.whole(t) for e in places], tree, put)
 
 
 def _replaced(whole: Any, index: int | None, value: Any) -> Any:

@@ -14,7 +14,7 @@ from slipid.app.check import refuse_if_wrong, sanity
 from slipid.app.config import read_config
 from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
-from slipid.app.trust import TrustReport, trust_report
+from slipid.app.trust import trust_report
 from slipid.fitting.multi_floor import multi_floor_runs
 from slipid.fitting.multi_floor_fit import fit_multi_floor
 from slipid.fitting.optimise import Optimum, optimise
@@ -22,6 +22,7 @@ from slipid.fitting.problem import FitState, Problem
 from slipid.infer.fit_file import save
 from slipid.infer.result import Fit
 from slipid.infer.summary import summarise
+from slipid.infer.verdicts.disputed import Trust
 from slipid.infer.verdicts.profile import Profile, profile, profiled
 from slipid.predict.agreement import contradiction, floor_errors, largest_shift
 from slipid.predict.slip_models import slip_models
@@ -52,7 +53,7 @@ class IdentifyResult:
 
     fit: Fit
     task: ConfigFitTask
-    trust: TrustReport
+    trust: Trust
     profiles: tuple[Profile, ...]
     written: tuple[str, ...]
 
@@ -148,9 +149,7 @@ def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:
             report.line(f"{finding.severity}: {finding}")
 
 
-def _write_run(
-    task: ConfigFitTask, trust: TrustReport, data: Path, out: Path, seconds: float
-) -> None:
+def _write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds: float) -> None:
     """Write run.json, and copies of the config and the bench file, which later commands read."""
     config = task.config
     if (bench := config.content.wheels.motor) is not None:

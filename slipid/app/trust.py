@@ -1,8 +1,5 @@
 """Verdict on a fit, by comparison of its open-loop predictions with those of the encoders."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-
 import numpy as np
 
 from slipid.data.runs import Runs
@@ -12,7 +9,6 @@ from slipid.predict import open_loop as replay
 from slipid.predict.kinematics import Encoder
 from slipid.predict.slip_models import FloorModels
 from slipid.predict.validation import ScoredRun, add_scores
-from slipid.support.content import Content
 from slipid.support.errors import DataError
 
 ENCODER = FloorModels(Encoder())
@@ -20,41 +16,7 @@ MOST_RUNS = 24
 """Largest number of predicted runs on each floor, which are picked evenly from the fitted runs."""
 
 
-@dataclass(frozen=True)
-class TrustReport:
-    """Verdict on a fit, with the prediction errors on which it is based.
-
-    Attributes:
-        trust: verdict with its reasons.
-        floors: mean end-point error over path length [1], of the fit and of the encoders alone, by
-            floor.
-        runs: number of predicted runs.
-    """
-
-    trust: Trust
-    floors: Mapping[str, EndPoints]
-    runs: int
-
-    @property
-    def warning(self) -> str | None:
-        """Return the warning that every picture of an unusable fit shows, or None."""
-        return f"THIS FIT IS {self.trust.word.upper()}" if self.is_bad else None
-
-    @property
-    def is_bad(self) -> bool:
-        """Return whether the fit must not be used."""
-        return self.trust.word == "not to be trusted"
-
-    def to_json(self) -> Content:
-        return {
-            "verdict": self.trust.word,
-            "reasons": list(self.trust.reasons),
-            "runs": self.runs,
-            "endpoint_error_over_path": {name: asdict(e) for name, e in self.floors.items()},
-        }
-
-
-def trust_report(fit: Fit, data: Runs) -> TrustReport:
+def trust_report(fit: Fit, data: Runs) -> Trust:
     """Return the verdict on a fit from open-loop predictions of the runs that it was fitted to."""
     some = data.subset(_picked(data))
     runs: dict[int, ScoredRun] = {}
@@ -73,8 +35,7 @@ def trust_report(fit: Fit, data: Runs) -> TrustReport:
     floors = {
         name: EndPoints(*np.mean(each, axis=0).tolist()) for name, each in sorted(errors.items())
     }
-    trust = verdict_of_trust(floors, fit.converged, fit.parameters.values())
-    return TrustReport(trust, floors, len(runs))
+    return verdict_of_trust(floors, fit.converged, fit.parameters.values(), len(runs))
 
 
 def _picked(data: Runs) -> list[int]:

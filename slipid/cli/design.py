@@ -55,18 +55,18 @@ def design(
     Writes design.json, design.png and design_commands.csv to OUT.
     """
     from slipid.infer.design import proposal
-    from slipid.infer.design.scope import DesignOptions
+    from slipid.infer.design.scope import Scope
     from slipid.infer.fit_file import load as load_fit
     from slipid.report.answers import show_design
     from slipid.support.jax_setup import setup_jax
 
-    motions = headings, speeds, turns, distance
-    wanted = DesignOptions(parameter or (), predict or (), runs, *motions, floor or (), load or ())
+    goals, places = (parameter or (), predict or ()), (floor or (), load or ())
     with Reporter(quiet=quiet) as report:
         setup_jax(quiet=True)
         fit = load_fit(out)
         report.stage("simulating candidate runs")
-        found = proposal.design(fit, wanted)
+        scope = Scope(fit, *goals, runs, headings, speeds, turns, distance, *places)
+        found = proposal.design(scope)
         report.stage("drawing")
         written = write(found, out)
     emit(json, found.content, lambda page: show_design(page, found.content), out, written)

@@ -206,19 +206,24 @@ def _cut(
     turned, ahead, behind = (interpolate(t, angle, when) for when in (at, at + half, at - half))
     span = np.clip(at + half, t[0], t[-1]) - np.clip(at - half, t[0], t[-1])
     speed = (ahead - behind) / np.maximum(span, 1e-3)[:, None]
-    zero = np.zeros((len(edges) - 1, angle.shape[1]))
-    live = data.live[rows]
-    mean_current = current_var = mean_voltage = voltage_var = zero
-    if data.current is not None:
-        amps = data.current[rows]
-        amps = amps if data.current_is_signed else np.abs(amps)
-        fresh = None if data.current_fresh is None else data.current_fresh[rows]
-        mean_current, count, missed = _mean(t, amps, live, fresh, at)
-        current_var = np.where(count > 0, noise / np.maximum(count, 1) + missed, UNREAD)
-    if data.voltage is not None:
-        fresh = None if data.voltage_fresh is None else data.voltage_fresh[rows]
-        mean_voltage, count, missed = _mean(t, data.voltage[rows], live, fresh, at)
-        voltage_var = np.where(count > 0, missed, UNREAD)
+    amps = None if data.current is None else data.current[rows]
+    if amps is not None and not data.current_is_signed:
+        amps = np.abs(amps)
+    volts = None if data.voltage is None else data.voltage[rows]
+
+    def meter(
+        values: np.ndarray | None, fresh: np.ndarray | None, noise: np.ndarray | float
+    ) -> tuple[PerWindow, PerWindow]:
+        """Return the mean of a current or voltage in each window, and the variance of the mean."""
+        if values is None:
+            zero = np.zeros((len(edges) - 1, angle.shape[1]))
+            return zero, zero
+        read = None if fresh is None else fresh[rows]
+        mean, count, missed = _mean(t, values, data.live[rows], read, at)
+        return mean, np.where(count > 0, noise / np.maximum(count, 1) + missed, UNREAD)
+
+    mean_current, current_var = meter(amps, data.current_fresh, noise)
+    mean_voltage, voltage_var = meter(volts, data.voltage_fresh, 0.0)
     return {
         "start": np.asarray(t[edges[0]]),
         "dt": np.diff(t[edges]),

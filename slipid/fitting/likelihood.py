@@ -76,10 +76,10 @@ def batch(
     if floor is None:
         floor = np.asarray([robot.surface_index(s) for s in windows.surface])
     return Batch(
-        surface=jnp.asarray(floor),
-        load=jnp.asarray([robot.load_index(s) for s in windows.load]),
-        session=jnp.asarray([robot.session_index(s) for s in windows.session]),
-        **{name: jnp.asarray(getattr(windows, name)) for name in _AS_THEY_ARE},
+        surface=jax.device_put(floor),
+        load=jax.device_put(np.array([robot.load_index(s) for s in windows.load])),
+        session=jax.device_put(np.array([robot.session_index(s) for s in windows.session])),
+        **{name: jax.device_put(np.asarray(getattr(windows, name))) for name in _AS_THEY_ARE},
         has_current=windows.has_current,
         has_voltage=windows.has_voltage,
         signed=windows.current_is_signed,
@@ -122,6 +122,7 @@ def wheel_speed(robot: Robot, b: Batch) -> PerDrive:
     return (b.turn - (robot.camera.lag - b.lag) * b.speed_change) / b.dt[..., None]
 
 
+@eqx.filter_jit
 def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
     """Return the motion and motor forces of every window at its contact equilibrium.
 
@@ -161,6 +162,7 @@ def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | No
     return jax.tree.map(lambda x: x.reshape(segments, windows, *x.shape[1:]), found)
 
 
+@eqx.filter_jit
 def marker_increments(
     robot: Robot, twist: Marker, dt: Float[Array, "segment window"], session: Int[Array, " segment"]
 ) -> Marker:
@@ -172,6 +174,7 @@ def marker_increments(
     return jax.vmap(jax.vmap(window, (0, 0, None)))(twist, dt, session)
 
 
+@eqx.filter_jit
 def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDrive:
     """Return the predicted motor current of every window [A]; its magnitude for unsigned logs."""
     friction = robot.surfaces.friction[b.surface]  # forces are relative to its mean over wheels
@@ -186,6 +189,7 @@ def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDri
     return jnp.sqrt(amps**2 + SMOOTH**2) + robot.motor.current_offset
 
 
+@eqx.filter_jit
 def measured_increments(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Marker:
     """Return measured marker increments in the frame of each window's start [m, m, rad]."""
 
@@ -198,11 +202,13 @@ def measured_increments(robot: Robot, pose: Float[Array, "segment edge 3"]) -> M
     return jax.vmap(segment)(pose)
 
 
+@eqx.filter_jit
 def motion_residual(robot: Robot, b: Batch, p: Predicted) -> Float[Array, "segment m"]:
     """Return predicted less measured marker increments, a row per segment [m, m, rad]."""
     return (p.increment - measured_increments(robot, b.pose)).reshape(b.dt.shape[0], -1)
 
 
+@eqx.filter_jit
 def electric_residuals(
     robot: Robot, b: Batch, motor_force: MotorForce, noise: ElectricNoise
 ) -> dict[str, Array]:
@@ -249,6 +255,7 @@ def _true_current_share(b: Batch, noise: ElectricNoise) -> tuple[PerDrive, PerDr
     return share, share * b.current_var
 
 
+@eqx.filter_jit
 def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, Array]:
     """Return log |d residuals / d data| of motion and of voltages, one value per segment each.
 
@@ -262,6 +269,7 @@ def log_jacobians(robot: Robot, b: Batch, noise: ElectricNoise) -> tuple[Array, 
     return camera, -jnp.sum(jnp.log(voltage_spread(b, noise)), axis=1)
 
 
+@eqx.filter_jit
 def camera_log_jacobian(
     robot: Robot, pose: Float[Array, "segment edge 3"]
 ) -> Float[Array, " segment"]:

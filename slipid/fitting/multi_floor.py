@@ -176,7 +176,7 @@ class MultiFloorBatch(eqx.Module):
     def of(runs: MultiFloorRuns, robot: Robot) -> "MultiFloorBatch":
         """Return the batch of runs for a robot."""
         b = lk.batch(runs.windows, robot, runs.floor)
-        return MultiFloorBatch(b, jnp.asarray(runs.counts, float))
+        return MultiFloorBatch(b, jax.device_put(np.asarray(runs.counts, float)))
 
     def as_if_on(self, floor: int) -> "MultiFloorBatch":
         """Return the same runs as if all wheels had always stood on one floor."""

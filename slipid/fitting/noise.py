@@ -16,6 +16,7 @@ the ammeter's noise, are added.
 from dataclasses import dataclass
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -43,6 +44,7 @@ class Components(eqx.Module):
     segments: Int[Array, " segment"]
     count: Float[Array, " segment"]
 
+    @eqx.filter_jit
     def covariance(
         self, log_variance: Float[Array, " variance"] | Float[np.ndarray, " variance"]
     ) -> Float[Array, "segment m m"]:
@@ -216,7 +218,7 @@ def _counted(of: Components, live: Bool[np.ndarray, "segment m"], first: int) ->
         which=of.which,
         known=jnp.where(live, of.known, 1.0),
         segments=of.segments + first,
-        count=jnp.asarray(live.sum(axis=1), float),
+        count=jax.device_put(live.sum(axis=1).astype(float)),
     )
 
 
@@ -232,11 +234,11 @@ def _components(
     """
     n, m = base.shape[0], base.shape[-1]
     return Components(
-        base=jnp.asarray(base),
-        which=jnp.asarray(which),
-        known=jnp.asarray(np.full((n, m), FLOOR[block]) + more),
-        segments=jnp.arange(n),
-        count=jnp.full(n, float(m)),
+        base=jax.device_put(base),
+        which=jax.device_put(which),
+        known=jax.device_put(np.full((n, m), FLOOR[block]) + more),
+        segments=jax.device_put(np.arange(n)),
+        count=jax.device_put(np.full(n, float(m))),
     )
 
 

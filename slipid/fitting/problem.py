@@ -133,7 +133,7 @@ class Problem:
             multi_floor=batch,
             blocks=self.noise.blocks,
             shared=shared,
-            typical=jnp.asarray(2 * np.log(self.noise.typical)),
+            typical=jax.device_put(2 * np.log(self.noise.typical)),
             scored=~np.isin(kinds, ("run", "pooled", *SHARED)),
             pooled=self.noise.names.index(POOLED),
             joint=not windows.has_current and MULTI_FLOOR_CURRENT not in self.noise.blocks,
@@ -202,7 +202,7 @@ class Problem:
 
         `effect` holds the latest estimate of the shared effects (segment, 3).
         """
-        where = jnp.asarray(log_v), jnp.asarray(keep), jnp.asarray(effect)
+        where = jax.device_put((np.asarray(log_v), np.asarray(keep), np.asarray(effect)))
         return _weighed(self.objective, residual, *where)
 
     def loss(

@@ -161,7 +161,10 @@ class SharedEffects(eqx.Module):
     session: Float[Array, "run session"]
     numbers: Int[Array, "3 3"]
 
-    def root(self, log_v: Float[Array, " variance"]) -> Float[Array, "3 run coef"]:
+    @eqx.filter_jit
+    def root(
+        self, log_v: Float[Array, " variance"] | Float[np.ndarray, " variance"]
+    ) -> Float[Array, "3 run coef"]:
         """Return S: effects along, across and in yaw per unit coefficient, e = S u."""
         std = jnp.where(self.numbers < 0, 0.0, jnp.exp(0.5 * log_v)[self.numbers])
         parts = [std[k, :, None, None] * x for k, x in ((1, self.near), (2, self.session[None]))]
@@ -191,11 +194,13 @@ def effects_by_floor(
         ]
         found.append(
             SharedEffects(
-                segments=jnp.asarray(mine),
-                effect=jnp.asarray(moved[mine]),
-                near=jnp.asarray(here.basis(speeds_and_loads[floor])),
-                session=jnp.asarray(session[:, : len(names) if len(names) > 1 else 0], float),
-                numbers=jnp.asarray(numbers),
+                segments=jax.device_put(mine),
+                effect=jax.device_put(moved[mine]),
+                near=jax.device_put(here.basis(speeds_and_loads[floor])),
+                session=jax.device_put(
+                    session[:, : len(names) if len(names) > 1 else 0].astype(float)
+                ),
+                numbers=jax.device_put(np.array(numbers)),
             )
         )
     return tuple(found), speeds_and_loads

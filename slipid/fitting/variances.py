@@ -72,6 +72,7 @@ class Objective(eqx.Module):
     pooled: int = eqx.field(static=True)
     joint: bool = eqx.field(static=True)
 
+    @eqx.filter_jit
     def prior_std(self, log_v: Vector) -> Array:
         """Return the prior std of every coordinate at given variances."""
         pooled = jnp.exp(0.5 * jnp.asarray(log_v)[self.pooled])

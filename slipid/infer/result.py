@@ -238,9 +238,9 @@ class Fit:
             DataError: a number does not exist or is fixed.
         """
         from slipid.infer.design import proposal
-        from slipid.infer.design.scope import DesignOptions
+        from slipid.infer.design.scope import Scope
 
-        return proposal.design(self, DesignOptions(parameters=parameters, runs=runs))
+        return proposal.design(Scope(self, parameters=parameters, runs=runs))
 
     def deploy(self) -> "DeployedRobot":
         """Return the model for the robot, with the intervals of the Laplace covariance.

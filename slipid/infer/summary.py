@@ -92,8 +92,8 @@ def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
     z, log_v = state.z, state.log_variance
     electric = problem.electric(z, log_v)
     residual, jacobian = problem.linear(z, electric)
-    seen = problem.weighed(residual, log_v, every, state.shared(len(problem.windows)))
-    roots = seen.whitening.root
+    weighed = problem.weighed(residual, log_v, every, state.shared(len(problem.windows)))
+    roots = weighed.whitening.root
     own = problem.space.electric.astype(float)
     prior = np.asarray(problem.objective.prior_std(log_v)) ** -2
     _, slope = log_jacobian(problem.objective, z, electric, every)
@@ -103,7 +103,7 @@ def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
         white = jnp.einsum("nij,nj->ni", root, residual[k])
         half = jnp.einsum("nij,njp->nip", root, jacobian[k])
         if k == "motion":
-            white, half = _freed(seen.effects, white, half)
+            white, half = _without_effects(weighed.effects, white, half)
         flat = np.asarray(half).reshape(-1, len(z)) * (1.0 if k in MOTION_BLOCKS else own)
         gradient = gradient + flat.T @ np.asarray(white).ravel()
         info = info + flat.T @ flat
@@ -114,5 +114,8 @@ def _remaining(problem: Problem, optimum: Optimum) -> tuple[float, str]:
 
 
 @jax.jit
-def _freed(tied: tuple[EffectPosterior, ...], white: Array, half: Array) -> tuple[Array, Array]:
-    return marginal_residuals(tied, white), marginal_slopes(tied, half)
+def _without_effects(
+    effects: tuple[EffectPosterior, ...], white: Array, half: Array
+) -> tuple[Array, Array]:
+    """Return whitened residuals and their derivative with the shared effects marginalised."""
+    return marginal_residuals(effects, white), marginal_slopes(effects, half)

@@ -63,14 +63,14 @@ def compose(pose: Float[Array, "3"], increment: Float[Array, "3"]) -> Float[Arra
     return jnp.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y, pose[2] + increment[2]])
 
 
+def chain(start: Float[Array, "3"], increments: Float[Array, "step 3"]) -> Float[Array, "edge 3"]:
+    """Return a start pose and the poses after every body-frame increment."""
+    _, poses = jax.lax.scan(lambda pose, d: (compose(pose, d),) * 2, start, increments)
+    return jnp.concatenate([start[None], poses])
+
+
 def path(
     xi: Float[Array, "step 3"], dt: Float[Array, " step"], start: Float[Array, "3"]
 ) -> Float[Array, "edge 3"]:
     """Return the poses before the first and after every step at constant twists (exact SE(2))."""
-
-    def step(pose: Array, increment: Array) -> tuple[Array, Array]:
-        pose = compose(pose, increment)
-        return pose, pose
-
-    poses = jax.lax.scan(step, start, jax.vmap(advance)(xi, dt))[1]
-    return jnp.concatenate([start[None], poses])
+    return chain(start, jax.vmap(advance)(xi, dt))

@@ -37,7 +37,7 @@ from slipid.fitting.variances import Search, Square
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.predict.kinematics import fourier
-from slipid.predict.predictive import PredictiveModel
+from slipid.predict.predictive import PredictiveModel, setups
 from slipid.predict.score import chords, mean_error
 from slipid.predict.slip_model import body_twist, turned
 from slipid.search_space import Space
@@ -218,7 +218,7 @@ def _unpredicted_motion(
     x = np.concatenate([series, turns, late, *swept], axis=-1)
     gap = moved - step
     out = np.empty_like(gap)
-    group = np.array([f"{a}@{b}" for a, b in zip(w.surface, w.load, strict=True)])
+    group = np.array(setups(w))
     for name in np.unique(group):
         mine = np.flatnonzero(group == name)
         square = np.einsum("pki,pkj->pij", x[mine], x[mine])

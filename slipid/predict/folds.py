@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from slipid.data.runs import Runs
 from slipid.fitting.optimise import Optimum, optimise
@@ -49,10 +49,16 @@ def fold_keys(data: Runs) -> list[FoldKey]:
     return [FoldKey(*key) for key in zip(where, heading, speed, strict=True)]
 
 
+def _by_heading(keys: Sequence[FoldKey], of: Callable[[Float[np.ndarray, " run"]], Fold]) -> Fold:
+    """Return the fold of every run by a function of its commanded heading [deg], -1 if unknown."""
+    heading = np.array([f.heading_deg for f in keys], float)
+    known = np.isfinite(heading)
+    return np.where(known, of(np.where(known, heading, 0.0)), -1)
+
+
 def sectors(keys: Sequence[FoldKey]) -> Fold:
     """Return the fold of every run: the 60 deg sector of its commanded heading, -1 if unknown."""
-    heading, known = _headings(keys)
-    return np.where(known, (np.floor((heading % 360.0 + 1e-6) / 60.0) % 6).astype(int), -1)
+    return _by_heading(keys, lambda h: (np.floor((h % 360.0 + 1e-6) / 60.0) % 6).astype(int))
 
 
 def random_headings(keys: Sequence[FoldKey]) -> Fold:
@@ -61,8 +67,7 @@ def random_headings(keys: Sequence[FoldKey]) -> Fold:
     Runs without a commanded heading have fold -1.
     """
     dealt = np.random.default_rng(0).permutation(72) % 6
-    heading, known = _headings(keys)
-    return np.where(known, dealt[np.round(heading / 5.0).astype(int) % 72], -1)
+    return _by_heading(keys, lambda h: dealt[np.round(h / 5.0).astype(int) % 72])
 
 
 def speeds(keys: Sequence[FoldKey], most: int | None = None) -> Fold:
@@ -83,15 +88,6 @@ def speeds(keys: Sequence[FoldKey], most: int | None = None) -> Fold:
         if len(np.unique(fold[(where == floor) & (fold >= 0)])) < 2:
             fold[where == floor] = -1
     return fold
-
-
-def _headings(
-    keys: Sequence[FoldKey],
-) -> tuple[Float[np.ndarray, " run"], Bool[np.ndarray, " run"]]:
-    """Return commanded headings [deg], zero where unknown, and a mask of the known ones."""
-    heading = np.array([f.heading_deg for f in keys], float)
-    known = np.isfinite(heading)
-    return np.where(known, heading, 0.0), known
 
 
 QUESTIONS: dict[str, Callable[[Sequence[FoldKey]], Fold]] = {

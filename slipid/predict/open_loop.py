@@ -18,8 +18,8 @@ from slipid.data.windows import Windows, windows
 from slipid.fitting import likelihood as lk
 from slipid.fitting.noise import travel
 from slipid.fitting.session_effects import by_axis
+from slipid.model import se2
 from slipid.model.robot import Robot
-from slipid.model.se2 import compose
 from slipid.predict.slip_model import turned, turned_left
 from slipid.search_space import Space
 
@@ -97,12 +97,7 @@ def corrected(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Float[Array
 @jax.jit
 def chain(start: Float[Array, "segment 3"], step: Float[Array, "segment window 3"]) -> Array:
     """Return the poses from a start pose and body-frame increments (segment, window + 1, 3)."""
-
-    def one(p: Array, steps: Array) -> Array:
-        _, poses = jax.lax.scan(lambda q, d: (compose(q, d),) * 2, p, steps)
-        return jnp.concatenate([p[None], poses])
-
-    return jax.vmap(one)(start, step)
+    return jax.vmap(se2.chain)(start, step)
 
 
 def tracks_from_increments(

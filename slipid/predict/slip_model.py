@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from slipid.data.wheel_signals import body_steps
 from slipid.data.windows import Windows
 from slipid.fitting.likelihood import marker_increments, measured_increments
 from slipid.model.geometry import Geometry
@@ -348,7 +349,6 @@ def relative_to_start(path: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "e
 
 def body_increments(pose: Float[np.ndarray, "edge 3"]) -> Float[np.ndarray, "step 3"]:
     """Return the body twist times the time of each step of a path (SE(2) logarithm) [m, m, rad]."""
-    turn = np.diff(pose[:, 2])
-    middle = 0.5 * (pose[1:, 2] + pose[:-1, 2])
-    arc = turned(-middle, np.diff(pose[:, :2], axis=0)) / np.sinc(turn / (2 * np.pi))[:, None]
-    return np.column_stack([arc, turn])
+    increments = body_steps(pose)
+    increments[:, :2] /= np.sinc(increments[:, 2:] / (2 * np.pi))  # arcs from chords
+    return increments

@@ -12,9 +12,9 @@ from slipid.report.page import Page, percent, table, verdict
 from slipid.support.content import Content
 
 if TYPE_CHECKING:
-    from slipid.app.trust import TrustReport
     from slipid.infer.posterior.diagnosis import Posterior
     from slipid.infer.result import Fit
+    from slipid.infer.verdicts.disputed import Trust
     from slipid.infer.verdicts.estimates import Estimate
     from slipid.infer.verdicts.profile import Profile
 
@@ -93,7 +93,7 @@ def show_fit(page: Page, fit: "Fit", profiles: "Sequence[Profile]" = ()) -> None
     page.line(f"{'converged' if fit.converged else 'NOT converged'}: {fit.reason}")
 
 
-def show_trust(page: Page, found: "TrustReport") -> None:
+def show_trust(page: Page, found: "Trust") -> None:
     """Write the open-loop errors of the fit on its own runs, and whether it can be trusted."""
     if found.floors:
         made = table(("surface", "end / path", "encoders alone"))
@@ -101,7 +101,7 @@ def show_trust(page: Page, found: "TrustReport") -> None:
             made.add_row(name, percent(e.model), percent(e.encoders))
         page.line(f"open loop from the first pose on, {found.runs} of the fitted runs:")
         page.table(made)
-    page.line(f"verdict: {found.trust}")
+    page.line(f"verdict: {found}")
 
 
 LARGEST_DRIFT = 3e-4

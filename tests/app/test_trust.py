@@ -4,13 +4,12 @@ import json
 
 import pytest
 
-from slipid.app.trust import TrustReport
 from slipid.infer.verdicts.disputed import EndPoints, Trust
 from slipid.plots import drawing
 
 
 def judged(word):
-    return TrustReport(Trust(word, ("it predicts worse",)), {"gray": EndPoints(0.4, 0.1)}, 12)
+    return Trust(word, ("it predicts worse",), {"gray": EndPoints(0.4, 0.1)}, 12)
 
 
 def test_pictures_of_a_fit_that_is_not_to_be_trusted_have_a_warning():

@@ -102,7 +102,7 @@ def writer_of(path: Path, storage: str, **options: Any):
 def write_bag(
     path: Path,
     storage: str,
-    said: Iterable[Message],
+    messages: Iterable[Message],
     definitions: Mapping[str, str] | None = None,
     empty: Mapping[str, str] | None = None,
     **options: Any,
@@ -120,7 +120,7 @@ def write_bag(
 
         for topic, name in (empty or {}).items():
             connection(topic, name)
-        for one in said:
+        for one in messages:
             raw = serialise(message(store, one.type, one.fields), one.type)
             writer.write(connection(one.topic, one.type), round(one.received * 1e9), raw)
     return path

@@ -254,7 +254,7 @@ class Posterior:
         self.pose = np.asarray(a.batch.pose)
         self.mean, self.std = self.space.prior_mean[self.at], np.asarray(a.prior_std)[self.at]
         self.tied = []
-        for tie in a.tied:
+        for tie in a.effects:
             span, root = np.asarray(tie.span), np.asarray(tie.root)
             rows = np.einsum("nma,anq->nmaq", span, root).reshape(-1, root.shape[0] * root.shape[2])
             self.tied.append((np.asarray(tie.segments), rows, np.asarray(tie.factor)))

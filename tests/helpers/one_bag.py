@@ -31,5 +31,5 @@ def read(path: Path, **given: Any) -> RawRun:
     return run
 
 
-def bag(tmp_path: Path, storage: str, *said: list[Message], **options: Any) -> Path:
-    return write_bag(tmp_path / f"bag{SUFFIX[storage]}", storage, in_order(*said), **options)
+def bag(tmp_path: Path, storage: str, *messages: list[Message], **options: Any) -> Path:
+    return write_bag(tmp_path / f"bag{SUFFIX[storage]}", storage, in_order(*messages), **options)

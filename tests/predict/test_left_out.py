@@ -17,7 +17,7 @@ from slipid.lab.selftest.logs import (
     simulate_logs,
     true_robot,
 )
-from slipid.predict import folds, predictive
+from slipid.predict import fitted_slip_model, folds
 from slipid.predict import open_loop as replay
 from slipid.predict.fitted_slip_model import FittedSlipModel
 from slipid.search_space import Choice
@@ -151,7 +151,7 @@ def test_regions_of_left_out_runs_know_what_sessions_share(logs, judged, learnt,
             assert (growth > 0.01 * np.linalg.eigvalsh(plain)[:, -1]).all(), model.name
     nothing = {name: 1e-30 for name in learnt.models[0].variance if name.startswith("session.")}
     monkeypatch.setattr(
-        predictive, "with_session_effects", lambda model, *_: (nothing, model.covariance)
+        fitted_slip_model, "with_session_effects", lambda model, *_: (nothing, model.covariance)
     )
     held = partial(folds.fit_fold, fit=lambda *_, **__: learnt.optimum)
     alone = held(task.problem(), CHOICES, task.dataset, QUESTION, judged)

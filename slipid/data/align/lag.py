@@ -38,7 +38,7 @@ class PoseLag:
 
     @property
     def decisive(self) -> bool:
-        """Return whether poses and wheels agree clearly better with this lag than without one."""
+        """True if poses and wheels agree clearly better at this lag than at zero lag."""
         drop = self.unexplained_at_zero - self.unexplained
         return self.unexplained < GAIN * self.unexplained_at_zero and drop > DROP
 

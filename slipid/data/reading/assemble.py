@@ -15,12 +15,11 @@ from slipid.data.align.clock import Clock, best_clock
 from slipid.data.align.regression import MotionPair
 from slipid.data.log import Log
 from slipid.data.reading.checks import UnusablePose
-from slipid.data.reading.layout import TURNS, SensorLayout
-from slipid.data.reading.signal import RawRun, Signal, clock_of
+from slipid.data.reading.layout import GROUPS, TURNS, SensorLayout
+from slipid.data.reading.signal import RawRun, Signal, clock_of, first_true
 from slipid.data.wheel_signals import integral, readings
 from slipid.support.errors import bad_data
 
-_POSE = ("pose_x", "pose_y", "pose_heading")
 EPOCH = 1e6
 """Time above which a clock must count from 1970, not from the start of the robot [s]."""
 
@@ -81,15 +80,11 @@ def _check_gaps(signal: Signal, layout: SensorLayout) -> None:
         if not len(steps):
             raise signal.source.error("no values", "the motion of every wheel", column=column)
         usual = float(np.median(steps))
-        bad = np.flatnonzero((steps > 20 * usual) & (steps > layout.max_gap))
-        if len(bad):
-            at = int(bad[0])
-            raise signal.source.error(
-                f"no value for {steps[at]:.3g} s",
-                f"one about every {usual:.3g} s, and none missing for {layout.max_gap:g} s",
-                sample=int(there[at]) + 1,
-                column=column,
-            )
+        at = first_true((steps > 20 * usual) & (steps > layout.max_gap))
+        if at is not None:
+            found = f"no value for {steps[at]:.3g} s"
+            expected = f"one about every {usual:.3g} s, and none missing for {layout.max_gap:g} s"
+            raise signal.source.error(found, expected, sample=int(there[at]) + 1, column=column)
 
 
 def _held(signal: Signal, clock: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time column"]:
@@ -149,11 +144,11 @@ def _angle(
         notes.append("wheel angle integrated from the reported speed")
     if slow:
         notes.append("wheel speeds refresh slower than rows: each reading counts once")
-    angle = np.stack(columns, axis=1) * _per_wheel(name, layout)
+    angle = np.stack(columns, axis=1) * per_wheel(name, layout)
     return angle - angle[0]
 
 
-def _per_wheel(name: str, layout: SensorLayout) -> float:
+def per_wheel(name: str, layout: SensorLayout) -> float:
     """Return the angle of the wheel per tick [rad], or per angle at the measured shaft [1]."""
     if name == "wheel_ticks":
         return 2.0 * np.pi / (float(layout.ticks_per_revolution or 1.0) * layout.gear_ratio)
@@ -200,7 +195,7 @@ def _of_wheels(signals: Mapping[str, Signal], layout: SensorLayout) -> dict[str,
 
 def _twist(held: Mapping[str, np.ndarray], rows: int) -> np.ndarray | None:
     """Return the commanded twist, zero along axes that were not logged; None if none was."""
-    names = [f"twist_command_{axis}" for axis in ("x", "y", "yaw")]
+    names = GROUPS["twist_command"]
     if not held.keys() & set(names):
         return None
     return np.concatenate([held.get(name, np.zeros((rows, 1))) for name in names], axis=1)
@@ -212,7 +207,7 @@ def _pose(
     """Return the pose at every time, its heading unwrapped, and whether each row has a new pose."""
     if "pose_x" not in signals:
         return None, None
-    parts = [signals[name] for name in _POSE]
+    parts = [signals[name] for name in GROUPS["pose"]]
     times = clock_of(parts)
     samples = np.full((len(times), 3), np.nan)
     for k, part in enumerate(parts):
@@ -245,7 +240,7 @@ def clock_against(run: RawRun, layout: SensorLayout, poses: Mapping[str, Signal]
         UnusablePose: the motion does not determine the offset between the clocks.
     """
     log = assembled(run, layout)
-    parts = [poses[name] for name in _POSE]
+    parts = [poses[name] for name in GROUPS["pose"]]
     time = clock_of(parts)
     x, y, turned = (part.values[:, 0] for part in parts)
     values = (x, y, np.unwrap(turned))

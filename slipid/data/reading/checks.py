@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from slipid.data.log import Log
 from slipid.data.reading.layout import TURNS, Layout, SensorLayout
-from slipid.data.reading.signal import Signal
+from slipid.data.reading.signal import Signal, first_true
 from slipid.data.reading.table import Table
 from slipid.data.wheel_signals import integral
 from slipid.support.errors import DataError, bad_data
@@ -36,22 +36,17 @@ def check_time(table: Table, layout: Layout, time: Float[np.ndarray, " row"]) ->
 
     if len(time) < MIN_ROWS:
         fail(0, f"{len(time)} row(s) of numbers", f"at least {MIN_ROWS}")
-    bad = np.flatnonzero(~np.isfinite(time))
-    if len(bad):
-        found = "no time" if np.isnan(time[bad[0]]) else "an infinite time"
-        fail(int(bad[0]), found, "a finite number in every row")
+    if (i := first_true(~np.isfinite(time))) is not None:
+        found = "no time" if np.isnan(time[i]) else "an infinite time"
+        fail(i, found, "a finite number in every row")
     steps = np.diff(time)
     if (steps == 0).all():
         fail(1, f"the time is {time[0]:g} s in every row", "time that increases")
-    bad = np.flatnonzero(steps <= 0)
-    if len(bad):
-        i = int(bad[0])
+    if (i := first_true(steps <= 0)) is not None:
         how = "repeats" if steps[i] == 0 else "goes backwards"
         fail(i + 1, f"time {how}: {time[i + 1]:.6g} s after {time[i]:.6g} s", "time that increases")
     usual = float(np.median(steps))
-    bad = np.flatnonzero((steps > 20 * usual) & (steps > layout.max_gap))
-    if len(bad):
-        i = int(bad[0])
+    if (i := first_true((steps > 20 * usual) & (steps > layout.max_gap))) is not None:
         found = f"the clock jumps by {steps[i]:.3g} s from {time[i]:.6g} s"
         fail(i + 1, found, f"steps of about {usual:.3g} s and none above {layout.max_gap:g} s")
     if not 1e-5 < usual < 60.0:
@@ -115,11 +110,9 @@ def _check_wheels(log: Log, signals: Mapping[str, Signal], layout: SensorLayout)
     # A wheel is dead if it was commanded to turn by more than 1 rad and its angle never changes.
     commanded = np.abs(integral(log.time, command)[-1])
     still = np.ptp(log.wheel_angle, axis=0) == 0
-    dead = np.flatnonzero(still & (commanded > 1.0))
-    if len(dead):
-        j = int(dead[0])
-        found = f"constant, though the wheel was commanded {commanded[j]:.3g} rad"
-        raise _at(log, signals, "wheel", None, j, found, "a wheel that turns when commanded")
+    if (dead := first_true(still & (commanded > 1.0))) is not None:
+        found = f"constant, though the wheel was commanded {commanded[dead]:.3g} rad"
+        raise _at(log, signals, "wheel", None, dead, found, "a wheel that turns when commanded")
 
 
 def _check_pose(log: Log, signals: Mapping[str, Signal], layout: SensorLayout) -> None:

@@ -48,6 +48,11 @@ SEVERAL = {"pose_quaternion": "1"}
 """Channels with a fixed number of columns: x, y, z and w of a quaternion."""
 CHANNELS: dict[str, str] = {**SINGLE, **SEVERAL, **PER_WHEEL}
 """Every channel that a layout may name, with its SI unit."""
+GROUPS = {
+    "pose": ("pose_x", "pose_y", "pose_heading"),
+    "twist_command": ("twist_command_x", "twist_command_y", "twist_command_yaw"),
+}
+"""Groups of channels that one message contains, by the name of the group in the layout of a bag."""
 TURNS = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
 """Channels from which the wheels' turns are known; the first available one counts."""
 
@@ -114,12 +119,21 @@ class SensorLayout:
     max_heading_jump: Positive = 1.6
 
     def lacks(self, channels: Collection[str]) -> str | None:
-        """Return the setting that channels need and the layout lacks, or None."""
-        if "wheel_ticks" in channels and self.ticks_per_revolution is None:
+        """Return a text about a channel or setting that channels need and that is absent, or None.
+
+        `channels` are all channels of a run.
+        """
+        have = {*channels}
+        if "wheel_ticks" in have and self.ticks_per_revolution is None:
             return "wheel_ticks without ticks_per_revolution; expected ticks per turn of the motor"
-        if {"motor_torque", "wheel_torque"} & {*channels} and self.torque_constant is None:
+        if {"motor_torque", "wheel_torque"} & have and self.torque_constant is None:
             wanted = "expected the motor's torque per current [N m/A]"
             return f"a torque without torque_constant; {wanted}"
+        turned = {"pose_heading", "pose_quaternion"} & have
+        if 0 < len({"pose_x", "pose_y"} & have) + len(turned) != 3:
+            return (
+                "a pose in parts; expected x, y and either heading or quaternion, or none of them"
+            )
         return None
 
 

@@ -258,12 +258,6 @@ def _problem(layout: Layout) -> str | None:
         return f"channels disagree on the number of wheels: {counts}; expected the same of each"
     if lacking := layout.lacks(have):
         return lacking
-    turned = {"pose_heading", "pose_quaternion"} & set(have)
-    if 0 < len({"pose_x", "pose_y"} & set(have)) + len(turned) != 3:
-        return (
-            "a pose in parts; expected pose_x, pose_y and one of pose_heading and "
-            "pose_quaternion, or none of them"
-        )
     for name, one in [("the robot's own file", layout), *layout.beside.items()]:
         if one.clock == "own" and not set(one.channels) <= {"time", *POSES}:
             return f"{name}: clock = 'own'; expected it for a file that has poses alone"

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from slipid.data.align.clock import Clock
 from slipid.support.errors import DataError, bad_data
@@ -107,14 +107,17 @@ def clock_of(signals: Sequence[Signal]) -> Float[np.ndarray, " time"]:
     return np.unique(np.concatenate([signal.time for signal in signals]))
 
 
+def first_true(mask: Bool[np.ndarray, " _"]) -> int | None:
+    """Return the index of the first True, or None if there is none."""
+    return int(np.argmax(mask)) if mask.any() else None
+
+
 def heading(turned: Signal) -> Signal:
     """Return the yaw angle [rad] of quaternions x, y, z, w; their length must be 1."""
     x, y, z, w = turned.values.T
     size = np.sqrt(x**2 + y**2 + z**2 + w**2)
-    bad = np.flatnonzero(np.abs(size - 1.0) > 0.05)
-    if len(bad):
-        found = f"a quaternion of length {size[bad[0]]:.3g}"
-        expected = "x, y, z, w in this order, of length 1"
-        raise turned.source.error(found, expected, sample=int(bad[0]))
+    if (bad := first_true(np.abs(size - 1.0) > 0.05)) is not None:
+        found = f"a quaternion of length {size[bad]:.3g}"
+        raise turned.source.error(found, "x, y, z, w in this order, of length 1", sample=bad)
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
     return Signal(turned.time, yaw[:, None], turned.source)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from slipid.data.reading.layout import Channel, Layout
 from slipid.data.reading.units import same_unit
-from slipid.support.errors import bad_data
+from slipid.support.errors import bad_data, first_names
 
 if TYPE_CHECKING:
     from pyarrow import Table as ParquetTable
@@ -30,23 +30,23 @@ class Table:
     Attributes:
         path: path of the file.
         sha256: SHA-256 hash of the file's bytes.
-        names: names of the columns that were read, or their positions.
+        names: names of the columns that were read; texts of their positions without names.
         values: numbers in the cells, NaN where a cell is empty.
         lines: line number in the file of each row of `values` (record number for Parquet), from 1.
     """
 
     path: Path
     sha256: str
-    names: tuple[str | int, ...]
+    names: tuple[str, ...]
     values: Float[np.ndarray, "row column"]
     lines: Int[np.ndarray, " row"]
 
-    def __getitem__(self, name: str | int) -> Float[np.ndarray, " row"]:
+    def __getitem__(self, name: str) -> Float[np.ndarray, " row"]:
         return self.values[:, self.names.index(name)]
 
     def stacked(self, channel: Channel) -> Float[np.ndarray, "row column"]:
         """Return the cells of a channel's columns, side by side."""
-        return self.values[:, [self.names.index(c) for c in channel.columns]]
+        return self.values[:, [self.names.index(str(c)) for c in channel.columns]]
 
     def rows(self, which: slice | np.ndarray) -> "Table":
         """Return the table with the selected rows."""
@@ -69,9 +69,8 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     sha256 = hashlib.sha256(raw).hexdigest()
     if path.suffix == ".parquet":
         header, values, texts = parquet_numbers(path, raw)
-        layout = replace(layout, names_row=layout.names_row or 1)
         names = wanted_names(path, header, layout, all_columns)
-        where = [header.index(str(name)) for name in names]
+        where = [header.index(name) for name in names]
         for at in sorted(texts.intersection(where)):
             raise bad_data(path, "values of another type", "numbers", column=header[at])
         return Table(path, sha256, names, values[:, where], 1 + np.arange(len(values)))
@@ -84,16 +83,15 @@ def read_table(path: Path, layout: Layout, *, all_columns: bool = False) -> Tabl
     check_fields(path, body, header, layout)
     if layout.units_row:
         check_units(path, text[layout.units_row - 1], header, layout)
-    where = [header.index(str(name)) if layout.names_row else int(name) for name in names]
+    where = [header.index(name) for name in names]
     values, wrong = cell_numbers(body, layout.delimiter, where)
     for i, j in np.argwhere(wrong)[:1].tolist():
         cell = cells_of(body[i], layout.delimiter)[where[j]]
         comma = re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell)
         expected = "a number" + " with a decimal point, not a decimal comma" * bool(comma)
-        row, column = layout.first_data_row + i, str(names[j])
-        raise bad_data(path, f"'{cell[:40]}'", expected, row=row, column=column)
-    lines_read = layout.first_data_row + np.arange(len(values))
-    return Table(path, sha256, names, values, lines_read)
+        row = layout.first_data_row + i
+        raise bad_data(path, f"'{cell[:40]}'", expected, row=row, column=names[j])
+    return Table(path, sha256, names, values, layout.first_data_row + np.arange(len(values)))
 
 
 def bytes_of(path: Path, limit: int = -1) -> bytes:
@@ -192,7 +190,7 @@ def number_in(cell: str) -> float | None:
 
 
 def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
-    """Return the name of every column, empty where it has none or there is no row of names.
+    """Return the name of every column, empty where it has none; their positions without names.
 
     Raises:
         DataError: the file ends before, another delimiter is used, or the names are numbers.
@@ -203,48 +201,39 @@ def header_cells(path: Path, lines: list[str], layout: Layout) -> list[str]:
         raise bad_data(path, f"the file ends after row {len(lines)}", expected, row=len(lines))
     line = lines[row - 1]
     cells = cells_of(line, layout.delimiter)
-    counts = {d: line.count(d) for d in (";", ",", "\t", "|") if d != layout.delimiter}
-    likely = max(counts, key=lambda d: counts[d])
-    if len(cells) < 2 <= counts[likely] + 1:
-        found = f"no delimiter {layout.delimiter!r}, but {counts[likely]} of {likely!r}"
+    others = {line.count(d): d for d in (";", ",", "\t", "|") if d != layout.delimiter}
+    if len(cells) == 1 and max(others):
+        found = f"no delimiter {layout.delimiter!r}, but {max(others)} of {others[max(others)]!r}"
         raise bad_data(path, found, f"cells separated by {layout.delimiter!r}", row=row)
     if not layout.names_row:
-        return [""] * len(cells)
-    try:
-        [float(cell) for cell in cells if cell]
-    except ValueError:
-        return cells
-    names = ", ".join(map(str, layout.columns[:6])) + ", ..." * (len(layout.columns) > 6)
-    raise bad_data(path, "numbers", f"the column names ({names})", row=row)
+        return [str(position) for position in range(len(cells))]
+    if all(number_in(cell) is not None for cell in cells if cell):
+        expected = f"the column names ({first_names(map(str, layout.columns))})"
+        raise bad_data(path, "numbers", expected, row=row)
+    return cells
 
 
 def wanted_names(
     path: Path, header: list[str], layout: Layout, all_columns: bool
-) -> tuple[str | int, ...]:
-    """Return the names, or positions, of the columns to read.
+) -> tuple[str, ...]:
+    """Return the names of the columns to read, or their positions as texts.
 
     Raises:
         DataError: a column of the layout is missing, or a name occurs more than once.
     """
-    if not layout.names_row:
-        for position in layout.columns:
-            if int(position) >= len(header):
-                found = f"{len(header)} columns"
-                expected = f"a column at position {position} (counted from 0)"
-                raise bad_data(path, found, expected, row=layout.first_data_row)
-        return tuple(range(len(header))) if all_columns else layout.columns
-    for name in layout.columns:
+    used = tuple(map(str, layout.columns))
+    row, count = layout.names_row or layout.first_data_row, Counter(header)
+    for name in used:
         if name not in header:
-            unused = [other for other in header if other not in layout.columns]
-            near = get_close_matches(str(name), unused, n=2)
+            near = get_close_matches(name, [other for other in header if other not in used], n=2)
             hint = f"did you mean {' or '.join(near)}? It has" if near else "it has"
             expected = f"it among the names; {hint} {', '.join(filter(None, header))}"
-            raise bad_data(path, "no such column", expected, row=layout.names_row, column=str(name))
-    names = tuple(filter(None, header)) if all_columns else layout.columns
-    for name, times in Counter(header).items():
-        if times > 1 and name in names:
-            found = f"{times} columns of this name"
-            raise bad_data(path, found, "one", row=layout.names_row, column=name)
+            raise bad_data(path, "no such column", expected, row=row, column=name)
+    names = tuple(filter(None, header)) if all_columns else used
+    for name in names:
+        if count[name] > 1:
+            found = f"{count[name]} columns of this name"
+            raise bad_data(path, found, "one", row=row, column=name)
     return names
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from slipid.infer.design import fisher as info
 from slipid.infer.design.planned_runs import PlannedRun, drivable, heading_grid, paper_grid
 from slipid.infer.design.planner import Goal, Planner, parameter_goal, prediction_goal, weighed
-from slipid.infer.design.scope import DesignOptions, Scope
+from slipid.infer.design.scope import Scope
 from slipid.infer.result import Fit
 from slipid.infer.verdicts.estimates import NEEDS_VOLTAGE
 from slipid.model.robot import Validity
@@ -69,17 +69,18 @@ class Design:
         return design_figure(self)
 
 
-def design(fit: Fit, options: DesignOptions) -> Design:
+def design(scope: Scope) -> Design:
     """Return the runs that reduce the stds of the goals most, and a comparison with grids of runs.
 
     Raises:
         DataError: the fit lacks a requested parameter, floor, load or prediction.
     """
-    scope, planner = Scope(fit, options), Planner.of(fit)
+    fit = scope.fit
+    planner = Planner.of(fit)
     candidates = scope.candidates()
     rows, now = planner.rows(candidates), planner.after(fit)
     last = now.plus(rows, info.ENDLESS)
-    weights = _goals(fit, options, scope, planner)
+    weights = _goals(scope, planner)
     lost = {g.name: s for g in weights if (s := _out_of_reach(fit, g, now, last, len(candidates)))}
     goals = [g for g in weights if g.name not in lost]
     content: Content = {
@@ -110,7 +111,7 @@ def design(fit: Fit, options: DesignOptions) -> Design:
     chosen: list[int] = []
     if goals:
         goal = weighed(goals, now, [weights[g] for g in goals])
-        chosen, _ = info.greedy(now, rows, goal, options.runs)
+        chosen, _ = info.greedy(now, rows, goal, scope.runs)
         chosen = info.exchanged(now, rows, goal, chosen)
         content["criterion"] = info.criterion_path(now, rows, goal, chosen)
         content["runs_saved"] = _saved(scope, planner, goals, goal, candidates, rows)
@@ -133,23 +134,24 @@ def design(fit: Fit, options: DesignOptions) -> Design:
         )
     content["messages"] = [*lost.values(), *_extrapolated(fit, runs)]
     content["data"] = {"hash": fit.data_hash, "runs": len(fit.runs)}
-    requested = bool(options.parameters or options.predictions)
+    requested = bool(scope.parameters or scope.predictions)
     reachable = bool(goals) and not (requested and lost)
     return Design(content, runs, scope.base, fit.validity, reachable)
 
 
-def _goals(fit: Fit, options: DesignOptions, scope: Scope, planner: Planner) -> dict[Goal, float]:
-    found = [parameter_goal(planner, path) for path in _paths(fit, options.parameters)]
+def _goals(scope: Scope, planner: Planner) -> dict[Goal, float]:
+    """Return the requested goals, or predictions and weakly identified numbers, with weights."""
+    found = [parameter_goal(planner, path) for path in _paths(scope.fit, scope.parameters)]
     found += [
         prediction_goal(planner, f"prediction {text}", scope.predicted(text))
-        for text in dict.fromkeys(options.predictions)
+        for text in dict.fromkeys(scope.predictions)
     ]
     if found:
         return dict.fromkeys(found, 1.0)
     weak = [
         parameter_goal(planner, e.path)
         for e in planner.space.free
-        if e.part != "camera" and fit.parameters[e.path].verdict == "weak"
+        if e.part != "camera" and scope.fit.parameters[e.path].verdict == "weak"
     ]
     ends = prediction_goal(planner, "prediction of every floor", scope.all_predicted())
     return {ends: 1.0} | dict.fromkeys(weak, 1.0 / max(len(weak), 1))

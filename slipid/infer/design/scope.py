@@ -1,4 +1,4 @@
-"""Options of a proposal of runs: its goals, and the candidate runs that they allow."""
+"""Scope of a proposal of runs: its goals, and the candidate runs that its options allow."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -12,35 +12,6 @@ from slipid.support.errors import DataError
 
 MOST_SPEEDS = 4
 """Largest number of candidate speeds of a floor."""
-
-
-@dataclass(frozen=True)
-class DesignOptions:
-    """Options of `slipid design`; one that is not given takes the range that fitted runs cover.
-
-    A goal is a number, or a prediction, whose std the new runs are to reduce.
-
-    Attributes:
-        parameters: patterns of the names of goals.
-        predictions: goals of the form `floor[@load][:speed[:heading_deg]]`.
-        runs: number of runs to propose.
-        headings: headings of candidates, numbers with commas [deg].
-        speeds: speeds of candidates, numbers with commas [m/s].
-        turns: yaw rates of candidates, numbers with commas [deg/s].
-        distance: path length of candidates [m].
-        floors: floors of candidates.
-        loads: load set-ups of candidates.
-    """
-
-    parameters: Sequence[str] = ()
-    predictions: Sequence[str] = ()
-    runs: int = 12
-    headings: str | None = None
-    speeds: str | None = None
-    turns: str | None = None
-    distance: float | None = None
-    floors: Sequence[str] = ()
-    loads: Sequence[str] = ()
 
 
 def _numbers(name: str, text: str | None, least: float = -np.inf) -> tuple[float, ...] | None:
@@ -58,21 +29,43 @@ def _numbers(name: str, text: str | None, least: float = -np.inf) -> tuple[float
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """Goals and candidate runs of a proposal: floors and loads of the fit, limited by the options.
+    """Goals and candidate runs of a proposal, by the options of `slipid design`.
+
+    An option that is not given takes the range that the fitted runs cover. A goal is a number, or a
+    prediction, whose std the new runs are to reduce.
+
+    Attributes:
+        fit: the fit.
+        parameters: patterns of the names of goals.
+        predictions: goals of the form `floor[@load][:speed[:heading_deg]]`.
+        runs: number of runs to propose.
+        headings: headings of candidates, numbers with commas [deg].
+        speeds: speeds of candidates, numbers with commas [m/s].
+        turns: yaw rates of candidates, numbers with commas [deg/s].
+        length: path length of candidates [m].
+        floors: floors of candidates.
+        loads: load set-ups of candidates.
 
     Raises:
         DataError: the fit lacks a floor or load, a list has no numbers, or no run is drivable.
     """
 
     fit: Fit
-    options: DesignOptions
+    parameters: Sequence[str] = ()
+    predictions: Sequence[str] = ()
+    runs: int = 12
+    headings: str | None = None
+    speeds: str | None = None
+    turns: str | None = None
+    length: float | None = None
+    floors: Sequence[str] = ()
+    loads: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        length = self.options.distance
-        if length is not None and not 0 < length < np.inf:
-            raise DataError(f"--distance {length:g}: expected metres above zero")
-        self._known("floor", self.options.floors, self.fit.validity)
-        self._known("load set-up", self.options.loads, self.fit.robot.body.loads)
+        if self.length is not None and not 0 < self.length < np.inf:
+            raise DataError(f"--distance {self.length:g}: expected metres above zero")
+        self._known("floor", self.floors, self.fit.validity)
+        self._known("load set-up", self.loads, self.fit.robot.body.loads)
 
     @staticmethod
     def _known(what: str, names: Sequence[str], known: Collection[str]) -> None:
@@ -88,8 +81,8 @@ class Scope:
     @property
     def setups(self) -> tuple[Setup, ...]:
         """Floors and loads of candidates."""
-        floors = self.options.floors or tuple(self.fit.validity)
-        loads = self.options.loads or self.fit.robot.body.loads
+        floors = self.floors or tuple(self.fit.validity)
+        loads = self.loads or self.fit.robot.body.loads
         return tuple((floor, load) for floor in floors for load in loads)
 
     @property
@@ -115,19 +108,19 @@ class Scope:
     @property
     def distance(self) -> dict[str, float]:
         """Path length of each floor's candidates [m], by default the mean of its runs."""
-        if self.options.distance is not None:
-            return dict.fromkeys(self.fit.validity, self.options.distance)
+        if self.length is not None:
+            return dict.fromkeys(self.fit.validity, self.length)
         return {floor: round(v.distance, 2) for floor, v in self.fit.validity.items()}
 
     def candidates(self) -> tuple[PlannedRun, ...]:
-        speeds = _numbers("speeds", self.options.speeds, least=0.0)
-        turns = _numbers("turns", self.options.turns)
+        speeds = _numbers("speeds", self.speeds, least=0.0)
+        turns = _numbers("turns", self.turns)
         found = candidates(
             self.setups,
             dict.fromkeys(self.fit.validity, speeds) if speeds else self.driven_speeds,
             self.distance,
             self.base,
-            _numbers("headings", self.options.headings) or HEADINGS,
+            _numbers("headings", self.headings) or HEADINGS,
             np.radians(turns).tolist() if turns else None,
         )
         return self._drivable(

@@ -1,6 +1,6 @@
 """Coordinates of a density, and the data and fitted values from which it is computed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -89,7 +89,7 @@ class Anchor(eqx.Module):
         scale: square root of the weight of each segment, small for an outlier.
         log_det: log determinant of each segment's noise covariance.
         shared: shared effects by floor.
-        tied: posterior of the shared effects, given residuals whitened by root and scale.
+        effects: posterior of the shared effects, given residuals whitened by root and scale.
         twist: twist of every window at the fit.
         twist_slope: derivative of the twists by the search vector.
         electric: noise that predictions of voltages depend on, with the fitted resistance.
@@ -102,7 +102,7 @@ class Anchor(eqx.Module):
     scale: dict[str, Array]
     log_det: dict[str, Array]
     shared: tuple[SharedEffects, ...]
-    tied: tuple[EffectPosterior, ...]
+    effects: tuple[EffectPosterior, ...]
     twist: Float[Array, "segment window 3"]
     twist_slope: Float[Array, "segment window 3 free"]
     electric: lk.ElectricNoise
@@ -133,7 +133,7 @@ class Anchor(eqx.Module):
             scale={k: jnp.sqrt(w * part[k] / part["motion"]) for k, w in weight.items()},
             log_det={k: -2 * jnp.sum(jnp.log(d), axis=-1) for k, d in diagonal.items()},
             shared=problem.objective.shared,
-            tied=weighed.effects,
+            effects=weighed.effects,
             twist=twist,
             twist_slope=slope,
             electric=electric,
@@ -152,8 +152,7 @@ class Anchor(eqx.Module):
 
     def noise(self, robot: Robot) -> lk.ElectricNoise:
         """Return the noise that predictions of voltages depend on, with a robot's resistance."""
-        held = self.electric
-        return lk.ElectricNoise(held.voltage_std, held.scatter, robot.motor.resistance)
+        return replace(self.electric, resistance=robot.motor.resistance)
 
     def white(self, k: str, r: Float[Array, "segment m"]) -> Float[Array, "segment m"]:
         """Return the residuals of a block, whitened and weighted."""

@@ -94,17 +94,12 @@ class Density:
         """Return the search vector with the coordinates x of the density and all others fitted."""
         return anchor.z.at[self.structure].set(x)
 
-    def of_all(
-        self, of: Callable[..., Result], x: np.ndarray | Array, held: HeldMotion | None = None
-    ) -> Result:
-        """Return the results of a method for one vector, for many vectors.
+    def mapped(self, of: Callable[..., Result], *many: Any) -> Result:
+        """Return the results of a function of (density, anchor, element) for many elements.
 
-        It is compiled once for all densities with the same coordinates.
+        `many` are the arrays of the elements, or None, one for each further argument of the
+        function. It is compiled once for all densities with the same coordinates.
         """
-        return self.mapped(of, (jnp.asarray(x), held))
-
-    def mapped(self, of: Callable[..., Result], many: tuple[Any, ...]) -> Result:
-        """Return the results of a function of (density, anchor, element) for many elements."""
         form = self._form
         if of not in form._each:
 
@@ -113,8 +108,8 @@ class Density:
 
             # stored here since JAX's own cache of compiled functions would never free it
             form._each[of] = jax.jit(each)
-        compiled: Callable[..., Result] = form._each[of]
-        return compiled(self.anchor, many)
+        found: Result = form._each[of](self.anchor, many)
+        return found
 
     def terms(
         self, x: Float[np.ndarray, "walker size"], held: HeldMotion | None = None
@@ -123,7 +118,7 @@ class Density:
 
         The electric part needs the motion of each walker, as returned by `hold`.
         """
-        out = np.array(self.of_all(Density.sums, x, held))
+        out = np.array(self.mapped(Density.sums, x, held))
         out[~np.isfinite(out)] = -np.inf
         return out
 
@@ -131,7 +126,7 @@ class Density:
         self, x: Float[np.ndarray, "walker size"], held: HeldMotion | None = None
     ) -> Float[np.ndarray, "walker size"]:
         """Return the gradient of every walker's log posterior; the arguments are as in `terms`."""
-        return np.array(self.of_all(Density._gradient, x, held))
+        return np.array(self.mapped(Density._gradient, x, held))
 
     def _gradient(self, anchor: Anchor, x: Array, held: HeldMotion | None) -> Array:
         return jax.grad(lambda x: jnp.sum(self.sums(anchor, x, held)))(x)
@@ -146,7 +141,7 @@ class Density:
             less = expected(r.shape[-1])  # f, so that the mode is that of the fit
             if k == "motion":
                 more = less * camera
-                for floor, posterior in enumerate(anchor.tied):
+                for floor, posterior in enumerate(anchor.effects):
                     out = out.at[floor].add(0.5 * _explained(posterior, white))
             elif k == "voltage":
                 more = less * spread
@@ -190,7 +185,7 @@ class Density:
         if "motion" not in found.residuals:
             return found
         motion = found.residuals["motion"]
-        effect = mean_effects(anchor.tied, anchor.white("motion", motion))
+        effect = mean_effects(anchor.effects, anchor.white("motion", motion))
         for of in anchor.shared:
             off = jnp.einsum("nma,na->nm", of.effect, effect[of.segments])
             motion = motion.at[of.segments].add(-off)
@@ -215,7 +210,7 @@ class Density:
 
     def hold(self, x: Float[np.ndarray, "walker size"]) -> HeldMotion:
         """Return the motion of the walkers of a motion density, for use with the electric part."""
-        return self.of_all(Density._held, x)
+        return self.mapped(Density._held, x, None)
 
     def _held(self, anchor: Anchor, x: Array, _: None) -> HeldMotion:
         z = self.full(anchor, x)
@@ -267,7 +262,7 @@ def electric_given_motion(
     student *= np.sqrt(_DEGREES / rng.chisquare(_DEGREES, student.shape[:2]))[..., None]
     chance = np.log(rng.uniform(size=(len(flat), _PROPOSALS)))
     many = (first.hold(flat), *map(jnp.asarray, (start, student, chance)))
-    drawn, moved = second.mapped(_draw, many)
+    drawn, moved = second.mapped(_draw, *many)
     return np.asarray(drawn).reshape(*x.shape[:2], -1), np.asarray(moved)
 
 

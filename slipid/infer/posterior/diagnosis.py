@@ -207,31 +207,18 @@ def estimates(
     geometric. Flat directions are those of the fit.
     """
     every, flat = draws.reshape(-1, fit.space.size), members(fit.flat)
-    out, prior_std = dict(fit.parameters), fit.verdict_space.prior_std
-    for e in fit.space.free:
-        at, d, old = fit.space.slices[e.path], e.declaration, fit.parameters[e.path]
+    out, space = dict(fit.parameters), fit.verdict_space
+    for e in space.free:
+        at, d, old = space.slices[e.path], e.declaration, fit.parameters[e.path]
         z = every[:, at]
-        values = np.asarray(jax.vmap(d.to_si)(jnp.asarray(z)))
-        low, high = np.quantile(values, [0.05, 0.95], axis=0)
-        scaled = np.cov((z / prior_std[at]).T).reshape(e.coordinates, e.coordinates)
-        ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
-        pairs = tuple(zip(low.tolist(), high.tolist(), strict=True))
+        mean, block = z.mean(axis=0), np.cov(z.T).reshape(e.coordinates, e.coordinates)
+        value = np.atleast_1d(d.to_si(mean))
         no_scale = e.path in verdicts.NEEDS_VOLTAGE and not fit.channels.voltage
         forced = old.verdict if no_scale or old.verdict == "at_bound" else None
-        from_zero = verdicts.from_zero(d, z.std(axis=0))
-        verdict, provenance = verdicts.verdict_of(ratio, from_zero, forced, e.path in flat)
-        pull = (z.mean(axis=0) - fit.space.prior_mean[at]) / prior_std[at]
-        out[e.path] = replace(
-            old,
-            value=verdicts.plain(d.to_si(jnp.asarray(z.mean(axis=0)))),
-            std=verdicts.plain(values.std(axis=0)),
-            interval90=pairs[0] if len(pairs) == 1 else pairs,
-            ratio=ratio,
-            verdict=verdict,
-            provenance=provenance,
-            pull=float(pull[np.argmax(np.abs(pull))]),
-            source="posterior",
-        )
+        prior = space.prior_mean[at], space.prior_std[at]
+        base = replace(old, value=verdicts.plain(value))
+        is_flat = e.path in flat
+        out[e.path] = verdicts.judged(base, d, value, mean, block, prior, forced, is_flat, z)
     return marked(out, fit.disputes)
 
 
@@ -241,17 +228,9 @@ def identified(found: Posterior) -> Content:
     content = identified_json(fit)
     for path, e in found.parameters.items():
         content["parameters"][path] = number_json(e)
-    ratios = verdicts.derived(fit.space, flat.mean(axis=0), np.cov(flat.T), fit.channels.voltage)
-    content["derived"] = {e.path: number_json(_drawn(e, fit, flat)) for e in ratios}
+    z, covariance, volts = flat.mean(axis=0), np.cov(flat.T), fit.channels.voltage
+    ratios = verdicts.derived(fit.space, z, covariance, volts, flat)
+    content["derived"] = {e.path: number_json(e) for e in ratios}
     some = flat[:: max(1, len(flat) // 400)]
-    curves = curves_of.curves(fit.space, flat.mean(axis=0), some, required(fit.problem).batch)
+    curves = curves_of.curves(fit.space, z, some, required(fit.problem).batch)
     return content | {"curves": curves_json(curves), "messages": list(found.messages)}
-
-
-def _drawn(ratio: verdicts.Estimate, fit: Fit, flat: np.ndarray) -> verdicts.Estimate:
-    """Return a ratio of numbers with the interval and the std of its draws."""
-    over, under = (fit.space.slices[path] for path in ratio.path.rsplit("/", 1))
-    draws = np.exp(flat[:, over] - flat[:, under])
-    low, high = np.quantile(draws, [0.05, 0.95]).tolist()
-    std = float(draws.std())
-    return replace(ratio, std=std, interval90=(low, high), source="posterior")

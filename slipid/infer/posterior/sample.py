@@ -144,7 +144,7 @@ def tree(found: Posterior, about: Mapping[str, str] | None = None) -> DataTree:
     noise, noise_dims = _noise(problem, found)
     x = found.z
     density = Density(problem, replace(Fitted.of(fit), z=x.mean(axis=(0, 1))), EVERYTHING)
-    of_segment = density.of_all(Density.log_likelihoods, x.reshape(-1, x.shape[-1]))
+    of_segment = density.mapped(Density.log_likelihoods, x.reshape(-1, x.shape[-1]), None)
     per_segment = {k: np.asarray(v).reshape(*x.shape[:2], -1) for k, v in of_segment.items()}
     run = np.unique(w.run)
     onto = (np.asarray(w.run)[:, None] == run).astype(float)
@@ -267,7 +267,7 @@ def _replicates(
     some, noise = x[:, picked], log_variance[:, picked].reshape(-1, log_variance.shape[-1])
     rng = np.random.default_rng(0)
     flat = some.reshape(-1, x.shape[-1])
-    residuals = density.of_all(Density.residual_blocks, flat)
+    residuals = density.mapped(Density.residual_blocks, flat, None)
     out = {k: np.array(v) for k, v in residuals.items()}
     for k, r in out.items():
         for one, log_v in zip(r, noise, strict=True):

@@ -15,7 +15,7 @@ A fit is trusted if it converged, predicts its runs, and has the numbers of a ph
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import combinations
 from math import isfinite
@@ -27,6 +27,7 @@ from scipy.stats import chi2, norm
 from slipid.fitting.variances import Search, Square
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.search_space import Space
+from slipid.support.content import Content
 
 LARGEST_P_VALUE = 0.01
 """Largest p-value at which a disagreement is reported."""
@@ -109,13 +110,40 @@ class EndPoints:
 
 @dataclass(frozen=True)
 class Trust:
-    """Level of trust in a fit, and the reasons against it, one sentence each."""
+    """Trust in a fit, with the prediction errors on which it is based.
+
+    Attributes:
+        word: level of trust.
+        reasons: reasons against the fit, one sentence each.
+        floors: errors by floor.
+        runs: number of predicted runs.
+    """
 
     word: Word
     reasons: tuple[str, ...]
+    floors: Mapping[str, EndPoints]
+    runs: int = 0
 
     def __str__(self) -> str:
         return f"{self.word}: {'; '.join(self.reasons)}" if self.reasons else self.word
+
+    @property
+    def is_bad(self) -> bool:
+        """True if the fit must not be used."""
+        return self.word == WORDS[-1]
+
+    @property
+    def warning(self) -> str | None:
+        """Warning that every picture of an unusable fit shows, or None."""
+        return f"THIS FIT IS {self.word.upper()}" if self.is_bad else None
+
+    def to_json(self) -> Content:
+        return {
+            "verdict": self.word,
+            "reasons": list(self.reasons),
+            "runs": self.runs,
+            "endpoint_error_over_path": {name: asdict(e) for name, e in self.floors.items()},
+        }
 
 
 _Reason = tuple[int, str]
@@ -123,7 +151,10 @@ _Reason = tuple[int, str]
 
 
 def verdict_of_trust(
-    floors: Mapping[str, EndPoints], converged: bool, parameters: Iterable[Estimate]
+    floors: Mapping[str, EndPoints],
+    converged: bool,
+    parameters: Iterable[Estimate],
+    runs: int = 0,
 ) -> Trust:
     """Return the trust in a fit, by its worst aspect: errors, convergence or fitted numbers.
 
@@ -131,6 +162,7 @@ def verdict_of_trust(
         floors: errors by floor, of held-out runs where there are any.
         converged: True if the fit converged.
         parameters: every number of the fit.
+        runs: number of predicted runs.
     """
     numbers = list(parameters)
     reasons = [*_of_errors(floors), *_of_numbers(numbers)]
@@ -141,7 +173,7 @@ def verdict_of_trust(
         reasons.append((1, "the logs determine none of its numbers"))
     reasons.sort(key=lambda reason: -reason[0])
     level = max((level for level, _ in reasons), default=0)
-    return Trust(WORDS[level], tuple(sentence for _, sentence in reasons))
+    return Trust(WORDS[level], tuple(sentence for _, sentence in reasons), floors, runs)
 
 
 def _of_errors(floors: Mapping[str, EndPoints]) -> Iterator[_Reason]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.fitting.variances import Search, Square
-from slipid.parameter import Declaration, Entry
+from slipid.parameter import Declaration
 from slipid.search_space import Choice, Space
 
 IDENTIFIED, WEAK = 0.3, 0.8
@@ -125,13 +125,24 @@ def estimates(
         has_voltage: True if voltages were logged.
         flat: paths of the numbers that change along flat directions.
     """
-    tree = space.tree(z)
-    return tuple(
-        _free(space, e, tree, z, covariance, has_voltage, e.path in flat)
-        if e.path in space.slices
-        else _fixed(e, tree, choices)
-        for e in space.all
-    )
+    tree, out = space.tree(z), []
+    for e in space.all:
+        d, value = e.declaration, np.atleast_1d(np.asarray(e.get(tree), float))
+        base = Estimate(path=e.path, unit=d.unit, doc=d.doc, labels=e.labels, value=plain(value))
+        if e.path not in space.slices:
+            chosen = [c for c in choices if fnmatchcase(e.path, c.pattern)]
+            is_override = any(c.fixed is not None or c.start is not None for c in chosen)
+            out.append(replace(base, provenance="override") if is_override else base)
+            continue
+        at, forced = space.slices[e.path], None
+        mean, prior = np.asarray(z)[at], (space.prior_mean[at], space.prior_std[at])
+        if e.path in NEEDS_VOLTAGE and not has_voltage:
+            forced = "not_identified"
+        elif _at_bound(d, value, (mean - prior[0]) / prior[1], prior[1]):
+            forced = "at_bound"
+        block, is_flat = covariance[at, at], e.path in flat
+        out.append(judged(base, d, value, mean, block, prior, forced, is_flat))
+    return tuple(out)
 
 
 def plain(x: Any) -> Any:
@@ -140,45 +151,7 @@ def plain(x: Any) -> Any:
     return float(x.reshape(())) if x.size == 1 else tuple(float(v) for v in x)
 
 
-def _fixed(entry: Entry, tree: Any, choices: Sequence[Choice]) -> Estimate:
-    chosen = any(
-        fnmatchcase(entry.path, c.pattern) and (c.fixed is not None or c.start is not None)
-        for c in choices
-    )
-    return Estimate(
-        path=entry.path,
-        unit=entry.declaration.unit,
-        doc=entry.declaration.doc,
-        labels=entry.labels,
-        value=plain(entry.get(tree)),
-        provenance="override" if chosen else "borrowed",
-    )
-
-
-def _free(
-    space: Space,
-    entry: Entry,
-    tree: Any,
-    z: np.ndarray,
-    covariance: np.ndarray,
-    has_voltage: bool,
-    is_flat: bool,
-) -> Estimate:
-    at, d = space.slices[entry.path], entry.declaration
-    value = np.atleast_1d(np.asarray(entry.get(tree), float))
-    base = Estimate(
-        path=entry.path, unit=d.unit, doc=d.doc, labels=entry.labels, value=plain(value)
-    )
-    mean, prior = np.asarray(z)[at], (space.prior_mean[at], space.prior_std[at])
-    forced = None
-    if entry.path in NEEDS_VOLTAGE and not has_voltage:
-        forced = "not_identified"
-    elif _at_bound(d, value, (mean - prior[0]) / prior[1], prior[1]):
-        forced = "at_bound"
-    return _judged(base, d, value, mean, covariance[at, at], prior, forced, is_flat)
-
-
-def _judged(
+def judged(
     base: Estimate,
     d: Declaration,
     value: Float[np.ndarray, " number"],
@@ -187,8 +160,11 @@ def _judged(
     prior: tuple[Float[np.ndarray, " coordinate"], Float[np.ndarray, " coordinate"]],
     forced: str | None,
     is_flat: bool,
+    drawn: Float[np.ndarray, "draw coordinate"] | None = None,
 ) -> Estimate:
     """Return an estimate with its interval and verdict.
+
+    The interval is that of the draws if there are any, else of the Gaussian approximation.
 
     Args:
         base: path, unit, meaning and value of the number.
@@ -199,21 +175,26 @@ def _judged(
         prior: mean and std of the prior in the search space.
         forced: verdict that replaces the one by the ratio of stds, None for none.
         is_flat: True if the number changes along a flat direction.
+        drawn: draws of a posterior in the search space.
     """
     prior_mean, prior_std = prior
     std_z, center = np.sqrt(np.diag(block)), np.asarray(d.to_si(prior_mean))
+    draws = drawn
     if d.constrained:
-        rng = np.random.default_rng(0)
-        spread = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
-        draws = np.asarray(d.to_si(spread))
-        low, high = np.quantile(draws, [0.05, 0.95], axis=0)
-        std = draws.std(axis=0)
         wide = np.full(len(value), prior_std.mean() / len(value))
+        if draws is None:
+            rng = np.random.default_rng(0)
+            draws = rng.multivariate_normal(mean, block, size=4000, method="cholesky")
     else:
+        wide = d.slope(center) * prior_std
+    if draws is None:
         most = LARGEST_LOG if d.logarithmic else np.inf
         ends = (np.minimum(mean + k * std_z, most) for k in (-Z95, Z95))
         low, high = (np.asarray(d.to_si(end)) for end in ends)
-        std, wide = d.slope(value) * std_z, d.slope(center) * prior_std
+        std = d.slope(value) * std_z
+    else:
+        values = np.asarray(d.to_si(draws))
+        (low, high), std = np.quantile(values, [0.05, 0.95], axis=0), values.std(axis=0)
     scaled = block / prior_std[:, None] / prior_std[None, :]
     ratio = float(np.sqrt(np.linalg.eigvalsh(scaled)[-1]))
     pull = (mean - prior_mean) / prior_std
@@ -229,6 +210,7 @@ def _judged(
         pull=float(pull[np.argmax(np.abs(pull))]),
         prior_mean=plain(center),
         prior_std=plain(wide),
+        source="laplace" if drawn is None else "posterior",
     )
 
 
@@ -276,35 +258,36 @@ def verdict_of(
     return verdict, "measured" if measured else "borrowed"
 
 
-def derived(space: Space, z: Search, covariance: Square, has_voltage: bool) -> tuple[Estimate, ...]:
+def derived(
+    space: Space,
+    z: Search,
+    covariance: Square,
+    has_voltage: bool,
+    draws: Float[np.ndarray, "draw free"] | None = None,
+) -> tuple[Estimate, ...]:
     """Return the quotients `RATIOS` with intervals and verdicts.
 
     The logarithm of a quotient is a difference of two coordinates. Its verdict follows from the
-    ratio of its posterior std, sqrt(c^T C c) with c = (.., 1, .., -1, ..), to its prior std.
+    ratio of its posterior std, sqrt(c^T C c) with c = (.., 1, .., -1, ..), to its prior std. With
+    draws of a posterior, of which z and the covariance are the mean and the covariance, intervals
+    are those of the draws.
     """
-    return tuple(
-        _quotient(space, d, over.path, under, z, covariance, has_voltage)
+    pairs = [
+        (over.path, under, d)
         for (quantity, under), d in RATIOS.items()
         for over in space.free
         if over.quantity == quantity and under in space.slices
-    )
-
-
-def _quotient(
-    space: Space,
-    d: Declaration,
-    over: str,
-    under: str,
-    z: np.ndarray,
-    covariance: np.ndarray,
-    has_voltage: bool,
-) -> Estimate:
-    c = np.zeros(len(z))
-    c[space.slices[over]], c[space.slices[under]] = 1.0, -1.0
-    mean, block = np.atleast_1d(c @ z), np.atleast_2d(c @ covariance @ c)
-    prior_std = np.atleast_1d(np.sqrt(np.sum((c * space.prior_std) ** 2)))
-    value = np.exp(mean)
-    base = Estimate(path=f"{over}/{under}", unit=d.unit, doc=d.doc, value=plain(value))
-    forced = "not_identified" if over == NEEDS_VOLTAGE[0] and not has_voltage else None
-    prior = np.atleast_1d(c @ space.prior_mean), prior_std
-    return _judged(base, d, value, mean, block, prior, forced, is_flat=False)
+    ]
+    out = []
+    for over, under, d in pairs:
+        c = np.zeros(len(z))
+        c[space.slices[over]], c[space.slices[under]] = 1.0, -1.0
+        mean, block = np.atleast_1d(c @ z), np.atleast_2d(c @ covariance @ c)
+        prior_std = np.atleast_1d(np.sqrt(np.sum((c * space.prior_std) ** 2)))
+        base = Estimate(path=f"{over}/{under}", unit=d.unit, doc=d.doc, value=float(np.exp(c @ z)))
+        forced = "not_identified" if over == NEEDS_VOLTAGE[0] and not has_voltage else None
+        prior, drawn = (np.atleast_1d(c @ space.prior_mean), prior_std), None
+        if draws is not None:
+            drawn = (draws @ c)[:, None]
+        out.append(judged(base, d, np.exp(mean), mean, block, prior, forced, False, drawn))
+    return tuple(out)

@@ -187,8 +187,8 @@ class _Refits:
         keep = problem.full_weight
         moving = problem.objective.joint or self.of_motion
         effect = (state if moving else self.state).shared(len(problem.windows))
-        seen = problem.weighed(blocks, log_v, keep, effect)
-        return problem.loss(state.z, log_v, keep, seen, self.electric)
+        weighed = problem.weighed(blocks, log_v, keep, effect)
+        return problem.loss(state.z, log_v, keep, weighed, self.electric)
 
     def side(self, sign: float) -> list[tuple[float, float]]:
         """Return points (coordinate, loss) from the estimate outward, downward for sign -1.
@@ -197,9 +197,12 @@ class _Refits:
         """
         points: list[tuple[float, float]] = []
         state, step, before = self.state, 0.5 * self.std, 0.0
-        mean, wide = self.problem.space.prior_mean[self.at], self.problem.space.prior_std[self.at]
-        base = self.lowest - 0.5 * ((self.start - mean) / wide) ** 2
-        reach = max(sign * mean + _FAR * wide, sign * self.start + _FAR * self.std)
+        mean, prior_std = (
+            self.problem.space.prior_mean[self.at],
+            self.problem.space.prior_std[self.at],
+        )
+        base = self.lowest - 0.5 * ((self.start - mean) / prior_std) ** 2
+        reach = max(sign * mean + _FAR * prior_std, sign * self.start + _FAR * self.std)
         growth = 1.5
         while len(points) < _MOST:
             z = np.array(state.z)
@@ -213,7 +216,7 @@ class _Refits:
             loss = self.loss(end.state)
             points.append((float(z[self.at]), loss))
             self.settled &= end.converged
-            rise = loss - 0.5 * ((z[self.at] - mean) / wide) ** 2 - base
+            rise = loss - 0.5 * ((z[self.at] - mean) / prior_std) ** 2 - base
             self.count += 1
             self.progress(self.count, rise)
             if rise > _TOO_FAR and before < RISE and step > _LEAST * self.std:

@@ -75,7 +75,11 @@ def formula(axes: list[Axis], power: np.ndarray, step: np.ndarray) -> str:
 def _product(axes: list[Axis], power: np.ndarray) -> str:
     names = [axis.label for axis in axes]
     if (np.abs(power - 1) < _SAME).all():
-        short = _short(axes)
+        short = [axis.label for axis in axes if axis.entry.quantity != "surface.friction"]
+        if len(axes) - len(short) > 1:  # one pattern for the frictions of several floors
+            short.append("surface.*.friction")
+        else:
+            short = names
         last = NEEDS_VOLTAGE[1] if NEEDS_VOLTAGE[1] in short else short[0]
         return f"{', '.join(short)} only as {', '.join(f'{p}/{last}' for p in short if p != last)}"
     if len(names) == 2:
@@ -83,11 +87,6 @@ def _product(axes: list[Axis], power: np.ndarray) -> str:
         held = _power(first, abs(k))
         held = f"{held} * {other}" if k < 0 else f"{other} / {held}"
         return f"{names[0]} and {names[1]} only as {held}"
-    if (np.abs(np.abs(power) - 1) < _SAME).all():
-        up, down = (
-            listed([n for n, k in zip(names, power, strict=True) if s * k > 0]) for s in (1, -1)
-        )
-        return f"no effect on the data if one factor multiplies {up} and divides {down}"
     parts = [
         f"{name} {'times' if k > 0 else 'divided by'} {_power('t', abs(k))}"
         for name, k in zip(names, power, strict=True)
@@ -118,13 +117,6 @@ def _sum(names: list[str], weight: np.ndarray) -> str:
         return f"{names[0]} and {names[1]} only as {other} {sign} {times}{first}"
     parts = [f"{n} {k:+.2g} t" for n, k in zip(names, weight, strict=True)]
     return f"no effect on the data for any t: {', '.join(parts)}"
-
-
-def _short(axes: list[Axis]) -> list[str]:
-    """Return the names of coordinates, with one pattern for the frictions of several floors."""
-    others = [axis.label for axis in axes if axis.entry.quantity != "surface.friction"]
-    several = len(axes) - len(others) > 1
-    return [*others, "surface.*.friction"] if several else [axis.label for axis in axes]
 
 
 VOLTAGE = "log the motor voltage (or duty and bus voltage)"

@@ -56,9 +56,9 @@ def simulate_windows(
             for every floor without an entry, and missing components are zero.
     """
     b = lk.batch(w, truth)
-    increment, amps, start = (np.asarray(x) for x in _predicted(truth, b, jnp.asarray(w.pose)))
+    increment, amps, start = (np.asarray(x) for x in _predicted(truth, b, w.pose))
     steps = increment + _process(truth, w, rng, std)
-    pose = np.array(_logged(truth, chain(jnp.asarray(start), jnp.asarray(steps))))
+    pose = np.array(_logged(truth, chain(start, steps)))
     pose[..., :2] += rng.normal(size=(*pose.shape[:2], 2)) * std.get("camera.place", 0.0)
     pose[..., 2] += rng.normal(size=pose.shape[:2]) * std.get("camera.heading", 0.0)
     each = _component_std(std, w, "current", "window")[:, None, None]
@@ -68,7 +68,7 @@ def simulate_windows(
     speed = w.turn / w.dt[..., None]
     signed = flowing - float(truth.motor.current_offset)
     signed = signed if w.current_is_signed else signed * np.tanh(speed / 0.2)
-    volts = np.asarray(truth.motor.voltage(jnp.asarray(signed), jnp.asarray(speed)))
+    volts = np.asarray(_voltage(truth, signed, speed))
     current = flowing + np.sqrt(w.current_var) * rng.normal(size=amps.shape)
     voltage = volts + rng.normal(size=amps.shape) * std.get("voltage.window", 0.0)
     return replace(
@@ -88,6 +88,11 @@ def _predicted(robot: Robot, b: lk.Batch, pose: Array) -> tuple[Array, Array, Ar
 @jax.jit
 def _logged(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Float[Array, "segment edge 3"]:
     return jax.vmap(jax.vmap(robot.camera.logged))(pose)
+
+
+@jax.jit
+def _voltage(robot: Robot, amps: Array, wheel_speed: Array) -> Array:
+    return robot.motor.voltage(amps, wheel_speed)
 
 
 def _component_std(std: Mapping[str, float], w: Windows, kind: str, part: str) -> np.ndarray:
@@ -119,7 +124,7 @@ def _shared(
         std.get(c.name, std.get(f"{c.kind}.{c.what}", 0.0) if c.kind in SHARED else 0.0)
         for c in components.components
     ]
-    log_v = jnp.asarray(2 * np.log(np.maximum(named, 1e-30)))
+    log_v = 2 * np.log(np.maximum(named, 1e-30))
     out = np.zeros((len(w), len(AXES)))
     for of in effects_by_floor(w, truth, components)[0]:
         root = np.asarray(of.root(log_v))

@@ -200,8 +200,8 @@ def test_residuals_are_less_shared_effects(problem):
     """Residuals less the conditional mean of shared effects have Student t likelihoods."""
     d, dense = density(problem, EVERYTHING), Dense(problem, BLOCKS[EVERYTHING])
     x = near(d)
-    found = d.of_all(Density.residual_blocks, x)
-    likelihoods = d.of_all(Density.log_likelihoods, x)
+    found = d.mapped(Density.residual_blocks, x, None)
+    likelihoods = d.mapped(Density.log_likelihoods, x, None)
     assert found.keys() == likelihoods.keys() == set(BLOCKS[EVERYTHING])
     for j, one in enumerate(x):
         z = np.asarray(d.full(d.anchor, jnp.asarray(one)))

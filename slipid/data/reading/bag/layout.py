@@ -9,16 +9,19 @@ from pydantic import AliasChoices, BeforeValidator, Field, StrictBool, StrictFlo
 from pydantic.dataclasses import dataclass
 
 from slipid.data.reading.bag.shape import check_path
-from slipid.data.reading.layout import CHANNELS, PER_WHEEL, TURNS, SensorLayout, several, unknown
+from slipid.data.reading.layout import (
+    CHANNELS,
+    GROUPS,
+    PER_WHEEL,
+    TURNS,
+    SensorLayout,
+    several,
+    unknown,
+)
 from slipid.data.reading.units import factor
 from slipid.support.errors import DataError
 from slipid.support.toml_file import CLOSED, NotNegative, Positive, checked
 
-GROUPS = {
-    "pose": ("pose_x", "pose_y", "pose_heading"),
-    "twist_command": ("twist_command_x", "twist_command_y", "twist_command_yaw"),
-}
-"""Groups of channels that one message contains, by the name of the group in a layout."""
 EFFORT = '"A" (current), "N*m" (motor_torque or wheel_torque), "V" (voltage) or "1" (duty)'
 """Text, for error messages, about the units that drivers use for the effort of a JointState."""
 
@@ -180,9 +183,7 @@ def _problem(layout: BagLayout) -> str | None:
             return f"{group} and {min(twice)}; expected one of them"
     if not have:
         return "topics: no channel; expected a table of channels"
-    if 0 < len(have & set(GROUPS["pose"])) < 3:
-        return "a pose in parts; expected pose, or all of pose_x, pose_y and pose_heading"
-    if lacking := layout.lacks(have):
+    if lacking := layout.lacks(layout.holds):
         return lacking
     if len(set(layout.joints)) < len(layout.joints):
         return f"joints {list(layout.joints)}; expected each once"

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from itertools import islice
 
 from slipid.data.reading.bag.definitions import MessageType
-from slipid.data.reading.bag.layout import EFFORT, GROUPS, BagLayout, TopicChannel
+from slipid.data.reading.bag.layout import EFFORT, BagLayout, TopicChannel
 from slipid.data.reading.bag.opened import BagTopic, OpenBag
 from slipid.data.reading.bag.shape import without_indices
 from slipid.data.reading.bag.streams import FieldPick, JointPick, Pick, TransformPick, edges_of
 from slipid.data.reading.bag.transforms import STATIC, ChainLink, chain_of
-from slipid.data.reading.layout import CHANNELS, PER_WHEEL
+from slipid.data.reading.layout import CHANNELS, GROUPS, PER_WHEEL
 from slipid.data.reading.units import converts, factor
 from slipid.support.errors import DataError, bad_data, did_you_mean, first_names
 

@@ -4,13 +4,15 @@ import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from math import inf, tau
+from math import inf
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import FiniteFloat
 
 from slipid.data.log import Log
+from slipid.data.reading.assemble import per_wheel
 from slipid.data.reading.bag.layout import BagLayout, RunRule
 from slipid.data.reading.bag.opened import BagTopic, OpenBag
 from slipid.data.reading.bag.plan import topic_of
@@ -19,13 +21,12 @@ from slipid.data.reading.bag.streams import Located
 from slipid.data.reading.layout import TURNS
 from slipid.data.reading.signal import Signal
 from slipid.support.errors import bad_data, did_you_mean
+from slipid.support.toml_file import Section, checked
 
 STILL = 0.02
 """Change of angle [rad], or speed [rad/s], above which a wheel moves."""
 PAUSE_S = 1.0
 """Least pause between runs that `slipid new` proposes for a bag with one long drive [s]."""
-COLUMNS = ("start", "end", "surface", "load", "name", "bag")
-"""Columns that a table of runs may have; the first two are required."""
 _Mark = tuple[str | float, str | None, str | None]
 """Value of the field that separates runs, and names of the surface and the load set-up, if any."""
 
@@ -133,14 +134,11 @@ def by_pauses(layout: BagLayout, signals: Mapping[str, Signal], pause_s: float) 
 def _moves(layout: BagLayout, signals: Mapping[str, Signal]) -> Float[np.ndarray, " move"]:
     """Return the times at which some wheel moves [s]."""
     name = next(name for name in TURNS if name in signals)
-    time, values = signals[name].time, signals[name].values
-    if name.startswith("motor_") or name == "wheel_ticks":
-        values = values / layout.gear_ratio
+    time, values = signals[name].time, signals[name].values * per_wheel(name, layout)
     if name.endswith("_speed"):
         return time[(np.abs(values) > STILL).any(axis=1)]
-    if name == "wheel_ticks":
-        values = values * (tau / float(layout.ticks_per_revolution or 1.0))
-        values = np.cumsum(values, axis=0) if layout.ticks_are_increments else values
+    if name == "wheel_ticks" and layout.ticks_are_increments:
+        values = np.cumsum(values, axis=0)
     moved = {row for column in values.T for row in _moved(column)}
     return time[sorted(moved)]
 
@@ -166,6 +164,17 @@ def runs_between_pauses(log: Log, pause_s: float) -> int:
     return int((np.diff(moves) > pause_s).sum()) + 1 if len(moves) else 0
 
 
+class _RunRow(Section):
+    """One row of a table of runs: begin and end [s], and perhaps names."""
+
+    start: FiniteFloat
+    end: FiniteFloat
+    surface: str = ""
+    load: str = ""
+    name: str = ""
+    bag: str = ""
+
+
 def by_table(path: Path, rule: RunRule, zero: float) -> list[RunSpan]:
     """Return the runs that a CSV table lists.
 
@@ -181,37 +190,22 @@ def by_table(path: Path, rule: RunRule, zero: float) -> list[RunSpan]:
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        expected = f"a CSV table of runs with the columns {', '.join(COLUMNS[:2])}"
+        expected = "a CSV table of runs with the columns start and end"
         raise bad_data(file, f"cannot be read ({error})", expected) from error
+    found = []
     reader = csv.DictReader(lines, skipinitialspace=True)
-    names = reader.fieldnames or []
-    for name in names:
-        if name not in COLUMNS:
-            found = f"column '{name}'{did_you_mean(name, COLUMNS)}"
-            raise bad_data(file, found, f"columns of {', '.join(COLUMNS)}", row=1)
-    if missing := [name for name in COLUMNS[:2] if name not in names]:
-        raise bad_data(file, f"no column '{missing[0]}'", "the columns start and end", row=1)
-    found_runs = []
     for cells in reader:
-        row = reader.line_num
-        if (cells.get("bag") or path.name) not in (path.name, path.stem):
+        filled = {name: cell for name, cell in cells.items() if name and cell is not None}
+        row = checked(f"{file} row {reader.line_num}", filled, _RunRow)
+        if row.bag not in ("", path.name, path.stem):
             continue
-        start, end = (_time(file, row, name, cells[name]) for name in COLUMNS[:2])
-        if not start < end:
-            raise bad_data(file, f"a run from {start:g} to {end:g} s", "start before end", row=row)
-        suffix = f"#{cells['name']}" if cells.get("name") else ""
-        surface, load = cells.get("surface") or None, cells.get("load") or None
-        found_runs.append(RunSpan(zero + start, zero + end, suffix, surface, load))
-    return found_runs
-
-
-def _time(file: Path, row: int, column: str, cell: str | None) -> float:
-    """Return the time in a cell [s]."""
-    try:
-        return float(cell or "")
-    except ValueError as error:
-        found = f"'{cell or ''}'"
-        raise bad_data(file, found, "a time in seconds", row=row, column=column) from error
+        if not row.start < row.end:
+            times = f"a run from {row.start:g} to {row.end:g} s"
+            raise bad_data(file, times, "start before end", row=reader.line_num)
+        suffix = f"#{row.name}" if row.name else ""
+        names = suffix, row.surface or None, row.load or None
+        found.append(RunSpan(zero + row.start, zero + row.end, *names))
+    return found
 
 
 def by_topic(bag: OpenBag, layout: BagLayout, rule: RunRule) -> list[RunSpan]:

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from slipid.data.reading.bag.layout import GROUPS, BagLayout
+from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.plan import ChannelPlan
 from slipid.data.reading.bag.streams import Edge, JointPick, Stream, TransformPick
 from slipid.data.reading.bag.transforms import STATIC, TransformSeries, composed, heading, tilt
-from slipid.data.reading.layout import CHANNELS, PER_WHEEL
-from slipid.data.reading.signal import Signal, SignalSource
+from slipid.data.reading.layout import CHANNELS, GROUPS, PER_WHEEL
+from slipid.data.reading.signal import Signal, SignalSource, first_true
 from slipid.data.reading.units import factor
 from slipid.support.errors import bad_data, did_you_mean, first_names
 
@@ -50,14 +50,13 @@ def cleaned(stream: Stream, layout: BagLayout, notes: list[str]) -> Stream:
     if (np.diff(time) > 0).all():
         return stream
     late = np.maximum.accumulate(time) - time
-    jumps = np.flatnonzero(late > layout.max_disorder * 1e9)
-    if len(jumps):
-        found = f"the clock jumps back by {late[jumps[0]] / 1e9:.3g} s"
+    if (jump := first_true(late > layout.max_disorder * 1e9)) is not None:
+        found = f"the clock jumps back by {late[jump] / 1e9:.3g} s"
         expected = (
             f"messages late by at most max_disorder = {layout.max_disorder:g} s; was the clock "
             f"set, or a recording added? Else {_RECEIVED}"
         )
-        raise stream.error(found, expected, int(jumps[0]))
+        raise stream.error(found, expected, jump)
     if disordered := int((late > 0).sum()):
         by = f"by up to {late.max() / 1e9:.3g} s"
         notes.append(f"topic {name}: {disordered} messages out of order {by} were sorted")
@@ -335,8 +334,7 @@ def _unit(
 ) -> Float[np.ndarray, "sample 4"]:
     """Return quaternions normalised to length 1; raise `DataError` if one is far from it."""
     length = np.linalg.norm(rotation, axis=1)
-    wrong = np.flatnonzero(np.abs(length - 1.0) > 0.1)
-    if len(wrong):
-        found = f"a quaternion of length {length[wrong[0]]:.3g}"
-        raise source.error(found, "length 1; is the orientation filled in?", int(wrong[0]))
+    if (wrong := first_true(np.abs(length - 1.0) > 0.1)) is not None:
+        found = f"a quaternion of length {length[wrong]:.3g}"
+        raise source.error(found, "length 1; is the orientation filled in?", wrong)
     return rotation / length[:, None]

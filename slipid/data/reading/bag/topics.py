@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from slipid.data.reading.bag.layout import GROUPS, BagLayout
+from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.opened import BagTopic, OpenBag, open_bag
 from slipid.data.reading.bag.plan import JOINT_STATE, fits, plan
 from slipid.data.reading.bag.runs import RunSpan, run_spans
 from slipid.data.reading.bag.signals import channel_signal, check_clocks, group_signals
 from slipid.data.reading.bag.streams import Pick, collected, edges_of
-from slipid.data.reading.layout import PER_WHEEL
+from slipid.data.reading.layout import GROUPS, PER_WHEEL
 from slipid.data.reading.signal import Identity, RawRun, Signal
 from slipid.support.errors import DataError
 

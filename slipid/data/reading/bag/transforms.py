@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from slipid.data.reading.bag.opened import BagTopic
 from slipid.data.reading.bag.streams import Edge, edges_of
+from slipid.data.wheel_signals import interpolate
 from slipid.support.errors import did_you_mean, first_names
 
 STATIC = "_static"
@@ -49,10 +50,8 @@ class TransformSeries:
         flips = np.sum(self.rotation[1:] * self.rotation[:-1], axis=1) < 0
         sign = np.where(np.append(0, np.cumsum(flips)) % 2, -1.0, 1.0)
         same_side = self.rotation * sign[:, None]
-        translation, rotation = (
-            np.column_stack([np.interp(time, self.time, column) for column in values.T])
-            for values in (self.translation, same_side)
-        )
+        translation = interpolate(self.time, self.translation, time)
+        rotation = interpolate(self.time, same_side, time)
         return TransformSeries(
             time, translation, rotation / np.linalg.norm(rotation, axis=1)[:, None]
         )

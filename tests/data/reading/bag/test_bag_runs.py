@@ -135,10 +135,10 @@ def test_a_table_of_stamps(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("begin,end\n1,2\n", ("row 1: column 'begin'", "start, end")),
-        ("start,ends\n1,2\n", ("column 'ends', did you mean end", "columns of")),
-        ("start,surface\n1,2\n", ("no column 'end'", "start and end")),
-        ("start,end\n1,2\n5,soon\n", ("row 3, column 'end': 'soon'", "seconds")),
+        ("begin,end\n1,2\n", ("row 2: start: missing", "begin: no such key", "start, end")),
+        ("start,ends\n1,2\n", ("ends: no such key, did you mean end",)),
+        ("start,surface\n1,2\n", ("row 2: end: missing",)),
+        ("start,end\n1,2\n5,soon\n", ("row 3: end: 'soon'", "a valid number")),
         ("start,end\n2,1\n", ("row 2: a run from 2 to 1 s", "start before end")),
         ("start,end\n1,2\n", ("no run of table", "1700000000.000", "from_start = true")),
         (None, ("runs.csv: cannot be read", "CSV table of runs")),
