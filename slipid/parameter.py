@@ -138,13 +138,13 @@ def parameter(
     """
     declaration = Declaration(unit=unit, symbol=symbol, doc=doc, **declared)
     return eqx.field(
-        converter=_as_numbers,
+        converter=as_numbers,
         metadata={"parameter": declaration, "per": per},
-        default_factory=lambda: _as_numbers(declaration.start),
+        default_factory=lambda: as_numbers(declaration.start),
     )
 
 
-def _as_numbers(x: Any) -> Array:
+def as_numbers(x: Any) -> Array:
     """Return an array of floating-point numbers; JAX compiles nothing for what is not one yet."""
     if isinstance(x, jax.core.Tracer) or (isinstance(x, jax.Array) and x.dtype.kind == "f"):
         return x

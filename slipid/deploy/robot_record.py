@@ -130,8 +130,8 @@ def _load(
 
 def directions(count: int) -> Float[Array, "twist 3"]:
     """Return twists [m/s, m/s, rad/s] of 1 m/s in evenly spaced directions, without turning."""
-    angle = jnp.linspace(0.0, 2 * jnp.pi, count, endpoint=False)
-    return jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
+    angle = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
+    return jax.device_put(np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=-1))
 
 
 def _turns(frame: WheelFrame) -> Float[Array, "twist 3"]:

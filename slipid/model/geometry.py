@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.parameter import parameter
+from slipid.parameter import as_numbers, parameter
 
 _MIRRORED = 0.01
 """Largest difference of a wheel from a mirror image, for `Geometry.mirror`.
@@ -107,19 +107,16 @@ class Geometry(eqx.Module):
     def frame(self) -> "WheelFrame":
         """Return the wheels as rows of matrices, for the current radii and drive offsets."""
         return _wheel_frame(
-            jnp.asarray(self.place) * self.base_radius,
-            jnp.asarray(self.drive_angle) + self.drive_offset,
-            jnp.asarray(self.roller_angle),
-            self._larger(),
+            np.asarray(self.place),
+            np.asarray(self.drive_angle),
+            np.asarray(self.roller_angle),
+            self.drive_offset,
+            self.radius_deviation,
             self.wheel_radius,
             self.base_radius,
+            self.drive_of,
             self.grips,
         )
-
-    def _larger(self) -> Float[Array, " wheel"]:
-        """Return the radius of each wheel over r."""
-        of_drives = jnp.broadcast_to(self.radius_deviation, (self.drives,))
-        return 1.0 + self.at_wheels(of_drives)
 
     @property
     def around(self) -> tuple[int, ...]:
@@ -154,19 +151,14 @@ class Geometry(eqx.Module):
 
         The row of a drive with several wheels is the mean over its wheels.
         """
-        frame = self.frame()
-        of_wheels = frame.hold / frame.drive_share[:, None]
-        if not self.drive_of:
-            return of_wheels
-        share = np.eye(self.drives)[list(self.drive_of)]
-        return jnp.asarray((share / share.sum(axis=0)).T) @ of_wheels
+        return _forward(self.frame(), self.drive_of)
 
     def pseudo_inverse(self) -> Float[Array, "3 drive"]:
         """Return J^+, which gives the least-squares body twist from the drives' rim speeds [m/s].
 
         Wheels that all point ahead do not determine motion sideways; J^+ gives zero for it.
         """
-        return jnp.asarray(np.linalg.pinv(np.asarray(self.forward()), rcond=1e-6))
+        return jax.device_put(np.linalg.pinv(np.asarray(self.forward()), rcond=1e-6))
 
 
 def at_wheels(
@@ -215,16 +207,21 @@ class WheelFrame(eqx.Module):
     ordinary: bool = eqx.field(static=True, default=False)
 
 
-@partial(jax.jit, static_argnames="grips")
+@partial(jax.jit, static_argnames=("drive_of", "grips"))
 def _wheel_frame(
-    p: Float[Array, "wheel 2"],
-    drive: Float[Array, " wheel"],
+    place: Float[Array, "wheel 2"],
+    drive_angle: Float[Array, " wheel"],
     roller: Float[Array, " wheel"],
-    larger: Float[Array, " wheel"],
+    drive_offset: Float[Array, "*wheel"],
+    radius_deviation: Float[Array, "*drive"],
     radius: Float[Array, ""],
     base: Float[Array, ""],
+    drive_of: tuple[int, ...],
     grips: tuple[bool, ...],
 ) -> WheelFrame:
+    p, drive = place * base, drive_angle + drive_offset
+    deviation = jnp.broadcast_to(radius_deviation, (len(set(drive_of)) or len(grips),))
+    larger = 1.0 + at_wheels(drive_of, deviation)
     free = drive - roller
     hold = free + 0.5 * math.pi
 
@@ -245,6 +242,15 @@ def _wheel_frame(
         base=base,
         ordinary=any(grips),
     )
+
+
+@partial(jax.jit, static_argnames="drive_of")
+def _forward(frame: WheelFrame, drive_of: tuple[int, ...]) -> Float[Array, "drive 3"]:
+    of_wheels = frame.hold / frame.drive_share[:, None]
+    if not drive_of:
+        return of_wheels
+    share = np.eye(len(set(drive_of)))[list(drive_of)]
+    return jnp.asarray((share / share.sum(axis=0)).T) @ of_wheels
 
 
 def omni(
@@ -330,10 +336,10 @@ def general(
     if base <= 0:
         raise ValueError("all wheels stand at the origin; expected their centres in metres")
     return Geometry(
-        wheel_radius=jnp.asarray(wheel_radius, dtype=float),
-        base_radius=jnp.asarray(base, dtype=float),
-        drive_offset=jnp.zeros(len(p)),
-        radius_deviation=jnp.zeros(len(set(drive_of)) or len(p)),
+        wheel_radius=as_numbers(wheel_radius),
+        base_radius=as_numbers(base),
+        drive_offset=as_numbers(np.zeros(len(p))),
+        radius_deviation=as_numbers(np.zeros(len(set(drive_of)) or len(p))),
         place=tuple((float(x), float(y)) for x, y in p / base),
         drive_angle=tuple(float(a) for a in np.radians(np.asarray(drive_deg, float))),
         roller_angle=tuple(math.radians(90.0 if a is None else float(a)) for a in roller_deg),

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.model import contact, geometry
@@ -12,7 +13,7 @@ from slipid.model.camera import Camera
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Geometry, WheelFrame
 from slipid.model.motor import Motor
-from slipid.parameter import entries, parameter
+from slipid.parameter import as_numbers, entries, parameter
 
 Number = int | float
 GRAVITY = 9.81
@@ -76,7 +77,7 @@ class Robot(eqx.Module):
     @classmethod
     def of(cls, shape: Geometry, mass: Number = 10.0) -> "Robot":
         """Return a robot with any wheels (see `slipid.model.geometry`) and no floors yet."""
-        return _with_mass(build(shape, ()), jnp.asarray(mass, dtype=float))
+        return _with_mass(build(shape, ()), as_numbers(mass))
 
     def on(
         self,
@@ -155,19 +156,23 @@ def build(
     """Return a robot with every parameter at its declared start value; surfaces are sorted."""
     names = sorted(surfaces)
     single = ContactSurface()
-    stack = {e.path: jnp.full((len(names),), e.get(single)) for e in entries(single)}
+    stack = {e.path: np.full(len(names), np.asarray(e.get(single))) for e in entries(single)}
     wheels = geometry.wheels
-    stack["load_bias"] = jnp.zeros((len(names), wheels))
+    stack["load_bias"] = np.zeros((len(names), wheels))
     return Robot(
         geometry=geometry,
-        body=Body(load_share=jnp.full((len(loads), wheels), 1 / wheels), loads=tuple(loads)),
-        motor=Motor(gear_ratio=jnp.asarray(geometry.gear_ratio)),
-        surfaces=ContactSurface(**stack, labels=tuple(names)),
+        body=Body(
+            load_share=as_numbers(np.full((len(loads), wheels), 1 / wheels)), loads=tuple(loads)
+        ),
+        motor=Motor(gear_ratio=as_numbers(geometry.gear_ratio)),
+        surfaces=ContactSurface(
+            **{k: as_numbers(x) for k, x in stack.items()}, labels=tuple(names)
+        ),
         camera=Camera(
-            session_yaw=jnp.zeros(len(sessions)),
-            marker_place=jnp.zeros(2),
-            tilt=jnp.zeros(2),
-            tangential=jnp.zeros(2),
+            session_yaw=as_numbers(np.zeros(len(sessions))),
+            marker_place=as_numbers(np.zeros(2)),
+            tilt=as_numbers(np.zeros(2)),
+            tangential=as_numbers(np.zeros(2)),
             centre=centre,
             sessions=tuple(sessions),
         ),

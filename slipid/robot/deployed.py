@@ -1,6 +1,6 @@
 """Arrays of an identified robot that estimators and controllers use; they come from robot.json."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Geometry, WheelFrame, at_drives, at_wheels
 from slipid.model.motor import Motor
+from slipid.parameter import as_numbers
 from slipid.robot.filter.effects import EffectLookup
 from slipid.robot.record import LoadRecord, Numbers, RobotRecord
 from slipid.robot.robot_file import REWRITE_HINT, check_record, geometry_of, read_robot, write_robot
@@ -235,7 +236,7 @@ def posterior_robots(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedR
     for k in picked:
         values = plain | {path: rows[k] for path, rows in record.draws.items()}
         one.append(_arrays(record, robot.load_setup, values, spread=False))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *one)
+    return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *one)
 
 
 def _arrays(
@@ -250,33 +251,34 @@ def _arrays(
 
     def of(prefix: str, kind: type[eqx.Module]) -> dict[str, Array]:
         names = [f.name for f in fields(kind) if "parameter" in f.metadata]
-        return {name: _array(values[f"{prefix}.{name}"]) for name in names}
+        return {name: as_numbers(values[f"{prefix}.{name}"]) for name in names}
 
     shape: dict[str, Any] = of("robot", Geometry) | vars(wheels)
     geometry = Geometry(**shape)
     rows = [of(f"surface.{floor.name}", ContactSurface) for floor in floors]
-    effect = _array([floor.effect for floor in floors])
-    whole = jnp.sqrt(effect**2 + _array(chosen.spread) ** 2)
+    effect = np.array([floor.effect for floor in floors], dtype=float)
+    with np.errstate(over="ignore"):
+        whole = np.sqrt(effect**2 + np.array(chosen.spread, dtype=float) ** 2)
     return DeployedRobot(
         frame=geometry.frame(),
-        places=jnp.asarray(geometry.place) * geometry.base_radius,
+        places=as_numbers(np.asarray(geometry.place) * np.asarray(geometry.base_radius)),
         forward=geometry.forward(),
         inverse=geometry.pseudo_inverse(),
-        motor=Motor(**of("motor", Motor), gear_ratio=_array(wheels.gear_ratio)),
+        motor=Motor(**of("motor", Motor), gear_ratio=as_numbers(wheels.gear_ratio)),
         floors=ContactSurface(
-            **{name: jnp.stack([row[name] for row in rows]) for name in rows[0]},
+            **{name: as_numbers(np.stack([row[name] for row in rows])) for name in rows[0]},
             labels=record.labels,
         ),
-        rest=_array(values[f"robot.load_share@{chosen.name}"]),
-        mass=_array(values["robot.mass"]),
-        process=_array([floor.process for floor in floors]),
-        effect=whole if spread else effect,
+        rest=as_numbers(values[f"robot.load_share@{chosen.name}"]),
+        mass=as_numbers(values["robot.mass"]),
+        process=as_numbers([floor.process for floor in floors]),
+        effect=as_numbers(whole if spread else effect),
         effect_table=_effect_table(chosen, whole),
-        friction_covariance=_friction_covariance(record) * spread,
-        current_std=_array([floor.current_std for floor in floors]),
-        current_trend=_array(record.current_trend),
-        highest=_array([record.highest_speed, chosen.highest_current]),
-        wheel_curve=_array(chosen.wheel_curve),
+        friction_covariance=as_numbers(_friction_covariance(record) * spread),
+        current_std=as_numbers([floor.current_std for floor in floors]),
+        current_trend=as_numbers(record.current_trend),
+        highest=as_numbers([record.highest_speed, chosen.highest_current]),
+        wheel_curve=as_numbers(chosen.wheel_curve),
         drive_of=wheels.drive_of,
         around=geometry.around,
         unseen=tuple(floor.unseen for floor in floors),
@@ -285,26 +287,23 @@ def _arrays(
     )
 
 
-def _array(value: Numbers | Sequence[object]) -> Array:
-    return jnp.asarray(value, dtype=float)
-
-
-def _effect_table(load: LoadRecord, whole: Array) -> EffectLookup:
+def _effect_table(load: LoadRecord, whole: Float[np.ndarray, "floor 3"]) -> EffectLookup:
     """Return the effect table of a load set-up, its remaining stds as shares of `whole`.
 
     `whole` (floor, 3) is the std of each floor's effects without a table [m/m, m/m, rad/m].
     """
     if load.told is None:
         return EffectLookup.empty(len(whole))
-    mean, left = _array(load.told.mean), _array(load.told.left)
-    part = left / jnp.maximum(whole[:, None, None], 1e-12)
-    return EffectLookup(jnp.log(_array(load.told.speeds)), jnp.concatenate([mean, part], axis=-1))
+    told = load.told
+    mean, left, speeds = (np.array(x, float) for x in (told.mean, told.left, told.speeds))
+    part = left / np.maximum(whole[:, None, None], 1e-12)
+    return EffectLookup(as_numbers(np.log(speeds)), as_numbers(np.concatenate([mean, part], -1)))
 
 
-def _friction_covariance(record: RobotRecord) -> Array:
+def _friction_covariance(record: RobotRecord) -> Float[np.ndarray, "floor floor"]:
     """Return the posterior covariance of the floors' log frictions; fixed frictions have 0."""
     still = (1.0,) * max(record.drawn, 1)
     paths = [f"surface.{name}.friction" for name in record.labels]
     logs = np.log(np.array([record.draws.get(path, still) for path in paths], dtype=float))
     off = logs - logs.mean(axis=1, keepdims=True)
-    return jnp.asarray(off @ off.T / off.shape[1])
+    return np.asarray(off @ off.T / off.shape[1])

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict
 from itertools import zip_longest
-from typing import Protocol
 
 from slipid.lab.benchmark.floors.husky import HuskyFloorTask, husky_classifiers
+from slipid.lab.benchmark.floors.protocol import FloorTask
 from slipid.lab.benchmark.floors.robotino import RobotinoFloorTask
 from slipid.lab.benchmark.protocols import PROTOCOLS, splits
 from slipid.lab.benchmark.rectangle import CONTROLLERS, RectangleTask
@@ -28,19 +28,8 @@ from slipid.support.progress import Reporter
 SCHEMA = "slipid.benchmark/1"
 Tables = dict[str, dict[str, dict[str, RowSummary]]]
 """Row summaries, by name of the data set, then of the protocol, then of the row."""
-
-
-class BenchmarkTask(Protocol):
-    """A part of the benchmark's work that saves its results in a checkpoint."""
-
-    @property
-    def name(self) -> str:
-        """Name of the task."""
-        ...
-
-    def run(self) -> str:
-        """Compute the results that the checkpoint lacks, and return the task's name."""
-        ...
+BenchmarkTask = FoldTask | FloorTask | RectangleTask
+"""A part of the benchmark's work that saves its results in a checkpoint."""
 
 
 def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -> Content:

@@ -1,7 +1,7 @@
 """Protocols of the benchmark: which runs are held out, and what methods are given about floors."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -55,26 +55,18 @@ PROTOCOLS: dict[str, BenchmarkProtocol] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Split:
+class Split(NamedTuple):
     """One fold of a kind of split.
 
     Attributes:
-        kind: kind of split.
         fold: index of the fold that is held out.
         training: indices of the training runs.
         held_out: indices of the held-out runs.
     """
 
-    kind: str
     fold: int
     training: Int[np.ndarray, " some"]
     held_out: Int[np.ndarray, " others"]
-
-    @property
-    def protocols(self) -> tuple[str, ...]:
-        """Protocols that use this kind of split."""
-        return tuple(name for name, p in PROTOCOLS.items() if p.split == self.kind)
 
 
 def base_of(floor: str) -> str:
@@ -143,7 +135,7 @@ def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
     """
     everybody = np.arange(len(facts))
     if kind == "all":
-        return [Split(kind, ALL, everybody, everybody[:0])]
+        return [Split(ALL, everybody, everybody[:0])]
     part = KINDS[kind](facts)
     where = np.array([f.floor for f in facts])
     found = []
@@ -152,7 +144,7 @@ def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
         if kind != "floors":
             held_out = held_out[np.isin(where[held_out], where[training])]
         if len(training) >= LEAST_TRAINING and len(held_out) >= LEAST_HELD_OUT:
-            found.append(Split(kind, fold, training, held_out))
+            found.append(Split(fold, training, held_out))
     return found
 
 

@@ -91,7 +91,7 @@ class RectangleTask:
         only = self.options.only or CONTROLLERS
         controllers = [name for name in CONTROLLERS if name in only]
         try:
-            wish = trial.TrialOptions(plant, controllers=tuple(controllers), starts=STARTS)
-            return trial.trial(self.folder, wish, executor, report).content
+            options = trial.TrialOptions(plant, controllers=tuple(controllers), starts=STARTS)
+            return trial.trial(self.folder, options, executor, report).content
         except Exception as error:  # a failed trial does not stop the rest of the benchmark
             return {"failed": FoldScore.of_error(error).absent}

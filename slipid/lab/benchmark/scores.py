@@ -21,10 +21,10 @@ from slipid.predict.slip_model import (
 )
 from slipid.support.content import Content
 
-SLIPS = 0.2
+SLIP_THRESHOLD = 0.2
 """Difference of the body's twist from that of the rolling wheels, relative to the latter, above
 which a window counts as slipping."""
-STANDS = 0.02
+REST_SPEED = 0.02
 """Norm of the rolling wheels' twist [m/s] up to which a window is not used for slip detection."""
 
 
@@ -108,9 +108,9 @@ def _windows(
     by_wheels = path_of(run.signals.rolling(spec), run.signals.dt)
     rolling = body_increments(by_wheels[edges]) / dt * spec.size
     size = np.linalg.norm(rolling, axis=1)
-    moving = size > STANDS
-    most = np.maximum(size, STANDS)
-    slips = np.linalg.norm(true - rolling, axis=1) > SLIPS * most
+    moving = size > REST_SPEED
+    most = np.maximum(size, REST_SPEED)
+    slips = np.linalg.norm(true - rolling, axis=1) > SLIP_THRESHOLD * most
     if predicted.slipping is None:
         score = np.round(np.linalg.norm(estimate - rolling, axis=1) / most, 6)
     else:

@@ -28,7 +28,7 @@ from slipid.predict.predictive import ForceBalance, force_balance_of
 from slipid.predict.slip_model import PredictedRun, RobotSpec, RunSignals, relative_to_start
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.estimator import Estimator
-from slipid.robot.interface import MIXED_FLOORS_PENALTY, NO_FLOOR, Readings, Settings
+from slipid.robot.interface import MIXED_FLOORS_PENALTY, NO_FLOOR, Measurement, Settings
 from slipid.robot.record import LogSensors
 from slipid.support.checkpoint import Checkpoint
 
@@ -41,7 +41,7 @@ Errors of predictions scatter far more from run to run.
 STEPS = 16
 """The steps of a replay are padded to a multiple of this number, so that few shapes are compiled.
 """
-TOGETHER = 32
+RUNS_PER_CALL = 32
 """Number of runs in one call of an estimator; fewer are padded, so that one shape is compiled."""
 LONGEST_S = 0.25
 """Longest step of an estimator [s]; longer steps are split, since it rejects those of 0.5 s."""
@@ -225,43 +225,29 @@ def _estimator(
     return Estimator(robot, settings, known)
 
 
-class _ReplayRows(eqx.Module):
-    """Inputs of an estimator in each row of several runs; NaN where a channel has no value.
-
-    Attributes:
-        angle: angle of each wheel since the start [rad].
-        current: current of each motor [A].
-        gyro: yaw rate [rad/s].
-        dt: duration of the row [s]; 0 in the first row and in rows of padding.
-    """
-
-    angle: Float[Array, "run row drive"]
-    current: Float[Array, "run row drive"]
-    gyro: Float[Array, "run row"]
-    dt: Float[Array, "run row"]
-
-
 @eqx.filter_jit
 def _replayed(
-    estimator: Estimator, start: Float[Array, "run 3"], rows: _ReplayRows
+    estimator: Estimator,
+    start: Float[Array, "run 3"],
+    rows: Measurement,
+    dt: Float[Array, "run row"],
 ) -> tuple[Array, Array, Array]:
     """Return estimates after each row of each run.
 
     The estimates are the pose [m, m, rad], the covariance of the position [m^2], and the
-    probability of each floor, averaged over the wheels.
+    probability of each floor, averaged over the wheels. `dt` is 0 in the first row and in rows of
+    padding [s].
     """
-    nothing = Readings.nothing(estimator.robot.drives)
 
-    def step(state: Any, row: _ReplayRows) -> Any:
-        z = replace(nothing, wheel_angle=row.angle, current=row.current, gyro=row.gyro)
-        state, estimate = estimator.step(state, z, row.dt)
+    def step(state: Any, row: tuple[Measurement, Array]) -> Any:
+        state, estimate = estimator.step(state, *row)
         floors = jnp.mean(estimate.surface_probability, axis=0)
         return state, (estimate.pose, estimate.covariance[:2, :2], floors)
 
-    def one(pose: Array, of_run: _ReplayRows) -> Any:
+    def one(pose: Array, *of_run: Any) -> Any:
         return jax.lax.scan(step, estimator.init(pose), of_run)[1]
 
-    return jax.vmap(one)(start, rows)
+    return jax.vmap(one)(start, rows, dt)
 
 
 def replay(
@@ -280,14 +266,14 @@ def replay(
     parts = [np.ceil(run.dt / LONGEST_S - 1e-9).astype(int).clip(1) for run in runs]
     longest = max(int(part.sum()) for part in parts)
     longest = -(-longest // STEPS) * STEPS + 1
-    shape, labels = (TOGETHER, longest), estimator.robot.labels
+    shape, labels = (RUNS_PER_CALL, longest), estimator.robot.labels
     known = [k for k, unseen in enumerate(estimator.robot.unseen) if not unseen]
     out: list[PredictedRun] = []
-    for first in range(0, len(runs), TOGETHER):
-        some = range(first, min(first + TOGETHER, len(runs)))
+    for first in range(0, len(runs), RUNS_PER_CALL):
+        some = range(first, min(first + RUNS_PER_CALL, len(runs)))
         angle, current = np.full((2, *shape, estimator.robot.drives), np.nan)
-        gyro, dt, begin = np.full(shape, np.nan), np.zeros(shape), np.zeros((TOGETHER, 3))
-        begin[: len(some)] = start[first : first + TOGETHER]
+        gyro, dt, begin = np.full(shape, np.nan), np.zeros(shape), np.zeros((RUNS_PER_CALL, 3))
+        begin[: len(some)] = start[first : first + RUNS_PER_CALL]
         for n, k in enumerate(some):
             run, part = runs[k], parts[k]
             rows = slice(1, int(part.sum()) + 1)
@@ -298,8 +284,10 @@ def replay(
                 current[n, rows] = np.repeat(run.current, part, axis=0)
             if run.gyro is not None:
                 gyro[n, rows] = np.repeat(run.gyro, part)
-        inputs = _ReplayRows(*(jnp.asarray(x) for x in (angle, current, gyro, dt)))
-        pose, cov, floors = map(np.asarray, _replayed(estimator, jnp.asarray(begin), inputs))
+        measured = {"wheel_angle": angle, "current": current, "gyro": gyro}
+        inputs = Measurement(**{name: jnp.asarray(x) for name, x in measured.items()})
+        found = _replayed(estimator, jnp.asarray(begin), inputs, jnp.asarray(dt))
+        pose, cov, floors = map(np.asarray, found)
         for n, k in enumerate(some):
             ends = np.cumsum(parts[k])
             path = np.concatenate([begin[n][None], pose[n, ends]])

@@ -13,13 +13,13 @@ from jaxtyping import Bool, Float, Int
 from slipid.lab.benchmark.scores import FoldScore, RunScore
 from slipid.lab.benchmark.slipid_rows import NAME
 
-NAMED = 4
+MOST_NAMED_ROWS = 4
 """Largest number of tied rows that a sentence names."""
 DRAWS = 1000
 """Number of draws of the bootstrap."""
 INTERVAL = (0.05, 0.95)
 """Quantiles of the draws at the ends of a 90 % interval."""
-FEW = 2
+FEWEST_CLUSTERS = 2
 """Number of clusters on a floor below which its runs are resampled one by one."""
 Weights = Float[np.ndarray, "draw run"]
 
@@ -108,7 +108,7 @@ def summary(folds: Mapping[str, Sequence[FoldScore]], reference: str) -> dict[st
 class Bootstrap:
     """Bootstrap draws of runs: on each floor, clusters of runs are resampled with replacement.
 
-    On a floor with fewer than `FEW` clusters, single runs are resampled.
+    On a floor with fewer than `FEWEST_CLUSTERS` clusters, single runs are resampled.
 
     Attributes:
         floor: index of the floor of each run.
@@ -137,7 +137,7 @@ class Bootstrap:
         for k in range(len(names)):
             mine = np.flatnonzero(floor == k)
             kinds, of = np.unique(cluster[mine], return_inverse=True)
-            if len(kinds) < FEW:  # too few clusters to estimate their scatter
+            if len(kinds) < FEWEST_CLUSTERS:  # too few clusters to estimate their scatter
                 kinds, of = mine, np.arange(len(mine))
             picked = rng.multinomial(len(kinds), np.full(len(kinds), 1 / len(kinds)), DRAWS)
             draws[1:, mine] = picked[:, of]
@@ -272,8 +272,8 @@ def sentence(name: str, protocol: str, found: Mapping[str, RowSummary]) -> str:
     text = f"{head}slipid errs by {mine}, the best other row, {best}, by {_percent(errors[best])}"
     tied = [row for row, b in behind.items() if b.low <= 0 <= b.high]
     if tied:
-        more = f" and {len(tied) - NAMED} more" if len(tied) > NAMED else ""
-        return f"{text}; not told apart from {', '.join(tied[:NAMED])}{more}"
+        more = f" and {len(tied) - MOST_NAMED_ROWS} more" if len(tied) > MOST_NAMED_ROWS else ""
+        return f"{text}; not told apart from {', '.join(tied[:MOST_NAMED_ROWS])}{more}"
     return f"{text}, {_points(behind[best])}" if best in behind else text
 
 

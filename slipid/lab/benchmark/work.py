@@ -146,13 +146,13 @@ def keys_of(task: FoldTask) -> list[tuple[str, str]]:
 
     Protocols with unknown floors need more than one floor.
     """
-    options, data, split = task.options, data_of(task.options, task.source), split_of(task)
-    own = [slipid_rows.NAME] + ([OWN_MAP] if split.kind == "all" else [])
+    options, data = task.options, data_of(task.options, task.source)
+    own = [slipid_rows.NAME] + ([OWN_MAP] if task.kind == "all" else [])
     every = own + [method.name for method in rows(data.spec)]
     names = [name for name in every if not options.only or name in options.only]
     several = len({base_of(f.floor) for f in data.facts}) > 1 and not options.quick
-    protocols = [p for p in split.protocols if PROTOCOLS[p].floor_known or several]
-    return [(protocol, name) for protocol in protocols for name in names]
+    found = [k for k, p in PROTOCOLS.items() if p.split == task.kind and (p.floor_known or several)]
+    return [(protocol, name) for protocol in found for name in names]
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +201,7 @@ def _fold_data(task: FoldTask) -> FoldData:
         return [_with_facts(batch, data, numbers) for batch in found]
 
     training = tuple(run.with_floor(True) for run in in_order(batches(split.training)))
-    if split.kind != "all":
+    if task.kind != "all":
         held_out = data.logged.subset(split.held_out)
         return FoldData(data, fit, training, tuple(batches(split.held_out)), held_out)
     assert data.crossing is not None

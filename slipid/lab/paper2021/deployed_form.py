@@ -56,7 +56,7 @@ from slipid.predict.steps import Steps, TrainingWindows
 NEEDS: frozenset[Channel] = frozenset({"current", "twist"})
 TIME_CONSTANT = -0.031 / float(np.log(tables.DEPLOYED_MEMORY))
 """Time constant of the authors' smoothing [s]: their computer sampled about every 31 ms."""
-MOST = 3000
+MOST_SAMPLES = 3000
 """Largest number of samples of a support vector regression."""
 
 
@@ -103,7 +103,7 @@ class PaperCode(_AsPublished):
 def recipe_samples(w: TrainingWindows, spec: RobotSpec) -> SlipSamples:
     """Return samples of single wheels and windows within the authors' limits of slip and current.
 
-    If there are more than `MOST`, so many are drawn at random.
+    If there are more than `MOST_SAMPLES`, so many are drawn at random.
     """
     signals = w.signals
     rim = signals.speed * spec.wheel_radius
@@ -113,7 +113,7 @@ def recipe_samples(w: TrainingWindows, spec: RobotSpec) -> SlipSamples:
         slip = 1.0 - real / rim
     amps = signals.along(spec)
     kept = (slip > 0.0) & (slip <= 1.0) & (amps > FIGURES_3_AND_4.min_current)
-    drawn = np.random.default_rng(0).permutation(int(kept.sum()))[:MOST]
+    drawn = np.random.default_rng(0).permutation(int(kept.sum()))[:MOST_SAMPLES]
     return SlipSamples(*(x[kept][drawn] for x in (amps, signals.torque(spec), slip)))
 
 

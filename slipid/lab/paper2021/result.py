@@ -54,13 +54,11 @@ class SquareTrack:
 
     Attributes:
         file: file of the track.
-        time: time of each frame [s].
         position: image x to the right and y down [mm], shape (frame, 2).
         heading: logged heading, unwrapped [deg].
     """
 
     file: TrackFile
-    time: np.ndarray
     position: np.ndarray
     heading: np.ndarray
 
@@ -116,7 +114,6 @@ def read_track(folder: Path, file: TrackFile) -> SquareTrack:
         raise bad_data(path, f"{frames} frames", expected)
     return SquareTrack(
         file=file,
-        time=table["time_s"],
         position=np.stack([table["x_mm"], table["y_mm"]], axis=1),
         heading=np.degrees(np.unwrap(np.radians(table["angle_deg"]))),
     )

@@ -20,7 +20,9 @@ metre it is a fifth.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 TURN = 0.17
@@ -84,8 +86,8 @@ class EffectLookup(eqx.Module):
     @classmethod
     def empty(cls, floors: int) -> "EffectLookup":
         """Return the table of effects without estimates: mean 0 and the whole std remaining."""
-        row = jnp.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
-        return cls(jnp.zeros(1), jnp.broadcast_to(row, (floors, 1, 1, 6)))
+        rows = np.tile([0.0, 0.0, 0.0, 1.0, 1.0, 1.0], (floors, 1, 1, 1))
+        return cls(jax.device_put(np.zeros(1)), jax.device_put(rows))
 
     def at(self, rolled: RolledMotion) -> tuple[Float[Array, "floor 3"], Float[Array, "floor 3"]]:
         """Return the mean effect on every floor, and the remaining share of its std.

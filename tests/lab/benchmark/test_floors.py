@@ -1,6 +1,6 @@
 """Floor classification without a pose: reading, folds, answers, intervals, slipid's own row."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -275,7 +275,7 @@ def test_a_table_compares_all_rows_with_the_reference():
     assert table.chance == 0.5
     assert (table.runs, table.floors) == (10, ("grass", "snow"))
     assert first.said == {"grass": {"grass": 100.0, "snow": 0.0}, "snow": {"grass": 0, "snow": 100}}
-    assert '"accuracy"' in json_text(table.to_json())
+    assert '"accuracy"' in json_text(asdict(table))
 
 
 def test_a_quick_table_is_of_one_fold_and_of_the_first_minute():

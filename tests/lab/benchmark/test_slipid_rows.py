@@ -117,7 +117,7 @@ def test_an_estimator_uses_currents_only_if_it_was_fitted_to_some(made, driven):
 
 @pytest.mark.slow
 def test_what_is_not_on_a_floor_of_the_robot_is_unknown(made, monkeypatch):
-    monkeypatch.setattr(slipid_rows, "TOGETHER", 1)
+    monkeypatch.setattr(slipid_rows, "RUNS_PER_CALL", 1)
     robot = deployed().with_unseen()
     heard = run_batches(made.runs, made.robot)[0].runs[0].signals
     (said,) = replay(Estimator(robot, Settings.of(robot)), [heard], np.zeros((1, 3)))

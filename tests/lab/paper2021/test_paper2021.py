@@ -223,7 +223,7 @@ def test_track_numbers_of_a_made_square():
     file = TrackFile("made", "made", "made", 4, 4, 1.0)
     position = np.array([[10.0, 0], [13, 4], [10, 8], [10, 20], [110, 20], [110, 0], [40, 40]])
     heading = np.array([350.0, 355, 360, 365, 370, 372, 375])
-    track = SquareTrack(file=file, time=np.arange(7.0), position=position, heading=heading)
+    track = SquareTrack(file=file, position=position, heading=heading)
     assert track.path_length == pytest.approx(5 + 5 + 12)
     assert track.displacement == pytest.approx(20.0)
     assert track.closure == pytest.approx(50.0)

@@ -10,7 +10,7 @@ I_c and gyro_c its mean currents and yaw rate, I(w) and W(w) the ammeter reading
 and the yaw rate that the model predicts in equilibrium at the wheel speeds w, w_c^2 the weight of
 the cell and rho a soft absolute value. Currents are correlated for seconds and differ from run to
 run. A cell of n rows therefore has a weight proportional to n / (1 + n / 20), and the weight of a
-whole run saturates above `LONG` rows.
+whole run saturates above `RUN_ROWS` rows.
 
 Ammeters. The Husky's ammeters measure the current that a motor takes from the battery. Where the
 floor pushes a wheel, as on the inner side of a turn, the motor brakes and the ammeter reads zero.
@@ -45,7 +45,7 @@ START = np.log([0.6, 0.15, 0.08])
 """Prior means of the logarithms, where the fit also starts; the prior std of each is 1."""
 CURRENT_A, YAW_RATE = 1.0, 0.2
 """Scales by which residuals of currents [A] and of the yaw rate [rad/s] are divided."""
-ALIKE, LONG = 20.0, 300.0
+CELL_ROWS, RUN_ROWS = 20.0, 300.0
 """Numbers of rows above which more rows hardly add weight: in one cell, and in one run."""
 CELLS = 512
 """Largest number of cells of a floor; fewer are padded to it, so that one shape is compiled."""
@@ -88,7 +88,7 @@ class Cells:
         turning = np.isfinite(gyro)
         known = member @ turning
         yaw = member @ np.where(turning, gyro, 0.0) / np.maximum(known, 1e-9)
-        counts = 3 * count / (1 + count / ALIKE) / (1 + len(speed) / LONG)
+        counts = 3 * count / (1 + count / CELL_ROWS) / (1 + len(speed) / RUN_ROWS)
         return cls(
             speed=speed[first],
             current=mean,
@@ -144,12 +144,17 @@ def fitted_floors(robot: Robot, runs: Sequence[FloorSignals]) -> Robot:
     """Return the robot with the parameters of each floor fitted to the runs on it."""
     for number, floor in enumerate(robot.surfaces.labels):
         cells = Cells.joined([run for run in runs if run.floor == floor]).thinned(CELLS)
-        misfit = _FloorMisfit(robot, number, cells)
+        arrays = (cells.speed, cells.current, cells.gyro, cells.weight)
+        index = jnp.asarray(number)
+        given = (robot, index, *map(jnp.asarray, arrays))
         solution = least_squares(
-            misfit.residuals, START, misfit.jacobian, loss="soft_l1", max_nfev=30
+            lambda logs, given=given: np.asarray(_residuals(logs, *given)),
+            START,
+            lambda logs, given=given: np.nan_to_num(np.asarray(_jacobian(logs, *given))),
+            loss="soft_l1",
+            max_nfev=30,
         )
-        logs = solution.x
-        robot = on_floor(robot, jnp.asarray(number), jnp.asarray(logs))
+        robot = on_floor(robot, index, jnp.asarray(solution.x))
     return robot
 
 
@@ -161,21 +166,13 @@ def currents_off(
 ) -> Float[np.ndarray, "row drive"]:
     """Return the modelled less the measured current of each row and drive on a floor [A].
 
-    Rows are evaluated in groups of `CELLS` by the compiled function of the fit.
+    Rows are evaluated in groups of `CELLS`, the last padded, so that one shape is compiled.
     """
-    logs = np.log([float(getattr(robot.surfaces, name)[number]) for name in FITTED])
-    count, drives = speed.shape
-    found = []
-    for first in range(0, count, CELLS):
-        w, amps = np.zeros((2, CELLS, drives))
-        rows = min(CELLS, count - first)
-        w[:rows], amps[:rows] = speed[first : first + rows], current[first : first + rows]
-        every = Cells(
-            w, amps, np.zeros(CELLS), np.ones((CELLS, 2)), np.ones_like(w), np.ones(CELLS)
-        )
-        off = _FloorMisfit(robot, number, every).residuals(logs)[: CELLS * drives]
-        found.append(CURRENT_A * off.reshape(CELLS, drives)[:rows])
-    return np.concatenate(found)
+    groups = -(-len(speed) // CELLS)
+    padded = np.zeros((groups * CELLS, speed.shape[1]))
+    padded[: len(speed)] = speed
+    parts = [_shown(robot, jnp.asarray(number), w)[0] for w in np.split(padded, groups)]
+    return np.concatenate(parts)[: len(speed)] - current
 
 
 def on_floor(robot: Robot, number: Array, logs: Float[Array, "3"]) -> Robot:
@@ -200,51 +197,25 @@ def shown(
     return jax.vmap(one)(speed)
 
 
-class _FloorMisfit:
-    """Residuals of currents and yaw rate as functions of a floor's parameters, with Jacobian."""
-
-    def __init__(self, robot: Robot, number: int, cells: Cells):
-        self.robot, self.number = robot, jnp.asarray(number)
-        every = (cells.speed, cells.current, cells.gyro, cells.weight)
-        self.cells = tuple(jnp.asarray(x) for x in every)
-        self.last: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
-
-    def residuals(self, logs: np.ndarray) -> np.ndarray:
-        """Return the residuals at logarithms of the floor's parameters."""
-        return self._both(logs)[0]
-
-    def jacobian(self, logs: np.ndarray) -> np.ndarray:
-        """Return the derivatives of the residuals with respect to the logarithms."""
-        return self._both(logs)[1]
-
-    def _both(self, logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals and Jacobian, computed together: the solver needs both at each point."""
-        key = logs.tobytes()
-        if key not in self.last:
-            slope, off = _with_jacobian(jnp.asarray(logs), self.robot, self.number, *self.cells)
-            self.last = {key: (np.asarray(off), np.nan_to_num(np.asarray(slope)))}
-        return self.last[key]
+_shown = jax.jit(shown)
 
 
+@jax.jit
 def _residuals(
     logs: Array, robot: Robot, number: Array, w: Array, amps: Array, gyro: Array, weight: Array
-) -> tuple[Array, Array]:
-    """Return the residuals of currents, yaw rate and prior twice: as value and as auxiliary output.
-
-    With the auxiliary output, `jax.jacfwd` returns the residuals beside their Jacobian.
-    """
+) -> Array:
+    """Return the residuals of currents, of the yaw rate and of the prior."""
     modelled, turn = shown(on_floor(robot, number, logs), number, w)
-    off = jnp.concatenate(
+    return jnp.concatenate(
         [
             ((modelled - amps) / CURRENT_A * weight[:, :1]).ravel(),
             (turn - gyro) / YAW_RATE * weight[:, 1],
             logs - START,
         ]
     )
-    return off, off
 
 
-_with_jacobian = jax.jit(jax.jacfwd(_residuals, has_aux=True))
+_jacobian = jax.jit(jax.jacfwd(_residuals))
 
 
 TURNING = 0.2

@@ -11,7 +11,7 @@ the robot moves in at least half of its rows up to that time.
 import abc
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import ClassVar
 
@@ -320,7 +320,7 @@ class FloorTask(abc.ABC):
         found = kept.load_json(self.name)
         if found is None or "failed" in found or any(row["absent"] for row in found["rows"]):
             try:
-                kept.save_json(self.name, self.make().to_json())
+                kept.save_json(self.name, asdict(self.make()))
             except Exception as error:  # a task that fails does not stop the others
                 kept.save_json(self.name, {"failed": FoldScore.of_error(error).absent})
         return self.name

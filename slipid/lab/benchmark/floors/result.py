@@ -1,8 +1,7 @@
 """Results of floor classifiers: answers, accuracies by length of the signals, and tables."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -97,10 +96,6 @@ class ClassifierTable:
     floors: tuple[str, ...]
     chance: float
     rows: tuple[ClassifierRow, ...]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields as plain values for JSON."""
-        return asdict(self)
 
 
 def after_seconds(

@@ -48,7 +48,7 @@ ABOUT = "Robotino on four floors, straight runs: wheel speeds and sizes of curre
 
 def robotino_classifiers() -> list[FloorClassifier]:
     """Return the classifiers other than slipid, without those that need an accelerometer."""
-    trees = [row for row in tree_classifiers() if not row.channels.vibration]
+    trees = [row for row in tree_classifiers() if "vibration" not in row.channels]
     return [CosineEnergyClassifier(), GaussianClassifier(), *trees]
 
 

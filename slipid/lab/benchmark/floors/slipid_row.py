@@ -36,7 +36,6 @@ from slipid.lab.benchmark.floors.fitting import (
     stiffness_of,
 )
 from slipid.lab.systems.floors.interface import Beliefs, FloorClassifier, FloorSignals, floors_of
-from slipid.model.contact_law import ContactSurface
 from slipid.model.robot import Robot
 from slipid.predict.slip_model import RobotSpec
 from slipid.robot.deployed import DeployedRobot
@@ -85,7 +84,7 @@ BENDS = (0.17, 0.45)
 
 v is the velocity [m/s], W the yaw rate [rad/s] of the rolling wheels, and L the base radius [m].
 """
-TOGETHER = 64
+RUNS_PER_CALL = 64
 """Number of runs in one call of the filter; fewer are padded, so that one shape is compiled."""
 SHARED_ROWS = 20.0
 """Weight, in rows, of a floor's mean squared residual in that of each kind of motion on it.
@@ -110,21 +109,6 @@ rows are not averaged (`filter_s`), and `gyro_std` is about the residual of the 
 fits [rad/s]."""
 
 
-@dataclass(frozen=True, eq=False)
-class FittedFloors:
-    """Fitted parameters of floors and motors.
-
-    Attributes:
-        surfaces: parameters of the floors.
-        motor: motor with its ammeter.
-        std: standard deviation of currents in each kind of motion on each floor [A].
-    """
-
-    surfaces: ContactSurface
-    motor: MeteredMotor
-    std: Float[np.ndarray, "kind floor"]
-
-
 @dataclass(frozen=True)
 class SlipidFloorClassifier(FloorClassifier):
     """slipid's floor filter as a floor classifier.
@@ -133,14 +117,16 @@ class SlipidFloorClassifier(FloorClassifier):
         robot: robot with its maker's data, without floors.
         zero_a: reading of its ammeters for wheels at rest [A].
         settings: settings of the estimator.
-        fitted: fitted parameters; None before a fit.
+        fitted: robot with fitted floors and motors with their ammeters; None before a fit.
+        std: standard deviation of currents in each kind of motion on each floor [A].
     """
 
     name: str = "slipid"
     robot: Robot | None = None
     zero_a: float = 0.0
     settings: Settings = SETTINGS
-    fitted: FittedFloors | None = field(default=None, repr=False)
+    fitted: Robot | None = field(default=None, repr=False)
+    std: Float[np.ndarray, "kind floor"] = field(default_factory=lambda: np.zeros(0), repr=False)
 
     def fit(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> "SlipidFloorClassifier":
         labels = floors_of(runs)
@@ -150,8 +136,7 @@ class SlipidFloorClassifier(FloorClassifier):
             robot.motor, jnp.asarray(stiffness_of(runs)), jnp.asarray(scatter_of(runs))
         )
         robot = fitted_floors(replace(robot, motor=motor), runs)
-        std = _scatter(robot, runs, spec)
-        return replace(self, labels=labels, fitted=FittedFloors(robot.surfaces, motor, std))
+        return replace(self, labels=labels, fitted=robot, std=_scatter(robot, runs, spec))
 
     def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         if self.fitted is None:
@@ -159,11 +144,11 @@ class SlipidFloorClassifier(FloorClassifier):
         plain = deployed(self._on(self.labels))
         robot = replace(plain, floors=self.fitted.surfaces, motor=self.fitted.motor)
         estimator = Estimator(robot, self.settings)
-        std, out = jnp.asarray(self.fitted.std), []
+        std, out = jnp.asarray(self.std), []
         rows = -(-max(map(len, runs)) // 8) * 8
-        for first in range(0, len(runs), TOGETHER):
-            some = [self._zeroed(run) for run in runs[first : first + TOGETHER]]
-            beliefs = np.asarray(_beliefs(estimator, std, _FilterRows.of(some, rows, spec)))
+        for first in range(0, len(runs), RUNS_PER_CALL):
+            some = [self._zeroed(run) for run in runs[first : first + RUNS_PER_CALL]]
+            beliefs = np.asarray(_beliefs(estimator, std, *_filter_rows(some, rows, spec)))
             out += [beliefs[k, : len(run)] for k, run in enumerate(some)]
         return [row[:, :-1] / row[:, :-1].sum(axis=1, keepdims=True) for row in out]
 
@@ -175,7 +160,7 @@ class SlipidFloorClassifier(FloorClassifier):
         """
         if self.fitted is None:
             return 0
-        return 3 * len(self.labels) + self.fitted.std.size + len(self.fitted.motor.stiffness)
+        return 3 * len(self.labels) + self.std.size + self.fitted.geometry.drives
 
     def _on(self, labels: tuple[str, ...]) -> Robot:
         """Return the robot on the named floors with parameters that are not yet fitted."""
@@ -222,58 +207,55 @@ def _scatter(
     return std
 
 
-class _FilterRows(eqx.Module):
-    """Inputs of the filter, run by run and row by row.
+def _filter_rows(
+    runs: Sequence[FloorSignals], rows: int, spec: RobotSpec
+) -> tuple[Readings, Float[Array, "run row"], Int[Array, "run row"]]:
+    """Return readings, duration [s] and kind of motion of each row, see `kinds`.
 
-    Attributes:
-        speed: wheel speed of each drive [rad/s].
-        current: current of each motor [A].
-        gyro: yaw rate [rad/s], NaN where it is missing.
-        dt: duration of each row [s]; 0 at rest and in rows of padding.
-        kind: kind of motion, see `kinds`.
+    Runs are padded to `rows` rows and to `RUNS_PER_CALL` runs. The duration is 0 in rows of
+    padding, and in rows at rest, which carry no evidence about the floor.
     """
-
-    speed: Float[Array, "*run row drive"]
-    current: Float[Array, "*run row drive"]
-    gyro: Float[Array, "*run row"]
-    dt: Float[Array, "*run row"]
-    kind: Int[Array, "*run row"]
-
-    @classmethod
-    def of(cls, runs: Sequence[FloorSignals], rows: int, spec: RobotSpec) -> "_FilterRows":
-        """Return the inputs of several runs, padded to `rows` rows and to `TOGETHER` runs."""
-        drives = runs[0].speed.shape[1]
-        speed, current = np.zeros((2, TOGETHER, rows, drives))
-        gyro, dt = np.full((TOGETHER, rows), np.nan), np.zeros((TOGETHER, rows))
-        kind = np.zeros((TOGETHER, rows), dtype=int)
-        for k, run in enumerate(runs):
-            n = len(run)
-            speed[k, :n], current[k, :n] = run.speed, run.current
-            # signals of a robot at rest carry no evidence about its floor
-            dt[k, :n] = np.where(run.moving, run.dt, 0.0)
-            gyro[k, :n] = np.nan if run.gyro is None else run.gyro
-            kind[k, :n] = kinds(run, spec)
-        return cls(*(jnp.asarray(x) for x in (speed, current, gyro, dt, kind)))
+    drives = runs[0].speed.shape[1]
+    speed, current = np.zeros((2, RUNS_PER_CALL, rows, drives))
+    gyro, dt = np.full((RUNS_PER_CALL, rows), np.nan), np.zeros((RUNS_PER_CALL, rows))
+    kind = np.zeros((RUNS_PER_CALL, rows), dtype=int)
+    for k, run in enumerate(runs):
+        n = len(run)
+        speed[k, :n], current[k, :n] = run.speed, run.current
+        dt[k, :n] = np.where(run.moving, run.dt, 0.0)
+        gyro[k, :n] = np.nan if run.gyro is None else run.gyro
+        kind[k, :n] = kinds(run, spec)
+    nothing = jax.tree.map(
+        lambda x: jnp.full((RUNS_PER_CALL, rows, *x.shape), x), Readings.nothing(drives)
+    )
+    measured = {"wheel_speed": speed, "current": current, "gyro": gyro}
+    readings = replace(nothing, **{name: jnp.asarray(x) for name, x in measured.items()})
+    return readings, jnp.asarray(dt), jnp.asarray(kind)
 
 
 @eqx.filter_jit
 def _beliefs(
-    estimator: Estimator, std: Float[Array, "kind floor"], runs: _FilterRows
+    estimator: Estimator,
+    std: Float[Array, "kind floor"],
+    readings: Readings,
+    dt: Float[Array, "run row"],
+    kind: Int[Array, "run row"],
 ) -> Float[Array, "run row floor_or_none"]:
     """Return the probability of every floor after every row; the last column is "none of them"."""
-    nothing = Readings.nothing(estimator.robot.drives)
 
-    def step(state: EstimatorState, row: _FilterRows) -> tuple[EstimatorState, Array]:
-        now = Estimator(replace(estimator.robot, current_std=std[row.kind]), estimator.settings)
-        z = replace(nothing, wheel_speed=row.speed, current=row.current, gyro=row.gyro)
-        state, estimate = now.advance(state, z, row.dt)
+    def step(
+        state: EstimatorState, row: tuple[Readings, Array, Array]
+    ) -> tuple[EstimatorState, Array]:
+        z, dt, kind = row
+        now = Estimator(replace(estimator.robot, current_std=std[kind]), estimator.settings)
+        state, estimate = now.advance(state, z, dt)
         return state, estimate.surface_probability.mean(axis=0)
 
-    def one(run: _FilterRows) -> Array:
+    def one(z: Readings, dt: Array, kind: Array) -> Array:
         state = estimator.init()
         state = replace(
-            state, wheels=replace(state.wheels, speed=run.speed[0]), current=run.current[0]
+            state, wheels=replace(state.wheels, speed=z.wheel_speed[0]), current=z.current[0]
         )
-        return jax.lax.scan(step, state, run)[1]
+        return jax.lax.scan(step, state, (z, dt, kind))[1]
 
-    return jax.vmap(one)(runs)
+    return jax.vmap(one)(readings, dt, kind)

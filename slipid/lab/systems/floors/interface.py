@@ -18,7 +18,7 @@ import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -28,6 +28,10 @@ from slipid.predict.slip_model import RobotSpec
 Beliefs = Float[np.ndarray, "row floor"]
 """Probability of each floor after every row."""
 Features = Float[np.ndarray, "row feature"]
+FloorChannel = Literal["current", "gyro", "vibration"]
+"""Optional channel of the features; wheel speeds are always used."""
+DEFAULT_CHANNELS: frozenset[FloorChannel] = frozenset({"current", "gyro"})
+"""Channels that slipid uses too, besides the wheel speeds."""
 STILL = 0.3
 """Wheel speed up to which a wheel counts as at rest [rad/s]."""
 WINDOWS_S = (0.5, 1.0, 2.0)
@@ -176,25 +180,10 @@ def accumulated(
     return np.asarray(beliefs / beliefs.sum(axis=1, keepdims=True))
 
 
-@dataclass(frozen=True)
-class FeatureChannels:
-    """Optional channels of the features; wheel speeds are always used.
-
-    Attributes:
-        current: True if the currents of the motors are used.
-        gyro: True if the gyro is used.
-        vibration: True if the vertical vibration is used.
-    """
-
-    current: bool = True
-    gyro: bool = True
-    vibration: bool = False
-
-
 def features(
     run: FloorSignals,
     spec: RobotSpec,
-    channels: FeatureChannels = FeatureChannels(),
+    channels: frozenset[FloorChannel] = DEFAULT_CHANNELS,
     windows_s: Sequence[float] = WINDOWS_S,
     restart_s: float = np.inf,
 ) -> Features:
@@ -204,18 +193,18 @@ def features(
     """
     start = run.segment_start(restart_s)
     columns = [np.minimum(run.time - run.time[start], max(windows_s))]
-    amps = np.abs(run.current) if channels.current else run.current[:, :0]
+    amps = np.abs(run.current) if "current" in channels else run.current[:, :0]
     for seconds in windows_s:
         window = TrailingWindow.of(run.time, seconds, start)
         columns += [m for x in (*amps.T, *run.speed.T) for m in window.mean_and_std(x)]
-        if channels.current:
+        if "current" in channels:
             turning = np.abs(run.speed).sum(axis=1)
             columns.append(window.mean(amps.sum(axis=1)) / (window.mean(turning) + 0.1))
-        if channels.gyro and run.gyro is not None:
+        if "gyro" in channels and run.gyro is not None:
             shortfall = yaw_rate_shortfall(run.gyro, run.rolling(spec)[:, 2])
             columns.append(window.mean(np.abs(run.gyro)))
             columns += window.mean_and_std(shortfall)
-        if channels.vibration and run.vibration is not None:
+        if "vibration" in channels and run.vibration is not None:
             columns += window.mean_and_std(run.vibration)
     return np.stack(columns, axis=1)
 

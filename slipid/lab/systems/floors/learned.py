@@ -57,9 +57,10 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.lab.systems.floors.interface import (
+    DEFAULT_CHANNELS,
     Beliefs,
-    FeatureChannels,
     Features,
+    FloorChannel,
     FloorClassifier,
     FloorSignals,
     accumulated,
@@ -74,12 +75,10 @@ if TYPE_CHECKING:
     from sklearn.ensemble import HistGradientBoostingClassifier
 
 LogLikelihood = Float[np.ndarray, "row floor"]
-LEAST = 1e-4
+LOWEST_PROBABILITY = 1e-4
 """Lower limit of the probability of a floor that the trees give for one row."""
-DEFAULT_CHANNELS = FeatureChannels()
-"""Channels that slipid uses too: wheel speeds, currents and gyro."""
-DRIVING = FeatureChannels(current=False, gyro=False)
-"""Wheel speeds as the only channel, to learn floors from the driving style."""
+DRIVING: frozenset[FloorChannel] = frozenset()
+"""Wheel speeds alone, to learn floors from the driving style."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +176,7 @@ class TreeEnsemble:
         frequency: frequency of each floor among the training rows.
     """
 
-    channels: FeatureChannels
+    channels: frozenset[FloorChannel]
     trees: "HistGradientBoostingClassifier"
     frequency: Float[np.ndarray, " floor"]
 
@@ -189,7 +188,9 @@ class TreeEnsemble:
         rows = np.concatenate([features(run, spec, self.channels) for run in runs])
         with one_thread():
             probability = self.trees.predict_proba(rows)
-        return np.asarray(np.log(np.maximum(probability, LEAST)) - np.log(self.frequency))
+        return np.asarray(
+            np.log(np.maximum(probability, LOWEST_PROBABILITY)) - np.log(self.frequency)
+        )
 
 
 @dataclass(frozen=True)
@@ -211,7 +212,7 @@ class BoostedTreesClassifier(FloorClassifier):
     """
 
     name: str = "boosted_trees"
-    channels: FeatureChannels = DEFAULT_CHANNELS
+    channels: frozenset[FloorChannel] = DEFAULT_CHANNELS
     without_driving: bool = False
     leaves: int = 4
     trees: int = 60
@@ -249,7 +250,7 @@ class BoostedTreesClassifier(FloorClassifier):
         return len(self.fitted) * self.trees * len(self.labels) * self.leaves
 
     def _ensemble(
-        self, runs: Sequence[FloorSignals], spec: RobotSpec, channels: FeatureChannels
+        self, runs: Sequence[FloorSignals], spec: RobotSpec, channels: frozenset[FloorChannel]
     ) -> TreeEnsemble:
         from sklearn.ensemble import HistGradientBoostingClassifier
 
@@ -279,5 +280,5 @@ def tree_classifiers() -> list[BoostedTreesClassifier]:
         trees,
         replace(fixed, name="boosted_trees_felt", without_driving=True),
         replace(fixed, name="boosted_trees_driving", channels=DRIVING),
-        replace(fixed, name="boosted_trees_vibration", channels=FeatureChannels(vibration=True)),
+        replace(fixed, name="boosted_trees_vibration", channels=DEFAULT_CHANNELS | {"vibration"}),
     ]

@@ -23,14 +23,16 @@ the wheels rest are left out. Predicted ratios are multiplied by the size again,
 rest does not slip.
 """
 
+import abc
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Protocol, runtime_checkable
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from slipid.lab.systems.one_thread import one_thread
 from slipid.predict.slip_model import (
     WINDOW_S,
     Channel,
@@ -38,6 +40,7 @@ from slipid.predict.slip_model import (
     RobotSpec,
     Run,
     RunSignals,
+    SlipModel,
     Twists,
     groups,
     path_of,
@@ -137,6 +140,7 @@ class SlipExamples:
         ratio: true slip ratio.
         weight: weight of each window; the mean of all weights is one.
         run: index of the run of each window.
+        floor: name of the floor of each window.
     """
 
     windows: SignalWindows
@@ -145,6 +149,7 @@ class SlipExamples:
     ratio: Ratios
     weight: Float[np.ndarray, " window"]
     run: Int[np.ndarray, " window"]
+    floor: np.ndarray
 
     @classmethod
     def of(cls, runs: Sequence[Run], spec: RobotSpec) -> "SlipExamples":
@@ -166,7 +171,38 @@ class SlipExamples:
             ratio=(true - windows.rolling)[moving] * spec.size / size[:, None],
             weight=weight_of(size),
             run=windows.run[moving],
+            floor=np.array([run.floor for run in runs])[windows.run[moving]],
         )
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedSlip(SlipModel, abc.ABC):
+    """Slip model by a regression of the slip ratio on the inputs of windows.
+
+    Attributes:
+        channels: channels of the inputs besides the encoders.
+        regressor: fitted regression of the slip ratio's three components; None before a fit.
+    """
+
+    channels: frozenset[Channel] = field(default=frozenset(), kw_only=True)
+    regressor: Regressor | None = field(default=None, kw_only=True)
+
+    @abc.abstractmethod
+    def trained(self, examples: SlipExamples) -> Self:
+        """Return the model with its regression fitted to the training windows."""
+
+    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> Self:
+        examples = SlipExamples.of(runs, spec)
+        with one_thread():
+            return replace(self.trained(examples), channels=examples.channels)
+
+    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
+        if self.regressor is None:
+            raise ValueError(f"{self.name}: predict before fit")
+        windows = SignalWindows.of(runs, spec)
+        with one_thread():
+            ratio = self.regressor.predict(windows.inputs(spec, self.channels))
+        return with_slip(runs, windows, ratio, spec)
 
 
 @dataclass(frozen=True, eq=False)

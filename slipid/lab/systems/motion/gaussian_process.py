@@ -15,7 +15,7 @@ Source: Rasmussen, Williams 2006, Gaussian Processes for RobotSpec Learning, MIT
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,6 +25,7 @@ from slipid.lab.systems.one_thread import one_thread
 
 if TYPE_CHECKING:
     from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import Kernel
 
 KEPT = 1000
 """Largest number of windows in the posterior."""
@@ -42,49 +43,17 @@ NOISES = (1e-4, 2.0)
 """Bounds of the variance of the noise, relative to the variance of the outputs."""
 
 
-@dataclass(frozen=True)
-class Kernel:
-    """Hyperparameters of the process; variances are relative to the variance of the outputs.
+def untuned_kernel(lengths: float | Float[np.ndarray, " input"], free: bool) -> "Kernel":
+    """Return the kernel with which a fit of the hyperparameters starts.
 
-    Attributes:
+    Args:
         lengths: length scale of each input, or a single one for all inputs.
         free: True if the length scales are fitted.
-        variance: variance of the process.
-        noise: variance of the measurement noise.
     """
+    from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
-    lengths: tuple[float, ...]
-    free: bool
-    variance: float = 1.0
-    noise: float = 0.1
-
-    @property
-    def numbers(self) -> int:
-        """Number of fitted hyperparameters."""
-        return 2 + (len(self.lengths) if self.free else 0)
-
-    def tuned(self, rows: "ProcessRows") -> "Kernel":
-        """Return the kernel of largest marginal likelihood for a sample of the rows.
-
-        The search starts from this kernel.
-        """
-        from sklearn.exceptions import ConvergenceWarning
-        from sklearn.gaussian_process import GaussianProcessRegressor
-
-        some = rows.drawn(TUNED)
-        start = GaussianProcessRegressor(
-            _sklearn_kernel(self), optimizer=_few_steps, normalize_y=True
-        )
-        with one_thread(), warnings.catch_warnings():
-            # a length scale at its upper bound only means that its input is irrelevant
-            warnings.simplefilter("ignore", ConvergenceWarning)
-            best = start.fit(some.x, some.y).kernel_
-        return replace(
-            self,
-            lengths=tuple(np.atleast_1d(best.k1.k2.length_scale).tolist()),
-            variance=float(best.k1.k1.constant_value),
-            noise=float(best.k2.noise_level),
-        )
+    matern = Matern(lengths, LENGTHS if free else "fixed", nu=1.5)
+    return ConstantKernel(1.0, VARIANCES) * matern + WhiteKernel(0.1, NOISES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,61 +81,36 @@ class ProcessRows:
         some = rng.choice(len(share), count, replace=False, p=share)
         return ProcessRows(self.x[some], self.y[some], self.weight[some])
 
+    def tuned(self, kernel: "Kernel") -> "Kernel":
+        """Return the kernel of largest marginal likelihood for a sample of the rows.
 
-@dataclass(frozen=True, eq=False)
-class ProcessPrediction:
-    """Mean and standard deviation of predicted outputs, including measurement noise."""
+        The search starts from the given kernel.
+        """
+        from sklearn.exceptions import ConvergenceWarning
 
-    mean: Float[np.ndarray, "row output"]
-    std: Float[np.ndarray, "row output"]
+        with warnings.catch_warnings():
+            # a length scale at its upper bound only means that its input is irrelevant
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            return self._fitted(kernel, TUNED, _few_steps).kernel_
 
+    def process(self, kernel: "Kernel") -> "GaussianProcessRegressor":
+        """Return the posterior of the process given a random sample of at most `KEPT` rows."""
+        return self._fitted(kernel, KEPT, None)
 
-@dataclass(frozen=True, eq=False)
-class GaussianProcess:
-    """Posterior of a process given a sample of rows.
-
-    Attributes:
-        kernel: hyperparameters.
-        known: rows on which the posterior is conditioned.
-        regressor: scikit-learn's process.
-    """
-
-    kernel: Kernel
-    known: ProcessRows
-    regressor: "GaussianProcessRegressor"
-
-    @classmethod
-    def of(cls, rows: ProcessRows, kernel: Kernel) -> "GaussianProcess":
-        """Return the posterior given a random sample of at most `KEPT` of the rows."""
+    def _fitted(
+        self, kernel: "Kernel", most: int, optimizer: Callable | None
+    ) -> "GaussianProcessRegressor":
         from sklearn.gaussian_process import GaussianProcessRegressor
 
-        known, start = rows.drawn(KEPT), _sklearn_kernel(kernel)
+        some = self.drawn(most)
+        process = GaussianProcessRegressor(kernel, optimizer=optimizer, normalize_y=True)
         with one_thread():
-            fitted = GaussianProcessRegressor(start, optimizer=None, normalize_y=True).fit(
-                known.x, known.y
-            )
-        return cls(kernel, known, fitted)
-
-    def predict(self, x: Float[np.ndarray, "row input"]) -> ProcessPrediction:
-        """Return the predicted outputs at the inputs."""
-        mean, std = self.regressor.predict(x, return_std=True)
-        outputs = self.known.y.shape[1]
-        return ProcessPrediction(mean.reshape(-1, outputs), std.reshape(-1, outputs))
-
-    @property
-    def numbers(self) -> int:
-        """Number of fitted numbers: hyperparameters and the entries of (K + noise I)^-1 y."""
-        return self.kernel.numbers + self.known.y.size
+            return process.fit(some.x, some.y)
 
 
-def _sklearn_kernel(kernel: Kernel) -> object:
-    """Return the kernel in scikit-learn's form."""
-    from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
-
-    bounds = LENGTHS if kernel.free else "fixed"
-    lengths = kernel.lengths[0] if len(kernel.lengths) == 1 else np.array(kernel.lengths)
-    matern = Matern(lengths, bounds, nu=1.5)
-    return ConstantKernel(kernel.variance, VARIANCES) * matern + WhiteKernel(kernel.noise, NOISES)
+def fitted_numbers(process: "GaussianProcessRegressor") -> int:
+    """Return the count of hyperparameters and of the entries of (K + noise I)^-1 y."""
+    return process.kernel_.n_dims + process.alpha_.size
 
 
 def _few_steps(

@@ -42,6 +42,7 @@ from scipy.special import softmax
 
 from slipid.lab.systems.motion.features import (
     Inputs,
+    LearnedSlip,
     Scale,
     SignalWindows,
     SlipExamples,
@@ -53,7 +54,7 @@ from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, Run
 
 KEPT = 20
 """Number of neurons of a layer whose outputs are the inputs of the next layer."""
-LEAST = 0.05
+LOWEST_OUTPUT = 0.05
 """Lower limit of the classifier's output for a floor in one window, which may be negative."""
 MEMORY = 0.9
 """Factor by which evidence about the floor fades from window to window."""
@@ -95,9 +96,9 @@ class NetworkSet:
         each = [grown(scaled, column, weight, in_a, growth) for column in outputs.scaled(y).T]
         return cls(inputs, outputs, each)
 
-    def output(self, x: Inputs) -> Float[np.ndarray, "window output"]:
+    def predict(self, X: Inputs) -> Float[np.ndarray, "window output"]:
         """Return the outputs, clipped to their training range."""
-        scaled = self.inputs.scaled(x)
+        scaled = self.inputs.scaled(X)
         return self.outputs.back(np.stack([one.output(scaled) for one in self.each], axis=1))
 
     @property
@@ -108,39 +109,29 @@ class NetworkSet:
 
 @final
 @dataclass(frozen=True, eq=False)
-class GmdhOne(SlipModel):
+class GmdhOne(LearnedSlip):
     """Slip model with one set of networks for all floors.
 
     Attributes:
         growth: settings of the networks' growth.
-        channels: channels of the inputs besides the encoders.
-        networks: networks of the slip ratio's three components.
+        regressor: networks of the slip ratio's three components; None before a fit.
     """
 
     name: str = "gmdh_one"
     growth: Growth = CANDIDATES[0]
-    channels: frozenset[Channel] = frozenset()
-    networks: NetworkSet | None = None
+    regressor: NetworkSet | None = None
 
     def candidates(self) -> Sequence["GmdhOne"]:
         return [replace(self, growth=growth) for growth in CANDIDATES]
 
-    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhOne":
-        data = SlipExamples.of(runs, spec)
-        in_a = first_half(data.run, [run.floor for run in runs])
-        networks = NetworkSet.grown(data.inputs, data.ratio, data.weight, in_a, self.growth)
-        return replace(self, channels=data.channels, networks=networks)
-
-    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
-        if self.networks is None:
-            raise ValueError(f"{self.name}: predict before fit")
-        windows = SignalWindows.of(runs, spec)
-        ratio = self.networks.output(windows.inputs(spec, self.channels))
-        return with_slip(runs, windows, ratio, spec)
+    def trained(self, examples: SlipExamples) -> "GmdhOne":
+        in_a = first_half(examples.run, examples.floor)
+        x, y, weight = examples.inputs, examples.ratio, examples.weight
+        return replace(self, regressor=NetworkSet.grown(x, y, weight, in_a, self.growth))
 
     @property
     def numbers(self) -> int:
-        return 0 if self.networks is None else self.networks.numbers
+        return 0 if self.regressor is None else self.regressor.numbers
 
 
 @final
@@ -168,12 +159,10 @@ class GmdhClass(SlipModel):
 
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhClass":
         data = SlipExamples.of(runs, spec)
-        floor_of_run = [run.floor for run in runs]
-        in_a = first_half(data.run, floor_of_run)
+        in_a = first_half(data.run, data.floor)
         # a floor on which no wheel turned has no training windows
-        named = np.array(floor_of_run)[data.run]
-        names = [name for name in dict.fromkeys(floor_of_run) if name in named]
-        on = np.stack([named == name for name in names], axis=1)
+        names = list(dict.fromkeys(data.floor.tolist()))
+        on = np.stack([data.floor == name for name in names], axis=1)
         floors = {
             name: NetworkSet.grown(
                 data.inputs[mine], data.ratio[mine], data.weight[mine], in_a[mine], self.growth
@@ -199,7 +188,7 @@ class GmdhClass(SlipModel):
         floor = np.where(given[windows.run] < 0, belief.argmax(axis=1), given[windows.run])
         ratio = np.zeros((len(inputs), 3))
         for number, networks in enumerate(self.floors.values()):
-            ratio[floor == number] = networks.output(inputs[floor == number])
+            ratio[floor == number] = networks.predict(inputs[floor == number])
         predicted = with_slip(runs, windows, ratio, spec)
         return [
             replace(of_run, floors=dict(zip(names, belief_of_run.T, strict=True)))
@@ -217,7 +206,7 @@ class GmdhClass(SlipModel):
         """
         if self.classifier is None:
             return np.ones((len(inputs), 1))
-        share = self.classifier.output(inputs).clip(min=LEAST)
+        share = self.classifier.predict(inputs).clip(min=LOWEST_OUTPUT)
         evidence = np.log(share / share.sum(axis=1, keepdims=True))
         # signals of a robot at rest carry no evidence about its floor
         evidence[~windows.moving] = 0.0
@@ -232,15 +221,13 @@ class GmdhClass(SlipModel):
         return sum(each.numbers for each in networks)
 
 
-def first_half(
-    run: Int[np.ndarray, " window"], floor_of_run: Sequence[str]
-) -> Bool[np.ndarray, " window"]:
+def first_half(run: Int[np.ndarray, " window"], floors: np.ndarray) -> Bool[np.ndarray, " window"]:
     """Return True for the windows of half A: those of half of each floor's runs, at random.
 
-    On a floor with only one run, half A has every other window.
+    On a floor with only one run, half A has every other window. `floors` names the floor of each
+    window.
     """
     rng = np.random.default_rng(SEED)
-    floors = np.array(floor_of_run)[run]
     in_a = np.zeros(len(run), dtype=bool)
     for floor in dict.fromkeys(floors.tolist()):
         mine = np.flatnonzero(floors == floor)

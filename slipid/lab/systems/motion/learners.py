@@ -42,20 +42,14 @@ Goodfellow, Bengio, Courville 2016, Deep Learning, MIT Press, section 7.8.
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from slipid.lab.systems.motion.features import (
-    Regressor,
-    Scale,
-    SignalWindows,
-    SlipExamples,
-    with_slip,
-)
-from slipid.lab.systems.one_thread import one_thread
-from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, RunSignals, SlipModel
+from slipid.lab.systems.motion.features import Inputs, LearnedSlip, Ratios, Scale, SlipExamples
+
+if TYPE_CHECKING:
+    from sklearn.neural_network import MLPRegressor
 
 FEWEST = 20
 """Smallest number of windows in a leaf, and of training windows for early stopping."""
@@ -68,15 +62,13 @@ PATIENCE = 6
 
 @final
 @dataclass(frozen=True, eq=False)
-class BoostedTrees(SlipModel):
+class BoostedTrees(LearnedSlip):
     """Slip model by boosted trees for each component of the slip ratio.
 
     Attributes:
         rate: learning rate.
         leaves: largest number of leaves of a tree.
         trees: number of trees of each component.
-        channels: channels of the inputs besides the encoders.
-        each: scikit-learn's fitted ensemble for each component.
         windows: number of training windows.
     """
 
@@ -84,82 +76,74 @@ class BoostedTrees(SlipModel):
     rate: float = 0.1
     leaves: int = 8
     trees: int = 60
-    channels: frozenset[Channel] = frozenset()
-    each: tuple[Regressor, ...] = ()
     windows: int = 0
 
     def candidates(self) -> Sequence["BoostedTrees"]:
         pairs = (0.1, 8), (0.05, 8), (0.2, 4), (0.1, 4)
         return [replace(self, rate=rate, leaves=leaves) for rate, leaves in pairs]
 
-    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "BoostedTrees":
+    def trained(self, examples: SlipExamples) -> "BoostedTrees":
         from sklearn.ensemble import HistGradientBoostingRegressor
+        from sklearn.multioutput import MultiOutputRegressor
 
-        examples = SlipExamples.of(runs, spec)
         # rows are drawn by weight, since scikit-learn takes ten times as long to bin weighted rows
         chance = np.random.default_rng(SEED).uniform(size=len(examples.weight))
         kept = chance <= examples.weight / examples.weight.max()
-        with one_thread():
-            each = tuple(
-                HistGradientBoostingRegressor(
-                    learning_rate=self.rate,
-                    max_iter=self.trees,
-                    max_leaf_nodes=self.leaves,
-                    min_samples_leaf=FEWEST,
-                    early_stopping=False,
-                    random_state=SEED,
-                ).fit(examples.inputs[kept], ratio)
-                for ratio in examples.ratio[kept].T
-            )
-        return replace(self, channels=examples.channels, each=each, windows=int(kept.sum()))
-
-    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
-        if not self.each:
-            raise ValueError(f"{self.name}: predict before fit")
-        windows = SignalWindows.of(runs, spec)
-        inputs = windows.inputs(spec, self.channels)
-        with one_thread():
-            ratio = np.stack([trees.predict(inputs) for trees in self.each], axis=1)
-        return with_slip(runs, windows, ratio, spec)
+        trees = HistGradientBoostingRegressor(
+            learning_rate=self.rate,
+            max_iter=self.trees,
+            max_leaf_nodes=self.leaves,
+            min_samples_leaf=FEWEST,
+            early_stopping=False,
+            random_state=SEED,
+        )
+        fitted = MultiOutputRegressor(trees).fit(examples.inputs[kept], examples.ratio[kept])
+        return replace(self, regressor=fitted, windows=int(kept.sum()))
 
     @property
     def numbers(self) -> int:
         """Largest possible number of leaf values and thresholds; small trees have fewer."""
         leaves = min(self.leaves, max(1, self.windows // FEWEST))
-        return len(self.each) * self.trees * (2 * leaves - 1)
+        return 0 if self.regressor is None else 3 * self.trees * (2 * leaves - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class ScaledNetwork:
+    """scikit-learn's network with standardised inputs and outputs."""
+
+    inputs: Scale
+    outputs: Scale
+    network: "MLPRegressor"
+
+    def predict(self, X: Inputs) -> Ratios:
+        """Return the slip ratios, clipped to their training range."""
+        return self.outputs.back(self.network.predict(self.inputs.scaled(X)))
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class NeuralNetwork(SlipModel):
+class NeuralNetwork(LearnedSlip):
     """Slip model by a multilayer perceptron for all components of the slip ratio.
 
     Attributes:
         hidden: sizes of the hidden layers.
         alpha: penalty on squared weights.
-        channels: channels of the inputs besides the encoders.
-        inputs: standardisation of the inputs.
-        outputs: standardisation of the outputs.
-        network: scikit-learn's fitted network.
+        regressor: the fitted network; None before a fit.
     """
 
     name: str = "neural_network"
     hidden: tuple[int, ...] = (32,)
     alpha: float = 1e-3
-    channels: frozenset[Channel] = frozenset()
-    inputs: Scale | None = None
-    outputs: Scale | None = None
-    network: Regressor | None = None
+    regressor: ScaledNetwork | None = None
 
     def candidates(self) -> Sequence["NeuralNetwork"]:
         pairs = (32, 1e-3), (16, 1e-1), (16, 1.0), (32, 1.0)
         return [replace(self, hidden=(size,), alpha=alpha) for size, alpha in pairs]
 
-    def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "NeuralNetwork":
+    def trained(self, examples: SlipExamples) -> "NeuralNetwork":
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.neural_network import MLPRegressor
 
-        examples = SlipExamples.of(runs, spec)
         inputs, outputs = Scale.of(examples.inputs), Scale.of(examples.ratio)
         network = MLPRegressor(
             hidden_layer_sizes=self.hidden,
@@ -170,27 +154,17 @@ class NeuralNetwork(SlipModel):
             n_iter_no_change=PATIENCE,
             random_state=SEED,
         )
-        with one_thread(), warnings.catch_warnings():
+        with warnings.catch_warnings():
             # the number of passes is limited on purpose, so reaching the limit needs no warning
             warnings.simplefilter("ignore", ConvergenceWarning)
             x, y = inputs.scaled(examples.inputs), outputs.scaled(examples.ratio)
             network.fit(x, y, sample_weight=examples.weight)
-        return replace(
-            self, channels=examples.channels, inputs=inputs, outputs=outputs, network=network
-        )
-
-    def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
-        if self.network is None or self.inputs is None or self.outputs is None:
-            raise ValueError(f"{self.name}: predict before fit")
-        windows = SignalWindows.of(runs, spec)
-        inputs = self.inputs.scaled(windows.inputs(spec, self.channels))
-        ratio = self.outputs.back(self.network.predict(inputs))
-        return with_slip(runs, windows, ratio, spec)
+        return replace(self, regressor=ScaledNetwork(inputs, outputs, network))
 
     @property
     def numbers(self) -> int:
         """Number of weights and biases."""
-        if self.network is None or self.inputs is None:
+        if self.regressor is None:
             return 0
-        sizes = [len(self.inputs.mean), *self.hidden, 3]
-        return sum((a + 1) * b for a, b in pairwise(sizes))
+        network = self.regressor.network
+        return sum(part.size for part in (*network.coefs_, *network.intercepts_))

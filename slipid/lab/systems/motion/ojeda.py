@@ -187,7 +187,9 @@ class Ojeda(SlipModel):
             return sporadic(steps, runs, spec)
         w = TrainingWindows.of(runs)
         if self.tuning == "continuous":
-            return continuous(steps, w, spec)
+            parts, gap = w.rows(spec.back @ steps.features(), spec)
+            used = parts.any(axis=(1, 2))
+            return forgetful(parts[used], gap[used], FORGETTING, PRIOR)
         return by_gyro(steps, w, hard.mean, spec)
 
 
@@ -213,13 +215,6 @@ def hard_runs(runs: Sequence[Run], spec: RobotSpec) -> list[Run]:
 def true_ends(runs: Sequence[Run]) -> Float[np.ndarray, "run 3"]:
     """Return the pose at each run's end relative to its start [m, m, rad]."""
     return np.stack([relative_to_start(run.pose)[-1] for run in runs])
-
-
-def continuous(steps: FlaggedSteps, w: TrainingWindows, spec: RobotSpec) -> Line:
-    """Return k0 and k1 fitted to displacements in windows with flagged slip, for known poses."""
-    parts, gap = w.rows(spec.back @ steps.features(), spec)
-    used = parts.any(axis=(1, 2))
-    return forgetful(parts[used], gap[used], FORGETTING, PRIOR)
 
 
 def forgetful(

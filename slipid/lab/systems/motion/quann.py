@@ -52,7 +52,7 @@ data, IEEE Robotics and Automation Letters 5(2).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -65,7 +65,11 @@ from slipid.lab.systems.motion.features import (
     at_steps,
     with_slip,
 )
-from slipid.lab.systems.motion.gaussian_process import GaussianProcess, Kernel, ProcessRows
+from slipid.lab.systems.motion.gaussian_process import (
+    ProcessRows,
+    fitted_numbers,
+    untuned_kernel,
+)
 from slipid.predict.slip_model import (
     Aim,
     Channel,
@@ -77,6 +81,9 @@ from slipid.predict.slip_model import (
     Twists,
     path_of,
 )
+
+if TYPE_CHECKING:
+    from sklearn.gaussian_process import GaussianProcessRegressor
 
 SLOW = 0.02
 """Lower limit of |v| in the energy per metre, which is proportional to power below it [m/s]."""
@@ -100,7 +107,7 @@ class QuannEnergy(SlipModel):
     length: float = 0.2
     law: Float[np.ndarray, "4"] | None = None
     fastest: Float[np.ndarray, "2"] | None = None
-    process: GaussianProcess | None = None
+    process: "GaussianProcessRegressor | None" = None
 
     def candidates(self) -> Sequence["QuannEnergy"]:
         return [replace(self, length=length) for length in (0.1, 0.2, 0.5)]
@@ -111,19 +118,17 @@ class QuannEnergy(SlipModel):
         energy = np.concatenate([run.power(spec) for run in windows.signals]) / speed
         terms = law_terms(motion)
         law = np.linalg.lstsq(terms * speed[:, None], energy * speed, rcond=1e-6)[0]
-        residual = (energy - terms @ law)[:, None]
-        rows = ProcessRows(places(windows, spec), residual, speed**2)
-        kernel = Kernel((self.length,), free=False).tuned(rows)
-        process = GaussianProcess.of(rows, kernel)
+        rows = ProcessRows(places(windows, spec), (energy - terms @ law)[:, None], speed**2)
+        process = rows.process(rows.tuned(untuned_kernel(self.length, free=False)))
         return replace(self, law=law, fastest=motion.max(axis=0), process=process)
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.process is None or self.law is None or self.fastest is None:
             raise ValueError(f"{self.name}: predict before fit")
         windows = SignalWindows.of(runs, spec)
-        residual = self.process.predict(places(windows, spec)).mean
+        residual = self.process.predict(places(windows, spec))
         motion = np.minimum(motions(windows.rolling), self.fastest)
-        energy = law_terms(motion) @ self.law + residual[:, 0]
+        energy = law_terms(motion) @ self.law + residual.ravel()
         rolling = [run.rolling(spec) for run in runs]
         of_steps = at_steps(energy[:, None], windows, runs)
         return [
@@ -133,7 +138,7 @@ class QuannEnergy(SlipModel):
 
     @property
     def numbers(self) -> int:
-        return 0 if self.process is None else 4 + self.process.numbers
+        return 0 if self.process is None else 4 + fitted_numbers(self.process)
 
 
 def rate(twist: Twists) -> Float[np.ndarray, " row"]:
@@ -183,7 +188,7 @@ class QuannSlip(SlipModel):
     needs: frozenset[Channel] = field(default=frozenset({"current"}), kw_only=True)
     anisotropic: bool = True
     scale: Scale | None = None
-    process: GaussianProcess | None = None
+    process: "GaussianProcessRegressor | None" = None
     inflation: float = 1.0
 
     def candidates(self) -> Sequence["QuannSlip"]:
@@ -194,26 +199,26 @@ class QuannSlip(SlipModel):
         inputs = slip_inputs(examples.windows, spec)[examples.windows.moving]
         scale = Scale.of(inputs)
         rows = ProcessRows(scale.scaled(inputs), examples.ratio, examples.weight)
-        lengths = (START,) * (inputs.shape[1] if self.anisotropic else 1)
-        kernel = Kernel(lengths, free=True).tuned(rows)
+        lengths = np.full(inputs.shape[1], START) if self.anisotropic else START
+        kernel = rows.tuned(untuned_kernel(lengths, free=True))
         squares = []
         for part in parts(np.unique(examples.run)):
             mine = np.isin(examples.run, part)
             # if there is only one run, it is predicted by a fit to itself
-            others = GaussianProcess.of(rows if mine.all() else rows.only(~mine), kernel)
+            others = (rows if mine.all() else rows.only(~mine)).process(kernel)
             known = replace(self, scale=scale, process=others, inflation=1.0)
             squares.append(end_squares(known, [runs[k] for k in part], spec))
         inflation = float(np.concatenate(squares).mean())
-        whole = GaussianProcess.of(rows, kernel)
-        return replace(self, scale=scale, process=whole, inflation=inflation)
+        return replace(self, scale=scale, process=rows.process(kernel), inflation=inflation)
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.process is None or self.scale is None:
             raise ValueError(f"{self.name}: predict before fit")
         windows = SignalWindows.of(runs, spec)
-        slip = self.process.predict(self.scale.scaled(slip_inputs(windows, spec)))
-        predicted = with_slip(runs, windows, slip.mean, spec)
-        std = at_steps(slip.std * windows.size[:, None] / spec.size, windows, runs)
+        inputs = self.scale.scaled(slip_inputs(windows, spec))
+        ratio, ratio_std = self.process.predict(inputs, return_std=True)
+        predicted = with_slip(runs, windows, ratio, spec)
+        std = at_steps(ratio_std * windows.size[:, None] / spec.size, windows, runs)
         return [
             replace(of_run, end_covariance=self.inflation * spread + CAMERA**2 * np.eye(2))
             for of_run, run, of_step in zip(predicted, runs, std, strict=True)
@@ -222,7 +227,7 @@ class QuannSlip(SlipModel):
 
     @property
     def numbers(self) -> int:
-        return 0 if self.process is None else 1 + self.process.numbers
+        return 0 if self.process is None else 1 + fitted_numbers(self.process)
 
 
 def slip_inputs(windows: SignalWindows, spec: RobotSpec) -> Inputs:

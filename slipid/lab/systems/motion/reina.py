@@ -53,7 +53,6 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.lab.systems.motion.reina_indicators import (
-    Indicators,
     LabelledRun,
     SlipThresholds,
     SmoothedSignals,
@@ -107,9 +106,8 @@ class _Detector(SlipModel):
 
     def score(self, signals: SmoothedSignals) -> Numbers:
         """Return the slip score of each step; 0 at rest."""
-        return np.where(
-            signals.moving, self._moving_score(Indicators.of(signals, self.limits)), 0.0
-        )
+        score = self._moving_score(*self.limits.indicators(signals))
+        return np.where(signals.moving, score, 0.0)
 
     def _mean_slip(self, examples: Sequence[LabelledRun]) -> float:
         """Return the mean slip of flagged steps, by least squares in the twists of windows."""
@@ -132,8 +130,8 @@ class _Detector(SlipModel):
         """Score from which slip is flagged."""
 
     @abc.abstractmethod
-    def _moving_score(self, indicators: Indicators) -> Numbers:
-        """Return the slip score of steps in which the robot moves."""
+    def _moving_score(self, encoder: Numbers, current: Numbers, gyro: Numbers | None) -> Numbers:
+        """Return the slip score from the indicators EI, CI and GI of a robot that moves."""
 
 
 @final
@@ -154,9 +152,8 @@ class ReinaDeterministic(_Detector):
     def _threshold(self) -> float:
         return 1.0
 
-    def _moving_score(self, indicators: Indicators) -> Numbers:
-        turning = indicators.encoder if indicators.gyro is None else indicators.gyro
-        return np.maximum(turning, indicators.current)
+    def _moving_score(self, encoder: Numbers, current: Numbers, gyro: Numbers | None) -> Numbers:
+        return np.maximum(encoder if gyro is None else gyro, current)
 
 
 @final
@@ -186,22 +183,23 @@ class ReinaFuzzy(_Detector):
         return 0.5
 
     def _trained(self, examples: Sequence[LabelledRun]) -> "ReinaFuzzy":
-        signals = [example.signals for example in examples]
-        inputs = np.concatenate([self._inputs(Indicators.of(s, self.limits)) for s in signals])
+        indicators = [self.limits.indicators(example.signals) for example in examples]
+        inputs = np.concatenate([self._inputs(*of_run) for of_run in indicators])
         slips = np.concatenate([example.slips for example in examples])
         known = np.isfinite(slips)
         untrained = Sugeno.logical_or(inputs.shape[1], self.sets)
         return replace(self, rules=untrained.trained(inputs[known], slips[known]))
 
-    def _moving_score(self, indicators: Indicators) -> Numbers:
-        inputs = self._inputs(indicators)
+    def _moving_score(self, encoder: Numbers, current: Numbers, gyro: Numbers | None) -> Numbers:
+        inputs = self._inputs(encoder, current, gyro)
         rules = self.rules or Sugeno.logical_or(inputs.shape[1], self.sets)
         return rules.infer(inputs)
 
-    def _inputs(self, indicators: Indicators) -> Float[np.ndarray, "step input"]:
+    def _inputs(
+        self, encoder: Numbers, current: Numbers, gyro: Numbers | None
+    ) -> Float[np.ndarray, "step input"]:
         """Return the indicators as columns; GI is 0 in a run without a gyro."""
-        columns = [indicators.encoder, indicators.current]
+        columns = [encoder, current]
         if np.isfinite(self.limits.turning):
-            zero = np.zeros_like(indicators.encoder)
-            columns.append(zero if indicators.gyro is None else indicators.gyro)
+            columns.append(np.zeros_like(encoder) if gyro is None else gyro)
         return np.stack(columns, axis=1)

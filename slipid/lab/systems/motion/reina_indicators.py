@@ -73,7 +73,7 @@ class Sugeno:
         return replace(self, consequents=np.linalg.solve(strength.T @ strength + prior, right))
 
 
-SLIPS = 0.2
+SLIP_THRESHOLD = 0.2
 """Difference of true and encoders' twist, relative to the latter, above which a window slips."""
 _REST = 0.01
 """Speed of the fastest rim up to which a robot counts as at rest [m/s]."""
@@ -161,30 +161,16 @@ class SlipThresholds:
             highest=max(limit(amps, quantile), usual + 1e-3),
         )
 
+    def indicators(self, signals: SmoothedSignals) -> tuple[Numbers, Numbers, Numbers | None]:
+        """Return EI, CI and GI in every step of a run, before they are clipped to 0..1.
 
-@dataclass(frozen=True, eq=False)
-class Indicators:
-    """Indicators of slip in every step, before they are clipped to 0..1.
-
-    Attributes:
-        encoder: EI, from wheel speeds and accelerations.
-        current: CI, from motor currents.
-        gyro: GI, from yaw rates; None without a gyro.
-    """
-
-    encoder: Numbers
-    current: Numbers
-    gyro: Numbers | None
-
-    @classmethod
-    def of(cls, signals: SmoothedSignals, limits: SlipThresholds) -> "Indicators":
-        """Return the indicators of a run's signals."""
-        turning = signals.turning if np.isfinite(limits.turning) else None
-        return cls(
-            encoder=np.maximum(signals.deviation, signals.change / limits.change),
-            current=(signals.amps - limits.usual) / (limits.highest - limits.usual),
-            gyro=None if turning is None else turning / limits.turning,
-        )
+        GI is None without a gyro.
+        """
+        encoder = np.maximum(signals.deviation, signals.change / self.change)
+        current = (signals.amps - self.usual) / (self.highest - self.usual)
+        if signals.turning is None or not np.isfinite(self.turning):
+            return encoder, current, None
+        return encoder, current, signals.turning / self.turning
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +199,7 @@ class LabelledRun:
         rolling = joined.signals.rolling(spec) * spec.size
         slip = rolling - joined.twist * spec.size
         size = np.linalg.norm(rolling, axis=1)
-        slips = np.where(size > _REST, np.linalg.norm(slip, axis=1) > SLIPS * size, np.nan)
+        slips = np.where(size > _REST, np.linalg.norm(slip, axis=1) > SLIP_THRESHOLD * size, np.nan)
         first = groups(run.signals.dt, WINDOW_S)
         return cls(
             signals=SmoothedSignals.of(run.signals, spec, seconds),
@@ -253,13 +239,8 @@ def _deviation(
         is_commanded = np.abs(commanded).max(axis=1, keepdims=True) > _REST
         shape = np.where(is_commanded, commanded, shape)
     turns = np.abs(shape) >= np.maximum(_DRIVING * np.abs(shape).max(axis=1, keepdims=True), 1e-9)
-    ratio = np.sort(np.where(turns, rim / np.where(turns, shape, 1.0), np.inf), axis=1)
-    # ratios of wheels that do not turn are infinite and sorted last, so that they can be left out
-    # of the median
-    count = np.maximum(turns.sum(axis=1, keepdims=True), 1)
-    middle = np.concatenate([(count - 1) // 2, count // 2], axis=1)
-    median = np.take_along_axis(ratio, middle, axis=1).mean(axis=1, keepdims=True)
-    reference = shape * np.where(np.isfinite(median), median, 0.0)
+    ratio = np.ma.masked_array(rim / np.where(turns, shape, 1.0), ~turns)
+    reference = shape * np.ma.median(ratio, axis=1, keepdims=True).filled(0.0)
     scale = np.maximum(np.abs(reference).max(axis=1, keepdims=True), _REST)
     return np.asarray(
         (np.abs(rim - reference) / np.maximum(np.abs(reference), _DRIVING * scale)).max(axis=1)

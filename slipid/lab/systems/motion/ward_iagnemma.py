@@ -270,14 +270,14 @@ class WardIagnemma(SlipModel):
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         padded = PaddedRuns.of(runs, spec)
-        tracked = self.filter(spec).track(padded)
-        size, fastest = (np.linalg.norm(q, axis=2) for q in (tracked.speeds, padded.rolling))
+        speeds, covariance = self.filter(spec).track(padded)
+        size, fastest = (np.linalg.norm(q, axis=2) for q in (speeds, padded.rolling))
         kept = np.where(fastest > REST, size / np.where(fastest > REST, fastest, 1.0), 1.0)
         slipping = np.clip(1.0 - kept, 0.0, 1.0)
         return [
             PredictedRun(
-                path_of(tracked.speeds[k, : len(run)] / spec.size, run.dt),
-                end_covariance=tracked.covariance[k, :2, :2],
+                path_of(speeds[k, : len(run)] / spec.size, run.dt),
+                end_covariance=covariance[k, :2, :2],
                 slipping=slipping[k, : len(run)],
             )
             for k, run in enumerate(runs)

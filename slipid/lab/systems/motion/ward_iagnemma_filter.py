@@ -87,19 +87,6 @@ class FilterState:
 
 
 @dataclass(frozen=True, eq=False)
-class FilteredRuns:
-    """Filtered states of padded runs.
-
-    Attributes:
-        speeds: q in every step [m/s].
-        covariance: covariance of the pose at the end of the run [m, m, rad].
-    """
-
-    speeds: Float[np.ndarray, "run step 3"]
-    covariance: Float[np.ndarray, "run 3 3"]
-
-
-@dataclass(frozen=True, eq=False)
 class SlipFilter:
     """The extended Kalman filter, with its fitted model.
 
@@ -117,8 +104,13 @@ class SlipFilter:
     uses_current: bool
     wander: float
 
-    def track(self, runs: PaddedRuns) -> FilteredRuns:
-        """Return the filtered states of all runs, computed together."""
+    def track(
+        self, runs: PaddedRuns
+    ) -> tuple[Float[np.ndarray, "run step 3"], Float[np.ndarray, "run 3 3"]]:
+        """Return filtered speeds q of all runs, and covariances of the poses at their ends.
+
+        Speeds are in m/s, covariances in products of [m, m, rad].
+        """
         count, steps = runs.dt.shape
         rolling = np.full((count, 1), self.dynamics.law.rolling)
         mean = np.concatenate([runs.rolling[:, 0], rolling, np.zeros((count, 1))], axis=1)
@@ -133,7 +125,7 @@ class SlipFilter:
             turn = state.mean[:, 2] / self.dynamics.base_radius * dt
             state = self._with_pose_error(state, heading + 0.5 * turn, dt)
             heading = heading + turn
-        return FilteredRuns(speeds, state.covariance[:, 5:, 5:])
+        return speeds, state.covariance[:, 5:, 5:]
 
     def _predicted(self, state: FilterState, rim: Drives, dt: Each) -> FilterState:
         """Return the state predicted by a step of the dynamics, with process noise."""

@@ -19,7 +19,6 @@ from slipid.lab.systems.floors.interface import training_rows
 from slipid.lab.systems.floors.learned import (
     DRIVING,
     BoostedTreesClassifier,
-    FeatureChannels,
     GaussianClassifier,
     features,
     tree_classifiers,
@@ -138,9 +137,9 @@ def test_rows_of_trees_use_the_channels_of_their_names():
         "boosted_trees_driving",
         "boosted_trees_vibration",
     ]
-    assert plain.channels == off.channels == FeatureChannels(True, True, False)
-    assert driving.channels == DRIVING == FeatureChannels(False, False, False)
-    assert vibration.channels == FeatureChannels(True, True, True)
+    assert plain.channels == off.channels == {"current", "gyro"}
+    assert driving.channels == DRIVING == set()
+    assert vibration.channels == {"current", "gyro", "vibration"}
     assert off.without_driving
     assert not plain.without_driving
 

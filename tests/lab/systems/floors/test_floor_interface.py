@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 
 from slipid.lab.systems.floors.cosine_energy import CosineEnergyClassifier
-from slipid.lab.systems.floors.interface import TrailingWindow, accumulated, training_rows
+from slipid.lab.systems.floors.interface import (
+    DEFAULT_CHANNELS,
+    TrailingWindow,
+    accumulated,
+    training_rows,
+)
 from slipid.lab.systems.floors.learned import (
+    DRIVING,
     BoostedTreesClassifier,
-    FeatureChannels,
     GaussianClassifier,
     features,
 )
@@ -91,13 +96,13 @@ def test_windows_leave_out_missing_values():
 def test_features_are_of_the_requested_channels():
     run = made_floor_run("grass", ahead(20), 2.0)
     other = replace(run, current=run.current + 1.0)
-    driving = FeatureChannels(current=False, gyro=False)
+    driving = DRIVING
     same = features(run, HUSKY, driving), features(other, HUSKY, driving)
     assert np.array_equal(*same)
     assert not np.array_equal(features(run, HUSKY), features(other, HUSKY))
     shaken = replace(run, vibration=2 * run.vibration)
     assert np.array_equal(features(run, HUSKY), features(shaken, HUSKY))
-    vibration = FeatureChannels(vibration=True)
+    vibration = DEFAULT_CHANNELS | {"vibration"}
     assert not np.array_equal(features(run, HUSKY, vibration), features(shaken, HUSKY, vibration))
 
 

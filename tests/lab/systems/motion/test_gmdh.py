@@ -136,7 +136,7 @@ def test_with_an_empty_half_all_rows_do_both():
 
 def test_halves_are_of_whole_runs_of_every_floor():
     run = np.repeat(np.arange(9), 4)
-    floors = ["gray"] * 4 + ["green"] * 4 + ["table"]
+    floors = np.repeat(["gray"] * 4 + ["green"] * 4 + ["table"], 4)
     in_a = first_half(run, floors)
     share = in_a.reshape(9, 4).mean(axis=1)
     assert share[:4].sum() == 2
@@ -157,8 +157,8 @@ def test_outputs_of_networks_are_clipped_to_the_training_range():
     x = np.random.default_rng(0).uniform([-1, -1, -3], [1, 1, 1], (100, 3))
     y = np.stack([x[:, 0] * x[:, 1], x[:, 2] ** 2], axis=1)
     networks = NetworkSet.grown(x, y, np.ones(100), np.arange(100) % 2 == 0, EXACT)
-    assert np.allclose(networks.output(x), y)
-    far = networks.output(np.full((1, 3), 50.0))
+    assert np.allclose(networks.predict(x), y)
+    far = networks.predict(np.full((1, 3), 50.0))
     # the corner where both are largest was not seen, nor squares beyond one on this side
     assert far[0] == pytest.approx([y[:, 0].max(), x[:, 2].max() ** 2], abs=1e-6)
 

@@ -159,7 +159,7 @@ def test_a_neural_network_learns_how_slip_turns_with_the_direction():
 
 def test_the_numbers_of_a_network_are_its_weights():
     method = NeuralNetwork(hidden=(5, 4), alpha=0.1).fit([slipping(0.0, [0.1, 0.0, 0.0])], ROBOTINO)
-    parts = (*method.network.coefs_, *method.network.intercepts_)
+    parts = (*method.regressor.network.coefs_, *method.regressor.network.intercepts_)
     assert method.numbers == sum(part.size for part in parts)
     assert NeuralNetwork().numbers == 0
 
@@ -167,7 +167,7 @@ def test_the_numbers_of_a_network_are_its_weights():
 def test_a_network_that_has_not_converged_does_not_warn():
     # few windows with different slips: none left out, and every pass gains a little
     runs = [slipping(k, [np.sin(3 * k), np.cos(k), 0.0], steps=5) for k in range(19)]
-    assert NeuralNetwork().fit(runs, ROBOTINO).network.n_iter_ == PASSES
+    assert NeuralNetwork().fit(runs, ROBOTINO).regressor.network.n_iter_ == PASSES
 
 
 def test_the_output_of_a_network_is_clipped_to_the_training_range():

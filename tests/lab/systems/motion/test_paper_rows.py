@@ -8,7 +8,7 @@ from sklearn.linear_model import LinearRegression
 from sklearn.svm import SVR
 
 from slipid.lab.paper2021.deployed_form import (
-    MOST,
+    MOST_SAMPLES,
     PaperCode,
     PaperPrint,
     PaperSvr,
@@ -218,7 +218,7 @@ def test_at_most_so_many_samples_are_drawn_and_always_the_same(rng):
         recipe_samples(TrainingWindows.of(runs), ROBOTINO),
         recipe_samples(TrainingWindows.of(runs), ROBOTINO),
     )
-    assert len(found) == MOST < 30 * 40 * 3
+    assert len(found) == MOST_SAMPLES < 30 * 40 * 3
     assert np.array_equal(found.slip, again.slip)
     # by lot, not those of the first runs alone
     assert found.slip.mean() == pytest.approx(slips.mean(), abs=0.01)

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from slipid.lab.systems.motion.features import SignalWindows
-from slipid.lab.systems.motion.gaussian_process import KEPT, GaussianProcess, Kernel, ProcessRows
+from slipid.lab.systems.motion.gaussian_process import (
+    KEPT,
+    ProcessRows,
+    fitted_numbers,
+    untuned_kernel,
+)
 from slipid.lab.systems.motion.quann import (
     PARTS,
     QuannEnergy,
@@ -21,12 +26,15 @@ from slipid.predict.slip_model import Run, RunSignals, path_of
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
 
 SIZES = np.array([1.0, 1.0, 0.125])
-KERNEL = Kernel((0.7, 1.5), free=True, variance=1.3, noise=0.05)
+KERNEL = untuned_kernel(np.array([0.7, 1.5]), free=True).clone_with_theta(
+    np.log([1.3, 0.7, 1.5, 0.05])
+)
 
 
 def matern(a, b, kernel):
-    d = np.sqrt((((a[:, None] - b[None]) / np.array(kernel.lengths)) ** 2).sum(axis=2))
-    return kernel.variance * (1 + np.sqrt(3) * d) * np.exp(-np.sqrt(3) * d)
+    variance, *lengths, _ = np.exp(kernel.theta)
+    d = np.sqrt((((a[:, None] - b[None]) / np.array(lengths)) ** 2).sum(axis=2))
+    return variance * (1 + np.sqrt(3) * d) * np.exp(-np.sqrt(3) * d)
 
 
 def rows(n=60, seed=0) -> ProcessRows:
@@ -39,41 +47,36 @@ def rows(n=60, seed=0) -> ProcessRows:
 def test_a_posterior_is_that_of_the_closed_form():
     known = rows()
     new = np.random.default_rng(1).uniform(-3, 3, (7, 2))
-    said = GaussianProcess.of(known, KERNEL).predict(new)
+    found, spread = known.process(KERNEL).predict(new, return_std=True)
     mean, std = known.y.mean(axis=0), known.y.std(axis=0)
     gram = matern(known.x, known.x, KERNEL) + 0.05 * np.eye(60)
     across = matern(new, known.x, KERNEL)
-    assert np.allclose(
-        said.mean, mean + std * (across @ np.linalg.solve(gram, (known.y - mean) / std))
-    )
+    assert np.allclose(found, mean + std * (across @ np.linalg.solve(gram, (known.y - mean) / std)))
     explained = (across * np.linalg.solve(gram, across.T).T).sum(axis=1)
-    assert np.allclose(said.std, np.sqrt(1.3 + 0.05 - explained)[:, None] * std)
+    assert np.allclose(spread, np.sqrt(1.3 + 0.05 - explained)[:, None] * std)
 
 
 def likelihood(known, kernel):
     """Return the log probability of all outputs, up to a constant."""
     z = (known.y - known.y.mean(axis=0)) / known.y.std(axis=0)
-    gram = matern(known.x, known.x, kernel) + kernel.noise * np.eye(len(z))
+    gram = matern(known.x, known.x, kernel) + np.exp(kernel.theta[-1]) * np.eye(len(z))
     return -0.5 * (z * np.linalg.solve(gram, z)).sum() - 0.5 * 2 * np.linalg.slogdet(gram)[1]
 
 
 def test_hyperparameters_make_what_is_known_most_likely():
     known = rows()
-    best = Kernel((2.0, 2.0), free=True).tuned(known)
+    start = untuned_kernel(np.array([2.0, 2.0]), free=True)
+    best = known.tuned(start)
     there = likelihood(known, best)
-    assert there > likelihood(known, Kernel((2.0, 2.0), free=True)) + 10
+    assert there > likelihood(known, start) + 10
     for factor in (0.7, 1.4):
-        for other in (
-            replace(best, lengths=(best.lengths[0] * factor, best.lengths[1])),
-            replace(best, lengths=(best.lengths[0], best.lengths[1] * factor)),
-            replace(best, noise=best.noise * factor),
-            replace(best, variance=best.variance * factor),
-        ):
-            assert likelihood(known, other) < there
-    assert best.numbers == 4
-    held = Kernel((0.9, 0.9), free=False).tuned(known)
-    assert held.lengths == (0.9, 0.9)
-    assert held.numbers == 2
+        for k in range(4):
+            shift = np.log(factor) * np.eye(4)[k]
+            assert likelihood(known, best.clone_with_theta(best.theta + shift)) < there
+    assert fitted_numbers(known.process(best)) == 4 + known.y.size
+    fixed = known.tuned(untuned_kernel(0.9, free=False))
+    assert fixed.k1.k2.length_scale == 0.9
+    assert fitted_numbers(known.process(fixed)) == 2 + known.y.size
 
 
 def test_rows_are_drawn_in_proportion_to_their_weight():
@@ -154,7 +157,7 @@ def test_a_covariance_is_that_of_the_slip_in_metres_and_radians():
     new = slipping(1.0, 77).signals
     (said,) = method.predict([new], ROBOTINO)
     inputs = slip_inputs(SignalWindows.of([new], ROBOTINO), ROBOTINO)
-    std = method.process.predict(method.scale.scaled(inputs)).std[0] * 0.2 / SIZES
+    std = method.process.predict(method.scale.scaled(inputs), return_std=True)[1][0] * 0.2 / SIZES
     spread = end_spread(said.path, np.tile(std, (40, 1)), new.dt)
     assert np.allclose(said.end_covariance, method.inflation * spread + 1e-6 * np.eye(2))
 

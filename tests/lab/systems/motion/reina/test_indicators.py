@@ -7,7 +7,6 @@ import pytest
 
 from slipid.lab.systems.motion.reina import ReinaDeterministic
 from slipid.lab.systems.motion.reina_indicators import (
-    Indicators,
     SlipThresholds,
     SmoothedSignals,
     smoothing,
@@ -75,19 +74,19 @@ def test_indicators_are_signals_over_their_limits():
     run = patchy(0, gyro=True)
     signals = SmoothedSignals.of(run.signals, ROBOTINO, 1e-3)
     limits = SlipThresholds(change=2.0, turning=0.06, usual=0.4, highest=0.8)
-    told = Indicators.of(signals, limits)
+    encoder, current, gyro = limits.indicators(signals)
     assert run.signals.current is not None
     fastest = np.abs(run.signals.speed).max(axis=1, keepdims=True)
     amps = np.where(np.abs(run.signals.speed) > 0.3 * fastest, run.signals.current, np.inf).min(
         axis=1
     )
-    assert told.current == pytest.approx((amps - 0.4) / 0.4)
+    assert current == pytest.approx((amps - 0.4) / 0.4)
     assert run.signals.gyro is not None
-    assert told.gyro == pytest.approx(
+    assert gyro == pytest.approx(
         np.abs(run.signals.rolling(ROBOTINO)[:, 2] - run.signals.gyro) / 0.06, rel=1e-3
     )
-    assert (told.encoder >= signals.change / 2.0).all()
-    assert Indicators.of(signals, replace(limits, turning=np.inf)).gyro is None
+    assert (encoder >= signals.change / 2.0).all()
+    assert replace(limits, turning=np.inf).indicators(signals)[2] is None
 
 
 def test_limits_are_quantiles_of_the_steps_that_do_not_slip():

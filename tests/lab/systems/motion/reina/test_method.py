@@ -8,7 +8,6 @@ from sklearn.metrics import roc_auc_score
 
 from slipid.lab.systems.motion.reina import ReinaDeterministic, ReinaFuzzy
 from slipid.lab.systems.motion.reina_indicators import (
-    Indicators,
     SlipThresholds,
     SmoothedSignals,
     Sugeno,
@@ -25,14 +24,14 @@ def test_slip_is_flagged_by_the_gyro_or_by_all_currents_but_not_by_the_encoders(
     method = ReinaDeterministic(limits=SlipThresholds(0.01, 0.05, 0.4, 0.8), slip=0.5)
     encoder = np.array([5.0, 5.0, 5.0, 0.0])
     current, gyro = np.array([0.2, 1.1, 0.2, 0.2]), np.array([0.3, 0.3, 1.2, 0.3])
-    assert (method._moving_score(Indicators(encoder, current, gyro)) >= 1.0).tolist() == [
+    assert (method._moving_score(encoder, current, gyro) >= 1.0).tolist() == [
         False,
         True,
         True,
         False,
     ]
     # without a gyro the encoders take its place
-    assert (method._moving_score(Indicators(encoder, current, None)) >= 1.0).tolist() == [
+    assert (method._moving_score(encoder, current, None) >= 1.0).tolist() == [
         True,
         True,
         True,
