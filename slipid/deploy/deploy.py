@@ -37,8 +37,6 @@ NO_CONTROLLER = (
 """Message for wheels that have no controller."""
 DRAWS = 64
 """Number of posterior draws in robot.json."""
-SOURCE: dict[type, Source] = {Fit: "laplace", Posterior: "posterior"}
-"""Method that a robot's intervals come from, by the class that the robot was deployed from."""
 
 
 def deploy(found: Fit | Posterior) -> DeployedRobot:
@@ -47,16 +45,18 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
     Its numbers are those of `identified.json`. They come from the posterior if there is one, else
     from the fit's Laplace approximation; `DeployedRobot.record.source` names the method.
     """
-    numbers = found.parameters
+    source: Source
     if isinstance(found, Posterior):
-        fit, flat = found.fit, found.flat
+        fit, flat, source = found.fit, found.flat, "posterior"
         rows = np.random.default_rng(0).choice(len(flat), DRAWS, replace=len(flat) < DRAWS)
         vectors, center = flat[rows], flat.mean(axis=0)
     else:
-        fit, vectors, center = found, found.draws(DRAWS), found.z
+        fit, vectors, center, source = found, found.draws(DRAWS), found.z, "laplace"
+    numbers = found.parameters
+    fixed = [Choice(glob.escape(path), fixed=e.value) for path, e in numbers.items()]
     record = _record(
         fit.contact,
-        _at(fit.robot, numbers),
+        Space(fit.robot, fixed).template,
         {path: _number(e) for path, e in numbers.items()},
         center,
         vectors,
@@ -69,7 +69,7 @@ def deploy(found: Fit | Posterior) -> DeployedRobot:
     return DeployedRobot.of(
         replace(
             record,
-            source=SOURCE[type(found)],
+            source=source,
             sensors=LogSensors(current_is_signed=fit.channels.signed, voltage=fit.channels.voltage),
             alike=alike,
             messages=found.messages,
@@ -168,12 +168,6 @@ def actuator_model_of(robot: DeployedRobot, gyro: bool) -> ActuatorModel:
     """Return the actuator model of a robot's twin, with the sensors of its logs."""
     sensors = robot.record.sensors
     return ActuatorModel(voltage=sensors.voltage, gyro=gyro, signed=sensors.current_is_signed)
-
-
-def _at(robot: Robot, numbers: Mapping[str, Estimate]) -> Robot:
-    """Return the robot with its numbers set to their estimates."""
-    fixed = [Choice(glob.escape(path), fixed=e.value) for path, e in numbers.items()]
-    return Space(robot, fixed).template
 
 
 def _number(e: Estimate) -> RecordedNumber:

@@ -18,7 +18,7 @@ import numpy as np
 Kind = Literal["real", "int", "bool"]
 DTYPES: dict[Kind, type] = {"real": np.float64, "int": np.int64, "bool": np.bool_}
 UNIT = re.compile(r"\[[^\]]+\]")
-ONE = "[1]"
+NO_UNIT = "[1]"
 """Unit written for a field whose description has none."""
 
 
@@ -52,11 +52,13 @@ class Struct:
         name: name of the type.
         about: comment of the struct, one sentence.
         fields: fields in the order of the tree's leaves.
+        example: a tree whose arrays have the shapes of the fields.
     """
 
     name: str
     about: str
     fields: tuple[Field, ...]
+    example: object
 
 
 def kind_of(dtype: np.dtype) -> Kind:
@@ -94,5 +96,5 @@ def fields_of(
                 parts += fields_of(getattr(tree, field.name), None, name, about)
         return tuple(parts)
     array = jnp.asarray(tree)
-    about = above if UNIT.search(above) else f"{above} {ONE}".strip()
+    about = above if UNIT.search(above) else f"{above} {NO_UNIT}".strip()
     return (Field(prefix, kind_of(array.dtype), tuple(array.shape), about),)

@@ -28,7 +28,7 @@ from slipid.robot.robot_file import typed
 from slipid.support.errors import DataError
 
 SCHEMA = "slipid.stablehlo/1"
-CLOSE = 1e-9
+TOLERANCE = 1e-9
 """Largest difference between a number that the loaded program computes and the library's result,
 relative to the number's scale [1]."""
 PLATFORMS = ("cpu", "cuda", "tpu")
@@ -144,19 +144,18 @@ def load_program(folder: Path | str) -> Program:
     try:
         about = json.loads(content["step.json"])
         schema = about.pop("schema")
-    except (ValueError, KeyError, AttributeError) as error:
-        raise DataError(f"{place / 'step.json'}: damaged; export the robot again") from error
-    if schema != SCHEMA:
-        raise DataError(
-            f"{place / 'step.json'}: written as {schema}, this slipid reads {SCHEMA}; update "
-            "slipid, or export the robot again"
-        )
-    try:
-        arrays = np.load(io.BytesIO(content["golden.npz"]), allow_pickle=False)
+        if schema != SCHEMA:
+            raise DataError(
+                f"{place / 'step.json'}: written as {schema}, this slipid reads {SCHEMA}; update "
+                "slipid, or export the robot again"
+            )
         signature = typed(Signature, about)
+        arrays = np.load(io.BytesIO(content["golden.npz"]), allow_pickle=False)
         start = [jnp.asarray(arrays[f"start{k}"]) for k in range(len(signature.state))]
         programs = [export.deserialize(bytearray(content[name])) for name in FILES[:2]]
         steps = Golden(arrays["given"], arrays["said"], arrays["command"])
+    except DataError:
+        raise
     except Exception as error:  # the parsers of three formats raise many kinds of errors
         raise DataError(f"{place}: damaged ({error}); export the robot again") from error
     program = Program(signature, tuple(start), *programs)
@@ -177,7 +176,7 @@ def _repeated(program: Program, steps: Golden, place: Path) -> None:
         for outputs in (single[count:], [x[1] for x in both[count:]]):
             numbers = np.concatenate([np.asarray(x, float).reshape(-1) for x in outputs])
             gap = np.abs(numbers - np.concatenate([estimate, command]))
-            if not (gap <= CLOSE * np.concatenate([scale, np.ones(len(command))])).all():
+            if not (gap <= TOLERANCE * np.concatenate([scale, np.ones(len(command))])).all():
                 raise DataError(
                     f"{place}: the program does not repeat what was computed when it was made "
                     f"(off by {gap.max():.1e}); export the robot again"

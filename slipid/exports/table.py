@@ -115,14 +115,14 @@ def _markdown(robot: DeployedRobot, lines: tuple[NumberRow, ...]) -> str:
     text = ["# Numbers of a robot identified by slipid", "", *in_markdown(robot)]
     text += [gains_origin(robot), ""]
     for group, title in _TITLES.items():
-        rows = [_shown(x) for x in lines if x.group == group]
+        rows = []
+        for x in (x for x in lines if x.group == group):
+            number = (x.symbol, short(x.value), repr(x.value), x.unit, interval(x.interval90))
+            rows.append(
+                (f"`{x.name}`", x.entry, *number, x.verdict_markdown, x.provenance, x.about)
+            )
         head = ("name", "", "symbol", "rounded", "value", "unit", "90 % interval", "verdict")
         text += [f"## {title}", "", *table((*head, "provenance", "meaning"), rows), ""]
     text += ["## Verdicts", ""]
     text += [f"- *{verdict_text(v)}*: {about}." for v, about in VERDICTS.items()]
     return "\n".join(text) + "\n"
-
-
-def _shown(x: NumberRow) -> tuple[str, ...]:
-    number = (short(x.value), repr(x.value), x.unit, interval(x.interval90))
-    return (f"`{x.name}`", x.entry, x.symbol, *number, x.verdict_markdown, x.provenance, x.about)

@@ -12,7 +12,7 @@ from slipid.infer.bench.verdict import BenchFit
 from slipid.infer.bench.windows import BenchWindows
 from slipid.plots.drawing import BLUE, INK, ORANGE, SHADE, figure, plain, save
 
-MOST = 4000
+MAX_POINTS = 4000
 """Approximate largest number of points of a curve; longer signals are thinned."""
 
 
@@ -49,7 +49,7 @@ def _signals(axes: Axes, equation: Equation) -> None:
     w = equation.windows
     clock, measured = _clock(w), w.measured.mean(axis=0)
     fitted = np.where(w.usable, measured - equation.residual.mean(axis=0), np.nan)
-    some = slice(None, None, max(1, len(clock) // MOST))
+    some = slice(None, None, max(1, len(clock) // MAX_POINTS))
     axes.plot(clock[some], measured[some], color=SHADE, lw=2.2, alpha=0.6, label="measured")
     axes.plot(clock[some], fitted[some], color=BLUE, lw=0.9, label="fitted")
     axes.set(ylabel=f"{equation.channel} [{equation.unit}]", xlabel="time [s]")
@@ -62,7 +62,7 @@ def _residuals(panels: list[Axes], equation: Equation) -> None:
     speed, current, residual = (x.mean(axis=0) for x in (w.speed, w.current, equation.residual))
     weight = equation.weight.sum(axis=0) + 1e-9
     used = np.flatnonzero(w.usable)
-    some = used[:: max(1, len(used) // MOST)]
+    some = used[:: max(1, len(used) // MAX_POINTS)]
     for axes, (x, label) in zip(
         panels,
         ((_clock(w), "time [s]"), (speed, "speed [rad/s]"), (current, "current [A]")),

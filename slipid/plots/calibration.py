@@ -13,9 +13,9 @@ from slipid.camera.calibration.quality import Quality
 from slipid.camera.overhead import OverheadCamera
 from slipid.plots.drawing import BLUE, GREEN, INK, ORANGE, figure, save
 
-LONGEST = 0.06
+ARROW_LENGTH = 0.06
 """Largest length at which the 95 % quantile of residuals is drawn, as a share of picture width."""
-STEPS = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0])
+GRID_STEPS = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0])
 """Possible distances between grid lines drawn on the floor [m]."""
 
 
@@ -40,7 +40,7 @@ def coverage_picture(quality: Quality, path: Path) -> Path:
     axes.grid(which="minor", color="#dddddd", lw=0.6)
     pixels = np.concatenate([view.pixels for view in fit.views])
     _arrows(axes, pixels, np.concatenate(fit.residuals), width)
-    _legend(axes)
+    drawing.legend(loc="outside lower center", ncols=3, frameon=False)
     return save(drawing, path)
 
 
@@ -60,7 +60,7 @@ def floor_picture(fit: FloorFit, path: Path) -> Path:
         line = fit.camera.pixels(ends)
         axes.plot(*line.T, color=colour, lw=2.5, label=f"world's {name}, {2 * step:g} m")
     _arrows(axes, fit.points.pixels, fit.residuals, width)
-    _legend(axes)
+    drawing.legend(loc="outside lower center", ncols=3, frameon=False)
     return save(drawing, path)
 
 
@@ -68,16 +68,9 @@ def _frame(title: str, width: int, height: int) -> tuple[Figure, Axes]:
     """Return a figure and axes in pixels of the image, with the first row at the top."""
     drawing = figure(9.0, 8.3 * height / width + 1.2, title)
     axes = drawing.add_subplot()
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
-    axes.set_aspect("equal")
-    axes.set_xlabel("u [pixel]")
-    axes.set_ylabel("v [pixel]")
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    axes.set(xlabel="u [pixel]", ylabel="v [pixel]")
     return drawing, axes
-
-
-def _legend(axes: Axes) -> None:
-    axes.figure.legend(loc="outside lower center", ncols=3, frameon=False)
 
 
 def _arrows(
@@ -88,16 +81,10 @@ def _arrows(
 ) -> None:
     """Draw points with their residuals [pixel], enlarged by a round factor to be visible."""
     largest = float(np.quantile(np.hypot(*residuals.T), 0.95))
-    wanted = LONGEST * width / max(largest, 1e-6)
+    wanted = ARROW_LENGTH * width / max(largest, 1e-6)
     times = 10 ** np.floor(np.log10(wanted))
     times *= max(k for k in (1, 2, 5) if k * times <= wanted)
-    ends = pixels + times * residuals
-    axes.plot(
-        np.stack([pixels[:, 0], ends[:, 0]]),
-        np.stack([pixels[:, 1], ends[:, 1]]),
-        color=INK,
-        lw=0.9,
-    )
+    axes.plot(*np.stack([pixels.T, (pixels + times * residuals).T], axis=1), color=INK, lw=0.9)
     axes.plot([], [], color=INK, lw=0.9, label=f"measured less computed, {times:g} times as long")
     axes.plot(*pixels.T, "o", color=BLUE, ms=3, label=f"{len(pixels)} corners or points")
 
@@ -110,7 +97,7 @@ def _floor_lines(axes: Axes, camera: OverheadCamera) -> float:
     floor = np.nan_to_num(camera.on_plane(edge, 0.0), nan=farthest)
     floor = np.clip(floor, camera.place[:2] - farthest, camera.place[:2] + farthest)
     low, high = floor.min(0), floor.max(0)
-    step = float(STEPS[np.argmin(np.abs(np.log(STEPS / ((high - low).max() / 8))))])
+    step = float(GRID_STEPS[np.argmin(np.abs(np.log(GRID_STEPS / ((high - low).max() / 8))))])
     for axis in (0, 1):
         for at in np.arange(np.ceil(low[axis] / step), high[axis] / step + 1e-9) * step:
             line = np.zeros((60, 3))

@@ -16,7 +16,7 @@ SHOWN = {
     "speeds": "one speed left out",
     "random": "random headings left out",
 }
-WORDS = {
+MODEL_NAMES = {
     "identified": "identified (force balance)",
     "nominal": "encoders, sizes as in the config",
     "encoder": "encoders, sizes as fitted",
@@ -120,7 +120,7 @@ def validation_figure(found: Content, which: str) -> Figure:
 
 def _readable(models: Sequence[str]) -> list[str]:
     """Return the names of models as a reader should see them."""
-    return [WORDS.get(model, model.replace("_", " ")) for model in models]
+    return [MODEL_NAMES.get(model, model.replace("_", " ")) for model in models]
 
 
 def _set_title(ax: Axes, floor: str, runs: int) -> None:

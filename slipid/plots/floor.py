@@ -11,11 +11,12 @@ from matplotlib.patches import Patch as Swatch
 from matplotlib.patches import PathPatch, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.patheffects import withStroke
+from scipy.ndimage import distance_transform_edt
 
 from slipid.data.geojson_map import Patch, VectorMap, covered
 from slipid.plots.drawing import INK, SHADE, figure, save
 
-NAMED = 0.01
+LABELLED_SHARE = 0.01
 """Share of the map's area from which a patch is labelled with its name."""
 HATCH = "////"
 
@@ -85,7 +86,7 @@ def _names(axes: Axes, vector: VectorMap) -> None:
     low_x, low_y, high_x, high_y = vector.region.extent_m
     whole = (high_x - low_x) * (high_y - low_y)
     for patch in vector.patches:
-        if patch.area < NAMED * whole:
+        if patch.area < LABELLED_SHARE * whole:
             continue
         x, y = middle(patch)
         dark = np.dot(to_rgb(vector.region.colours[patch.surface]), [0.3, 0.6, 0.1]) < 0.5
@@ -101,8 +102,6 @@ def middle(patch: Patch) -> Float[np.ndarray, "2"]:
 
     The resolution is a hundredth of the patch's longer side.
     """
-    from scipy.ndimage import distance_transform_edt
-
     low, high = patch.rings[0].min(axis=0), patch.rings[0].max(axis=0)
     step = float((high - low).max()) / 100
     columns, rows = (int(n) for n in np.maximum(np.ceil((high - low) / step), 1))

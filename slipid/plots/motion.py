@@ -24,7 +24,7 @@ ROWS = (
 )
 MOST_SPEEDS = 4
 """Largest number of speeds that are drawn."""
-RAYS, LOOPS = 16, 3
+STRAIGHT_RUNS, OTHER_RUNS = 16, 3
 """Largest number of runs in a panel of paths, if all runs are straight, and otherwise."""
 LEAST_OCTANTS = 5
 """Smallest number of octants of headings with straight segments for a panel over heading."""
@@ -153,13 +153,13 @@ def _spread(data: Runs, runs: list[int]) -> list[int]:
     If all runs have headings, they are runs of the most frequent speed, evenly spread over
     headings.
     """
-    heading, speed, most = data.heading[runs], data.speed[runs], LOOPS
+    heading, speed, most = data.heading[runs], data.speed[runs], OTHER_RUNS
     if np.isfinite(heading).all():
         values, counts = np.unique(np.round(speed, 3), return_counts=True)
         runs = [
             k for k, v in zip(runs, speed, strict=True) if abs(v - values[counts.argmax()]) < 1e-3
         ]
-        most = RAYS
+        most = STRAIGHT_RUNS
         runs.sort(key=lambda k: float(data.heading[k] % (2 * np.pi)))
     at = np.unique(np.linspace(0, len(runs), min(most, len(runs)), endpoint=False).astype(int))
     return [runs[k] for k in at]

@@ -16,9 +16,9 @@ from slipid.plots.motion import named
 
 SIDEWAYS_COLOUR = "#35B779"
 """Colour of the curve of a wheel whose sideways speed equals its rim speed; dots use it too."""
-STANDING = 0.05
+AT_REST = 0.05
 """Ratio of a wheel's speed to that of the fastest wheel up to which it counts as at rest."""
-ROLLING = 0.3
+TOO_SLOW = 0.3
 """Ratio of a wheel's speed to that of the fastest wheel up to which its slip is not drawn, since it
 would be too uncertain."""
 
@@ -57,7 +57,7 @@ def _cloud(ax: Axes, robot: Robot, measured: MeasuredWindows, floor: str) -> Pat
     """
     mine = np.array([measured.groups[g][0] == floor for g in measured.group])
     fastest = np.abs(measured.wheel_speed).max(axis=1, keepdims=True)
-    turns = (np.abs(measured.wheel_speed) > ROLLING * fastest) & mine[:, None]
+    turns = (np.abs(measured.wheel_speed) > TOO_SLOW * fastest) & mine[:, None]
     turns &= np.isfinite(measured.wheel_slip)
     if not turns.any():
         return None
@@ -187,7 +187,7 @@ def _amps(
     assert measured.amps is not None
     # wheels at rest are left out: their gear holds them, which the motor model does not describe
     speed, fastest = measured.wheel_speed[:, wheel], np.abs(measured.wheel_speed).max(axis=1)
-    mine = mine & (np.abs(speed) > STANDING * fastest)
+    mine = mine & (np.abs(speed) > AT_REST * fastest)
     speed = speed[mine]
     torque = measured.torque[mine, wheel] * np.sign(speed)
     amps = measured.amps[mine, wheel]

@@ -16,7 +16,7 @@ import pytest
 from slipid.deploy.controllers import control_loop_of
 from slipid.exports.c99.builder import Names
 from slipid.exports.c99.code import Code
-from slipid.exports.c99.function import Argument, function, traced
+from slipid.exports.c99.function import Argument, function
 from slipid.exports.c99.text import table
 from slipid.exports.text import template
 from slipid.lab.trial.controllers import ROWS
@@ -190,13 +190,14 @@ def settled(folder: Path) -> tuple[int, np.ndarray]:
         Argument.plain("twist", (3, count), False, True),
         Argument.plain("felt", (f.wheels, count), False, True),
     )
-    run = traced(
-        lambda start, rim: contact.settle(start, rim, on, f.inverse),
-        jnp.zeros((3, count)),
-        jnp.zeros(f.wheels),
-    )
     names = Names()
-    made = function(names, "settled", "", arguments, run)
+    made = function(
+        names,
+        "settled",
+        "",
+        arguments,
+        lambda start, rim: contact.settle(start, rim, on, f.inverse),
+    )
     head = [
         "#include <float.h>",
         "#include <math.h>",

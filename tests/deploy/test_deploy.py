@@ -34,11 +34,11 @@ def fitted(small) -> Path:
 def agree(out: Path) -> DeployedRobot:
     """The robot of a folder, every number of it that of identified.json."""
     robot = read_robot(out)
-    said = json.loads((out / "identified.json").read_text())["parameters"]
+    fitted = json.loads((out / "identified.json").read_text())["parameters"]
     kept = json.loads((out / "robot.json").read_text())["parameters"]
-    assert {path for path in said if not path.startswith("camera.")} == set(kept)
+    assert {path for path in fitted if not path.startswith("camera.")} == set(kept)
     for path, number in kept.items():
-        assert {key: said[path][key] for key in number} == number
+        assert {key: fitted[path][key] for key in number} == number
     numbers = robot.record.parameters
     assert float(robot.motor.resistance) == numbers["motor.resistance"].value
     assert tuple(robot.rest.tolist()) == numbers["robot.load_share@as_built"].value
@@ -56,11 +56,8 @@ def test_a_fit_writes_its_robot(fitted):
     assert record.floors[0].seen.runs == len(DRIVES)
     assert record.floors[0].process[0] == pytest.approx(fit.variance["process.soft.along"] ** 0.5)
     assert Settings.of(robot).current_is_signed == fit.channels.signed
-    assert (
-        Settings.of(robot).further_floor_penalty
-        == Settings().further_floor_penalty
-        != MIXED_FLOORS_PENALTY
-    )
+    penalty = Settings().further_floor_penalty
+    assert Settings.of(robot).further_floor_penalty == penalty != MIXED_FLOORS_PENALTY
     free = {path for path in fit.space.slices if not path.startswith("camera.")}
     assert set(record.draws) == free
     again = deploy(fit)
@@ -71,17 +68,17 @@ def test_a_fit_writes_its_robot(fitted):
 
 def test_its_effect_table_equals_the_forecasts(fitted):
     robot, contact = read_robot(fitted), load(fitted).contact
-    told = robot.record.loads[0].told
-    for n, speed in enumerate(told.speeds):
+    table = robot.record.loads[0].told
+    for n, speed in enumerate(table.speeds):
         for k in (0, 17, 50):
             pace = (SpeedAndLoad(float(np.log(speed)), robot.load_setup),)
             mirror = contact.robot.geometry.mirror()
-            way = TravelConditions(np.array([2 * np.pi * k / DIRECTIONS]), pace, mirror)
-            known = contact.shared[robot.labels[0]].forecast(way)
-            np.testing.assert_allclose(told.mean[0][n][k], -known.mean[0], rtol=2e-3, atol=1e-6)
+            conditions = TravelConditions(np.array([2 * np.pi * k / DIRECTIONS]), pace, mirror)
+            known = contact.shared[robot.labels[0]].forecast(conditions)
+            np.testing.assert_allclose(table.mean[0][n][k], -known.mean[0], rtol=2e-3, atol=1e-6)
             # the numbers are not known either
             least = np.sqrt(np.diag(known.covariance[0]))
-            assert (np.array(told.left[0][n][k]) > 0.999 * least).all()
+            assert (np.array(table.left[0][n][k]) > 0.999 * least).all()
 
 
 def test_after_sampling_no_two_files_disagree(fitted, sampled):
@@ -90,7 +87,7 @@ def test_after_sampling_no_two_files_disagree(fitted, sampled):
     assert record.source == "posterior"
     assert record.parameters["surface.soft.creep"].source == "posterior"
     assert record.numbers != before.numbers
-    assert any("did not converge" in said for said in record.messages)
+    assert any("did not converge" in message for message in record.messages)
     assert len(set(record.draws["surface.soft.creep"])) > DRAWS // 4
 
 
@@ -115,14 +112,8 @@ def test_gains_of_an_older_file_outlive_the_same_numbers_and_are_driven_with(fit
 
 def older_gains() -> dict[str, object]:
     """Tuned gains, as `slipid tune` of earlier versions wrote them into robot.json."""
-    rows = (
-        ("place", "1/s"),
-        ("yaw", "1/s"),
-        ("integral", "1/s^2"),
-        ("ahead", "1"),
-        ("observer", "1"),
-    )
-    units = dict((*rows, ("preview", "s")))
+    units = {"place": "1/s", "yaw": "1/s", "integral": "1/s^2", "ahead": "1", "observer": "1"}
+    units["preview"] = "s"
     values = {
         name: {"value": 1.25 if unit == "1/s" else 0.25, "unit": unit, "spread": 0.1}
         for name, unit in units.items()

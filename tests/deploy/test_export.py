@@ -48,15 +48,8 @@ def test_all_forms_come_from_one_robot(folder):
     assert {name.split("/")[0] for name in names} == {"README.md", "robot.json", *FORMS}
     again = DeployedRobot.load(folder / "robot.json")
     assert again.record.numbers == ROBOT.record.numbers
-    for name in (
-        "README.md",
-        "c/src/slipid.h",
-        "c/src/slipid.c",
-        "c/README.md",
-        "ros2/slipid.yaml",
-    ):
-        assert ROBOT.record.numbers in (folder / name).read_text(), name
-    for name in ("ros2/README.md", "table/gains.md"):
+    in_c = ("c/src/slipid.h", "c/src/slipid.c", "c/README.md")
+    for name in (*in_c, "README.md", "ros2/slipid.yaml", "ros2/README.md", "table/gains.md"):
         assert ROBOT.record.numbers in (folder / name).read_text(), name
 
 
@@ -66,7 +59,7 @@ def test_its_example_drives_as_the_library_did(folder, tmp_path):
     """With a C compiler and the folder, and nothing else."""
     here = tmp_path / "c"
     shutil.copytree(folder / "c", here)
-    said = subprocess.run(
+    result = subprocess.run(
         "mkdir build && cc -O2 -Isrc -o build/drive examples/drive/drive.c src/slipid.c -lm &&"
         " build/drive < examples/drive/readings.txt | cmp - examples/drive/commands.txt",
         shell=True,
@@ -75,7 +68,7 @@ def test_its_example_drives_as_the_library_did(folder, tmp_path):
         capture_output=True,
         text=True,
     )
-    assert said.returncode == 0, said.stdout + said.stderr
+    assert result.returncode == 0, result.stdout + result.stderr
     lines = (here / "examples/drive/commands.txt").read_text().splitlines()
     assert len(lines) > 300
     assert float(lines[-1].split()[-1]) == pytest.approx(rectangle().duration + REST_S, abs=0.05)
@@ -124,10 +117,8 @@ class Program:
 def test_the_program_drives_the_test_site_to_the_last_printed_digit(tmp_path):
     """One process is the robot, in C; the other is the world, in MuJoCo."""
     pytest.importorskip("mujoco")
-    control_loop, path = (
-        control_loop_of(ROBOT, ROWS["contact"]),
-        rectangle(0.4, 0.2).after_rest(REST_S),
-    )
+    control_loop = control_loop_of(ROBOT, ROWS["contact"])
+    path = rectangle(0.4, 0.2).after_rest(REST_S)
     for name, text in c_files(ROBOT, control_loop, path).items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
@@ -174,30 +165,26 @@ def test_a_robot_is_found_in_a_folder_or_a_file_with_some_of_its_floors(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("wish", "said"),
+    ("options", "message"),
     [
         (ExportOptions(("c", "ros")), "no form 'ros', did you mean ros2"),
         (ExportOptions(()), "no form"),
         (ExportOptions(controller="contacts"), "no controller 'contacts', did you mean contact"),
-        (
-            ExportOptions(controller="contact_map"),
-            "needs the map of its floors; name one with --map",
-        ),
+        (ExportOptions(controller="contact_map"), "needs the map of its floors"),
         (ExportOptions(map=Path("site.toml")), "uses no map; leave out --map"),
         (ExportOptions(path="square"), "no path 'square'"),
         (ExportOptions(speed=9.0), "speed 9 m/s"),
     ],
 )
-def test_invalid_options_are_refused_before_anything_is_written(tmp_path, wish, said):
-    with pytest.raises(DataError, match=said):
-        export(ROBOT, tmp_path / "out", wish, QUIET)
+def test_invalid_options_are_refused_before_anything_is_written(tmp_path, options, message):
+    with pytest.raises(DataError, match=message):
+        export(ROBOT, tmp_path / "out", options, QUIET)
     assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_with_other_files_is_refused_before_anything_is_made(tmp_path, monkeypatch):
     (tmp_path / "mine.txt").write_text("kept")
-    monkeypatch.setattr(
-        "slipid.deploy.export.control_loop_of", lambda *_, **__: pytest.fail("made")
-    )
+    made = "slipid.deploy.export.control_loop_of"
+    monkeypatch.setattr(made, lambda *_, **__: pytest.fail("made"))
     with pytest.raises(DataError, match="files that no export wrote"):
         export(ROBOT, tmp_path, ExportOptions(), QUIET)

@@ -44,9 +44,9 @@ def test_it_compiles_without_a_warning_and_repeats_the_librarys_steps(
         pytest.skip(f"needs {compiler}")
     done = built(folder, tmp_path / "check", *flags, compiler=compiler)
     assert done.returncode == 0, done.stderr
-    said = subprocess.run([tmp_path / "check"], capture_output=True, text=True)
-    assert said.returncode == 0, said.stdout
-    assert re.search(r"48 steps, \d+ numbers each: largest difference", said.stdout)
+    result = subprocess.run([tmp_path / "check"], capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout
+    assert re.search(r"48 steps, \d+ numbers each: largest difference", result.stdout)
 
 
 @pytest.mark.slow
@@ -60,9 +60,9 @@ def test_the_folders_test_fails_where_a_number_is_another_one(folder, tmp_path):
         f"{head}golden_command[GOLDEN_STEPS][SLIPID_WHEELS] = {{{changed}"
     )
     assert built(tmp_path / "c", tmp_path / "check", "-O1").returncode == 0
-    said = subprocess.run([tmp_path / "check"], capture_output=True, text=True)
-    assert said.returncode == 1
-    assert "command" in said.stdout
+    result = subprocess.run([tmp_path / "check"], capture_output=True, text=True)
+    assert result.returncode == 1
+    assert "command" in result.stdout
 
 
 @pytest.mark.slow
@@ -74,8 +74,8 @@ def test_no_sanitizer_finds_anything(folder, tmp_path):
         pytest.skip("needs a compiler with sanitizers")
     done = built(folder, tmp_path / "check", *flags)
     assert done.returncode == 0, done.stderr
-    said = subprocess.run([tmp_path / "check"], capture_output=True, text=True)
-    assert said.returncode == 0, said.stderr
+    result = subprocess.run([tmp_path / "check"], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
 
 
 @pytest.mark.slow
@@ -97,16 +97,8 @@ def test_no_heap_and_no_globals(folder, tmp_path):
 def test_parts_for_float_and_for_double_cannot_be_linked(folder, tmp_path):
     made, flags = tmp_path / "slipid.o", ["-std=c99", "-O0", "-DSLIPID_FLOAT"]
     subprocess.run(["cc", *flags, "-c", "-o", made, folder / "src/slipid.c"], check=True)
-    command = [
-        "cc",
-        "-I",
-        folder / "src",
-        "-o",
-        tmp_path / "x",
-        folder / "test/check.c",
-        made,
-        "-lm",
-    ]
+    sources = [folder / "test/check.c", made, "-lm"]
+    command = ["cc", "-I", folder / "src", "-o", tmp_path / "x", *sources]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode != 0
     assert "slipid_init" in done.stderr
@@ -135,5 +127,5 @@ def test_the_sketch_for_arduino_compiles_and_runs(folder, tmp_path):
     subprocess.run(["cc", "-std=c99", *flags, "-c", "-o", made, source], check=True)
     words = ["g++", *strict, *flags, "-I", folder / "examples/Slipid", tmp_path / "main.cpp", made]
     subprocess.run([*words, "-o", tmp_path / "sketch", "-lm"], check=True)
-    said = subprocess.run([tmp_path / "sketch"], capture_output=True, text=True, check=True)
-    assert said.stdout == "0 0"
+    result = subprocess.run([tmp_path / "sketch"], capture_output=True, text=True, check=True)
+    assert result.stdout == "0 0"

@@ -34,13 +34,10 @@ def test_a_changed_byte_is_reported_with_its_file(folder, name):
         check_folder(folder)
 
 
-def test_an_added_file_is_reported(folder):
+def test_added_and_lost_files_are_reported(folder):
     (folder / "c/src/more.c").write_text("int y;\n")
     with pytest.raises(DataError, match=r"more\.c: not there when the folder was written"):
         check_folder(folder)
-
-
-def test_a_lost_file_is_reported(folder):
     (folder / "c/src/slipid.c").unlink()
     with pytest.raises(DataError, match=r"slipid\.c: No such file"):
         check_folder(folder)

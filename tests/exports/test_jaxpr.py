@@ -107,9 +107,11 @@ def test_the_export_says_so_instead_of_ending_in_a_traceback(monkeypatch):
             self.clear()
             self.update(without)
 
+    def run(x):
+        return jax.lax.fori_loop(0, 3, lambda k, c: c * x[0], x[1])
+
     without = _written()
     monkeypatch.setattr(Params, "__init__", bare)
     arguments = [Argument.plain("x", (3,)), Argument.plain("y", (), False, True)]
-    made = traced(lambda x: [jax.lax.fori_loop(0, 3, lambda k, c: c * x[0], x[1])], jnp.ones(3))
     with pytest.raises(DataError, match=UNKNOWN.format("scan")):
-        function(Names(), "f", "", arguments, made)
+        function(Names(), "f", "", arguments, run)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from slipid.exports.c99.builder import Names
-from slipid.exports.c99.function import Argument, function, traced
+from slipid.exports.c99.function import Argument, function
 from slipid.exports.c99.lower import UnsupportedError
 from slipid.exports.c99.text import table
 from slipid.exports.text import template
@@ -236,20 +236,14 @@ def _library(folder: Path) -> ctypes.CDLL:
     names, functions = Names(), []
     for k, (run, *shapes) in enumerate(FUNCTIONS.values()):
         arguments, _ = _arguments(_real(run), shapes)
-        like = [jnp.ones(shape) for shape in shapes]
-        functions.append(function(names, f"f{k}", "", arguments, traced(_real(run), *like)))
+        functions.append(function(names, f"f{k}", "", arguments, _real(run)))
     return _compiled(names, functions, folder)
 
 
 def _compiled(names: Names, functions, folder: Path) -> ctypes.CDLL:
     reads = frozenset().union(*(f.reads for f in functions))
     tables = [line for m in names.tables.values() if m.name in reads for line in table(m)]
-    head = [
-        "#include <float.h>",
-        "#include <math.h>",
-        "#include <stdbool.h>",
-        "#include <stdint.h>",
-    ]
+    head = [f"#include <{name}.h>" for name in ("float", "math", "stdbool", "stdint")]
     text = [*head, "typedef double slipid_real;", template("c99/prelude.c"), *tables]
     text += [line for f in functions for line in (f"{f.head};", *f.text)]
     (folder / "all.c").write_text("\n".join(text))
@@ -309,8 +303,7 @@ def test_c_has_the_numbers_of_jax_where_some_are_none(library, name):
 
 def text_of(run, *shapes):
     """Body of a function in C."""
-    like = [jnp.ones(shape) for shape in shapes]
-    made = function(Names(), "f", "", _arguments(run, shapes)[0], traced(run, *like))
+    made = function(Names(), "f", "", _arguments(run, shapes)[0], run)
     return "\n".join(made.lines)
 
 
@@ -343,8 +336,7 @@ def test_long_constants_are_copied_in_a_loop():
 def test_arguments_that_are_filled_in_place_are_read_first(tmp_path):
     names = Names()
     arguments = [Argument.plain(name, LANES, True, True) for name in ("x", "y")]
-    like = (jnp.ones(N), jnp.ones(N))
-    made = function(names, "f", "", arguments, traced(lambda x, y: [y[::-1], x], *like))
+    made = function(names, "f", "", arguments, lambda x, y: [y[::-1], x])
     x, y = np.arange(1.0 * N), np.arange(1.0 * N) ** 2
     pointers = [a.ctypes.data_as(ctypes.c_void_p) for a in (x, y)]
     _compiled(names, [made], tmp_path).f(*pointers)
@@ -357,18 +349,18 @@ def test_a_primitive_without_a_form_in_c_is_refused_by_name_and_line():
         return jnp.sort(x)
 
     with pytest.raises(UnsupportedError, match=r"'sort' has no form in C .*'?add, "):
-        function(Names(), "f", "", _arguments(bad, [LANES])[0], traced(bad, jnp.ones(N)))
+        function(Names(), "f", "", _arguments(bad, [LANES])[0], bad)
     robot = small_twin.deployed()
 
     def own(x):
         return jnp.sort(robot.forward @ x) + robot.motor.current(jnp.cumsum(x), x)
 
     with pytest.raises(UnsupportedError, match="'sort'"):
-        function(Names(), "f", "", _arguments(own, [SMALL])[0], traced(own, jnp.ones(3)))
+        function(Names(), "f", "", _arguments(own, [SMALL])[0], own)
 
 
 @pytest.mark.parametrize(
-    ("run", "said"),
+    ("run", "reason"),
     [
         (lambda x: x.at[np.array([1, 1])].add(1.0), "a place that is written twice"),
         (lambda x: x.at[jnp.argmin(x)].set(1.0), "places that are not known before"),
@@ -383,9 +375,9 @@ def test_a_primitive_without_a_form_in_c_is_refused_by_name_and_line():
         (lambda x: jax.lax.scan(lambda c, y: (c + y, c), 0.0, x)[1], "goes through an array"),
     ],
 )
-def test_operations_with_other_results_in_c_are_refused(run, said):
-    with pytest.raises(UnsupportedError, match=said):
-        function(Names(), "f", "", _arguments(run, [LANES])[0], traced(run, jnp.ones(N)))
+def test_operations_with_other_results_in_c_are_refused(run, reason):
+    with pytest.raises(UnsupportedError, match=reason):
+        function(Names(), "f", "", _arguments(run, [LANES])[0], run)
 
 
 def test_a_product_with_a_constant_0_stops_what_is_no_number(library):

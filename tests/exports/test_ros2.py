@@ -149,7 +149,7 @@ def test_defaults_are_the_values_and_all_is_described(node, declared):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    ("name", "value", "fault"),
     [
         ("motor.resistance", 0.0, "gt<>"),
         ("motor.resistance", 5, "no double"),
@@ -164,10 +164,10 @@ def test_defaults_are_the_values_and_all_is_described(node, declared):
         ("limits.twist", 0.0, "gt<>"),
     ],
 )
-def test_wrong_parameters_are_refused_by_the_declaration(node, declared, name, value, said):
+def test_wrong_parameters_are_refused_by_the_declaration(node, declared, name, value, fault):
     found = faults({**node, name: value}, declared)
     assert len(found) == 1
-    assert said in found[0]
+    assert fault in found[0]
 
 
 def test_numbers_read_back_to_the_last_bit(robot, node):

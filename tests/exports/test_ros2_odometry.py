@@ -159,33 +159,33 @@ def test_a_robot_that_no_controller_fits_gets_none(shape):
     ids=lambda errs: errs.floor,
 )
 def test_variances_are_those_of_errors_that_are_drawn(errs):
-    """Ways straight ahead with an error that stays and one that comes anew, many times."""
-    rng, steps, way, speed, many = np.random.default_rng(0), 100, 1.5, 0.2, 10_000
+    """Paths straight ahead with an error that stays and one that comes anew, many times."""
+    rng, steps, distance, speed, many = np.random.default_rng(0), 100, 1.5, 0.2, 10_000
     stays = rng.normal(size=(many, 1, 3)) * np.hypot(errs.effect, errs.slip)
-    anew = rng.normal(size=(many, steps, 3)) * errs.process / np.sqrt(way / steps)
-    rate, step = stays + anew, way / steps  # per metre
+    anew = rng.normal(size=(many, steps, 3)) * errs.process / np.sqrt(distance / steps)
+    rate, step = stays + anew, distance / steps  # per metre
     heading = (np.cumsum(rate[..., 2], axis=1) - rate[..., 2] / 2) * step
-    across = rate[..., 1].mean(axis=1) * way + heading.mean(axis=1) * way
-    along, turned = rate[..., :1].mean(axis=1) * way, rate[..., 2].mean(axis=1) * way
+    across = rate[..., 1].mean(axis=1) * distance + heading.mean(axis=1) * distance
+    along, turned = rate[..., :1].mean(axis=1) * distance, rate[..., 2].mean(axis=1) * distance
     wide = max(along.var(), across.var())
-    np.testing.assert_allclose(errs.pose(way), [wide, wide, turned.var()], rtol=0.05)
+    np.testing.assert_allclose(errs.pose(distance), [wide, wide, turned.var()], rtol=0.05)
     velocity = (rate[:, 0] * speed).var(axis=0)
     wide = velocity[:2].max()
     np.testing.assert_allclose(
         errs.twist(speed, step / speed), [wide, wide, velocity[2]], rtol=0.05
     )
-    after = (stays[:, 0] * way).var(axis=0)
+    after = (stays[:, 0] * distance).var(axis=0)
     wide = after[:2].max()
-    walked = np.array(errs.walk(speed, way)) * way / speed
+    walked = np.array(errs.walk(speed, distance)) * distance / speed
     np.testing.assert_allclose(walked, [wide, wide, after[2]], rtol=0.05)
 
 
 @pytest.mark.slow
 def test_slip_is_what_wheels_go_beyond_the_body(robot):
-    speed, ways, forward = top_speed(robot), np.arange(24) * np.pi / 12, np.asarray(robot.forward)
+    speed, angles, forward = top_speed(robot), np.arange(24) * np.pi / 12, np.asarray(robot.forward)
     for k, errs in enumerate(odometry_errors(robot)):
         missed = []
-        for angle in ways:
+        for angle in angles:
             u = np.array([np.cos(angle), np.sin(angle), 0.0])
             rim = jnp.asarray(speed * forward @ u)
             xi = contact.equilibrium(rim, robot.frame, robot.floors.at(k), robot.rest)

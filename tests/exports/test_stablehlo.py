@@ -34,7 +34,7 @@ def folder(tmp_path, content):
 
 
 @pytest.mark.slow
-def test_a_program_that_was_read_back_says_what_the_pilot_says(folder):
+def test_a_loaded_program_gives_the_results_of_the_control_loop(folder):
     program, count = load_program(folder), 5
     begin, rng = LOOP.init(), np.random.default_rng(0)
     state = begin.estimator, begin.controller
@@ -43,13 +43,13 @@ def test_a_program_that_was_read_back_says_what_the_pilot_says(folder):
         z = Readings.nothing(3)
         z = z.__class__(**{**vars(z), "wheel_speed": jnp.asarray(rng.normal(size=3))})
         reference = jnp.asarray(rng.normal(size=6))
-        seen, said = LOOP.estimator.step(state[0], z, PERIOD)
-        held, command = LOOP.controller.step(state[1], reference, said, PERIOD)
-        state = seen, held
+        estimator, estimate = LOOP.estimator.step(state[0], z, PERIOD)
+        controller, command = LOOP.controller.step(state[1], reference, estimate, PERIOD)
+        state = estimator, controller
         given = [*jax.tree.leaves(z), reference, jnp.asarray(PERIOD)]
         found = program.step.call(*kept, *given)
         both = program.batch.call(*many, *(jnp.stack([x] * count) for x in given))
-        wanted = jax.tree.leaves((state, said, command))
+        wanted = jax.tree.leaves((state, estimate, command))
         for one, several, want in zip(found, both, wanted, strict=True):
             np.testing.assert_allclose(one, want, rtol=1e-12, atol=1e-15)
             np.testing.assert_allclose(several, np.stack([want] * count), rtol=1e-12, atol=1e-15)

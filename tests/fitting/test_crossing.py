@@ -107,7 +107,7 @@ def crossed(truth_, runs, seed, offset=OFFSET):
     first = jnp.zeros((runs, 3))
     _, places = jax.lax.scan(jax.vmap(onward), first, jnp.swapaxes(increment, 0, 1))
     poses = jnp.concatenate([first[:, None], jnp.swapaxes(places, 0, 1)], axis=1)
-    pose = np.array(jax.vmap(jax.vmap(truth_.camera.logged))(poses))
+    pose = np.array(jax.jit(jax.vmap(jax.vmap(truth_.camera.logged)))(poses))
     pose += rng.normal(size=pose.shape) * [PLACE, PLACE, HEADING]
     noise = CURRENT * rng.normal(size=amps.shape) + offset * rng.normal(size=(runs, 1, 3))
     w = replace(w, pose=pose, current=np.asarray(amps) + noise)
@@ -284,7 +284,7 @@ def test_wheels_stand_where_the_camera_says_less_the_marker():
     x, y, heading = 0.3, -0.2, np.pi / 2
     px, py = np.asarray(true.camera.marker_place)
     marker = jnp.array([x - py, y + px, heading + 0.1])
-    logged = np.asarray(true.camera.logged(marker))
+    logged = np.asarray(jax.jit(true.camera.logged)(marker))
     found = cut.wheel_places(true, replace(w, pose=np.tile(logged, (1, 2, 1))))
     place = 0.125 * np.asarray(true.geometry.place)
     expected = np.stack([x - place[:, 1], y + place[:, 0]], 1)

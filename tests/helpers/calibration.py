@@ -209,7 +209,7 @@ def _predicted(truth, b):
 
 @jax.jit
 def _logged_of(truth, pose):
-    return jax.vmap(jax.vmap(truth.camera.logged))(pose)
+    return jax.jit(jax.vmap(jax.vmap(truth.camera.logged)))(pose)
 
 
 def _logged(truth, start, increment):

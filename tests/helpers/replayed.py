@@ -159,7 +159,7 @@ def _ends(
     fresh = fresh[fresh >= first_row(data, run, float(robot.geometry.wheel_radius))]
     rows = fresh[[0, -1]]
     yaw = float(robot.camera.yaw(robot.session_index(data.session[run])))
-    camera = np.array([robot.camera.corrected(jnp.asarray(p)) for p in log.pose[rows]])
+    camera = np.array(jax.jit(jax.vmap(robot.camera.corrected))(log.pose[rows]))
     camera[:, 2] -= yaw
     at = log.time[rows] - float(robot.camera.lag)
 
@@ -214,7 +214,7 @@ def wheels(
 def poses(robot: Robot, log: Log, session: str) -> np.ndarray:
     """Pose of the body at every row, in the frame of the corrected camera (row, 3)."""
     assert log.pose is not None
-    pose = np.array(jax.vmap(robot.camera.corrected)(jnp.asarray(log.pose[log.pose_fresh])))
+    pose = np.array(jax.jit(jax.vmap(robot.camera.corrected))(log.pose[log.pose_fresh]))
     pose[:, 2] = np.unwrap(pose[:, 2]) - float(robot.camera.yaw(robot.session_index(session)))
     at = log.time + float(robot.camera.lag)
     return np.stack([np.interp(at, log.time[log.pose_fresh], x) for x in pose.T], axis=1)

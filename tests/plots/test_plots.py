@@ -26,8 +26,7 @@ from slipid.lab.selftest.logs import (
 )
 from slipid.model.geometry import differential, omni
 from slipid.plots import fit as plots
-from slipid.plots import fit as plots_robot
-from slipid.plots.compare import WORDS, validation_figure
+from slipid.plots.compare import MODEL_NAMES, validation_figure
 from slipid.plots.drawing import figure, save
 from slipid.plots.measured_windows import by_heading, measured_windows
 from slipid.plots.motion import heading_figure
@@ -98,9 +97,9 @@ def test_floors_are_ordered_by_slip():
 def test_torque_from_unsigned_currents_is_that_of_the_contact():
     p = segments()
     turning = np.abs(p.wheel_speed) > 0.5
-    gap = driving_torque(ROBOT, p) - p.torque * np.sign(p.wheel_speed)
+    difference = driving_torque(ROBOT, p) - p.torque * np.sign(p.wheel_speed)
     # half a step of 1/39 A is 0.01 N m
-    assert np.abs(gap[turning]).max() < 0.02
+    assert np.abs(difference[turning]).max() < 0.02
     assert np.abs(p.torque[turning]).max() > 0.3
 
 
@@ -117,14 +116,8 @@ def test_wheel_slip_and_torque_lie_on_the_curve_of_a_wheel():
 
 def test_curve_of_a_straight_wheel_is_the_published_one():
     for floor, curve in fit().curves.items():
-        torque = wheel_curve(
-            fit().robot,
-            floor,
-            curve.slip,
-            0.0,
-            curve.wheel_speed,
-            curve.load_share,
-        )
+        place = (curve.wheel_speed, curve.load_share)
+        torque = wheel_curve(fit().robot, floor, curve.slip, 0.0, *place)
         np.testing.assert_allclose(torque, curve.torque_nm, rtol=0.01, atol=1e-3)
 
 
@@ -166,7 +159,7 @@ def test_turning_segments_have_no_direction():
 
 
 def test_loads_are_written_at_their_wheels():
-    made = plots_robot.load_figure(fit())
+    made = plots.load_figure(fit())
     texts = {t.get_text().split("\n")[0]: t for t in made.axes[0].texts}
     e = fit().parameters["robot.load_share@as_built"]
     for k, share in enumerate(e.value):
@@ -179,7 +172,7 @@ def test_loads_are_written_at_their_wheels():
 def test_every_slip_model_has_a_readable_name():
     shapes = omni([60.0, 180.0, 300.0], 0.1, 0.04), differential(0.2, 0.04)
     names = {model.name for shape in shapes for model in slip_models(shape, has_current=True)}
-    assert set(WORDS) == {"identified", *names}
+    assert set(MODEL_NAMES) == {"identified", *names}
 
 
 def test_errors_are_drawn_to_scale():

@@ -212,14 +212,15 @@ def name_parts(name: str) -> NameParts:
             numbers.append(part)
             continue
         for word in [part] if part in _ROLES else _apart(part):
-            near = [] if word in _ROLES else get_close_matches(word, _LONG, n=1, cutoff=_NEAR)
-            if word not in _ROLES and (len(word) < 3 or not near):
+            near = [word] if word in _ROLES else []
+            if not near and len(word) >= 3:
+                near = get_close_matches(word, _LONG, n=1, cutoff=_NEAR)
+            if not near:
                 unknown.append(word)
                 continue
-            if near:
+            if near[0] != word:
                 mended.append(f"{word} -> {near[0]}")
-            word = near[0] if near else word
-            roles.append((*_ROLES[word], word))
+            roles.append((*_ROLES[near[0]], near[0]))
     return NameParts(tuple(roles), tuple(numbers), tuple(unknown), tuple(mended))
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from slipid.exports.c99.ir import Array, At, Cell, CodeBlock, Memory, Nested, Statement, Variable
+from slipid.exports.c99.ir import Array, At, Cell, CodeBlock, Memory, Statement, Variable
 from slipid.exports.fields import DTYPES, Kind
 
 CALLS = ("r_atan2", "r_cos", "r_exp", "r_log", "r_pow", "r_rem", "r_sin", "r_floor")
@@ -106,13 +106,7 @@ class Builder:
             Statement(None, template, (cell,), memory, times, source=self.source)
         )
 
-    def append(
-        self, lanes: int = 0, nested: Nested | None = None, calls: bool = False
-    ) -> CodeBlock:
-        """Return a new block, appended after all others."""
-        return self.put(CodeBlock(self, 0, lanes, calls, nested=nested))
-
-    def put(self, block: CodeBlock) -> CodeBlock:
+    def append(self, block: CodeBlock) -> CodeBlock:
         """Append a block after all others, and return it."""
         block.place = len(self.blocks)
         self.blocks.append(block)
@@ -144,9 +138,9 @@ class Builder:
         apart = calls and lanes > 0
         first = max((self._after(cell, lanes) for cell in cells), default=0)
         for block in self.blocks[first:]:
-            if (block.lanes, block.calls, block.nested) == (lanes, apart, None):
+            if (block.lanes, block.calls) == (lanes, apart) and not block.bodies:
                 return block
-        return self.append(lanes, calls=apart)
+        return self.append(CodeBlock(self, lanes, apart))
 
     def _after(self, cell: Cell, lanes: int) -> int:
         """Return the index of the first block in which a statement can use a cell."""

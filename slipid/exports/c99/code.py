@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from slipid.exports.c99.builder import Names
-from slipid.exports.c99.function import Argument, Function, function, traced
+from slipid.exports.c99.function import Argument, Function, function
 from slipid.exports.c99.text import TYPES, WIDTH, folded, table
 from slipid.exports.description import header
 from slipid.exports.fields import Struct, fields_of
@@ -56,17 +56,10 @@ class Code:
         self.reading = _struct("reading", about, nothing, Measurement)
         self.estimate = _struct("estimate", "What is believed.", estimate)
         self.structs = self.estimator, self.controller, self.reading, self.estimate
-        self.functions = list(self._functions(begin.estimator, begin.controller, nothing, estimate))
+        self.functions = list(self._functions())
 
-    def _functions(
-        self,
-        estimator: eqx.Module,
-        controller: eqx.Module,
-        nothing: Readings,
-        estimate: eqx.Module,
-    ) -> Iterator[Function]:
-        """Yield all functions; arguments are examples of states, readings and estimates."""
-        loop, zero, wheels = self.loop, jnp.zeros(()), self.robot.wheels
+    def _functions(self) -> Iterator[Function]:
+        loop, wheels = self.loop, self.robot.wheels
         pose, dt = Argument.plain("pose", (3,)), Argument.plain("dt", ())
         yield function(
             self._names,
@@ -78,14 +71,14 @@ class Code:
                 Argument.of("controller", self.controller, read=False, written=True),
                 pose,
             ),
-            traced(lambda p: (loop.init(p).estimator, loop.init(p).controller), jnp.zeros(3)),
+            lambda pose: (loop.init(pose).estimator, loop.init(pose).controller),
         )
         yield function(
             self._names,
             "slipid_nothing",
             "Make a reading one of no sensor at all; fill in what there is.",
             (Argument.of("reading", self.reading, read=False, written=True),),
-            traced(lambda: Readings.nothing(wheels)),
+            lambda: Readings.nothing(wheels),
         )
         yield function(
             self._names,
@@ -97,7 +90,7 @@ class Code:
                 dt,
                 Argument.of("estimate", self.estimate, read=False, written=True),
             ),
-            traced(loop.estimator.step, estimator, nothing, zero),
+            loop.estimator.step,
         )
         yield function(
             self._names,
@@ -111,7 +104,7 @@ class Code:
                 dt,
                 Argument.plain("command", (wheels,), read=False, written=True),
             ),
-            traced(loop.controller.step, controller, jnp.zeros(6), estimate, zero),
+            loop.controller.step,
         )
         if self.path is not None:
             yield self._follow(self.path)
@@ -131,12 +124,12 @@ class Code:
             f"The path begins at {begin} [m, m, rad] and lasts {path.duration:g} s; it waits for a "
             "robot that lags.",
             (
-                Argument.plain("time", (), True, True),
+                Argument.plain("time", (), written=True),
                 Argument.plain("pose", (3,)),
                 Argument.plain("dt", ()),
-                Argument.plain("reference", (6,), False, True),
+                Argument.plain("reference", (6,), read=False, written=True),
             ),
-            traced(follow, jnp.zeros(()), jnp.zeros(3), jnp.zeros(())),
+            follow,
         )
 
     @property
@@ -190,7 +183,7 @@ class Code:
 
 def _struct(name: str, about: str, tree: object, documented: type | None = None) -> Struct:
     """Return the struct of a tree; `documented` is as in `fields_of`."""
-    return Struct(f"slipid_{name}", about, fields_of(tree, documented))
+    return Struct(f"slipid_{name}", about, fields_of(tree, documented), tree)
 
 
 def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 
 from slipid.exports.c99.builder import Builder, Names
 from slipid.exports.c99.ir import Array, Memory, Value, in_memory
@@ -23,6 +24,7 @@ class Argument:
         name: name of the argument.
         type: name of the struct that the argument points to; empty for plain numbers.
         fields: fields of the struct; a single one for plain numbers.
+        example: a tree of arrays with the shapes of the fields, as the traced function takes it.
         read: whether the function reads it.
         written: whether the function fills it.
     """
@@ -30,6 +32,7 @@ class Argument:
     name: str
     type: str
     fields: tuple[Field, ...]
+    example: object
     read: bool
     written: bool
 
@@ -38,35 +41,36 @@ class Argument:
         cls, name: str, shape: tuple[int, ...], read: bool = True, written: bool = False
     ) -> Argument:
         """Return an argument that is a number, or an array of numbers."""
-        return cls(name, "", (Field(name, "real", shape, ""),), read, written)
+        return cls(name, "", (Field(name, "real", shape, ""),), jnp.zeros(shape), read, written)
 
     @classmethod
     def of(cls, name: str, struct: Struct, read: bool = True, written: bool = False) -> Argument:
         """Return an argument that is a pointer to a struct."""
-        return cls(name, struct.name, struct.fields, read, written)
+        return cls(name, struct.name, struct.fields, struct.example, read, written)
 
     @property
     def memories(self) -> list[Memory]:
         """Memory of each of its fields."""
-        if self.type:
-            return [
-                Memory(f"{self.name}->{f.name}", f.numbers, f.size, scalar=not f.shape)
-                for f in self.fields
-            ]
-        field = self.fields[0]
-        name = f"(*{self.name})" if self.written and not field.shape else self.name
-        return [Memory(name, field.numbers, field.size, scalar=not field.shape)]
+        plain = f"(*{self.name})" if self.written and not self.fields[0].shape else self.name
+        return [
+            Memory(
+                f"{self.name}->{f.name}" if self.type else plain,
+                f.numbers,
+                f.size,
+                scalar=not f.shape,
+            )
+            for f in self.fields
+        ]
 
     @property
     def declared(self) -> str:
         """Text of its declaration in the function's head."""
-        const = "" if self.written else "const "
+        const, field = "" if self.written else "const ", self.fields[0]
         if self.type:
             return f"{const}{self.type} *{self.name}"
-        field = self.fields[0]
         if field.shape:
             return f"{const}slipid_real {self.name}[{field.size}]"
-        return f"slipid_real *{self.name}" if self.written else f"slipid_real {self.name}"
+        return f"slipid_real {'*' if self.written else ''}{self.name}"
 
 
 @dataclass(frozen=True)
@@ -105,17 +109,17 @@ def function(
     name: str,
     about: str,
     arguments: Sequence[Argument],
-    traced: Traced,
+    run: Callable[..., object],
 ) -> Function:
-    """Return a traced function as a C function.
+    """Return a function of JAX as a C function.
 
     Args:
         names: numbers for names and constant tables of the generated file.
         name: name of the function.
         about: comment of its declaration.
         arguments: arguments in order.
-        traced: function whose inputs are the fields of all arguments that are read and whose
-            results are the fields of all arguments that are written, in the arguments' order.
+        run: function whose inputs are the trees of all arguments that are read and whose results
+            are those of all arguments that are written, in the arguments' order.
 
     Raises:
         UnsupportedError: the function uses a primitive without a rule.
@@ -127,7 +131,8 @@ def function(
         if argument.read
         for memory, field in zip(argument.memories, argument.fields, strict=True)
     ]
-    results = lowered(builder, traced, values)
+    examples = [argument.example for argument in arguments if argument.read]
+    results = lowered(builder, traced(run, *examples), values)
     targets = [memory for a in arguments if a.written for memory in a.memories]
     overwritten = frozenset(memory.name for memory in targets)
     changed = [
@@ -138,7 +143,11 @@ def function(
     for memory, value in changed:
         store(builder, value, memory)
     body = FunctionBody(builder)
-    unused = _unused(arguments, body.reads)
+    unused = [
+        f"  (void){a.name};"
+        for a in arguments
+        if not a.written and not any(memory.name in body.reads for memory in a.memories)
+    ]
     lines = (*unused, *body.lines)
     return Function(name, about, tuple(arguments), lines, body.reads, body.scratch)
 
@@ -162,11 +171,3 @@ def _holds(memory: Memory, value: Value) -> bool:
         return False
     like = in_memory(memory, value.shape)
     return value.axis == like.axis and bool((value.cells == like.cells).all())
-
-
-def _unused(arguments: Sequence[Argument], reads: frozenset[str]) -> list[str]:
-    """Return C statements that mark arguments as deliberately unused."""
-    idle = [
-        a.name for a in arguments if not a.written and not any(m.name in reads for m in a.memories)
-    ]
-    return [f"  (void){name};" for name in idle]

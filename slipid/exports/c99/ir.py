@@ -140,37 +140,27 @@ class Statement:
 class CodeBlock:
     """Statements that run one after the other, for every lane if `lanes` is not 0.
 
+    A block with bodies is a condition or a repetition, and has no statements of its own.
+
     Attributes:
         owner: builder that it belongs to.
-        place: its index among the blocks of the owner.
         lanes: number of iterations of the loop; 0 for straight-line code.
         calls: whether its statements call functions.
+        when: condition under which the first of two bodies runs, else the second.
+        times: number of times that the one body of a repetition runs.
+        bodies: builders of the bodies.
+        place: its index among the blocks of the owner.
         statements: statements in order.
-        nested: a condition or a repetition, which has blocks of its own.
     """
 
     owner: Builder
-    place: int
     lanes: int = 0
     calls: bool = False
+    when: Cell | None = None
+    times: int = 1
+    bodies: Sequence[Builder] = ()
+    place: int = 0
     statements: list[Statement] = field(default_factory=list)
-    nested: Nested | None = None
-
-
-@dataclass(eq=False)
-class Nested:
-    """A condition with two bodies of code, or a repetition of one body.
-
-    Attributes:
-        when: condition under which the first of two bodies runs, else the second; None for a
-            repetition.
-        times: number of times that the body of a repetition runs.
-        bodies: builders of the bodies.
-    """
-
-    when: Cell | None
-    times: int
-    bodies: list[Builder]
 
 
 @dataclass(frozen=True)

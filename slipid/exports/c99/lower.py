@@ -11,16 +11,15 @@ import numpy as np
 from jax.extend.core import JaxprEqn, Var
 from jax.extend.core import Literal as JaxLiteral
 
-from slipid.exports.c99 import elementwise, moves, sums
+from slipid.exports.c99 import arithmetic, moves
+from slipid.exports.c99.arithmetic import BINARY, REDUCED, UNARY, Rule, Shaped
 from slipid.exports.c99.builder import Builder
-from slipid.exports.c99.elementwise import BINARY, UNARY, Rule, Shaped
 from slipid.exports.c99.ir import (
     Array,
     At,
     Cell,
     CodeBlock,
     Memory,
-    Nested,
     NoFormError,
     Statement,
     Value,
@@ -35,24 +34,23 @@ from slipid.exports.c99.ir import (
 from slipid.exports.c99.jaxpr import Params, ScanParameters, Traced, branches, called, source_line
 from slipid.exports.c99.moves import MOVES, SOURCES, moved
 from slipid.exports.c99.sources import along, rearranged
-from slipid.exports.c99.sums import REDUCED
 from slipid.exports.fields import DTYPES
 from slipid.support.errors import DataError
 
 RULES: dict[str, Rule] = {
-    **{name: elementwise.unary(name) for name in UNARY},
-    **{name: elementwise.binary(name) for name in BINARY},
-    **{name: sums.reduced(name) for name in REDUCED},
-    "argmin": sums.argmin,
-    "convert_element_type": elementwise.converted,
-    "dot_general": sums.dot,
+    **{name: arithmetic.unary(name) for name in UNARY},
+    **{name: arithmetic.binary(name) for name in BINARY},
+    **{name: arithmetic.reduced(name) for name in REDUCED},
+    "argmin": arithmetic.argmin,
+    "convert_element_type": arithmetic.converted,
+    "dot_general": arithmetic.dot,
     "dynamic_slice": moves.dynamic_slice,
     "gather": moves.gather,
-    "integer_pow": elementwise.integer_pow,
+    "integer_pow": arithmetic.integer_pow,
     "scatter": moves.scatter,
     "scatter-add": moves.scattered("add", 0.0),
     "scatter-mul": moves.scattered("mul", 1.0),
-    "select_n": elementwise.select,
+    "select_n": arithmetic.select,
 }
 """Rules that turn a primitive into C, by the primitive's name.
 
@@ -144,7 +142,7 @@ def _cond(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
         lowered(body, branch, values[1:]) for body, branch in zip(bodies, choices, strict=True)
     ]
     when = builder.compute("bool", "{0} != 0", (along(builder, which, (), None).item(),))
-    block = builder.append(nested=Nested(when, 1, bodies[::-1]))
+    block = builder.append(CodeBlock(builder, when=when, bodies=bodies[::-1]))
     out: list[Value] = []
     for pair in zip(*results, strict=True):
         memory = _memory(builder, pair[0], block)
@@ -166,7 +164,7 @@ def _scan(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
     if len(values) != carried + consts or len(scan.body.jaxpr.outvars) != carried:
         raise NoFormError("a loop that goes through an array")
     body = Builder(builder.names, builder)
-    body.turns = CodeBlock(builder, 0, nested=Nested(None, scan.turns, [body]))
+    body.turns = CodeBlock(builder, times=scan.turns, bodies=[body])
     begun = values[consts:]
     memories = [_memory(builder, value, body.turns) for value in begun]
     for value, memory in zip(begun, memories, strict=True):
@@ -177,7 +175,7 @@ def _scan(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
     results = [apart(body, value, names) for value in results]
     for value, memory in zip(results, memories, strict=True):
         store(body, value, memory)
-    builder.put(body.turns)
+    builder.append(body.turns)
     return list(carry)
 
 
@@ -205,7 +203,7 @@ def store(builder: Builder, value: Value, memory: Memory) -> None:
     cells = along(builder, value, shape, axis)
     lanes = 0 if axis is None else shape[axis]
     rows = rows_of(numbered(shape), axis).reshape(-1, max(lanes, 1))
-    end = builder.append(lanes)
+    end = builder.append(CodeBlock(builder, lanes))
     for row, cell in zip(rows, cells.reshape(-1), strict=True):
         stride = int(row[1] - row[0]) if lanes > 1 else 0
         text = f"{_place(memory, int(row[0]), stride)} = {{0}};"

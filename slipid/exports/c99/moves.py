@@ -9,8 +9,8 @@ import numpy as np
 from jax import lax
 from jax.extend.core import Primitive
 
+from slipid.exports.c99.arithmetic import Rule, Shaped, binary
 from slipid.exports.c99.builder import Builder
-from slipid.exports.c99.elementwise import Rule, Shaped, binary
 from slipid.exports.c99.ir import (
     Array,
     At,

@@ -36,19 +36,13 @@ class Sources:
     """Numbers of some arrays, flattened and joined; a place is an index into all of them.
 
     Attributes:
-        constant: whether all numbers are constants.
-        numbers: the constants, if all numbers are constants.
         kind: kind of the numbers.
     """
 
     def __init__(self, builder: Builder, sources: Sequence[Value]):
         self._builder, self._sources = builder, sources
-        sizes = [prod(s.shape) for s in sources]
-        self._starts = np.concatenate([[0], np.cumsum(sizes)])
-        self.constant = not any(isinstance(s, Array) for s in sources)
+        self._starts = np.cumsum([0, *(prod(s.shape) for s in sources)])
         self.kind = kind_of_value(sources[0])
-        flat = [np.asarray(s).reshape(-1) for s in sources if not isinstance(s, Array)]
-        self.numbers = np.concatenate(flat) if self.constant else np.zeros(0)
         self._ones: dict[int, Cell] = {}
 
     def _source(self, place: int) -> tuple[Value, int]:
@@ -64,11 +58,8 @@ class Sources:
         axis = max(free, key=lambda a: (free[a], places.shape[a], a), default=None)
         if axis is not None and 2 * free[axis] * places.shape[axis] >= places.size > 0:
             return axis
-        return longest(places.shape) if self._laned(places) else None
-
-    def _laned(self, places: np.ndarray) -> bool:
-        """Return whether the result is long enough for lanes, and not one number repeated."""
-        return len(np.unique(places)) > UNROLLED or max(places.shape, default=0) >= 2 * LANES
+        large = len(np.unique(places)) > UNROLLED or max(places.shape, default=0) >= 2 * LANES
+        return longest(places.shape) if large else None
 
     def _free(self, places: np.ndarray, axis: int) -> int:
         rows = np.moveaxis(places, axis, -1)
@@ -223,18 +214,12 @@ def _runs(cells: Sequence[Cell]) -> list[list[Cell]]:
     """
     runs: list[list[Cell]] = []
     for cell in cells:
-        if runs and _goes_on(runs[-1], cell):
+        offsets = _places([*runs[-1][-2:], cell]) if runs else None
+        if offsets is not None and len(set(np.diff(offsets))) == 1:
             runs[-1].append(cell)
         else:
             runs.append([cell])
     return [part for run in runs for part in ([run] if len(run) > 2 else [[c] for c in run])]
-
-
-def _goes_on(run: list[Cell], cell: Cell) -> bool:
-    places = _places([*run[-2:], cell])
-    if places is None:
-        return False
-    return len(places) < 3 or bool(places[2] - places[1] == places[1] - places[0])
 
 
 def rearranged(
@@ -248,9 +233,10 @@ def rearranged(
         places: place of every number of the result in the joined sources.
         axis: axis of the result's lanes, None for no lanes; by default (-1) the cheapest one.
     """
+    constants = [np.ravel(s) for s in sources if not isinstance(s, Array)]
+    if len(constants) == len(sources):
+        return np.concatenate(constants)[places]
     known = Sources(builder, sources)
-    if known.constant:
-        return known.numbers[places]
     if axis == -1:
         axis = known.best_axis(places)
     rows = rows_of(places, axis)

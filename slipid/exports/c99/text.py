@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slipid.exports.c99.builder import Builder
-from slipid.exports.c99.ir import At, Cell, CodeBlock, Constant, Memory, Nested, Statement, Variable
+from slipid.exports.c99.ir import At, Cell, CodeBlock, Constant, Memory, Statement, Variable
 from slipid.exports.fields import DTYPES, Kind
 
 
@@ -39,10 +39,10 @@ class Usage:
         """Mark the statements and arrays that are used, from the end to the beginning."""
         for block in reversed(builder.blocks):
             self._step -= 1
-            if block.nested is not None:
-                self._inside(block.nested)
-                if block.nested.when is not None:
-                    self._uses(block.nested.when, block)
+            if block.bodies:
+                self._inside(block)
+            if block.when is not None:
+                self._uses(block.when, block)
             for statement in reversed(block.statements):
                 if self._needed(statement):
                     self._mark(statement, block)
@@ -58,7 +58,7 @@ class Usage:
         for cell in statement.cells:
             self._uses(cell, block)
 
-    def _inside(self, nested: Nested) -> None:
+    def _inside(self, nested: CodeBlock) -> None:
         """Mark what the bodies use; memory filled before a repetition stays live until its end."""
         end = self._step
         for body in nested.bodies:
@@ -106,7 +106,7 @@ class _Life:
     last: int
 
 
-def _within(memory: Memory, nested: Nested) -> bool:
+def _within(memory: Memory, nested: CodeBlock) -> bool:
     """Return whether memory is filled within the bodies of a condition or repetition."""
     owner = None if memory.home is None else memory.home.owner
     while owner is not None and owner not in nested.bodies:
@@ -201,18 +201,16 @@ class FunctionBody:
     def _text(self, builder: Builder, indent: str) -> list[str]:
         lines: list[str] = []
         for block in builder.blocks:
-            lines += self._nested(block, indent) if block.nested else self._block(block, indent)
+            lines += self._nested(block, indent) if block.bodies else self._block(block, indent)
         return lines
 
     def _nested(self, block: CodeBlock, indent: str) -> list[str]:
-        nested = block.nested
-        assert nested is not None
-        bodies = [self._text(body, indent + "  ") for body in nested.bodies]
-        if nested.when is not None:
+        bodies = [self._text(body, indent + "  ") for body in block.bodies]
+        if block.when is not None:
             yes, no = bodies
-            head = f"{indent}if ({self._cell(nested.when, block)}) {{"
+            head = f"{indent}if ({self._cell(block.when, block)}) {{"
             return [head, *yes, f"{indent}}} else {{", *no, f"{indent}}}"]
-        head = f"{indent}for (int32_t turn = 0; turn < {nested.times}; ++turn) {{"
+        head = f"{indent}for (int32_t turn = 0; turn < {block.times}; ++turn) {{"
         return [head, *bodies[0], f"{indent}}}"]
 
     def _block(self, block: CodeBlock, indent: str) -> list[str]:

@@ -148,7 +148,7 @@ STATE = (*_POSE, *(f"v{name}" for name in _POSE), "ax", "ay", "az")
 FUSED = ("vx", "vy", "vyaw")
 """States that the filter takes from odometry. The odometry's pose is not used, since it is the
 integral of the same velocities."""
-HELD = 1e-6
+PLANAR_NOISE = 1e-6
 """Process noise, variance per second, of the states that `two_d_mode` keeps at zero."""
 ACCELERATION = 0.01
 """Process noise of accelerations, variance per second [m^2/s^5]. No sensor measures them here, so
@@ -198,7 +198,7 @@ def process_noise(robot: DeployedRobot, errors: OdometryErrors) -> Parameter:
     speed, turn = change**2 * PERIOD_S, (change / float(robot.frame.base)) ** 2 * PERIOD_S
     noise = dict(zip(("x", "y", "yaw"), errors.walk(top_speed(robot), DISTANCE_M), strict=True))
     noise |= {"vx": speed, "vy": speed, "vyaw": turn, "ax": ACCELERATION, "ay": ACCELERATION}
-    matrix = np.diag([noise.get(name, HELD) for name in STATE])
+    matrix = np.diag([noise.get(name, PLANAR_NOISE) for name in STATE])
     about = (
         f"On '{errors.floor}'. Pose: errors that stay the same over the path, and so are no noise "
         f"of single velocities, as a random walk with the same error after {short(DISTANCE_M)} m, "
