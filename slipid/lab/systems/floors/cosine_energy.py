@@ -61,19 +61,6 @@ SLOW = 0.02
 """Speed u up to which a row is not used, since its direction of travel is undefined [m/s]."""
 
 
-@dataclass(frozen=True, eq=False)
-class CosineSeries:
-    """Fitted series of each floor.
-
-    Attributes:
-        weight: coefficients of the constant, then of cosine and sine of each harmonic in turn.
-        std: standard deviation of the residuals from each floor's series.
-    """
-
-    weight: Float[np.ndarray, "floor term"]
-    std: Float[np.ndarray, " floor"]
-
-
 @dataclass(frozen=True)
 class CosineEnergyClassifier(FloorClassifier):
     """Floor classifier by the energy coefficient, a series in the direction of travel.
@@ -88,7 +75,9 @@ class CosineEnergyClassifier(FloorClassifier):
         window_s: length of the trailing window over which signals are averaged [s].
         apart_s: time between independent rows, see `accumulated` [s].
         memory_s: time constant of the evidence, see `accumulated` [s].
-        fitted: the fitted series; None before a fit.
+        weight: fitted coefficients of each floor's series: of the constant, then of cosine and sine
+            of each harmonic in turn.
+        std: standard deviation of the residuals from each floor's series.
     """
 
     name: str = "belyaev_kushnarev"
@@ -99,7 +88,8 @@ class CosineEnergyClassifier(FloorClassifier):
     window_s: float = 0.5
     apart_s: float = 0.5
     memory_s: float = 20.0
-    fitted: CosineSeries | None = field(default=None, repr=False)
+    weight: Float[np.ndarray, "floor term"] = field(default_factory=lambda: np.zeros(0), repr=False)
+    std: Float[np.ndarray, " floor"] = field(default_factory=lambda: np.zeros(0), repr=False)
 
     def candidates(self) -> Sequence["CosineEnergyClassifier"]:
         both = (True, False)
@@ -118,23 +108,23 @@ class CosineEnergyClassifier(FloorClassifier):
             normal = a.T @ a + ridge + 1e-9 * np.eye(len(ridge))
             weights.append(np.linalg.solve(normal, a.T @ energy))
             stds.append(max(float((energy - a @ weights[-1]).std()), 1e-6))
-        return replace(self, labels=labels, fitted=CosineSeries(np.stack(weights), np.array(stds)))
+        return replace(self, labels=labels, weight=np.stack(weights), std=np.array(stds))
 
     def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
-        if self.fitted is None:
+        if not self.labels:
             raise ValueError(f"{self.name} was not fitted")
         out = []
         for run in runs:
             angle, energy = self._direction_and_energy(run, spec).T
-            expected = terms(angle, self.harmonics) @ self.fitted.weight.T
-            z = (energy[:, None] - expected) / self.fitted.std
-            log = -0.5 * z**2 - np.log(self.fitted.std)
+            expected = terms(angle, self.harmonics) @ self.weight.T
+            z = (energy[:, None] - expected) / self.std
+            log = -0.5 * z**2 - np.log(self.std)
             out.append(accumulated(log, run, self.apart_s, self.memory_s))
         return out
 
     @property
     def numbers(self) -> int:
-        return 0 if self.fitted is None else self.fitted.weight.size + self.fitted.std.size
+        return self.weight.size + self.std.size
 
     def _direction_and_energy(
         self, run: FloorSignals, spec: RobotSpec

@@ -164,10 +164,10 @@ def test_a_series_is_the_one_that_data_were_made_from():
     weight = np.array([0.5, 0.1, -0.05, 0.0, 0.08])
     method = CosineEnergyClassifier(harmonics=2, ridge=0.0)
     done = method.fit([circle_run(weight, "gray")], ROBOTINO)
-    assert np.allclose(done.fitted.weight[0], weight, atol=1e-9)
+    assert np.allclose(done.weight[0], weight, atol=1e-9)
     noisy = method.fit([circle_run(weight, "gray", noise=0.05)], ROBOTINO)
-    assert noisy.fitted.std[0] == pytest.approx(0.05, rel=0.2)
-    assert np.allclose(noisy.fitted.weight[0], weight, atol=0.02)
+    assert noisy.std[0] == pytest.approx(0.05, rel=0.2)
+    assert np.allclose(noisy.weight[0], weight, atol=0.02)
 
 
 def test_a_ridge_pulls_waves_towards_nothing_and_not_the_mean():
@@ -176,7 +176,7 @@ def test_a_ridge_pulls_waves_towards_nothing_and_not_the_mean():
     done = CosineEnergyClassifier(harmonics=2, ridge=rows / 2).fit(
         [circle_run(weight, "gray")], ROBOTINO
     )
-    assert np.allclose(done.fitted.weight[0], [0.5, 0.05, 0, 0, 0], atol=2e-3)
+    assert np.allclose(done.weight[0], [0.5, 0.05, 0, 0, 0], atol=2e-3)
 
 
 def test_the_likelihood_is_that_of_normal_coefficients():
@@ -187,12 +187,12 @@ def test_the_likelihood_is_that_of_normal_coefficients():
     ]
     method = CosineEnergyClassifier(harmonics=2, ridge=0.0, apart_s=10.0, memory_s=np.inf)
     done = method.fit(runs, ROBOTINO)
-    assert done.fitted.std[1] > 1.5 * done.fitted.std[0]
+    assert done.std[1] > 1.5 * done.std[0]
     one = runs[0].rows(0, 2)
     beliefs = done.probability([replace(one, time=np.array([0.0, 10.0]))], ROBOTINO)[0]
     angle, energy = method._direction_and_energy(one, ROBOTINO).T
-    series = terms(angle, 2) @ done.fitted.weight.T
-    density = np.exp(-0.5 * ((energy[:, None] - series) / done.fitted.std) ** 2) / done.fitted.std
+    series = terms(angle, 2) @ done.weight.T
+    density = np.exp(-0.5 * ((energy[:, None] - series) / done.std) ** 2) / done.std
     expected = np.cumprod(density, axis=0)
     assert np.allclose(beliefs, expected / expected.sum(axis=1, keepdims=True))
 
