@@ -284,7 +284,7 @@ def test_wheels_stand_where_the_camera_says_less_the_marker():
     x, y, heading = 0.3, -0.2, np.pi / 2
     px, py = np.asarray(true.camera.marker_place)
     marker = jnp.array([x - py, y + px, heading + 0.1])
-    logged = np.asarray(jax.jit(true.camera.logged)(marker))
+    logged = np.asarray(eqx.filter_jit(true.camera.logged)(marker))
     found = cut.wheel_places(true, replace(w, pose=np.tile(logged, (1, 2, 1))))
     place = 0.125 * np.asarray(true.geometry.place)
     expected = np.stack([x - place[:, 1], y + place[:, 0]], 1)
