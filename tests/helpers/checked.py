@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import is_dataclass
 from types import CodeType, FunctionType
-from typing import Any
+from typing import Any, Self
 
 import jaxtyping
 
@@ -41,7 +41,12 @@ def _checks(fn: FunctionType, typechecker: Callable) -> Callable:
 
     # annotations are words that are looked up where the function was defined
     there = FunctionType(called.__code__, fn.__globals__, fn.__name__, None, called.__closure__)
-    return _eager(functools.wraps(fn)(there), typechecker=typechecker)
+    functools.wraps(fn)(there)
+    if fn.__annotations__.get("return") is Self:
+        # beartype knows what it is where it decorates the class, not where it decorates a method
+        del there.__annotations__["return"]
+        there.__signature__ = inspect.signature(fn).replace(return_annotation=inspect.Signature.empty)
+    return _eager(there, typechecker=typechecker)
 
 
 def _shared(fn: FunctionType) -> bool:

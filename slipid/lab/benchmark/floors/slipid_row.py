@@ -126,7 +126,9 @@ class SlipidFloorClassifier(FloorClassifier):
     zero_a: float = 0.0
     settings: Settings = SETTINGS
     fitted: Robot | None = field(default=None, repr=False)
-    std: Float[np.ndarray, "kind floor"] = field(default_factory=lambda: np.zeros(0), repr=False)
+    std: Float[np.ndarray, "kind floor"] = field(
+        default_factory=lambda: np.zeros((0, 0)), repr=False
+    )
 
     def fit(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> "SlipidFloorClassifier":
         labels = floors_of(runs)

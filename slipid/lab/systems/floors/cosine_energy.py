@@ -88,7 +88,9 @@ class CosineEnergyClassifier(FloorClassifier):
     window_s: float = 0.5
     apart_s: float = 0.5
     memory_s: float = 20.0
-    weight: Float[np.ndarray, "floor term"] = field(default_factory=lambda: np.zeros(0), repr=False)
+    weight: Float[np.ndarray, "floor term"] = field(
+        default_factory=lambda: np.zeros((0, 0)), repr=False
+    )
     std: Float[np.ndarray, " floor"] = field(default_factory=lambda: np.zeros(0), repr=False)
 
     def candidates(self) -> Sequence["CosineEnergyClassifier"]:
