@@ -10,14 +10,14 @@ from typing import Literal
 
 from slipid.data.check.joined import PoseConvention
 from slipid.data.check.mistakes import Candidate, Mistake
-from slipid.data.check.ratios import ScaleCause, ScaleRatios
+from slipid.data.check.ratios import QUANTITIES, ScaleCause, ScaleRatio
 from slipid.support.content import Content
 
 Severity = Literal["wrong", "suspicious", "note"]
 """Severity of a finding: `wrong` must be corrected before a fit, `suspicious` may be right but
 should be looked at, `note` is about what could not be checked."""
-ORDER: tuple[Severity, ...] = ("wrong", "suspicious", "note")
-NAMED = 4
+SEVERITIES: tuple[Severity, ...] = ("wrong", "suspicious", "note")
+MOST_NAMED_RUNS = 4
 """Largest number of runs that a sentence names; the others are only counted."""
 
 
@@ -65,14 +65,14 @@ class Finding:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return the first `NAMED` names, and the number of the others."""
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+    """Return the first `MOST_NAMED_RUNS` names, and the number of the others."""
+    more = len(names) - MOST_NAMED_RUNS
+    return ", ".join(names[:MOST_NAMED_RUNS]) + (f" and {more} more" if more > 0 else "")
 
 
 def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return the findings, those that forbid a fit first."""
-    return tuple(sorted(findings, key=lambda f: ORDER.index(f.severity)))
+    return tuple(sorted(findings, key=lambda f: SEVERITIES.index(f.severity)))
 
 
 def wrong(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -87,24 +87,6 @@ _CONVENTION_SENTENCES = {
     "pose_mirrored": "the poses are mirrored, as from below or in an image whose y points down",
     "heading_quaternion": "the heading is the z of a quaternion, sin(yaw / 2), not an angle",
 }
-_CAUSES = {
-    "time": ("time_unit", "time"),
-    "pose_length": ("pose_length", "the scale of the poses"),
-    "heading": ("heading_unit", "the heading"),
-    "wheel_gear": ("wheel_scale", "the angle of the wheels"),
-    "wheel_turns": ("wheel_scale", "the angle of the wheels"),
-    "wheel_radius": ("wheel_scale", "wheel_radius_m"),
-    "base": ("base_radius", "the distance of the wheels from the centre"),
-    "gyro": ("gyro_unit", "the channel gyro"),
-    "report": ("wheel_speed_unit", "the channel wheel_speed (or motor_speed)"),
-    "command_wheels": (
-        "command_unit",
-        "the channel wheel_speed_command (or motor_speed_command)",
-    ),
-    "command_twist": ("command_unit", "the channel twist_command_x and twist_command_y"),
-    "command_yaw": ("command_unit", "the channel twist_command_yaw"),
-}
-"""Kind of finding, and name of the scaled quantity in its text, for the name of each cause."""
 
 
 def mistake_finding(mistake: Mistake) -> Finding:
@@ -201,9 +183,9 @@ def _convention_finding(kind: str, convention: PoseConvention) -> Finding:
 
 
 def cause_findings(
-    fitting: Sequence[ScaleCause], single: bool, why: str, gear_ratio: float
+    fitting: Sequence[ScaleCause], single: bool, scales: Mapping[str, ScaleRatio], gear_ratio: float
 ) -> tuple[Finding, ...]:
-    """Return findings about wrong factors.
+    """Return findings about wrong factors, from ratios outside their ranges.
 
     If causes fit alone, the likeliest one is the finding and others are alternatives in its text;
     if two causes fit only together, both are findings.
@@ -211,11 +193,18 @@ def cause_findings(
     Args:
         fitting: causes that fit, the likeliest first.
         single: whether each of these causes fits alone.
-        why: sentence about the ratios that are out of range.
+        scales: ratios by name.
         gear_ratio: gear ratio of the declared robot.
     """
+    why = ratio_sentence(scales)
     if not fitting:
-        return ()
+        found = Finding(
+            "scales",
+            "the channels disagree about the robot's path length, and no single number explains "
+            f"it: {why}",
+            "check the units of all channels, gear_ratio, wheel_radius_m and base_radius_m",
+        )
+        return (found,) if why else ()
     if not single:
         return tuple(_factor_finding(one, gear_ratio).explained(why) for one in fitting)
     first, *others = (_factor_finding(one, gear_ratio) for one in fitting)
@@ -227,7 +216,7 @@ def cause_findings(
     return (first.explained(why, likely[:2]),)
 
 
-def ratio_sentence(scales: ScaleRatios) -> str:
+def ratio_sentence(known: Mapping[str, ScaleRatio]) -> str:
     """Return a sentence with the value of every ratio that is outside its range."""
     sentences = {
         "travel": "the body's path length is {:.3g} times that of the wheels",
@@ -238,13 +227,12 @@ def ratio_sentence(scales: ScaleRatios) -> str:
         "report": "the reported wheel speeds are {:.3g} times those of the encoders",
         "gyro": "the gyro turns {:.3g} times as much as the poses",
     }
-    unnatural = {k: r.value for k, r in scales.known.items() if not r.natural}
-    return ", ".join(sentences[k].format(value) for k, value in unnatural.items())
+    return ", ".join(sentences[k].format(r.value) for k, r in known.items() if not r.natural)
 
 
 def _factor_finding(cause: ScaleCause, gear_ratio: float) -> Finding:
     """Return the finding about a quantity that is too large or too small by a factor."""
-    factor, (kind, channel) = cause.factor, _CAUSES[cause.name]
+    factor, (kind, channel, *_) = cause.factor, QUANTITIES[cause.name]
     ratio = f"{max(factor, 1 / factor):.3g}"
     size = f"{ratio} times too {'large' if factor > 1 else 'small'}"
     found = f"{channel} is {size}"

@@ -17,19 +17,20 @@ from slipid.data.check.joined import (
     usable,
 )
 
-MOVED_M = 0.2
+LEAST_PATH_M = 0.2
 """Path length by the wheels above which a run is judged, since its poses must move as well [m]."""
-STILL_M = 1e-6
+ROUNDING_M = 1e-6
 """Path length below which poses do not change, except for rounding [m]."""
-ROWS = 20
+LEAST_ROWS = 20
 """Least number of rows of a run that is judged."""
-ODD, TIMES, USUAL = 0.3, 10.0, 0.9
-"""A run has poses of another run if its disagreement, 1 - cosine, exceeds both `ODD` and `TIMES`
-times that of the median run. No run is judged if the median run's cosine is below `USUAL`."""
-CLIPPED = 4.0
+ODD_DISAGREEMENT, ODD_RATIO, USUAL_COSINE = 0.3, 10.0, 0.9
+"""A run has poses of another run if its disagreement, 1 - cosine, exceeds both `ODD_DISAGREEMENT`
+and `ODD_RATIO` times that of the median run. No run is judged if the median run's cosine is below
+`USUAL_COSINE`."""
+LONGEST_RATIO = 4.0
 """Multiple of the median length of the body increments to which longer increments are
 shortened [1]."""
-ALL = 0.5
+SHARE_IF_ALL = 0.5
 """Share of runs with constant poses from which the finding is about all runs [1]."""
 
 
@@ -44,11 +45,19 @@ class RunAgreement:
         poses_m: path length of the poses (run,) [m].
         cosine: normalised scalar product of the body increments from the poses and from the wheels
             (run,) [1].
+        judged: whether the run has enough rows, and its wheels travel far enough, to be judged
+            (run,).
     """
 
     wheels_m: Float[np.ndarray, " run"]
     poses_m: Float[np.ndarray, " run"]
     cosine: Float[np.ndarray, " run"]
+    judged: Bool[np.ndarray, " run"]
+
+    @property
+    def still(self) -> Bool[np.ndarray, " run"]:
+        """Return, for each run, whether its poses do not change although its wheels turn."""
+        return self.judged & (self.poses_m < ROUNDING_M)
 
 
 def agreement(
@@ -66,7 +75,7 @@ def agreement(
     known = usable(body, predicted)
     body, predicted, run = body[known], predicted[known], at.run[known]
     length = np.linalg.norm(body, axis=1)
-    most = CLIPPED * float(np.median(length[length > 0])) if (length > 0).any() else 1.0
+    most = LONGEST_RATIO * float(np.median(length[length > 0])) if (length > 0).any() else 1.0
     body = body * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
     # Slip shortens the motion along each axis by a different factor.
     squares = (predicted**2).sum(axis=0)
@@ -78,23 +87,21 @@ def agreement(
 
     size = np.sqrt(total((body**2).sum(axis=1)) * total((scaled**2).sum(axis=1)))
     both = total((body * scaled).sum(axis=1))
+    wheels_m = total(np.linalg.norm(predicted, axis=1))
+    rows = (data.end - data.begin) / data.row
     return RunAgreement(
-        total(np.linalg.norm(predicted, axis=1)),
+        wheels_m,
         total(np.linalg.norm(body, axis=1)),
         np.where(size > 0, both / np.where(size > 0, size, 1.0), 0.0),
+        (rows >= LEAST_ROWS) & (wheels_m > LEAST_PATH_M),
     )
-
-
-def standing(data: JoinedRuns, compared: RunAgreement) -> Bool[np.ndarray, " run"]:
-    """Return, for each run, whether its poses do not change although its wheels turn."""
-    return (compared.poses_m < STILL_M) & (compared.wheels_m > MOVED_M) & (_rows(data) >= ROWS)
 
 
 def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
     """Yield findings about runs with constant poses, and about runs with poses of another run."""
-    still = standing(data, compared)
+    still = compared.still
     if still.any():
-        every = bool(still.mean() >= ALL)
+        every = bool(still.mean() >= SHARE_IF_ALL)
         yield Finding(
             "pose_constant",
             f"the poses do not change in {still.sum()} of {len(still)} runs while the wheels "
@@ -105,17 +112,13 @@ def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
             runs=() if every else _names(data, still),
         )
     # Runs in which the floor holds the robot in place disagree for a reason, and are not judged.
-    moves = ~still & (_rows(data) >= ROWS) & (compared.wheels_m > MOVED_M)
+    moves = compared.judged & ~still
     if moves.any():
-        moves &= (
-            compared.poses_m
-            > 0.25
-            * np.median(compared.poses_m[moves] / compared.wheels_m[moves])
-            * compared.wheels_m
-        )
-    if moves.sum() < 2 or (usual := float(np.median(compared.cosine[moves]))) < USUAL:
+        share = compared.poses_m / np.maximum(compared.wheels_m, 1e-300)
+        moves &= share > 0.25 * np.median(share[moves])
+    if moves.sum() < 2 or (usual := float(np.median(compared.cosine[moves]))) < USUAL_COSINE:
         return
-    odd = moves & (1 - compared.cosine > max(ODD, TIMES * (1 - usual)))
+    odd = moves & (1 - compared.cosine > max(ODD_DISAGREEMENT, ODD_RATIO * (1 - usual)))
     if odd.any():
         yield Finding(
             "pose_of_another_run",
@@ -126,10 +129,6 @@ def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
             "them out of the globs of [[logs]]",
             runs=_names(data, odd),
         )
-
-
-def _rows(data: JoinedRuns) -> Float[np.ndarray, " run"]:
-    return np.asarray((data.end - data.begin) / data.row)
 
 
 def _names(data: JoinedRuns, which: Bool[np.ndarray, " run"]) -> tuple[str, ...]:

@@ -13,15 +13,15 @@ from slipid.predict import folds as compared
 from slipid.predict.folds import FoldKey, speeds
 from slipid.predict.slip_model import Run
 
-FOLDS = 2
+HEADING_FOLDS = 2
 """Number of folds by headings and by sectors; one fold holds every other sector."""
-SPEEDS = 2
+SPEED_FOLDS = 2
 """Largest number of folds by speeds; if there are more speeds, several share a fold."""
-INNER = 1
+INNER_FOLDS = 1
 """Number of folds of the training runs that are held out in turn to pick settings."""
 LEAST_TRAINING, LEAST_HELD_OUT = 8, 3
 """Smallest numbers of training runs and of held-out runs of a split."""
-ALL = -1
+ONLY_FOLD = -1
 """Index of the only fold of the split "all", whose runs are all training runs."""
 Labels = Int[np.ndarray, " run"]
 
@@ -105,13 +105,13 @@ def headings(facts: Sequence[FoldKey]) -> Labels:
     bins = np.round(np.where(known, heading, 0.0) / 5.0) % 72
     bins = np.where(known, bins, 72 + np.arange(len(heading)))
     number = np.unique(bins, return_inverse=True)[1]
-    return np.random.default_rng(0).permutation(number.max() + 1)[number] % FOLDS
+    return np.random.default_rng(0).permutation(number.max() + 1)[number] % HEADING_FOLDS
 
 
 def sectors(facts: Sequence[FoldKey]) -> Labels:
     """Return folds by sector of the heading, every other sector in one; -1 without a heading."""
     sector = compared.sectors(facts)
-    return np.where(sector < 0, sector, sector % FOLDS)
+    return np.where(sector < 0, sector, sector % HEADING_FOLDS)
 
 
 def floors(facts: Sequence[FoldKey]) -> Labels:
@@ -122,7 +122,7 @@ def floors(facts: Sequence[FoldKey]) -> Labels:
 KINDS: dict[str, Callable[[Sequence[FoldKey]], Labels]] = {
     "headings": headings,
     "sectors": sectors,
-    "speeds": partial(speeds, most=SPEEDS),
+    "speeds": partial(speeds, most=SPEED_FOLDS),
     "floors": floors,
 }
 
@@ -135,7 +135,7 @@ def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
     """
     everybody = np.arange(len(facts))
     if kind == "all":
-        return [Split(ALL, everybody, everybody[:0])]
+        return [Split(ONLY_FOLD, everybody, everybody[:0])]
     part = KINDS[kind](facts)
     where = np.array([f.floor for f in facts])
     found = []
@@ -151,18 +151,18 @@ def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
 def inner(runs: Sequence[Run], kind: str) -> Labels:
     """Return the inner fold of every training run, for the cross-validation that picks settings.
 
-    The training runs are divided by the protocol's kind of split. The `INNER` largest parts are
-    held out in turn and numbered from 0. All other runs are -1, or `INNER` where runs are assigned
-    at random, and always remain training runs. If the training runs have fewer than two parts of
-    the kind, they are divided by headings. This is always so for sectors: every other sector is
-    missing from the training runs already, and without one more the gap would be three times as
-    wide as that of the protocol.
+    The training runs are divided by the protocol's kind of split. The `INNER_FOLDS` largest parts
+    are held out in turn and numbered from 0. All other runs are -1, or `INNER_FOLDS` where runs are
+    assigned at random, and always remain training runs. If the training runs have fewer than two
+    parts of the kind, they are divided by headings. This is always so for sectors: every other
+    sector is missing from the training runs already, and without one more the gap would be three
+    times as wide as that of the protocol.
     """
     facts = [facts_of_run(run) for run in runs]
     for name in dict.fromkeys((kind if kind in KINDS else "headings", "headings")):
         part = KINDS[name](facts)
         names, count = np.unique(part[part >= 0], return_counts=True)
         if len(names) > 1:
-            order = names[np.argsort(-count, kind="stable")][:INNER]
+            order = names[np.argsort(-count, kind="stable")][:INNER_FOLDS]
             return np.select([part == name for name in order], range(len(order)), -1)
-    return np.random.default_rng(0).permutation(len(runs)) % (INNER + 1)
+    return np.random.default_rng(0).permutation(len(runs)) % (INNER_FOLDS + 1)

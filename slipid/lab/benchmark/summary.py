@@ -78,30 +78,23 @@ class RowSummary:
     failed: bool = False
 
 
-def summary(folds: Mapping[str, Sequence[FoldScore]], reference: str) -> dict[str, RowSummary]:
-    """Return the summary of every row over its folds, compared with the row named `reference`.
-
-    A row that is absent in some fold is absent altogether, since it would be averaged over other
-    runs than the rest.
-    """
-    present = {
-        name: each for name, each in folds.items() if each and not any(r.absent for r in each)
-    }
-    done = {name: [run for row in each for run in row.runs] for name, each in present.items()}
+def summary(
+    folds: Mapping[str, Sequence[FoldScore[RunScore]]], reference: str
+) -> dict[str, RowSummary]:
+    """Return the summary of every row over its folds, compared with the row named `reference`."""
+    scores = {name: FoldScore.of_folds(each) for name, each in folds.items()}
+    done = {name: score.runs for name, score in scores.items() if score.runs}
+    first = next(iter(done.values()), ())
+    weights, base = Bootstrap.of(first), done.get(reference)
     out: dict[str, RowSummary] = {}
-    first = next(iter(done.values()), [])
-    if first:
-        weights = Bootstrap.of(first)
-        base = done.get(reference)
-        for name, runs in done.items():
-            assert [run.name for run in runs] == [run.name for run in first]
-            rival = None if name == reference else base
-            out[name] = _summary(present[name], runs, rival, weights)
-    for name, each in folds.items():
-        if name not in out:
-            why = next((row.absent for row in each if row.absent), "no run")
-            out[name] = RowSummary(absent=why, failed=any(row.failed for row in each))
-    return {name: out[name] for name in folds}
+    for name, score in scores.items():
+        if not score.runs:
+            out[name] = RowSummary(absent=score.absent or "no run", failed=score.failed)
+            continue
+        assert [run.name for run in score.runs] == [run.name for run in first]
+        rival = None if name == reference else base
+        out[name] = _summary(score, folds[name], rival, weights)
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,11 +159,13 @@ def mean_interval(draws: Float[np.ndarray, " draw"]) -> MeanInterval:
 
 
 def _summary(
-    rows: Sequence[FoldScore],
-    runs: Sequence[RunScore],
+    score: FoldScore[RunScore],
+    folds: Sequence[FoldScore[RunScore]],
     rival: Sequence[RunScore] | None,
     by: Bootstrap,
 ) -> RowSummary:
+    runs = score.runs
+
     def mean(of: Callable[[RunScore], float | bool | None]) -> MeanInterval | None:
         x = np.array([np.nan if (v := of(run)) is None else float(v) for run in runs])
         return mean_interval(by.mean(x)) if np.isfinite(x).any() else None
@@ -179,9 +174,6 @@ def _summary(
     behind = None
     if rival is not None:
         behind = mean_interval(by.mean(error - np.array([run.endpoint_error for run in rival])))
-
-    def median(name: str) -> float:
-        return float(np.median([getattr(row, name) for row in rows]))
 
     return RowSummary(
         endpoint_error=mean_interval(by.mean(error)),
@@ -195,12 +187,12 @@ def _summary(
         floor_accuracy=mean(lambda run: run.floor_right),
         energy_error=mean(lambda run: run.energy_error),
         runs=len(runs),
-        numbers=int(median("numbers")),
-        tune_s=median("tune_s"),
-        fit_s=median("fit_s"),
-        step_us=median("step_us"),
-        settings=tuple(row.settings for row in rows),
-        unconverged=sum(not row.converged for row in rows),
+        numbers=score.numbers,
+        tune_s=score.tune_s,
+        fit_s=score.fit_s,
+        step_us=score.step_us,
+        settings=tuple(fold.settings for fold in folds),
+        unconverged=sum(not fold.converged for fold in folds),
     )
 
 

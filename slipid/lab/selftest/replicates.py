@@ -30,6 +30,8 @@ from slipid.infer.result import draws
 from slipid.infer.slip_curves import curves, slip_on
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import flat_directions, members
+from slipid.model.camera import Camera
+from slipid.model.motor import Motor
 from slipid.model.robot import Robot
 from slipid.predict.open_loop import chain, contact_increments, corrected
 from slipid.predict.slip_model import as_increments
@@ -58,7 +60,7 @@ def simulate_windows(
     b = lk.batch(w, truth)
     increment, amps, start = (np.asarray(x) for x in _predicted(truth, b, w.pose))
     steps = increment + _process(truth, w, rng, std)
-    pose = np.array(_logged(truth, chain(start, steps)))
+    pose = np.array(_logged(truth.camera, chain(start, steps)))
     pose[..., :2] += rng.normal(size=(*pose.shape[:2], 2)) * std.get("camera.place", 0.0)
     pose[..., 2] += rng.normal(size=pose.shape[:2]) * std.get("camera.heading", 0.0)
     each = _component_std(std, w, "current", "window")[:, None, None]
@@ -68,7 +70,7 @@ def simulate_windows(
     speed = w.turn / w.dt[..., None]
     signed = flowing - float(truth.motor.current_offset)
     signed = signed if w.current_is_signed else signed * np.tanh(speed / 0.2)
-    volts = np.asarray(_voltage(truth, signed, speed))
+    volts = np.asarray(_voltage(truth.motor, signed, speed))
     current = flowing + np.sqrt(w.current_var) * rng.normal(size=amps.shape)
     voltage = volts + rng.normal(size=amps.shape) * std.get("voltage.window", 0.0)
     return replace(
@@ -85,14 +87,8 @@ def _predicted(robot: Robot, b: lk.Batch, pose: Array) -> tuple[Array, Array, Ar
     return p.increment, lk.predicted_current(robot, b, p.motor_force), corrected(robot, pose)[:, 0]
 
 
-@jax.jit
-def _logged(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Float[Array, "segment edge 3"]:
-    return jax.vmap(jax.vmap(robot.camera.logged))(pose)
-
-
-@jax.jit
-def _voltage(robot: Robot, amps: Array, wheel_speed: Array) -> Array:
-    return robot.motor.voltage(amps, wheel_speed)
+_logged = jax.jit(jax.vmap(jax.vmap(Camera.logged, (None, 0)), (None, 0)))
+_voltage = jax.jit(Motor.voltage)
 
 
 def _component_std(std: Mapping[str, float], w: Windows, kind: str, part: str) -> np.ndarray:
@@ -135,8 +131,8 @@ def _shared(
 
 FILE = "replicates"
 """Name of the checkpoint's file of finished replicates, from which a later call continues."""
-SCATTER, MOST = 0.5, 0.5
-"""True parameters are drawn with a std of `SCATTER` times the prior std, the latter at most `MOST`.
+SCATTER, MOST_PRIOR_STD = 0.5, 0.5
+"""True parameters are drawn with a std of `SCATTER` times the prior std, at most `MOST_PRIOR_STD`.
 
 Both stds are in the search space.
 """
@@ -185,14 +181,13 @@ class Replicate:
         curves: slip curves by floor.
         predictions: mean distance between predicted and true end of a run, divided by the true
             chord, by floor and slip model.
-        converged, reason: True if the fit converged, and why it stopped.
+        converged: True if the fit converged.
     """
 
     parameters: dict[str, NumberRecovery]
     curves: dict[str, CurveRecovery]
     predictions: dict[str, dict[str, float]]
     converged: bool
-    reason: str
 
 
 _FILE = TypeAdapter(list[Replicate])
@@ -212,7 +207,7 @@ def plausible(
     """
     space, given = problem.space, config.content.selftest.truth
     center = space.prior_mean.copy()
-    scatter = SCATTER * np.minimum(space.prior_std, MOST)
+    scatter = SCATTER * np.minimum(space.prior_std, MOST_PRIOR_STD)
     for pattern, value in given.items():
         where = f"{config.path}: selftest.truth.'{pattern}'"
         mine = [e for e in space.free if fnmatchcase(e.path, pattern)]
@@ -302,13 +297,11 @@ def recovery(
         curves=_curves(problem, truth, z, covariance),
         predictions=_predictions(problem.windows, truth, found),
         converged=bool(end.converged),
-        reason=end.reason,
     )
 
 
 def _number(e: Estimate, truth: np.ndarray, score: np.ndarray) -> NumberRecovery:
-    pairs = e.interval90 if e.labels else [e.interval90]
-    values = e.value if e.labels else [e.value]
+    pairs, values = (x if e.labels else [x] for x in (e.interval90, e.value))
     return NumberRecovery(
         unit=e.unit,
         labels=list(e.labels),
@@ -353,11 +346,9 @@ def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, 
     }
     chord, floor = np.linalg.norm(true, axis=1), np.asarray(w.surface)
     travels = chord > 0.1 * np.median(chord)  # turns on the spot have no chord
-    out: dict[str, dict[str, float]] = {}
-    for name in dict.fromkeys(w.surface):
-        if (mine := travels & (floor == name)).any():
-            gaps = {
-                model: np.linalg.norm(end - true, axis=1) for model, end in predicted_ends.items()
-            }
-            out[name] = {m: float(np.mean((gap / chord)[mine])) for m, gap in gaps.items()}
-    return out
+    error = {m: np.linalg.norm(end - true, axis=1) / chord for m, end in predicted_ends.items()}
+    return {
+        name: {model: float(np.mean(of_model[mine])) for model, of_model in error.items()}
+        for name in dict.fromkeys(w.surface)
+        if (mine := travels & (floor == name)).any()
+    }

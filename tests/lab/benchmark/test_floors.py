@@ -30,14 +30,12 @@ from slipid.lab.benchmark.floors.husky import (
 )
 from slipid.lab.benchmark.floors.protocol import (
     EvaluationSettings,
-    ScoredClassifier,
     answers_of,
     classifier_table,
     folds_of,
-    joined,
     tuned_classifier,
 )
-from slipid.lab.benchmark.floors.result import Answer, ClassifierRow, after_seconds, confusion
+from slipid.lab.benchmark.floors.result import Answer, after_seconds, confusion
 from slipid.lab.benchmark.floors.robotino import (
     RobotinoFloorTask,
     beliefs_of,
@@ -45,6 +43,7 @@ from slipid.lab.benchmark.floors.robotino import (
     robotino_classifiers,
 )
 from slipid.lab.benchmark.floors.slipid_row import SlipidFloorClassifier, kinds
+from slipid.lab.benchmark.scores import FoldScore
 from slipid.lab.benchmark.work import BenchmarkOptions
 from slipid.lab.systems.floors.interface import FloorClassifier, floors_of
 from slipid.predict.slip_model import PredictedRun
@@ -511,10 +510,11 @@ def test_what_the_estimator_calls_unknown_is_left_out_of_the_comparison():
 
 
 def test_a_classifier_that_fails_in_one_fold_has_an_empty_row():
-    lost = ScoredClassifier(ClassifierRow("trees", absent="ValueError: no leaf"), ())
-    there = ScoredClassifier(ClassifierRow("trees", numbers=4), (answer("a", 1),))
-    assert joined([there, lost]) == lost
-    assert joined([there, there]) == ScoredClassifier(there.row, there.answers * 2)
+    lost = FoldScore.of_error(ValueError("no leaf"))
+    there = FoldScore((answer("a", 1),), numbers=4)
+    assert FoldScore.of_folds([there, lost]).absent == "ValueError: no leaf"
+    assert FoldScore.of_folds([there, lost]).runs == ()
+    assert FoldScore.of_folds([there, there]) == replace(there, runs=there.runs * 2)
 
 
 def test_rows_on_the_robotino_use_no_vibration():

@@ -52,7 +52,7 @@ NEEDED = COLUMNS[:5]
 """Columns in which a missing value is an error: time, currents and rim speeds."""
 LONGEST_S = 0.5
 """Time between two rows above which a file is split into two runs there [s]."""
-FEWEST = 3
+FEWEST_ROWS = 3
 """Smallest number of rows of a run; shorter runs are left out."""
 
 
@@ -89,8 +89,8 @@ def read_floor_runs(root: Path, wheel_radius: float) -> list[FloorSignals]:
 def _runs(path: Path, wheel_radius: float) -> list[FloorSignals]:
     """Return the runs of one file; DataError if a value is missing or times do not increase."""
     table = read_table(path, LAYOUT)
-    if len(table.values) < FEWEST:
-        raise bad_data(path, f"{len(table.values)} rows", f"at least {FEWEST}")
+    if len(table.values) < FEWEST_ROWS:
+        raise bad_data(path, f"{len(table.values)} rows", f"at least {FEWEST_ROWS}")
     for name in NEEDED:
         missing = np.flatnonzero(~np.isfinite(table[name]))
         if len(missing):
@@ -111,7 +111,7 @@ def _runs(path: Path, wheel_radius: float) -> list[FloorSignals]:
     )
     edges = [0, *(np.flatnonzero(np.diff(whole.time) > LONGEST_S) + 1), len(whole)]
     runs = [whole.rows(int(a), int(b)) for a, b in pairwise(edges)]
-    return [run for run in runs if len(run) >= FEWEST]
+    return [run for run in runs if len(run) >= FEWEST_ROWS]
 
 
 def husky_classifiers() -> list[FloorClassifier]:

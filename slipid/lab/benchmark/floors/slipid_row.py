@@ -11,11 +11,12 @@ gyro. Besides the parameters of the floors it is given
 
 At the first row of a run, the filter starts with the measured wheel speeds, not from rest.
 
-Parameters of floors, motors and scatters come from the training runs. `SETTINGS`, `BENDS`, the
-model of the ammeters and the weights in `slipid.lab.benchmark.floors.fitting` are not picked by an
-inner cross-validation, as settings of other rows are: they were set by hand after about a hundred
-variants were compared by their cross-validated accuracy on `borealtc`. The accuracy of slipid on
-`borealtc` is therefore optimistic, to the extent that this choice was tuned to these runs.
+Parameters of floors, motors and scatters come from the training runs. `SETTINGS`, `BEND_RATIOS`,
+the model of the ammeters and the weights in `slipid.lab.benchmark.floors.fitting` are not picked by
+an inner cross-validation, as settings of other rows are: they were set by hand after about a
+hundred variants were compared by their cross-validated accuracy on `borealtc`. The accuracy of
+slipid on `borealtc` is therefore optimistic, to the extent that this choice was tuned to these
+runs.
 """
 
 from collections.abc import Sequence
@@ -36,6 +37,7 @@ from slipid.lab.benchmark.floors.fitting import (
     stiffness_of,
 )
 from slipid.lab.systems.floors.interface import Beliefs, FloorClassifier, FloorSignals, floors_of
+from slipid.lab.systems.padded import padded
 from slipid.model.robot import Robot
 from slipid.predict.slip_model import RobotSpec
 from slipid.robot.deployed import DeployedRobot
@@ -79,7 +81,7 @@ def deployed(robot: Robot) -> DeployedRobot:
     return DeployedRobot.of(record)
 
 
-BENDS = (0.17, 0.45)
+BEND_RATIOS = (0.17, 0.45)
 """Smallest ratio L |W| / (|v| + L |W|) that counts as a bend, and as turning on the spot.
 
 v is the velocity [m/s], W the yaw rate [rad/s] of the rolling wheels, and L the base radius [m].
@@ -183,14 +185,14 @@ def kinds(run: FloorSignals, spec: RobotSpec) -> Int[np.ndarray, " row"]:
     """Return the kind of motion in each row: 0 straight, 1 in a bend, 2 on the spot."""
     x, y, yaw = run.rolling(spec).T
     turn = spec.base_radius * np.abs(yaw)
-    return np.digitize(turn / np.maximum(np.hypot(x, y) + turn, 1e-9), BENDS)
+    return np.digitize(turn / np.maximum(np.hypot(x, y) + turn, 1e-9), BEND_RATIOS)
 
 
 def _scatter(
     robot: Robot, runs: Sequence[FloorSignals], spec: RobotSpec
 ) -> Float[np.ndarray, "kind floor"]:
     """Return the std of current residuals in each kind of motion on every floor [A]."""
-    count = len(BENDS) + 1
+    count = len(BEND_RATIOS) + 1
     std = np.ones((count, len(robot.surfaces.labels)))
     for k, floor in enumerate(robot.surfaces.labels):
         speed, current, kind = [], [], []
@@ -217,21 +219,17 @@ def _filter_rows(
     Runs are padded to `rows` rows and to `RUNS_PER_CALL` runs. The duration is 0 in rows of
     padding, and in rows at rest, which carry no evidence about the floor.
     """
-    drives = runs[0].speed.shape[1]
-    speed, current = np.zeros((2, RUNS_PER_CALL, rows, drives))
-    gyro, dt = np.full((RUNS_PER_CALL, rows), np.nan), np.zeros((RUNS_PER_CALL, rows))
-    kind = np.zeros((RUNS_PER_CALL, rows), dtype=int)
-    for k, run in enumerate(runs):
-        n = len(run)
-        speed[k, :n], current[k, :n] = run.speed, run.current
-        dt[k, :n] = np.where(run.moving, run.dt, 0.0)
-        gyro[k, :n] = np.nan if run.gyro is None else run.gyro
-        kind[k, :n] = kinds(run, spec)
-    nothing = jax.tree.map(
-        lambda x: jnp.full((RUNS_PER_CALL, rows, *x.shape), x), Readings.nothing(drives)
-    )
-    measured = {"wheel_speed": speed, "current": current, "gyro": gyro}
+    shape, drives = (RUNS_PER_CALL, rows), runs[0].speed.shape[1]
+    gyros = [np.full(len(run), np.nan) if run.gyro is None else run.gyro for run in runs]
+    measured = {
+        "wheel_speed": padded([run.speed for run in runs], shape),
+        "current": padded([run.current for run in runs], shape),
+        "gyro": padded(gyros, shape, np.nan),
+    }
+    nothing = jax.tree.map(lambda x: jnp.full((*shape, *x.shape), x), Readings.nothing(drives))
     readings = replace(nothing, **{name: jnp.asarray(x) for name, x in measured.items()})
+    dt = padded([np.where(run.moving, run.dt, 0.0) for run in runs], shape)
+    kind = padded([kinds(run, spec) for run in runs], shape)
     return readings, jnp.asarray(dt), jnp.asarray(kind)
 
 

@@ -53,11 +53,10 @@ from slipid.lab.systems.floors.interface import (
     floors_of,
     training_rows,
 )
+from slipid.model.robot import GRAVITY
 from slipid.predict.slip_model import RobotSpec
 
-GRAVITY = 9.81
-"""Acceleration of gravity [m/s^2]."""
-SLOW = 0.02
+LEAST_SPEED = 0.02
 """Speed u up to which a row is not used, since its direction of travel is undefined [m/s]."""
 
 
@@ -133,7 +132,7 @@ class CosineEnergyClassifier(FloorClassifier):
     ) -> Float[np.ndarray, "row 2"]:
         """Return direction of travel [rad] and energy coefficient e of every row.
 
-        The coefficient, or its logarithm, is NaN in rows at or below the speed `SLOW`.
+        The coefficient, or its logarithm, is NaN in rows at or below the speed `LEAST_SPEED`.
         """
         window = TrailingWindow.of(run.time, self.window_s)
         x, y, yaw = (window.mean(column) for column in run.rolling(spec).T)
@@ -143,7 +142,7 @@ class CosineEnergyClassifier(FloorClassifier):
         amps, shaft = np.abs(run.current), np.abs(spec.gear_ratio * run.speed)
         heat = spec.resistance * self.losses * amps
         power = ((heat + spec.back_emf * shaft) * amps).sum(axis=1)
-        moving = speed > SLOW
+        moving = speed > LEAST_SPEED
         energy = window.mean(power) / (spec.mass * GRAVITY * np.where(moving, speed, np.nan))
         energy = np.log(np.maximum(energy, 1e-9)) if self.logarithm else energy
         return np.stack([np.arctan2(sideways, x), energy], axis=1)

@@ -7,13 +7,13 @@ import pytest
 
 from slipid.lab.systems.motion.features import SignalWindows
 from slipid.lab.systems.motion.gaussian_process import (
-    KEPT,
+    MOST_WINDOWS,
     ProcessRows,
     fitted_numbers,
     untuned_kernel,
 )
 from slipid.lab.systems.motion.quann import (
-    PARTS,
+    INFLATION_PARTS,
     QuannEnergy,
     QuannSlip,
     end_spread,
@@ -82,8 +82,8 @@ def test_hyperparameters_make_what_is_known_most_likely():
 def test_rows_are_drawn_in_proportion_to_their_weight():
     many = rows(n=4000)
     weighted = replace(many, weight=np.where(many.x[:, 0] > 0, 3.0, 1.0))
-    drawn = weighted.drawn(KEPT)
-    assert len(drawn.x) == KEPT == len(np.unique(drawn.x, axis=0))
+    drawn = weighted.drawn(MOST_WINDOWS)
+    assert len(drawn.x) == MOST_WINDOWS == len(np.unique(drawn.x, axis=0))
     assert (drawn.x[:, 0] > 0).mean() == pytest.approx(0.75, abs=0.08)
     assert len(many.drawn(5000).x) == 4000
 
@@ -175,7 +175,7 @@ def test_inflation_is_from_runs_that_the_process_does_not_know():
 def test_every_run_is_in_one_part():
     numbers = np.array([3, 5, 8, 9, 11, 12])
     dealt = parts(numbers)
-    assert len(dealt) == PARTS
+    assert len(dealt) == INFLATION_PARTS
     assert sorted(np.concatenate(dealt).tolist()) == numbers.tolist()
     assert [part.tolist() for part in parts(np.array([4]))] == [[4]]
 
