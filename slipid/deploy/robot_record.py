@@ -16,7 +16,6 @@ since the estimated effect changes with the numbers and compensates them.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
-from functools import reduce
 from types import MappingProxyType
 
 import equinox as eqx
@@ -29,7 +28,7 @@ from slipid.fitting.noise import SHARED
 from slipid.fitting.shared_effects import AXES, SpeedAndLoad, TravelConditions
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import WheelFrame, at_drives, at_wheels
+from slipid.model.geometry import Geometry, WheelFrame
 from slipid.model.motor import Motor
 from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.parameter import entries
@@ -81,7 +80,7 @@ def robot_record(
 def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numbers, ...]]]:
     """Yield path and draws of every number that varies over draws, except those of the camera."""
     for e in entries(robot):
-        leaf = np.asarray(reduce(getattr, e.leaf, draws))
+        leaf = np.asarray(e.whole(draws))
         rows = leaf if e.index is None else leaf[:, e.index]
         if not e.path.startswith("camera.") and (rows != rows[0]).any():
             yield e.path, tuple(plain(np.asarray(row)) for row in rows)
@@ -115,9 +114,8 @@ def _load(
     frame, twists = shape.frame(), directions(36)
     if not shape.determines_twist:
         twists = jnp.concatenate([twists, _turns(frame)])
-    wheels, rest = _WheelArrays.of(robot), robot.body.load_share[k]
-    floors, motor, mass = robot.surfaces, robot.motor, robot.body.mass
-    speed, amps, slip = _circle(wheels, floors, rest, motor, mass, jnp.asarray(top), twists)
+    rest, motor, mass = robot.body.load_share[k], robot.motor, robot.body.mass
+    speed, amps, slip = _circle(frame, robot.surfaces, rest, motor, mass, jnp.asarray(top), twists)
     curve = np.asarray(_wheel_curve(speed, amps, slip))
     return record.LoadRecord(
         name=name,
@@ -139,26 +137,9 @@ def _turns(frame: WheelFrame) -> Float[Array, "twist 3"]:
     return jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / frame.base
 
 
-class _WheelArrays(eqx.Module):
-    """Geometry of the wheels as arrays, so that robots of equal structure share compiled code."""
-
-    frame: WheelFrame
-    forward: Float[Array, "*draw drive 3"]
-    drive_of: tuple[int, ...] = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, robot: Robot) -> "_WheelArrays":
-        shape = robot.geometry
-        return cls(shape.frame(), shape.forward(), shape.drive_of)
-
-    def rim(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """Return the rim speeds of the wheels from those of their drives [m/s]."""
-        return at_wheels(self.drive_of, of_drives)
-
-
 @eqx.filter_jit
 def _circle(
-    wheels: _WheelArrays,
+    frame: WheelFrame,
     surfaces: ContactSurface,
     rest: Float[Array, " wheel"],
     motor: Motor,
@@ -171,20 +152,19 @@ def _circle(
     Twists are scaled to 0.4 and 0.8 of the highest wheel speed `top` [rad/s]. Each result has the
     shape (floor, speed and twist, drive).
     """
-    frame = wheels.frame
-    speed = twists @ wheels.forward.T / frame.radius
+    forward = frame.forward()
+    speed = twists @ forward.T / frame.radius
     speed = jnp.stack([0.4 * top, 0.8 * top])[:, None, None] * speed / jnp.max(jnp.abs(speed))
 
     def one(w: Array, floor: ContactSurface) -> tuple[Array, Array]:
         turned = frame.radius * w
-        rim = wheels.rim(turned)
+        rim = frame.at_wheels(turned)
         xi = contact.equilibrium(rim, frame, floor, rest)
         force = floor.friction * mass * GRAVITY * frame.radius
-        where = xi, rim, frame, floor, rest
-        forces = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
-        torque = at_drives(wheels.drive_of, force * motor.opposing_force(forces))
+        forces = contact.motor_forces(xi, rim, frame, floor, rest)
+        torque = frame.at_drives(force * motor.opposing_force(forces))
         amps = motor.current(torque, w)
-        lost = turned - wheels.forward @ xi
+        lost = turned - forward @ xi
         return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
 
     flat = speed.reshape(-1, speed.shape[-1])
@@ -245,12 +225,13 @@ def moved_per_metre(
         twist: twists of 1 m/s [m/s, m/s, rad/s].
     """
     rest = draws.body.load_share[:, load]
-    return _moved(jax.vmap(_WheelArrays.of)(draws), draws.surfaces, rest, speed, twist)
+    frames = jax.vmap(Geometry.frame)(draws.geometry)
+    return _moved(frames, draws.surfaces, rest, speed, twist)
 
 
 @eqx.filter_jit
 def _moved(
-    wheels: _WheelArrays,
+    frames: WheelFrame,
     surfaces: ContactSurface,
     rest: Float[Array, "draw wheel"],
     speed: Array,
@@ -258,8 +239,8 @@ def _moved(
 ) -> Array:
     """Return the result of `moved_per_metre`; this part is compiled."""
 
-    def one(wheels: _WheelArrays, surfaces: ContactSurface, rest: Array) -> Array:
-        rim, frame = wheels.rim(speed * twist @ wheels.forward.T), wheels.frame
+    def one(frame: WheelFrame, surfaces: ContactSurface, rest: Array) -> Array:
+        rim = frame.at_wheels(speed * twist @ frame.forward().T)
         xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
             surfaces
         )
@@ -267,7 +248,7 @@ def _moved(
         across = xi[..., 1] * twist[:, 0] - xi[..., 0] * twist[:, 1]
         return jnp.stack([along, across, xi[..., 2]], axis=-1) / speed
 
-    return jax.vmap(one)(wheels, surfaces, rest)
+    return jax.vmap(one)(frames, surfaces, rest)
 
 
 DIRECTIONS = 72

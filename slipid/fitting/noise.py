@@ -141,7 +141,7 @@ def noise(windows: Windows, robot: Robot, multi_floor: MultiFloorRuns | None = N
         for floor in several_sessions if kind == "session" else floors:
             table += [Component(kind, what, floor, u, part * v) for what, u, v in _EFFECT]
     table.append(Component("pooled", "load_bias", None, "1", 0.05))
-    on = _floors(windows, robot)
+    on = np.array([[robot.surface_index(s)] for s in windows.surface])
     blocks = {"motion": _motion_components(windows, robot, 2 + 6 * on)}
     if multi_floor is not None:
         table += _multi_floor_components(multi_floor, robot, len(windows), len(table), blocks)
@@ -289,11 +289,6 @@ def _motion_components(
     base = np.stack([p @ p.transpose(0, 2, 1) for p in parts], axis=1)
     of_floor = first + np.arange(6)
     return _components("motion", base, np.insert(of_floor, 0, [[0], [1]], axis=1))
-
-
-def _floors(windows: Windows, robot: Robot) -> Int[np.ndarray, "segment 1"]:
-    """Return the index of each segment's floor."""
-    return np.array([[robot.surface_index(s)] for s in windows.surface])
 
 
 def axes(u: np.ndarray) -> np.ndarray:

@@ -70,18 +70,13 @@ def with_session_effects(
     scores = weighted * (_weights(model, np.zeros_like(model.run)) * keep)[:, None, None]
     of_session = by_axis(variance, "session", w)
     meat = np.zeros_like(model.covariance)
-    of_segment = floors_and_sessions(w)
+    of_segment = list(zip(w.surface, w.session, strict=True))
     for pair in dict.fromkeys(of_segment):
         mine = np.array([other == pair for other in of_segment]) & (keep > 0)
         if mine.any():
             u = scores[mine].sum(axis=0)
             meat += u.T @ (of_session[mine][0][:, None] * u)
     return variance, model.covariance + model.covariance @ meat @ model.covariance
-
-
-def floors_and_sessions(w: Windows) -> list[tuple[str, str]]:
-    """Return the floor and session of every segment; segments of equal pairs share effects."""
-    return list(zip(w.surface, w.session, strict=True))
 
 
 def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.ndarray, "segment 3"]:

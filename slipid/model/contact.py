@@ -168,30 +168,21 @@ def equilibrium(
     return _solve(problem) if near is None else _solve_near(problem)
 
 
-def traction(
+def motor_forces(
     xi: Float[Array, "3"],
     rim: Float[Array, " wheel"],
     frame: WheelFrame,
     surface: ContactSurface,
     rest: Float[Array, " wheel"],
-) -> Float[Array, " wheel"]:
-    """Return the traction of each wheel that its motor works against, along the drive [mu m g]."""
-    return Balance(rim, stand(frame, surface, rest)).motor_force(Planar(*xi))
+) -> Float[Array, "wheel 2"]:
+    """Return the forces at each wheel that motors work against, along the drive [mu m g].
 
-
-def rolling_drag(
-    xi: Float[Array, "3"],
-    rim: Float[Array, " wheel"],
-    frame: WheelFrame,
-    surface: ContactSurface,
-    rest: Float[Array, " wheel"],
-) -> Float[Array, " wheel"]:
-    """Return the rolling drag of each wheel along its drive, for `Motor.rolling_drag` 1 [mu m g].
-
-    At that value a wheel that rolls along its drive has as much drag as its rollers have. The motor
-    works against this drag; it exerts no force on the body.
+    They are the traction, and the rolling drag for `Motor.rolling_drag` 1. At that value a wheel
+    that rolls along its drive has as much drag as its rollers have; this drag exerts no force on
+    the body. Arguments are those of `equilibrium`.
     """
-    return Balance(rim, stand(frame, surface, rest)).rolling_drag(Planar(*xi))
+    balance, at = Balance(rim, stand(frame, surface, rest)), Planar(*xi)
+    return jnp.stack([balance.motor_force(at), balance.rolling_drag(at)], axis=-1)
 
 
 def settle(

@@ -77,7 +77,8 @@ class Robot(eqx.Module):
     @classmethod
     def of(cls, shape: Geometry, mass: Number = 10.0) -> "Robot":
         """Return a robot with any wheels (see `slipid.model.geometry`) and no floors yet."""
-        return _with_mass(build(shape, ()), as_numbers(mass))
+        robot = build(shape, ())
+        return replace(robot, body=replace(robot.body, mass=as_numbers(mass)))
 
     def on(
         self,
@@ -91,7 +92,7 @@ class Robot(eqx.Module):
         `image_centre` is where the camera's tilt and distortion are zero [m].
         """
         made = build(self.geometry, surfaces, loads, sessions, image_centre)
-        return _with_mass(replace(made, motor=self.motor), self.body.mass)
+        return replace(made, motor=self.motor, body=replace(made.body, mass=self.body.mass))
 
     def surface_index(self, name: str) -> int:
         """Return the position of a floor in the stack; ValueError with the choices if unknown."""
@@ -140,10 +141,6 @@ class Validity:
     speeds: tuple[float, ...]
     turn_rates: tuple[float, ...]
     distance: float
-
-
-def _with_mass(robot: Robot, mass: Array) -> Robot:
-    return replace(robot, body=replace(robot.body, mass=mass))
 
 
 def build(
@@ -204,14 +201,9 @@ def motor_forces(
     surface: Array,
     load: Array,
 ) -> Float[Array, "wheel 2"]:
-    """Return the forces that each motor works against at a twist, in units of mean(mu) m g.
-
-    They are the traction, and the drag along the drive for `Motor.rolling_drag` 1
-    (`contact.rolling_drag`).
-    """
-    rim, floor = frame.radius * wheel_speed, robot.surfaces.at(surface)
-    where = xi, rim, frame, floor, robot.body.load_share[load]
-    return jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
+    """Return `contact.motor_forces` of every wheel at a twist, in units of mean(mu) m g."""
+    floor, rest = robot.surfaces.at(surface), robot.body.load_share[load]
+    return contact.motor_forces(xi, frame.radius * wheel_speed, frame, floor, rest)
 
 
 def wheel_torque(

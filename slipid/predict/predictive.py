@@ -28,7 +28,7 @@ from scipy.special import gammaln
 
 from slipid.data.windows import Windows
 from slipid.fitting import likelihood as lk
-from slipid.fitting.hierarchy import TravelDirections, extrapolation
+from slipid.fitting.hierarchy import TravelDirections, axis_effects, extrapolation
 from slipid.fitting.noise import SHARED, effects, travel
 from slipid.fitting.problem import FitState, Problem
 from slipid.fitting.session_effects import by_axis
@@ -248,7 +248,8 @@ def force_balance_of(
     motion = residual["motion"], jacobian["motion"]
     direction = TravelConditions.of(w, problem.robot).direction
     travelled = TravelDirections(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
-    grown = extrapolation(problem.objective, motion, keep[: len(w)], covariance, log_v, travelled)
+    counted = jnp.asarray(keep[: len(w)])
+    axes = axis_effects(problem.objective, motion, counted, covariance, log_v)
     return ForceBalance(
         problem.space.tree(state.z),
         by_name(problem, log_v),
@@ -256,7 +257,7 @@ def force_balance_of(
         problem.space,
         z,
         shared=_fitted_effects(problem, state, keep, residual, jacobian),
-        extrapolation=grown,
+        extrapolation=extrapolation(axes, log_v, travelled),
     )
 
 

@@ -217,6 +217,7 @@ class Controller(eqx.Module):
         self.correction, self.law = correction, law
         self.gains = Gains.of(robot) if gains is None else gains
 
+    @eqx.filter_jit
     def init(self) -> ControllerState:
         """Return the state of a controller that has commanded nothing yet."""
         none, still, zero = jnp.zeros(self.robot.wheels), jnp.zeros(3), jnp.zeros(())

@@ -288,15 +288,7 @@ def _sized(where: str, value: Numbers, size: int) -> None:
 
 
 def _inside(where: str, value: Numbers, declaration: Declaration, size: int) -> None:
-    """Raise `ValueError` for a value of another size, or one outside its declared bounds."""
+    """Raise `ValueError` for a value of another size, or one that breaks a declared rule."""
     _sized(where, value, size)
-    x = np.asarray(value)
-    if declaration.shares:
-        if not ((x > 0).all() and abs(x.sum() - 1) < 1e-6):
-            raise ValueError(f"{where} = {value}: expected positive shares that sum to 1")
-    elif declaration.deviation:
-        if not abs(x.sum()) < 1e-6:
-            raise ValueError(f"{where} = {value}: expected numbers that sum to 0")
-    elif not ((x > declaration.lower) & (x < declaration.upper)).all():
-        low, high = declaration.lower, declaration.upper
-        raise ValueError(f"{where} = {value}: expected inside ({low:g}, {high:g})")
+    if rule := declaration.broken_rule(np.asarray(value)):
+        raise ValueError(f"{where} = {value}: expected {rule}")

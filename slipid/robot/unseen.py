@@ -88,8 +88,9 @@ def _middle(record: RobotRecord) -> dict[str, RecordedNumber]:
         each = np.array([record.parameters[f"surface.{n}.{quantity}"].value for n in record.labels])
         signed = quantity in _SIGNED
         middle = each.mean(axis=0) if signed else np.exp(np.log(each).mean(axis=0))
-        middle_floor[quantity] = RecordedNumber.without_std(
-            plain(np.asarray(middle)), number.unit, "not_identified", "borrowed"
+        value = plain(np.asarray(middle))
+        middle_floor[quantity] = RecordedNumber(
+            value, number.unit, verdict="not_identified", provenance="borrowed"
         )
     return middle_floor
 

@@ -55,7 +55,7 @@ def one_by_one(kind, rim):
     def of(under):
         floor = floors.at(under)
         xi = contact.equilibrium(rim, frame, floor, rest)
-        return xi, contact.traction(xi, rim, frame, floor, rest)
+        return xi, contact.motor_forces(xi, rim, frame, floor, rest)[:, 0]
 
     xi, pull = jax.vmap(of)(index)
     return xi.T, pull.T

@@ -38,6 +38,7 @@ DT = 0.05
 KINDS = ("contact", "curve")
 CHESS = Floor.of("abc", np.add.outer(np.arange(9), np.arange(9)) % 3, (-1.0, -1.0), 0.25, "abc")
 solve = eqx.filter_jit(FloorFilter.solve)
+limited = eqx.filter_jit(limit_command)
 BAD = (np.nan, np.inf, -np.inf, 1e300, -1e300, 1e-310, 0.0, -1.0, 1e9, 3e7, 50.0)
 
 
@@ -241,7 +242,7 @@ def test_saturation_keeps_the_direction():
     for _ in range(50):
         wanted = rng.normal(size=3) * 30
         got = np.asarray(
-            limit_command(jnp.asarray(wanted), jnp.zeros(3), jnp.zeros(3), robot(), LIMITS, 0.5)
+            limited(jnp.asarray(wanted), jnp.zeros(3), jnp.zeros(3), robot(), LIMITS, 0.5)
         )
         np.testing.assert_allclose(np.cross(got, wanted), 0.0, atol=1e-9)
         assert got @ wanted > 0
@@ -251,9 +252,7 @@ def test_saturation_keeps_the_direction():
 def test_a_command_needs_no_more_than_the_supply_has_left(amps):
     f, limits = robot(), Limits(voltage=6.0, acceleration=1e4)
     wanted, motor = np.array([10.0, -9.0, 2.0]), f.motor
-    got = np.asarray(
-        limit_command(jnp.asarray(wanted), jnp.zeros(3), jnp.asarray(amps), f, limits, DT)
-    )
+    got = np.asarray(limited(jnp.asarray(wanted), jnp.zeros(3), jnp.asarray(amps), f, limits, DT))
     np.testing.assert_allclose(got / wanted, got[0] / wanted[0], rtol=1e-12)
     needs = np.abs(got) * float(motor.gear_ratio * motor.back_emf)
     left = 6.0 - float(motor.resistance) * np.abs(amps)

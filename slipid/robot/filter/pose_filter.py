@@ -64,7 +64,9 @@ class PoseFilter(eqx.Module):
     robot: RobotArrays
     settings: Settings
 
-    def init(self, pose: Float[Array, "3"], std: tuple[float, float] = (0.0, 0.0)) -> PoseState:
+    def init(
+        self, pose: Float[Array, "3"], std: Float[Array, "2"] | tuple[float, float] = (0.0, 0.0)
+    ) -> PoseState:
         """Return the state at rest at a pose [m, m, rad] with stds [m], [rad]."""
         place, turn = std
         begin, bias = jnp.asarray([place, place, turn]), jnp.asarray([self.settings.gyro_bias_std])
