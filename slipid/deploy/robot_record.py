@@ -15,7 +15,7 @@ since the estimated effect changes with the numbers and compensates them.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from types import MappingProxyType
 
 import equinox as eqx
@@ -29,8 +29,7 @@ from slipid.fitting.shared_effects import AXES, SpeedAndLoad, TravelConditions
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Geometry, WheelFrame
-from slipid.model.motor import Motor
-from slipid.model.robot import GRAVITY, Robot, Validity
+from slipid.model.robot import Robot, Standing, Validity
 from slipid.parameter import entries
 from slipid.predict.predictive import ForceBalance
 from slipid.robot import record
@@ -114,8 +113,10 @@ def _load(
     frame, twists = shape.frame(), directions(36)
     if not shape.determines_twist:
         twists = jnp.concatenate([twists, _turns(frame)])
-    rest, motor, mass = robot.body.load_share[k], robot.motor, robot.body.mass
-    speed, amps, slip = _circle(frame, robot.surfaces, rest, motor, mass, jnp.asarray(top), twists)
+    standing = Standing(
+        frame, robot.surfaces, robot.body.load_share[k], robot.motor, robot.body.mass
+    )
+    speed, amps, slip = _circle(standing, jnp.asarray(top), twists)
     curve = np.asarray(_wheel_curve(speed, amps, slip))
     return record.LoadRecord(
         name=name,
@@ -139,36 +140,25 @@ def _turns(frame: WheelFrame) -> Float[Array, "twist 3"]:
 
 @eqx.filter_jit
 def _circle(
-    frame: WheelFrame,
-    surfaces: ContactSurface,
-    rest: Float[Array, " wheel"],
-    motor: Motor,
-    mass: Array,
-    top: Array,
-    twists: Float[Array, "twist 3"],
+    on: Standing, top: Array, twists: Float[Array, "twist 3"]
 ) -> tuple[Array, Array, Array]:
     """Return wheel speeds [rad/s], currents [A] and slip ratios [1] for some twists.
 
-    Twists are scaled to 0.4 and 0.8 of the highest wheel speed `top` [rad/s]. Each result has the
-    shape (floor, speed and twist, drive).
+    `on` is the robot with all floors, stacked. Twists are scaled to 0.4 and 0.8 of the highest
+    wheel speed `top` [rad/s]. Each result has the shape (floor, speed and twist, drive).
     """
-    forward = frame.forward()
+    frame, forward = on.frame, on.frame.forward()
     speed = twists @ forward.T / frame.radius
     speed = jnp.stack([0.4 * top, 0.8 * top])[:, None, None] * speed / jnp.max(jnp.abs(speed))
 
     def one(w: Array, floor: ContactSurface) -> tuple[Array, Array]:
-        turned = frame.radius * w
-        rim = frame.at_wheels(turned)
-        xi = contact.equilibrium(rim, frame, floor, rest)
-        force = floor.friction * mass * GRAVITY * frame.radius
-        forces = contact.motor_forces(xi, rim, frame, floor, rest)
-        torque = frame.at_drives(force * motor.opposing_force(forces))
-        amps = motor.current(torque, w)
+        standing, turned = replace(on, floor=floor), frame.radius * w
+        xi = standing.twist(frame.at_wheels(w))
         lost = turned - forward @ xi
-        return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
+        return standing.current(xi, w), lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
 
     flat = speed.reshape(-1, speed.shape[-1])
-    amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(surfaces)
+    amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(on.floor)
     return jnp.broadcast_to(flat, amps.shape), amps, slip
 
 

@@ -168,23 +168,6 @@ def equilibrium(
     return _solve(problem) if near is None else _solve_near(problem)
 
 
-def motor_forces(
-    xi: Float[Array, "3"],
-    rim: Float[Array, " wheel"],
-    frame: WheelFrame,
-    surface: ContactSurface,
-    rest: Float[Array, " wheel"],
-) -> Float[Array, "wheel 2"]:
-    """Return the forces at each wheel that motors work against, along the drive [mu m g].
-
-    They are the traction, and the rolling drag for `Motor.rolling_drag` 1. At that value a wheel
-    that rolls along its drive has as much drag as its rollers have; this drag exerts no force on
-    the body. Arguments are those of `equilibrium`.
-    """
-    balance, at = Balance(rim, stand(frame, surface, rest)), Planar(*xi)
-    return jnp.stack([balance.motor_force(at), balance.rolling_drag(at)], axis=-1)
-
-
 def settle(
     start: Float[Array, "3 floors"], rim: Array, on: Stance, plain: Float[Array, "3 wheel"]
 ) -> tuple[Float[Array, "3 floors"], Float[Array, "wheel floors"]]:

@@ -74,8 +74,8 @@ class Motor(eqx.Module):
     def opposing_force(self, motor_force: Float[Array, "*w 2"]) -> Float[Array, " *w"]:
         """Return the force that a motor works against: traction plus drag along the drive.
 
-        `motor_force` holds the two, as `slipid.model.contact.motor_forces` returns them, and the
-        result has the same unit.
+        `motor_force` holds the two, as `slipid.model.robot.Standing.motor_forces` returns them, and
+        the result has the same unit.
         """
         return motor_force[..., 0] + self.rolling_drag * motor_force[..., 1]
 

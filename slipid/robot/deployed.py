@@ -9,11 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Drives, Geometry, WheelFrame
 from slipid.model.motor import Motor
+from slipid.model.robot import Standing
 from slipid.parameter import as_numbers
 from slipid.robot.filter.effects import EffectLookup
 from slipid.robot.record import LoadRecord, Numbers, RobotRecord
@@ -90,6 +91,10 @@ class RobotArrays(Drives):
         if not self.drive_of:
             return self.inverse
         return self.inverse @ self.on_average(jnp.eye(self.wheels)).T
+
+    def standing(self, under: Int[Array, " wheel"]) -> Standing:
+        """Return the robot with the floors number `under` under its wheels."""
+        return Standing(self.frame, self.floors.at(under), self.rest, self.motor, self.mass)
 
     @property
     def labels(self) -> tuple[str, ...]:

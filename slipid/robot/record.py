@@ -99,11 +99,6 @@ class Wheels:
     drive_of: tuple[int, ...]
     gear_ratio: float
 
-    @property
-    def drives(self) -> int:
-        """Number of drives, equal to `Geometry.drives` but computed without arrays."""
-        return len(set(self.drive_of)) or len(self.place)
-
 
 @dataclass(frozen=True)
 class FloorRecord:

@@ -24,8 +24,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.model import contact
-from slipid.model.robot import GRAVITY
 from slipid.model.se2 import advance, compose
 from slipid.parameter import as_numbers
 from slipid.robot.closed_loop import PERIOD
@@ -206,9 +204,8 @@ class Twin(eqx.Module):
         """Return the pose one substep later, and the twist by contact equilibrium."""
         f = self.robot
         under = self.floor.under(pose, f.places)
-        rim = f.frame.radius * w
-        xi = contact.equilibrium(rim, f.frame, f.floors.at(under), f.rest)
-        rolled = RolledMotion.of(f.inverse @ rim, f.frame.base)
+        xi = f.standing(under).twist(w)
+        rolled = RolledMotion.of(f.inverse @ (f.frame.radius * w), f.frame.base)
         mean, part = f.effect_table.at(rolled)
         errors, far, share = mean + part * f.effect * effect, rolled.speed * h, f.rest[:, None]
         off = far * jnp.sum(share * errors[under], axis=0)
@@ -230,14 +227,11 @@ class Twin(eqx.Module):
         """Return signed currents [A], and their correlated errors after this period [A]."""
         f, wheels, xi, w = self.robot, self.robot.wheels, now.twist, now.speed
         under = self.floor.under(now.pose, f.places)
-        floor = f.floors.at(under)
-        forces = contact.motor_forces(xi, f.frame.radius * w, f.frame, floor, f.rest)
-        force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
         keep = float(np.exp(-PERIOD / self.actuators.drift_s))
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
         drift = keep * now.drift + fresh
         moves = jnp.tanh(w / 0.2) ** 2  # a standing motor draws no current
-        model = f.motor.current(force * f.motor.opposing_force(forces), w)
+        model = f.standing(under).current(xi, w)
         free = (f.inverse @ (f.frame.radius * w))[:2]
         more = f.current_trend @ jnp.stack([1.0, jnp.sqrt(free @ free + 1e-24)])
         return model + moves * (jnp.sign(model) * more + now.offset + drift), drift

@@ -631,9 +631,9 @@ def test_mecanum_goes_sideways():
     assert xi[1] < 0.3
 
 
-def rolling_drag(*where):
+def rolling_drag(xi, rim, frame, floor, rest):
     """Drag of each wheel along its drive that only its motor works against."""
-    return contact.motor_forces(*where)[:, 1]
+    return Balance(rim, stand(frame, floor, rest)).rolling_drag(Planar(*xi))
 
 
 def test_a_wheel_drags_along_its_drive_as_far_as_it_rolls_that_way():
