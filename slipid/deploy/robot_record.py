@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.fitting.noise import SHARED
+from slipid.fitting.session_effects import on_floor
 from slipid.fitting.shared_effects import AXES, SpeedAndLoad, TravelConditions
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
@@ -87,18 +88,12 @@ def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numb
 
 def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> record.FloorRecord:
     """Return the record of a floor's errors, from the stds of variance components by name."""
-
-    def of(kind: str, default: record.Axes) -> np.ndarray:
-        return np.array(
-            [std.get(f"{kind}.{name}.{a}", d) for a, d in zip(AXES, default, strict=True)]
-        )
-
-    shared = [of(kind, (0.0, 0.0, 0.0)) ** 2 for kind in SHARED]
-    effect = np.sqrt(of("run", (0.01, 0.01, 0.03)) ** 2 + sum(shared))
+    shared = sum(on_floor(std, kind, name) ** 2 for kind in SHARED)
+    effect = np.sqrt(on_floor(std, "run", name, (0.01, 0.01, 0.03)) ** 2 + shared)
     kinds = [std.get(f"current.{name}.{kind}", 0.05) for kind in ("window", "run")]
     return record.FloorRecord(
         name=name,
-        process=axes_of(of("process", (0.005, 0.002, 0.01))),
+        process=axes_of(on_floor(std, "process", name, (0.005, 0.002, 0.01))),
         effect=axes_of(effect),
         current_std=float((kinds[0] ** 2 + kinds[1] ** 2) ** 0.5),
         seen=seen,
@@ -283,18 +278,15 @@ def _effect_table(
         effect = contact.shared[floor].forecast(rows)
         growth = contact.extrapolation.get(f"{floor}@{load}", 1.0)
         given = np.diagonal(effect.covariance, axis1=1, axis2=2)
-        given = given + _variances(contact, "session", floor)
+        given = given + on_floor(contact.variance, "session", floor)
         corrected = predicted[:, n] - np.einsum("nap,kp->kna", effect.slope, draws - center)
         at = effect.mean + effect.slope @ (center - contact.z)
         mean[n] = -at.reshape(shape[1:])
-        variance = _variances(contact, "run", floor) + growth * (given + spread_of(corrected) ** 2)
+        variance = on_floor(contact.variance, "run", floor) + growth * (
+            given + spread_of(corrected) ** 2
+        )
         left[n] = np.sqrt(variance).reshape(shape[1:])
     return EffectRecord(tuple(_rounded(np.exp(s)) for s in log_speed), _rows(mean), _rows(left))
-
-
-def _variances(contact: ForceBalance, kind: str, floor: str) -> Float[np.ndarray, "3"]:
-    """Return the variances of one kind of effect on a floor, by axis."""
-    return np.array([contact.variance.get(f"{kind}.{floor}.{axis}", 0.0) for axis in AXES])
 
 
 def _rows(grid: _Grid) -> tuple[tuple[tuple[record.Axes, ...], ...], ...]:

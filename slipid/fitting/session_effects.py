@@ -84,7 +84,18 @@ def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.nd
 
     They are zero where `variance` has no entry `<kind>.<floor>.<axis>`.
     """
-    return np.array([[variance.get(f"{kind}.{f}.{axis}", 0.0) for axis in AXES] for f in w.surface])
+    return np.array([on_floor(variance, kind, floor) for floor in w.surface])
+
+
+def on_floor(
+    values: Mapping[str, float],
+    kind: str,
+    floor: str,
+    default: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Float[np.ndarray, "3"]:
+    """Return the values `<kind>.<floor>.<axis>` along, across and in yaw."""
+    names = [f"{kind}.{floor}.{axis}" for axis in AXES]
+    return np.array([values.get(name, usual) for name, usual in zip(names, default, strict=True)])
 
 
 def _variances(

@@ -50,6 +50,7 @@ from slipid.fitting.variances import (
 )
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
+from slipid.predict.slip_model import setups
 from slipid.search_space import Space
 
 Residuals = Float[np.ndarray, "segment m"]
@@ -303,11 +304,6 @@ def parameter_covariance(jac: Slopes, cov: np.ndarray) -> np.ndarray:
         some = jac[mine][..., columns]
         out[mine] = (some @ cov[np.ix_(columns, columns)]) @ np.swapaxes(some, -1, -2)
     return out
-
-
-def setups(w: Windows) -> list[str]:
-    """Return the floor and load of every segment, `floor@load`."""
-    return [f"{floor}@{load}" for floor, load in zip(w.surface, w.load, strict=True)]
 
 
 def by_name(problem: Problem, log_v: Vector) -> dict[str, float]:

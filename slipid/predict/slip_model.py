@@ -48,6 +48,11 @@ def body_twist(w: Windows, robot: Robot) -> np.ndarray:
     return np.concatenate([arc, yaw[..., None]], -1) / w.dt[..., None]
 
 
+def setups(w: Windows) -> list[str]:
+    """Return the floor and load of every segment, `floor@load`."""
+    return [f"{floor}@{load}" for floor, load in zip(w.surface, w.load, strict=True)]
+
+
 def turned(angle: np.ndarray | float, v: np.ndarray) -> np.ndarray:
     """Return plane vectors (..., 2), each turned by its angle (...)."""
     c, s = np.cos(angle), np.sin(angle)

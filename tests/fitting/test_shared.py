@@ -26,7 +26,8 @@ from slipid.fitting.shared_effects import (
     marginal_residuals,
 )
 from slipid.fitting.variances import fitted_covariance
-from slipid.predict.predictive import force_balance_of, setups
+from slipid.predict.predictive import force_balance_of
+from slipid.predict.slip_model import setups
 from slipid.search_space import Choice
 from tests.helpers.dense import of_shared
 from tests.helpers.made_windows import made, robot
