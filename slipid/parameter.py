@@ -155,6 +155,10 @@ def parameter(
     )
 
 
+known = functools.partial(parameter, free=False)
+"""Declaration of a number that stays fixed unless the user frees it."""
+
+
 def as_numbers(x: Any) -> Array:
     """Return an array of floating-point numbers; JAX compiles nothing for what is not one yet."""
     if isinstance(x, jax.core.Tracer) or (isinstance(x, jax.Array) and x.dtype.kind == "f"):

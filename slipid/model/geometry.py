@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.parameter import as_numbers, parameter
+from slipid.parameter import as_numbers, known
 
 _MIRRORED = 0.01
 """Largest difference of a wheel from a mirror image, for `Geometry.mirror`.
@@ -81,17 +81,11 @@ class Geometry(Drives):
         gear_ratio: n, motor speed over wheel speed.
     """
 
-    wheel_radius: Array = parameter(
-        "m", "r", "wheel radius", start=0.05, lower=0.0, spread=0.02, free=False
-    )
-    base_radius: Array = parameter(
-        "m", "L", "base radius", start=0.15, lower=0.0, spread=0.02, free=False
-    )
-    drive_offset: Array = parameter(
-        "rad", "delta", "drive direction offset", start=0.0, spread=0.01, free=False
-    )
-    radius_deviation: Array = parameter(
-        "1", "rho", "wheel radius over r, less 1", start=0.0, spread=0.005, free=False, of="drive"
+    wheel_radius: Array = known("m", "r", "wheel radius", start=0.05, lower=0.0, spread=0.02)
+    base_radius: Array = known("m", "L", "base radius", start=0.15, lower=0.0, spread=0.02)
+    drive_offset: Array = known("rad", "delta", "drive direction offset", start=0.0, spread=0.01)
+    radius_deviation: Array = known(
+        "1", "rho", "wheel radius over r, less 1", start=0.0, spread=0.005, of="drive"
     )
     place: tuple[tuple[float, float], ...] = eqx.field(static=True, default=())
     drive_angle: tuple[float, ...] = eqx.field(static=True, default=())

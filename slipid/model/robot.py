@@ -15,7 +15,7 @@ from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Geometry, WheelFrame
 from slipid.model.motor import Motor
 from slipid.model.se2 import Planar
-from slipid.parameter import as_numbers, entries, parameter
+from slipid.parameter import as_numbers, entries, known, parameter
 
 Number = int | float
 GRAVITY = 9.81
@@ -25,9 +25,9 @@ GRAVITY = 9.81
 class Body(eqx.Module):
     """Mass, inertia and load shares; the leading axis of `load_share` is the load set-up."""
 
-    mass: Array = parameter("kg", "m", "mass", start=10.0, lower=0.0, spread=0.1, free=False)
-    yaw_inertia: Array = parameter(
-        "kg*m^2", "I_z", "inertia about the vertical", start=0.2, lower=0.0, spread=0.5, free=False
+    mass: Array = known("kg", "m", "mass", start=10.0, lower=0.0, spread=0.1)
+    yaw_inertia: Array = known(
+        "kg*m^2", "I_z", "inertia about the vertical", start=0.2, lower=0.0, spread=0.5
     )
     load_share: Array = parameter(
         "1",
