@@ -93,22 +93,12 @@ def effect_information(
     return out
 
 
-class TravelDirections(NamedTuple):
-    """Direction of travel, distance and load set-up of every segment.
-
-    Attributes:
-        direction: direction of travel relative to the body [rad], nan for turns on the spot.
-        distance: distance driven [m].
-        setup: name that stands for the floor and the load set-up of the segment.
-    """
-
-    direction: Float[np.ndarray, " segment"]
-    distance: Float[np.ndarray, " segment"]
-    setup: Sequence[str]
-
-
 def extrapolation(
-    axes: Iterable[AxisEffects], log_v: Variances, travel: TravelDirections
+    axes: Iterable[AxisEffects],
+    log_v: Variances,
+    direction: Float[np.ndarray, " segment"],
+    distance: Float[np.ndarray, " segment"],
+    setup: Sequence[str],
 ) -> dict[str, float]:
     """Return the factors that correct too small variances in unfitted directions, by set-up.
 
@@ -122,14 +112,19 @@ def extrapolation(
     where the model is wrong on a larger scale; and it down-weights outliers, which occur in
     forecast runs as well.
 
+    Args:
+        axes: results of `axis_effects`.
+        log_v: all log variances.
+        direction: direction of travel relative to the body [rad], nan for turns on the spot.
+        distance: distance driven in every segment [m].
+        setup: name that stands for the floor and the load set-up of every segment.
+
     Sources: Sundararajan and Keerthi 2001, Neural Computation 13(5), eq. for leaving out; Bachoc
     2013, Computational Statistics and Data Analysis 66, on wrong models.
     """
-    held_out = _held_out_effects(axes, log_v, travel.direction)
-    names = np.asarray(travel.setup)
+    held_out, names = _held_out_effects(axes, log_v, direction), np.asarray(setup)
     return {
-        name: _variance_growth(held_out, travel.distance, names == name)
-        for name in dict.fromkeys(names)
+        name: _variance_growth(held_out, distance, names == name) for name in dict.fromkeys(names)
     }
 
 

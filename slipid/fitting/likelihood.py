@@ -189,16 +189,18 @@ def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDri
 
 
 @eqx.filter_jit
+def corrected(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Float[Array, "segment edge 3"]:
+    """Return logged poses in corrected metres."""
+    return jax.vmap(jax.vmap(robot.camera.corrected))(pose)
+
+
+@eqx.filter_jit
 def measured_increments(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Marker:
     """Return measured marker increments in the frame of each window's start [m, m, rad]."""
-
-    def segment(edges: Float[Array, "edge 3"]) -> Float[Array, "window 3"]:
-        p = jax.vmap(robot.camera.corrected)(edges)
-        c, s = jnp.cos(p[:-1, 2]), jnp.sin(p[:-1, 2])
-        d = p[1:] - p[:-1]
-        return jnp.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], d[:, 2]], axis=-1)
-
-    return jax.vmap(segment)(pose)
+    p = corrected(robot, pose)
+    c, s = jnp.cos(p[:, :-1, 2]), jnp.sin(p[:, :-1, 2])
+    x, y, yaw = jnp.moveaxis(p[:, 1:] - p[:, :-1], -1, 0)
+    return jnp.stack([c * x + s * y, c * y - s * x, yaw], axis=-1)
 
 
 @eqx.filter_jit

@@ -28,7 +28,7 @@ from scipy.special import gammaln
 
 from slipid.data.windows import Windows
 from slipid.fitting import likelihood as lk
-from slipid.fitting.hierarchy import TravelDirections, axis_effects, extrapolation
+from slipid.fitting.hierarchy import axis_effects, extrapolation
 from slipid.fitting.noise import SHARED, effects, travel
 from slipid.fitting.problem import FitState, Problem
 from slipid.fitting.session_effects import by_axis
@@ -127,7 +127,7 @@ class PredictiveModel(abc.ABC):
         The density is per logged unit of position and heading.
         """
         return log_student(*self.scale(problem)) + np.asarray(
-            _camera_log_jacobian(self.robot, problem.batch.pose)
+            lk.camera_log_jacobian(self.robot, problem.batch.pose)
         )
 
 
@@ -145,9 +145,6 @@ def log_student(
     norm = gammaln((DEGREES + m) / 2) - gammaln(DEGREES / 2) - 0.5 * m * np.log(DEGREES * np.pi)
     tail = 0.5 * (DEGREES + m) * np.log1p((white**2).sum(-1) / DEGREES)
     return np.asarray(norm - log_det - tail)
-
-
-_camera_log_jacobian = jax.jit(lk.camera_log_jacobian)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +245,7 @@ def force_balance_of(
     residual, jacobian = problem.linear(z, problem.electric(z, log_v))
     motion = residual["motion"], jacobian["motion"]
     direction = TravelConditions.of(w, problem.robot).direction
-    travelled = TravelDirections(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
+    distance = travel(w, problem.robot)[0].sum(axis=1)
     counted = jnp.asarray(keep[: len(w)])
     axes = axis_effects(problem.objective, motion, counted, covariance, log_v)
     return ForceBalance(
@@ -258,7 +255,7 @@ def force_balance_of(
         problem.space,
         z,
         shared=_fitted_effects(problem, state, keep, residual, jacobian),
-        extrapolation=extrapolation(axes, log_v, travelled),
+        extrapolation=extrapolation(axes, log_v, direction, distance, setups(w)),
     )
 
 
