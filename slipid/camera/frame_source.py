@@ -11,12 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.camera.frame import Frame, FrameSource, even_times, grey_of, read_times, stamp
-from slipid.camera.opencv import opencv, read_picture, size_of
+from slipid.camera.opencv import is_picture, opencv, pictures_in, read_picture, size_of
 from slipid.support.errors import DataError
 
-BROKEN = 25
+MOST_BROKEN = 25
 """Number of consecutive frames that cannot be decoded after which a video counts as ended."""
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 MEDIAN_FRAMES = 25
 """Approximate number of frames of a video whose median is its still picture."""
 Times = Float[np.ndarray, " frame"]
@@ -44,7 +43,7 @@ class Capture:
 
         Without `decode` the frame is skipped, and an empty array is returned.
         """
-        for _ in range(BROKEN):
+        for _ in range(MOST_BROKEN):
             if not self._capture.grab():
                 continue
             if not decode:
@@ -190,9 +189,7 @@ class PictureFolder(FrameSource):
         Raises:
             DataError: there is no picture, or the numbers of pictures and times differ.
         """
-        paths = sorted(p for p in folder.iterdir() if is_picture(p))
-        if not paths:
-            raise DataError(f"{folder}: no picture; expected {', '.join(PICTURES)}")
+        paths = pictures_in(folder)
         if times is None:
             if fps is None:
                 raise DataError(f"{folder}: pictures have no times; expected --fps or --times FILE")
@@ -265,11 +262,6 @@ def open_source(
         given = even_times(1, fps or 1.0) if given is None else given
         return PictureFolder.of(path, (path,), given)
     return Video.at(path, fps, given)
-
-
-def is_picture(path: Path) -> bool:
-    """Return whether a file is a picture, judged by its suffix."""
-    return path.suffix.lower() in PICTURES
 
 
 def still(path: Path) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -13,7 +12,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from slipid.support.errors import DataError, did_you_mean
 
-NEARLY = 0.8
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+"""Suffixes by which pictures are recognised; a picture of a board may have any."""
+NEARLY_MOST = 0.8
 """Share of the largest number of detected markers from which on a smaller dictionary is preferred
 [1]."""
 Mask = Bool[np.ndarray, "row column"]
@@ -76,16 +77,8 @@ def marker_count(dictionary: str) -> int:
     return len(marker_dictionary(dictionary).bytesList)
 
 
-@dataclass(frozen=True)
-class VisibleMarkers:
-    """Numbers of the markers detected in pictures, and the name of their dictionary."""
-
-    dictionary: str
-    numbers: list[int]
-
-
-def visible_markers(pictures: Sequence[np.ndarray]) -> VisibleMarkers:
-    """Return the markers in pictures, whatever their dictionary.
+def visible_markers(pictures: Sequence[np.ndarray]) -> tuple[str, list[int]]:
+    """Return the dictionary of the markers in pictures, whatever it is, and the markers' numbers.
 
     Of the dictionaries with nearly the most detected markers, the smallest one is chosen.
     """
@@ -96,8 +89,20 @@ def visible_markers(pictures: Sequence[np.ndarray]) -> VisibleMarkers:
         numbers[name] = {int(n) for one in ids if one is not None for n in np.ravel(one)}
     # a large dictionary contains smaller ones, and detects a few more markers by chance
     most = max(map(len, numbers.values()))
-    best = min((n for n in numbers if len(numbers[n]) >= NEARLY * most), key=marker_count)
-    return VisibleMarkers(best, sorted(numbers[best]))
+    best = min((n for n in numbers if len(numbers[n]) >= NEARLY_MOST * most), key=marker_count)
+    return best, sorted(numbers[best])
+
+
+def is_picture(path: Path) -> bool:
+    """Return whether a file is a picture, judged by its suffix."""
+    return path.suffix.lower() in SUFFIXES
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """Return the pictures in a folder by name; raise `DataError` if there is none."""
+    if paths := sorted(filter(is_picture, folder.iterdir())):
+        return paths
+    raise DataError(f"{folder}: no picture; expected {', '.join(SUFFIXES)}")
 
 
 def read_picture(path: Path) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -12,13 +13,12 @@ from slipid.support.errors import DataError
 
 LEAST_CELLS, MOST_CELLS = 400, 4_000_000
 """Smallest and largest number of cells of a map."""
-FARTHEST = 3.0
+FARTHEST_IN_HEIGHTS = 3.0
 """Distance from the point below the lens up to which the floor is mapped, in heights of the lens
 above the floor [1]."""
 
 
-@dataclass(frozen=True)
-class Extent:
+class Extent(NamedTuple):
     """A rectangle of the floor along the axes [m]."""
 
     low_x: float
@@ -108,11 +108,12 @@ def view_of(camera: OverheadCamera) -> Extent:
         DataError: the camera sees no floor nearby.
     """
     floor = camera.on_plane(_pixel_grid(camera, -0.5), 0.0).reshape(-1, 2)
-    floor = floor[np.linalg.norm(floor - camera.place[:2], axis=1) <= FARTHEST * camera.height]
+    floor = floor[
+        np.linalg.norm(floor - camera.place[:2], axis=1) <= FARTHEST_IN_HEIGHTS * camera.height
+    ]
     if not len(floor):
         raise DataError("the camera sees no floor nearby; expected one that looks down")
-    (low_x, low_y), (high_x, high_y) = floor.min(axis=0), floor.max(axis=0)
-    return Extent(float(low_x), float(low_y), float(high_x), float(high_y))
+    return Extent(*map(float, (*floor.min(axis=0), *floor.max(axis=0))))
 
 
 def _pixel_grid(camera: OverheadCamera, edge: float) -> Float[np.ndarray, "65 65 2"]:
@@ -187,7 +188,10 @@ def _before_lens(camera: OverheadCamera, points: Float[np.ndarray, "row column 3
     ideal = camera.lens.ideal(_pixel_grid(camera, 0.0))
     widest = 1.02 * np.linalg.norm(ideal, axis=-1).max()
     rays = (points - camera.place) @ camera.rotation.T
-    near = np.linalg.norm(points[..., :2] - camera.place[:2], axis=-1) <= FARTHEST * camera.height
+    near = (
+        np.linalg.norm(points[..., :2] - camera.place[:2], axis=-1)
+        <= FARTHEST_IN_HEIGHTS * camera.height
+    )
     depth = rays[..., 2]
     return near & (depth > 0) & (np.linalg.norm(rays[..., :2], axis=-1) <= widest * depth)
 

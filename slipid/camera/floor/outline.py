@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from slipid.camera.opencv import Labels, Mask, opencv
 
-FITTED = 6
+FITTED_STEPS = 6
 """Smallest number of steps of a border part to which a line is fitted; a step is a cell's edge."""
 
 
@@ -175,7 +175,7 @@ def _through(
 
     For few steps it is the line from the first to the last one.
     """
-    if len(steps) < FITTED:
+    if len(steps) < FITTED_STEPS:
         return steps[0], (steps[-1] - steps[0]) / np.linalg.norm(steps[-1] - steps[0])
     inner = steps[1:-1]  # the steps at the ends may belong to the neighbouring lines
     middle = inner.mean(axis=0)

@@ -113,9 +113,14 @@ def _parquet(track: TrackedPoses) -> bytes:
     return out.getvalue()
 
 
-GRID = 0.25
+GRID_M = 0.25
 """Distance between neighbouring lines of the grid drawn on the floor [m]."""
-FLOOR, EDGE, AHEAD, LEFT = (190, 190, 60), (0, 170, 255), (40, 40, 230), (60, 190, 60)
+GRID_BGR, EDGE_BGR, AHEAD_BGR, LEFT_BGR = (
+    (190, 190, 60),
+    (0, 170, 255),
+    (40, 40, 230),
+    (60, 190, 60),
+)
 """Colours, as blue, green, red, of the grid on the floor, the edges of markers, and the axes of a
 body that point ahead and to the left."""
 
@@ -188,18 +193,18 @@ def _grid(drawn: np.ndarray, camera: OverheadCamera) -> None:
     floor = camera.on_plane(frame.reshape(-1, 2), 0.0)
     floor = floor[np.isfinite(floor).all(axis=1)]
     low, high = floor.min(axis=0), floor.max(axis=0)
-    high = np.minimum(high, low + 100 * GRID)  # a tilted camera may see the horizon
-    lines = [np.arange(np.ceil(low[k] / GRID), high[k] / GRID) * GRID for k in range(2)]
+    high = np.minimum(high, low + 100 * GRID_M)  # a tilted camera may see the horizon
+    lines = [np.arange(np.ceil(low[k] / GRID_M), high[k] / GRID_M) * GRID_M for k in range(2)]
     for axis in range(2):
         along = np.linspace(low[1 - axis], high[1 - axis], 40)
         for at in lines[axis]:
             points = np.zeros((len(along), 3))
             points[:, axis], points[:, 1 - axis] = at, along
-            _line(drawn, camera, points, FLOOR, 2 if abs(at) < 1e-9 else 1)
+            _line(drawn, camera, points, GRID_BGR, 2 if abs(at) < 1e-9 else 1)
             if abs(at) > 1e-9:
                 _label(drawn, camera, at * np.eye(3)[axis], f"{'xy'[axis]} {at:g}")
-    text = f"lines on the floor every {GRID:g} m, thick through the origin"
-    cv2.putText(drawn, text, (20, height - 20), cv2.FONT_HERSHEY_SIMPLEX, 0.8, FLOOR, 2)
+    text = f"lines on the floor every {GRID_M:g} m, thick through the origin"
+    cv2.putText(drawn, text, (20, height - 20), cv2.FONT_HERSHEY_SIMPLEX, 0.8, GRID_BGR, 2)
 
 
 def _label(
@@ -211,7 +216,7 @@ def _label(
     width, height = camera.lens.image_px
     if 0 <= x < width and 0 <= y < height:
         where = (round(x) + 6, round(y) - 6)
-        cv2.putText(drawn, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.6, FLOOR, 1, cv2.LINE_AA)
+        cv2.putText(drawn, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.6, GRID_BGR, 1, cv2.LINE_AA)
 
 
 def _body(
@@ -224,13 +229,13 @@ def _body(
     place = np.array([pose[0], pose[1], 0.0])
     for marker in track.target.markers:
         around = marker.corners[[0, 1, 2, 3, 0]] @ turn.T + place
-        _line(drawn, camera, around, EDGE, 2)
+        _line(drawn, camera, around, EDGE_BGR, 2)
     length = 1.5 * max(marker.size for marker in track.target.markers)
     origin = np.array([0.0, 0.0, track.target.height])
-    for axis, colour in enumerate((AHEAD, LEFT)):
+    for axis, colour in enumerate((AHEAD_BGR, LEFT_BGR)):
         tip = origin + length * np.eye(3)[axis]
         _line(drawn, camera, np.stack([origin, tip]) @ turn.T + place, colour, 3)
     at = camera.pixels((origin + place)[None])[0] + (30, -60)
     text = f"{track.target.name}: {pose[0]:.3f}, {pose[1]:.3f} m, {np.degrees(pose[2]):.1f} deg"
     where = tuple(np.round(at).astype(int).tolist())
-    cv2.putText(drawn, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.9, AHEAD, 2)
+    cv2.putText(drawn, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.9, AHEAD_BGR, 2)

@@ -39,41 +39,30 @@ number of lanes of the result; None if the operation must be computed as it is."
 
 
 UNARY = {
-    "abs": "r_abs({0})",
-    "cos": "r_cos({0})",
-    "exp": "r_exp({0})",
-    "floor": "r_floor({0})",
+    **{
+        name: f"r_{name}({{0}})"
+        for name in ("abs", "cos", "exp", "floor", "log", "sign", "sin", "sqrt", "tanh")
+    },
+    **dict.fromkeys(("copy", "stop_gradient"), "{0}"),
     "is_finite": "is_finite({0})",
-    "log": "r_log({0})",
     "neg": "-{0}",
     "not": "!{0}",
     "rsqrt": "R(1.0) / r_sqrt({0})",
-    "sign": "r_sign({0})",
-    "sin": "r_sin({0})",
-    "sqrt": "r_sqrt({0})",
     "square": "{0} * {0}",
-    "tanh": "r_tanh({0})",
-    "copy": "{0}",
-    "stop_gradient": "{0}",
 }
 BINARY = {
-    "add": "{0} + {1}",
-    "add_any": "{0} + {1}",
+    **{name: f"r_{name}({{0}}, {{1}})" for name in ("atan2", "max", "min", "pow", "rem")},
+    **dict.fromkeys(("add", "add_any"), "{0} + {1}"),
     "and": "{0} & {1}",
-    "atan2": "r_atan2({0}, {1})",
     "div": "{0} / {1}",
     "eq": "{0} == {1}",
     "ge": "{0} >= {1}",
     "gt": "{0} > {1}",
     "le": "{0} <= {1}",
     "lt": "{0} < {1}",
-    "max": "r_max({0}, {1})",
-    "min": "r_min({0}, {1})",
     "mul": "{0} * {1}",
     "ne": "{0} != {1}",
     "or": "{0} | {1}",
-    "pow": "r_pow({0}, {1})",
-    "rem": "r_rem({0}, {1})",
     "sub": "{0} - {1}",
 }
 INTEGER_TEMPLATES = {"max": "i_max({0}, {1})", "min": "i_min({0}, {1})", "rem": "{0} % {1}"}
