@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.camera.csv_rows import csv_rows
-from slipid.camera.opencv import Grey, opencv
+from slipid.camera.opencv import Grey, cv2
 from slipid.support.errors import DataError, bad_data
 
 LOST_SHARE = 0.02
@@ -86,7 +86,6 @@ def grey_of(picture: np.ndarray) -> Grey:
     """Return the grey levels of a picture, which may be in blue, green, red or already grey."""
     if picture.ndim == 2 or picture.shape[2] == 1:
         return np.asarray(picture).reshape(picture.shape[:2])
-    cv2 = opencv()
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
 
 

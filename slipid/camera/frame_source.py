@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.camera.frame import Frame, FrameSource, even_times, grey_of, read_times, stamp
-from slipid.camera.opencv import is_picture, opencv, pictures_in, read_picture, size_of
+from slipid.camera.opencv import cv2, is_picture, pictures_in, read_picture, size_of
 from slipid.support.errors import DataError
 
 MOST_BROKEN = 25
@@ -30,7 +30,6 @@ class Capture:
     """
 
     def __init__(self, place: str):
-        cv2 = opencv()
         self._capture = cv2.VideoCapture(int(place) if place.isdigit() else place)
         if not self._capture.isOpened():
             raise DataError(
@@ -90,7 +89,7 @@ class Video(FrameSource):
                     f"{path}: no frame that OpenCV can decode; expected a video (a file that was "
                     "cut off, as by a full disk, may have lost its index)"
                 )
-            announced = capture.value(opencv().CAP_PROP_FRAME_COUNT)
+            announced = capture.value(cv2.CAP_PROP_FRAME_COUNT)
         count = int(announced) if 0 < announced < 1e9 else None
         if times is not None:
             count = len(times)
@@ -124,7 +123,7 @@ class Video(FrameSource):
         if self.fps is not None:
             return k / self.fps
         if self.times is None:
-            return capture.value(opencv().CAP_PROP_POS_MSEC) / 1000.0
+            return capture.value(cv2.CAP_PROP_POS_MSEC) / 1000.0
         if k >= len(self.times):
             raise DataError(
                 f"{self.name}: more than the {len(self.times)} frames that have a time; expected "
@@ -276,7 +275,7 @@ def still(path: Path) -> np.ndarray:
     if is_picture(path) or not path.is_file() or not path.stat().st_size:
         return read_picture(path)
     with closing(Capture(str(path))) as capture:
-        count = int(capture.value(opencv().CAP_PROP_FRAME_COUNT))
+        count = int(capture.value(cv2.CAP_PROP_FRAME_COUNT))
         every, kept = max(1, count // MEDIAN_FRAMES), []
         for k in numbers():
             chosen = k % every == 0

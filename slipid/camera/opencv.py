@@ -26,7 +26,7 @@ Grey = UInt8[np.ndarray, "row column"]
 
 
 @cache
-def opencv() -> ModuleType:
+def _opencv() -> ModuleType:
     """Return the module cv2, with OpenCV's own messages about unreadable files switched off.
 
     Raises:
@@ -50,11 +50,21 @@ def opencv() -> ModuleType:
     return cv2
 
 
+class _LoadedOnUse:
+    """The module cv2, loaded when one of its attributes is first used; see `_opencv`."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(_opencv(), name)
+
+
+cv2: Any = _LoadedOnUse()
+
+
 def dictionary_names() -> list[str]:
     """Return the names of OpenCV's marker dictionaries, such as `4X4_50`."""
     prefix = "DICT_"
-    aruco = opencv().aruco
-    return sorted(name.removeprefix(prefix) for name in dir(aruco) if name.startswith(prefix))
+    names = dir(cv2.aruco)
+    return sorted(name.removeprefix(prefix) for name in names if name.startswith(prefix))
 
 
 def marker_dictionary(name: str) -> Any:
@@ -68,8 +78,7 @@ def marker_dictionary(name: str) -> Any:
     if short not in names:
         hint = did_you_mean(short, names)
         raise DataError(f"no marker dictionary '{name}'{hint}; expected one of {', '.join(names)}")
-    aruco = opencv().aruco
-    return aruco.getPredefinedDictionary(getattr(aruco, f"DICT_{short}"))
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{short}"))
 
 
 def marker_count(dictionary: str) -> int:
@@ -82,9 +91,9 @@ def visible_markers(pictures: Sequence[np.ndarray]) -> tuple[str, list[int]]:
 
     Of the dictionaries with nearly the most detected markers, the smallest one is chosen.
     """
-    aruco, numbers = opencv().aruco, dict[str, set[int]]()
+    numbers: dict[str, set[int]] = {}
     for name in dictionary_names():
-        detector = aruco.ArucoDetector(marker_dictionary(name))
+        detector = cv2.aruco.ArucoDetector(marker_dictionary(name))
         ids = [detector.detectMarkers(np.ascontiguousarray(one))[1] for one in pictures if one.size]
         numbers[name] = {int(n) for one in ids if one is not None for n in np.ravel(one)}
     # a large dictionary contains smaller ones, and detects a few more markers by chance
@@ -117,7 +126,6 @@ def read_picture(path: Path) -> np.ndarray:
         raise DataError(f"{path}: {error.strerror}; expected a picture") from error
     if not data:
         raise DataError(f"{path}: the file is empty; expected a picture (PNG, JPEG, ...)")
-    cv2 = opencv()
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error:  # OpenCV raises this for too large pictures
@@ -141,7 +149,6 @@ def ideal_points(
 
     The distortion is inverted by iteration to convergence.
     """
-    cv2 = opencv()
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
     iterated = getattr(cv2, "undistortPointsIter", None)
     if iterated is not None:  # OpenCV 4

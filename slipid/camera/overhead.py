@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, FiniteFloat, model_validator
 
-from slipid.camera.opencv import ideal_points, opencv
+from slipid.camera.opencv import cv2, ideal_points
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, write_json
@@ -126,7 +126,6 @@ class OverheadCamera:
 
     def pixels(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """Return the pixels at which places in the world [m] appear."""
-        cv2 = opencv()
         flat = np.ascontiguousarray(points, float).reshape(-1, 1, 3)
         shape = (*np.shape(points)[:-1], 2)
         if not len(flat):

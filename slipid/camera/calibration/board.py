@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.camera.opencv import (
+    cv2,
     marker_count,
     marker_dictionary,
-    opencv,
     pictures_in,
     size_of,
     visible_markers,
@@ -127,7 +127,7 @@ class Board:
     def pattern(self) -> object:
         """The board as an object of OpenCV."""
         size, dictionary = (self.columns, self.rows), marker_dictionary(self.dictionary)
-        board = opencv().aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
+        board = cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
         if self.legacy:
             board.setLegacyPattern(True)
         return board
@@ -197,7 +197,7 @@ def board_of(size: str, square_m: float, marker_m: float, dictionary: str, legac
 
 def view_of(board: Board, picture: Picture) -> View:
     """Return the corners of the board in a picture; the view is empty if it is not detected."""
-    detector = opencv().aruco.CharucoDetector(board.pattern)
+    detector = cv2.aruco.CharucoDetector(board.pattern)
     pixels, numbers = detector.detectBoard(picture.image)[:2]
     if numbers is None:
         return View(picture.path.name, np.zeros((0, 2)), np.zeros((0, 2)))

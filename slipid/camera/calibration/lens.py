@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.camera.calibration.board import View, check_enough
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import cv2
 from slipid.camera.overhead import Lens
 from slipid.support.errors import DataError
 
@@ -44,7 +44,7 @@ class Pose:
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
         """Rotation matrix of the pose, from the object's axes to the camera's."""
-        return np.asarray(opencv().Rodrigues(self.turn)[0])
+        return np.asarray(cv2.Rodrigues(self.turn)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ def project(lens: Lens, pose: Pose, points: Float[np.ndarray, "point 3"]) -> Pro
     """Return the pixels at which points of an object [m] appear, with derivatives."""
     flat = np.ascontiguousarray(points).reshape(-1, 1, 3)
     given = (flat, pose.turn, pose.shift, lens.matrix, lens.distortion)
-    pixels, slope = (np.asarray(one) for one in opencv().projectPoints(*given)[:2])
+    pixels, slope = (np.asarray(one) for one in cv2.projectPoints(*given)[:2])
     return Projection(pixels.reshape(-1, 2), slope[:, :6], slope[:, 6:])
 
 
@@ -129,7 +129,6 @@ def fit_lens(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> Lens
     Raises:
         DataError: the views do not determine a lens.
     """
-    cv2 = opencv()
     points = [solid(view).astype(np.float32).reshape(-1, 1, 3) for view in views]
     pixels = [view.pixels.astype(np.float32).reshape(-1, 1, 2) for view in views]
     flags = 0 if k3 else cv2.CALIB_FIX_K3
@@ -185,7 +184,6 @@ def _with_covariance(lens: Lens, views: list[View], poses: list[Pose]) -> LensFi
 
 def pose_of(lens: Lens, view: View) -> Pose:
     """Return the pose of a board seen through a known lens."""
-    cv2 = opencv()
     points, pixels = solid(view).reshape(-1, 1, 3), view.pixels.reshape(-1, 1, 2)
     given = (points, pixels, lens.matrix, lens.distortion)
     starts = cv2.solvePnPGeneric(*given, flags=cv2.SOLVEPNP_IPPE)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from slipid.camera.calibration.lens import Pose, lens_of, parameters_of, project, rms
 from slipid.camera.calibration.points import FloorPoints
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import cv2
 from slipid.camera.overhead import Lens, OverheadCamera
 from slipid.support.errors import DataError
 
@@ -168,7 +168,6 @@ def _fitted(lens: Lens, points: FloorPoints) -> FloorFit | None:
 
 def _candidates(lens: Lens, points: FloorPoints) -> list[Pose]:
     """Return poses that are local minima of the error; points in a plane have two of them."""
-    cv2 = opencv()
     middle = points.places.mean(0)
     # OpenCV recognises points in a plane only if their z is 0; centred numbers are most precise
     places = np.ascontiguousarray(points.places - middle).reshape(-1, 1, 3)
@@ -186,7 +185,7 @@ def _candidates(lens: Lens, points: FloorPoints) -> list[Pose]:
 
 def _differ(pose: Pose, other: Pose) -> bool:
     """Return whether the rotations of two poses differ by more than a degree."""
-    turn = opencv().Rodrigues(pose.rotation.T @ other.rotation)[0]
+    turn = cv2.Rodrigues(pose.rotation.T @ other.rotation)[0]
     return bool(np.degrees(np.linalg.norm(turn)) > 1)
 
 

@@ -11,7 +11,8 @@ from slipid.camera.csv_rows import csv_rows
 from slipid.support.errors import DataError, bad_data, did_you_mean
 
 COLUMNS = ("u", "v", "x", "y")
-EXPECTED = "a CSV file of points: columns u, v (pixels), x, y (metres) and perhaps z"
+EXPECTED = "u, v (pixels), x, y (metres) and perhaps z"
+"""Columns of a file of points, for messages."""
 LEAST_POINTS = 4
 LINE_WIDTH = 0.02
 """Ratio of the points' spread across their main direction to that along it, below which they count
@@ -50,9 +51,9 @@ def read_points(path: Path, image_px: tuple[int, int]) -> FloorPoints:
         DataError: the file is absent, lacks a column, has a cell that is not a number or a pixel
             outside the picture; or the points do not determine the camera's place.
     """
-    rows = [row for row in csv_rows(path, EXPECTED) if any(row[1])]
+    rows = [row for row in csv_rows(path, f"a CSV file with columns {EXPECTED}") if any(row[1])]
     if not rows:
-        raise DataError(f"{path}: the file is empty; expected {EXPECTED}")
+        raise DataError(f"{path}: the file is empty; expected columns {EXPECTED}")
     header = [name.lower() for name in rows.pop(0)[1]]
     if missing := [name for name in COLUMNS if name not in header]:
         hint = did_you_mean(missing[0], header)

@@ -23,7 +23,7 @@ HELD_OUT_FOLDS = 5
 TILTED_DEG = 12.0
 """Tilt of the board above which a view separates focal length and distance [deg]."""
 LEAST_TILTED = 3
-CELLS = np.array([8, 6])
+CELLS = (8, 6)
 """Numbers of cells across and down into which the picture is divided, to measure coverage."""
 REFUSED_SHARE, POOR_SHARE = 0.35, 0.6
 """Share of the cells with corners below which a lens is refused, and below which it is reported as
@@ -60,9 +60,7 @@ class Coverage:
 def coverage(pixels: Float[np.ndarray, "corner 2"], image_px: tuple[int, int]) -> Coverage:
     """Return the coverage of a picture by corners."""
     size = np.array(image_px)
-    cells = np.clip((pixels + 0.5) / size * CELLS, 0, CELLS - 1).astype(int)
-    visited = np.zeros(CELLS[::-1], bool)
-    visited[cells[:, 1], cells[:, 0]] = True
+    visited = np.histogramdd(pixels, CELLS, [(-0.5, n - 0.5) for n in image_px])[0].T > 0
     from_middle = (pixels - (size - 1) / 2) / (size / 2)
     # the smaller of the shares in x and y counts: the middle of an edge is near no picture corner
     reach = min(float((from_middle * one).min(1).max()) for one in product((1, -1), repeat=2))

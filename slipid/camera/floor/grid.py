@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from slipid.camera.opencv import Mask, marker_dictionary, opencv
+from slipid.camera.opencv import Mask, cv2, marker_dictionary
 from slipid.camera.overhead import OverheadCamera
 from slipid.support.errors import DataError
 
@@ -93,7 +93,6 @@ class Rectified:
 
 def filled(polygon: Float[np.ndarray, "corner 2"], rows: int, columns: int) -> Mask:
     """Return the points of a grid that lie in a polygon, whose corners are columns and rows."""
-    cv2 = opencv()
     mask = np.zeros((rows, columns), np.uint8)
     parts = 16  # OpenCV draws to a sixteenth of a step, set by the last argument below
     corners = np.rint(np.clip(polygon, -1e6, 1e6) * parts).astype(np.int32)
@@ -160,7 +159,6 @@ def grid_over(extent: Extent, cell: float, picture: Path) -> Grid:
 
 def rectified(picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, grid: Grid) -> Rectified:
     """Return the picture projected onto the floor; cells out of view are black."""
-    cv2 = opencv()
     centres = grid.centres()
     points = np.concatenate([centres, np.zeros((*centres.shape[:2], 1))], axis=-1)
     ahead = _before_lens(camera, points)
@@ -228,7 +226,7 @@ def detected_robots(
     picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, shape: RobotShape
 ) -> tuple[DetectedRobot, ...]:
     """Return all robots whose markers are detected in a picture."""
-    detector = opencv().aruco.ArucoDetector(marker_dictionary(shape.dictionary))
+    detector = cv2.aruco.ArucoDetector(marker_dictionary(shape.dictionary))
     corners, numbers, _ = detector.detectMarkers(picture)
     robots = []
     for outline, number in zip(corners, [] if numbers is None else numbers.ravel(), strict=True):
@@ -248,7 +246,7 @@ def hidden_by(
     levels = np.linspace(0, shape.height, 5)
     points = np.concatenate([np.column_stack([ring, np.full(len(ring), z)]) for z in levels])
     # a cylinder is convex, so it hides the convex hull of its rings
-    outline = opencv().convexHull(camera.pixels(points).astype(np.float32))
+    outline = cv2.convexHull(camera.pixels(points).astype(np.float32))
     width, height = camera.lens.image_px
     hull: Float[np.ndarray, "corner 2"] = np.asarray(outline, float).reshape(-1, 2)
     return filled(hull, height, width)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import cv2
 
 DEGREE = 4
 """Highest sum of the degrees in x and y of the polynomials in a gain or a veil."""
@@ -46,7 +46,6 @@ def features_of(colour: UInt8[np.ndarray, "row column 3"], smooth: float = 1.0) 
         colour: colours of the cells.
         smooth: std of the Gaussian that smooths their noise [cells].
     """
-    cv2 = opencv()
     fine = colour.astype(np.float32) / 255
     soft = cv2.GaussianBlur(fine, (0, 0), smooth)
     lab = cv2.cvtColor(soft, cv2.COLOR_BGR2LAB)
@@ -60,7 +59,6 @@ def texture(lightness: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "ro
     v is a median over a window, so that edges between surfaces, thin lines in the window, do not
     affect it.
     """
-    cv2 = opencv()
     change = np.abs(lightness - cv2.GaussianBlur(lightness, (0, 0), 2.5))
     coarse = np.clip(change * 16, 0, 255).astype(np.uint8)
     typical = cv2.medianBlur(coarse, 13).astype(np.float32) / 16
@@ -83,7 +81,6 @@ def to_srgb(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]
 
 def lab_of(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
     """Return the CIELAB values of linear RGB."""
-    cv2 = opencv()
     bgr = to_srgb(rgb)[..., ::-1].astype(np.float32).reshape(-1, 1, 3)
     if not len(bgr):
         return np.zeros(rgb.shape)

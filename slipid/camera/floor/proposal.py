@@ -24,7 +24,7 @@ from slipid.camera.floor.light import (
     lab_of,
 )
 from slipid.camera.floor.surfaces import COARSE_CELLS, MarkedCells, positions, thinned
-from slipid.camera.opencv import Labels, Mask, opencv
+from slipid.camera.opencv import Labels, Mask, cv2
 from slipid.support.errors import DataError
 
 JOIN_LIMITS = (5.0, 7.0, 8.0, 8.0, 8.0)
@@ -97,7 +97,6 @@ def proposed(features: Features, visible: Mask, count: int | None) -> MarkedCell
 
 def patches_of(features: Features, visible: Mask) -> Patches:
     """Return patches of connected cells within which the appearance changes slowly."""
-    cv2 = opencv()
     step = max(1, round(np.sqrt(visible.size / (2 * COARSE_CELLS))))
     few, some = thinned(features, step), visible[step // 2 :: step, step // 2 :: step]
     soft = cv2.GaussianBlur(few.appearance[..., :3], (0, 0), 1.2)

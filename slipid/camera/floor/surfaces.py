@@ -19,7 +19,7 @@ from slipid.camera.floor.light import (
     fit_illumination,
     lab_of,
 )
-from slipid.camera.opencv import Labels, Mask, opencv
+from slipid.camera.opencv import Labels, Mask, cv2
 
 MOST_ROUNDS = 10
 STEADY_SHARE = 3e-4
@@ -91,7 +91,6 @@ class Surfaces:
 
     def appearances(self, shape: tuple[int, int]) -> Float32[np.ndarray, "surface row column 4"]:
         """Return the L, a, b and texture that each surface would have in every cell."""
-        cv2 = opencv()
         rows, columns = min(shape[0], 48), min(shape[1], 48)
         at = positions((rows, columns))
         coarse = lab_of(self.lit.illumination.rgb_of(self.lit.colours, at))
@@ -151,7 +150,6 @@ def thinned(features: Features, step: int) -> Features:
     """Return the features of every `step`-th cell along both axes, smoothed over `step` cells."""
     if step == 1:
         return features
-    cv2 = opencv()
     cut = slice(step // 2, None, step)
     appearance, rgb = (
         cv2.GaussianBlur(one, (0, 0), 0.4 * step)[cut, cut]
@@ -162,7 +160,6 @@ def thinned(features: Features, step: int) -> Features:
 
 def _flat(appearance: Float[np.ndarray, "row column 4"]) -> Mask:
     """Return cells whose neighbours look about the same; others lie on edges and mix colours."""
-    cv2 = opencv()
     lab = np.ascontiguousarray(appearance[..., :3])
     kernel = np.ones((3, 3), np.uint8)
     change = (cv2.dilate(lab, kernel) - cv2.erode(lab, kernel)).max(axis=-1)
@@ -237,7 +234,6 @@ def smoothed(costs: Costs, visible: Mask) -> Labels:
     shares of its neighbours reduce the costs of their surfaces. Cells that are not visible do not
     affect others and get the label `UNKNOWN`.
     """
-    cv2 = opencv()
     weight = visible.astype(np.float32)
     around = np.maximum(cv2.GaussianBlur(weight, (0, 0), NEIGHBOUR_STD), 1e-3)
     total = costs
@@ -260,7 +256,6 @@ def without_small_patches(labels: Labels, visible: Mask, width: int) -> Labels:
         visible: cells that may have a surface.
         width: width of the narrowest patch that is kept [cells].
     """
-    cv2 = opencv()
     size = 2 * (width // 2) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     kept = np.zeros(labels.shape, bool)

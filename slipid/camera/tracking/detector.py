@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from slipid.camera.opencv import Grey, marker_dictionary, opencv, size_of
+from slipid.camera.opencv import Grey, cv2, marker_dictionary, size_of
 
 WHOLE_INTERVAL = 30
 """Interval, in frames, at which the whole frame is searched."""
@@ -104,7 +104,7 @@ class MarkerDetector:
     def __init__(self, dictionary: str):
         book = marker_dictionary(dictionary)
         self._squares = int(book.markerSize) + 2
-        self._detector = opencv().aruco.ArucoDetector(book)
+        self._detector = cv2.aruco.ArucoDetector(book)
 
     def detect(self, grey: Grey, region: Region | None = None) -> list[Detection]:
         """Return all markers in a frame, or in a region of it."""
@@ -234,7 +234,6 @@ def _profiles(grey: Grey, edges: _Edges) -> Float[np.ndarray, "marker 4 along ac
         + (edges.outward[:, :, None] * aside[..., None])[:, :, None]
     )
     flat = places.reshape(-1, ALONG * ACROSS, 2).astype(np.float32)
-    cv2 = opencv()
     brightness = cv2.remap(
         *(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR), borderMode=cv2.BORDER_REPLICATE
     )

@@ -14,7 +14,7 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from slipid.camera.opencv import Grey, opencv
+from slipid.camera.opencv import Grey, cv2
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.track import Flag, TrackedPoses
 from slipid.support.errors import DataError
@@ -140,7 +140,6 @@ def write_preview(
     Raises:
         DataError: the suffix is not that of a picture, or the file cannot be written.
     """
-    cv2 = opencv()
     drawn = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
     _grid(drawn, camera)
     for track in tracks:
@@ -160,7 +159,6 @@ def check_drawable(path: Path) -> None:
 
 
 def _encoded(path: Path, drawn: UInt8[np.ndarray, "row column 3"]) -> bytes:
-    cv2 = opencv()
     try:
         there, data = cv2.imencode(path.suffix or ".", drawn)
     except cv2.error:
@@ -178,7 +176,6 @@ def _line(
     width: int,
 ) -> None:
     """Draw a line through points in the world [m], unless it lies far outside the picture."""
-    cv2 = opencv()
     pixels = camera.pixels(points)
     if np.isfinite(pixels).all() and (np.abs(pixels) < 1e5).all():
         whole = np.round(pixels).astype(np.int32).reshape(-1, 1, 2)
@@ -187,7 +184,6 @@ def _line(
 
 def _grid(drawn: np.ndarray, camera: OverheadCamera) -> None:
     """Draw a grid on the visible floor, and write the distance between its lines."""
-    cv2 = opencv()
     width, height = camera.lens.image_px
     frame = np.stack(np.meshgrid(np.linspace(0, width, 9), np.linspace(0, height, 9)), -1)
     floor = camera.on_plane(frame.reshape(-1, 2), 0.0)
@@ -211,7 +207,6 @@ def _label(
     drawn: np.ndarray, camera: OverheadCamera, place: Float[np.ndarray, "3"], text: str
 ) -> None:
     """Write text beside a place on the floor [m], if the place lies in the picture."""
-    cv2 = opencv()
     x, y = camera.pixels(place[None])[0].tolist()
     width, height = camera.lens.image_px
     if 0 <= x < width and 0 <= y < height:
@@ -223,7 +218,6 @@ def _body(
     drawn: np.ndarray, camera: OverheadCamera, track: TrackedPoses, pose: Float[np.ndarray, "3"]
 ) -> None:
     """Draw the markers' edges expected at a pose, and the body's axes, x red and y green."""
-    cv2 = opencv()
     c, s = np.cos(pose[2]), np.sin(pose[2])
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     place = np.array([pose[0], pose[1], 0.0])

@@ -7,6 +7,7 @@ parameter is read-only, and the names and arguments of validators.
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from os.path import commonprefix
 
 from slipid.exports.text import WIDTH, one_line, wrapped
 
@@ -97,10 +98,7 @@ def _nested(parameters: Sequence[Parameter], depth: int, leaf: _Leaf) -> Iterato
     before: list[str] = []
     for parameter in parameters:
         *groups, name = parameter.name.split(".")
-        same = 0
-        while same < min(len(groups), len(before)) and groups[same] == before[same]:
-            same += 1
-        for k in range(same, len(groups)):
+        for k in range(len(commonprefix([groups, before])), len(groups)):
             yield "  " * (depth + k) + f"{groups[k]}:"
         before = groups
         yield from leaf(parameter, name, "  " * (depth + len(groups)))
