@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from slipid.exports.c99.builder import Builder, Names
-from slipid.exports.c99.ir import Array, Memory, Value, in_memory
+from slipid.exports.c99.ir import Memory, Value, holds, in_memory
 from slipid.exports.c99.jaxpr import Traced
 from slipid.exports.c99.lower import apart, lowered, store
 from slipid.exports.c99.text import FunctionBody, folded
@@ -125,7 +125,7 @@ def function(
     changed = [
         (memory, apart(builder, value, overwritten))
         for memory, value in zip(targets, results, strict=True)
-        if not _holds(memory, value)
+        if not holds(memory, value)
     ]
     for memory, value in changed:
         store(builder, value, memory)
@@ -150,11 +150,3 @@ def traced(run: Callable[..., object], *like: object) -> Traced:
         return jax.tree.leaves(run(*jax.tree.unflatten(structure, leaves)))
 
     return Traced.of(jax.make_jaxpr(of)(*jax.tree.leaves(like)))
-
-
-def _holds(memory: Memory, value: Value) -> bool:
-    """Return whether memory already holds a value, so that nothing has to be stored."""
-    if not isinstance(value, Array):
-        return False
-    like = in_memory(memory, value.shape)
-    return value.axis == like.axis and bool((value.cells == like.cells).all())

@@ -7,7 +7,6 @@ parameter is read-only, and the names and arguments of validators.
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from os.path import commonprefix
 
 from slipid.exports.text import WIDTH, one_line, wrapped
 
@@ -98,7 +97,10 @@ def _nested(parameters: Sequence[Parameter], depth: int, leaf: _Leaf) -> Iterato
     before: list[str] = []
     for parameter in parameters:
         *groups, name = parameter.name.split(".")
-        for k in range(len(commonprefix([groups, before])), len(groups)):
+        same = 0
+        while same < min(len(groups), len(before)) and groups[same] == before[same]:
+            same += 1
+        for k in range(same, len(groups)):
             yield "  " * (depth + k) + f"{groups[k]}:"
         before = groups
         yield from leaf(parameter, name, "  " * (depth + len(groups)))
