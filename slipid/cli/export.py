@@ -1,5 +1,6 @@
 """`slipid export`: write an identified robot to a folder in forms that robots can load."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -67,14 +68,7 @@ def export(
         robot = read_robot(source, load, _names(floors))
         options = ExportOptions(_names(to), controller, path, speed, map)
         done = run(robot, out, options, report, ROWS)
-    content = {
-        "schema": "slipid.export/1",
-        "folder": str(done.folder),
-        "robot": done.robot,
-        "forms": list(done.forms),
-        "files": list(done.files),
-        "warnings": list(done.warnings),
-    }
+    content = {"schema": "slipid.export/1", **asdict(done), "folder": str(done.folder)}
     emit(json, content, lambda page: show_export(page, done))
     return 0
 
