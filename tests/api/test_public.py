@@ -12,6 +12,7 @@ import pytest
 import slipid as sl
 from tests.api.conftest import write_runs
 
+
 @pytest.mark.slow
 def test_the_example_of_the_readme_runs(world):
     assert (world["folder"] / "robot.json").is_file()
