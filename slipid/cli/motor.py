@@ -1,49 +1,31 @@
 """`slipid motor`: identify a motor on a bench from a single log file, without a config."""
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, MaybeOut, Quiet, emit, guarded
+from slipid.cli.common import Json, MaybeOut, Quiet, emit, flag, guarded, option
 from slipid.support.progress import Reporter
 
-if TYPE_CHECKING:
-    from slipid.data.reading.motor_layout import GivenColumns
+Column = str | None
+_column = partial(option, "NAME[:UNIT]")
 
 
 @guarded
 def motor(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Log, a CSV or Parquet file.")],
-    time: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="Column of the time, in s.")
-    ] = None,
-    voltage: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="Voltage across the motor, in V.")
-    ] = None,
-    current: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="Current in A; I:mA for others.")
-    ] = None,
-    speed: Annotated[
-        str | None,
-        typer.Option(metavar="NAME[:UNIT]", help="Speed of the shaft, in rad/s; w:rpm for others."),
-    ] = None,
-    angle: Annotated[
-        str | None,
-        typer.Option(metavar="NAME[:UNIT]", help="Angle of the shaft, in rad, for the speed."),
-    ] = None,
-    duty: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="Share of the bus voltage; d:% too.")
-    ] = None,
-    bus: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="Bus voltage, with --duty, in V.")
-    ] = None,
-    unsigned: Annotated[
-        bool, typer.Option("--unsigned", help="The current is a magnitude.")
-    ] = False,
+    time: Annotated[Column, _column("Column of the time, in s.")] = None,
+    voltage: Annotated[Column, _column("Voltage across the motor, in V.")] = None,
+    current: Annotated[Column, _column("Current in A; I:mA for others.")] = None,
+    speed: Annotated[Column, _column("Speed of the shaft, in rad/s; w:rpm for others.")] = None,
+    angle: Annotated[Column, _column("Angle of the shaft, in rad, for the speed.")] = None,
+    duty: Annotated[Column, _column("Share of the bus voltage; d:% too.")] = None,
+    bus: Annotated[Column, _column("Bus voltage, with --duty, in V.")] = None,
+    unsigned: Annotated[bool, flag("--unsigned", "The current is a magnitude.")] = False,
     delimiter: Annotated[
-        str | None,
-        typer.Option(metavar="CHARACTER", help="Text between cells; guessed by default."),
+        str | None, option("CHARACTER", "Text between cells; guessed by default.")
     ] = None,
     out: MaybeOut = None,
     json: Json = None,
@@ -56,6 +38,7 @@ def motor(
     motor.json and a picture. Exit code 1 where the model does not explain the log.
     """
     from slipid.app.bench import read_motor_log
+    from slipid.data.reading.motor_layout import given_columns
     from slipid.report.estimates import show_bench
     from slipid.support.files import write_json
 
@@ -68,9 +51,10 @@ def motor(
         "duty": duty,
         "bus_voltage": bus,
     }
+    given = {c: given_columns(text, c) for c, text in columns.items() if text is not None}
     with Reporter(quiet=quiet) as report:
         report.stage("reading the log")
-        task = read_motor_log(file, _given(columns), delimiter, not unsigned)
+        task = read_motor_log(file, given, delimiter, not unsigned)
         fit = task.fit(report)
         content, written = fit.to_json(), ["motor.json"]
         if out is not None:
@@ -81,11 +65,3 @@ def motor(
             written += [path.name for path in bench_plots(fit, out)]
     emit(json, content, lambda page: show_bench(page, fit, task.columns_used), out, written)
     return 0 if fit.good else 1
-
-
-def _given(columns: dict[str, str | None]) -> "dict[str, GivenColumns]":
-    """Return the columns that options name, by channel; `columns` has the texts of the options."""
-    from slipid.data.reading.motor_layout import given_columns
-
-    given = {channel: text for channel, text in columns.items() if text is not None}
-    return {channel: given_columns(text, channel) for channel, text in given.items()}

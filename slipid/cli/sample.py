@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots
+from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots, option
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -13,17 +13,13 @@ from slipid.support.progress import Reporter
 @for_robots
 def sample(
     out: OutFolder,
-    data: Annotated[
-        Path | None, typer.Option("--data", metavar="DIR", help="Folder of the logs, if it moved.")
-    ] = None,
-    draws: Annotated[
-        int, typer.Option("--draws", min=10, help="Draws kept of each of four ensembles.")
-    ] = 400,
-    most: Annotated[int, typer.Option("--most", min=40, help="Largest number of blocks.")] = 400,
+    data: Annotated[Path | None, option("DIR", "Folder of the logs, if it moved.")] = None,
+    draws: Annotated[int, typer.Option(min=10, help="Draws kept of each of four ensembles.")] = 400,
+    most: Annotated[int, typer.Option(min=40, help="Largest number of blocks.")] = 400,
     block: Annotated[
-        int, typer.Option("--block", min=1, hidden=True, help="Steps that are kept together.")
+        int, typer.Option(min=1, hidden=True, help="Steps that are kept together.")
     ] = 20,
-    seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
@@ -32,6 +28,7 @@ def sample(
     from slipid.support.files import read_json
 
     try:
+        from slipid.app.sample import WRITTEN
         from slipid.app.sample import sample as run
         from slipid.deploy.deploy import write_robot
         from slipid.infer.posterior.blocks import Plan
@@ -39,12 +36,12 @@ def sample(
     except ImportError as error:
         raise DataError(f"{error}; expected `pip install slipid[posterior]`") from error
     with Reporter(quiet=quiet) as report:
-        done = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)
-        robot = write_robot(out, done.posterior)
+        posterior, about = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)
+        robot = write_robot(out, posterior)
         report.stage("drawing")
-        drawn = posterior_plots(done.posterior, out)
+        drawn = posterior_plots(posterior, out)
     content = read_json(out / "identified.json", "what sample wrote")
-    shown = done.posterior.parameters.values(), done.about, content["messages"]
-    written = (*done.written, *robot, *(path.name for path in drawn))
+    shown = posterior.parameters.values(), about, content["messages"]
+    written = (*WRITTEN, *robot, *(path.name for path in drawn))
     emit(json, content, lambda page: show_sample(page, *shown), out, written)
-    return 0 if done.posterior.converged else 1
+    return 0 if posterior.converged else 1
