@@ -16,7 +16,6 @@ since the estimated effect changes with the numbers and compensates them.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
-from functools import reduce
 from types import MappingProxyType
 
 import equinox as eqx
@@ -26,10 +25,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.fitting.noise import SHARED
+from slipid.fitting.session_effects import on_floor
 from slipid.fitting.shared_effects import AXES, SpeedAndLoad, TravelConditions
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import WheelFrame, at_wheels
+from slipid.model.geometry import Geometry, WheelFrame
 from slipid.model.robot import Robot, Validity, steady_states
 from slipid.parameter import Numbers, entries
 from slipid.predict.predictive import ForceBalance
@@ -81,7 +81,7 @@ def robot_record(
 def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numbers, ...]]]:
     """Yield path and draws of every number that varies over draws, except those of the camera."""
     for e in entries(robot):
-        leaf = np.asarray(reduce(getattr, e.leaf, draws))
+        leaf = np.asarray(e.whole(draws))
         rows = leaf if e.index is None else leaf[:, e.index]
         if not e.path.startswith("camera.") and (rows != rows[0]).any():
             yield e.path, tuple(plain(np.asarray(row)) for row in rows)
@@ -89,18 +89,12 @@ def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numb
 
 def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> record.FloorRecord:
     """Return the record of a floor's errors, from the stds of variance components by name."""
-
-    def of(kind: str, default: record.Axes) -> np.ndarray:
-        return np.array(
-            [std.get(f"{kind}.{name}.{a}", d) for a, d in zip(AXES, default, strict=True)]
-        )
-
-    shared = [of(kind, (0.0, 0.0, 0.0)) ** 2 for kind in SHARED]
-    effect = np.sqrt(of("run", (0.01, 0.01, 0.03)) ** 2 + sum(shared))
+    shared = sum(on_floor(std, kind, name) ** 2 for kind in SHARED)
+    effect = np.sqrt(on_floor(std, "run", name, (0.01, 0.01, 0.03)) ** 2 + shared)
     kinds = [std.get(f"current.{name}.{kind}", 0.05) for kind in ("window", "run")]
     return record.FloorRecord(
         name=name,
-        process=axes_of(of("process", (0.005, 0.002, 0.01))),
+        process=axes_of(on_floor(std, "process", name, (0.005, 0.002, 0.01))),
         effect=axes_of(effect),
         current_std=float((kinds[0] ** 2 + kinds[1] ** 2) ** 0.5),
         seen=seen,
@@ -137,23 +131,6 @@ def _turns(frame: WheelFrame) -> Float[np.ndarray, "twist 3"]:
     return np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / np.asarray(frame.base)
 
 
-class _WheelArrays(eqx.Module):
-    """Geometry of the wheels as arrays, so that robots of equal structure share compiled code."""
-
-    frame: WheelFrame
-    forward: Float[Array, "*draw drive 3"]
-    drive_of: tuple[int, ...] = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, robot: Robot) -> "_WheelArrays":
-        shape = robot.geometry
-        return cls(shape.frame(), shape.forward(), shape.drive_of)
-
-    def rim(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """Return the rim speeds of the wheels from those of their drives [m/s]."""
-        return at_wheels(self.drive_of, of_drives)
-
-
 def _circle(
     robot: Robot, load: int, top: float, twists: Float[np.ndarray, "twist 3"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -162,9 +139,8 @@ def _circle(
     Twists are scaled to 0.4 and 0.8 of the highest wheel speed `top` [rad/s]. Each result has the
     shape (floor and twist, drive).
     """
-    forward, radius = (
-        np.asarray(x) for x in (robot.geometry.forward(), robot.geometry.frame().radius)
-    )
+    frame = robot.geometry.frame()
+    forward, radius = np.asarray(frame.forward()), float(frame.radius)
     speed = twists @ forward.T
     speed *= top / np.abs(speed).max()
     floors = len(robot.surfaces.labels)
@@ -228,29 +204,26 @@ def moved_per_metre(
     """
     count, floors = len(draws.body.mass), len(draws.surfaces.labels)
     at, floor, way = (x.ravel() for x in np.indices((count, floors, len(twist))))
-    wheels = jax.tree.map(lambda x: np.asarray(x)[at], _wheel_arrays(draws))
+    frames = jax.tree.map(lambda x: np.asarray(x)[at], jax.vmap(Geometry.frame)(draws.geometry))
     surfaces = jax.tree.map(lambda x: np.asarray(x)[at, floor], draws.surfaces)
     rest, ahead = np.asarray(draws.body.load_share)[at, int(load)], np.asarray(twist)[way]
-    xi = in_blocks(_equilibria, wheels, surfaces, rest, float(speed) * ahead) / float(speed)
+    xi = in_blocks(_equilibria, frames, surfaces, rest, float(speed) * ahead) / float(speed)
     along = (xi[:, :2] * ahead[:, :2]).sum(axis=1)
     across = xi[:, 1] * ahead[:, 0] - xi[:, 0] * ahead[:, 1]
     return np.stack([along, across, xi[:, 2]], axis=-1).reshape(count, floors, -1, 3)
 
 
-_wheel_arrays = eqx.filter_jit(jax.vmap(_WheelArrays.of))
-
-
 @eqx.filter_jit
 def _equilibria(
-    wheels: _WheelArrays, surface: ContactSurface, rest: Array, twist: Array
+    frames: WheelFrame, surface: ContactSurface, rest: Array, twist: Array
 ) -> Float[Array, "row 3"]:
     """Return the twists of robots whose wheels roll as for given twists without slip."""
 
-    def one(wheels: _WheelArrays, surface: ContactSurface, rest: Array, twist: Array) -> Array:
-        rim = wheels.rim(wheels.forward @ twist)
-        return contact.equilibrium(rim, wheels.frame, surface, rest)
+    def one(frame: WheelFrame, surface: ContactSurface, rest: Array, twist: Array) -> Array:
+        rim = frame.at_wheels(frame.forward() @ twist)
+        return contact.equilibrium(rim, frame, surface, rest)
 
-    return jax.vmap(one)(wheels, surface, rest, twist)
+    return jax.vmap(one)(frames, surface, rest, twist)
 
 
 DIRECTIONS = 72
@@ -295,18 +268,15 @@ def _effect_table(
         effect = contact.shared[floor].forecast(rows)
         growth = contact.extrapolation.get(f"{floor}@{load}", 1.0)
         given = np.diagonal(effect.covariance, axis1=1, axis2=2)
-        given = given + _variances(contact, "session", floor)
+        given = given + on_floor(contact.variance, "session", floor)
         corrected = predicted[:, n] - np.einsum("nap,kp->kna", effect.slope, draws - center)
         at = effect.mean + effect.slope @ (center - contact.z)
         mean[n] = -at.reshape(shape[1:])
-        variance = _variances(contact, "run", floor) + growth * (given + spread_of(corrected) ** 2)
+        variance = on_floor(contact.variance, "run", floor) + growth * (
+            given + spread_of(corrected) ** 2
+        )
         left[n] = np.sqrt(variance).reshape(shape[1:])
     return EffectRecord(tuple(_rounded(np.exp(s)) for s in log_speed), _rows(mean), _rows(left))
-
-
-def _variances(contact: ForceBalance, kind: str, floor: str) -> Float[np.ndarray, "3"]:
-    """Return the variances of one kind of effect on a floor, by axis."""
-    return np.array([contact.variance.get(f"{kind}.{floor}.{axis}", 0.0) for axis in AXES])
 
 
 def _rows(grid: _Grid) -> tuple[tuple[tuple[record.Axes, ...], ...], ...]:

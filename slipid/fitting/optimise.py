@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.fitting import likelihood as lk
-from slipid.fitting.hierarchy import effect_variances, pooled
+from slipid.fitting.hierarchy import axis_effects, effect_variances, pooled
 from slipid.fitting.noise import SHARED
 from slipid.fitting.problem import (
     CREEPS,
@@ -158,7 +158,8 @@ def one_round(
     covariance = np.linalg.inv(information)
     if scoring:
         weight, motion = weighed.whitening.weight["motion"], (whole["motion"], jacobian["motion"])
-        found = effect_variances(objective, motion, weight, covariance, np.asarray(log_v))
+        axes = axis_effects(objective, motion, weight, covariance, np.asarray(log_v))
+        found = effect_variances(axes, np.asarray(log_v))
         found[objective.pooled] = pooled(information, z, objective, np.asarray(log_v))
         log_v = jnp.asarray(found)
     std = np.sqrt(np.diag(covariance))

@@ -11,8 +11,7 @@ from slipid.data.runs import Runs
 from slipid.data.windows import windows
 from slipid.fitting import likelihood as lk
 from slipid.infer import slip_curves as curves
-from slipid.model import robot as model
-from slipid.model.robot import Robot, steady_states
+from slipid.model.robot import GRAVITY, Robot, steady_states
 from slipid.parameter import as_numbers
 from slipid.predict.slip_model import body_twist
 
@@ -160,7 +159,7 @@ def by_heading(
 def _borne(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
     """Return predicted currents [A], and torques of the drag along the drive direction [N m]."""
     motor_force = lk.predict(robot, b).motor_force
-    force = robot.surfaces.friction[b.surface] * robot.body.mass * model.GRAVITY
+    force = robot.surfaces.friction[b.surface] * robot.body.mass * GRAVITY
     drag = robot.motor.rolling_drag * motor_force[..., 1]
     torque = robot.geometry.wheel_radius * force[:, None, None] * drag
     return lk.predicted_current(robot, b, motor_force), torque
