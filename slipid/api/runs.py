@@ -16,7 +16,7 @@ from slipid.data.runs import Runs, collect
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.lab.selftest import logs as known
 from slipid.lab.selftest.logs import simulate_logs
-from slipid.model.robot import Robot, motor_current, twist, wheel_torque
+from slipid.model.robot import Robot
 from slipid.report.estimates import show_check
 from slipid.report.page import text_of
 from slipid.support.content import Content
@@ -164,15 +164,16 @@ def _steady(
     robot: Robot, command: Float[Array, "command 3"], floor: Array, load: Array
 ) -> tuple[Array, ...]:
     frame = robot.geometry.frame()
+    standing = robot.standing(frame, floor, load)
 
     def one(row: Float[Array, "3"]) -> tuple[Array, ...]:
-        driven = robot.geometry.forward() @ row / frame.radius
-        speed = robot.geometry.at_wheels(driven)
+        driven = frame.forward() @ row / frame.radius
+        speed = frame.at_wheels(driven)
         direction, stands = jnp.sign(speed), jnp.abs(speed) < 1e-6
-        xi = twist(robot, frame, speed, floor, load)
-        torque = wheel_torque(robot, frame, xi, speed, floor, load)
+        xi = standing.twist(speed)
+        torque = standing.wheel_torque(xi, speed)
         rim = jnp.where(stands, jnp.nan, frame.radius * frame.drive_share * speed)
-        current = motor_current(robot, frame, xi, driven, floor, load) * jnp.sign(driven)
+        current = standing.current(xi, driven) * jnp.sign(driven)
         return xi, speed, 1 - frame.hold @ xi / rim, torque * direction, current
 
     return jax.vmap(one)(command)

@@ -15,8 +15,7 @@ since the estimated effect changes with the numbers and compensates them.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
-from functools import reduce
+from dataclasses import fields, replace
 from types import MappingProxyType
 
 import equinox as eqx
@@ -26,12 +25,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.fitting.noise import SHARED
+from slipid.fitting.session_effects import on_floor
 from slipid.fitting.shared_effects import AXES, SpeedAndLoad, TravelConditions
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import WheelFrame, at_drives, at_wheels
-from slipid.model.motor import Motor
-from slipid.model.robot import GRAVITY, Robot, Validity
+from slipid.model.geometry import Geometry, WheelFrame
+from slipid.model.robot import Robot, Standing, Validity
 from slipid.parameter import entries
 from slipid.predict.predictive import ForceBalance
 from slipid.robot import record
@@ -81,7 +80,7 @@ def robot_record(
 def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numbers, ...]]]:
     """Yield path and draws of every number that varies over draws, except those of the camera."""
     for e in entries(robot):
-        leaf = np.asarray(reduce(getattr, e.leaf, draws))
+        leaf = np.asarray(e.whole(draws))
         rows = leaf if e.index is None else leaf[:, e.index]
         if not e.path.startswith("camera.") and (rows != rows[0]).any():
             yield e.path, tuple(plain(np.asarray(row)) for row in rows)
@@ -89,18 +88,12 @@ def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numb
 
 def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> record.FloorRecord:
     """Return the record of a floor's errors, from the stds of variance components by name."""
-
-    def of(kind: str, default: record.Axes) -> np.ndarray:
-        return np.array(
-            [std.get(f"{kind}.{name}.{a}", d) for a, d in zip(AXES, default, strict=True)]
-        )
-
-    shared = [of(kind, (0.0, 0.0, 0.0)) ** 2 for kind in SHARED]
-    effect = np.sqrt(of("run", (0.01, 0.01, 0.03)) ** 2 + sum(shared))
+    shared = sum(on_floor(std, kind, name) ** 2 for kind in SHARED)
+    effect = np.sqrt(on_floor(std, "run", name, (0.01, 0.01, 0.03)) ** 2 + shared)
     kinds = [std.get(f"current.{name}.{kind}", 0.05) for kind in ("window", "run")]
     return record.FloorRecord(
         name=name,
-        process=axes_of(of("process", (0.005, 0.002, 0.01))),
+        process=axes_of(on_floor(std, "process", name, (0.005, 0.002, 0.01))),
         effect=axes_of(effect),
         current_std=float((kinds[0] ** 2 + kinds[1] ** 2) ** 0.5),
         seen=seen,
@@ -115,9 +108,10 @@ def _load(
     frame, twists = shape.frame(), directions(36)
     if not shape.determines_twist:
         twists = jnp.concatenate([twists, _turns(frame)])
-    wheels, rest = _WheelArrays.of(robot), robot.body.load_share[k]
-    floors, motor, mass = robot.surfaces, robot.motor, robot.body.mass
-    speed, amps, slip = _circle(wheels, floors, rest, motor, mass, jnp.asarray(top), twists)
+    standing = Standing(
+        frame, robot.surfaces, robot.body.load_share[k], robot.motor, robot.body.mass
+    )
+    speed, amps, slip = _circle(standing, jnp.asarray(top), twists)
     curve = np.asarray(_wheel_curve(speed, amps, slip))
     return record.LoadRecord(
         name=name,
@@ -139,56 +133,27 @@ def _turns(frame: WheelFrame) -> Float[Array, "twist 3"]:
     return jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / frame.base
 
 
-class _WheelArrays(eqx.Module):
-    """Geometry of the wheels as arrays, so that robots of equal structure share compiled code."""
-
-    frame: WheelFrame
-    forward: Float[Array, "*draw drive 3"]
-    drive_of: tuple[int, ...] = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, robot: Robot) -> "_WheelArrays":
-        shape = robot.geometry
-        return cls(shape.frame(), shape.forward(), shape.drive_of)
-
-    def rim(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """Return the rim speeds of the wheels from those of their drives [m/s]."""
-        return at_wheels(self.drive_of, of_drives)
-
-
 @eqx.filter_jit
 def _circle(
-    wheels: _WheelArrays,
-    surfaces: ContactSurface,
-    rest: Float[Array, " wheel"],
-    motor: Motor,
-    mass: Array,
-    top: Array,
-    twists: Float[Array, "twist 3"],
+    on: Standing, top: Array, twists: Float[Array, "twist 3"]
 ) -> tuple[Array, Array, Array]:
     """Return wheel speeds [rad/s], currents [A] and slip ratios [1] for some twists.
 
-    Twists are scaled to 0.4 and 0.8 of the highest wheel speed `top` [rad/s]. Each result has the
-    shape (floor, speed and twist, drive).
+    `on` is the robot with all floors, stacked. Twists are scaled to 0.4 and 0.8 of the highest
+    wheel speed `top` [rad/s]. Each result has the shape (floor, speed and twist, drive).
     """
-    frame = wheels.frame
-    speed = twists @ wheels.forward.T / frame.radius
+    frame, forward = on.frame, on.frame.forward()
+    speed = twists @ forward.T / frame.radius
     speed = jnp.stack([0.4 * top, 0.8 * top])[:, None, None] * speed / jnp.max(jnp.abs(speed))
 
     def one(w: Array, floor: ContactSurface) -> tuple[Array, Array]:
-        turned = frame.radius * w
-        rim = wheels.rim(turned)
-        xi = contact.equilibrium(rim, frame, floor, rest)
-        force = floor.friction * mass * GRAVITY * frame.radius
-        where = xi, rim, frame, floor, rest
-        forces = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
-        torque = at_drives(wheels.drive_of, force * motor.opposing_force(forces))
-        amps = motor.current(torque, w)
-        lost = turned - wheels.forward @ xi
-        return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
+        standing, turned = replace(on, floor=floor), frame.radius * w
+        xi = standing.twist(frame.at_wheels(w))
+        lost = turned - forward @ xi
+        return standing.current(xi, w), lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
 
     flat = speed.reshape(-1, speed.shape[-1])
-    amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(surfaces)
+    amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(on.floor)
     return jnp.broadcast_to(flat, amps.shape), amps, slip
 
 
@@ -245,12 +210,13 @@ def moved_per_metre(
         twist: twists of 1 m/s [m/s, m/s, rad/s].
     """
     rest = draws.body.load_share[:, load]
-    return _moved(jax.vmap(_WheelArrays.of)(draws), draws.surfaces, rest, speed, twist)
+    frames = jax.vmap(Geometry.frame)(draws.geometry)
+    return _moved(frames, draws.surfaces, rest, speed, twist)
 
 
 @eqx.filter_jit
 def _moved(
-    wheels: _WheelArrays,
+    frames: WheelFrame,
     surfaces: ContactSurface,
     rest: Float[Array, "draw wheel"],
     speed: Array,
@@ -258,8 +224,8 @@ def _moved(
 ) -> Array:
     """Return the result of `moved_per_metre`; this part is compiled."""
 
-    def one(wheels: _WheelArrays, surfaces: ContactSurface, rest: Array) -> Array:
-        rim, frame = wheels.rim(speed * twist @ wheels.forward.T), wheels.frame
+    def one(frame: WheelFrame, surfaces: ContactSurface, rest: Array) -> Array:
+        rim = frame.at_wheels(speed * twist @ frame.forward().T)
         xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
             surfaces
         )
@@ -267,7 +233,7 @@ def _moved(
         across = xi[..., 1] * twist[:, 0] - xi[..., 0] * twist[:, 1]
         return jnp.stack([along, across, xi[..., 2]], axis=-1) / speed
 
-    return jax.vmap(one)(wheels, surfaces, rest)
+    return jax.vmap(one)(frames, surfaces, rest)
 
 
 DIRECTIONS = 72
@@ -312,18 +278,15 @@ def _effect_table(
         effect = contact.shared[floor].forecast(rows)
         growth = contact.extrapolation.get(f"{floor}@{load}", 1.0)
         given = np.diagonal(effect.covariance, axis1=1, axis2=2)
-        given = given + _variances(contact, "session", floor)
+        given = given + on_floor(contact.variance, "session", floor)
         corrected = predicted[:, n] - np.einsum("nap,kp->kna", effect.slope, draws - center)
         at = effect.mean + effect.slope @ (center - contact.z)
         mean[n] = -at.reshape(shape[1:])
-        variance = _variances(contact, "run", floor) + growth * (given + spread_of(corrected) ** 2)
+        variance = on_floor(contact.variance, "run", floor) + growth * (
+            given + spread_of(corrected) ** 2
+        )
         left[n] = np.sqrt(variance).reshape(shape[1:])
     return EffectRecord(tuple(_rounded(np.exp(s)) for s in log_speed), _rows(mean), _rows(left))
-
-
-def _variances(contact: ForceBalance, kind: str, floor: str) -> Float[np.ndarray, "3"]:
-    """Return the variances of one kind of effect on a floor, by axis."""
-    return np.array([contact.variance.get(f"{kind}.{floor}.{axis}", 0.0) for axis in AXES])
 
 
 def _rows(grid: _Grid) -> tuple[tuple[tuple[record.Axes, ...], ...], ...]:

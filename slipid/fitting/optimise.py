@@ -12,7 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from slipid.fitting import likelihood as lk
-from slipid.fitting.hierarchy import effect_variances, pooled
+from slipid.fitting.hierarchy import axis_effects, effect_variances, pooled
 from slipid.fitting.multi_floor import MULTI_FLOOR_MOTION
 from slipid.fitting.noise import SHARED
 from slipid.fitting.problem import (
@@ -157,7 +157,8 @@ def one_round(
     covariance = np.linalg.inv(information)
     if scoring:
         weight, motion = weighed.whitening.weight["motion"], (whole["motion"], jacobian["motion"])
-        found = effect_variances(objective, motion, weight, covariance, np.asarray(log_v))
+        axes = axis_effects(objective, motion, weight, covariance, np.asarray(log_v))
+        found = effect_variances(axes, np.asarray(log_v))
         found[objective.pooled] = pooled(information, z, objective, np.asarray(log_v))
         log_v = jnp.asarray(found)
     std = np.sqrt(np.diag(covariance))

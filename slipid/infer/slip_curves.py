@@ -12,7 +12,6 @@ from slipid.data.runs import Runs
 from slipid.fitting import likelihood as lk
 from slipid.fitting.noise import travel
 from slipid.model import contact_law as law
-from slipid.model import robot as model
 from slipid.model.contact_law import ContactSurface
 from slipid.model.robot import GRAVITY, Robot, Validity
 from slipid.search_space import Space
@@ -61,11 +60,12 @@ def wheel_states(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
     speed = robot.geometry.at_wheels(lk.wheel_speed(robot, b))
 
     def one(w: Array, surface: Array, load: Array) -> tuple[Array, Array]:
-        xi = model.twist(robot, frame, w, surface, load)
+        standing = robot.standing(frame, surface, load)
+        xi = standing.twist(w)
         rim = frame.radius * w
         active = jnp.sqrt(rim**2 + (frame.roll @ xi) ** 2 + 1e-12)
-        torque = model.wheel_torque(robot, frame, xi, w, surface, load)
-        return torque, (rim * frame.drive_share - frame.hold @ xi) / active
+        slide = rim * frame.drive_share - frame.hold @ xi
+        return standing.wheel_torque(xi, w), slide / active
 
     return speed, *jax.vmap(jax.vmap(one, (0, None, None)))(speed, b.surface, b.load)
 

@@ -11,8 +11,7 @@ from slipid.data.runs import Runs
 from slipid.data.windows import windows
 from slipid.fitting import likelihood as lk
 from slipid.infer import slip_curves as curves
-from slipid.model import robot as model
-from slipid.model.robot import Robot
+from slipid.model.robot import GRAVITY, Robot
 from slipid.predict.slip_model import body_twist
 
 STRAIGHT = 0.98
@@ -159,7 +158,7 @@ def by_heading(
 def _borne(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
     """Return predicted currents [A], and torques of the drag along the drive direction [N m]."""
     motor_force = lk.predict(robot, b).motor_force
-    force = robot.surfaces.friction[b.surface] * robot.body.mass * model.GRAVITY
+    force = robot.surfaces.friction[b.surface] * robot.body.mass * GRAVITY
     drag = robot.motor.rolling_drag * motor_force[..., 1]
     torque = robot.geometry.wheel_radius * force[:, None, None] * drag
     return lk.predicted_current(robot, b, motor_force), torque
@@ -168,5 +167,4 @@ def _borne(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
 @jax.jit
 def _twists(robot: Robot, wheel_speed: Array, surface: Array, load: Array) -> Array:
     frame = robot.geometry.frame()
-    wheels = robot.geometry.at_wheels(wheel_speed)
-    return jax.vmap(lambda w: model.twist(robot, frame, w, surface, load))(wheels)
+    return jax.vmap(robot.standing(frame, surface, load).twist)(frame.at_wheels(wheel_speed))

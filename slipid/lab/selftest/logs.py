@@ -22,7 +22,7 @@ from slipid.data.wheel_signals import interpolate
 from slipid.fitting.shared_effects import AXES
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.model.geometry import omni
-from slipid.model.robot import Robot, build, motor_current, twist
+from slipid.model.robot import Robot, build
 from slipid.model.se2 import compose, path
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
@@ -336,8 +336,9 @@ def _twists(robot: Robot, speed: Array, floor: Array, load: Array) -> tuple[Arra
     frame = robot.geometry.frame()
 
     def one(w: Array, f: Array, s: Array) -> tuple[Array, Array]:
-        xi = twist(robot, frame, robot.geometry.at_wheels(w), f, s)
-        return xi, motor_current(robot, frame, xi, w, f, s)
+        standing = robot.standing(frame, f, s)
+        xi = standing.twist(frame.at_wheels(w))
+        return xi, standing.current(xi, w)
 
     return jax.vmap(jax.vmap(one, (0, None, None)))(speed, floor, load)
 

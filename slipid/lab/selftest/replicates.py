@@ -31,7 +31,7 @@ from slipid.infer.slip_curves import curves, slip_on
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import flat_directions, members
 from slipid.model.robot import Robot
-from slipid.predict.open_loop import chain, contact_increments, corrected
+from slipid.predict.open_loop import chain, contact_increments
 from slipid.predict.slip_model import as_increments
 from slipid.search_space import Choice, Space
 from slipid.support.checkpoint import Checkpoint
@@ -82,7 +82,8 @@ def simulate_windows(
 @jax.jit
 def _predicted(robot: Robot, b: lk.Batch, pose: Array) -> tuple[Array, Array, Array]:
     p = lk.predict(robot, b)
-    return p.increment, lk.predicted_current(robot, b, p.motor_force), corrected(robot, pose)[:, 0]
+    start = lk.corrected(robot, pose)[:, 0]
+    return p.increment, lk.predicted_current(robot, b, p.motor_force), start
 
 
 @jax.jit
