@@ -28,7 +28,7 @@ def map_(
         int | None, option("N", "Number of surfaces to propose.", min=1, max=40)
     ] = None,
     cell: Annotated[
-        float | None, option("M", "Edge of a cell; a pixel's by default.", min=0.0001, max=1)
+        float | None, option("M", "Edge of a cell; a pixel's by default.", min=1e-4, max=1)
     ] = None,
     dictionary: Annotated[
         str, option("NAME", "ArUco dictionary of the robot's marker.")

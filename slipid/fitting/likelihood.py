@@ -129,21 +129,32 @@ def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
     """
     frame = robot.geometry.frame()
 
-    def window(w: Array, near: Array | None, surface: Array, load: Array) -> tuple[Array, Array]:
-        w, standing = frame.at_wheels(w), robot.standing(frame, surface, load)
-        xi = standing.twist(w, near)
-        return xi, frame.at_drives(standing.motor_forces(xi, w).T).T
+    def window(w: Array, near: Array | None, surface: Array, load: Array) -> Array:
+        return robot.standing(frame, surface, load).twist(frame.at_wheels(w), near)
 
-    twist, motor_force = each_window(window, b, wheel_speed(robot, b), near)
-    return Predicted(marker_increments(robot, twist, b.dt, b.session), twist, motor_force)
+    twist = each_window(window, b, wheel_speed(robot, b), near)
+    increment = marker_increments(robot, twist, b.dt, b.session)
+    return Predicted(increment, twist, motor_forces(robot, b, twist))
+
+
+@eqx.filter_jit
+def motor_forces(robot: Robot, b: Batch, twist: Marker) -> MotorForce:
+    """Return the forces each motor works against in every window at given body twists [mu m g]."""
+    frame = robot.geometry.frame()
+
+    def window(w: Array, xi: Array, surface: Array, load: Array) -> Array:
+        force = robot.standing(frame, surface, load).motor_forces(xi, frame.at_wheels(w))
+        return frame.at_drives(force.T).T
+
+    return each_window(window, b, wheel_speed(robot, b), twist)
 
 
 def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | None = None) -> Any:
     """Return the results of function `of` for every window, with axes (segment, window, ...).
 
-    `of` takes the wheel speeds of a window [rad/s], a nearby twist or None, and the indices of its
-    surface and load. It is mapped over one flat axis of all windows: tracing two nested axes takes
-    JAX half as long again.
+    `of` takes the wheel speeds of a window [rad/s], its element of `near` or None, and the indices
+    of its surface and load. It is mapped over one flat axis of all windows: tracing two nested axes
+    takes JAX half as long again.
     """
     segments, windows = b.dt.shape
 

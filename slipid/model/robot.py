@@ -2,11 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from slipid.model import contact, geometry
 from slipid.model.camera import Camera
@@ -16,6 +19,7 @@ from slipid.model.geometry import Geometry, WheelFrame
 from slipid.model.motor import Motor
 from slipid.model.se2 import Planar
 from slipid.parameter import as_numbers, entries, known, parameter
+from slipid.support.blocks import in_blocks
 
 Number = int | float
 GRAVITY = 9.81
@@ -247,3 +251,46 @@ def build(
             sessions=tuple(sessions),
         ),
     )
+
+
+class SteadyStates(NamedTuple):
+    """Steady motions of a robot whose wheels keep given speeds, a row for each.
+
+    Attributes:
+        twist: body twists (vx, vy [m/s], yaw rate [rad/s]).
+        torque: torques of the traction of the wheels [N m].
+        current: signed currents of the motors [A].
+    """
+
+    twist: Float[np.ndarray, "row 3"]
+    torque: Float[np.ndarray, "row wheel"]
+    current: Float[np.ndarray, "row drive"]
+
+
+def steady_states(
+    robot: Robot,
+    wheel_speed: Float[np.ndarray, "row drive"],
+    surface: int | Int[np.ndarray, " row"],
+    load: int | Int[np.ndarray, " row"],
+) -> SteadyStates:
+    """Return the steady motions at wheel speeds of the drives [rad/s].
+
+    `surface` and `load` are indices of the floors and the load set-ups. Nothing is compiled for
+    another number of rows.
+    """
+    places = (np.broadcast_to(np.asarray(x), len(wheel_speed)) for x in (surface, load))
+    return SteadyStates(*in_blocks(partial(_steady_states, robot), wheel_speed, *places))
+
+
+@eqx.filter_jit
+def _steady_states(
+    robot: Robot, wheel_speed: Array, surface: Array, load: Array
+) -> tuple[Array, Array, Array]:
+    frame = robot.geometry.frame()
+
+    def one(w: Array, surface: Array, load: Array) -> tuple[Array, Array, Array]:
+        standing, of_wheels = robot.standing(frame, surface, load), frame.at_wheels(w)
+        xi = standing.twist(of_wheels)
+        return xi, standing.wheel_torque(xi, of_wheels), standing.current(xi, w)
+
+    return jax.vmap(one)(wheel_speed, surface, load)
