@@ -57,7 +57,7 @@ def with_unseen(record: RobotRecord) -> RobotRecord:
     for name, (soft, grip) in zip(names, grid, strict=True):
         factor = {"creep": soft, "roller_drag": DRAG * soft, "friction": grip}
         for quantity, number in middle.items():
-            value = np.exp(factor.get(quantity, 0.0)) * np.asarray(number.value)
+            value = np.asarray(np.exp(factor.get(quantity, 0.0)) * np.asarray(number.value))
             parameters[f"surface.{name}.{quantity}"] = replace(number, value=plain(value))
     process = np.mean([floor.process for floor in record.floors], axis=0)
     current_std = CURRENT_FACTOR * float(np.mean([floor.current_std for floor in record.floors]))
