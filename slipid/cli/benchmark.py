@@ -3,25 +3,18 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from slipid.cli.common import Jobs, Json, Out, Quiet, emit, executor_of, guarded
+from slipid.cli.common import Jobs, Json, Out, Quiet, emit, executor_of, flag, guarded, option
 from slipid.support.progress import Reporter
 
 
 @guarded
 def benchmark(
-    data: Annotated[
-        Path, typer.Option("--data", metavar="DIR", help="Folder of the public data sets.")
-    ],
+    data: Annotated[Path, option("DIR", "Folder of the public data sets.")],
     out: Out = Path("out/benchmark"),
     quick: Annotated[
-        bool,
-        typer.Option("--quick", help="Some of the runs, one fold of headings, given floors."),
+        bool, flag("--quick", "Some of the runs, one fold of headings, given floors.")
     ] = False,
-    rows: Annotated[
-        str | None, typer.Option(metavar="NAMES", help="Rows, by commas; all by default.")
-    ] = None,
+    rows: Annotated[str | None, option("NAMES", "Rows, by commas; all by default.")] = None,
     jobs: Jobs = None,
     json: Json = None,
     quiet: Quiet = False,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, Quiet, emit, guarded
+from slipid.cli.common import Json, Quiet, emit, flag, guarded, option
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -27,57 +27,39 @@ def calibrate(
         list[str] | None,
         typer.Argument(metavar="PICTURE...", help="Pictures of a board: files, folders or globs."),
     ] = None,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="Camera file to write.")
-    ] = Path("camera.json"),
+    out: Annotated[Path, option("FILE", "Camera file to write.")] = Path("camera.json"),
     board: Annotated[
-        str | None, typer.Option(metavar="7x5", help="Squares of the ChArUco board along x and y.")
+        str | None, option("7x5", "Squares of the ChArUco board along x and y.")
     ] = None,
-    square: Annotated[
-        float | None, typer.Option(metavar="M", help="Edge of a square, in m.")
-    ] = None,
-    marker: Annotated[
-        float | None, typer.Option(metavar="M", help="Edge of a marker, in m.")
-    ] = None,
-    dictionary: Annotated[
-        str, typer.Option(metavar="NAME", help="Dictionary of the board's markers.")
-    ] = "4X4_50",
-    legacy: Annotated[
-        bool, typer.Option("--legacy", help="The board was drawn by OpenCV before 4.6.")
-    ] = False,
+    square: Annotated[float | None, option("M", "Edge of a square, in m.")] = None,
+    marker: Annotated[float | None, option("M", "Edge of a marker, in m.")] = None,
+    dictionary: Annotated[str, option("NAME", "Dictionary of the board's markers.")] = "4X4_50",
+    legacy: Annotated[bool, flag("--legacy", "The board was drawn by OpenCV before 4.6.")] = False,
     k3: Annotated[
-        bool, typer.Option("--k3", help="Also fit k3, for wide lenses whose error stays large.")
+        bool, flag("--k3", "Also fit k3, for wide lenses whose error stays large.")
     ] = False,
-    camera: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Camera file with a known lens.")
-    ] = None,
+    camera: Annotated[Path | None, option("FILE", "Camera file with a known lens.")] = None,
     floor: Annotated[
-        Path | None,
-        typer.Option(metavar="PICTURE", help="Picture of the board lying on the floor."),
+        Path | None, option("PICTURE", "Picture of the board lying on the floor.")
     ] = None,
     board_height: Annotated[
-        float,
-        typer.Option(metavar="M", help="Height of the lying board's face above the floor, in m."),
+        float, option("M", "Height of the lying board's face above the floor, in m.")
     ] = 0.0,
     points: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Measured points: u, v, x, y and maybe z.")
+        Path | None, option("CSV", "Measured points: u, v, x, y and maybe z.")
     ] = None,
     size_std: Annotated[
         float | None,
-        typer.Option(
-            metavar="PART", help="Relative std of the board's or tape's size; 0.001 by default."
-        ),
+        option("PART", "Relative std of the board's or tape's size; 0.001 by default."),
     ] = None,
     metres_per_pixel: Annotated[
-        float | None,
-        typer.Option(metavar="M", help="Size of a pixel on the floor, without any calibration."),
+        float | None, option("M", "Size of a pixel on the floor, without any calibration.")
     ] = None,
     lens_height: Annotated[
-        float | None, typer.Option(metavar="M", help="Height of the lens, with --metres-per-pixel.")
+        float | None, option("M", "Height of the lens, with --metres-per-pixel.")
     ] = None,
     turn: Annotated[
-        float | None,
-        typer.Option(metavar="DEG", help="Turn of the world's x and y, with --metres-per-pixel."),
+        float | None, option("DEG", "Turn of the world's x and y, with --metres-per-pixel.")
     ] = None,
     json: Json = None,
     quiet: Quiet = False,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ParamSpec
 
 import typer
+from typer.models import OptionInfo
 
 from slipid.support.errors import DataError
 
@@ -16,25 +17,41 @@ if TYPE_CHECKING:
 
     from slipid.report.page import Page
 
+
+def option(
+    metavar: str,
+    words: str,
+    *names: str,
+    min: float | None = None,
+    max: float | None = None,
+) -> OptionInfo:
+    """Return an option with a value, for an annotation.
+
+    Args:
+        metavar: what the value is, in a word.
+        words: meaning of the option.
+        names: name of the option; by default it follows from that of the parameter.
+        min, max: limits of a number.
+    """
+    made: OptionInfo = typer.Option(*names, metavar=metavar, help=words, min=min, max=max)
+    return made
+
+
+def flag(name: str, words: str) -> OptionInfo:
+    """Return an option without a value, which has no opposite."""
+    made: OptionInfo = typer.Option(name, help=words)
+    return made
+
+
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Config, a TOML file.")]
 OutFolder = Annotated[Path, typer.Argument(metavar="OUT", help="Folder identify wrote.")]
-DataFolder = Annotated[
-    Path, typer.Option("--data", metavar="DIR", help="Folder the globs of the config start from.")
-]
-Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write to.")]
-MaybeOut = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="Folder to write to, if wanted.")
-]
-Load = Annotated[
-    str | None, typer.Option("--load", metavar="NAME", help="Load set-up; the first by default.")
-]
-Jobs = Annotated[
-    int | None, typer.Option("--jobs", min=1, help="Processes at once; by default all cores.")
-]
-Json = Annotated[
-    str | None, typer.Option("--json", metavar="FILE", help="Also write JSON there; - is stdout.")
-]
-Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
+DataFolder = Annotated[Path, option("DIR", "Folder the globs of the config start from.")]
+Out = Annotated[Path, option("DIR", "Folder to write to.")]
+MaybeOut = Annotated[Path | None, option("DIR", "Folder to write to, if wanted.")]
+Load = Annotated[str | None, option("NAME", "Load set-up; the first by default.")]
+Jobs = Annotated[int | None, typer.Option(min=1, help="Processes at once; by default all cores.")]
+Json = Annotated[str | None, option("FILE", "Also write JSON there; - is stdout.")]
+Quiet = Annotated[bool, flag("--quiet", "No progress.")]
 Words = ParamSpec("Words")
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Out, Quiet, executor_of, guarded
+from slipid.cli.common import Out, Quiet, executor_of, guarded, option
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -24,10 +24,10 @@ PARTS = ("fit", "unseen")
 def demo(
     out: Out = Path("demo_out"),
     plant: Annotated[
-        str, typer.Option(metavar="NAME", help="recorded, or mujoco to drive the logs anew.")
+        str, option("NAME", "recorded, or mujoco to drive the logs anew.")
     ] = "recorded",
     seed: Annotated[
-        int | None, typer.Option("--seed", min=0, help="Seed of runs that are driven anew.")
+        int | None, typer.Option(min=0, help="Seed of runs that are driven anew.")
     ] = None,
     quiet: Quiet = False,
 ) -> int:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots
+from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots, option
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -16,37 +16,28 @@ if TYPE_CHECKING:
 def design(
     out: OutFolder,
     parameter: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME", help="Parameter to sharpen; * and ? allowed; may be repeated."
-        ),
+        list[str] | None, option("NAME", "Parameter to sharpen; * and ? allowed; may be repeated.")
     ] = None,
     predict: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="FLOOR[@LOAD][:SPEED[:HEADING]]",
-            help="Prediction to sharpen, as gray:0.3:45 (m/s, deg); may be repeated.",
+        option(
+            "FLOOR[@LOAD][:SPEED[:HEADING]]",
+            "Prediction to sharpen, as gray:0.3:45 (m/s, deg); may be repeated.",
         ),
     ] = None,
     runs: Annotated[int, typer.Option(min=1, max=1000, help="How many to propose.")] = 12,
     headings: Annotated[
-        str | None, typer.Option(metavar="LIST", help="Headings of candidates, as 0,45,90, in deg.")
+        str | None, option("LIST", "Headings of candidates, as 0,45,90, in deg.")
     ] = None,
     speeds: Annotated[
-        str | None, typer.Option(metavar="LIST", help="Speeds of candidates, as 0.1,0.2, in m/s.")
+        str | None, option("LIST", "Speeds of candidates, as 0.1,0.2, in m/s.")
     ] = None,
-    turns: Annotated[
-        str | None, typer.Option(metavar="LIST", help="Turning rates, as -40,0,40, in deg/s.")
-    ] = None,
+    turns: Annotated[str | None, option("LIST", "Turning rates, as -40,0,40, in deg/s.")] = None,
     distance: Annotated[
-        float | None, typer.Option(metavar="M", help="Length of a run, in m; as driven by default.")
+        float | None, option("M", "Length of a run, in m; as driven by default.")
     ] = None,
-    floor: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Floor that can be driven on.")
-    ] = None,
-    load: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Load set-up that can be driven.")
-    ] = None,
+    floor: Annotated[list[str] | None, option("NAME", "Floor that can be driven on.")] = None,
+    load: Annotated[list[str] | None, option("NAME", "Load set-up that can be driven.")] = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:

@@ -1,11 +1,12 @@
 """`slipid export`: write an identified robot to a folder in forms that robots can load."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, Load, Quiet, emit, for_robots
+from slipid.cli.common import Json, Load, Quiet, emit, flag, for_robots, option
 from slipid.support.progress import Reporter
 
 
@@ -19,27 +20,19 @@ def export(
         ),
     ],
     to: Annotated[
-        str, typer.Option("--to", metavar="FORMS", help="By commas: c, ros2, stablehlo, table.")
+        str, option("FORMS", "By commas: c, ros2, stablehlo, table.")
     ] = "c,ros2,stablehlo,table",
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write to.")
-    ] = None,
+    out: Annotated[Path | None, option("DIR", "Folder to write to.")] = None,
     controller: Annotated[
-        str, typer.Option(metavar="NAME", help="Row of the trial: contact, slip_odometry, ...")
+        str, option("NAME", "Row of the trial: contact, slip_odometry, ...")
     ] = "contact",
-    path: Annotated[
-        str, typer.Option(metavar="NAME", help="Path that the example in C follows.")
-    ] = "rectangle",
-    speed: Annotated[float, typer.Option(metavar="M_S", help="Along the path, in m/s.")] = 0.2,
+    path: Annotated[str, option("NAME", "Path that the example in C follows.")] = "rectangle",
+    speed: Annotated[float, option("M_S", "Along the path, in m/s.")] = 0.2,
     load: Load = None,
-    floors: Annotated[
-        str, typer.Option(metavar="NAMES", help="Floors there are, by commas; all by default.")
-    ] = "",
-    map: Annotated[
-        Path | None, typer.Option("--map", metavar="FILE", help="Floor map, for contact_map.")
-    ] = None,
+    floors: Annotated[str, option("NAMES", "Floors there are, by commas; all by default.")] = "",
+    map: Annotated[Path | None, option("FILE", "Floor map, for contact_map.")] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Only check a folder that was exported before.")
+        bool, flag("--check", "Only check a folder that was exported before.")
     ] = False,
     json: Json = None,
     quiet: Quiet = False,
@@ -75,14 +68,7 @@ def export(
         robot = read_robot(source, load, _names(floors))
         options = ExportOptions(_names(to), controller, path, speed, map)
         done = run(robot, out, options, report, ROWS)
-    content = {
-        "schema": "slipid.export/1",
-        "folder": str(done.folder),
-        "robot": done.robot,
-        "forms": list(done.forms),
-        "files": list(done.files),
-        "warnings": list(done.warnings),
-    }
+    content = {"schema": "slipid.export/1", **asdict(done), "folder": str(done.folder)}
     emit(json, content, lambda page: show_export(page, done))
     return 0
 

@@ -5,9 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, guarded
+from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, flag, guarded, option
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -23,11 +21,10 @@ def identify(
     data: DataFolder,
     out: Out,
     profile: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PATH", help="Also profile a number's likelihood; may be repeated."),
+        list[str] | None, option("PATH", "Also profile a number's likelihood; may be repeated.")
     ] = None,
     anyway: Annotated[
-        bool, typer.Option("--anyway", help="Fit logs and config that do not go together.")
+        bool, flag("--anyway", "Fit logs and config that do not go together.")
     ] = False,
     json: Json = None,
     quiet: Quiet = False,

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, Out, Quiet, emit, guarded
+from slipid.cli.common import Json, Out, Quiet, emit, guarded, option
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -20,30 +20,24 @@ PROPOSAL = "palette.toml"
 def map_(
     image: Annotated[Path, typer.Argument(metavar="IMAGE", help="Picture of the floor, or video.")],
     out: Out,
-    camera: Annotated[
-        Path, typer.Option(metavar="FILE", help="Camera that `slipid calibrate` wrote.")
-    ],
+    camera: Annotated[Path, option("FILE", "Camera that `slipid calibrate` wrote.")],
     config: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Surfaces by colour or by points, region, masks."),
+        Path | None, option("FILE", "Surfaces by colour or by points, region, masks.")
     ] = None,
     surfaces: Annotated[
-        int | None, typer.Option(metavar="N", min=1, max=40, help="Number of surfaces to propose.")
+        int | None, option("N", "Number of surfaces to propose.", min=1, max=40)
     ] = None,
     cell: Annotated[
-        float | None,
-        typer.Option(metavar="M", min=1e-4, max=1, help="Edge of a cell; a pixel's by default."),
+        float | None, option("M", "Edge of a cell; a pixel's by default.", min=1e-4, max=1)
     ] = None,
     dictionary: Annotated[
-        str, typer.Option(metavar="NAME", help="ArUco dictionary of the robot's marker.")
+        str, option("NAME", "ArUco dictionary of the robot's marker.")
     ] = "4X4_50",
     robot_radius: Annotated[
-        float,
-        typer.Option(metavar="M", min=0, max=10, help="Radius of the robot, which is masked."),
+        float, option("M", "Radius of the robot, which is masked.", min=0, max=10)
     ] = 0.2,
     marker_height: Annotated[
-        float,
-        typer.Option(metavar="M", min=0, max=10, help="Height of the marker above the floor."),
+        float, option("M", "Height of the marker above the floor.", min=0, max=10)
     ] = 0.25,
     json: Json = None,
     quiet: Quiet = False,

@@ -1,18 +1,16 @@
 """`slipid motor`: identify a motor on a bench from a single log file, without a config."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, MaybeOut, Quiet, emit, guarded
+from slipid.cli.common import Json, MaybeOut, Quiet, emit, flag, guarded, option
 from slipid.support.progress import Reporter
 
 Column = str | None
-
-
-def _column(words: str) -> object:
-    return typer.Option(metavar="NAME[:UNIT]", help=words)
+_column = partial(option, "NAME[:UNIT]")
 
 
 @guarded
@@ -25,12 +23,9 @@ def motor(
     angle: Annotated[Column, _column("Angle of the shaft, in rad, for the speed.")] = None,
     duty: Annotated[Column, _column("Share of the bus voltage; d:% too.")] = None,
     bus: Annotated[Column, _column("Bus voltage, with --duty, in V.")] = None,
-    unsigned: Annotated[
-        bool, typer.Option("--unsigned", help="The current is a magnitude.")
-    ] = False,
+    unsigned: Annotated[bool, flag("--unsigned", "The current is a magnitude.")] = False,
     delimiter: Annotated[
-        str | None,
-        typer.Option(metavar="CHARACTER", help="Text between cells; guessed by default."),
+        str | None, option("CHARACTER", "Text between cells; guessed by default.")
     ] = None,
     out: MaybeOut = None,
     json: Json = None,

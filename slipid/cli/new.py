@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import guarded
+from slipid.cli.common import flag, guarded, option
 
 if TYPE_CHECKING:
     from slipid.app.new.config_text import NewConfig
@@ -21,15 +21,11 @@ def _text(words: str, panel: str | None = None) -> object:
 
 @guarded
 def new(
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Config to write.")] = Path(
-        "robot.toml"
-    ),
+    out: Annotated[Path, option("FILE", "Config to write.")] = Path("robot.toml"),
     log: Annotated[
         Path | None,
-        typer.Option(
-            "--from",
-            metavar="LOG",
-            help="A log (CSV, Parquet, bag) or a folder of logs to read; asks nothing.",
+        option(
+            "LOG", "A log (CSV, Parquet, bag) or a folder of logs to read; asks nothing.", "--from"
         ),
     ] = None,
     drive: Annotated[Text, _text("omni, mecanum, skid, differential or general.")] = None,
@@ -57,9 +53,9 @@ def new(
     ] = None,
     rollers_deg: Annotated[Text, _text("General: rollers to these, as 45,none.", _WHEELS)] = None,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Ask nothing: take defaults, marked in the config.")
+        bool, flag("--yes", "Ask nothing: take defaults, marked in the config.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False,
+    force: Annotated[bool, flag("--force", "Overwrite.")] = False,
 ) -> int:
     """Write a commented config for your robot: asks for it, or reads its logs (--from)."""
     # Every argument that is a text describes the robot.

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import guarded
+from slipid.cli.common import guarded, option
 
 
 @guarded
@@ -18,10 +18,7 @@ def reference(
         ),
     ] = None,
     config: Annotated[
-        Path | None,
-        typer.Option(
-            "--config", metavar="CONFIG", help="Parameters of this robot and its choices."
-        ),
+        Path | None, option("CONFIG", "Parameters of this robot and its choices.")
     ] = None,
 ) -> int:
     """Print every key, channel, unit and parameter, with its default and its meaning (Markdown)."""

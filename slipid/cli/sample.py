@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots
+from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots, option
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -13,17 +13,13 @@ from slipid.support.progress import Reporter
 @for_robots
 def sample(
     out: OutFolder,
-    data: Annotated[
-        Path | None, typer.Option("--data", metavar="DIR", help="Folder of the logs, if it moved.")
-    ] = None,
-    draws: Annotated[
-        int, typer.Option("--draws", min=10, help="Draws kept of each of four ensembles.")
-    ] = 400,
-    most: Annotated[int, typer.Option("--most", min=40, help="Largest number of blocks.")] = 400,
+    data: Annotated[Path | None, option("DIR", "Folder of the logs, if it moved.")] = None,
+    draws: Annotated[int, typer.Option(min=10, help="Draws kept of each of four ensembles.")] = 400,
+    most: Annotated[int, typer.Option(min=40, help="Largest number of blocks.")] = 400,
     block: Annotated[
-        int, typer.Option("--block", min=1, hidden=True, help="Steps that are kept together.")
+        int, typer.Option(min=1, hidden=True, help="Steps that are kept together.")
     ] = 20,
-    seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:

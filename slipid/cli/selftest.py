@@ -5,17 +5,14 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import ConfigFile, Json, Out, Quiet, emit, for_robots
+from slipid.cli.common import ConfigFile, Json, Out, Quiet, emit, for_robots, option
 from slipid.support.progress import Reporter
 
 
 @for_robots
 def selftest(
     config: ConfigFile,
-    data: Annotated[
-        Path | None,
-        typer.Option("--data", metavar="DIR", help="Logs whose wheel motion is taken, if any."),
-    ] = None,
+    data: Annotated[Path | None, option("DIR", "Logs whose wheel motion is taken, if any.")] = None,
     out: Out = Path("selftest_out"),
     replicates: Annotated[int, typer.Option(min=1, help="Number of simulated experiments.")] = 8,
     seed: Annotated[int, typer.Option(min=0, help="Seed of truths and noise.")] = 0,

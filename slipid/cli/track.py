@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, Quiet, emit, guarded
+from slipid.cli.common import Json, Quiet, emit, guarded, option
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -22,49 +22,35 @@ def track(
             metavar="VIDEO|FOLDER|DEVICE", help="Video, pictures, or a camera's number."
         ),
     ],
-    camera: Annotated[
-        Path, typer.Option(metavar="FILE", help="Camera that slipid calibrate wrote.")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Poses: .csv or .parquet.")],
+    camera: Annotated[Path, option("FILE", "Camera that slipid calibrate wrote.")],
+    out: Annotated[Path, option("FILE", "Poses: .csv or .parquet.")],
     marker_size: Annotated[
-        float | None, typer.Option(metavar="M", help="Edge of the marker's black square, in m.")
+        float | None, option("M", "Edge of the marker's black square, in m.")
     ] = None,
     marker_height: Annotated[
-        float | None, typer.Option(metavar="M", help="Height of the marker above the floor, in m.")
+        float | None, option("M", "Height of the marker above the floor, in m.")
     ] = None,
     marker_yaw: Annotated[
-        float,
-        typer.Option(metavar="DEG", help="Angle of its top edge, counter-clockwise from ahead."),
+        float, option("DEG", "Angle of its top edge, counter-clockwise from ahead.")
     ] = 0.0,
-    dictionary: Annotated[
-        str, typer.Option(metavar="NAME", help="Dictionary of the marker.")
-    ] = "4X4_50",
+    dictionary: Annotated[str, option("NAME", "Dictionary of the marker.")] = "4X4_50",
     id: Annotated[
         int | None, typer.Option(min=0, help="Number of the marker; the only one by default.")
     ] = None,
     targets: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Several markers, boards or robots, instead of these."),
+        Path | None, option("FILE", "Several markers, boards or robots, instead of these.")
     ] = None,
-    fps: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Frame rate; by default the video's times.")
-    ] = None,
+    fps: Annotated[float | None, option("HZ", "Frame rate; by default the video's times.")] = None,
     times: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Times of the frames: CSV of frame, time.")
+        Path | None, option("FILE", "Times of the frames: CSV of frame, time.")
     ] = None,
-    region: Annotated[
-        str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="Only this part, in pixels.")
-    ] = None,
+    region: Annotated[str | None, option("X0,Y0,X1,Y1", "Only this part, in pixels.")] = None,
     seconds: Annotated[
-        float | None,
-        typer.Option(metavar="S", help="Duration of a recording from a device, which needs it."),
+        float | None, option("S", "Duration of a recording from a device, which needs it.")
     ] = None,
-    preview: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also draw one frame, to check by eye.")
-    ] = None,
+    preview: Annotated[Path | None, option("FILE", "Also draw one frame, to check by eye.")] = None,
     preview_frame: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=0, help="Which frame; by default the first with a pose."),
+        int | None, option("N", "Which frame; by default the first with a pose.", min=0)
     ] = None,
     json: Json = None,
     quiet: Quiet = False,

@@ -5,7 +5,18 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Jobs, Json, Load, OutFolder, Quiet, emit, executor_of, for_robots
+from slipid.cli.common import (
+    Jobs,
+    Json,
+    Load,
+    OutFolder,
+    Quiet,
+    emit,
+    executor_of,
+    flag,
+    for_robots,
+    option,
+)
 from slipid.support.progress import Reporter
 
 
@@ -13,30 +24,22 @@ from slipid.support.progress import Reporter
 def trial(
     out: OutFolder,
     plant: Annotated[
-        str, typer.Option(metavar="NAME", help="testsite (MuJoCo), or twin: the fit itself.")
+        str, option("NAME", "testsite (MuJoCo), or twin: the fit itself.")
     ] = "testsite",
-    map: Annotated[
-        Path | None, typer.Option("--map", metavar="FILE", help="Floor map; else made of patches.")
-    ] = None,
+    map: Annotated[Path | None, option("FILE", "Floor map; else made of patches.")] = None,
     told_map: Annotated[
         Path | None,
-        typer.Option(
-            "--told-map",
-            metavar="FILE",
-            help="Map that is given to controllers with a map; the true one by default.",
-        ),
+        option("FILE", "Map that is given to controllers with a map; the true one by default."),
     ] = None,
-    controllers: Annotated[
-        str | None, typer.Option(metavar="NAMES", help="By commas; all by default.")
-    ] = None,
+    controllers: Annotated[str | None, option("NAMES", "By commas; all by default.")] = None,
     path: Annotated[
-        str, typer.Option(metavar="NAME", help="rectangle, circle, eight, or turning: it turns.")
+        str, option("NAME", "rectangle, circle, eight, or turning: it turns.")
     ] = "rectangle",
-    speed: Annotated[float, typer.Option(metavar="M_S", help="Along the path, in m/s.")] = 0.2,
+    speed: Annotated[float, option("M_S", "Along the path, in m/s.")] = 0.2,
     starts: Annotated[int, typer.Option(min=1, max=99, help="Poses to start from.")] = 20,
     load: Load = None,
     tuned_gains: Annotated[
-        bool, typer.Option("--tuned-gains", help="Even where they are no better than by hand.")
+        bool, flag("--tuned-gains", "Even where they are no better than by hand.")
     ] = False,
     jobs: Jobs = None,
     json: Json = None,

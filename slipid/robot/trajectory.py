@@ -91,9 +91,10 @@ class Path(eqx.Module):
 
     def after_rest(self, seconds: float) -> "Path":
         """Return the path preceded by a rest of this duration at its start."""
-        count = round(seconds / STEP)
-        still = jnp.broadcast_to(self.rows[0].at[3:].set(0.0), (count, 6))
-        return Path(jnp.concatenate([still, self.rows]), self.marks + count * STEP, self.corners)
+        count, rows = round(seconds / STEP), np.asarray(self.rows)
+        still = np.tile(rows[0] * [1, 1, 1, 0, 0, 0], (count, 1))
+        marks = jnp.asarray(np.asarray(self.marks) + count * STEP)
+        return Path(jnp.asarray(np.concatenate([still, rows])), marks, self.corners)
 
 
 def waypoints(

@@ -8,7 +8,6 @@ files lie beside it.
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from re import sub
 
@@ -17,7 +16,7 @@ from jaxtyping import Float
 
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.reading.column_names import ColumnMeaning, meaning_of
-from slipid.data.reading.layout import PER_WHEEL, Layout
+from slipid.data.reading.layout import GROUPS, PER_WHEEL, TURNS, Layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.reader import read_logs
 from slipid.data.reading.table_format import TableFormat, TableNumbers, format_of
@@ -26,8 +25,6 @@ from slipid.support.errors import DataError
 _ORDER = ("fl", "fr", "ml", "mr", "rl", "rr", "l", "r")
 """Labels of wheels in the order in which the types of drive count wheels."""
 _QUATERNION = ("x", "y", "z", "w")
-WHEEL_MOTION = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
-"""Channels with the motion of the wheels, the most informative first."""
 _LEAST_TICKS = 50
 """Magnitude above which whole numbers of a position are taken for ticks."""
 
@@ -86,9 +83,7 @@ def channels_in(numbers: TableNumbers) -> Channels:
         notes.append(f"not used, a second column: {', '.join(also)}")
     kept, dropped = _consistent(list(first.values()))
     used = {at for one in kept for at in one.columns}
-    unused = [
-        name for at, name in enumerate(format.names) if name and at in meanings and at not in used
-    ]
+    unused = [format.names[at] for at in meanings if at not in used]
     return kept, unused, notes + dropped
 
 
@@ -113,11 +108,10 @@ def rank(label: str) -> tuple[int, int, str]:
 
     Known labels are in the order of the drives, numbers in their order after them.
     """
-    if label in _QUATERNION:
-        return (0, _QUATERNION.index(label), label)
-    if label in _ORDER:
-        return (1, _ORDER.index(label), label)
-    return (2, int(label) if label.isdecimal() else 0, label)
+    known = (*_QUATERNION, *_ORDER)
+    if label in known:
+        return (0, known.index(label), label)
+    return (1, int(label) if label.isdecimal() else 0, label)
 
 
 def _resolved(found: list[FileChannel]) -> list[FileChannel]:
@@ -157,7 +151,7 @@ def _stays_up(values: Float[np.ndarray, "row column"]) -> bool:
 
 def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
     """Return the channels with the same wheels as the motion, and a line about each other one."""
-    turns = [one for name in WHEEL_MOTION for one in found if one.channel == name]
+    turns = [one for name in TURNS for one in found if one.channel == name]
     per_wheel = turns or [one for one in found if one.channel in PER_WHEEL]
     count = len(per_wheel[0].columns) if per_wheel else 0
     labels = set(per_wheel[0].labels) if per_wheel else set()
@@ -205,7 +199,7 @@ def unnamed_channels(numbers: TableNumbers) -> Channels:
         put("time", time)
     if whole:
         put("wheel_ticks", *whole)
-    for channel, at in zip(("pose_x", "pose_y", "pose_heading"), others, strict=False):
+    for channel, at in zip(GROUPS["pose"], others, strict=False):
         if len(others) >= 3:
             put(channel, at)
     used = {at for one in found for at in one.columns}
@@ -277,8 +271,8 @@ def globs_of(root: Path, kind: FileKind, others: Sequence[Path]) -> list[str]:
 
 def _narrow_globs(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> list[str]:
     """Return a common glob for some files, or several narrower ones if it matches other files."""
-    glob = common_glob(paths)
-    if not any(_glob_matches(glob, path) for path in theirs):
+    glob, depth = common_glob(paths), len(paths[0].parts)
+    if not any(path.match(glob) and len(path.parts) == depth for path in theirs):
         return [glob]
     folders = {path.parent for path in paths}
     if len(folders) > 1:
@@ -296,13 +290,6 @@ def floor_of(glob: str) -> str:
     """Return the name of the floor of a glob's files: that of the top folder, or "floor"."""
     first, *others = glob.split("/")
     return first if len(others) > 1 and "*" not in first else "floor"
-
-
-def _glob_matches(glob: str, path: PurePosixPath) -> bool:
-    parts = glob.split("/")
-    return len(parts) == len(path.parts) and all(
-        fnmatchcase(name, part) for name, part in zip(path.parts, parts, strict=True)
-    )
 
 
 def _common_name(names: tuple[str, ...]) -> str:

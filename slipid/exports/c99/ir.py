@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Cells = np.ndarray
 """Numpy array of objects, each of which is a `Cell`."""
-LANES = 7
+LOOP_FROM = 7
 """Length from which on an axis of an array becomes a loop in C."""
 
 
@@ -194,6 +194,11 @@ def kind_of_value(value: Value) -> Kind:
     return value.kind if isinstance(value, Array) else kind_of(value.dtype)
 
 
+def axis_of(value: Value) -> int | None:
+    """Return the axis of a value's lanes; None without lanes."""
+    return value.axis if isinstance(value, Array) else None
+
+
 def cells_of(shape: Sequence[int], cells: Sequence[Cell]) -> Cells:
     """Return cells in row-major order as an array of this shape."""
     out = np.empty(len(cells), dtype=object)
@@ -211,7 +216,7 @@ def varies(cell: Cell) -> bool:
 
 def longest(shape: Sequence[int]) -> int | None:
     """Return the axis that becomes a loop by default, the longest; None where all are short."""
-    if max(shape, default=0) < LANES:
+    if max(shape, default=0) < LOOP_FROM:
         return None
     return max(range(len(shape)), key=lambda axis: (shape[axis], axis))
 
@@ -240,3 +245,11 @@ def read_at(memory: Memory, places: np.ndarray, index: Variable | None = None) -
 def in_memory(memory: Memory, shape: tuple[int, ...]) -> Array:
     """Return the array of this shape that memory holds in row-major order."""
     return read_at(memory, numbered(shape))
+
+
+def holds(memory: Memory, value: Value) -> bool:
+    """Return whether memory already holds a value in row-major order."""
+    if not isinstance(value, Array):
+        return False
+    like = in_memory(memory, value.shape)
+    return value.axis == like.axis and bool((value.cells == like.cells).all())

@@ -12,11 +12,12 @@ Source: a small version of simulation-based calibration (Talts et al. 2018, arXi
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from pydantic import TypeAdapter
 
 from slipid.app.config import Config
@@ -33,9 +34,10 @@ from slipid.infer.verdicts.unidentified import flat_directions, members
 from slipid.model.camera import Camera
 from slipid.model.motor import Motor
 from slipid.model.robot import Robot
-from slipid.predict.open_loop import chain, contact_increments, corrected
+from slipid.predict.open_loop import chain, contact_increments
 from slipid.predict.slip_model import as_increments
 from slipid.search_space import Choice, Space
+from slipid.support.blocks import in_blocks
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -57,10 +59,14 @@ def simulate_windows(
         std: std of each variance component by its name (`fit.noise`); a name without a floor holds
             for every floor without an entry, and missing components are zero.
     """
-    b = lk.batch(w, truth)
-    increment, amps, start = (np.asarray(x) for x in _predicted(truth, b, w.pose))
+
+    def predicted(which: Int[np.ndarray, " segment"]) -> tuple[Array, Array, Array]:
+        return _predicted(truth, lk.batch(w.segments(which), truth), w.pose[which])
+
+    increment, amps, start = in_blocks(predicted, np.arange(len(w)), block=32)
     steps = increment + _process(truth, w, rng, std)
-    pose = np.array(_logged(truth.camera, chain(start, steps)))
+    path = np.asarray(chain(start, steps))
+    pose = in_blocks(partial(_logged, truth.camera), path.reshape(-1, 3)).reshape(path.shape)
     pose[..., :2] += rng.normal(size=(*pose.shape[:2], 2)) * std.get("camera.place", 0.0)
     pose[..., 2] += rng.normal(size=pose.shape[:2]) * std.get("camera.heading", 0.0)
     each = _component_std(std, w, "current", "window")[:, None, None]
@@ -84,10 +90,11 @@ def simulate_windows(
 @jax.jit
 def _predicted(robot: Robot, b: lk.Batch, pose: Array) -> tuple[Array, Array, Array]:
     p = lk.predict(robot, b)
-    return p.increment, lk.predicted_current(robot, b, p.motor_force), corrected(robot, pose)[:, 0]
+    start = lk.corrected(robot, pose)[:, 0]
+    return p.increment, lk.predicted_current(robot, b, p.motor_force), start
 
 
-_logged = jax.jit(jax.vmap(jax.vmap(Camera.logged, (None, 0)), (None, 0)))
+_logged = jax.jit(jax.vmap(Camera.logged, (None, 0)))
 _voltage = jax.jit(Motor.voltage)
 
 

@@ -288,7 +288,7 @@ def test_the_distance_from_a_path_is_from_its_line():
 
 
 def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
-    tuned = Gains.at(TUNED)
+    tuned = Gains(*TUNED)
     robot = DeployedRobot.of(replace(deployed.record, gains=tuned_for("as_built")))
     for row in ROWS.values():
         if row.law is not None:  # it takes a second to make
@@ -302,7 +302,7 @@ def test_rows_of_the_paper_have_its_loop_and_ours_the_tuned_gains(deployed):
 
 def test_a_law_stands_in_place_of_the_pose_loop(deployed):
     """With gains that are all the same the law of Goswami and Padhy is the pose loop."""
-    gains = Gains.at((1.5, 1.5, 0.0, 0.0, 0.0))
+    gains = Gains(1.5, 1.5, 0.0, 0.0, 0.0)
     loop = Controller(deployed, gains)
     same, other = (
         Controller(deployed, gains, law=GoswamiPadhy(jnp.full(3, k))) for k in (1.5, 3.0)

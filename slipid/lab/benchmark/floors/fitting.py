@@ -37,7 +37,7 @@ from scipy.optimize import least_squares
 
 from slipid.lab.systems.floors.interface import FloorSignals
 from slipid.model.motor import Motor
-from slipid.model.robot import Robot, motor_current, twist
+from slipid.model.robot import Robot
 
 FITTED = ("friction", "creep", "rolling_resistance")
 """Names of the parameters that are fitted for every floor; the fit is in their logarithms."""
@@ -189,11 +189,12 @@ def shown(
     robot: Robot, number: Array, speed: Float[Array, "row drive"]
 ) -> tuple[Float[Array, "row drive"], Float[Array, " row"]]:
     """Return the modelled ammeter readings [A] and yaw rates [rad/s] at wheel speeds on a floor."""
-    frame, load = robot.geometry.frame(), jnp.zeros((), int)
+    frame = robot.geometry.frame()
+    standing = robot.standing(frame, number, jnp.zeros((), int))
 
     def one(w: Array) -> tuple[Array, Array]:
-        xi = twist(robot, frame, robot.geometry.at_wheels(w), number, load)
-        return motor_current(robot, frame, xi, w, number, load), xi[2]
+        xi = standing.twist(frame.at_wheels(w))
+        return standing.current(xi, w), xi[2]
 
     return jax.vmap(one)(speed)
 
