@@ -5,13 +5,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from slipid.lab.benchmark.scores import FoldScore, RunScore
 from slipid.lab.benchmark.slipid_rows import NAME
+from slipid.support.content import Content
 
 MOST_NAMED_ROWS = 4
 """Largest number of tied rows that a sentence names."""
@@ -32,7 +33,7 @@ class MeanInterval(NamedTuple):
     high: float
 
 
-RowSummary = dict[str, Any]
+RowSummary = Content
 """Row of a method in one protocol of one data set, in the form of benchmark.json.
 
 Values that are not listed are means of the attribute of `RunScore` with the same name

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from slipid.lab.benchmark.summary import Bootstrap, mean_interval
+from slipid.support.content import Content
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Answer:
     probability: float
 
 
-Accuracies = dict[str, Any]
+Accuracies = Content
 """Accuracy of a classifier after the first seconds of every stretch, in the form of benchmark.json.
 
 - seconds: length of the signals used [s].
@@ -42,7 +42,7 @@ Accuracies = dict[str, Any]
 
 Of `accuracy`, `balanced` and `behind` there is the value and its interval (`MeanInterval`).
 """
-ClassifierTable = dict[str, Any]
+ClassifierTable = Content
 """Table of all classifiers on one set of runs, in the form of benchmark.json.
 
 - about: description of the runs.
