@@ -25,6 +25,8 @@ LONG = (
     *("test_result", "test_trial"),
 )
 """Files that take longest, the longest first."""
+TOGETHER = {"test_cli": "small", "test_crossing": "small", "test_folds": "small"}
+"""Files whose fits have the same structure run in one process: it compiles them once."""
 MANY = 1_000_000
 """Objects that were made since garbage was collected, from which on it is again."""
 MOST_MB = 1300.0
@@ -124,6 +126,10 @@ def pytest_collection_modifyitems(items):
     """Files that take longest come first, so that two workers end together."""
     place = {name: k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: place.get(item.path.stem, len(LONG)))
+    for item in items:
+        file = item.path.relative_to(ROOT).as_posix()
+        group = "api" if item.path.parent.name == "api" else TOGETHER.get(item.path.stem, file)
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture(scope="module", autouse=True)

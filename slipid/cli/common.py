@@ -22,8 +22,8 @@ def option(
     metavar: str,
     words: str,
     *names: str,
-    min: float | None = None,
-    max: float | None = None,
+    min: int | float | None = None,
+    max: int | float | None = None,
 ) -> OptionInfo:
     """Return an option with a value, for an annotation.
 
