@@ -122,8 +122,9 @@ def pytest_configure(config):
         jax.config.update("jax_disable_most_optimizations", plain.lower() in ("1", "true", "yes"))
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Files that take longest come first, so that two workers end together."""
+    """Files that take longest come first, so that two workers end together; xdist reads marks."""
     place = {name: k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: place.get(item.path.stem, len(LONG)))
     for item in items:
