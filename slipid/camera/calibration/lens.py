@@ -141,7 +141,7 @@ def fit_lens(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> Lens
     poses = [Pose(np.ravel(r), np.ravel(t)) for r, t in zip(fit[3], fit[4], strict=True)]
     finite = np.isfinite(np.concatenate([parameters_of(lens), *(pose.shift for pose in poses)]))
     if not finite.all():
-        raise indeterminate("the fit of the lens does not end at numbers")
+        raise indeterminate("the fit of the lens diverges")
     return _with_covariance(lens, list(views), poses)
 
 
