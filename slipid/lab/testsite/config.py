@@ -93,7 +93,7 @@ def plan(path: Path, text: str) -> SimulationPlan:
     """
     mapping = mapping_of(path, text)
     surfaces = mapping.get("surfaces", {})
-    if isinstance(surfaces, dict):  # keys that the config leaves out keep slipid's own values
+    if isinstance(surfaces, dict):  # keys that the config omits keep their default values
         known = {
             name: {**asdict(SURFACES[name]), **given}
             for name, given in surfaces.items()

@@ -605,7 +605,7 @@ def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
         DataError, match=r"another load set-up \(far\), not for as_built; leave out"
     ):
         check_gains(tmp_path, other)
-    with pytest.raises(DataError, match="it has no tuned gains; leave out --tuned-gains"):
+    with pytest.raises(DataError, match="it has no tuned gains; omit --tuned-gains"):
         check_gains(tmp_path, deployed)
 
 
