@@ -88,7 +88,7 @@ def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numb
 
 
 def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> record.FloorRecord:
-    """Return the record of a floor's errors, from the stds of variance components by name."""
+    """Return the record of a floor's errors, from the stds of variance components keyed by name."""
     shared = sum(on_floor(std, kind, name) ** 2 for kind in SHARED)
     effect = np.sqrt(on_floor(std, "run", name, (0.01, 0.01, 0.03)) ** 2 + shared)
     kinds = [std.get(f"current.{name}.{kind}", 0.05) for kind in ("window", "run")]

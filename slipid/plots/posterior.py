@@ -78,7 +78,7 @@ def pair_figure(found: Posterior) -> Figure:
 
 
 PICTURES = {"intervals": interval_figure, "pairs": pair_figure}
-"""Functions that draw the pictures of a posterior, by name."""
+"""Functions that draw the pictures of a posterior, keyed by name."""
 
 
 def curved_pairs(z: np.ndarray) -> list[tuple[int, int]]:

@@ -18,7 +18,7 @@ CLOSED = ConfigDict(extra="forbid")
 Positive = Annotated[float, Field(gt=0, strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, strict=True, allow_inf_nan=False)]
 Part = Annotated[float, Field(ge=0, lt=1)]
-"""Share of a whole, at least 0 and below 1 [1]."""
+"""Fraction of a whole, at least 0 and below 1 [1]."""
 Model = TypeVar("Model")
 Step = str | int
 """Step of a location in a TOML file: the key of a table, or the index in a list."""

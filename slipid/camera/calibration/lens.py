@@ -25,8 +25,8 @@ exceeds it for one corner in 10^7."""
 HARMLESS_PX = 0.3
 """Residual below which no view or corner is excluded, since it is harmless [pixel]."""
 MOST_VIEWS_EXCLUDED = 0.25
-"""Largest share of the views that may be excluded; if more do not fit, it is not clear which ones
-are right [1]."""
+"""Largest fraction of the views that may be excluded; if more do not fit, it is not clear which
+ones are right [1]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ LEAST_TO_DROP = 6
 LEAST_TO_TEST = 5
 """Number of points below which the fit cannot show which of them is bad."""
 MOST_POINTS_EXCLUDED = 0.25
-"""Largest share of the points that may be excluded [1]."""
+"""Largest fraction of the points that may be excluded [1]."""
 TWIN_RATIO = 2.0
 """Ratio of the errors of two poses below which the points do not clearly decide between them
 [1]."""
@@ -31,7 +31,7 @@ STEP_IN_STDS = 0.01
 """Step of numerical derivatives, in stds of the variable [1]."""
 GRID_POINTS = 5
 INNER_SHARE = 0.8
-"""Share of the picture's width and height in which lengths on the floor are compared [1]."""
+"""Fraction of the picture's width and height in which lengths on the floor are compared [1]."""
 
 
 @dataclass(frozen=True, eq=False)

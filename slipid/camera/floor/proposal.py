@@ -33,7 +33,7 @@ SEPARATE_FROM = 7.0
 """Smallest distance of colours of patches that are proposed as two surfaces [units of CIELAB]. It
 is small, since users can easily give two proposed surfaces one name, but not easily split one."""
 LEAST_PART = 0.002
-"""Share of the floor below which a patch is too small to propose a surface [1]."""
+"""Fraction of the floor below which a patch is too small to propose a surface [1]."""
 LIGHTNESS_WEIGHT = 0.8
 """Weight of a difference of lightness relative to one of a or b [1]; it is below 1 since shading
 changes lightness."""

@@ -24,7 +24,7 @@ indistinguishable [spreads within a surface].
 If one surface is given two names, the two differ by about 3.2, since the noise is divided in two.
 """
 MOST_UNKNOWN = 1 / 3
-"""Largest share of the requested floor that may be unknown in a good map [1]."""
+"""Largest fraction of the requested floor that may be unknown in a good map [1]."""
 MOST_NAMED = 3
 """Number of patches of low confidence that are reported one by one, the largest first."""
 WEAK_CONFIDENCE = 1.0
@@ -56,7 +56,7 @@ class PictureMap:
     proposal: str | None
 
     def share(self, k: int) -> float:
-        """Return the share of the known floor that surface number `k` covers [1]."""
+        """Return the fraction of the known floor that surface number `k` covers [1]."""
         return float((self.labels == k).sum() / max(1, int((self.labels >= 0).sum())))
 
     def to_json(self) -> Content:

@@ -23,7 +23,7 @@ from slipid.camera.opencv import Labels, Mask, cv2
 
 MOST_ROUNDS = 10
 STEADY_SHARE = 3e-4
-"""Share of cells that change their surface in a round below which learning ends [1]."""
+"""Fraction of cells that change their surface in a round below which learning ends [1]."""
 COARSE_CELLS = 25_000
 """Approximate number of cells of the low resolution picture from which surfaces are learnt."""
 MOST_SAMPLES = 5_000

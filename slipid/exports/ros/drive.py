@@ -25,8 +25,8 @@ from slipid.robot.deployed import DeployedRobot
 LARGEST_DIFFERENCE = 0.05
 """Largest difference of kinematics up to which a controller still fits a robot.
 
-It is the error of a rim speed as a share of the body's speed [1], the speed being that of points on
-the base radius where the body turns on the spot."""
+It is the error of a rim speed as a fraction of the body's speed [1], the speed being that of points
+on the base radius where the body turns on the spot."""
 CORNERS = ("front_left", "front_right", "rear_right", "rear_left")
 
 

@@ -68,7 +68,7 @@ class SimulationPlan:
         hash: hash of the config and of the map files it names.
         content: content of the config.
         site: robot, sensors and surfaces.
-        maps: maps of floors with several surfaces, by name.
+        maps: maps of floors with several surfaces, keyed by name.
         runs: name and program of each run.
         filmed: names of the runs that are filmed.
     """

@@ -82,9 +82,9 @@ def minimise(
     swarm: Swarm,
     seed: int = 0,
 ) -> tuple[Float[np.ndarray, " n"], list[float]]:
-    """Return the best point that a swarm finds in a box, and the smallest cost so far per iteration.
+    """Return the best point that a swarm finds in a box, and how the smallest cost so far fell.
 
-    The first of these costs is that of the start. The same seed gives the same results.
+    It is given for the start and after each iteration. The same seed gives the same results.
 
     Args:
         cost: function to minimise.

@@ -17,7 +17,7 @@ from slipid.support.errors import DataError
 
 
 def refuse_unknown_to_site(floor: FloorMap, load: str, wheels: int) -> None:
-    """Raise `DataError` if the test site lacks the load set-up, a surface or this count of wheels."""
+    """Raise `DataError` if the test site lacks a surface, the load set-up or so many wheels."""
     robot, other = Site().robot, "With --plant twin the identified model is driven itself"
     has = len(robot.wheel_azimuths_deg)
     if wheels != has:

@@ -34,7 +34,7 @@ class AfterSeconds:
     Attributes:
         seconds: length of the signals used [s].
         stretches: number of stretches.
-        accuracy: share of the stretches in which the most probable floor is the true one.
+        accuracy: fraction of the stretches in which the most probable floor is the true one.
         balanced: mean over floors of the accuracy on each floor.
         behind: accuracy less that of slipid on the same resampled runs; None for slipid itself.
         by_floor: accuracy on each floor.
@@ -60,7 +60,7 @@ class ClassifierRow:
         settings: settings picked by cross-validation in each fold, in words.
         numbers: number of fitted parameters, median over folds.
         after: accuracy after each time.
-        said: confusion table after the longest time: `said[true][named]` is the share of the
+        said: confusion table after the longest time: `said[true][named]` is the fraction of the
             stretches on the true floor in which a floor was named [%].
         fit_s: time of one fit, median over folds [s].
         tune_s: time to pick settings, median over folds [s].
@@ -136,7 +136,7 @@ def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> AfterSe
 
 
 def confusion(answers: Sequence[Answer], seconds: float) -> dict[str, dict[str, float]]:
-    """Return the share of answers that name each floor, by true floor, after `seconds` s [%]."""
+    """Return the fraction of answers that name each floor, by true floor, after `seconds` s [%]."""
     mine = [a for a in answers if a.seconds == seconds]
     names = sorted({a.floor for a in mine} | {a.named for a in mine})
     table: dict[str, dict[str, float]] = {}
