@@ -48,7 +48,7 @@ def _tuned_gains(by: Literal["swarm", "gradient"]) -> tuple[float, ...]:
     own = STEP * np.arange(len(rows))
     reference = np.stack([np.interp(times, own, column) for column in rows.T], axis=1)
     task = TuningTask(
-        reference, np.array(TUNING_STARTS), actuators.command_shares(), actuators.lag_gain, PERIOD
+        reference, np.array(TUNING_STARTS), actuators.command_weights(), actuators.lag_gain, PERIOD
     )
     return tuple((by_swarm(task) if by == "swarm" else by_gradient(task)).tolist())
 

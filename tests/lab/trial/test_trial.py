@@ -155,7 +155,7 @@ def test_way_points_are_refused_with_the_reason():
         reference.rectangle(speed=-0.2)
     with pytest.raises(ValueError, match="twice in a row"):
         reference.waypoints([(0.0, 0.0), (0.0, 0.0)])
-    with pytest.raises(ValueError, match="each another than the last"):
+    with pytest.raises(ValueError, match="each different from the last"):
         reference.curve([(0.0, 0.0), (0.0, 0.0)])
     with pytest.raises(ValueError, match="expected both positive"):
         reference.circle(speed=0.0)
