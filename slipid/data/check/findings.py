@@ -4,7 +4,7 @@ A finding says what is wrong or could not be checked, and which key of the confi
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from math import isclose, pi
 from typing import Literal
 
@@ -55,13 +55,7 @@ class Finding:
 
     def to_json(self) -> Content:
         """Return the finding in the form in which `check.json` has it."""
-        return {
-            "kind": self.kind,
-            "severity": self.severity,
-            "found": self.found,
-            "remedy": self.remedy,
-            "runs": list(self.runs),
-        }
+        return asdict(self) | {"runs": list(self.runs)}
 
 
 def listed(names: Sequence[str]) -> str:

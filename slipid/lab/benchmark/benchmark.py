@@ -3,7 +3,6 @@
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict
 from itertools import zip_longest
 from operator import methodcaller
 
@@ -152,8 +151,5 @@ def _set(
         "over": data.source.over,
         "runs": len(data.logged) + (0 if data.crossing is None else len(data.crossing)),
         "hash": data.job.data_hash,
-        "protocols": {
-            protocol: {row: asdict(one) for row, one in found.items()}
-            for protocol, found in protocols.items()
-        },
+        "protocols": protocols,
     }

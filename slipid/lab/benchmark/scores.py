@@ -198,11 +198,10 @@ class FoldScore(Generic[Scored]):
         def median(name: str) -> float:
             return float(np.median([getattr(fold, name) for fold in folds]))
 
-        absent = next((fold.absent for fold in folds if fold.absent), "")
+        if absent := next((fold.absent for fold in folds if fold.absent), ""):
+            return cls(absent=absent, failed=any(fold.failed for fold in folds))
         return cls(
-            runs=() if absent else tuple(run for fold in folds for run in fold.runs),
-            absent=absent,
-            failed=any(fold.failed for fold in folds),
+            runs=tuple(run for fold in folds for run in fold.runs),
             numbers=int(median("numbers")),
             tune_s=median("tune_s"),
             fit_s=median("fit_s"),

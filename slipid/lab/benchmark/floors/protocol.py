@@ -11,7 +11,7 @@ the robot moves in at least half of its rows up to that time.
 import abc
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
@@ -20,7 +20,6 @@ from jaxtyping import Int
 
 from slipid.lab.benchmark.floors.result import (
     Answer,
-    ClassifierRow,
     ClassifierTable,
     after_seconds,
     confusion,
@@ -220,26 +219,28 @@ def table_of(
     if not first:
         raise ValueError("; ".join(f"{name}: {one.absent}" for name, one in done.items()))
     rival = done[reference].runs if reference in done else ()
-    rows = []
-    for name, one in done.items():
-        if one.absent:
-            rows.append(ClassifierRow(name, absent=one.absent))
-            continue
-        row = ClassifierRow(
-            name,
-            settings=tuple(fold.settings for fold in folds[name]),
-            numbers=one.numbers,
-            after=after_seconds(one.runs, None if name == reference else rival or None),
-            said=confusion(one.runs, max(settings.seconds)),
-            fit_s=one.fit_s,
-            tune_s=one.tune_s,
-            row_us=one.step_us,
-        )
-        rows.append(row)
+    rows = [
+        {
+            "name": name,
+            "settings": [fold.settings for fold in folds[name]],
+            "numbers": one.numbers,
+            "after": after_seconds(one.runs, None if name == reference else rival or None),
+            "said": confusion(one.runs, max(settings.seconds)) or None,
+            "fit_s": one.fit_s,
+            "tune_s": one.tune_s,
+            "row_us": one.step_us,
+            "absent": one.absent,
+        }
+        for name, one in done.items()
+    ]
     floor = [a.floor for a in first if a.seconds == min(settings.seconds)]
-    chance = max(floor.count(name) for name in set(floor)) / len(floor)
-    names = tuple(sorted({run.floor for run in runs}))
-    return ClassifierTable(about, len({run.name for run in runs}), names, chance, tuple(rows))
+    return {
+        "about": about,
+        "runs": len({run.name for run in runs}),
+        "floors": sorted({run.floor for run in runs}),
+        "chance": max(floor.count(name) for name in set(floor)) / len(floor),
+        "rows": rows,
+    }
 
 
 @dataclass(frozen=True)
@@ -289,7 +290,7 @@ class FloorTask(abc.ABC):
         found = kept.load_json(self.name)
         if found is None or "failed" in found or any(row["absent"] for row in found["rows"]):
             try:
-                kept.save_json(self.name, asdict(self.make()))
+                kept.save_json(self.name, self.make())
             except Exception as error:  # a task that fails does not stop the others
                 kept.save_json(self.name, {"failed": FoldScore.of_error(error).absent})
         return self.name

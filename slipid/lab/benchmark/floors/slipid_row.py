@@ -192,23 +192,18 @@ def _scatter(
     robot: Robot, runs: Sequence[FloorSignals], spec: RobotSpec
 ) -> Float[np.ndarray, "kind floor"]:
     """Return the std of current residuals in each kind of motion on every floor [A]."""
-    count = len(BEND_RATIOS) + 1
-    std = np.ones((count, len(robot.surfaces.labels)))
+    count, std = len(BEND_RATIOS) + 1, []
     for k, floor in enumerate(robot.surfaces.labels):
-        speed, current, kind = [], [], []
+        rows = []
         for run in (run for run in runs if run.floor == floor):
             take = np.flatnonzero(run.moving)
             take = take[:: max(1, len(take) // MOST_ROWS)]
-            speed.append(run.speed[take])
-            current.append(run.current[take])
-            kind.append(kinds(run, spec)[take])
-        off = currents_off(robot, k, np.concatenate(speed), np.concatenate(current))
-        squares, of_kind = (off**2).mean(axis=1), np.concatenate(kind)
-        for n in range(count):
-            mine = squares[of_kind == n]
-            shared = SHARED_ROWS * squares.mean()
-            std[n, k] = np.sqrt((mine.sum() + shared) / (len(mine) + SHARED_ROWS))
-    return std
+            rows.append((run.speed[take], run.current[take], kinds(run, spec)[take]))
+        speed, current, kind = map(np.concatenate, zip(*rows, strict=True))
+        squares = (currents_off(robot, k, speed, current) ** 2).mean(axis=1)
+        total, rows_of = np.bincount(kind, squares, count), np.bincount(kind, minlength=count)
+        std.append(np.sqrt((total + SHARED_ROWS * squares.mean()) / (rows_of + SHARED_ROWS)))
+    return np.stack(std, axis=1)
 
 
 def _filter_rows(
