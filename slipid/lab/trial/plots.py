@@ -1,4 +1,4 @@
-"""Picture of a trial: the paths of every controller over the floor, and their errors."""
+"""Figure of a trial: the paths of every controller over the floor, and their errors."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +19,7 @@ Paths = Mapping[str, np.ndarray]
 TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
 """Colours of surfaces, in the order of the map's surfaces."""
 FAINT = SERIES[4]
-"""Colour of the paths from all starts but one, which is orange."""
+"""Colour of the paths from all starts but the highlighted one, which is orange."""
 ERRORS = {
     "closure_error_median": "closure error [mm]",
     "cross_track_rmse": "cross-track rms [mm]",
@@ -30,17 +30,17 @@ ERRORS = {
 def trial_plot(
     content: Content, paths: Paths, wanted: np.ndarray, floor: FloorMap, path: Path
 ) -> Path:
-    """Write a picture of a trial and return its file.
+    """Write a figure of a trial and return its file.
 
-    For every controller it shows the paths from all starts, moved to one start, with the run from
-    a typical start over the map; bars show medians of errors.
+    For every controller it shows the paths from all starts, moved to a common start pose, and
+    highlights the run from a typical start over the map; bars show medians of errors.
 
     Args:
         content: content of trial.json.
-        paths: true poses (step, 3) by name of the run, `CONTROLLER/startNN`.
+        paths: true poses (step, 3), keyed by name of the run, `CONTROLLER/startNN`.
         wanted: positions on the reference path (row, 2) [m].
         floor: map of the floor.
-        path: file of the picture.
+        path: file of the figure.
     """
     names = list(content["summary"])
     rows = -(-len(names) // 3)
@@ -59,7 +59,7 @@ def trial_plot(
 
 
 def _verdict(content: Content) -> str:
-    """Return a text that names the controller with the smallest closure error, if it is clear."""
+    """Return a title that names the controller with the smallest closure error, if one is best."""
     best = content["closes_best"]
     if best is None:
         return f"{', '.join(content['not_told_apart'])} are not distinguished"
