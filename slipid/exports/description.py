@@ -98,7 +98,7 @@ LIMITS: Mapping[str, tuple[str, str]] = {
 
 
 def gains_origin(robot: DeployedRobot) -> str:
-    """Return sentences about the origin of a robot's gains and about the limits, not identified."""
+    """Return sentences about the origin of a robot's gains and limits, which are not identified."""
     limits = "Limits are the defaults of slipid: put in those of your motors and supply."
     tuned = robot.record.gains
     if tuned is None:

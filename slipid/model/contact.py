@@ -72,7 +72,7 @@ def _damped(balance: Balance, xi: Planar) -> Planar:
     damping = jnp.asarray(_DAMPING)
     tried = jax.vmap(merit)(damping)
     best = jnp.argmin(tried)
-    # where all wheels slide, forces hardly depend on the twist and Newton's step leads far away
+    # where all wheels slide, forces depend little on the twist and Newton's step leads far away
     stuck = (tried[best] >= before) & (before > _ROUNDING)
     return jax.tree.map(partial(jnp.where, stuck), balance.chord(xi), less(damping[best]))
 
@@ -181,7 +181,7 @@ def settle(
     Args:
         start: twists [m/s, m/s, rad/s].
         rim: rim speeds, the same on all floors (wheel,) or by column (wheel, floors) [m/s].
-        on: how the robot stands on each combination of floors, arrays (wheel, floors).
+        on: stance of the robot on each combination of floors, arrays (wheel, floors).
         plain: J^+, body twist without slip per rim speed.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Pictures of single wheels: slip over torque, and motor current over predicted traction."""
+"""Figures of single wheels: slip over torque, and motor current over predicted traction."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,10 +17,10 @@ from slipid.plots.motion import named
 SIDEWAYS_COLOUR = "#35B779"
 """Colour of the curve of a wheel whose sideways speed equals its rim speed; dots use it too."""
 AT_REST = 0.05
-"""Ratio of a wheel's speed to that of the fastest wheel up to which it counts as at rest."""
+"""Largest ratio of a wheel's speed to that of the fastest wheel at which it counts as at rest."""
 TOO_SLOW = 0.3
-"""Ratio of a wheel's speed to that of the fastest wheel up to which its slip is not drawn, since it
-would be too uncertain."""
+"""Largest ratio of a wheel's speed to that of the fastest wheel at which its slip is too uncertain
+to be drawn."""
 
 
 def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:
@@ -125,7 +125,7 @@ def wheel_curve(
         slip: slip of the wheel along its drive direction [1].
         sideways: ratio of the wheel's sideways speed to its rim speed [1].
         wheel_speed: speed of the wheel [rad/s].
-        share: share of the weight on the wheel.
+        share: fraction of the weight on the wheel.
 
     Source: `slipid.model.contact_law`.
     """
@@ -185,7 +185,7 @@ def _amps(
     ax: Axes, measured: MeasuredWindows, mine: np.ndarray, wheel: int, top: float
 ) -> PathCollection:
     assert measured.amps is not None
-    # wheels at rest are left out: their gear holds them, which the motor model does not describe
+    # omit wheels at rest: their gear holds them, which the motor model does not describe
     speed, fastest = measured.wheel_speed[:, wheel], np.abs(measured.wheel_speed).max(axis=1)
     mine = mine & (np.abs(speed) > AT_REST * fastest)
     speed = speed[mine]

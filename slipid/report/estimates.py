@@ -1,4 +1,4 @@
-"""Tables of parameters before and after a fit and beside the truth, and of prediction errors."""
+"""Tables of parameters before and after a fit, with true values, and of prediction errors."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -228,7 +228,7 @@ def compared(fit: "Fit", truth: Content) -> list[TruthRow]:
 
 
 def show_truth(page: Page, fit: "Fit", truth: Content) -> None:
-    """Write estimates beside true values, and how many intervals contain the truth."""
+    """Write estimates next to true values, and how many intervals contain the truth."""
     rows = compared(fit, truth)
     columns = ("parameter", "truth", "identified", "unit", "90 % interval", "truth in it", "")
     made = table(columns, right=("truth", "identified"))

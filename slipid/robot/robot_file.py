@@ -174,13 +174,13 @@ def _content(path: Path) -> dict[str, object]:
 
 
 def _refused(word: str) -> None:
-    raise ValueError(f"{word} is no number")
+    raise ValueError(f"{word} is not a number")
 
 
 def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
     content = dict(pairs)
     if len(content) < len(pairs):
-        raise ValueError("a key stands there twice")
+        raise ValueError("a key occurs twice")
     return content
 
 
@@ -218,7 +218,7 @@ def check_record(record: RobotRecord) -> None:
 
 
 def geometry_of(record: RobotRecord) -> Geometry:
-    """Return the geometry of a record's wheels, with fitted numbers at their start values."""
+    """Return the geometry of a record's wheels, with fitted parameters at their start values."""
     plain = Geometry(**vars(record.wheels))
     return replace(
         plain, drive_offset=jnp.zeros(plain.wheels), radius_deviation=jnp.zeros(plain.drives)

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 STEP = 0.02
 """Time between two rows of a path [s]."""
 FULL_SPEED_M, WAIT_M = 0.02, 0.12
-"""Distance of the robot from its reference up to which a path keeps its speed, and distance from
-which it waits; in between it slows down linearly [m]."""
+"""Distances of the robot from its reference below which a path keeps its speed, and above which it
+stops and waits; in between it slows down linearly [m]."""
 LONGEST = 0.5
 """Largest time step by which a path advances [s]."""
 
@@ -36,7 +36,7 @@ class Path(eqx.Module):
         return (len(self.rows) - 1) * STEP
 
     def at(self, time: Float[Array, ""] | float) -> Float[Array, "6"]:
-        """Return pose and rates at a time of the path [s]; beyond an end they are those at it."""
+        """Return pose and rates at a time of the path [s]; outside it, those of the nearer end."""
         place = jnp.clip(jnp.asarray(time) / STEP, 0.0, len(self.rows) - 1.000001)
         low = jnp.floor(place).astype(jnp.int32)
         high, part = jnp.minimum(low + 1, len(self.rows) - 1), place - low
@@ -172,7 +172,7 @@ def curve(
     p = np.asarray(places, float)
     length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p, axis=0).T))])
     if len(p) < 2 or np.diff(length).min() < 1e-9:
-        raise ValueError("a curve's places; expected two or more, each another than the last")
+        raise ValueError("places of a curve; expected two or more, each different from the last")
     distance, rate = _trapezoid(float(length[-1]), speed, acceleration, pause)
     distance, rate = np.append(0.0, distance), np.append(0.0, rate)
     place = np.stack([np.interp(distance, length, x) for x in p.T], axis=1)

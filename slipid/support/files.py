@@ -70,14 +70,14 @@ def _plain(value: object) -> object:
         return value.tolist()
     if isinstance(value, Path):
         return value.as_posix()
-    raise TypeError(f"{type(value).__name__} does not go into JSON")
+    raise TypeError(f"{type(value).__name__} cannot be written as JSON")
 
 
 def read_json(path: Path, what: str) -> Any:
     """Return the content of a JSON file that slipid wrote.
 
     Raises:
-        DataError: the file is missing or not JSON; the message has `what` was expected.
+        DataError: the file is missing or not JSON; the message names `what` was expected.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))

@@ -7,7 +7,7 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 EVERY_S = 2.0
-"""Least time between two plain lines about one stage [s]."""
+"""Shortest time between two plain lines about one stage [s]."""
 MEMORY_S = 3600.0
 """Time over which the speed of progress is averaged for the remaining time [s]; it is long, since a
 step of a fit may take minutes."""
@@ -61,7 +61,7 @@ class Reporter:
             self.line(f"{name} ...")
 
     def note(self, what: str) -> None:
-        """Show a text about the current activity beside the bar; without a bar, do nothing."""
+        """Show a text about the current activity next to the bar; without a bar, do nothing."""
         if self._task is not None:
             self._bars.update(self._task, what=what)
 

@@ -36,7 +36,7 @@ def test_a_changed_byte_is_reported_with_its_file(folder, name):
 
 def test_added_and_lost_files_are_reported(folder):
     (folder / "c/src/more.c").write_text("int y;\n")
-    with pytest.raises(DataError, match=r"more\.c: not there when the folder was written"):
+    with pytest.raises(DataError, match=r"more\.c: added after the folder was written"):
         check_folder(folder)
     (folder / "c/src/slipid.c").unlink()
     with pytest.raises(DataError, match=r"slipid\.c: No such file"):
@@ -118,7 +118,7 @@ def test_a_folder_that_was_cut_short_can_be_written_again(folder, monkeypatch):
 def test_what_a_killed_process_left_is_cleared(folder):
     for name in ("c/src/.slipid.c.0123abcd", f".{SUMS}.89abcdef"):
         (folder / name).write_text("a par")
-    with pytest.raises(DataError, match="not there when the folder was written"):
+    with pytest.raises(DataError, match="added after the folder was written"):
         check_folder(folder)
     write_folder(folder, CONTENT)
     assert sorted(check_folder(folder)) == sorted(CONTENT)

@@ -47,7 +47,7 @@ USES: Mapping[str, str] = {
     "slipid_parameters.yaml": "their declaration for generate_parameter_library: types, "
     "descriptions with verdicts, validators; the defaults are the numbers themselves",
 }
-"""Use of each file, by name, without the files for single floors."""
+"""Use of each file, keyed by name, without the files for single floors."""
 _FLOOR = (
     "covariances of the drive controller and process noise of `robot_localization.yaml` on this "
     "floor: give it after those files, it overrides them"

@@ -48,7 +48,7 @@ def tuned(method: SlipModel, runs: Sequence[Run], spec: RobotSpec, kind: str) ->
     With each setting, the method is fitted without a part of the runs and scored on that part. The
     part is chosen by the protocol's kind of split where the training runs allow it. The score is
     the mean error, averaged with equal weights of floors: that of the end point relative to the
-    path length, or that of the energy, as `SlipModel.aim` says. A setting with which the method
+    path length or that of the energy, see `SlipModel.aim`. A setting with which the method
     cannot be fitted has the worst score. All training runs are used, since settings that are best
     for fewer runs are too cautious. For a method that is fitted floor by floor, one fit to all runs
     together is also tried, with the best settings, and used if it has the smaller loss.

@@ -96,7 +96,7 @@ class FoldTask:
         return self.name
 
     def rows(self) -> dict[tuple[str, str], FoldScore[RunScore]]:
-        """Return the scores in the checkpoint, by protocol and row."""
+        """Return the scores in the checkpoint, keyed by protocol and row."""
         kept = checkpoint_of(self, fit=False)
         found = {key: kept.load_json("_".join(key)) for key in keys_of(self)}
         return {key: FoldScore.of_json(one) for key, one in found.items() if one is not None}
@@ -158,7 +158,7 @@ class FoldData:
     Attributes:
         data: the data set.
         fit: slipid's fit, or an empty score with the reason why there is none.
-        training: training runs, whose signals tell the floor.
+        training: training runs, whose signals name the floor.
         batches: held-out runs, in batches with equal numbers of steps.
         held_out: logs of the held-out runs.
     """

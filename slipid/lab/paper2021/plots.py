@@ -132,7 +132,7 @@ def _draw_track(axes: Axes, track: SquareTrack) -> None:
     axes.plot(*xy.T, color=colour, lw=2)
     side = xy[: track.file.side_frames]
     axes.plot(*side.T, color=colour, lw=6, alpha=0.4, label="first side")
-    # arrows are 160 mm of path apart: at equal times, they would overlap where the robot stands
+    # arrows are 160 mm of path apart: at equal times, they would overlap while the robot rests
     travel = np.cumsum(np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T))
     every = np.searchsorted(travel, np.arange(80.0, travel[-1], 160.0))
     # logged headings are 90 deg ahead of right-handed ones on the floor

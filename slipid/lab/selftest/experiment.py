@@ -36,9 +36,9 @@ as small as its standard deviations say. A parameter that fails one of them was 
 unless it counts as not recovered anyway.
 """
 LEAST_CONVERGED = 0.75
-"""Smallest share of the replicates' fits that must converge for a successful self test."""
+"""Smallest fraction of the replicates' fits that must converge for a successful self test."""
 VERDICT_ORDER = ("identified", "weak", "not_identified", "at_bound")
-"""Verdicts of a fit; of equally frequent ones, the last in this order counts."""
+"""Verdicts of a fit; if several are equally frequent, the last one in this order is reported."""
 
 
 def selftest(
@@ -127,7 +127,7 @@ def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
     paths = [e.path for e in problem.space.free] + [e.path for e in ratios]
     given = config.content.selftest.wanted
     patterns = ["surface.*.creep"]
-    if problem.robot.geometry.determines_twist:  # other drives hardly show where the weight is
+    if problem.robot.geometry.determines_twist:  # other drives depend little on load
         patterns += ["surface.*.roller_drag", "robot.load_share@*"]
     patterns += ["surface.*.friction/motor.back_emf"] if w.has_current else []
     patterns += ["motor.resistance", "motor.back_emf"] if w.has_current and w.has_voltage else []
@@ -147,7 +147,7 @@ def summary(replicates: Sequence[Replicate], wanted: Sequence[str]) -> Content:
     Returns:
         Content of selftest.json: errors, coverage, verdict and recovery of each of the
         `parameters` (ratios included); errors of `curves` and `predictions` by floor; `failed`, the
-        wanted parameters that were not recovered; `recovered`, True if there are none of these and
+        required parameters that were not recovered; `recovered`, True if there are none, and if
         enough fits converged.
     """
     first = replicates[0]

@@ -32,7 +32,7 @@ from slipid.support.blocks import in_blocks
 
 
 def true_numbers(robot: Robot) -> dict[str, float | list[float]]:
-    """Return the value of every parameter of a robot by its path, as plain numbers."""
+    """Return the value of every parameter of a robot as plain numbers, keyed by path."""
     return {e.path: np.asarray(e.get(robot)).tolist() for e in entries(robot)}
 
 
@@ -47,7 +47,7 @@ _FLOORS = {
     "scrub": (0.001, 0.002),
     "lead": (0.0015, 0.0045),
 }
-"""True surface parameters of the floors "firm" and "soft" in SI units, by name."""
+"""True surface parameters of the floors "firm" and "soft" in SI units, keyed by name."""
 TRUTH: dict[str, float | tuple[float, ...]] = {
     "robot.mass": 12.0,
     "robot.load_share@as_built": (0.29, 0.42, 0.29),
@@ -147,7 +147,7 @@ class SimulatedSensors:
         wobble: amplitude of an oscillation of the wheel angle, divided by the wheel speed [s]; it
             imitates speed control, which is never quite steady.
         has_voltage: True if voltages are logged.
-        signed: True if currents are logged with their sign.
+        signed: True if currents are logged with sign, False for magnitudes.
     """
 
     std: Mapping[str, float] = field(

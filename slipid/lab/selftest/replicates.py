@@ -2,9 +2,9 @@
 
 A replicate draws true parameters near the centre of their priors, fills the windows of the
 experiment with the measurements that a robot with these parameters would give, including noise, and
-fits them from the usual start values. Wheel motion, floors, loads, sessions and sampling are those
-of the given windows. The noise is that of the likelihood at typical variances. Replicates therefore
-show what the experiment can recover if the model is right; they cannot show an error of the model.
+fits them from the default start values. Wheel motion, floors, loads, sessions and sampling are
+those of the given windows. The noise is that of the likelihood at typical variances. Replicates
+therefore show what the experiment can recover if the model is right, but no error of the model.
 
 Source: a small version of simulation-based calibration (Talts et al. 2018, arXiv:1804.06788).
 """
@@ -172,7 +172,7 @@ class CurveRecovery:
 
     Attributes:
         gap: largest difference in slip between fitted and true curve [-].
-        inside: share of the points of the true curve that lie in the fit's 90 % band.
+        inside: fraction of the points of the true curve that lie in the fit's 90 % band.
     """
 
     gap: float

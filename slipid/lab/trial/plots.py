@@ -1,4 +1,4 @@
-"""Picture of a trial: the paths of every controller over the floor, and their errors."""
+"""Figure of a trial: the paths of every controller over the floor, and their errors."""
 
 from pathlib import Path
 from textwrap import wrap
@@ -18,7 +18,7 @@ from slipid.support.content import Content
 TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
 """Colours of surfaces, in the order of the map's surfaces."""
 FAINT = SERIES[4]
-"""Colour of the paths from all starts but one, which is orange."""
+"""Colour of the paths from all starts but the highlighted one, which is orange."""
 ERRORS = {
     "closure_error_median": "closure error [mm]",
     "cross_track_rmse": "cross-track rms [mm]",
@@ -27,10 +27,10 @@ ERRORS = {
 
 
 def trial_plot(trial: TrialResult, path: Path) -> Path:
-    """Write a picture of a trial to a file and return the file.
+    """Write a figure of a trial to a file and return the file.
 
-    For every controller it shows the paths from all starts, moved to one start, with the run from
-    a typical start over the map; bars show medians of errors.
+    For every controller it shows the paths from all starts, moved to a common start pose, and
+    highlights the run from a typical start over the map; bars show medians of errors.
     """
     content = trial.content
     names = list(content["summary"])
@@ -50,7 +50,7 @@ def trial_plot(trial: TrialResult, path: Path) -> Path:
 
 
 def _verdict(content: Content) -> str:
-    """Return a text that names the controller with the smallest closure error, if it is clear."""
+    """Return a title that names the controller with the smallest closure error, if one is best."""
     best = content["closes_best"]
     if best is None:
         return f"{', '.join(content['not_told_apart'])} are not distinguished"

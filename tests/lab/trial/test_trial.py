@@ -155,7 +155,7 @@ def test_way_points_are_refused_with_the_reason():
         reference.rectangle(speed=-0.2)
     with pytest.raises(ValueError, match="twice in a row"):
         reference.waypoints([(0.0, 0.0), (0.0, 0.0)])
-    with pytest.raises(ValueError, match="each another than the last"):
+    with pytest.raises(ValueError, match="each different from the last"):
         reference.curve([(0.0, 0.0), (0.0, 0.0)])
     with pytest.raises(ValueError, match="expected both positive"):
         reference.circle(speed=0.0)
@@ -605,7 +605,7 @@ def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
         DataError, match=r"another load set-up \(far\), not for as_built; leave out"
     ):
         check_gains(tmp_path, other)
-    with pytest.raises(DataError, match="it has no tuned gains; leave out --tuned-gains"):
+    with pytest.raises(DataError, match="it has no tuned gains; omit --tuned-gains"):
         check_gains(tmp_path, deployed)
 
 

@@ -230,7 +230,7 @@ def checked_stream(stream: Stream) -> Stream:
     if len(stream.number):
         return stream
     found = f"no numbers in {', '.join(stream.columns)} of any message"
-    raise stream.error(found, "an array that is filled in, and has the wanted index")
+    raise stream.error(found, "a non-empty array that has the requested index")
 
 
 def _check_joints(plan: ChannelPlan, streams: Sequence[Stream]) -> None:

@@ -53,11 +53,11 @@ NEEDED = COLUMNS[:5]
 LONGEST_S = 0.5
 """Time between two rows above which a file is split into two runs there [s]."""
 FEWEST_ROWS = 3
-"""Smallest number of rows of a run; shorter runs are left out."""
+"""Smallest number of rows of a run; shorter runs are omitted."""
 
 
 def husky() -> Robot:
-    """Return the Husky by its maker's data and measured motor friction, without floors."""
+    """Return the Husky with its maker's data and measured motor friction, without floors."""
     robot = build(skid_steer(0.256, 0.275, RADIUS, 78.71, drive_of=(0, 1, 0, 1)), ())
     gain = float(robot.motor.gain)
     motor = replace(
@@ -115,7 +115,7 @@ def _runs(path: Path, wheel_radius: float) -> list[FloorSignals]:
 
 
 def husky_classifiers() -> list[FloorClassifier]:
-    """Return all classifiers, slipid first, unfitted."""
+    """Return all floor classifiers before their fit, slipid's first."""
     slipid = SlipidFloorClassifier(robot=husky(), zero_a=ZERO_A)
     return [slipid, CosineEnergyClassifier(), GaussianClassifier(), *tree_classifiers()]
 

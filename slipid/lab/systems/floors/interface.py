@@ -33,7 +33,7 @@ FloorChannel = Literal["current", "gyro", "vibration"]
 DEFAULT_CHANNELS: frozenset[FloorChannel] = frozenset({"current", "gyro"})
 """Channels that slipid uses too, besides the wheel speeds."""
 REST_WHEEL_SPEED = 0.3
-"""Wheel speed up to which a wheel counts as at rest [rad/s]."""
+"""Largest wheel speed at which a wheel counts as at rest [rad/s]."""
 WINDOWS_S = (0.5, 1.0, 2.0)
 """Lengths of the feature windows [s]."""
 
@@ -162,8 +162,8 @@ def accumulated(
     log p_t = exp(-dt / memory) log p_{t-1} + (dt / apart) log l_t + const,   p_0 uniform
 
     Rows are not independent: all rows within `apart_s` [s] together count as one observation.
-    Evidence fades with the time constant `memory_s` [s]. A row in which the robot stands, or whose
-    likelihood is not finite, does not change the belief.
+    Evidence fades with the time constant `memory_s` [s]. A row in which the robot is at rest, or
+    whose likelihood is not finite, does not change the belief.
     """
     used = run.moving & np.isfinite(log_likelihood).all(axis=1)
     evidence = np.where(used[:, None], log_likelihood, 0.0) * (run.dt / apart_s)[:, None]
@@ -208,10 +208,10 @@ def features(
 def yaw_rate_shortfall(
     gyro: Float[np.ndarray, " row"], rolling: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, " row"]:
-    """Return by how much the body turns less than the rolling wheels suggest [rad/s].
+    """Return the shortfall of the body's yaw rate below that of the rolling wheels [rad/s].
 
     It is the difference of the yaw rates from encoders and gyro, positive where the body turns
-    less, whatever the sense of rotation.
+    less, for either sense of rotation.
     """
     return np.asarray(np.where(rolling < 0, gyro - rolling, rolling - gyro))
 
