@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 NOTEBOOKS := $(wildcard notebooks/*.ipynb)
 BENCHES := $(wildcard tests/benchmarks/bench_*.py)
-TWO := -n 2 --dist loadgroup --no-loadscope-reorder
+TWO := -n 2 --dist loadfile --no-loadscope-reorder
 QUICK = $(BIN)/python -m pytest -q $(TWO) -m "not slow and not nightly"
 # The newest Python named in pyproject.toml, of another version than the default one, on the PATH or kept by pyenv.
 NEWEST = $(shell \

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 from slipid.support.jax_setup import one_blas_thread, plain_loops
 
@@ -122,15 +123,23 @@ def pytest_configure(config):
         jax.config.update("jax_disable_most_optimizations", plain.lower() in ("1", "true", "yes"))
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Files that take longest come first, so that two workers end together; xdist reads marks."""
+    """Files that take longest come first, so that two workers end together."""
     place = {name: k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: place.get(item.path.stem, len(LONG)))
-    for item in items:
-        file = item.path.relative_to(ROOT).as_posix()
-        group = "api" if item.path.parent.name == "api" else TOGETHER.get(item.path.stem, file)
-        item.add_marker(pytest.mark.xdist_group(group))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """A file runs in one process, and so do the files of a group."""
+
+    class GroupScheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            group = "api" if file.startswith("tests/api/") else TOGETHER.get(Path(file).stem)
+            return group or file
+
+    return GroupScheduling(config, log)
 
 
 @pytest.fixture(scope="module", autouse=True)
