@@ -17,6 +17,7 @@ from slipid.app.compare import finished
 from slipid.app.logs import packaged_config
 from slipid.cli.main import app
 from slipid.data.runs import collect
+from slipid.data.windows import windows
 from slipid.fitting.likelihood import batch
 from slipid.fitting.problem import Problem
 from slipid.fitting.session_effects import LinearModel, with_session_effects
@@ -25,7 +26,7 @@ from slipid.infer.design.planned_runs import PlannedRun
 from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
 from slipid.predict import open_loop as replay
 from slipid.predict.fitted_slip_model import fit_with_noise, slopes
-from slipid.predict.folds import folds_of, inner_folds
+from slipid.predict.folds import folds_of, inner_folds, problem_of_runs
 from slipid.predict.predictive import ForceBalance, by_name, log_student
 from slipid.predict.ranking import ranking, transfer
 from slipid.predict.score import Score, forecast, mean_error
@@ -376,6 +377,23 @@ def test_a_fold_is_kept_whole_and_only_for_the_job_it_is_of(tmp_path):
     assert again("b", lambda: {"x": 1}) == {"x": 1}
     path.write_text(path.read_text()[:-9])
     assert again("b", lambda: {"x": 2}) == {"x": 2}
+
+
+def test_what_runs_of_one_speed_cannot_tell_is_held_unless_the_user_says_otherwise(logs):
+    data = collect(logs)
+    robot = true_robot(PLAN)
+    problem = Problem(windows(data, 0.04, float(robot.camera.lag)), robot, [])
+    of_one_speed = np.flatnonzero(folds_of(data, "speeds") == 0)
+    viscous = {"surface.soft.slide_viscosity", "surface.soft.roller_viscosity"}
+    assert problem_of_runs(problem, [], data, np.arange(len(data))) is problem
+    some = problem_of_runs(problem, [], data, of_one_speed).space
+    assert some.names == problem.space.names
+    assert {name for name, held in zip(some.names, some.held, strict=True) if held} == viscous
+    np.testing.assert_allclose(some.start[some.held], np.log(1e-4))
+    np.testing.assert_allclose(some.prior_mean[some.held], np.log(1e-4))
+    mine = [Choice("surface.soft.slide_viscosity", prior_mean=0.03, prior_std=0.01)]
+    kept = problem_of_runs(problem, mine, data, of_one_speed).space
+    assert kept.held.sum() == 1
 
 
 @pytest.mark.slow
