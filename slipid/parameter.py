@@ -37,12 +37,12 @@ class Declaration:
             between them.
         spread: default std of the prior in the search space: a log-std where the space is
             logarithmic, in [unit] where there are no bounds.
-        free: whether the number is fitted unless the user says otherwise.
-        shares: whether the numbers of the array are positive and sum to one.
-        deviation: whether the numbers of the array sum to zero and stand for what the model lacks;
+        free: True if the number is fitted unless the user says otherwise.
+        shares: True if the numbers of the array are positive and sum to one.
+        deviation: True if the numbers of the array sum to zero and stand for what the model lacks;
             their common spread is estimated from the data, up to about `spread`.
         doc: one line for people.
-        electric: whether the number is estimated from currents and voltages given the motion, not
+        electric: True if the number is estimated from currents and voltages given the motion, not
             from the motion.
         of: what each number of a vector belongs to: a wheel, a drive or an axis.
     """
@@ -62,12 +62,12 @@ class Declaration:
 
     @property
     def logarithmic(self) -> bool:
-        """Whether the search space is logarithmic."""
+        """True if the search space is logarithmic."""
         return math.isinf(self.upper) and not math.isinf(self.lower)
 
     @property
     def constrained(self) -> bool:
-        """Whether the array has one search-space coordinate less than it has numbers."""
+        """True if the array has one search-space coordinate less than it has numbers."""
         return self.shares or self.deviation
 
     def to_search(self, value: Any) -> np.ndarray:

@@ -98,7 +98,7 @@ def simulate_runs(
         speeds: speeds of the runs [m/s].
         turns: number of additional curved runs, on every floor at every speed.
         truth: true values of parameters, by path, that replace the usual ones [SI].
-        current, voltage: whether currents and voltages of the motors are logged.
+        current, voltage: True if currents and voltages of the motors are logged.
         seed: seed of the noise.
 
     Raises:

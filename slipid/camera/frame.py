@@ -47,7 +47,7 @@ class FrameSource(ABC):
         name: name of the source in messages.
         image_px: width and height of every frame [pixel].
         count: expected number of frames; None if it is not known.
-        exact: whether `count` is exact, as it is if a time is given for each frame.
+        exact: True if `count` is exact, as it is if a time is given for each frame.
         identity: text that differs if the content differs, such as name, size and date of a file.
     """
 

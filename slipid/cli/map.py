@@ -18,41 +18,55 @@ PROPOSAL = "palette.toml"
 
 @guarded
 def map_(
-    image: Annotated[Path, typer.Argument(metavar="IMAGE", help="Picture of the floor, or video.")],
+    image: Annotated[Path, typer.Argument(metavar="IMAGE", help="Picture or video of the floor.")],
     out: Out,
     camera: Annotated[
-        Path, typer.Option(metavar="FILE", help="Camera that `slipid calibrate` wrote.")
+        Path, typer.Option(metavar="FILE", help="Camera file of `slipid calibrate`.")
     ],
     config: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Surfaces by colour or by points, region, masks."),
+        typer.Option(
+            metavar="FILE", help="Config of the map: surfaces by colour or points, region, masks."
+        ),
     ] = None,
     surfaces: Annotated[
         int | None, typer.Option(metavar="N", min=1, max=40, help="Number of surfaces to propose.")
     ] = None,
     cell: Annotated[
         float | None,
-        typer.Option(metavar="M", min=1e-4, max=1, help="Edge of a cell; a pixel's by default."),
+        typer.Option(
+            metavar="M",
+            min=1e-4,
+            max=1,
+            help="Edge length of a map cell, in m; by default that of a pixel.",
+        ),
     ] = None,
     dictionary: Annotated[
-        str, typer.Option(metavar="NAME", help="ArUco dictionary of the robot's marker.")
+        str,
+        typer.Option(
+            metavar="NAME", help="ArUco dictionary of the robot's marker, to mask the robot."
+        ),
     ] = "4X4_50",
     robot_radius: Annotated[
         float,
-        typer.Option(metavar="M", min=0, max=10, help="Radius of the robot, which is masked."),
+        typer.Option(
+            metavar="M", min=0, max=10, help="Radius of the masked disc around the robot, in m."
+        ),
     ] = 0.2,
     marker_height: Annotated[
         float,
-        typer.Option(metavar="M", min=0, max=10, help="Height of the marker above the floor."),
+        typer.Option(
+            metavar="M", min=0, max=10, help="Height of the marker above the floor, in m."
+        ),
     ] = 0.25,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    r"""Map the surfaces of a floor from one picture from above; needs slipid\[camera].
+    r"""Make a map of the surfaces of a floor from one picture from above; needs slipid\[camera].
 
-    Without a config it proposes surfaces and writes a palette.toml, in which to rename them before
-    the next run. It writes map.geojson, which every option for a map takes, and a picture to check
-    it. The exit code is 1 where the map is poor.
+    Without a config, the command proposes surfaces and writes them to palette.toml; rename them
+    there and run the command again with --config. It writes map.geojson, the format of all options
+    for maps, and a picture of the map for checking. The exit code is 1 if the map is poor.
     """
     from slipid.camera.floor.grid import RobotShape
     from slipid.camera.floor.picture import MapOptions, map_of
@@ -68,9 +82,8 @@ def map_(
         result = map_of(image, OverheadCamera.load(camera), options, report)
         if result.proposal is not None and (out / PROPOSAL).exists():
             raise DataError(
-                f"{out / PROPOSAL}: it is there already and may have been edited, and surfaces are "
-                f"to be proposed; expected --config {out / PROPOSAL} with surfaces in it, or "
-                "another folder"
+                f"{out / PROPOSAL}: exists already, and proposing surfaces would overwrite it; "
+                f"expected --config {out / PROPOSAL} with surfaces in it, or another folder"
             )
         result.vector.save(out / "map.geojson")
         floor_plot(result.vector, result.floor.colour, result.floor.in_view, out / "map.png")
@@ -95,7 +108,8 @@ def show(page: "Page", result: "PictureMap", out: Path) -> None:
         rows.add_row(one["surface"], one["colour"], str(one["patches"]), area, share, confidence)
     page.table(rows)
     page.line(
-        "confidence: how much worse, in spreads, the next best surface explains the weakest patch"
+        "confidence: how much worse the second best surface explains the least certain patch, in "
+        "standard deviations of its colour"
     )
     for robot in result.robots:
         page.line(
@@ -107,5 +121,7 @@ def show(page: "Page", result: "PictureMap", out: Path) -> None:
     for sentence in result.poor:
         page.line(f"poor: {sentence}")
     if result.proposal is not None:
-        page.line(f"surfaces are proposed: rename or join them in {out / PROPOSAL}, then add")
+        page.line(
+            f"these surfaces are a proposal: rename or merge them in {out / PROPOSAL}, then add"
+        )
         page.line(f"  --config {out / PROPOSAL}")

@@ -14,46 +14,62 @@ if TYPE_CHECKING:
 
 @guarded
 def motor(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Log, a CSV or Parquet file.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Log file (CSV or Parquet).")],
     time: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="Column of the time, in s.")
+        str | None, typer.Option(metavar="NAME[:UNIT]", help="Column with the time, in s.")
     ] = None,
     voltage: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="Voltage across the motor, in V.")
+        str | None,
+        typer.Option(metavar="NAME[:UNIT]", help="Column with the voltage across the motor, in V."),
     ] = None,
     current: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="Current in A; I:mA for others.")
+        str | None,
+        typer.Option(
+            metavar="NAME[:UNIT]", help="Column with the current, in A; other units as I:mA."
+        ),
     ] = None,
     speed: Annotated[
         str | None,
-        typer.Option(metavar="NAME[:UNIT]", help="Speed of the shaft, in rad/s; w:rpm for others."),
+        typer.Option(
+            metavar="NAME[:UNIT]",
+            help="Column with the shaft speed, in rad/s; other units as w:rpm.",
+        ),
     ] = None,
     angle: Annotated[
         str | None,
-        typer.Option(metavar="NAME[:UNIT]", help="Angle of the shaft, in rad, for the speed."),
+        typer.Option(
+            metavar="NAME[:UNIT]", help="Column with the shaft angle, in rad, instead of the speed."
+        ),
     ] = None,
     duty: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="Share of the bus voltage; d:% too.")
+        str | None,
+        typer.Option(
+            metavar="NAME[:UNIT]",
+            help="Column with the duty cycle, instead of the voltage; d:% for percent.",
+        ),
     ] = None,
     bus: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="Bus voltage, with --duty, in V.")
+        str | None,
+        typer.Option(metavar="NAME[:UNIT]", help="Column with the bus voltage, in V; with --duty."),
     ] = None,
     unsigned: Annotated[
-        bool, typer.Option("--unsigned", help="The current is a magnitude.")
+        bool, typer.Option("--unsigned", help="The logged current is a magnitude without sign.")
     ] = False,
     delimiter: Annotated[
         str | None,
-        typer.Option(metavar="CHARACTER", help="Text between cells; guessed by default."),
+        typer.Option(metavar="CHARACTER", help="Character between cells; guessed by default."),
     ] = None,
     out: MaybeOut = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Identify a motor's resistance, back-EMF, friction and inertia from voltage, current, speed.
+    """Identify a motor on a bench from its log: resistance, back-EMF, friction and inertia.
 
-    Columns that are not named are guessed. Several motors: names by commas. The speed must be that
-    of the motor shaft: no log shows that it was taken behind a gear. With --out it writes
-    motor.json and a picture. Exit code 1 where the model does not explain the log.
+    The log needs the voltage, current and speed of the motor. Columns that are not given are found
+    by their names. For several motors, separate their columns by commas. The speed must be that of
+    the motor shaft; a speed measured behind a gear cannot be detected and gives wrong results. With
+    --out, the command writes motor.json and a picture. The exit code is 1 if the model does not
+    explain the log.
     """
     from slipid.app.bench import read_motor_log
     from slipid.report.estimates import show_bench
@@ -84,7 +100,7 @@ def motor(
 
 
 def _given(columns: dict[str, str | None]) -> "dict[str, GivenColumns]":
-    """Return the columns that options name, by channel; `columns` has the texts of the options."""
+    """Return the columns given by options, by channel; `columns` has the texts of the options."""
     from slipid.data.reading.motor_layout import given_columns
 
     given = {channel: text for channel, text in columns.items() if text is not None}

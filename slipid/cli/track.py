@@ -19,60 +19,89 @@ def track(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="VIDEO|FOLDER|DEVICE", help="Video, pictures, or a camera's number."
+            metavar="VIDEO|FOLDER|DEVICE", help="Video, pictures, or the number of a camera device."
         ),
     ],
     camera: Annotated[
-        Path, typer.Option(metavar="FILE", help="Camera that slipid calibrate wrote.")
+        Path, typer.Option(metavar="FILE", help="Camera file of `slipid calibrate`.")
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Poses: .csv or .parquet.")],
+    out: Annotated[
+        Path,
+        typer.Option("--out", metavar="FILE", help="File of poses to write (.csv or .parquet)."),
+    ],
     marker_size: Annotated[
-        float | None, typer.Option(metavar="M", help="Edge of the marker's black square, in m.")
+        float | None,
+        typer.Option(metavar="M", help="Edge length of the marker's black square, in m."),
     ] = None,
     marker_height: Annotated[
         float | None, typer.Option(metavar="M", help="Height of the marker above the floor, in m.")
     ] = None,
     marker_yaw: Annotated[
         float,
-        typer.Option(metavar="DEG", help="Angle of its top edge, counter-clockwise from ahead."),
+        typer.Option(
+            metavar="DEG",
+            help="Direction of the marker's top edge, in deg counter-clockwise from the robot's x "
+            "axis.",
+        ),
     ] = 0.0,
     dictionary: Annotated[
-        str, typer.Option(metavar="NAME", help="Dictionary of the marker.")
+        str, typer.Option(metavar="NAME", help="Name of the dictionary of the marker.")
     ] = "4X4_50",
     id: Annotated[
-        int | None, typer.Option(min=0, help="Number of the marker; the only one by default.")
+        int | None,
+        typer.Option(min=0, help="Number of the marker; by default the only one that is seen."),
     ] = None,
     targets: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Several markers, boards or robots, instead of these."),
+        typer.Option(
+            metavar="FILE",
+            help="Config of several markers, boards or robots, instead of the marker options.",
+        ),
     ] = None,
     fps: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Frame rate; by default the video's times.")
+        float | None,
+        typer.Option(
+            metavar="HZ", help="Frame rate, in Hz; by default the times in the video are used."
+        ),
     ] = None,
     times: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Times of the frames: CSV of frame, time.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="CSV file of the frame times, with columns frame and time [s]."
+        ),
     ] = None,
     region: Annotated[
-        str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="Only this part, in pixels.")
+        str | None,
+        typer.Option(
+            metavar="X0,Y0,X1,Y1", help="Part of the picture in which to search, in pixels."
+        ),
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(metavar="S", help="Duration of a recording from a device, which needs it."),
+        typer.Option(
+            metavar="S", help="Duration of the recording in s; required for a camera device."
+        ),
     ] = None,
     preview: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also draw one frame, to check by eye.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Picture to write, with the poses of one frame drawn in it."
+        ),
     ] = None,
     preview_frame: Annotated[
         int | None,
-        typer.Option(metavar="N", min=0, help="Which frame; by default the first with a pose."),
+        typer.Option(
+            metavar="N", min=0, help="Number of this frame; by default the first with a pose."
+        ),
     ] = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
     """Track a robot with a marker in the video of a calibrated camera above it.
 
-    Every frame has a row with pose and covariance, or with the reason why it was rejected; nothing
-    is interpolated. The exit code is 1 where the poses should not be used as they are.
+    The file has a row for every frame, with the pose and its covariance, or with the reason why the
+    frame was rejected; nothing is interpolated. The exit code is 1 if the poses are too poor to be
+    used unchanged.
     """
     from slipid.camera.frame_source import open_source
     from slipid.camera.overhead import OverheadCamera
@@ -90,11 +119,11 @@ def track(
             bodies = read_targets(targets)
         elif marker_size is None or marker_height is None:
             raise DataError(
-                "no size or no height of the marker; expected --marker-size and --marker-height in "
-                "metres, or --targets FILE"
+                "the size or the height of the marker is missing; expected --marker-size and "
+                "--marker-height in metres, or --targets FILE"
             )
         else:
-            report.stage("looking for the marker")
+            report.stage("searching for the marker")
             yaw = math.radians(marker_yaw)
             lone = tracking.LoneMarker(marker_size, marker_height, id, dictionary, yaw)
             bodies = (lone.target(frames, part),)

@@ -1,4 +1,4 @@
-"""`slipid trial`: drive the 2021 paper's rectangle, or another path, with every controller."""
+"""`slipid trial`: drive the rectangle of the 2021 paper, or another path, with every controller."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,39 +13,56 @@ from slipid.support.progress import Reporter
 def trial(
     out: OutFolder,
     plant: Annotated[
-        str, typer.Option(metavar="NAME", help="testsite (MuJoCo), or twin: the fit itself.")
+        str,
+        typer.Option(
+            metavar="NAME", help="Simulated robot: testsite (MuJoCo), or twin (the fitted model)."
+        ),
     ] = "testsite",
     map: Annotated[
-        Path | None, typer.Option("--map", metavar="FILE", help="Floor map; else made of patches.")
+        Path | None,
+        typer.Option(
+            "--map", metavar="FILE", help="Floor map; by default patches of the fitted floors."
+        ),
     ] = None,
     told_map: Annotated[
         Path | None,
         typer.Option(
             "--told-map",
             metavar="FILE",
-            help="Map that is given to controllers with a map; the true one by default.",
+            help="Map for the controllers that use one; by default the true map.",
         ),
     ] = None,
     controllers: Annotated[
-        str | None, typer.Option(metavar="NAMES", help="By commas; all by default.")
+        str | None,
+        typer.Option(metavar="NAMES", help="Controllers separated by commas; all by default."),
     ] = None,
     path: Annotated[
-        str, typer.Option(metavar="NAME", help="rectangle, circle, eight, or turning: it turns.")
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Path: rectangle, circle, eight, or turning (the robot also rotates).",
+        ),
     ] = "rectangle",
-    speed: Annotated[float, typer.Option(metavar="M_S", help="Along the path, in m/s.")] = 0.2,
-    starts: Annotated[int, typer.Option(min=1, max=99, help="Poses to start from.")] = 20,
+    speed: Annotated[
+        float, typer.Option(metavar="M_S", help="Speed along the path, in m/s.")
+    ] = 0.2,
+    starts: Annotated[int, typer.Option(min=1, max=99, help="Number of start poses.")] = 20,
     load: Load = None,
     tuned_gains: Annotated[
-        bool, typer.Option("--tuned-gains", help="Even where they are no better than by hand.")
+        bool,
+        typer.Option(
+            "--tuned-gains",
+            help="Use tuned gains even if they are no better than those set by hand.",
+        ),
     ] = False,
     jobs: Jobs = None,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:
-    """Drive the 2021 paper's rectangle, or another path, with every controller, and judge them.
+    """Drive a simulated robot along a path with every controller, and compare their errors.
 
-    Gains are those set by hand, or tuned ones of an older robot.json that are better. Writes
-    trial.json and trial.png to OUT; runs that are done are kept and not driven again.
+    The gains are those set by hand, or the tuned gains of an older robot.json if these are better.
+    Writes trial.json and trial.png to OUT. Finished runs are kept and not simulated again.
     """
     from slipid.lab.trial.plots import trial_plot
     from slipid.lab.trial.trial import TrialOptions, controller_names

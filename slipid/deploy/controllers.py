@@ -30,10 +30,10 @@ class ControllerRow:
         correction: torque correction of the 2021 paper.
         law: function that makes, for a robot, a published law that replaces the pose loop; None
             for the pose loop.
-        tuned: whether it uses the tuned gains of robot.json where they are better than those set by
+        tuned: True if it uses the tuned gains of robot.json where they are better than those set by
             hand.
-        gyro: whether the robot has a gyro.
-        mapped: whether the estimator has the map of the site's floors.
+        gyro: True if the robot has a gyro.
+        mapped: True if the estimator has the map of the site's floors.
     """
 
     observer: str

@@ -45,7 +45,7 @@ class WheelFloors(eqx.Module):
         surface: number of the surface in the map's list of surfaces.
         border: distance from the middle of the wheel to the nearest other surface [m], to within
             half a cell of the map; infinite on a map of a single surface.
-        inside: whether the wheel is on the map; beyond its edge, surface and border are those of
+        inside: True if the wheel is on the map; beyond its edge, surface and border are those of
             the nearest cell.
     """
 

@@ -79,7 +79,7 @@ def optimise(
             this many posterior stds, and every log variance by less than three times as much.
         tell: function called after every round, for progress and checkpoints.
         free: 1 for coordinates that may move from the start, 0 for fixed ones (free,).
-        variances: whether the variances of the noise are fitted, too.
+        variances: True if the variances of the noise are fitted, too.
     """
     keep = problem.full_weight if keep is None else np.asarray(keep, float)
     state = staged_start(problem, keep, tell) if start is None else replace(start, stage="joint")

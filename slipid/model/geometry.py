@@ -18,8 +18,7 @@ from slipid.parameter import as_numbers, parameter
 _MIRRORED = 0.01
 """Largest difference of a wheel from a mirror image, for `Geometry.mirror`.
 
-It limits distances, in base radii, and twice the angle between lines [rad].
-"""
+It limits distances, in base radii, and twice the angle between lines [rad]."""
 
 
 class Geometry(eqx.Module):
@@ -93,7 +92,7 @@ class Geometry(eqx.Module):
 
     @property
     def determines_twist(self) -> bool:
-        """Whether the wheel rotations determine x, y and yaw if nothing slips."""
+        """True if the wheel rotations determine x, y and yaw if nothing slips."""
         return int(np.linalg.matrix_rank(np.asarray(self.forward()), tol=1e-6)) == 3
 
     def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:

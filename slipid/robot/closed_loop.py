@@ -48,7 +48,7 @@ class ControlLoopOutput(eqx.Module):
         command: wheel speeds [rad/s].
         estimate: output of the estimator.
         time: time of the path [s].
-        gave_up: whether the robot was stuck and has stopped for good.
+        gave_up: True if the robot was stuck and has stopped for good.
     """
 
     command: Float[Array, " wheel"]
@@ -200,7 +200,7 @@ class PathMetrics:
         energy_j: energy used by the motors [J]; None where the plant does not know it.
         effort: root mean square change of the commanded wheel speeds per period [rad/s].
         seconds: duration of the run [s].
-        finished: whether the end of the path was reached.
+        finished: True if the end of the path was reached.
     """
 
     along_track_mm: tuple[float, ...]

@@ -117,7 +117,7 @@ class ControllerState(eqx.Module):
         still: time for which the body has not moved as demanded; it counts down while the body
             moves as demanded [s].
         tried: time since the current recovery began; 0 while there is none [s].
-        begun: whether a command has been computed yet.
+        begun: True if a command has been computed yet.
     """
 
     command: Float[Array, " wheel"]
@@ -130,7 +130,7 @@ class ControllerState(eqx.Module):
 
     @property
     def gave_up(self) -> Bool[Array, ""]:
-        """Whether the controller has stopped for good because the robot is stuck."""
+        """True if the controller has stopped for good because the robot is stuck."""
         return self.tried > GIVES_UP_S
 
 

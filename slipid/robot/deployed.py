@@ -130,7 +130,7 @@ class DeployedRobot(RobotArrays):
 
     @property
     def steers(self) -> bool:
-        """Whether its wheels can produce any twist, each of them driven alone.
+        """True if its wheels can produce any twist, each of them driven alone.
 
         A robot that does not steer has an estimator but no controller, since
         `slipid.robot.controller` demands sideways motion as well.

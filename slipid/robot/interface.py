@@ -38,7 +38,7 @@ class Settings(eqx.Module):
     """Settings of an estimator; they are chosen, not identified.
 
     Attributes:
-        current_is_signed: whether the ammeters measure the sign of a current.
+        current_is_signed: True if the ammeters measure the sign of a current.
         forget_s: time over which measurements count as one independent piece of evidence on the
             floors [s].
         filter_s: time constant of the filter of currents [s].
@@ -167,9 +167,9 @@ class StateEstimate(eqx.Module):
         surface_probability: probability of each floor under each wheel, in the order of `labels`,
             and of none of them in the last column [1].
         covariance: covariance of the pose in the world frame, in products of [m, m, rad].
-        stale: whether readings of a wheel are missing for too long.
-        immobilised: whether the wheels turn while the body stands still.
-        out_of_range: whether speed or currents exceed those of the fitted runs, or the floor is
+        stale: True if readings of a wheel are missing for too long.
+        immobilised: True if the wheels turn while the body stands still.
+        out_of_range: True if speed or currents exceed those of the fitted runs, or the floor is
             unknown.
         labels: names of the floors.
     """
@@ -194,7 +194,7 @@ class StateEstimate(eqx.Module):
 
     @property
     def finite(self) -> Bool[Array, ""]:
-        """Whether every number of the estimate is finite."""
+        """True if every number of the estimate is finite."""
         parts = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(self) if x.dtype != bool]
         return jnp.all(jnp.stack(parts))
 

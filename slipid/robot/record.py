@@ -235,7 +235,7 @@ class GainsRecord:
     Attributes:
         values: the gains.
         load: load set-up they were tuned for.
-        gyro: whether the robot had a gyro.
+        gyro: True if the robot had a gyro.
         method: method of the search.
         loss: losses of the gains set by hand and of the tuned gains.
         better_than_hand: share of the cases in which the tuned gains win.
@@ -254,7 +254,7 @@ class GainsRecord:
 
     @property
     def is_better(self) -> bool:
-        """Whether the tuned gains are used instead of those set by hand."""
+        """True if the tuned gains are used instead of those set by hand."""
         return self.verdict == "better than by hand"
 
 

@@ -49,11 +49,11 @@ class ActuatorModel:
         ammeter_a: std of the noise of a measured current [A].
         drift_s: correlation time of the errors of modelled currents [s].
         voltmeter_v: std of the noise of a measured voltage [V].
-        voltage: whether voltages are measured.
+        voltage: True if voltages are measured.
         gyro_noise: std of the noise of a measured yaw rate [rad/s].
         gyro_bias: std of the bias of a measured yaw rate [rad/s].
-        gyro: whether yaw rates are measured.
-        signed: whether measured currents have signs.
+        gyro: True if yaw rates are measured.
+        signed: True if measured currents have signs.
         substeps: number of simulation steps of wheels and body in a control period.
         smooth: True for encoders without ticks, which measure angles exactly.
     """

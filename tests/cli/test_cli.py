@@ -55,7 +55,7 @@ def test_help_names_every_command():
 
 
 def test_help_keeps_words_in_brackets():
-    assert "plan of [selftest] in the config" in invoke("selftest", "--help").stdout
+    assert "planned in [selftest] of the config" in invoke("selftest", "--help").stdout
     assert "slipid[testsite]" in invoke("simulate", "--help").stdout
 
 
@@ -599,7 +599,7 @@ def test_export_names_missing_options(tmp_path):
     assert "robot.json: not there" in invoke("export", tmp_path, "--out", tmp_path / "o").output
     told = invoke("export", tmp_path)
     assert told.exit_code == 2
-    assert "name one with --out" in told.output
+    assert "--out is missing" in told.output
     assert invoke("export", tmp_path, "--check").exit_code == 2
 
 

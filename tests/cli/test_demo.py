@@ -63,7 +63,7 @@ def test_the_recording_is_what_its_config_drives():
 
 
 def test_a_plant_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(DataError, match="no plant 'gazebo'; expected recorded or mujoco"):
+    with pytest.raises(DataError, match="--plant gazebo: unknown; expected recorded or mujoco"):
         demo.run(tmp_path, "gazebo", None, InProcess(), Reporter(quiet=True))
 
 

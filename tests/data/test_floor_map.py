@@ -125,7 +125,7 @@ def test_the_four_zones_meet_in_the_middle_of_the_rectangle():
         ),
         (('base = "table"', ""), "base: missing; expected a value"),
         (("extent_m = [0.0, 0.0, 1.0, 1.0]", ""), "extent_m: missing; expected a value"),
-        (("[0.0, 0.0, 1.0, 1.0]", "[1.0, 0.0, 0.0, 1.0]"), "expected lowest x, y"),
+        (("[0.0, 0.0, 1.0, 1.0]", "[1.0, 0.0, 0.0, 1.0]"), "expected lowest x, lowest y"),
         (("cell_m = 0.01", "cell_m = 0"), "cell_m: 0; expected: input should be greater than 0"),
         (
             ("cell_m = 0.01", "cells_m = 0.01"),
@@ -288,5 +288,5 @@ def test_geojson_without_a_map_is_refused(tmp_path):
     low = vector_map(ringed("table", WHOLE)).to_json()
     low["slipid"]["extent_m"] = [1.0, 0.0, 0.0, 1.0]
     path.write_text(json.dumps(low))
-    with pytest.raises(DataError, match="expected lowest x, y, then highest x, y"):
+    with pytest.raises(DataError, match="expected lowest x, lowest y, highest x, highest y"):
         read_map(path)

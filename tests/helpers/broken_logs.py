@@ -345,7 +345,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "burst of missing values",
         _cell(range(80, 130), "m2pos", "NaN"),
-        ("exp07.csv row 80", "column 'm2pos'", "no value for 1.58 s", "one about every 0.031 s"),
+        ("exp07.csv row 80", "column 'm2pos'", "no value for 1.58 s", "values about every 0.031 s"),
     ),
     Case(
         "no value at all",

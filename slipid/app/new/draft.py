@@ -26,7 +26,7 @@ class ChannelDraft:
         unit: unit of the columns.
         comment: comment on the line of the config.
         question: open question; empty if there is none.
-        commented_out: whether the line is written as a comment, without effect.
+        commented_out: True if the line is written as a comment, without effect.
     """
 
     channel: str
@@ -90,7 +90,7 @@ class LayoutDraft:
         name: name of the layout.
         file: draft for the run's own file.
         beside: drafts for further files of the run.
-        examples: whether examples of other channels and files are written below the layout.
+        examples: True if examples of other channels and files are written below the layout.
     """
 
     name: str
@@ -133,7 +133,7 @@ class LogsDraft:
             is not written, so that the default holds.
         above: comments above the section.
         question: open question about the surface; empty if there is none.
-        commented_out: whether the section is written as a comment, without effect.
+        commented_out: True if the section is written as a comment, without effect.
     """
 
     glob: str

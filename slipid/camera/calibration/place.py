@@ -46,7 +46,7 @@ class FloorFit:
         twin_px: root mean square error of the next best pose that also looks down [pixel]; None if
             there is none.
         left_out: sentences about points that do not fit.
-        disputed: whether some points that do not fit could not be excluded from the fit.
+        disputed: True if some points that do not fit could not be excluded from the fit.
     """
 
     camera: OverheadCamera

@@ -30,7 +30,7 @@ class Detections:
 
     Attributes:
         frame, time: number and time [s] of every frame.
-        repeated: whether a frame's picture is identical to that of the frame before.
+        repeated: True if a frame's picture is identical to that of the frame before.
         row: frame of each detection, as an index into `frame`.
         id: number of the detected marker.
         corners: x, y of its corners in OpenCV's order [pixel].

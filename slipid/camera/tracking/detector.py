@@ -82,7 +82,7 @@ class Region:
 
     @property
     def empty(self) -> bool:
-        """Whether the region contains no pixel."""
+        """True if the region contains no pixel."""
         return self.right <= self.left or self.bottom <= self.top
 
 
@@ -131,7 +131,7 @@ class MarkerTracker:
         last: last detection of each wanted marker.
         speed: motion of each marker's middle between the last two frames [pixel].
         whole: number of frames so far that were searched completely.
-        twice: whether a marker was detected twice in the last frame; the next frame is then
+        twice: True if a marker was detected twice in the last frame; the next frame is then
             searched completely, so that the tracker does not follow the wrong one.
     """
 

@@ -12,20 +12,20 @@ import numpy as np
 from slipid.data.check.interpretation import Evidence, Interpretation, misfit, misfits
 from slipid.data.check.joined import PoseConvention
 
-MISTAKES = 3
+MOST_MISTAKES = 3
 """Largest number of mistakes, which are found one after another."""
-GAIN = 0.05
-"""Constant part of the least reduction of the misfit for which a mistake is accepted, `GAIN` plus
-`SHARE` times the remaining misfit [1]."""
-SHARE = 0.3
-"""Relative part of that least reduction [1]; no real log without a mistake comes near it."""
-EXPLAINED = 0.4
+LEAST_GAIN = 0.05
+"""A correction must reduce the misfit by at least `LEAST_GAIN` plus `LEAST_GAIN_RATIO` times the
+remaining misfit [1]."""
+LEAST_GAIN_RATIO = 0.3
+"""See `LEAST_GAIN` [1]; real logs without a mistake stay far below this reduction."""
+MOST_UNEXPLAINED = 0.4
 """Largest share of the poses' motion that an accepted pose convention leaves unexplained [1]."""
-ALIKE = 0.02
+ALTERNATIVE_MARGIN = 0.02
 """Difference of misfits below which another kind of mistake is named as an alternative [1]."""
-TURN_DEG = 15
+GRID_DEG = 15
 """Grid spacing of the searched heading offsets and azimuths [deg]."""
-MANY = 6
+MOST_PERMUTED = 6
 """Number of wheels above which only exchanges of two columns are tried, not all orders."""
 
 
@@ -36,8 +36,8 @@ class Candidate:
     Attributes:
         kind: name of the kind of mistake.
         meant: the interpretation.
-        cost: small number added to the misfit when candidates are ranked, so that of those with
-            about the same misfit the simplest mistake is accepted [1].
+        cost: small number added to the misfit when candidates are ranked, so that of several
+            candidates with about the same misfit the simplest is accepted [1].
     """
 
     kind: str
@@ -47,13 +47,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Mistake:
-    """A mistake in the declaration, whose correction explains the logs decisively better.
+    """A mistake in the config, whose correction explains the logs decisively better.
 
     Attributes:
         found: the candidate interpretation that corrects the mistake.
         before: misfit without the correction.
         after: misfit with the correction.
-        others: corrections of other kinds of mistake that explain the logs about as well.
+        others: corrections of other kinds that explain the logs about equally well.
     """
 
     found: Candidate
@@ -65,7 +65,7 @@ class Mistake:
 def mistakes(evidence: Evidence) -> tuple[Interpretation, tuple[Mistake, ...]]:
     """Return the right interpretation, and the mistakes in the declared one that it corrects."""
     meant, found = Interpretation(), []
-    for _ in range(MISTAKES):
+    for _ in range(MOST_MISTAKES):
         one = _next_mistake(evidence, meant)
         if one is None:
             break
@@ -78,19 +78,19 @@ def _next_mistake(evidence: Evidence, current: Interpretation) -> Mistake | None
     """Return the simplest mistake that explains the logs decisively better, or None."""
     before = misfit(evidence, current)
     tried = [(misfit(evidence, c.meant), c) for c in candidates(evidence, current)]
-    # Another convention of the poses counts only if the poses then follow the wheels.
+    # Another convention of the poses is accepted only if the poses then follow the wheels.
     tried = [
         (left, c)
         for left, c in tried
         if c.meant.convention == current.convention
-        or misfits(evidence, c.meant)["pose"] < EXPLAINED
+        or misfits(evidence, c.meant)["pose"] < MOST_UNEXPLAINED
     ]
     after, best = min(tried, key=lambda pair: pair[0] + pair[1].cost)
-    if before - after < GAIN + SHARE * after:
+    if before - after < LEAST_GAIN + LEAST_GAIN_RATIO * after:
         return None
     alternatives: dict[str, Candidate] = {}
     for left, other in sorted(tried, key=lambda pair: pair[0] + pair[1].cost):
-        if other.kind != best.kind and left < after + ALIKE:
+        if other.kind != best.kind and left < after + ALTERNATIVE_MARGIN:
             alternatives.setdefault(other.kind, other)
     return Mistake(best, before, after, tuple(alternatives.values()))
 
@@ -102,7 +102,7 @@ def candidates(evidence: Evidence, current: Interpretation) -> Iterator[Candidat
         yield Candidate("wheel_sign", replace(current, sign=sign), cost)
     for order, cost in _orders(wheels):
         yield Candidate("wheel_order", replace(current, order=order), cost)
-    for azimuth in range(-180 + TURN_DEG, 180, TURN_DEG):
+    for azimuth in range(-180 + GRID_DEG, 180, GRID_DEG):
         if azimuth:
             yield Candidate("wheel_azimuths", replace(current, azimuth=azimuth), 0.025)
     if current.convention == PoseConvention():
@@ -139,7 +139,7 @@ def _conventions(current: Interpretation) -> Iterator[Candidate]:
         ("heading_unit", 0.0, PoseConvention("radians")),
         ("heading_quaternion", 0.005, PoseConvention("half_sine")),
     ]
-    for offset in range(-180 + TURN_DEG, 181, TURN_DEG):
+    for offset in range(-180 + GRID_DEG, 181, GRID_DEG):
         if offset:
             cost = 0.01 if offset % 90 == 0 else 0.02
             found.append(("heading_offset", cost, PoseConvention(offset=offset)))
@@ -148,9 +148,10 @@ def _conventions(current: Interpretation) -> Iterator[Candidate]:
 
 
 def _signs(wheels: int, rolling: np.ndarray) -> Iterator[tuple[tuple[int, ...], float]]:
-    """Yield every choice of reversed wheels, as signs, with its cost.
+    """Yield the signs of the wheels for every choice of reversed wheels, each with its cost.
 
-    A single wheel, all wheels, or the wheels of one side cost nothing; any other choice costs 0.02.
+    Reversing a single wheel, all wheels, or the wheels of one side costs nothing; any other choice
+    costs 0.02.
     """
     sides = {tuple(np.flatnonzero(side)) for side in (rolling[:, 2] > 0, rolling[:, 2] < 0)}
     for count in range(1, wheels + 1):
@@ -166,7 +167,7 @@ def _orders(wheels: int) -> Iterator[tuple[tuple[int, ...], float]]:
     The cost grows with the number of columns that are not in their declared place.
     """
     declared = tuple(range(wheels))
-    for order in permutations(declared) if wheels <= MANY else _exchanges(declared):
+    for order in permutations(declared) if wheels <= MOST_PERMUTED else _exchanges(declared):
         moved = sum(k != at for at, k in enumerate(order))
         if moved:
             yield order, {2: 0.0, 3: 0.01}.get(moved, 0.015)

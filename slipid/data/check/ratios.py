@@ -36,22 +36,22 @@ from slipid.data.check.joined import (
     usable,
 )
 
-TURNS = 0.01
+LEAST_ROTATION = 0.01
 """Least share of rotation in the predicted motion for which rotations are compared [1]."""
-FORWARD = 0.02
+LEAST_TRANSLATION = 0.02
 """Least share of translation in the predicted motion for which translations are compared [1]."""
-RIGID = 1e-6
+SAME_DATA_TOLERANCE = 1e-6
 """Relative difference between the wheels' angle and their integrated speed below which the angle
 was computed from the speed [1]."""
 
 _Range = tuple[float, float, float]
 """Least, usual and largest natural value of a ratio [1]."""
 _WIDE: Mapping[str, _Range] = {
-    # A carpet may hold a robot in place, hence the small lower end (used if commands confirm the
+    # A robot may slip in place on carpet, hence the small lower end (used if commands confirm the
     # motion of the wheels). The scale of a camera may be wrong by an eighth.
     "travel": (0.012, 0.8, 1.35),
     "turning": (0.35, 0.8, 1.35),
-    # Commands precede the motion, and are larger than it where brakes or limits act.
+    # Commands precede the motion, and exceed it if brakes or limits act.
     "drive": (0.65, 1.1, 1.75),
     "steer": (0.65, 1.1, 1.75),
     "command": (0.7, 1.1, 1.75),
@@ -59,7 +59,7 @@ _WIDE: Mapping[str, _Range] = {
     "gyro": (0.75, 1.0, 1.33),
 }
 _UNVOUCHED: _Range = (0.3, 0.8, 1.35)
-"""Natural range of `travel` if no command was logged that could confirm the wheels' motion."""
+"""Natural range of `travel` if no command was logged to confirm the motion of the wheels."""
 _SCRUBBING: Mapping[str, _Range] = {"turning": (0.25, 0.55, 1.15), "steer": (0.4, 1.3, 3.2)}
 """Natural ranges for robots whose wheels cannot roll sideways: they turn less than their wheel
 speeds and track predict, and their drivers command more rotation to make up for it."""
@@ -85,9 +85,9 @@ class ScaleRatios:
     """Ratios between the channels of a set of runs.
 
     Attributes:
-        known: ratios that could be computed, by name.
-        speed_is_angle: whether the wheels' angle is the integral of the reported speeds, so that
-            the ratio `report` means nothing.
+        known: the ratios that can be computed, by name.
+        speed_is_angle: True if the wheel angles are integrals of the reported speeds, so that the
+            ratio `report` has no meaning.
     """
 
     known: Mapping[str, ScaleRatio]
@@ -141,9 +141,9 @@ def _along(
     if not total > 0:
         return None, None
     ahead, about = predicted[:2].sum(), predicted[2]
-    along = float(both[:2].sum() / ahead) if ahead > FORWARD * total else None
-    # Rotations that are predicted to be small are hidden by the rotations that slip causes.
-    turns = about > TURNS * total and both[2] ** 2 > 0.25 * about * sums.body[2, 2]
+    along = float(both[:2].sum() / ahead) if ahead > LEAST_TRANSLATION * total else None
+    # Small predicted rotations are hidden by rotations due to slip.
+    turns = about > LEAST_ROTATION * total and both[2] ** 2 > 0.25 * about * sums.body[2, 2]
     return along, float(both[2] / about) if turns else None
 
 
@@ -185,15 +185,15 @@ def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
     total = float((turned**2).sum())
     if not total > 0:
         return None, False
-    same = float(((reported - turned) ** 2).sum()) < RIGID**2 * total
+    same = float(((reported - turned) ** 2).sum()) < SAME_DATA_TOLERANCE**2 * total
     ratio = float(np.abs(reported * turned).sum()) / total
     return ratio, same
 
 
-NEAR = 0.02
+FACTOR_MARGIN = 0.02
 """Margin by which a common factor may lie outside the range of a fitting cause, in its logarithm
 [1]."""
-ROWS_S = (0.001, 1.5)
+USUAL_ROW_S = (0.001, 1.5)
 """Range of the time between rows in which the unit of time is not suspected [s]."""
 
 _COMMON = {
@@ -222,7 +222,7 @@ class ScaleCause:
     Attributes:
         name: name of the cause.
         factor: factor by which the quantity, or the values of its channels, are too large [1].
-        common: whether the factor is a common error, such as 1000.
+        common: True if the factor is a common error, such as 1000.
     """
 
     name: str
@@ -234,7 +234,7 @@ def causes(speed_is_angle: bool) -> Mapping[str, Mapping[str, float]]:
     """Return the power of each cause's factor in every ratio that it changes.
 
     The likeliest causes come first. A factor above 1 means that the channel's values are too large.
-    `speed_is_angle` says whether the wheels' angle was integrated from their speeds.
+    `speed_is_angle` is True if the wheel angles were integrated from their speeds.
     """
     rates = {"drive": 1.0, "steer": 1.0, "command": 1.0, "gyro": 1.0, "report": 1.0}
     integrated = {"travel": -1.0, "turning": -1.0, "gyro": 1.0}
@@ -271,7 +271,7 @@ def single_causes(
     if all(r.natural for r in scales.known.values()):
         return (), True
     possible = dict(causes(scales.speed_is_angle))
-    if ROWS_S[0] <= row_s <= ROWS_S[1]:
+    if USUAL_ROW_S[0] <= row_s <= USUAL_ROW_S[1]:
         del possible["time"]
     common = _common(gear_ratio, scales.speed_is_angle)
     single = _singles(scales.known, possible, common)
@@ -307,7 +307,7 @@ def _singles(
         low, high = _range(known, power)
         if low > high:
             continue
-        inside = [f for f in common[name] if low - NEAR <= log(f) <= high + NEAR]
+        inside = [f for f in common[name] if low - FACTOR_MARGIN <= log(f) <= high + FACTOR_MARGIN]
         middle = min(max(_middle(known, power), low), high)
         best = min(inside, key=lambda f: abs(log(f) - middle), default=None)
         found.append(ScaleCause(name, exp(middle) if best is None else best, best is not None))

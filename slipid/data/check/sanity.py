@@ -1,7 +1,7 @@
 """The sanity check of runs before a fit.
 
-It checks whether encoders, commands, gyro, currents and poses agree with each other and with the
-declared robot.
+Encoders, commands, gyro, currents and poses must agree with each other and with the geometry in the
+config.
 
 Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`, `wheel_speed_unit`,
 `heading_sign`, `heading_unit`, `heading_offset`, `heading_quaternion`, `pose_axis`, `pose_swapped`,
@@ -18,7 +18,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slipid.data.align.lag import PoseLag, pose_lag
-from slipid.data.check.columns import BROUGHT, SAME, electric, exchanged, misordered
+from slipid.data.check.columns import (
+    CONSEQUENTIAL_KINDS,
+    SUPERSEDING_KINDS,
+    electric,
+    exchanged,
+    misordered,
+)
 from slipid.data.check.findings import (
     Finding,
     cause_findings,
@@ -38,28 +44,33 @@ from slipid.data.check.joined import (
     usable,
 )
 from slipid.data.check.mistakes import mistakes
-from slipid.data.check.ratios import FORWARD, TURNS, ScaleRatios, ratios, single_causes
+from slipid.data.check.ratios import (
+    LEAST_ROTATION,
+    LEAST_TRANSLATION,
+    ScaleRatios,
+    ratios,
+    single_causes,
+)
 from slipid.data.check.single_runs import agreement, single_runs, standing
 from slipid.data.runs import Runs
 from slipid.model.geometry import Geometry
 
-FEW = 20
+LEAST_STEPS = 20
 """Least number of steps in which poses and wheels can be compared."""
-FOREIGN = 0.4
-"""Share of the poses' motion left unexplained, in the best interpretation, above which poses and
-wheels do not belong together [1]."""
+UNRELATED_SHARE = 0.4
+"""If the best interpretation leaves more than this share of the poses' motion unexplained, poses
+and wheels do not belong together [1]."""
 LATE_S = 1.0
-"""Magnitude of the lag of the poses from which there is a finding [s]."""
+"""Smallest magnitude of the lag of the poses that is a finding [s]."""
 TOO_LATE_S = 1.9
-"""Magnitude of the lag above which the finding is `wrong`, since a fit would start too far off
-[s]."""
+"""A finding about a larger lag is `wrong`, since a fit would start too far from it [s]."""
 SLOW_M_S, SLOW_ROW_S = 0.01, 2.0
-"""Rim speed [m/s] and time between rows [s]: if the speed is below and the time above these, the
-unit of time is smaller than declared."""
+"""If the rim speed [m/s] is below and the time between rows [s] above these values, the unit of
+time is smaller than declared."""
 FAST_M_S, FAST_ROW_S = 50.0, 1e-3
-"""Rim speed [m/s] and time between rows [s]: if the speed is above and the time below these, the
-unit of time is larger than declared."""
-SHORT = 0.62
+"""If the rim speed [m/s] is above and the time between rows [s] below these values, the unit of
+time is larger than declared."""
+SHORT_TRAVEL_RATIO = 0.62
 """Ratio of the body's path length to that of the wheels below which there is a finding if no
 command confirms the wheels [1]."""
 
@@ -73,7 +84,7 @@ class _Compared:
         moved: increments of the robot's channels, shifted by the lag of the poses.
         evidence: sums of products of these increments and those of the body.
         meant: the right interpretation.
-        poses: whether the poses are usable for further comparisons.
+        poses: True if the poses are usable for further comparisons.
     """
 
     findings: tuple[Finding, ...]
@@ -84,7 +95,7 @@ class _Compared:
 
 
 def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tuple[Finding, ...]:
-    """Return what is wrong with runs or with their declaration, the worst first, then notes.
+    """Return the findings about runs and their config, the worst first, notes last.
 
     Args:
         data: runs.
@@ -93,9 +104,11 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
     """
     channels = joined(data)
     found = tuple(_all(channels, edges(channels), geometry, mass_kg, pose_lag(data)))
-    if not {finding.kind for finding in found} & {*SAME}:
+    if not {finding.kind for finding in found} & {*SUPERSEDING_KINDS}:
         columns = tuple(misordered(data.logs))
-        found = tuple(f for f in found if not columns or f.kind not in BROUGHT) + columns
+        found = (
+            tuple(f for f in found if not columns or f.kind not in CONSEQUENTIAL_KINDS) + columns
+        )
     return worst_first(found)
 
 
@@ -109,7 +122,10 @@ def _all(
     """Yield all findings but `wheel_columns`, in no particular order."""
     found = _compared(data, at, geometry, lag)
     if found is None:
-        yield _not_checked(f"the runs are too short: {len(at.run)} steps, {FEW} are needed")
+        yield _not_checked(
+            f"the runs are too short: {len(at.run)} steps of motion, expected at least "
+            f"{LEAST_STEPS}"
+        )
         return
     yield from found.findings
     scales = ratios(data, at, found.moved, found.evidence, found.meant)
@@ -132,7 +148,7 @@ def _compared(
     """Return the comparison of poses with wheels, or None if there are too few steps."""
     lag = lag if lag is not None and lag.decisive else PoseLag(0.0, 1.0, 1.0)
     moved = increments(data, at, lag.seconds)
-    if usable(moved.wheels).sum() < FEW:
+    if usable(moved.wheels).sum() < LEAST_STEPS:
         return None
     evidence = gather(geometry, at, moved)
     declared = agreement(data, at, moved, evidence, Interpretation())
@@ -140,7 +156,7 @@ def _compared(
         return _Compared(tuple(single_runs(data, declared)), moved, evidence)
     meant, found = mistakes(evidence)
     left = misfits(evidence, meant)["pose"]
-    if left > FOREIGN:
+    if left > UNRELATED_SHARE:
         return _Compared((_foreign(left),), moved, evidence)
     # sin(heading / 2) does not determine the heading beyond half a turn, so that single runs may
     # seem to disagree.
@@ -152,14 +168,15 @@ def _compared(
 
 
 def _of_lag(lag: PoseLag) -> Iterator[Finding]:
-    """Yield the finding about poses that come much later or earlier than the encoders."""
+    """Yield the finding that the poses are much later or earlier than the encoders, if they are."""
     if abs(lag.seconds) < LATE_S:
         return
     late = "after" if lag.seconds > 0 else "before"
     yield Finding(
         "lag",
-        f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: so {lag.unexplained:.2f} of "
-        f"the motion is left unexplained, without {lag.unexplained_at_zero:.2f}",
+        f"the poses come {abs(lag.seconds):.1f} s {late} the encoders: with this lag "
+        f"{lag.unexplained:.2f} of the motion is unexplained, without it "
+        f"{lag.unexplained_at_zero:.2f}",
         f"shift the poses' times by {-lag.seconds:+.1f} s, or start 'camera.lag' in [parameters] "
         f"at {lag.seconds:.1f}",
         "wrong" if abs(lag.seconds) > TOO_LATE_S else "suspicious",
@@ -173,10 +190,10 @@ def _foreign(left: float) -> Finding:
     """
     return Finding(
         "pose_unexplained",
-        f"the poses do not follow the wheels: {left:.2f} of their motion is left unexplained, in "
-        "any order, with any signs and axes",
-        "check whether poses and encoders are of the same runs and of the same time, and whether "
-        "the wheels were on the ground",
+        "the poses do not follow the wheels: for every order, sign and axis tried, at least "
+        f"{left:.2f} of their motion is unexplained",
+        "check that poses and encoders come from the same runs and times, and that the wheels "
+        "were on the ground",
     )
 
 
@@ -187,8 +204,8 @@ def _factors(scales: ScaleRatios, row_s: float, gear_ratio: float) -> Iterator[F
     if not fitting and not all(r.natural for r in scales.known.values()):
         yield Finding(
             "scales",
-            "the channels disagree about the robot's path length, and no single number explains "
-            f"it: {ratio_sentence(scales)}",
+            "the channels disagree about the motion, and no single wrong number explains it: "
+            f"{ratio_sentence(scales)}",
             "check the units of all channels, gear_ratio, wheel_radius_m and base_radius_m",
         )
 
@@ -198,7 +215,8 @@ def _of_time(
 ) -> Iterator[Finding]:
     """Yield the finding that time is in another unit than declared.
 
-    It uses implausible rim speeds and times between rows, for logs whose ratios do not show it.
+    The evidence is an implausible rim speed and time between rows; ratios of channels may not show
+    it.
     """
     row = float(np.median(data.row))
     speed = np.abs(moved.wheels) / (at.after - at.before)[:, None] * radius
@@ -213,17 +231,17 @@ def _of_time(
 
 
 def _suspicious(scales: ScaleRatios) -> Iterator[Finding]:
-    """Yield the finding that the wheels travel much further than the body, without any command."""
+    """Yield the finding that the wheels travel much further than the body, without a command."""
     travel = scales.known.get("travel")
     if travel is None or "drive" in scales.known or "command" in scales.known:
         return
-    if travel.natural and travel.value < SHORT:
+    if travel.natural and travel.value < SHORT_TRAVEL_RATIO:
         yield Finding(
             "travel",
-            f"the body's path length is {travel.value:.2f} times the wheels', and no command "
-            "is logged that could confirm the wheels",
+            f"the path of the body is {travel.value:.2f} times as long as that of the wheels, and "
+            "no command is logged that could confirm the wheels",
             "check wheel_radius_m, gear_ratio, ticks_per_revolution and the unit of the poses, "
-            "unless the wheels slip so much",
+            "unless the wheels really slip that much",
             "suspicious",
         )
 
@@ -233,12 +251,13 @@ def _notes(data: JoinedRuns, evidence: Evidence, meant: Interpretation) -> Itera
     yield from _unmoved(evidence, meant)
     if evidence.twist is None and evidence.command is None:
         yield _not_checked(
-            "no command is logged: wheel turns that are logged too large look like wheels that slip"
+            "no command is logged, so logged wheel rotations that are too large cannot be told "
+            "from slip"
         )
     if data.current is not None and not data.current_is_signed:
         yield _not_checked("currents are magnitudes: their signs cannot be checked")
     if _constant(data.gyro):
-        yield _not_checked("the gyro never changes: it cannot be checked")
+        yield _not_checked("the gyro channel is constant and cannot be checked")
 
 
 def _not_checked(what: str) -> Finding:
@@ -253,12 +272,12 @@ def _unmoved(evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
         return
     share = pose.predicted(to_body(evidence, meant))
     share = share / max(float(share.sum()), 1e-300)
-    if share[2] < TURNS:
+    if share[2] < LEAST_ROTATION:
         yield _not_checked("no run turns: base radius, unit of the heading and gyro are unchecked")
-    if share[0] < FORWARD:
-        yield _not_checked("no run drives ahead: order and signs are checked in part only")
-    if evidence.free and share[1] < FORWARD:
-        yield _not_checked("no run drives sideways: order and signs are checked in part only")
+    if share[0] < LEAST_TRANSLATION:
+        yield _not_checked("no run drives ahead: order and signs are only partly checked")
+    if evidence.free and share[1] < LEAST_TRANSLATION:
+        yield _not_checked("no run drives sideways: order and signs are only partly checked")
 
 
 def _constant(channel: JoinedChannel | None) -> bool:

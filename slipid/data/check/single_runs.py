@@ -1,4 +1,4 @@
-"""Search for single runs with wrong poses: poses of another run, or poses that never change."""
+"""Search for single runs with wrong poses: poses of another run, or constant poses."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,19 +18,21 @@ from slipid.data.check.joined import (
 )
 
 MOVED_M = 0.2
-"""Path length by the wheels above which a run is judged, since its poses must move as well [m]."""
+"""A run is judged if the path length by the wheels exceeds this, since its poses must then move
+[m]."""
 STILL_M = 1e-6
-"""Path length below which poses do not change, except for rounding [m]."""
-ROWS = 20
-"""Least number of rows of a run that is judged."""
-ODD, TIMES, USUAL = 0.3, 10.0, 0.9
-"""A run has poses of another run if its disagreement, 1 - cosine, exceeds both `ODD` and `TIMES`
-times that of the median run. No run is judged if the median run's cosine is below `USUAL`."""
-CLIPPED = 4.0
+"""Poses with a path shorter than this are constant, except for rounding [m]."""
+LEAST_ROWS = 20
+"""Runs with fewer rows are not judged."""
+ODD_DISAGREEMENT, ODD_RATIO, LEAST_MEDIAN_COSINE = 0.3, 10.0, 0.9
+"""A run has poses of another run if its disagreement, 1 - cosine, exceeds both `ODD_DISAGREEMENT`
+and `ODD_RATIO` times that of the median run. No run is judged if the cosine of the median run is
+below `LEAST_MEDIAN_COSINE`."""
+CLIP_RATIO = 4.0
 """Multiple of the median length of the body increments to which longer increments are
 shortened [1]."""
-ALL = 0.5
-"""Share of runs with constant poses from which the finding is about all runs [1]."""
+ALL_RUNS_SHARE = 0.5
+"""If at least this share of the runs has constant poses, the finding is about all runs [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,7 @@ def agreement(
     known = usable(body, predicted)
     body, predicted, run = body[known], predicted[known], at.run[known]
     length = np.linalg.norm(body, axis=1)
-    most = CLIPPED * float(np.median(length[length > 0])) if (length > 0).any() else 1.0
+    most = CLIP_RATIO * float(np.median(length[length > 0])) if (length > 0).any() else 1.0
     body = body * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
     # Slip shortens the motion along each axis by a different factor.
     squares = (predicted**2).sum(axis=0)
@@ -86,26 +88,28 @@ def agreement(
 
 
 def standing(data: JoinedRuns, compared: RunAgreement) -> Bool[np.ndarray, " run"]:
-    """Return, for each run, whether its poses do not change although its wheels turn."""
-    return (compared.poses_m < STILL_M) & (compared.wheels_m > MOVED_M) & (_rows(data) >= ROWS)
+    """Return, for each run, whether its poses are constant although its wheels turn."""
+    return (
+        (compared.poses_m < STILL_M) & (compared.wheels_m > MOVED_M) & (_rows(data) >= LEAST_ROWS)
+    )
 
 
 def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
     """Yield findings about runs with constant poses, and about runs with poses of another run."""
     still = standing(data, compared)
     if still.any():
-        every = bool(still.mean() >= ALL)
+        every = bool(still.mean() >= ALL_RUNS_SHARE)
         yield Finding(
             "pose_constant",
             f"the poses do not change in {still.sum()} of {len(still)} runs while the wheels "
             f"travel {np.median(compared.wheels_m[still]):.2g} m",
             "check the columns of pose_x, pose_y and pose_heading, and the marker's visibility"
             if every
-            else "leave these runs out of the globs of [[logs]]",
+            else "exclude these runs from the globs of [[logs]]",
             runs=() if every else _names(data, still),
         )
-    # Runs in which the floor holds the robot in place disagree for a reason, and are not judged.
-    moves = ~still & (_rows(data) >= ROWS) & (compared.wheels_m > MOVED_M)
+    # Runs in which the robot slips in place disagree for a good reason, and are not judged.
+    moves = ~still & (_rows(data) >= LEAST_ROWS) & (compared.wheels_m > MOVED_M)
     if moves.any():
         moves &= (
             compared.poses_m
@@ -113,17 +117,17 @@ def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
             * np.median(compared.poses_m[moves] / compared.wheels_m[moves])
             * compared.wheels_m
         )
-    if moves.sum() < 2 or (usual := float(np.median(compared.cosine[moves]))) < USUAL:
+    if moves.sum() < 2 or (usual := float(np.median(compared.cosine[moves]))) < LEAST_MEDIAN_COSINE:
         return
-    odd = moves & (1 - compared.cosine > max(ODD, TIMES * (1 - usual)))
+    odd = moves & (1 - compared.cosine > max(ODD_DISAGREEMENT, ODD_RATIO * (1 - usual)))
     if odd.any():
         yield Finding(
             "pose_of_another_run",
             f"the poses of {odd.sum()} of {len(odd)} runs do not follow their wheels "
             f"(agreement {np.median(compared.cosine[odd]):.2f}, in the others "
             f"{np.median(compared.cosine[moves & ~odd]):.2f})",
-            "check whether these files hold poses of another run, or of another time, and leave "
-            "them out of the globs of [[logs]]",
+            "check whether these files contain poses of another run or of another time; if so, "
+            "exclude them from the globs of [[logs]]",
             runs=_names(data, odd),
         )
 

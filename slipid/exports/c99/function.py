@@ -25,8 +25,8 @@ class Argument:
         type: name of the struct that the argument points to; empty for plain numbers.
         fields: fields of the struct; a single one for plain numbers.
         example: a tree of arrays with the shapes of the fields, as the traced function takes it.
-        read: whether the function reads it.
-        written: whether the function fills it.
+        read: True if the function reads it.
+        written: True if the function fills it.
     """
 
     name: str

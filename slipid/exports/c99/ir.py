@@ -53,8 +53,8 @@ class Memory:
         size: count of its numbers.
         home: block that fills it; None where it is filled before the function begins.
         values: bytes of a table of constants, empty for other memory.
-        scalar: whether it is a single number that C accesses without an index.
-        lanes: whether it stores the lanes of a variable. Truth values are then stored as the
+        scalar: True if it is a single number that C accesses without an index.
+        lanes: True if it stores the lanes of a variable. Truth values are then stored as the
             numbers 1 and 0, since compilers vectorize loops over numbers of one size.
     """
 
@@ -121,7 +121,7 @@ class Statement:
         cells: cells for these places.
         writes: memory that the template fills.
         times: count of the numbers that it fills in a loop of its own; 0 for no such loop.
-        always: whether it is kept even if nothing reads that memory.
+        always: True if it is kept even if nothing reads that memory.
         start: initial value of a reduction; empty for other statements.
         source: file and line of the Python code that it is generated from.
     """
@@ -145,7 +145,7 @@ class CodeBlock:
     Attributes:
         owner: builder that it belongs to.
         lanes: number of iterations of the loop; 0 for straight-line code.
-        calls: whether its statements call functions.
+        calls: True if its statements call functions.
         when: condition under which the first of two bodies runs, else the second.
         times: number of times that the one body of a repetition runs.
         bodies: builders of the bodies.

@@ -32,7 +32,7 @@ class Parameter:
         value: value, which is the default in a declaration.
         about: description in one paragraph; empty where that of the parameter before covers both.
         checks: validators of the value.
-        read_only: whether it can be set only when the node starts.
+        read_only: True if it can be set only when the node starts.
         per_line: number of array entries per line; 0 for as many as fit.
     """
 

@@ -47,7 +47,7 @@ class RolledMotion(eqx.Module):
         axes: directions along, across and in yaw, as columns in the body frame.
         straight: speed of the body without its turn [m/s].
         angle: direction of travel in the body frame [rad].
-        travels: whether the body travels in a direction rather than turning on the spot.
+        travels: True if the body travels in a direction rather than turning on the spot.
     """
 
     speed: Float[Array, ""]

@@ -45,7 +45,7 @@ class TimeStep(eqx.Module):
 
     Attributes:
         dt: duration as `slipid.robot.filter.wheels.time_step` returns it [s].
-        moves: whether a wheel turns.
+        moves: True if a wheel turns.
         acceleration: acceleration of the fastest changing wheel [rad/s^2].
     """
 

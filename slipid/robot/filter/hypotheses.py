@@ -31,7 +31,7 @@ class Hypotheses:
             under this wheel and the other wheels unchanged; where there is none, the number of
             hypotheses.
         uniform: for each floor, the hypothesis that has it under all wheels.
-        on: whether the floor is under the wheel.
+        on: True if the floor is under the wheel.
     """
 
     under: Int[np.ndarray, "hypothesis wheel"]

@@ -48,7 +48,7 @@ class _StepMotion(eqx.Module):
         axes: directions along, across and in yaw, as columns in the body frame.
         slope: derivative of the twist by the nuisance states without the gyro's bias.
         share: expected share of the load on each floor [1].
-        by_gyro: whether a gyro measures the yaw rate.
+        by_gyro: True if a gyro measures the yaw rate.
     """
 
     speed: Float[Array, ""]

@@ -128,7 +128,7 @@ def test_the_command_without_a_config_writes_one_and_keeps_an_edited_one(tmp_pat
     assert f"--config {out / 'palette.toml'}" in text
     code, text = invoked(*common)
     assert code == 2
-    assert "it is there already and may have been edited" in text
+    assert "exists already, and proposing surfaces would overwrite it" in text
     config = (out / "palette.toml").read_text()
     (out / "palette.toml").write_text(config.replace("surface_1", "lawn"))
     code, text = invoked(*common, "--config", out / "palette.toml")

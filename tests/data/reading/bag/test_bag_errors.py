@@ -78,7 +78,7 @@ def test_a_missing_topic_is_answered_with_near_names_and_fitting_topics(tmp_path
     topics = {"wheel_angle": {"topic": "/joint_state"}}
     words = ("no topic '/joint_state' for wheel_angle", "did you mean /joint_states")
     refused(
-        tmp_path, messages, topics, *words, "one of /arm/states, /joint_states, which hold such"
+        tmp_path, messages, topics, *words, "one of /arm/states, /joint_states, which have such"
     )
 
 
@@ -108,8 +108,8 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
 @pytest.mark.parametrize(
     ("channel", "spec", "words"),
     [
-        ("gyro", {"topic": "/pose"}, (POSE, "the field of gyro is unknown", "sensor_msgs/Imu")),
-        ("pose", {"topic": "/imu"}, ("no pose of type", "TransformStamped", "field that holds it")),
+        ("gyro", {"topic": "/pose"}, (POSE, "whose field for gyro is not known", "sensor_msgs/Imu")),
+        ("pose", {"topic": "/imu"}, ("no pose of type", "TransformStamped", "field that contains it")),
         ("twist_command", {"topic": "/pose"}, ("no twist_command", "geometry_msgs/Twist")),
         ("bus_voltage", {"topic": "/imu"}, ("BatteryState", "field = one of its numbers")),
         (
@@ -130,7 +130,7 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
         (
             "gyro",
             {"topic": "/imu", "field": "angular_velocity.z[2]"},
-            ("no numbers in angular_velocity.z[2]", "wanted index"),
+            ("no numbers in angular_velocity.z[2]", "given index"),
         ),
         (
             "gyro",
@@ -230,7 +230,7 @@ def test_an_array_that_changes_its_length(tmp_path):
         for k, t in enumerate(TIME.tolist())
     ]
     topics = {"current": {"topic": "/amps", "unit": "A"}}
-    refused(tmp_path, messages, topics, "message 18", "3 numbers, and 2 of them before")
+    refused(tmp_path, messages, topics, "message 18", "3 numbers, but 2 in earlier messages")
 
 
 # numbers
@@ -304,7 +304,7 @@ def test_of_messages_with_one_stamp_the_last_stands(tmp_path):
     stamps[50] = stamps[49]
     run = accepted(tmp_path, imu(stamps=stamps), {"gyro": {"topic": "/imu"}})
     assert run.signals["gyro"].source.lines[48:51].tolist() == [49, 51, 52]
-    assert "1 messages with the stamp of another left out" in run.notes[0]
+    assert "1 messages with the same stamp as another were left out" in run.notes[0]
 
 
 @pytest.mark.parametrize(("apart", "notes"), [(0.2, 0), (3.0, 1)])
@@ -338,7 +338,7 @@ def test_a_definition_that_is_nowhere(tmp_path):
         runs_of(path, declared_bag_layout({"topics": topics}, "layout"))
     (tmp_path / "Amps.msg").write_text("my_msgs/Inner inner\n")
     given = {"topics": topics, "definitions": str(tmp_path)}
-    with pytest.raises(DataError, match=r"Inner, which my_msgs/msg/Amps is made of.* no Inner.msg"):
+    with pytest.raises(DataError, match=r"Inner, which my_msgs/msg/Amps contains.* no Inner.msg"):
         runs_of(path, declared_bag_layout(given, "layout"))
     (tmp_path / "Inner.msg").write_text("float64 x\n")
     with pytest.raises(DataError, match=r"topic '/amps' message 1: it is no my_msgs/msg/Amps"):
