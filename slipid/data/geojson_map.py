@@ -80,7 +80,7 @@ class VectorMap:
         write_json(path, self.to_json())
 
     def to_json(self) -> Content:
-        """Return a GeoJSON FeatureCollection of the patches, with the rest under the key `slipid`."""
+        """Return a GeoJSON FeatureCollection of the patches, with the region under `slipid`."""
         region = self.region.model_dump(mode="json", by_alias=True)
         region["extent_m"] = [round(bound, DIGITS) for bound in self.region.extent_m]
         features = [self._feature(patch) for patch in self.patches]

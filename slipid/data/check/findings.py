@@ -85,7 +85,7 @@ _CONVENTION_SENTENCES = {
     "heading_sign": "the heading of the poses turns in the opposite direction of the body",
     "pose_axis": "an axis of the poses has the wrong sign",
     "pose_swapped": "x and y of the poses are exchanged",
-    "pose_mirrored": "the poses are mirrored, as seen from below or in an image with y pointing down",
+    "pose_mirrored": "the poses are mirrored, as if seen from below or with y pointing down",
     "heading_quaternion": "the heading is the z of a quaternion, sin(yaw / 2), not an angle",
 }
 _CAUSES = {

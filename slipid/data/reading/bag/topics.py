@@ -191,7 +191,7 @@ def _signals(bag: OpenBag, layout: BagLayout, notes: list[str]) -> dict[str, Sig
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"{count} in {name}" for name, count in counts.items())
         raise DataError(
-            f"{bag.files.path}: channels disagree on the number of wheels: {listed}; expected the "
-            'same of each; name those that count by index (field = ["currents[0]", "currents[1]"])'
+            f"{bag.files.path}: channels have different numbers of wheels: {listed}; expected the "
+            'same number in all; select elements by index (field = ["currents[0]", "currents[1]"])'
         )
     return signals
