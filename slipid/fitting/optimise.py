@@ -1,4 +1,4 @@
-"""Maximum a posteriori fit by turns: Student-t weights, fitted numbers, and noise variances."""
+"""Maximum a posteriori fit, which alternates Student-t weights, numbers and noise variances."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ from slipid.fitting.variances import (
     scoring_step,
 )
 
-_REFUSED = 12
+_MOST_REFUSED = 12
 """Largest number of steps that the solver may refuse in a round."""
 
 
@@ -46,7 +46,7 @@ class Optimum:
         state: state after the last round.
         covariance: Laplace covariance of the search vector.
         converged: True if the last round changed less than the tolerance.
-        reason: reason why the fit stopped, as text for people.
+        reason: reason why the fit stopped, as a sentence.
         history: loss after every round, minus log posterior up to a constant.
     """
 
@@ -78,7 +78,7 @@ def optimise(
         tolerance: the fit stops after a round in which every fitted number changed by less than
             this many posterior stds, and every log variance by less than three times as much.
         tell: function called after every round, for progress and checkpoints.
-        free: 1 for coordinates that may move from the start, 0 for fixed ones (free,).
+        free: 1 for coordinates that may change from the start, 0 for fixed ones (free,).
         variances: True if the variances of the noise are fitted, too.
     """
     keep = problem.full_weight if keep is None else np.asarray(keep, float)
@@ -94,7 +94,7 @@ def optimise(
         if state.moved < tolerance:
             break
     covariance = problem.laplace(state.z, state.log_variance, keep)
-    reason = f"{most_rounds} rounds without settling"
+    reason = f"{most_rounds} rounds without convergence"
     if settled := state.moved < tolerance:
         reason = f"no number changed by {100 * tolerance:g} % of its std in round {state.round}"
     return Optimum(state, covariance, settled, reason, tuple(history))
@@ -136,7 +136,7 @@ def one_round(
     electric = problem.electric(z, log_v)
     whole, jacobian, motor_force = linear(objective, jnp.asarray(z), electric)
     effect = effects_given(weighed.effects, root["motion"], whole["motion"])
-    # weights and effects depend on each other: a full step of both can oscillate for ever
+    # Weights and effects depend on each other, and full steps of both could oscillate forever.
     effect = 0.5 * (effect + before) if state.round else effect
     residual = without_effects(objective, whole, effect)
     voltage = problem.voltage_information(z, log_v, motor_force)
@@ -145,12 +145,16 @@ def one_round(
     for _ in range(scoring):
         log_v = scoring_step(objective, residual, spread, log_v, jnp.asarray(keep), voltage)
         last, voltage = voltage, problem.voltage_information(z, log_v, motor_force)
-        if last is not None and voltage is not None:  # voltage residuals are scaled by their noise
+        if (
+            last is not None and voltage is not None
+        ):  # Voltage residuals are divided by their noise.
             scale = jnp.sqrt(voltage.share / last.share)
             residual = residual | {"voltage": voltage.residual}
             both = scale[:, :, None] * scale[:, None, :]
             spread = spread | {"voltage": spread["voltage"] * both}
-    if voltage is not None and scoring:  # a new noise does not merely rescale the derivative by R
+    if (
+        voltage is not None and scoring
+    ):  # A changed noise does not merely rescale the derivative by R.
         electric = problem.electric(z, log_v)
         whole, jacobian = problem.linear(z, electric)
     information = np.asarray(problem.precision(jacobian, log_v, keep))
@@ -184,7 +188,7 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
     space, labels = problem.space, problem.robot.surfaces.labels
     mask = space.where(lambda e: e.surface is not None).astype(float)
     creep = space.where(lambda e: e.quantity == "surface.creep")
-    # far from the optimum every run is an outlier: start with wide variances
+    # Far from the optimum every run would be an outlier, so start with large variances.
     usual = {"camera": 1.0, "pooled": 1.0} | dict.fromkeys(SHARED, 0.1)
     wide = [usual.get(c.kind, 3.0) for c in problem.noise.components]
     log_v = 2 * np.log(problem.noise.typical) + 2 * np.log(wide)
@@ -197,12 +201,18 @@ def staged_start(problem: Problem, keep: np.ndarray, tell: Callable[[FitState], 
         stage = f"floor by floor, start {attempt + 1} of {len(CREEPS)}"
         start = np.where(creep, np.log(value), first)
         state = FitState(start, log_v, 0, np.inf, np.inf, stage)
-        for steps in (15, 6, 6):  # the solver's damping starts at 1, far below the problem's scale
+        for steps in (
+            15,
+            6,
+            6,
+        ):  # The damping of the solver starts at 1, far below the scale of the problem.
             state = one_round(independent, state, keep, mask, steps=steps, scoring=0)
             tell(state)
         residual, _ = independent.linear(state.z, problem.electric(state.z, state.log_variance))
         found = problem.whitening(residual, state.log_variance, problem.full_weight)
-        cost = -np.log(np.asarray(found.weight["motion"]))  # loss per segment, up to scale, offset
+        cost = -np.log(
+            np.asarray(found.weight["motion"])
+        )  # loss per segment, up to a factor and an offset
         for number, label in enumerate(labels):
             mine = float(np.sum(cost[(floors == number) & (keep[: len(floors)] > 0)]))
             if mine < best[number]:
@@ -257,8 +267,8 @@ class RoundInputs(eqx.Module):
 class LimitedLevenberg(optx.LevenbergMarquardt):
     """Levenberg-Marquardt solver that stops after `most` accepted steps.
 
-    Refused steps do not count: each makes the next step smaller, so that a round that stopped after
-    refused steps would look like convergence. The solver counts its evaluation of the start as an
+    Refused steps are not counted: each makes the next step smaller, so that a round that stopped
+    after refused steps would look converged. The solver counts its evaluation of the start as an
     accepted step.
     """
 
@@ -279,7 +289,7 @@ class LimitedLevenberg(optx.LevenbergMarquardt):
     ) -> tuple[Array, optx.RESULTS]:
         done, result = super().terminate(fn, y, args, options, state, tags)
         taken = state.num_accepted_steps - 1 >= self.most
-        return done | taken | (state.num_steps >= self.most + _REFUSED), result
+        return done | taken | (state.num_steps >= self.most + _MOST_REFUSED), result
 
 
 @eqx.filter_jit
@@ -305,8 +315,8 @@ def _stacked(y: Array, fixed: RoundInputs) -> Array:
     electric = lk.electric_residuals(given, objective.batch, fixed.motor_force, fixed.electric)
     blocks = {"motion": motion} | electric
     if (of := objective.multi_floor) is not None:
-        # here, too, currents change electric numbers only. Friction is one of them and changes the
-        # motion, so that currents need a prediction of their own, with the other numbers at z
+        # Here, too, currents change electric numbers only. Friction is one of them and changes the
+        # motion, so that currents need a separate prediction, with the other numbers at z.
         blocks |= of.residuals(given, lk.predict(given, of.batch))
         of_robot = of.residuals(robot, lk.predict(robot, of.batch))
         blocks[MULTI_FLOOR_MOTION] = of_robot[MULTI_FLOOR_MOTION]

@@ -263,7 +263,8 @@ def test_poses_of_another_run_are_refused_with_what_to_do(tmp_path):
     assert found.logs == ()
     (line,) = found.aside
     assert re.search(
-        r"set aside: .*run.poses.csv: .*does not determine the offset of its clock.*starts, stops", line
+        r"set aside: .*run.poses.csv: .*not determine the offset of its clock.*starts, stops",
+        line,
     )
 
 
@@ -321,5 +322,5 @@ def test_only_poses_may_have_a_clock_of_their_own():
     table = layout()
     columns = {"current": {"columns": ["i", "j", "k"], "unit": "A"}}
     table["beside"] = {"{stem}.poses.csv": {"format": "tracked", "columns": columns}}
-    with pytest.raises(DataError, match=r"poses\.csv: clock = 'own'; allowed only for a file with poses"):
+    with pytest.raises(DataError, match=r"poses\.csv: clock = 'own'; allowed only for a file"):
         declared_layout(table, "test")

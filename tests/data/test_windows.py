@@ -355,7 +355,7 @@ def test_runs_without_poses_are_refused():
 
 def test_a_robot_that_stands_is_refused():
     data = collect([run("a.csv"), run("still.csv", start=100.0)])
-    with pytest.raises(DataError, match=r"still\.csv: no wheel moves 10 mm; expected a run"):
+    with pytest.raises(DataError, match=r"still\.csv: no wheel rim moves by 10 mm; expected a run"):
         windows(data, RADIUS)
 
 

@@ -8,7 +8,7 @@ from functools import reduce
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from slipid.fitting.likelihood import SMOOTH
+from slipid.fitting.likelihood import SMOOTHING_A
 from slipid.model import contact, contact_law
 from slipid.parameter import entries, share_basis
 
@@ -89,7 +89,7 @@ class Rival:
         torque = v["geometry", "wheel_radius"] * weight * borne
         drag = m["coulomb_friction"] * np.tanh(speed / 0.2) + m["viscous_friction"] * speed
         amps = (torque + drag) / (self.g.gear_ratio * m["efficiency"] * m["back_emf"])
-        amps = np.sqrt(amps**2 + SMOOTH**2) if not self.b.signed else amps
+        amps = np.sqrt(amps**2 + SMOOTHING_A**2) if not self.b.signed else amps
         pieces = len(self.b.dt)
         current = amps + m["current_offset"] - self.amps
         return {"motion": self.motion(v, xi), "current": current.reshape(pieces, -1)}

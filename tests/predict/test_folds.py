@@ -274,7 +274,7 @@ def test_models_that_say_the_same_can_hardly_be_told_apart():
             assert verdict.pop("constant") in ("best", "tied")
             others += verdict.values()
             if "worse" not in verdict.values():
-                assert f"{name}: the data cannot tell" in floor.sentence
+                assert f"{name}: the data cannot distinguish" in floor.sentence
     assert others.count("worse") <= 4  # of twelve
 
 

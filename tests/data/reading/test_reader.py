@@ -125,7 +125,10 @@ def test_a_config_starts_from_a_preset_and_overrides_it(root):
         ({"format": "robotino2022", "names_row": True}, "names_row: True; .*valid integer"),
         ({"format": "robotino2022", "delimiter": ";;"}, "delimiter: ';;'; .*at most 1 char"),
         ({"format": "robotino2022", "new_run": "often"}, "new_run: 'often'; .*time_restarts"),
-        ({"format": "robotino2022", "first_data_row": 2}, "expected a row below those of names and units"),
+        (
+            {"format": "robotino2022", "first_data_row": 2},
+            "expected a row below those of names",
+        ),
         (
             {"format": "robotino2022", "metres_per_pixel": [1, -1]},
             "metres_per_pixel.2.: -1; .*greater than 0",

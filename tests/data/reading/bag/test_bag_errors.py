@@ -108,8 +108,16 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
 @pytest.mark.parametrize(
     ("channel", "spec", "words"),
     [
-        ("gyro", {"topic": "/pose"}, (POSE, "whose field for gyro is not known", "sensor_msgs/Imu")),
-        ("pose", {"topic": "/imu"}, ("no pose of type", "TransformStamped", "field that contains it")),
+        (
+            "gyro",
+            {"topic": "/pose"},
+            (POSE, "field for gyro is not known", "sensor_msgs/Imu"),
+        ),
+        (
+            "pose",
+            {"topic": "/imu"},
+            ("no pose of type", "TransformStamped", "that contains it"),
+        ),
         ("twist_command", {"topic": "/pose"}, ("no twist_command", "geometry_msgs/Twist")),
         ("bus_voltage", {"topic": "/imu"}, ("BatteryState", "field = one of its numbers")),
         (
@@ -145,7 +153,7 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
         (
             "wheel_speed",
             {"topic": "/joint_states", "field": "position"},
-            ("'rad' cannot be converted to rad/s", "belong to", "wheel_angle"),
+            ("'rad' cannot be converted to rad/s", "are possible for", "wheel_angle"),
         ),
         (
             "wheel_speed",
@@ -155,7 +163,7 @@ def test_a_topic_with_messages_of_two_types(tmp_path):
         (
             "wheel_angle",
             {"topic": "/joint_states", "scale": [1.0, 1.0, -1.0]},
-            ("2 columns for 3 scales",),
+            ("2 columns, but 3 scales",),
         ),
         (
             "pose",
@@ -187,7 +195,11 @@ def test_wrong_joint_names(tmp_path):
 
 def test_no_joint_names(tmp_path):
     topics = {"wheel_angle": {"topic": "/joint_states"}}
-    words = ("no joints are named", "order of the drives", "there are: wheel_left, wheel_right")
+    words = (
+        "no joints are named",
+        "order of the drives",
+        "the messages have: wheel_left, wheel_right",
+    )
     refused(tmp_path, wheels(), topics, *words, joints=())
 
 
@@ -240,7 +252,7 @@ def test_poses_without_numbers(tmp_path):
     x = TIME - START
     x[40:60] = np.nan
     topics = {"pose": {"topic": "/pose"}}
-    words = ("message 41", "pose.position.x is nan", "20 such among 200", "drop_nan = true")
+    words = ("message 41", "pose.position.x is nan", "20 such values among 200", "drop_nan = true")
     refused(tmp_path, poses(x=x), topics, *words)
     run = accepted(tmp_path / "kept", poses(x=x), topics, drop_nan=True)
     assert len(run.signals["pose_x"].time) == 180
@@ -249,7 +261,7 @@ def test_poses_without_numbers(tmp_path):
 
 def test_all_poses_without_numbers(tmp_path):
     topics = {"pose": {"topic": "/pose"}}
-    words = ("200 such among 200", "does the driver fill")
+    words = ("200 such values among 200", "does the driver fill")
     refused(tmp_path, poses(x=np.full(len(TIME), np.nan)), topics, *words, drop_nan=True)
 
 
