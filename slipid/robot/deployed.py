@@ -1,4 +1,4 @@
-"""Arrays of an identified robot that estimators and controllers use; they come from robot.json."""
+"""Arrays of an identified robot from robot.json, as used by estimators and controllers."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -23,11 +23,11 @@ from slipid.support.errors import DataError
 
 
 class RobotArrays(eqx.Module):
-    """Arrays of an identified robot with one load set-up, as estimators and controllers hold them.
+    """Arrays of an identified robot with one load set-up, for estimators and controllers.
 
-    Compiled code depends only on the static fields, which describe the robot's structure, so robots
-    of equal structure share it whatever their numbers. A drive is a motor with its encoder and
-    ammeter. There is one for every wheel unless a motor drives several wheels.
+    Compiled code depends only on the static fields, which describe the structure of the robot, so
+    that robots of equal structure share it even if their numbers differ. A drive is a motor with
+    its encoder and ammeter. Every wheel has one, unless a motor drives several wheels.
 
     Attributes:
         frame: directions and radii of the wheels.
@@ -92,7 +92,7 @@ class RobotArrays(eqx.Module):
 
     @property
     def by_wheels(self) -> Float[Array, "3 wheel"]:
-        """Matrix from rim speeds to body twist, where wheels of a drive share their speed."""
+        """Matrix from rim speeds of wheels to body twist, for equal speeds of wheels of a drive."""
         if not self.drive_of:
             return self.inverse
         return self.inverse @ self.on_average(jnp.eye(self.wheels)).T
@@ -130,10 +130,10 @@ class DeployedRobot(RobotArrays):
 
     @property
     def steers(self) -> bool:
-        """True if its wheels can produce any twist, each of them driven alone.
+        """True if the drives can produce any body twist.
 
-        A robot that does not steer has an estimator but no controller, since
-        `slipid.robot.controller` demands sideways motion as well.
+        Other robots have an estimator but no controller, since `slipid.robot.controller` also
+        demands sideways motion.
         """
         shape = geometry_of(self.record)
         return not shape.drive_of and shape.determines_twist
@@ -172,20 +172,20 @@ class DeployedRobot(RobotArrays):
         """Write robot.json, with all load set-ups.
 
         Raises:
-            ValueError: arrays differ from those of the record, since they were changed later; the
-                file can hold only the record.
+            ValueError: the arrays differ from those of the record because they were changed; only
+                the record can be stored in a file.
             DataError: the file cannot be written.
         """
         same = DeployedRobot.of(self.record, self.load_setup)
         pairs = zip(jax.tree.leaves(self), jax.tree.leaves(same), strict=True)
         if not all(np.array_equal(a, b) for a, b in pairs):
             raise ValueError(
-                "arrays of this robot are not those of its record, so a file cannot hold them"
+                "the arrays of this robot differ from its record and cannot be stored in a file"
             )
         write_robot(Path(path), self.record)
 
     def on(self, *floors: str) -> "DeployedRobot":
-        """Return the robot for a site that is known to have these floors only.
+        """Return the robot for a site on which only these floors occur.
 
         Raises:
             ValueError: no floor is given, one is given twice or is not identified; the message
@@ -196,7 +196,7 @@ class DeployedRobot(RobotArrays):
             if name not in self.labels:
                 raise ValueError(f"no floor '{name}'; identified: {known}")
         if len(set(floors)) < max(len(floors), 1):
-            raise ValueError(f"floors {list(floors)}; expected each once of {known}")
+            raise ValueError(f"floors {list(floors)}; expected different names out of {known}")
         rows = tuple(self.labels.index(name) for name in floors)
         return DeployedRobot.of(self.record.on(rows), self.load_setup)
 
@@ -218,14 +218,14 @@ def with_record(robot: RobotArrays) -> DeployedRobot:
     """
     if not isinstance(robot, DeployedRobot):
         raise ValueError(
-            "arrays of a robot without its record; expected a DeployedRobot, or settings and gains "
-            "to go with the arrays"
+            "the arrays of a robot without its record; expected a DeployedRobot, or settings and "
+            "gains in addition to the arrays"
         )
     return robot
 
 
 def posterior_robots(robot: DeployedRobot, picked: tuple[int, ...]) -> DeployedRobot:
-    """Return the robots of the posterior draws number `picked`, stacked along a leading axis.
+    """Return the robots of the posterior draws with indices `picked`, stacked along a leading axis.
 
     `DeployedRobot.effect` then holds only the differences between runs, since the draws themselves
     show the spread of the numbers. The means of the effect tables, the remaining shares of their

@@ -5,8 +5,8 @@ into a body motion, from which a second filter computes the pose (`pose_filter`)
 
     xi = sum_c p_c xi_c,   pose <- pose * exp(xi dt) * (late corrections from the floors)
 
-with p_c the probability of hypothesis c, one floor under each wheel, and xi_c the body twist
-[m/s, m/s, rad/s] if that hypothesis is true.
+with p_c the probability of hypothesis c (a floor for each wheel), and xi_c the body twist [m/s,
+m/s, rad/s] if that hypothesis is true.
 """
 
 from dataclasses import replace
@@ -32,7 +32,7 @@ from slipid.robot.interface import (
     as_arrays,
 )
 
-CURRENT_FROM = 0.4
+SLIP_CURRENT = 0.4
 """Motor current above which the 2021 paper's deployed estimator subtracts slip [A]."""
 
 
@@ -136,7 +136,7 @@ class Estimator(AbstractEstimator[EstimatorState]):
         )
 
     def _slip(self, w: Array, twist: Array) -> Array:
-        """Return the slip ratio of each drive [1]; it is 0 while the drive stands."""
+        """Return the slip ratio of each drive [1]; it is 0 while the drive stands still."""
         f, turns = self.robot, jnp.abs(w) > 1e-3
         rim = f.frame.radius * jnp.where(turns, w, 1.0)
         return jnp.where(turns, jnp.clip(1 - f.forward @ twist / rim, -2.0, 2.0), 0.0)
@@ -160,11 +160,12 @@ class Estimator(AbstractEstimator[EstimatorState]):
 
 
 def _corrected(floors: FloorState, left: Array, place: PoseState, expected: Array) -> FloorState:
-    """Return the belief after a map corrected the pose.
+    """Return the belief over hypotheses after a map has corrected the pose.
 
     Args:
         floors: belief before the correction.
-        left: share of the distances between poses that the correction leaves, in world axes (3, 3).
+        left: share of the distances between the poses of hypotheses that remains after the
+            correction, in world axes (3, 3).
         place: corrected pose.
         expected: probability of each hypothesis by the map at the corrected pose.
     """
@@ -193,7 +194,7 @@ class Odometry(AbstractEstimator[OdometryState]):
         robot: identified robot.
         settings: settings; by default those for the sensors and floors of the robot's logs.
         curve: True for a slip ratio by `DeployedRobot.wheel_curve`, a + b |I| where the smoothed
-            current I [A] exceeds `CURRENT_FROM`, as on the 2021 paper's robot; False for no slip.
+            current I [A] exceeds `SLIP_CURRENT`, as on the 2021 paper's robot; False for no slip.
     """
 
     robot: RobotArrays
@@ -221,13 +222,15 @@ class Odometry(AbstractEstimator[OdometryState]):
         wheels = read_wheels(f, s, old.wheels, z, dt)
         w = wheels.speed
         known = jnp.isfinite(z.current) & (jnp.abs(z.current) < 10.0 * f.highest[1])
-        a = 1 - jnp.exp(-dt / 0.6)  # 0.6 s: the paper's robot kept 0.97 of the value per row
+        a = 1 - jnp.exp(
+            -dt / 0.6
+        )  # 0.6 s, since the filter of the paper's robot had a factor of 0.97 per row
         smoothed = old.current + a * (jnp.abs(z.current) - old.current)
         amps = jnp.where(known, smoothed, old.current)
         slip = jnp.zeros_like(w)
         if self.curve:
             line = f.wheel_curve[:, 0] + f.wheel_curve[:, 1] * amps
-            slip = jnp.where(amps > CURRENT_FROM, jnp.clip(line, 0.0, 0.95), 0.0)
+            slip = jnp.where(amps > SLIP_CURRENT, jnp.clip(line, 0.0, 0.95), 0.0)
         twist = f.inverse @ (f.frame.radius * w * (1 - slip))
         pose = compose(old.pose, advance(twist, dt))
         unknown = jnp.zeros((f.wheels, len(f.labels) + 1)).at[:, -1].set(1.0)

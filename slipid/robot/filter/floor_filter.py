@@ -1,7 +1,7 @@
 """Filter over the floors under the wheels, with one hypothesis for all wheels together.
 
-A robot whose wheels stand on several floors moves as one body, so every hypothesis is one floor per
-wheel (`hypotheses`), and one more is "unknown":
+All wheels move the same body, so every hypothesis assigns a floor to each wheel (`hypotheses`); one
+further hypothesis is "unknown":
 
     xi_c, I_c     contact equilibrium with the estimated effect of a single floor, and motor
                   currents, of hypothesis c at the wheel speeds
@@ -12,9 +12,9 @@ wheel (`hypotheses`), and one more is "unknown":
 with p_c the probability of c, xi_c its body twist [m/s, m/s, rad/s], I the measured and I_c the
 predicted currents [A], and tau the time within which evidence repeats (`Settings.forget_s`) [s].
 
-A wheel's current shows its share of the whole drag, not the drag beneath it; only all currents
-together distinguish the floors. Evidence that comes late corrects the pose by the distance between
-the hypotheses' poses (interacting multiple models; Blom and Bar-Shalom 1988).
+The current of a wheel shows its share of the whole drag, not the drag of the floor under it; only
+all currents together distinguish the floors. Late evidence corrects the pose by the distance
+between the poses of the hypotheses (interacting multiple models; Blom and Bar-Shalom 1988).
 """
 
 from dataclasses import replace
@@ -36,8 +36,8 @@ from slipid.robot.filter.wheels import MotorCurrents
 from slipid.robot.interface import Settings
 
 INERTIA_ACCELERATION = 30.0
-"""Wheel acceleration at which evidence on floors weighs half, since the equilibrium lacks inertia
-[rad/s^2]."""
+"""Wheel acceleration at which evidence about floors has half its weight, since the equilibrium
+neglects inertia [rad/s^2]."""
 
 
 class TimeStep(eqx.Module):
@@ -122,12 +122,13 @@ class FloorFilter(eqx.Module):
     def prior(self) -> Float[Array, " hypothesis"]:
         """Return the probability of every hypothesis before any measurement.
 
-        All floors without a run together are as improbable as one further floor under the robot.
+        All hypothetical floors (`slipid.robot.unseen`) together have the prior probability of one
+        further floor under the robot.
         """
         under = hypotheses_of(self.robot).under
         kinds = np.array([len(set(row)) for row in under.tolist()])
         unseen = np.array(self.robot.unseen)[under[:, 0]]
-        further = kinds - 1 + unseen  # floors beyond the first one under the robot
+        further = kinds - 1 + unseen  # number of further floors under the robot
         weight = jnp.exp(-self.settings.further_floor_penalty * further) / np.where(
             unseen, unseen.sum(), 1
         )
@@ -142,10 +143,10 @@ class FloorFilter(eqx.Module):
         tick: TimeStep,
         mapped: Float[Array, " hypothesis"] | None = None,
     ) -> tuple[FloorState, BodyMotion]:
-        """Return the beliefs one time step later, and the motion that follows from them.
+        """Return the belief one time step later, and the resulting motion.
 
         Args:
-            old: beliefs before the step.
+            old: belief before the step.
             w: wheel speed of every drive [rad/s].
             currents: motor currents.
             turn: yaw rate by the gyro without its bias, NaN without a gyro [rad/s].
@@ -159,7 +160,7 @@ class FloorFilter(eqx.Module):
         mean, part = f.effect_table.at(rolled)
         xi = settled + effects_by_hypothesis(f, rolled.speed * mean @ rolled.axes.T)
         known_log, unknown_log = self._evidence(xi, predicted, currents, w, turn)
-        # evidence weighs less while wheels accelerate, since the equilibrium lacks inertia
+        # Evidence has less weight while wheels accelerate, since the equilibrium neglects inertia.
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)
         weight = weight / (1 + (tick.acceleration / INERTIA_ACCELERATION) ** 2)
         prior, apart = self._mixed(old, xi, tick, mapped)
@@ -190,7 +191,7 @@ class FloorFilter(eqx.Module):
     def _left(self, part: Float[Array, "floor 3"], known: Array, under: Array) -> Array:
         """Return the remaining std of every floor's effects as a share of the whole std [1].
 
-        With wheels on several floors the whole std remains, since the estimates hold for all wheels
+        With wheels on several floors the whole std remains, since the estimates are for all wheels
         on one floor.
         """
         alone = known[hypotheses_of(self.robot).uniform]
@@ -220,7 +221,7 @@ class FloorFilter(eqx.Module):
         """Return the derivative of a twist by the log friction of each floor under the wheels.
 
         It follows from the balance of forces. Its magnitude is limited to the body's speed, since
-        linearization fails where all wheels slide.
+        linearization fails if all wheels slide.
         """
         f = self.robot
         rim = f.frame.radius * f.at_wheels(w)
@@ -231,7 +232,7 @@ class FloorFilter(eqx.Module):
         def force(mu: Array) -> Planar:
             return Balance(rim, replace(on, floor=replace(on.floor, friction=mu))).force(xi)
 
-        def pushed(part: Array) -> Planar:  # frictions are relative to their mean
+        def pushed(part: Array) -> Planar:  # Friction coefficients are divided by their mean.
             return jax.jvp(force, (mu,), (part - mu * jnp.mean(part),))[1]
 
         slope = solve3(Balance(rim, on).jacobian(xi), jax.vmap(pushed)(each.T))
@@ -260,12 +261,12 @@ class FloorFilter(eqx.Module):
         counts = jnp.append(measured > 0, jnp.isfinite(turn))
         worst = (s.unknown_std + 1.0) ** 2
         score = jnp.sum(jnp.where(counts, jnp.minimum(gap**2 / var, worst), 0.0), axis=1)
-        # one logarithm of a product costs a robot's computer less than several logarithms
+        # One logarithm of a product is cheaper than several logarithms.
         spread = jnp.prod(jnp.where(counts, var / jnp.mean(var, axis=0), 1.0), axis=1)
         return -0.5 * (score + jnp.log(spread)), -0.5 * s.unknown_std**2 * jnp.sum(counts)
 
     def _of_friction(self, amps: Float[Array, "hypothesis drive"]) -> Array:
-        """Return the variance of currents that uncertain frictions of several floors cause [A^2].
+        """Return the variance of currents due to uncertain friction of several floors [A^2].
 
         A wheel carries a share of the whole drag in proportion to its floor's friction divided by
         the mean friction.
@@ -276,7 +277,7 @@ class FloorFilter(eqx.Module):
         return amps**2 * self.robot.on_average(var.reshape(on.shape[:2]))
 
     def _stiction(self, w: Array) -> Array:
-        """Return the variance of the current of a standing wheel [A^2]; it is 0 for a turning one.
+        """Return the variance of the current of a wheel at standstill [A^2]; 0 for a turning wheel.
 
         Static friction lets the current lie anywhere between two bounds, taken as uniform.
         """
@@ -298,7 +299,8 @@ class FloorFilter(eqx.Module):
             fresh, whole = mapped, _followed(whole, old.expected, mapped, change)
         stayed = whole[:, 0] * (1 - 0.05 * change)
         of_known = stayed + 0.2 * change * unknown * fresh
-        # the probability that returns from "unknown" has the mean pose, relative pose 0
+        # The probability that returns from "unknown" gets the mean pose, which has the relative
+        # pose 0.
         apart = whole[:, 1:] * ((1 - 0.05 * change) / of_known)[:, None]
         of_none = unknown * (1 - 0.2 * change) + 0.05 * change * sure
         return jnp.append(of_known, of_none), apart
@@ -317,7 +319,7 @@ class FloorFilter(eqx.Module):
         return self._estranged(p, change)
 
     def _estranged(self, p: Float[Array, "hypothesis column"], change: Array) -> Array:
-        """Return the belief after the whole robot may have moved to or from a floor without a run.
+        """Return the belief after the whole robot may have moved to or from a hypothetical floor.
 
         Such a change is as improbable as one to the "unknown" floor.
         """
@@ -338,8 +340,8 @@ class FloorFilter(eqx.Module):
         """Return poses of the hypotheses relative to their mean, and the jump of the mean pose.
 
         The jump is the change of the mean pose beyond the mean twist; late evidence on the floors
-        causes it. Each hypothesis continues from its own pose with its own twist; the yaw rate of a
-        gyro, if there is one, replaces that of all twists.
+        causes it. Each hypothesis continues from its pose with its twist; the yaw rate of a gyro,
+        if there is one, replaces that of all twists.
         """
         xi = xi.at[:, 2].set(jnp.where(jnp.isfinite(turn), turn, xi[:, 2]))
         poses = jax.vmap(compose)(apart, jax.vmap(advance, (0, None))(xi, tick.dt))

@@ -227,7 +227,7 @@ def test_a_fixed_number_stays(record):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda r: {"current": 1000 * r.current}, "amperes"),
+        (lambda r: {"current": 1000 * r.current}, "unit of the current"),
         (lambda r: {"current": r.voltage, "voltage": r.current}, "exchanged"),
         (lambda r: {"current": -r.current}, "current has the wrong sign"),
         (lambda r: {"speed": -r.speed}, "speed has the wrong sign"),

@@ -103,7 +103,7 @@ def test_powers_differ_by_formula():
     three = [*both, *wording.axes_of(numbers("surface.soft.creep")[0])]
     open_ = wording._product(three, np.array([1.0, -0.5, 0.8]))
     assert open_.startswith(
-        f"no effect on the data for any factor t: {a} times t, {b} divided by t^0.5, "
+        f"changes without effect on the data, for any factor t: {a} times t, {b} divided by t^0.5, "
     )
     assert open_.endswith(" times t^0.8")
     assert wording._sum([a, b], np.array([1.0, -1.0])) == f"{a} and {b} only as {b} + {a}"

@@ -88,7 +88,7 @@ def test_where_no_topic_fits_all_are_listed(tmp_path):
 
 def test_an_empty_topic(tmp_path):
     topics = {"gyro": {"topic": "/imu"}}
-    words = ("topic '/imu'", "no message", "holds gyro", "was its driver on?")
+    words = ("topic '/imu'", "no message", "topic of gyro", "was its driver on?")
     refused(tmp_path, wheels(), topics, *words, empty={"/imu": IMU})
 
 
@@ -189,7 +189,11 @@ def test_odometry_is_no_command(tmp_path):
 
 def test_wrong_joint_names(tmp_path):
     topics = {"wheel_angle": {"topic": "/joint_states"}}
-    words = ("no joint 'wheel_lft'", "did you mean wheel_left", "there: wheel_left, wheel_right")
+    words = (
+        "no joint 'wheel_lft'",
+        "did you mean wheel_left",
+        "in the messages: wheel_left, wheel_right",
+    )
     refused(tmp_path, wheels(), topics, *words, joints=("wheel_lft", "wheel_right"))
 
 
