@@ -84,26 +84,20 @@ def read_bench_task(config: Config, root: Path, report: Reporter) -> BenchTask:
     counts = {len(p) for p in parts}
     if len(counts) > 1:
         raise DataError(f"{config.path}: logs of {min(counts)} and of {max(counts)} motors")
+    with_voltage = [p for p in parts if p[0].voltage is not None]
+    if without := len(parts) - len(with_voltage) if with_voltage else 0:
+        skipped.append(f"skipped: {without} logs without a voltage, others have one")
+        parts = with_voltage
     robot = config.content.robot
     names = robot.names if isinstance(robot, BenchMotors) else []
-    labels = _labels(names, counts.pop(), str(config.path))
-    with_voltage = [p for p in parts if p[0].voltage is not None]
-    dropped: list[str] = []
-    if 0 < len(with_voltage) < len(parts):
-        without = len(parts) - len(with_voltage)
-        dropped, parts = (
-            [f"skipped: {without} logs without a voltage, others have one"],
-            with_voltage,
-        )
-    records = {label: tuple(p[k] for p in parts) for k, label in enumerate(labels)}
-    choices = {label: _choices(config, label) for label in labels}
-    lines = (*skipped, *dropped)
-    for line in lines:
+    records = _by_motor(parts, names, config.path)
+    choices = {label: _choices(config, label) for label in records}
+    for line in skipped:
         report.line(line)
     unit_is_known = any(
         fnmatch.fnmatch("motor.resistance", c.pattern) for cs in choices.values() for c in cs
     )
-    return BenchTask(records, choices, lines, (), unit_is_known)
+    return BenchTask(records, choices, tuple(skipped), (), unit_is_known)
 
 
 def read_motor_log(
@@ -123,15 +117,13 @@ def read_motor_log(
     layout = motor_layout(format_of(path, delimiter), given, signed)
     logs = counted_once(read_logs(path, layout, path.parent, None, "bench").logs)
     refuse_misordered(logs)
-    parts = [records_of(log, layout) for log in logs]
-    labels = _labels((), len(parts[0]), str(path))
-    records = {label: tuple(p[k] for p in parts) for k, label in enumerate(labels)}
+    records = _by_motor([records_of(log, layout) for log in logs], (), path)
     columns_used = tuple(
         f"{channel.removeprefix('motor_')}: {', '.join(map(str, c.columns))} [{c.unit}]"
         for channel, c in layout.channels.items()
     )
     unit_is_known = "current" in given and given["current"].unit is not None
-    return BenchTask(records, dict.fromkeys(labels, ()), (), columns_used, unit_is_known)
+    return BenchTask(records, dict.fromkeys(records, ()), (), columns_used, unit_is_known)
 
 
 def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
@@ -145,22 +137,19 @@ def records_of(log: Log, layout: SensorLayout) -> list[BenchRecord]:
         speed = np.gradient(log.wheel_angle, log.time, axis=0)
     speed = speed * layout.gear_ratio
     current = log.current if log.current_is_signed else np.abs(log.current) * np.sign(speed)
-    out = []
-    for k in range(speed.shape[1]):
-        # A fit needs rows with independent errors, so only rows with new readings are used.
-        read = _read(log, k)
-        out.append(
-            BenchRecord(
-                name=log.name,
-                sha256=log.sha256,
-                time=log.time[read],
-                voltage=None if log.voltage is None else log.voltage[read, k],
-                current=current[read, k],
-                speed=speed[read, k],
-                signed=log.current_is_signed,
-            )
+    # A fit needs rows with independent errors, so only rows with new readings are used.
+    return [
+        BenchRecord(
+            name=log.name,
+            sha256=log.sha256,
+            time=log.time[read],
+            voltage=None if log.voltage is None else log.voltage[read, k],
+            current=current[read, k],
+            speed=speed[read, k],
+            signed=log.current_is_signed,
         )
-    return out
+        for k, read in enumerate(_read(log, k) for k in range(speed.shape[1]))
+    ]
 
 
 def _read(log: Log, motor: int) -> Bool[np.ndarray, " time"]:
@@ -177,12 +166,21 @@ def _read(log: Log, motor: int) -> Bool[np.ndarray, " time"]:
     return out
 
 
-def _labels(names: Sequence[str], motors: int, where: str) -> tuple[str, ...]:
+def _by_motor(
+    logs: Sequence[Sequence[BenchRecord]], names: Sequence[str], where: Path
+) -> dict[str, tuple[BenchRecord, ...]]:
+    """Return the records of each motor by its label: its name, or else its number from 1.
+
+    A single motor without a name has the label "". `logs` has a record of each motor in each log,
+    and `where` is the file with the names, for messages.
+    """
+    motors = len(logs[0])
     if names and len(names) != motors:
         raise DataError(
             f"{where}: robot.names: {len(names)} names; expected {motors}, one per motor"
         )
-    return tuple(names) or (("",) if motors == 1 else tuple(str(k + 1) for k in range(motors)))
+    labels = names or ([""] if motors == 1 else [str(k + 1) for k in range(motors)])
+    return dict(zip(labels, zip(*logs, strict=True), strict=True))
 
 
 def _choices(config: Config, label: str) -> tuple[Choice, ...]:

@@ -1,7 +1,5 @@
 """Priors of the parameters of a robot's motor, from a fit of that motor on a test bench."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,30 +20,12 @@ meters of the bench."""
 _EXPECTED = "what `slipid identify` of a motor, or `slipid motor --out`, wrote"
 
 
-@dataclass(frozen=True)
-class BenchEstimate:
-    """Estimate of one parameter of one motor on a bench: value, std and verdict."""
-
-    value: float
-    std: float
-    verdict: str
+Identified = dict[str, list[tuple[float, float]]]
+"""Value and std of each motor for which a parameter is identified, by the parameter's name."""
 
 
-@dataclass(frozen=True)
-class BenchFile:
-    """Content of a bench file.
-
-    Attributes:
-        path: path of the file.
-        numbers: estimates of each parameter, one for each motor, by the parameter's name.
-    """
-
-    path: Path
-    numbers: Mapping[str, list[BenchEstimate]]
-
-
-def bench_of(config: Config) -> BenchFile | None:
-    """Return the bench file that a config names, or None if it names none.
+def bench_of(config: Config) -> tuple[Path, Identified] | None:
+    """Return the bench file that a config names and its estimates, or None if it names none.
 
     Raises:
         DataError: the file is missing, damaged, or not the result of a bench.
@@ -57,7 +37,7 @@ def bench_of(config: Config) -> BenchFile | None:
     # the bench's folder.
     kept = config.path.parent / COPY_NAME
     path = kept if kept.is_file() else config.path.parent / named
-    return BenchFile(path, _read(path, f"{config.path}: robot.motor"))
+    return path, _read(path, f"{config.path}: robot.motor")
 
 
 def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[str]]:
@@ -72,37 +52,33 @@ def bench_priors(config: Config, gear_ratio: float) -> tuple[list[Choice], list[
     bench = bench_of(config)
     if bench is None:
         return [], []
-    path = bench.path
-    choices, left_out = [], []
-    for name in NAMES:
-        sure = [t for t in bench.numbers.get(name, []) if t.verdict == "identified"]
-        if not sure:
-            left_out.append(name)
-            continue
+    path, known = bench
+    choices = []
+    for name in (name for name in NAMES if name in known):
         power = {"coulomb_friction": 1, "viscous_friction": 2}.get(name, 0)
-        mean, std = _pooled(sure)
+        mean, std = _pooled(known[name])
         if power and gear_ratio > 1:
             std = float(np.hypot(std, GEAR_STD * mean))
         times = gear_ratio**power
         choices.append(Choice(f"motor.{name}", prior_mean=times * mean, prior_std=times * std))
     lines = [f"motor from {path}: {', '.join(c.pattern for c in choices) or 'nothing'}"]
-    if left_out:
+    if left_out := [name for name in NAMES if name not in known]:
         lines.append(f"not taken from {path}, not identified there: {', '.join(left_out)}")
     return choices, lines
 
 
-def _pooled(sure: list[BenchEstimate]) -> tuple[float, float]:
+def _pooled(known: list[tuple[float, float]]) -> tuple[float, float]:
     """Return the mean of the estimates of several motors, and the std of a single motor's value.
 
     The std combines the std of the estimates with their spread between motors.
     """
-    values = [t.value for t in sure]
-    spread = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
-    return float(np.mean(values)), float(np.hypot(spread, np.mean([t.std for t in sure])))
+    values, stds = np.transpose(known)
+    spread = np.std(values, ddof=1) if len(values) > 1 else 0.0
+    return float(np.mean(values)), float(np.hypot(spread, np.mean(stds)))
 
 
-def _read(path: Path, where: str) -> Mapping[str, list[BenchEstimate]]:
-    """Return the estimates in a bench file by the parameter's name, one for each motor.
+def _read(path: Path, where: str) -> Identified:
+    """Return the identified parameters in a bench file.
 
     `where` is the config and key that name the file, for messages.
     """
@@ -111,13 +87,13 @@ def _read(path: Path, where: str) -> Mapping[str, list[BenchEstimate]]:
     if schema != SCHEMA or content.get("drive") != "motor":
         found = "a robot's numbers" if schema == SCHEMA else f"schema {schema}"
         raise DataError(f"{where}: {path}: {found}; expected {_EXPECTED}")
-    estimates: dict[str, list[BenchEstimate]] = {}
+    known: Identified = {}
     try:
         for full, number in content["parameters"].items():
-            if number["std"] is not None:
+            if number["verdict"] == "identified":
                 name = full.partition("@")[0].removeprefix("motor.")
-                known = float(number["value"]), float(number["std"]), str(number["verdict"])
-                estimates.setdefault(name, []).append(BenchEstimate(*known))
+                estimate = float(number["value"]), float(number["std"])
+                known.setdefault(name, []).append(estimate)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{where}: {path}: damaged ({error}); expected {_EXPECTED}") from error
-    return estimates
+    return known

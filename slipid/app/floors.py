@@ -1,6 +1,5 @@
 """Look-up of the floor under each wheel in logged runs, with a map and a fitted camera."""
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,14 +102,8 @@ def _run_floors(robot: Robot, lookup: FloorLookup, log: Log, session: str) -> Ru
         jnp.asarray(robot.geometry.place) * robot.geometry.base_radius - robot.camera.marker_place
     )
     found = lookup.under(pose, wheels)
-    return RunFloors(
-        log.name,
-        log.time[rows],
-        np.asarray(pose),
-        np.asarray(found.surface),
-        np.asarray(found.border),
-        np.asarray(found.inside),
-    )
+    arrays = (pose, found.surface, found.border, found.inside)
+    return RunFloors(log.name, log.time[rows], *map(np.asarray, arrays))
 
 
 def write_floors(folder: Path, lookup: FloorLookup, runs: list[RunFloors]) -> list[Path]:
@@ -120,23 +113,19 @@ def write_floors(folder: Path, lookup: FloorLookup, runs: list[RunFloors]) -> li
     """
     paths = []
     for run in runs:
-        wheels = run.surface.shape[1]
-        text = io.StringIO()
-        names = [f"floor_{k + 1}" for k in range(wheels)] + [
-            f"border_{k + 1}" for k in range(wheels)
-        ]
-        text.write(",".join(["time", "x", "y", "heading", *names]) + "\n")
-        for k in range(len(run.time)):
-            numbers = [f"{v:.5f}" for v in (run.time[k], *run.pose[k])]
-            there = run.inside[k]
-            floors = [
-                lookup.surfaces[s] if i else "" for s, i in zip(run.surface[k], there, strict=True)
+        wheels = range(1, run.surface.shape[1] + 1)
+        names = [f"{what}_{wheel}" for what in ("floor", "border") for wheel in wheels]
+        lines = [",".join(["time", "x", "y", "heading", *names])]
+        known = run.inside & np.isfinite(run.border)
+        for k, time in enumerate(run.time):
+            numbers = [f"{v:.5f}" for v in (time, *run.pose[k])]
+            floors = np.where(run.inside[k], np.take(lookup.surfaces, run.surface[k]), "")
+            borders = [
+                f"{v:.4f}" if i else "" for v, i in zip(run.border[k], known[k], strict=True)
             ]
-            known = np.isfinite(run.border[k]) & there
-            borders = [f"{v:.4f}" if i else "" for v, i in zip(run.border[k], known, strict=True)]
-            text.write(",".join([*numbers, *floors, *borders]) + "\n")
+            lines.append(",".join([*numbers, *floors, *borders]))
         path = folder / Path(run.name.replace("#", "_")).with_suffix(".csv")
-        write_bytes(path, text.getvalue().encode())
+        write_bytes(path, "\n".join([*lines, ""]).encode())
         paths.append(path)
     return paths
 

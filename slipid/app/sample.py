@@ -1,7 +1,7 @@
 """Sampling of the posterior of a fit: the work of `slipid sample` except its pictures."""
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,26 +25,17 @@ FOLDER = "sampling"
 """Name of the folder, inside the result folder, with the blocks of an unfinished chain."""
 
 
-@dataclass(frozen=True, eq=False)
-class SampleResult:
-    """Result of `sample`.
-
-    Attributes:
-        posterior: draws of the posterior, with their diagnosis.
-        about: content of sample.json, which describes the convergence of the chains.
-        written: names of the written files.
-    """
-
-    posterior: Posterior
-    about: Content
-    written: tuple[str, ...]
+WRITTEN = ("posterior.nc", "sample.json", "identified.json")
+"""Names of the files that are written."""
 
 
-def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporter) -> SampleResult:
-    """Return draws of the posterior of the fit in `out`, and write them and new intervals there.
+def sample(
+    out: Path, data: Path | None, plan: Plan, draws: int, report: Reporter
+) -> tuple[Posterior, Content]:
+    """Return draws of the posterior of the fit in `out`, and the content of sample.json.
 
-    The files are posterior.nc, sample.json and, with the intervals, identified.json. An interrupted
-    chain is continued.
+    The draws, the content and, with new intervals, identified.json are written to `out`. An
+    interrupted chain is continued.
 
     Args:
         out: folder that `slipid identify` wrote.
@@ -75,8 +66,7 @@ def sample(out: Path, data: Path | None, plan: Plan, draws: int, report: Reporte
     write_json(out / "sample.json", about)
     if posterior.converged:
         kept.remove()
-    written = ("posterior.nc", "sample.json", "identified.json")
-    return SampleResult(posterior, about, written)
+    return posterior, about
 
 
 def _summary(posterior: Posterior, plan: Plan, seconds: float) -> Content:

@@ -139,24 +139,23 @@ def calibrate(
         return _uncalibrated(Path(words[0]), described, size_std, out, json)
     _refuse_combinations(words, camera, floor, points)
     with Reporter(quiet=quiet) as report:
-        known_board = None
-        if words or floor is not None:
-            known_board = _board(board, (square, marker), dictionary, legacy)
+        edges = square, marker
+        seen = _board(board, edges, dictionary, legacy) if words or floor is not None else None
         report.stage("reading pictures")
         if camera is not None:
             lens = lens_from_file(camera)
         else:
-            assert known_board is not None  # a board is required if there are pictures
-            lens = lens_from_pictures(words, known_board, k3)
+            assert seen is not None  # a board is required if there are pictures
+            lens = lens_from_pictures(words, seen, k3)
         fit = None
         if points is not None:
             fit = floor_from_points(lens, points, std)
-        elif floor is not None and known_board is not None:
+        elif floor is not None and seen is not None:
             if not 0 <= board_height < math.inf:
                 raise DataError(
                     f"--board-height {board_height:g}; expected a height in metres, 0 or more"
                 )
-            fit = floor_from_board(lens, known_board, floor, board_height, std)
+            fit = floor_from_board(lens, seen, floor, board_height, std)
         report.stage("writing")
         return _write(lens, fit, out, json)
 
@@ -238,10 +237,8 @@ def _write(lens: "CalibratedLens", fit: "FloorFit | None", out: Path, json: str 
     if fit is not None:
         files.append(floor_picture(fit, out.with_name(f"{out.stem}_floor.png")))
     content = read_json(out, "the camera file that was just written")
-    report, fresh = content["report"], lens.quality is not None
-    emit(
-        json, content, lambda page: _show(page, report, fresh), out.parent, [f.name for f in files]
-    )
+    report, fresh, names = content["report"], lens.quality is not None, [f.name for f in files]
+    emit(json, content, lambda page: _show(page, report, fresh), out.parent, names)
     return 1 if report.get("poor") else 0
 
 

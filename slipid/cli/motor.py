@@ -1,57 +1,38 @@
 """`slipid motor`: identify a motor on a bench from a single log file, without a config."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from slipid.cli.common import Json, MaybeOut, Quiet, emit, guarded
 from slipid.support.progress import Reporter
 
-if TYPE_CHECKING:
-    from slipid.data.reading.motor_layout import GivenColumns
+Column = str | None
+
+
+def _column(words: str) -> object:
+    return typer.Option(metavar="NAME[:UNIT]", help=words)
 
 
 @guarded
 def motor(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Log file (CSV or Parquet).")],
-    time: Annotated[
-        str | None, typer.Option(metavar="NAME[:UNIT]", help="Column with the time, in s.")
-    ] = None,
-    voltage: Annotated[
-        str | None,
-        typer.Option(metavar="NAME[:UNIT]", help="Column with the voltage across the motor, in V."),
-    ] = None,
+    time: Annotated[Column, _column("Column with the time, in s.")] = None,
+    voltage: Annotated[Column, _column("Column with the voltage across the motor, in V.")] = None,
     current: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME[:UNIT]", help="Column with the current, in A; other units as I:mA."
-        ),
+        Column, _column("Column with the current, in A; other units as I:mA.")
     ] = None,
     speed: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME[:UNIT]",
-            help="Column with the shaft speed, in rad/s; other units as w:rpm.",
-        ),
+        Column, _column("Column with the shaft speed, in rad/s; other units as w:rpm.")
     ] = None,
     angle: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME[:UNIT]", help="Column with the shaft angle, in rad, instead of the speed."
-        ),
+        Column, _column("Column with the shaft angle, in rad, instead of the speed.")
     ] = None,
     duty: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME[:UNIT]",
-            help="Column with the duty cycle, instead of the voltage; d:% for percent.",
-        ),
+        Column, _column("Column with the duty cycle, instead of the voltage; d:% for percent.")
     ] = None,
-    bus: Annotated[
-        str | None,
-        typer.Option(metavar="NAME[:UNIT]", help="Column with the bus voltage, in V; with --duty."),
-    ] = None,
+    bus: Annotated[Column, _column("Column with the bus voltage, in V; with --duty.")] = None,
     unsigned: Annotated[
         bool, typer.Option("--unsigned", help="The logged current is a magnitude without sign.")
     ] = False,
@@ -72,6 +53,7 @@ def motor(
     explain the log.
     """
     from slipid.app.bench import read_motor_log
+    from slipid.data.reading.motor_layout import given_columns
     from slipid.report.estimates import show_bench
     from slipid.support.files import write_json
 
@@ -84,9 +66,10 @@ def motor(
         "duty": duty,
         "bus_voltage": bus,
     }
+    given = {c: given_columns(text, c) for c, text in columns.items() if text is not None}
     with Reporter(quiet=quiet) as report:
         report.stage("reading the log")
-        task = read_motor_log(file, _given(columns), delimiter, not unsigned)
+        task = read_motor_log(file, given, delimiter, not unsigned)
         fit = task.fit(report)
         content, written = fit.to_json(), ["motor.json"]
         if out is not None:
@@ -97,11 +80,3 @@ def motor(
             written += [path.name for path in bench_plots(fit, out)]
     emit(json, content, lambda page: show_bench(page, fit, task.columns_used), out, written)
     return 0 if fit.good else 1
-
-
-def _given(columns: dict[str, str | None]) -> "dict[str, GivenColumns]":
-    """Return the columns given by options, by channel; `columns` has the texts of the options."""
-    from slipid.data.reading.motor_layout import given_columns
-
-    given = {channel: text for channel, text in columns.items() if text is not None}
-    return {channel: given_columns(text, channel) for channel, text in given.items()}

@@ -71,38 +71,27 @@ def new(
     force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False,
 ) -> int:
     """Write a commented config for your robot, from your answers to questions or from its logs."""
-    from slipid.app.new.config_text import new_config, refuse_existing
+    # Every argument that is a text describes the robot.
+    options = {name: text for name, text in locals().items() if isinstance(text, str)}
+
+    from slipid.app.new.config_text import new_config
     from slipid.app.new.draft import template_draft
     from slipid.app.new.propose import propose
-    from slipid.app.new.robot_questions import RobotOptions, ask
+    from slipid.app.new.robot_questions import ask
+    from slipid.support.errors import DataError
+    from slipid.support.files import write_bytes
 
-    refuse_existing(out, force)
-    options = RobotOptions(
-        drive=drive,
-        wheels=wheels,
-        azimuths_deg=azimuths_deg,
-        base_radius_m=base_radius_m,
-        wheelbase_m=wheelbase_m,
-        track_m=track_m,
-        shared=shared,
-        places_m=places_m,
-        directions_deg=directions_deg,
-        rollers_deg=rollers_deg,
-        wheel_radius_m=wheel_radius_m,
-        gear_ratio=gear_ratio,
-        mass_kg=mass_kg,
-        ticks_per_revolution=ticks_per_revolution,
-    )
-    data = "DIR"
-    if log is not None:
-        proposal = propose(log, options)
-        for sentence in proposal.sentences:
-            typer.echo(sentence)
-        config, data = new_config(proposal.draft, out.name), proposal.draft.data
+    if out.exists() and not force:
+        raise DataError(f"{out}: exists already; expected a new file, or --force")
+    if log is None:
+        draft = template_draft(ask(options, None if yes else _ask))
     else:
-        config = new_config(template_draft(ask(options, None if yes else _ask)), out.name)
-    config.write(out, force)
-    _show(config, out, data)
+        draft = propose(log, options)
+    for sentence in draft.sentences:
+        typer.echo(sentence)
+    config = new_config(draft, out.name)
+    write_bytes(out, config.text.encode())
+    _show(config, out, draft.data)
     return 0
 
 

@@ -48,6 +48,7 @@ def sample(
     from slipid.support.files import read_json
 
     try:
+        from slipid.app.sample import WRITTEN
         from slipid.app.sample import sample as run
         from slipid.deploy.deploy import write_robot
         from slipid.infer.posterior.blocks import Plan
@@ -55,12 +56,12 @@ def sample(
     except ImportError as error:
         raise DataError(f"{error}; install it by `pip install slipid[posterior]`") from error
     with Reporter(quiet=quiet) as report:
-        done = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)
-        robot = write_robot(out, done.posterior)
+        posterior, about = run(out, data, Plan(seed=seed, most=most, block=block), draws, report)
+        robot = write_robot(out, posterior)
         report.stage("drawing")
-        drawn = posterior_plots(done.posterior, out)
-    content = read_json(out / "identified.json", "a result of `slipid sample`")
-    shown = done.posterior.parameters.values(), done.about, content["messages"]
-    written = (*done.written, *robot, *(path.name for path in drawn))
+        drawn = posterior_plots(posterior, out)
+    content = read_json(out / "identified.json", "what sample wrote")
+    shown = posterior.parameters.values(), about, content["messages"]
+    written = (*WRITTEN, *robot, *(path.name for path in drawn))
     emit(json, content, lambda page: show_sample(page, *shown), out, written)
-    return 0 if done.posterior.converged else 1
+    return 0 if posterior.converged else 1

@@ -13,7 +13,7 @@ from slipid.app.config import geometry, parsed
 from slipid.app.new.config_lines import QUESTION_MARK, ConfigLine, drawing
 from slipid.app.new.config_text import new_config
 from slipid.app.new.draft import template_draft
-from slipid.app.new.robot_questions import DRIVES, RobotOptions, ask
+from slipid.app.new.robot_questions import DRIVES, ask
 from slipid.data.reading.presets import declared_layout
 from slipid.model import geometry as g
 from slipid.support.errors import DataError
@@ -46,7 +46,7 @@ CASES = {
 
 
 def made(drive: str, **more: str):
-    told = RobotOptions(**{**CASES[drive][0], **SIZES, "drive": drive, **more})
+    told = {**CASES[drive][0], **SIZES, "drive": drive, **more}
     return new_config(template_draft(ask(told, None)), "mine.toml")
 
 
@@ -57,7 +57,7 @@ def refuse(*_: object) -> str:
 @pytest.mark.parametrize("drive", CASES)
 def test_wheels_stand_where_the_answers_place_them(drive):
     _, places, directions, drives = CASES[drive]
-    told = RobotOptions(**{**CASES[drive][0], **SIZES, "drive": drive})
+    told = {**CASES[drive][0], **SIZES, "drive": drive}
     config = new_config(template_draft(ask(told, refuse)), "mine.toml")
     content = parsed(Path("mine.toml"), config.text).content
     robot = geometry(content.robot)
@@ -107,9 +107,7 @@ def test_logs_without_ticks_have_speeds():
 
 
 def test_missing_answers_are_questions_in_the_file_and_in_the_list():
-    config = new_config(
-        template_draft(ask(RobotOptions(drive="skid", track_m="0.5"), None)), "mine.toml"
-    )
+    config = new_config(template_draft(ask({"drive": "skid", "track_m": "0.5"}, None)), "mine.toml")
     asked = [question.partition(":")[0] for question in config.questions]
     assert "half_length_m" in asked
     assert "half_width_m" not in asked
@@ -128,7 +126,7 @@ def test_only_questions_of_the_drive_are_put_and_repeated_after_wrong_answers():
         said.append((asks.split(",")[0], wrong))
         return next(answers)
 
-    known = ask(RobotOptions(), asker)
+    known = ask({}, asker)
     assert (known.drive, known.wheelbase_m, known.track_m, known.shared) == ("skid", 0.5, 0.6, True)
     assert not known.defaults
     wrong = [text for _, text in said if text]
@@ -157,7 +155,7 @@ def test_only_questions_of_the_drive_are_put_and_repeated_after_wrong_answers():
 )
 def test_a_wrong_option_is_one_clear_error(told, message):
     with pytest.raises(DataError) as caught:
-        new_config(template_draft(ask(RobotOptions(**told), None)), "mine.toml")
+        new_config(template_draft(ask(told, None)), "mine.toml")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 

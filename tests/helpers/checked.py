@@ -45,7 +45,9 @@ def _checks(fn: FunctionType, typechecker: Callable) -> Callable:
     if fn.__annotations__.get("return") is Self:
         # beartype knows what it is where it decorates the class, not where it decorates a method
         del there.__annotations__["return"]
-        there.__signature__ = inspect.signature(fn).replace(return_annotation=inspect.Signature.empty)
+        there.__signature__ = inspect.signature(fn).replace(
+            return_annotation=inspect.Signature.empty
+        )
     return _eager(there, typechecker=typechecker)
 
 

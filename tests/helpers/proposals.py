@@ -9,7 +9,6 @@ from slipid.app.config import parsed
 from slipid.app.logs import read_dataset
 from slipid.app.new.config_text import new_config
 from slipid.app.new.propose import propose
-from slipid.app.new.robot_questions import RobotOptions
 from tests.helpers.made_tables import RADIUS, TRACK
 from tests.helpers.said import KeptMessages
 
@@ -23,8 +22,8 @@ ROBOT = {
 
 
 def proposed(path: Path, **told: str):
-    proposal = propose(path, RobotOptions(**told))
-    return proposal, new_config(proposal.draft, "mine.toml")
+    draft = propose(path, told)
+    return draft, new_config(draft, "mine.toml")
 
 
 def layout_in(config, name: str = "mine"):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from slipid.app.new.config_lines import ConfigLine, toml
-from slipid.app.new.draft import BagDraft, ConfigDraft, ConfigProposal, LogsDraft
+from slipid.app.new.draft import ConfigDraft, LayoutDraft, LogsDraft
 from slipid.app.new.file_channels import common_glob, floor_of, rank
 from slipid.app.new.guess import guess_robot
 from slipid.app.new.robot_questions import RobotAnswers, RobotOptions
@@ -24,8 +24,10 @@ _EFFORT = (
     "what is the effort: a current (A), a torque (motor_torque or wheel_torque, N*m), a voltage "
     "(V) or a duty (1)?"
 )
-
-
+_TOPICS_HELP = (
+    "The topic of each channel. Known types of messages need neither field nor unit; the frame of "
+    "a pose in /tf and the meaning of the effort of joints must be given."
+)
 _BY_NAME = ("current", "voltage", "duty")
 """Channels that are recognised by the names of fields in messages of unknown types."""
 
@@ -50,6 +52,19 @@ class _TopicChannel:
     field: str = ""
     unit: str = ""
 
+    def line(self) -> ConfigLine:
+        """Return the line of the config for the channel, commented out for an effort."""
+        topic = self.topic
+        inside = f"topic = {toml(topic.name)}"
+        if self.field:
+            inside += f", field = {toml(self.field)}, unit = {toml(self.unit)}"
+        if topic.type == _TRANSFORMS and topic.frames:
+            frame, _, child = topic.frames[0].partition(" -> ")
+            inside += f", frame = {toml(frame)}, child = {toml(child)}"
+        rated = topic.type + ("" if topic.rate is None else f", {topic.rate:.3g} Hz")
+        effort = self.question == _EFFORT
+        return ConfigLine(self.channel, f"{{ {inside} }}", rated, self.question, effort)
+
 
 def bags_in(path: Path) -> list[Path]:
     """Return the bags at or below a path, as a config names them.
@@ -63,7 +78,7 @@ def bags_in(path: Path) -> list[Path]:
     return sorted([*(folder / _METADATA for folder in folders), *alone])
 
 
-def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> ConfigProposal:
+def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> ConfigDraft:
     """Return the proposed config for bags, which is made from the first bag.
 
     Args:
@@ -82,7 +97,7 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
         (one.wheels for name in _WHEEL_CHANNELS for one in channels if one.channel == name), 0
     )
     channels += _by_field_names(topics, channels, wheels)
-    guessed = guess_robot(options, wheels, ())
+    robot, hints = guess_robot(options, wheels, ())
     questions = [doubt] if doubt else []
     if not any(one.channel == "pose" for one in channels):
         questions.append("no topic with a pose was found: a fit needs one")
@@ -92,28 +107,28 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
     root = path.parent if is_bag else path
     inside = [PurePosixPath(one.relative_to(root)) for one in bags]
     inside = [one for one in inside if len(one.parts) == len(inside[0].parts)]
-    layout = BagDraft(
+    layout = LayoutDraft(
         "mine",
-        _layout_lines(guessed.robot, joints, channels),
-        tuple(_topic_lines(channels)),
-        _unused(topics, channels),
-        tuple(questions),
+        _layout_lines(robot, joints, channels),
+        tuple(one.line() for one in channels),
+        "topics",
+        help=(_TOPICS_HELP,),
+        above=_unused(topics, channels),
+        questions=tuple(questions),
     )
     floor = "on which floor was it driven? A topic or table can give it: runs, in the layout"
     glob = common_glob(inside)
-    draft = ConfigDraft(
-        guessed.robot,
-        (),
-        (LogsDraft(glob, "mine", floor_of(glob), question=floor),),
-        preset_channels=frozenset(one.channel for one in channels if one.question != _EFFORT),
-        above=(f"Proposed from {bag}.",),
-        data=str(root),
-        hints=guessed.hints,
-        bags=(layout,),
-    )
     sentences = [f"{bag}: {len(topics)} topics"]
     sentences += [f"  {one.topic.name} ({one.topic.type}): {one.channel}" for one in channels]
-    return ConfigProposal(draft, tuple(sentences))
+    return ConfigDraft(
+        robot,
+        (layout,),
+        (LogsDraft(glob, "mine", floor_of(glob), question=floor),),
+        above=(f"Proposed from {bag}.",),
+        data=str(root),
+        hints=hints,
+        sentences=tuple(sentences),
+    )
 
 
 def _joints(topics: Sequence[Topic]) -> tuple[tuple[str, ...], str]:
@@ -154,7 +169,7 @@ def _best_topics(topics: Sequence[Topic], joints: int) -> Iterator[_TopicChannel
             yield _TopicChannel(channel, topic, wheels, _pose_question(channel, topic))
         if any(f.path == "effort" and f.count for f in topic.fields) and "current" not in taken:
             taken.add("current")
-            yield _TopicChannel("current", topic, joints, _EFFORT)
+            yield _TopicChannel("current", topic, joints, _EFFORT, "effort", "A")
 
 
 def _by_field_names(
@@ -191,23 +206,6 @@ def _pose_question(channel: str, topic: Topic) -> str:
     return ""
 
 
-def _topic_lines(channels: Sequence[_TopicChannel]) -> Iterator[ConfigLine]:
-    """Yield the line of the config for each channel."""
-    for one in channels:
-        inside = f"topic = {toml(one.topic.name)}"
-        commented_out = one.question == _EFFORT
-        if commented_out:
-            inside += ', field = "effort", unit = "A"'
-        elif one.field:
-            inside += f", field = {toml(one.field)}, unit = {toml(one.unit)}"
-        if one.topic.type == _TRANSFORMS and one.topic.frames:
-            frame, _, child = one.topic.frames[0].partition(" -> ")
-            inside += f", frame = {toml(frame)}, child = {toml(child)}"
-        rate = "" if one.topic.rate is None else f", {one.topic.rate:.3g} Hz"
-        rated = one.topic.type + rate
-        yield ConfigLine(one.channel, f"{{ {inside} }}", rated, one.question, commented_out)
-
-
 def _layout_lines(
     robot: RobotAnswers, joints: tuple[str, ...], channels: Sequence[_TopicChannel]
 ) -> tuple[ConfigLine, ...]:
@@ -219,7 +217,7 @@ def _layout_lines(
 
     lines = [ConfigLine("kind", toml("bag"))]
     have = {one.channel for one in channels}
-    lines += [line("joints", list(joints))] if joints else []
+    lines += [line("joints", joints)] if joints else []
     if "wheel_ticks" in have:
         ask = ""
         if "ticks_per_revolution" in robot.defaults:
@@ -234,13 +232,11 @@ def _layout_lines(
 
 def _unused(topics: Sequence[Topic], channels: Sequence[_TopicChannel]) -> tuple[str, ...]:
     """Return a comment for each unused topic, with the fields of its messages."""
-    used = {one.topic.name for one in channels}
-    others = [topic for topic in topics if topic.name not in used and topic.count]
-    return tuple(f"Not used: {topic.name} ({topic.type}){_field_list(topic)}" for topic in others)
-
-
-def _field_list(topic: Topic) -> str:
-    if topic.problem:
-        return f": {topic.problem}"
-    paths = [field.path for field in topic.fields if not field.path.startswith("header")]
-    return f" has {', '.join(paths[:8])}" if paths else ""
+    used, notes = {one.topic.name for one in channels}, []
+    for topic in topics:
+        if topic.name not in used and topic.count:
+            paths = [field.path for field in topic.fields if not field.path.startswith("header")]
+            fields = f" has {', '.join(paths[:8])}" if paths else ""
+            has = f": {topic.problem}" if topic.problem else fields
+            notes.append(f"Not used: {topic.name} ({topic.type}){has}")
+    return tuple(notes)

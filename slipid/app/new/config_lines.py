@@ -127,15 +127,6 @@ LABEL_WIDTH = 3
 """Largest number of characters of a wheel: its number, its arrow, and the letter of its motor."""
 
 
-@dataclass(frozen=True)
-class _DrawnWheel:
-    """Wheel in the drawing; rows count down and columns to the right, from the middle."""
-
-    row: int
-    column: int
-    label: str
-
-
 def drawing(robot: Geometry) -> str:
     """Return a drawing of the robot from above, x up and y left, and a line about every wheel.
 
@@ -143,9 +134,10 @@ def drawing(robot: Geometry) -> str:
     which it rolls at a positive speed, and the letter of the motor that it shares with other
     wheels.
     """
-    lines = ["seen from above, arrows: direction of a positive wheel speed", ""]
-    lines += _picture(_grid_wheels(robot))
-    lines += [
+    lines = [
+        "seen from above, arrows: direction of a positive wheel speed",
+        "",
+        *_picture(_grid_wheels(robot)),
         "",
         *(_wheel_line(robot, wheel) for wheel in range(robot.wheels)),
         *_motor_lines(robot),
@@ -159,27 +151,23 @@ def direction(degrees: float) -> str:
     return (*names, "ahead right")[round(degrees / 45) % 8]
 
 
-def _grid_wheels(robot: Geometry) -> list[_DrawnWheel]:
-    """Return the wheels on a grid of characters, moved down where they would overlap.
+def _grid_wheels(robot: Geometry) -> dict[tuple[int, int], str]:
+    """Return the label of each wheel by its row and column, moved down where they would overlap.
 
-    A character is about twice as high as wide, so one row is as far as two columns.
+    Rows count down and columns to the right, from the middle. A character is about twice as high
+    as wide, so one row is as far as two columns.
     """
     place = np.asarray(robot.place) * float(robot.base_radius)
     step = max(np.abs(place[:, 0]).max() / _ROWS, np.abs(place[:, 1]).max() / (_COLUMNS / 2), 1e-9)
-    taken: set[tuple[int, int]] = {(0, 0)}
-    wheels = []
+    labels: dict[tuple[int, int], str] = {}
     for k, (x, y) in enumerate(place.tolist()):
         row, column = -round(x / step), -round(2 * y / step)
-        while any((row, column + d) in taken for d in range(-LABEL_WIDTH, LABEL_WIDTH + 1)):
+        near = range(column - LABEL_WIDTH, column + LABEL_WIDTH + 1)
+        while any((row, c) in labels or (row, c) == (0, 0) for c in near):
             row += 1
-        taken.add((row, column))
-        wheels.append(_DrawnWheel(row, column, _label(robot, k)))
-    return wheels
-
-
-def _label(robot: Geometry, wheel: int) -> str:
-    arrow = _ARROWS[round(math.degrees(robot.drive_angle[wheel]) / 45) % 8]
-    return f"{wheel + 1}{arrow}{_letter(robot, wheel)}"
+        arrow = _ARROWS[round(math.degrees(robot.drive_angle[k]) / 45) % 8]
+        labels[row, column] = f"{k + 1}{arrow}{_letter(robot, k)}"
+    return labels
 
 
 def _letter(robot: Geometry, wheel: int) -> str:
@@ -189,10 +177,11 @@ def _letter(robot: Geometry, wheel: int) -> str:
     return _LETTERS[robot.drive_of[wheel] % len(_LETTERS)]
 
 
-def _picture(wheels: list[_DrawnWheel]) -> list[str]:
-    top = min(-_LEAST, *(w.row for w in wheels)) - 1
-    bottom = max(0, *(w.row for w in wheels))
-    width = max(_COLUMNS, *(abs(w.column) for w in wheels)) + _MARGIN
+def _picture(labels: dict[tuple[int, int], str]) -> list[str]:
+    """Return the drawing of the axes and of the wheels' labels, given by row and column."""
+    rows, columns = zip(*labels, strict=True)
+    top, bottom = min(-_LEAST, *rows) - 1, max(0, *rows)
+    width = max(_COLUMNS, *map(abs, columns)) + _MARGIN
     canvas = [[" "] * (2 * width) for _ in range(bottom - top + 1)]
 
     def put(row: int, column: int, text: str) -> None:
@@ -201,16 +190,13 @@ def _picture(wheels: list[_DrawnWheel]) -> list[str]:
     for row in range(top + 1, 0):
         put(row, 0, "|")
     put(top, 0, "^ x")
-    left = min(w.column for w in wheels) - 6 if any(w.row == 0 for w in wheels) else -8
-    for column in range(left, 0):
-        put(0, column, "-")
-    put(0, left - 3, "y <")
-    put(0, 0, "+")
-    for w in wheels:
-        put(w.row, w.column - 1, w.label)
-    rows = ["".join(row).rstrip() for row in canvas]
-    blank = min(len(row) - len(row.lstrip()) for row in rows if row)
-    return [f"    {row[blank:]}" if row else "" for row in rows]
+    left = min(columns) - 6 if 0 in rows else -8
+    put(0, left - 3, "y <" + "-" * -left + "+")
+    for (row, column), label in labels.items():
+        put(row, column - 1, label)
+    lines = ["".join(row).rstrip() for row in canvas]
+    blank = min(len(line) - len(line.lstrip()) for line in lines if line)
+    return [f"    {line[blank:]}" if line else "" for line in lines]
 
 
 def _wheel_line(robot: Geometry, wheel: int) -> str:

@@ -5,11 +5,9 @@ from pathlib import Path
 
 from slipid.app.config import LogsSection, OmniDrive, Wheels, geometry, parsed
 from slipid.app.new.config_lines import ConfigBlock, ConfigLine, drawing, toml
-from slipid.app.new.draft import BagDraft, ConfigDraft, FileDraft, LayoutDraft, LogsDraft
+from slipid.app.new.draft import ConfigDraft, LogsDraft
 from slipid.app.new.robot_questions import robot_of
 from slipid.app.reference.keys import in_short
-from slipid.support.errors import DataError
-from slipid.support.files import write_bytes
 
 _ORDER = {
     "omni": "each wheel drives 90 deg further than it stands",
@@ -45,49 +43,16 @@ _DATASHEET = (
     "datasheet?"
 )
 FRAME = "x ahead, y left, angles counter-clockwise from ahead; wheels in the order of the columns"
-_LENGTHS_HELP = (
-    '"poses" of motion capture, lidar or RTK, which make the wheel radius free; or "wheels" that '
-    "were measured, which make the scale of the camera free:"
+_FIT = ConfigBlock(
+    "",
+    above=(
+        'Which lengths are known? "poses" of motion capture, lidar or RTK, which make the wheel '
+        'radius free; or "wheels" that were measured, which make the scale of the camera free:',
+        "[fit]",
+        'lengths_from = "poses"',
+    ),
 )
-_COLUMNS_HELP = (
-    "The channel and unit of each column of your files. Time: s, ms, us or ns, since the start "
-    "or since 1970. Others: rad, deg, rev, rad/s, rpm, tick, m, mm, A, mA, V, percent and so on.",
-    "Remove what you do not log. A fit needs time, the motion of the wheels and the pose; currents "
-    "identify friction, voltages (or duty and bus_voltage) the motor's constants.",
-)
-_OTHER_CHANNELS = (
-    'With a quaternion: pose_quaternion = { columns = ["qx", "qy", "qz", "qw"], unit = "1" }',
-    'Effort of a JointState: current (unit "A"), or motor_torque or wheel_torque (unit "N*m"), for '
-    "which the layout needs torque_constant [N m/A]. Sensors may be slower than the rows: leave "
-    "cells empty, or repeat the last value.",
-)
-_MORE_FILES = (
-    "More files of the same run, each with its own rows, beside the first one:",
-    '[layouts.mine.beside."mocap.csv"]    # or "{stem}_pose.csv"; keys as above',
-    '[layouts.mine.beside."mocap.csv".columns]',
-    'time = { column = "stamp", unit = "ns" }',
-)
-
-
-def blocks_of(draft: ConfigDraft, robot: Wheels, picture: str, name: str) -> list[ConfigBlock]:
-    """Return all tables of a config in order.
-
-    Args:
-        draft: draft of the config.
-        robot: section `[robot]`, made from the answers in the draft.
-        picture: drawing of the robot.
-        name: name of the config file.
-    """
-    return [
-        ConfigBlock("", above=_head(draft, name)),
-        _robot_block(draft, robot, picture),
-        *(block for layout in draft.layouts for block in _layout_blocks(layout)),
-        *(block for bag in draft.bags for block in _bag_blocks(bag)),
-        *(_logs_block(logs, first=k == 0) for k, logs in enumerate(draft.logs)),
-        _fit_block(),
-        _weights_block(geometry(robot).wheels),
-        _parameters_block(draft.channels),
-    ]
+"""Table `[fit]` as a comment, which asks whether poses are in true metres: no log shows it."""
 
 
 def _head(draft: ConfigDraft, name: str) -> tuple[str, ...]:
@@ -103,16 +68,15 @@ def _head(draft: ConfigDraft, name: str) -> tuple[str, ...]:
 
 def _robot_block(draft: ConfigDraft, robot: Wheels, picture: str) -> ConfigBlock:
     """Return the table `[robot]`, with the drawing above it."""
-    lines = [
-        ConfigLine("drive", toml(robot.drive), _ORDER[robot.drive], _open_question(draft, "drive"))
-    ]
-    given = robot.model_dump(exclude_none=True, exclude={"drive"}, exclude_defaults=False)
+    given = robot.model_dump(exclude_none=True)
     if isinstance(robot, OmniDrive) and robot.roller_angle_deg == 90.0:
         del given["roller_angle_deg"]  # the default, that of ordinary omni wheels
     # The keys of the type of drive come first, those that all robots have after them.
     common = ("wheel_radius_m", "gear_ratio", "mass_kg")
-    for key in (*(k for k in given if k not in common), *common):
-        comment = in_short(type(robot), key)
+    own = (key for key in given if key not in ("drive", *common))
+    lines = []
+    for key in ("drive", *own, *common):
+        comment = _ORDER[robot.drive] if key == "drive" else in_short(type(robot), key)
         lines.append(ConfigLine(key, toml(given[key]), comment, _open_question(draft, key)))
     return ConfigBlock("[robot]", tuple(lines), above=(*picture.splitlines(), "", FRAME))
 
@@ -121,89 +85,25 @@ def _open_question(draft: ConfigDraft, key: str) -> str:
     """Return the question about a key of `[robot]` with a default; empty if it was answered."""
     if _ANSWER_OF_KEY.get(key, key) not in draft.robot.defaults or key == "drives":
         return ""
-    hints = (hint.question for hint in draft.hints if hint.key == key and hint.question)
-    return next(hints, _QUESTIONS.get(key, _ASK_MEASURED))
-
-
-def _layout_blocks(layout: LayoutDraft) -> list[ConfigBlock]:
-    """Return the tables of a layout and its columns, those of further files of a run included."""
-    where = f"layouts.{layout.name}"
-    below = (*_OTHER_CHANNELS, *_MORE_FILES) if layout.examples else ()
-    blocks = _file_blocks(where, layout.file, _COLUMNS_HELP, below)
-    for one in layout.beside:
-        above = (f"Of the same run, in {one.pattern}:",)
-        blocks += _file_blocks(f"{where}.beside.{toml(one.pattern)}", one, above)
-    return blocks
-
-
-def _file_blocks(
-    where: str, file: FileDraft, above: tuple[str, ...], below: tuple[str, ...] = ()
-) -> list[ConfigBlock]:
-    columns = tuple(channel.line() for channel in file.channels)
-    return [
-        ConfigBlock(f"[{where}]", file.lines(), above=above, questions=file.questions),
-        ConfigBlock(f"[{where}.columns]", columns, above=file.above, below=below),
-    ]
-
-
-def _bag_blocks(bag: BagDraft) -> list[ConfigBlock]:
-    """Return the tables of a layout of bags and its topics."""
-    above = (
-        "The topic of each channel. Known types of messages need neither field nor unit; the frame "
-        "of a pose in /tf and the meaning of the effort of joints must be given.",
-    )
-    return [
-        ConfigBlock(f"[layouts.{bag.name}]", bag.settings, above=above, questions=bag.questions),
-        ConfigBlock(f"[layouts.{bag.name}.topics]", bag.topics, above=bag.above),
-    ]
+    return draft.hints.get(key) or _QUESTIONS.get(key, _ASK_MEASURED)
 
 
 def _logs_block(logs: LogsDraft, first: bool) -> ConfigBlock:
     """Return the table of a section of logs; the keys are explained only in the first section."""
-
-    def line(key: str, value: str, commented_out: bool = False) -> ConfigLine:
-        return ConfigLine(
-            key,
-            toml(value),
-            in_short(LogsSection, key) if first else "",
-            commented_out=commented_out,
-        )
-
-    surface = in_short(LogsSection, "surface") + '; "folder": the folder names it'
-    lines = [
-        line("glob", logs.glob, logs.commented_out),
-        line("format", logs.format, logs.commented_out),
-        ConfigLine(
-            "surface",
-            toml(logs.surface),
-            surface if first else "",
-            logs.question,
-            logs.commented_out,
-        ),
-        line("load", "as_built", logs.commented_out),
-    ]
-    if logs.session:
-        lines.append(line("session", logs.session, logs.commented_out))
+    values = {"glob": logs.glob, "format": logs.format, "surface": logs.surface}
+    values |= {"load": "as_built"} | ({"session": logs.session} if logs.session else {})
+    lines = []
+    for key, value in values.items():
+        comment = in_short(LogsSection, key) if first else ""
+        if key == "surface" and first:
+            comment += '; "folder": the folder names it'
+        question = logs.question if key == "surface" else ""
+        lines.append(ConfigLine(key, toml(value), comment, question, logs.commented_out))
     if first:
-        lines.append(line("map", "maps/site.toml", commented_out=True))
+        example = toml("maps/site.toml")
+        lines.append(ConfigLine("map", example, in_short(LogsSection, "map"), commented_out=True))
     above = logs.above or (("One section per set of logs.",) if first else ())
-    return ConfigBlock(
-        "# [[logs]]" if logs.commented_out else "[[logs]]", tuple(lines), above=above
-    )
-
-
-def _fit_block() -> ConfigBlock:
-    """Return the commented-out table `[fit]`, which asks whether poses are in true metres.
-
-    Logs do not show it.
-    """
-    above = (
-        "Which lengths are known? " + _LENGTHS_HELP,
-        "[fit]",
-    )
-    return ConfigBlock(
-        "", (ConfigLine("lengths_from", toml("poses"), commented_out=True),), above=above
-    )
+    return ConfigBlock("# [[logs]]" if logs.commented_out else "[[logs]]", tuple(lines), above)
 
 
 def _weights_block(wheels: int) -> ConfigBlock:
@@ -218,24 +118,22 @@ def _weights_block(wheels: int) -> ConfigBlock:
 
 def _parameters_block(channels: frozenset[str]) -> ConfigBlock:
     """Return the table `[parameters]`, with choices that suit logs with the given channels."""
-    current = channels & {"current", "motor_torque", "wheel_torque"}
-    voltage = "voltage" in channels or {"duty", "bus_voltage"} <= channels
-    yaw = '"camera.marker_yaw"'
-    lines = [
-        ConfigLine(yaw, "{ free = true }", "marker's heading less the robot's [rad]"),
-    ]
-    if current:
+    free, fixed = "{ free = true }", "{ free = false }"
+    lines = [ConfigLine('"camera.marker_yaw"', free, "marker's heading less the robot's [rad]")]
+    if channels & {"current", "motor_torque", "wheel_torque"}:
+        voltage = "voltage" in channels or {"duty", "bus_voltage"} <= channels
         ask = "" if voltage else _DATASHEET
-        resistance, emf = "{ mean = 1.0, std = 0.5 }", "{ mean = 0.05, std = 0.025 }"
-        lines.append(
-            ConfigLine('"motor.resistance"', f"{{ prior = {resistance} }}", "[ohm], datasheet", ask)
-        )
-        lines.append(ConfigLine('"motor.back_emf"', f"{{ prior = {emf} }}", "[V s/rad]"))
+        resistance = "{ prior = { mean = 1.0, std = 0.5 } }"
+        emf = "{ prior = { mean = 0.05, std = 0.025 } }"
+        lines += [
+            ConfigLine('"motor.resistance"', resistance, "[ohm], datasheet", ask),
+            ConfigLine('"motor.back_emf"', emf, "[V s/rad]"),
+        ]
     else:
-        lines.append(ConfigLine('"motor.*"', "{ free = false }", "no current: motors unknown"))
-        lines.append(
-            ConfigLine('"surface.*.friction"', "{ free = false }", "nor the friction of floors")
-        )
+        lines += [
+            ConfigLine('"motor.*"', fixed, "no current: motors unknown"),
+            ConfigLine('"surface.*.friction"', fixed, "nor the friction of floors"),
+        ]
     above = (
         "Patterns of parameter names. fixed = value; start = value; free = true or false; prior is "
         "Gaussian in the parameter's own unit. `slipid reference parameters` lists the names.",
@@ -249,26 +147,13 @@ class NewConfig:
 
     Attributes:
         text: text of the file.
-        robot: section `[robot]`.
         drawing: drawing of the robot.
         questions: open questions in the text.
     """
 
     text: str
-    robot: Wheels
     drawing: str
     questions: tuple[str, ...]
-
-    def write(self, out: Path, force: bool = False) -> None:
-        """Write the file; raise `DataError` if it exists, unless `force`."""
-        refuse_existing(out, force)
-        write_bytes(out, self.text.encode())
-
-
-def refuse_existing(out: Path, force: bool) -> None:
-    """Raise `DataError` if a file exists, unless `force`; this is done before the user is asked."""
-    if out.exists() and not force:
-        raise DataError(f"{out}: exists already; expected a new file, or --force")
 
 
 def new_config(draft: ConfigDraft, name: str) -> NewConfig:
@@ -283,8 +168,16 @@ def new_config(draft: ConfigDraft, name: str) -> NewConfig:
     """
     robot = robot_of(draft.robot)
     picture = drawing(geometry(robot))
-    blocks = blocks_of(draft, robot, picture, name)
+    blocks = [
+        ConfigBlock("", above=_head(draft, name)),
+        _robot_block(draft, robot, picture),
+        *(block for layout in draft.layouts for block in layout.blocks()),
+        *(_logs_block(logs, first=k == 0) for k, logs in enumerate(draft.logs)),
+        _FIT,
+        _weights_block(geometry(robot).wheels),
+        _parameters_block(draft.channels),
+    ]
     text = "\n\n".join(block.text() for block in blocks) + "\n"
     parsed(Path(name), text)
     questions = tuple(question for block in blocks for question in block.open_questions)
-    return NewConfig(text, robot, picture, questions)
+    return NewConfig(text, picture, questions)

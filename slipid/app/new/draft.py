@@ -1,14 +1,30 @@
 """Drafts of a config and its sections, from which its text is made; also a draft without logs."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
-from slipid.app.new.config_lines import ConfigLine, toml
+from slipid.app.new.config_lines import ConfigBlock, ConfigLine, toml
 from slipid.app.new.robot_questions import RobotAnswers
 from slipid.app.reference.keys import in_short
 from slipid.data.reading.layout import Layout
 
 _EXAMPLE_NAMES = "the column names and units below are examples: write those of your files"
+COLUMNS_HELP = (
+    "The channel and unit of each column of your files. Time: s, ms, us or ns, since the start "
+    "or since 1970. Others: rad, deg, rev, rad/s, rpm, tick, m, mm, A, mA, V, percent and so on.",
+    "Remove what you do not log. A fit needs time, the motion of the wheels and the pose; currents "
+    "identify friction, voltages (or duty and bus_voltage) the motor's constants.",
+)
+_EXAMPLES = (
+    'With a quaternion: pose_quaternion = { columns = ["qx", "qy", "qz", "qw"], unit = "1" }',
+    'Effort of a JointState: current (unit "A"), or motor_torque or wheel_torque (unit "N*m"), for '
+    "which the layout needs torque_constant [N m/A]. Sensors may be slower than the rows: leave "
+    "cells empty, or repeat the last value.",
+    "More files of the same run, each with its own rows, beside the first one:",
+    '[layouts.mine.beside."mocap.csv"]    # or "{stem}_pose.csv"; keys as above',
+    '[layouts.mine.beside."mocap.csv".columns]',
+    'time = { column = "stamp", unit = "ns" }',
+)
 _LABELS = {
     (4, False): ("fl", "fr", "rl", "rr"),
     (4, True): ("left", "right"),
@@ -17,111 +33,35 @@ _LABELS = {
 
 
 @dataclass(frozen=True)
-class ChannelDraft:
-    """Draft of a channel in a layout.
-
-    Attributes:
-        channel: name of the channel.
-        columns: names of the columns, or their positions from 0.
-        unit: unit of the columns.
-        comment: comment on the line of the config.
-        question: open question; empty if there is none.
-        commented_out: True if the line is written as a comment, without effect.
-    """
-
-    channel: str
-    columns: tuple[str | int, ...]
-    unit: str
-    comment: str = ""
-    question: str = ""
-    commented_out: bool = False
-
-    def line(self) -> ConfigLine:
-        """Return the line of the config for the channel."""
-        several = len(self.columns) > 1
-        named = toml(list(self.columns) if several else self.columns[0])
-        inside = f"column{'s' if several else ''} = {named}, unit = {toml(self.unit)}"
-        return ConfigLine(
-            self.channel, f"{{ {inside} }}", self.comment, self.question, self.commented_out
-        )
-
-
-@dataclass(frozen=True)
-class FileDraft:
-    """Draft of the layout of one kind of file.
-
-    Attributes:
-        channels: channels in the columns.
-        delimiter: text between columns; empty for a file that is not text (Parquet).
-        names_row, units_row, first_data_row: lines of names, units and first numbers, as in
-            `Layout`.
-        settings: lines with the other keys of the layout.
-        above: comments above the columns.
-        questions: open questions about the whole file.
-        pattern: name of a further file of a run, as in `Layout.beside`; empty for the run's own
-            file.
-    """
-
-    channels: tuple[ChannelDraft, ...]
-    delimiter: str = ","
-    names_row: int = 1
-    units_row: int = 0
-    first_data_row: int = 2
-    settings: tuple[ConfigLine, ...] = ()
-    above: tuple[str, ...] = ()
-    questions: tuple[str, ...] = ()
-    pattern: str = ""
-
-    def lines(self) -> tuple[ConfigLine, ...]:
-        """Return the lines of the layout except its columns."""
-        if not self.delimiter:
-            return self.settings
-        rows = ("names_row", "units_row") if self.units_row else ("names_row",)
-        lines = [layout_line("delimiter", self.delimiter)]
-        lines += [layout_line(key, getattr(self, key)) for key in (*rows, "first_data_row")]
-        return (*lines, *self.settings)
-
-
-@dataclass(frozen=True)
 class LayoutDraft:
-    """Draft of the layout of all files of a run.
+    """Draft of the layout of one kind of file, or of bags.
 
     Attributes:
-        name: name of the layout.
-        file: draft for the run's own file.
-        beside: drafts for further files of the run.
-        examples: True if examples of other channels and files are written below the layout.
-    """
-
-    name: str
-    file: FileDraft
-    beside: tuple[FileDraft, ...] = ()
-    examples: bool = False
-
-    @property
-    def channels(self) -> Iterator[ChannelDraft]:
-        """Yield every channel of all files that is not commented out."""
-        for file in (self.file, *self.beside):
-            yield from (channel for channel in file.channels if not channel.commented_out)
-
-
-@dataclass(frozen=True)
-class BagDraft:
-    """Draft of a layout of bags.
-
-    Attributes:
-        name: name of the layout.
-        settings: lines of the layout except its topics.
-        topics: a line for each channel with its topic.
-        above: comments above the topics.
+        name: name of the layout; of a further file of a run, with `beside` and the file's name.
+        settings: lines of the layout except its channels.
+        channels: a line for each channel with its columns, or with its topic.
+        table: key of the table of channels: columns or topics.
+        help: comments above the layout.
+        above, below: comments above and below the channels.
         questions: open questions about the whole layout.
     """
 
     name: str
     settings: tuple[ConfigLine, ...]
-    topics: tuple[ConfigLine, ...]
+    channels: tuple[ConfigLine, ...]
+    table: str = "columns"
+    help: tuple[str, ...] = COLUMNS_HELP
     above: tuple[str, ...] = ()
+    below: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()
+
+    def blocks(self) -> list[ConfigBlock]:
+        """Return the tables of the layout and of its channels."""
+        head = f"layouts.{self.name}"
+        return [
+            ConfigBlock(f"[{head}]", self.settings, self.help, questions=self.questions),
+            ConfigBlock(f"[{head}.{self.table}]", self.channels, self.above, self.below),
+        ]
 
 
 @dataclass(frozen=True)
@@ -146,26 +86,19 @@ class LogsDraft:
 
 
 @dataclass(frozen=True)
-class RobotHint:
-    """Question about a key of `[robot]` that replaces the usual one, since it suits the logs."""
-
-    key: str
-    question: str
-
-
-@dataclass(frozen=True)
 class ConfigDraft:
     """Draft of a whole config.
 
     Attributes:
         robot: answers about the robot.
-        layouts: layouts of log files; logs in the format of a preset need none.
+        layouts: layouts of log files and bags; logs in the format of a preset need none.
         logs: sections of logs.
-        preset_channels: channels that are logged, but not in `layouts`: those of presets and bags.
+        preset_channels: channels that are logged in the format of a preset.
         above: comments at the beginning of the file.
         data: data folder, as a command line names it.
-        hints: questions about the robot that replace the usual ones.
-        bags: layouts of bags.
+        hints: questions by the key of `[robot]`, which replace the usual ones since they suit the
+            logs.
+        sentences: lines about what was found in the logs.
     """
 
     robot: RobotAnswers
@@ -174,22 +107,24 @@ class ConfigDraft:
     preset_channels: frozenset[str] = frozenset()
     above: tuple[str, ...] = ()
     data: str = "DIR"
-    hints: tuple[RobotHint, ...] = ()
-    bags: tuple[BagDraft, ...] = ()
+    hints: Mapping[str, str] = field(default_factory=dict)
+    sentences: tuple[str, ...] = ()
 
     @property
     def channels(self) -> frozenset[str]:
         """Return the names of all channels that are logged."""
-        own = (channel.channel for layout in self.layouts for channel in layout.channels)
-        return self.preset_channels | frozenset(own)
+        lines = (line for layout in self.layouts for line in layout.channels)
+        return self.preset_channels | {line.key for line in lines if not line.commented_out}
 
 
-@dataclass(frozen=True)
-class ConfigProposal:
-    """Proposed draft of a config, with sentences about what was found in the logs."""
-
-    draft: ConfigDraft
-    sentences: tuple[str, ...]
+def channel_line(
+    channel: str, columns: tuple[str | int, ...], unit: str, comment: str = "", question: str = ""
+) -> ConfigLine:
+    """Return the line for a channel; columns are given by their names or positions from 0."""
+    several = len(columns) > 1
+    named = toml(columns if several else columns[0])
+    inside = f"column{'s' if several else ''} = {named}, unit = {toml(unit)}"
+    return ConfigLine(channel, f"{{ {inside} }}", comment, question)
 
 
 def layout_line(key: str, value: object, question: str = "", comment: str = "") -> ConfigLine:
@@ -197,14 +132,26 @@ def layout_line(key: str, value: object, question: str = "", comment: str = "") 
     return ConfigLine(key, toml(value), comment or in_short(Layout, key), question)
 
 
+def row_lines(
+    delimiter: str = ",", names_row: int = 1, units_row: int = 0, first_data_row: int = 2
+) -> list[ConfigLine]:
+    """Return the lines about the rows of a text file; none for a file that is not text (Parquet).
+
+    Arguments are the keys of a layout; there is no line about a missing row of units.
+    """
+    rows = {"delimiter": delimiter, "names_row": names_row, "units_row": units_row}
+    rows["first_data_row"] = first_data_row
+    shown = (key for key in rows if delimiter and (units_row or key != "units_row"))
+    return [layout_line(key, rows[key]) for key in shown]
+
+
 def template_draft(answers: RobotAnswers) -> ConfigDraft:
     """Return the draft of a config without logs.
 
     Its layout has every channel that the robot may log, in one file for each run.
     """
-    layout = LayoutDraft(
-        "mine", FileDraft(_channels(answers), settings=_settings(answers)), examples=True
-    )
+    settings = (*row_lines(), *_settings(answers))
+    layout = LayoutDraft("mine", settings, _channels(answers), below=_EXAMPLES)
     return ConfigDraft(answers, (layout,), (LogsDraft("*/*.csv", "mine"),))
 
 
@@ -223,7 +170,7 @@ def _settings(answers: RobotAnswers) -> tuple[ConfigLine, ...]:
     return (ticks, increments, gear, signed)
 
 
-def _channels(answers: RobotAnswers) -> tuple[ChannelDraft, ...]:
+def _channels(answers: RobotAnswers) -> tuple[ConfigLine, ...]:
     labels = _LABELS.get((answers.wheels, answers.shared))
     if labels is None or answers.drive in ("omni", "general"):
         labels = tuple(str(k + 1) for k in range(answers.wheels))
@@ -231,23 +178,18 @@ def _channels(answers: RobotAnswers) -> tuple[ChannelDraft, ...]:
     def each(name: str) -> tuple[str, ...]:
         return tuple(f"{name}_{label}" for label in labels)
 
-    ticks = bool(answers.ticks_per_revolution)
-    turns = ChannelDraft("wheel_ticks", each("ticks"), "tick", "or wheel_angle, motor_angle")
-    speed = ChannelDraft("wheel_speed", each("speed"), "rad/s", "or motor_speed, before the gear")
-    sideways = answers.drive in ("omni", "mecanum", "general")
-    twist = [("twist_command_x", "command_x", "m/s"), ("twist_command_y", "command_y", "m/s")]
-    twist = twist if sideways else twist[:1]
-    commands = [
-        ChannelDraft(*(channel, (column,), unit))
-        for channel, column, unit in (*twist, ("twist_command_yaw", "command_yaw", "rad/s"))
-    ]
+    ticks = channel_line("wheel_ticks", each("ticks"), "tick", "or wheel_angle, motor_angle")
+    speed = channel_line("wheel_speed", each("speed"), "rad/s", "or motor_speed, before the gear")
+    sideways = channel_line("twist_command_y", ("command_y",), "m/s")
     return (
-        ChannelDraft("time", ("time",), "s", question=_EXAMPLE_NAMES),
-        turns if ticks else speed,
-        ChannelDraft("current", each("current"), "A"),
-        ChannelDraft("voltage", each("voltage"), "V", "at the motors, not the battery's"),
-        ChannelDraft("pose_x", ("x",), "m", "at the rate of its sensor; empty cells between"),
-        ChannelDraft("pose_y", ("y",), "m"),
-        ChannelDraft("pose_heading", ("heading",), "rad"),
-        *commands,
+        channel_line("time", ("time",), "s", question=_EXAMPLE_NAMES),
+        ticks if answers.ticks_per_revolution else speed,
+        channel_line("current", each("current"), "A"),
+        channel_line("voltage", each("voltage"), "V", "at the motors, not the battery's"),
+        channel_line("pose_x", ("x",), "m", "at the rate of its sensor; empty cells between"),
+        channel_line("pose_y", ("y",), "m"),
+        channel_line("pose_heading", ("heading",), "rad"),
+        channel_line("twist_command_x", ("command_x",), "m/s"),
+        *([sideways] if answers.drive in ("omni", "mecanum", "general") else []),
+        channel_line("twist_command_yaw", ("command_yaw",), "rad/s"),
     )

@@ -53,46 +53,11 @@ class FileChannel:
     questions: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class FileChannels:
-    """All channels that were found in a file.
-
-    Attributes:
-        found: the channels.
-        unused: names of the other columns with numbers.
-        notes: remarks for the user.
-    """
-
-    found: tuple[FileChannel, ...]
-    unused: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    def get(self, channel: str) -> FileChannel | None:
-        """Return a channel, or None if the file does not have it."""
-        return next((one for one in self.found if one.channel == channel), None)
-
-    def first(self, *channels: str) -> FileChannel | None:
-        """Return the first of some channels that the file has, or None if it has none of them."""
-        return next((found for name in channels if (found := self.get(name))), None)
-
-    @property
-    def turns(self) -> FileChannel | None:
-        """Return the most informative channel with the motion of the wheels, or None."""
-        return self.first(*WHEEL_MOTION)
-
-    @property
-    def wheels(self) -> int:
-        """Return the number of wheels, or drives, with columns in the file."""
-        return len(self.turns.columns) if self.turns else 0
-
-    @property
-    def has_pose(self) -> bool:
-        """Return whether the file has a complete pose: x, y, and a heading or a quaternion."""
-        turned = self.get("pose_heading") or self.get("pose_quaternion")
-        return bool(self.get("pose_x") and self.get("pose_y") and turned)
+Channels = tuple[list[FileChannel], list[str], list[str]]
+"""The channels of a file, the names of its other columns with numbers, and remarks for the user."""
 
 
-def channels_in(numbers: TableNumbers) -> FileChannels:
+def channels_in(numbers: TableNumbers) -> Channels:
     """Return the channels in the named columns of a file."""
     format, meanings = numbers.format, {}
     for at, name in enumerate(format.names):
@@ -112,15 +77,19 @@ def channels_in(numbers: TableNumbers) -> FileChannels:
     first: dict[str, FileChannel] = {}
     for resolved in _resolved(found):
         first.setdefault(resolved.channel, resolved)
-    notes = _odometry_note(numbers, meanings) + [
-        f"not used, a second column: {', '.join(also)}"
-    ] * bool(also)
+    wheels = [format.names[at] for at, one in meanings.items() if one.channel == "odometry"]
+    notes = []
+    if wheels:
+        odometry = "odometry is no measured pose, it comes from the wheels"
+        notes.append(f"{', '.join(wheels)}: {odometry}")
+    if also:
+        notes.append(f"not used, a second column: {', '.join(also)}")
     kept, dropped = _consistent(list(first.values()))
     used = {at for one in kept for at in one.columns}
     unused = [
         name for at, name in enumerate(format.names) if name and at in meanings and at not in used
     ]
-    return FileChannels(tuple(kept), tuple(unused), tuple(notes + dropped))
+    return kept, unused, notes + dropped
 
 
 def _file_channel(
@@ -215,14 +184,7 @@ def _same_wheels(labels: set[str], one: FileChannel) -> bool:
     return set(one.labels) == labels or numbers != all(label.isdecimal() for label in one.labels)
 
 
-def _odometry_note(numbers: TableNumbers, meanings: dict[int, ColumnMeaning]) -> list[str]:
-    names = [numbers.format.names[at] for at, one in meanings.items() if one.channel == "odometry"]
-    if not names:
-        return []
-    return [f"{', '.join(names)}: odometry is no measured pose, it comes from the wheels"]
-
-
-def unnamed_channels(numbers: TableNumbers) -> FileChannels:
+def unnamed_channels(numbers: TableNumbers) -> Channels:
     """Return guessed channels of columns without names, each with a question.
 
     Time is the first increasing column, whole numbers are ticks, and three others are the pose.
@@ -247,16 +209,7 @@ def unnamed_channels(numbers: TableNumbers) -> FileChannels:
         if len(others) >= 3:
             put(channel, at)
     used = {at for one in found for at in one.columns}
-    unused = tuple(str(k) for k in range(values.shape[1]) if k not in used)
-    return FileChannels(tuple(found), unused)
-
-
-def without(channels: FileChannels, names: frozenset[str]) -> FileChannels:
-    """Return the channels of a file without those in `names`, which come from another file."""
-    kept = tuple(one for one in channels.found if one.channel not in names)
-    again = sorted(one.channel for one in channels.found if one.channel in names)
-    notes = (f"Also here, but taken from the other file: {', '.join(again)}.",) if again else ()
-    return replace(channels, found=kept, notes=(*channels.notes, *notes))
+    return found, [str(k) for k in range(values.shape[1]) if k not in used], []
 
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".log", ".parquet")
@@ -267,31 +220,23 @@ _FILES_TRIED = 3
 """Largest number of files that are read to find out whether a preset fits."""
 
 
-@dataclass(frozen=True)
-class RejectedFile:
-    """A file that is not a readable log, with the reason."""
-
-    path: Path
-    reason: str
-
-
-def formats_below(folder: Path) -> tuple[list[TableFormat], list[RejectedFile]]:
-    """Return the format of every log in a folder and below, and the files that are not logs.
+def formats_below(folder: Path) -> tuple[list[TableFormat], dict[Path, str]]:
+    """Return the format of every log in a folder and below, and why other files are not logs.
 
     Raises:
         DataError: there is no log.
     """
-    found, not_logs = [], []
+    found, not_logs = [], {}
     paths = sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix.lower() in SUFFIXES)
     for path in paths:
         try:
             found.append(format_of(path))
         except DataError as error:
-            not_logs.append(RejectedFile(path, str(error)))
+            not_logs[path] = str(error)
     if not found:
         there = f"no log in {len(paths)} files" if paths else "no CSV or Parquet file below it"
-        listed = "".join(f"\n{one.reason}" for one in not_logs[:3])
-        raise DataError(f"{folder}: {there}; expected logs of a robot{listed}")
+        listed = list(not_logs.values())[:3]
+        raise DataError("\n".join([f"{folder}: {there}; expected logs of a robot", *listed]))
     return found, not_logs
 
 
@@ -402,28 +347,21 @@ def folder_per_run(kind: FileKind) -> bool:
     return len(kind.paths) > 1 and len({path.parent for path in kind.paths}) == len(kind.paths)
 
 
-@dataclass(frozen=True)
-class PresetMatches:
-    """Presets that can read a kind of files.
+def matching_presets(kind: FileKind) -> tuple[str | None, list[str]]:
+    """Return the preset that is certainly right for a kind of files, or None, and others.
 
-    Attributes:
-        sure: preset whose many column names all match, so that it is certainly right, or None.
-        perhaps: other presets, with so few columns that they may match by chance.
+    Many column names of the first all match; the others can read the first files of the kind, but
+    have so few columns that this may be by chance.
     """
-
-    sure: str | None
-    perhaps: tuple[str, ...]
-
-
-def matching_presets(kind: FileKind) -> PresetMatches:
-    """Return the presets that can read the first files of a kind."""
     fits = [name for name, layout in PRESETS.items() if _matches(kind.formats[0], layout)]
     fits = [name for name in fits if _reads(kind, PRESETS[name])]
     fits.sort(key=lambda name: len(PRESETS[name].columns), reverse=True)
-    named = [name for name in fits if PRESETS[name].names_row]
-    telling = [name for name in named if len(PRESETS[name].columns) >= _TELLING_COLUMNS]
-    sure = telling[0] if telling else None
-    return PresetMatches(sure, tuple(name for name in fits if name not in telling))
+    telling = [
+        name
+        for name in fits
+        if PRESETS[name].names_row and len(PRESETS[name].columns) >= _TELLING_COLUMNS
+    ]
+    return next(iter(telling), None), [name for name in fits if name not in telling]
 
 
 def _matches(format: TableFormat, layout: Layout) -> bool:

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from slipid.app.new.config_lines import ConfigLine
-from slipid.app.new.draft import ChannelDraft, FileDraft, RobotHint, layout_line
+from slipid.app.new.draft import LayoutDraft, channel_line, layout_line, row_lines
 from slipid.app.new.file_channels import FileChannel
 from slipid.app.new.file_study import (
     ANGLES,
     CURRENTS,
+    PIXELS,
     SPEEDS,
     FileStudy,
     RunStudy,
@@ -17,6 +18,7 @@ from slipid.app.new.file_study import (
     reading_rate,
     ticks_are_increments,
 )
+from slipid.app.new.robot_questions import RobotAnswers
 from slipid.app.new.units import (
     RADII,
     UnitGuess,
@@ -25,11 +27,11 @@ from slipid.app.new.units import (
     duty_unit,
     heading_unit,
     speed_unit,
+    usual_step,
     usual_unit,
 )
 from slipid.data.reading.units import factor
 
-PIXELS = ("pixel", "pixels", "pix", "px")
 ASK_EFFORT = (
     "what is it: a current (unit A), a torque (N*m, and torque_constant in the layout), a voltage "
     "(V) or a duty (1)?"
@@ -45,31 +47,40 @@ _BATTERY_VOLTAGE = (
 )
 
 
-def file_draft(one: FileStudy, run: RunStudy) -> FileDraft:
-    """Return the draft of the layout of one file of a run."""
-    channels = [channel_draft(one, found, run) for found in one.channels.found]
-    format = one.format
-    above = list(one.channels.notes)
-    if one.channels.unused:
-        above.append(f"Not used: {', '.join(one.channels.unused)}.")
+def file_draft(
+    name: str, one: FileStudy, run: RunStudy, robot: RobotAnswers, help: tuple[str, ...]
+) -> LayoutDraft:
+    """Return the draft of the layout of one file of a run.
+
+    Args:
+        name: name of the layout.
+        one: study of the file.
+        run: study of its run.
+        robot: answers about the robot, with defaults for unknown ones.
+        help: comments above the layout.
+    """
+    format, main = one.format, one is run.main
+    channels = [channel_draft(one, found, run, robot) for found in one.found]
+    above = list(one.notes)
+    if one.unused:
+        above.append(f"Not used: {', '.join(one.unused)}.")
     if not format.names_row and format.delimiter:
         above.append("Columns without names, by their places from 0.")
-    main, named = one is run.main, list(filter(None, format.names)) or ["none have a name"]
-    return FileDraft(
-        tuple(sorted(channels, key=lambda channel: channel.channel != "time")),
-        delimiter=format.delimiter,
-        names_row=format.names_row,
-        units_row=_units_row(one),
-        first_data_row=format.first_data_row,
-        settings=tuple(_row_lines(one, main) + (_layout_settings(run) if main else [])),
+    named = ", ".join(filter(None, format.names)) or "none have a name"
+    rows = row_lines(format.delimiter, format.names_row, _units_row(one), format.first_data_row)
+    return LayoutDraft(
+        name,
+        (*rows, *_row_lines(one, main), *(_layout_settings(run, robot) if main else [])),
+        tuple(sorted(channels, key=lambda line: line.key != "time")),
+        help=help,
         above=tuple(above),
-        questions=() if one.channels.found else (_ASK_COLUMNS.format(", ".join(named)),),
+        questions=() if one.found else (_ASK_COLUMNS.format(named),),
     )
 
 
 def _units_row(one: FileStudy) -> int:
     """Return the row of units, which the reader checks; 0 if a used column has no unit in it."""
-    used = [at for found in one.channels.found for at in found.columns]
+    used = [at for found in one.found for at in found.columns]
     return one.format.units_row if all(one.format.units[at] for at in used) else 0
 
 
@@ -82,7 +93,7 @@ def _row_lines(one: FileStudy, main: bool) -> list[ConfigLine]:
         ask = "no column of time: how long is a row [s]?"
         return [layout_line("row_period", 0.05, ask)]
     steps, lines = np.diff(one.time), []
-    usual = one.usual_step
+    usual = usual_step(one.time)
     if main and (steps < -10 * usual).any():
         lines.append(layout_line("new_run", "time_restarts"))
     elif (steps < 0).any():
@@ -98,30 +109,23 @@ def _row_lines(one: FileStudy, main: bool) -> list[ConfigLine]:
     return lines
 
 
-def _layout_settings(run: RunStudy) -> list[ConfigLine]:
+def _layout_settings(run: RunStudy, robot: RobotAnswers) -> list[ConfigLine]:
     """Return the lines of the layout about encoders and currents, for all files of a run."""
     lines = []
-    robot, ticks = run.robot, run.find("wheel_ticks")
-    if ticks is not None:
+    if (ticks := run.find("wheel_ticks")) is not None:
         ask = ""
         if "ticks_per_revolution" in robot.defaults:
             ask = "how many, of the motor shaft, all edges counted?" + _ticks_by_speed(run, ticks)
         lines.append(layout_line("ticks_per_revolution", robot.ticks_per_revolution or 1000.0, ask))
-        step = ticks_are_increments(ticks, run.main, run.by_pose)
+        step = ticks_are_increments(ticks, run)
         ask = "do ticks add up, or does each row have those since the last?" if step is None else ""
         lines.append(layout_line("ticks_are_increments", bool(step), ask))
     lines.append(layout_line("gear_ratio", robot.gear_ratio, comment="as above"))
     if run.find(*CURRENTS) is not None and not run.of_supply:
-        sign = run.has_sign
+        sign, comment = run.has_sign, "false where only magnitudes are logged"
         ask = "the logs do not show it: do currents have a sign, or are they magnitudes?"
-        lines.append(
-            layout_line(
-                "current_is_signed",
-                sign is not False,
-                ask if sign is None else "",
-                "false where only magnitudes are logged",
-            )
-        )
+        ask = ask if sign is None else ""
+        lines.append(layout_line("current_is_signed", sign is not False, ask, comment))
     return lines
 
 
@@ -130,7 +134,7 @@ def _ticks_by_speed(run: RunStudy, ticks: FileChannel) -> str:
 
     It is empty if the main file does not have both ticks and speeds.
     """
-    speed = run.main.channels.first(*reversed(SPEEDS))
+    speed = run.main.find(*reversed(SPEEDS))
     if speed is None or not speed.unit or run.main.clock is None:
         return ""
     time, rates = run.main.time, np.nan_to_num(speed.values) * factor(speed.unit, "rad/s")
@@ -144,61 +148,54 @@ def _ticks_by_speed(run: RunStudy, ticks: FileChannel) -> str:
     )
 
 
-def radius_hint(run: RunStudy) -> tuple[RobotHint, ...]:
+def radius_hint(run: RunStudy, robot: RobotAnswers) -> dict[str, str]:
     """Return a question with the wheel radius that the poses imply, if all wheels point ahead."""
     speed, ratio = run.find("wheel_speed"), run.pose_over_wheel_speed
     if ratio is None or speed is None or len(speed.columns) > 2:
-        return ()
-    unit = speed.unit or unit_of(run.main, speed, run).unit
+        return {}
+    unit = speed.unit or unit_of(run.main, speed, run, robot).unit
     radius = ratio / factor(unit, "rad/s")
     if not RADII[0] <= radius <= RADII[1]:
-        return ()
-    return (
-        RobotHint(
-            "wheel_radius_m", f"taken by default: measure it; the poses say about {radius:.2g}"
-        ),
-    )
+        return {}
+    ask = f"taken by default: measure it; the poses say about {radius:.2g}"
+    return {"wheel_radius_m": ask}
 
 
-def channel_draft(one: FileStudy, found: FileChannel, run: RunStudy) -> ChannelDraft:
-    """Return the draft of a channel, with its unit, its rate and open questions."""
+def channel_draft(
+    one: FileStudy, found: FileChannel, run: RunStudy, robot: RobotAnswers
+) -> ConfigLine:
+    """Return the line for a channel, with its unit, its rate and open questions."""
     columns = tuple(one.format.column(at) for at in found.columns)
-    unit = UnitGuess(found.unit) if found.unit else unit_of(one, found, run)
-    comments = [reading_rate(one, found) if found.channel != "time" else "", unit.reason]
-    questions = list(dict.fromkeys(found.questions)) + [unit.doubt] * bool(unit.doubt)
-    draft = ChannelDraft(
-        found.channel, columns, unit.unit, "; ".join(filter(None, comments)), " ".join(questions)
-    )
-    return _unused_draft(draft, found, run)
+    unit = UnitGuess(found.unit) if found.unit else unit_of(one, found, run, robot)
+    rate = reading_rate(one, found) if found.channel != "time" else ""
+    questions = dict.fromkeys(filter(None, (*found.questions, unit.doubt)))
+    comment = "; ".join(filter(None, (rate, unit.reason)))
+    line = channel_line(found.channel, columns, unit.unit, comment, " ".join(questions))
+    unusable = _unusable(found, run)
+    return line if unusable is None else replace(line, commented_out=True, **unusable)
 
 
-def _unused_draft(draft: ChannelDraft, found: FileChannel, run: RunStudy) -> ChannelDraft:
-    """Return the draft of a channel, commented out if the channel must not be used as it is."""
-    speed = run.find(*SPEEDS)
-    if found.channel.endswith("torque") and found.unit != "N*m":
-        return replace(draft, commented_out=True, question=ASK_EFFORT)
-    if found.channel.endswith("torque"):
-        return replace(
-            draft, commented_out=True, question="give torque_constant [N m/A] in the layout"
-        )
-    if found.channel == "current" and run.of_supply:
-        return replace(draft, commented_out=True, comment=_SUPPLY_CURRENT)
-    runs = (run.find(found.channel) for run in run.runs)
-    if found.channel == "voltage" and is_battery_voltage([one for one in runs if one], speed):
-        return replace(draft, commented_out=True, comment=_BATTERY_VOLTAGE)
-    if found.channel == "bus_voltage" and run.find("duty") is None:
-        return replace(draft, commented_out=True, comment="of use beside a duty cycle alone")
-    if found.channel.startswith("pose_") and not any(s.channels.has_pose for s in run.all):
-        return replace(
-            draft, commented_out=True, comment="a pose in parts is none: x, y and a heading"
-        )
-    if found.channel.startswith("pose_") and run.by_pose.unit.unit in PIXELS:
-        ask = "give metres_per_pixel in the layout" if found.channel == "pose_x" else ""
-        return replace(draft, commented_out=True, question=ask)
-    return draft
+def _unusable(found: FileChannel, run: RunStudy) -> dict[str, str] | None:
+    """Return the question or comment about a channel that must not be used as it is, else None."""
+    channel = found.channel
+    if channel.endswith("torque"):
+        effort = "give torque_constant [N m/A] in the layout"
+        return {"question": effort if found.unit == "N*m" else ASK_EFFORT}
+    if channel == "current" and run.of_supply:
+        return {"comment": _SUPPLY_CURRENT}
+    runs = (run.find(channel) for run in run.runs)
+    if channel == "voltage" and is_battery_voltage([one for one in runs if one], run.find(*SPEEDS)):
+        return {"comment": _BATTERY_VOLTAGE}
+    if channel == "bus_voltage" and run.find("duty") is None:
+        return {"comment": "of use beside a duty cycle alone"}
+    if channel.startswith("pose_") and not run.has_pose:
+        return {"comment": "a pose in parts is none: x, y and a heading"}
+    if channel.startswith("pose_") and run.place_unit.unit in PIXELS:
+        return {"question": "give metres_per_pixel in the layout" if channel == "pose_x" else ""}
+    return None
 
 
-def unit_of(one: FileStudy, found: FileChannel, run: RunStudy) -> UnitGuess:
+def unit_of(one: FileStudy, found: FileChannel, run: RunStudy, robot: RobotAnswers) -> UnitGuess:
     """Return a guess of the unit of a channel, whose name has no unit."""
     channel = found.channel
     most = float(np.nanmax(np.abs(found.values)))
@@ -206,7 +203,7 @@ def unit_of(one: FileStudy, found: FileChannel, run: RunStudy) -> UnitGuess:
         return one.clock or UnitGuess("s")
     if channel in ("pose_x", "pose_y"):
         # The question about the unit is asked for x only.
-        place = run.by_pose.unit
+        place = run.place_unit
         return place if channel == "pose_x" else UnitGuess(place.unit)
     if channel == "pose_heading":
         farthest = max(run.runs, key=_pose_heading_range)
@@ -215,10 +212,9 @@ def unit_of(one: FileStudy, found: FileChannel, run: RunStudy) -> UnitGuess:
     if channel in (*SPEEDS, *ANGLES):
         ratio = run.pose_over_wheel_speed
         if channel.startswith("motor") and ratio is not None:
-            unknown = "gear_ratio" in run.robot.defaults
-            ratio = None if unknown else ratio * run.robot.gear_ratio
-        unit = speed_unit if channel in SPEEDS else angle_unit
-        return unit(ratio, run.radius)
+            ratio = None if "gear_ratio" in robot.defaults else ratio * robot.gear_ratio
+        radius = None if "wheel_radius_m" in robot.defaults else robot.wheel_radius_m
+        return (speed_unit if channel in SPEEDS else angle_unit)(ratio, radius)
     if channel.endswith("speed_command"):
         speed = run.find(channel.removesuffix("_command"))
         if speed is None:
@@ -247,13 +243,11 @@ def _heading_range(run: RunStudy) -> float:
     It is 0 without them.
     """
     for one in run.all:
-        reading_rate = one.channels.first("gyro", "twist_command_yaw")
-        if reading_rate is None or one.clock is None:
+        rate = one.find("gyro", "twist_command_yaw")
+        if rate is None or one.clock is None:
             continue
-        unit = (
-            reading_rate.unit or _turn_rate_unit(float(np.nanmax(np.abs(reading_rate.values)))).unit
-        )
-        speeds = np.nan_to_num(reading_rate.values[:-1, 0]) * factor(unit, "rad/s")
+        unit = rate.unit or _turn_rate_unit(float(np.nanmax(np.abs(rate.values)))).unit
+        speeds = np.nan_to_num(rate.values[:-1, 0]) * factor(unit, "rad/s")
         return float(np.ptp(np.cumsum(speeds * np.diff(one.time))))
     return 0.0
 

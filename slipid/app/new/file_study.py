@@ -7,14 +7,19 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from slipid.app.new.file_channels import FileChannel, FileChannels, channels_in, unnamed_channels
-from slipid.app.new.robot_questions import RobotAnswers
-from slipid.app.new.units import UnitGuess, position_unit, speed_of, time_unit
+from slipid.app.new.file_channels import (
+    WHEEL_MOTION,
+    FileChannel,
+    FileKind,
+    channels_in,
+    unnamed_channels,
+)
+from slipid.app.new.units import UnitGuess, position_unit, time_unit, usual_step
 from slipid.data.reading.table_format import TableFormat, TableNumbers, numbers_of
 from slipid.data.reading.units import factor
 from slipid.data.wheel_signals import refresh_period
 
-METRES = UnitGuess("m")
+PIXELS = ("pixel", "pixels", "pix", "px")
 _ALIGNED_DRIVES = 2
 """Number of drives up to which all wheels are taken to point ahead."""
 _SPARSE = 0.02
@@ -30,13 +35,17 @@ class FileStudy:
 
     Attributes:
         numbers: numbers in the file.
-        channels: channels in the file.
+        found: channels in the file.
+        unused: names of the other columns with numbers.
+        notes: remarks for the user.
         time: time of every row [s]; if no time is logged, the number of the row.
         clock: unit of the time; None if no time is logged.
     """
 
     numbers: TableNumbers
-    channels: FileChannels
+    found: Sequence[FileChannel]
+    unused: Sequence[str]
+    notes: Sequence[str]
     time: Float[np.ndarray, " row"]
     clock: UnitGuess | None
 
@@ -46,23 +55,51 @@ class FileStudy:
         return self.numbers.format
 
     @property
-    def usual_step(self) -> float:
-        """Return the median time between rows [s]."""
-        steps = np.diff(self.time)
-        steps = steps[steps > 0]
-        return float(np.median(steps)) if len(steps) else 1.0
+    def wheels(self) -> int:
+        """Return the number of wheels, or drives, with columns in the file."""
+        turns = self.find(*WHEEL_MOTION)
+        return len(turns.columns) if turns else 0
+
+    @property
+    def has_pose(self) -> bool:
+        """Return whether the file has a complete pose: x, y, and a heading or a quaternion."""
+        turned = self.find("pose_heading", "pose_quaternion")
+        return bool(self.find("pose_x") and self.find("pose_y") and turned)
+
+    def find(self, *channels: str) -> FileChannel | None:
+        """Return the first of some channels that the file has, or None if it has none of them."""
+        return first_of(channels, [self])
+
+    def column(self, channel: str) -> Float[np.ndarray, " row"]:
+        """Return the numbers of a channel that the file has in one column."""
+        return next(one for one in self.found if one.channel == channel).values[:, 0]
+
+    def without(self, names: frozenset[str]) -> "FileStudy":
+        """Return the study without the channels in `names`, which come from another file."""
+        kept = [one for one in self.found if one.channel not in names]
+        again = sorted(one.channel for one in self.found if one.channel in names)
+        note = f"Also here, but taken from the other file: {', '.join(again)}."
+        return replace(self, found=kept, notes=[*self.notes, note] if again else self.notes)
+
+
+def first_of(channels: Sequence[str], files: Sequence[FileStudy]) -> FileChannel | None:
+    """Return the first of some channels that is in one of the files, or None."""
+    found = (
+        one for name in channels for file in files for one in file.found if one.channel == name
+    )
+    return next(found, None)
 
 
 def study_file(format: TableFormat) -> FileStudy:
     """Return the study of a file; raise `DataError` if its numbers cannot be read."""
     numbers = numbers_of(format)
-    columns = channels_in(numbers) if any(format.names) else unnamed_channels(numbers)
-    found = columns.get("time")
-    if found is None:
-        return FileStudy(numbers, columns, np.arange(len(numbers.values), dtype=float), None)
+    channels = channels_in(numbers) if any(format.names) else unnamed_channels(numbers)
+    one = FileStudy(numbers, *channels, np.arange(len(numbers.values), dtype=float), None)
+    if (found := one.find("time")) is None:
+        return one
     values = found.values[:, 0]
     clock = UnitGuess(found.unit) if found.unit else time_unit(values)
-    return FileStudy(numbers, columns, values * factor(clock.unit, "s"), clock)
+    return replace(one, time=values * factor(clock.unit, "s"), clock=clock)
 
 
 def reading_rate(one: FileStudy, found: FileChannel) -> str:
@@ -75,83 +112,56 @@ def reading_rate(one: FileStudy, found: FileChannel) -> str:
     if there.sum() < 3 or one.clock is None:
         return ""
     time, values = time[there], values[there]
-    steps = np.diff(time)
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
-    empty = 1.0 - float(there.mean())
-    often = f"{_rate_text(usual)}, empty in between" if empty > _SPARSE else _rate_text(usual)
-    period = refresh_period([(time, values)])
+    usual = usual_step(time)
+    empty = ", empty in between" if 1.0 - float(there.mean()) > _SPARSE else ""
+    rate, period = f"{1 / usual:.3g} Hz{empty}", refresh_period([(time, values)])
     if period is not None and period > 1.5 * usual:
-        return f"{often}; read anew {_rate_text(period)}"
-    return often
+        return f"{rate}; read anew {1 / period:.3g} Hz"
+    return rate
 
 
-def _rate_text(period: float) -> str:
-    return f"{1.0 / period:.3g} Hz" if period > 0 else ""
+def pose_path(
+    one: FileStudy | None,
+) -> tuple[UnitGuess, Float[np.ndarray, "3 pose"] | None]:
+    """Return the unit of the positions in a file, and its path: time [s], x and y [m] of each pose.
 
-
-@dataclass(frozen=True)
-class PoseMotion:
-    """Motion of the robot according to its logged pose; arrays are None without a pose.
-
-    Attributes:
-        speed: 90 % quantile of the speed [m/s]; None without a pose.
-        unit: unit of x and y in the file.
-        time: times of the poses [s].
-        x, y: positions [m].
-        steps: distance of each pose from the previous one [m].
+    The path is None if the file has no pose, or none with a time and a length.
     """
-
-    speed: float | None = None
-    unit: UnitGuess = METRES
-    time: Float[np.ndarray, " pose"] | None = None
-    x: Float[np.ndarray, " pose"] | None = None
-    y: Float[np.ndarray, " pose"] | None = None
-    steps: Float[np.ndarray, " pose"] | None = None
-
-
-def pose_motion(one: FileStudy | None) -> PoseMotion:
-    """Return the motion according to the pose in a file; it is empty if the file has no pose."""
-    if one is None or not one.channels.has_pose:
-        return PoseMotion()
-    x, y = one.channels.get("pose_x"), one.channels.get("pose_y")
-    assert x is not None
-    assert y is not None
-    px, py = x.values[:, 0], y.values[:, 0]
-    if x.unit:
-        place = UnitGuess(x.unit)
+    if one is None or not one.has_pose:
+        return UnitGuess("m"), None
+    x, y = one.column("pose_x"), one.column("pose_y")
+    logged = next(found.unit for found in one.found if found.channel == "pose_x")
+    if logged:
+        unit = UnitGuess(logged)
     elif one.clock is None:
-        place = UnitGuess("m", doubt="in which unit?")
+        unit = UnitGuess("m", doubt="in which unit?")
     else:
-        place = position_unit(one.time, px, py)
-    if place.unit in ("pixel", "pixels", "pix", "px") or one.clock is None:
-        return PoseMotion(unit=place)
-    scale = factor(place.unit, "m")
-    there = ~(np.isnan(px) | np.isnan(py) | np.isnan(one.time))
-    time, px, py = one.time[there], px[there] * scale, py[there] * scale
-    steps = np.append(0.0, np.hypot(np.diff(px), np.diff(py)))
-    return PoseMotion(speed_of(time, px, py), place, time, px, py, steps)
+        unit = position_unit(one.time, x, y)
+    if unit.unit in PIXELS or one.clock is None:
+        return unit, None
+    scale = factor(unit.unit, "m")
+    path = np.stack([one.time, x * scale, y * scale])
+    return unit, path[:, ~np.isnan(path).any(axis=0)]
 
 
-def ticks_are_increments(found: FileChannel, one: FileStudy, by_pose: PoseMotion) -> bool | None:
+def ticks_are_increments(found: FileChannel, run: "RunStudy") -> bool | None:
     """Return whether ticks are increments since the previous row; None if it is not clear.
 
     The path length by the pose is proportional to increments, else to the changes of the ticks.
     """
-    values = np.nan_to_num(found.values)
-    of_rows, of_changes = (
-        np.abs(values).sum(axis=1)[1:],
-        np.abs(np.diff(values, axis=0)).sum(axis=1),
-    )
-    if by_pose.time is not None and by_pose.steps is not None and len(by_pose.time) > 20:
-        travelled = np.interp(one.time, by_pose.time, np.cumsum(by_pose.steps))
+    values, path, time = np.nan_to_num(found.values), run.path, run.main.time
+    of_rows = np.abs(values).sum(axis=1)[1:]
+    of_changes = np.abs(np.diff(values, axis=0)).sum(axis=1)
+    if path is not None and path.shape[1] > 20:
+        steps = np.hypot(*np.diff(path[1:]))
+        travelled = np.interp(time, path[0], np.append(0.0, np.cumsum(steps)))
         width = max(1, len(travelled) // 60)
-        sums = [
-            _block_sums(row, width) for row in (of_rows, of_changes, np.abs(np.diff(travelled)))
-        ]
-        if all(float(np.std(part)) > 0 for part in sums):
-            rows, changes = (float(np.corrcoef(part, sums[2])[0, 1]) for part in sums[:2])
+        signals = (of_rows, of_changes, np.abs(np.diff(travelled)))
+        sums = np.stack([_block_sums(row, width) for row in signals])
+        if (sums.std(axis=1) > 0).all():
+            rows, changes = np.corrcoef(sums)[:2, 2]
             if abs(rows - changes) > 0.15:
-                return rows > changes
+                return bool(rows > changes)
     if not of_changes.any():
         return None
     usual = float(np.median(of_changes[of_changes > 0]))
@@ -165,30 +175,33 @@ def _block_sums(values: Float[np.ndarray, " row"], width: int) -> Float[np.ndarr
     return values[: count * width].reshape(count, width).sum(axis=1)
 
 
-def pose_over_wheel_speed(one: FileStudy, speed: FileChannel, by_pose: PoseMotion) -> float | None:
+def pose_over_wheel_speed(
+    one: FileStudy,
+    wheels: Float[np.ndarray, "row column"],
+    path: Float[np.ndarray, "3 pose"] | None,
+) -> float | None:
     """Return the ratio of body speed [m/s] to wheel speed [unit of the file] while wheels turn.
 
     If wheel speeds are in rad/s and all wheels point ahead, it is the wheel radius [m]; for other
     robots it is close to that. The result is None if poses or wheel speeds are missing.
     """
-    if by_pose.time is None or by_pose.x is None or by_pose.y is None or one.clock is None:
+    if path is None or one.clock is None:
         return None
     # If all wheels point ahead, their mean is the signed motion; else the rms is its magnitude.
-    ahead = speed.values.shape[1] <= _ALIGNED_DRIVES
-    rows = speed.values.mean(axis=1) if ahead else np.sqrt((speed.values**2).mean(axis=1))
+    ahead = wheels.shape[1] <= _ALIGNED_DRIVES
+    rows = wheels.mean(axis=1) if ahead else np.sqrt((wheels**2).mean(axis=1))
     there = ~(np.isnan(rows) | np.isnan(one.time))
     time, rows = one.time[there], rows[there]
     if len(time) < 3:
         return None
     turned = np.append(0.0, np.cumsum(0.5 * (rows[1:] + rows[:-1]) * np.diff(time)))
-    start, end = max(time[0], by_pose.time[0]), min(time[-1], by_pose.time[-1])
+    start, end = max(time[0], path[0, 0]), min(time[-1], path[0, -1])
     if end <= start:
         return None
     edges = np.linspace(start, end, max(2, int(end - start)))
     by_wheels = np.abs(np.diff(np.interp(edges, time, turned)))
     # Distances over long steps are used, since noise of the poses increases their path length.
-    x, y = (np.interp(edges, by_pose.time, part) for part in (by_pose.x, by_pose.y))
-    chords = np.hypot(np.diff(x), np.diff(y))
+    chords = np.hypot(*(np.diff(np.interp(edges, path[0], part)) for part in path[1:]))
     good = by_wheels > 0.3 * by_wheels.max(initial=0.0)
     ratio = float(np.median(chords[good] / by_wheels[good])) if good.any() else 0.0
     return ratio if ratio > 0 else None
@@ -231,9 +244,9 @@ def is_battery_voltage(voltages: Sequence[FileChannel], speed: FileChannel | Non
     return stays_up and (speed is None or float(np.nanstd(speed.values)) > 0.0)
 
 
-def file_with_pose(studies: tuple[FileStudy, ...]) -> FileStudy | None:
+def file_with_pose(studies: Sequence[FileStudy]) -> FileStudy | None:
     """Return the first file with a pose, or None."""
-    return next((one for one in studies if one.channels.has_pose), None)
+    return next((one for one in studies if one.has_pose), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,26 +254,45 @@ class RunStudy:
     """Study of all files of a run together.
 
     Attributes:
-        robot: answers about the robot, with defaults for unknown ones.
-        main: file with the wheels.
-        all: all files of the run.
+        kind: kind of the files with the wheels, one for each run.
+        main: study of the file with the wheels.
+        beside: name of each further file of the run, as in `Layout.beside`, and its study.
         others: studies of further runs, for properties that a single run may not show.
     """
 
-    robot: RobotAnswers
+    kind: FileKind
     main: FileStudy
-    all: tuple[FileStudy, ...]
+    beside: tuple[tuple[str, FileStudy], ...] = ()
     others: tuple["RunStudy", ...] = ()
 
+    @property
+    def all(self) -> tuple[FileStudy, ...]:
+        """Return the studies of all files of the run."""
+        return (self.main, *(one for _, one in self.beside))
+
+    @property
+    def has_pose(self) -> bool:
+        """Return whether a file of the run has a pose."""
+        return file_with_pose(self.all) is not None
+
+    @property
+    def complete(self) -> bool:
+        """Return whether the run has wheels and a pose."""
+        return self.has_pose and any(one.wheels for one in self.all)
+
     @cached_property
-    def by_pose(self) -> PoseMotion:
-        """Return the motion according to the pose."""
-        return pose_motion(file_with_pose(self.all))
+    def place_unit(self) -> UnitGuess:
+        """Return the unit of the positions of the pose."""
+        return pose_path(file_with_pose(self.all))[0]
+
+    @cached_property
+    def path(self) -> Float[np.ndarray, "3 pose"] | None:
+        """Return the time [s], x and y [m] of each pose; None if they are unknown."""
+        return pose_path(file_with_pose(self.all))[1]
 
     def find(self, *channels: str) -> FileChannel | None:
         """Return the first of some channels that is in one of the files, or None."""
-        found = (one.channels.get(name) for name in channels for one in self.all)
-        return next((one for one in found if one is not None), None)
+        return first_of(channels, self.all)
 
     @property
     def runs(self) -> tuple["RunStudy", ...]:
@@ -272,23 +304,25 @@ class RunStudy:
         """Return the median over all runs of the ratio of body speed to wheel speed, or None."""
         found = []
         for run in self.runs:
-            speed = run.main.channels.first(*SPEEDS)
-            angle = run.main.channels.first(*ANGLES)
-            if speed is None and angle is not None and run.main.clock is not None:
-                rates = np.gradient(angle.values, run.main.time, axis=0)
-                speed = replace(angle, values=rates)
-            ratio = None if speed is None else pose_over_wheel_speed(run.main, speed, run.by_pose)
-            found += [ratio] if ratio is not None else []
-        return float(np.median(found)) if found else None
+            one, speed, angle = run.main, run.main.find(*SPEEDS), run.main.find(*ANGLES)
+            if speed is not None:
+                found.append(pose_over_wheel_speed(one, speed.values, run.path))
+            elif angle is not None and one.clock is not None:
+                rates = np.gradient(angle.values, one.time, axis=0)
+                found.append(pose_over_wheel_speed(one, rates, run.path))
+        known = [ratio for ratio in found if ratio is not None]
+        return float(np.median(known)) if known else None
+
+    @property
+    def currents(self) -> list[tuple[FileChannel, FileChannel | None]]:
+        """Return the currents and wheel speeds of each run with currents."""
+        found = [(run.find(*CURRENTS), run.find(*SPEEDS)) for run in self.runs]
+        return [(current, speed) for current, speed in found if current is not None]
 
     @property
     def has_sign(self) -> bool | None:
         """Return whether currents have a sign in some run; None if no run shows it."""
-        signs = [
-            has_sign(current, run.find(*SPEEDS))
-            for run in self.runs
-            if (current := run.find(*CURRENTS)) is not None
-        ]
+        signs = [has_sign(current, speed) for current, speed in self.currents]
         return True if True in signs else False if False in signs else None
 
     @property
@@ -297,13 +331,5 @@ class RunStudy:
 
         They are then positive in both directions of the wheels, and negative at times.
         """
-        currents = [(run.find(*CURRENTS), run.find(*SPEEDS)) for run in self.runs]
-        known = [(current, speed) for current, speed in currents if current is not None]
-        both_ways = any(has_magnitudes(current, speed) for current, speed in known)
-        return both_ways and any(np.nanmin(current.values) < 0.0 for current, _ in known)
-
-    @property
-    def radius(self) -> float | None:
-        """Return the wheel radius [m] if the user gave it, else None."""
-        taken = "wheel_radius_m" in self.robot.defaults
-        return None if taken else self.robot.wheel_radius_m
+        both_ways = any(has_magnitudes(*known) for known in self.currents)
+        return both_ways and any(np.nanmin(current.values) < 0.0 for current, _ in self.currents)

@@ -1,19 +1,19 @@
 """Proposal of a config for a log or a folder of logs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from slipid.app.config import geometry, parsed
 from slipid.app.logs import layout_of
 from slipid.app.new.bags import bags_in, propose_bags
-from slipid.app.new.config_lines import ConfigLine
+from slipid.app.new.config_lines import ConfigLine, toml
 from slipid.app.new.config_text import new_config
-from slipid.app.new.draft import ConfigDraft, ConfigProposal, LayoutDraft, LogsDraft
+from slipid.app.new.draft import COLUMNS_HELP, ConfigDraft, LayoutDraft, LogsDraft
 from slipid.app.new.file_channels import floor_of, folder_per_run, globs_of
 from slipid.app.new.file_draft import file_draft, radius_hint
 from slipid.app.new.file_study import FileStudy, RunStudy
-from slipid.app.new.guess import RunFiles, SortedFiles, guess_robot, sort_files
+from slipid.app.new.guess import SortedFiles, guess_robot, sort_files
 from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, robot_of
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
@@ -25,10 +25,11 @@ from slipid.data.reading.reader import read_logs
 from slipid.support.errors import DataError
 
 FLOOR = "floor"
+_NOT_WHOLE = "Without wheels or without a pose, so nothing to fit:"
 _FLOOR = "on which floor was {} driven? Its name, or folder where folders are called after floors"
 
 
-def propose(path: Path, options: RobotOptions) -> ConfigProposal:
+def propose(path: Path, options: RobotOptions) -> ConfigDraft:
     """Return the proposed config for a log or a folder of logs.
 
     Args:
@@ -41,40 +42,35 @@ def propose(path: Path, options: RobotOptions) -> ConfigProposal:
     if not path.exists():
         raise DataError(f"{path}: no such file or folder; expected a log, or a folder of logs")
     if bags := bags_in(path):
-        proposed = propose_bags(bags, path, options)
-        return replace(proposed, draft=_bags_checked(proposed.draft, bags[0]))
+        return _bags_checked(propose_bags(bags, path, options), bags[0])
     found = sort_files(path)
-    wheels = max((group.main.channels.wheels for group in found.groups), default=0)
-    for _, name in found.presets:
-        wheels = max(wheels, _wheels_of(PRESETS[name]))
+    counts = [group.main.wheels for group in found.groups]
+    wheels = max(counts + [_wheels_of(PRESETS[name]) for _, name in found.presets])
     files = tuple(one for group in found.groups for one in group.all)
     _refuse_bench(path, found, wheels, files)
-    guessed = guess_robot(options, wheels, files)
-    robot = _with_preset_gear(guessed.robot, found)
-    known = [_run_study(group, robot) for group in found.groups]
+    robot, hints = guess_robot(options, wheels, files)
+    robot = _with_preset_gear(robot, found)
     logs = _logs(found)
     used = {one.format for one in logs if not one.commented_out}
     presets = [PRESETS[name] for _, name in found.presets if name in used]
+    for group in found.groups:
+        hints = radius_hint(group, robot) | hints
     draft = ConfigDraft(
         robot,
-        tuple(
-            _layout(group, one, k)
-            for k, (group, one) in enumerate(zip(found.groups, known, strict=True))
-        ),
+        tuple(one for k, run in enumerate(found.groups) for one in _layouts(run, robot, _name(k))),
         tuple(logs),
         preset_channels=frozenset(channel for layout in presets for channel in layout.channels),
         above=(f"Proposed from {path}.", *found.hints),
         data=str(found.root),
-        hints=(*guessed.hints, *(hint for one in known for hint in radius_hint(one))),
+        hints=hints,
+        sentences=(*found.sentences, *found.hints),
     )
-    return ConfigProposal(
-        _checked_by_reader(draft, found, wheels), (*found.sentences, *found.hints)
-    )
+    return _checked_by_reader(draft, found.groups, wheels)
 
 
 def _refuse_bench(path: Path, found: SortedFiles, wheels: int, files: Sequence[FileStudy]) -> None:
     """Raise `DataError` for the log of a motor on a bench, which `slipid motor` reads."""
-    if found.presets or wheels > 1 or not files or any(one.channels.has_pose for one in files):
+    if found.presets or wheels > 1 or not files or any(one.has_pose for one in files):
         return
     first = files[0].format.path
     try:
@@ -103,18 +99,17 @@ def _with_preset_gear(robot: RobotAnswers, found: SortedFiles) -> RobotAnswers:
     return replace(robot, gear_ratio=gears.pop(), defaults=robot.defaults - {"gear_ratio"})
 
 
-def _run_study(group: RunFiles, robot: RobotAnswers) -> RunStudy:
-    others = tuple(RunStudy(robot, other.main, other.all) for other in group.others)
-    return RunStudy(robot, group.main, group.all, others)
-
-
-def _layout(group: RunFiles, known: RunStudy, number: int) -> LayoutDraft:
-    file = file_draft(group.main, known)
-    if not any(one.channels.has_pose for one in group.all):
+def _layouts(run: RunStudy, robot: RobotAnswers, name: str) -> list[LayoutDraft]:
+    """Return the drafts of the layouts of all files of a run."""
+    first = file_draft(name, run.main, run, robot, COLUMNS_HELP)
+    if not run.has_pose:
         ask = "no pose was found (x, y, and a heading or a quaternion): a fit needs one"
-        file = replace(file, questions=(*file.questions, ask))
-    beside = tuple(replace(file_draft(one, known), pattern=name) for name, one in group.beside)
-    return LayoutDraft(_name(number), file, beside)
+        first = replace(first, questions=(*first.questions, ask))
+    beside = (
+        (f"{name}.beside.{toml(pattern)}", one, f"Of the same run, in {pattern}:")
+        for pattern, one in run.beside
+    )
+    return [first, *(file_draft(key, one, run, robot, (help,)) for key, one, help in beside)]
 
 
 def _name(number: int) -> str:
@@ -123,46 +118,47 @@ def _name(number: int) -> str:
 
 def _logs(found: SortedFiles) -> list[LogsDraft]:
     """Return a log section for each glob; those without wheels or a pose are commented out."""
-    named = [(kind, name) for kind, name in found.presets]
-    named += [(group.kind, _name(k)) for k, group in enumerate(found.groups)]
-    every = {path for kind, _ in named for path in kind.paths}
-    every |= {path for one in found.other_kinds for path in one.paths} | set(found.no_logs)
-    whole = {name for name in PRESETS if {"pose_x"} <= PRESETS[name].channels.keys()}
-    whole -= {name for name in PRESETS if not _wheels_of(PRESETS[name])}
+    named = [*found.presets, *((group.kind, _name(k)) for k, group in enumerate(found.groups))]
+    whole = {
+        name
+        for name, layout in PRESETS.items()
+        if "pose_x" in layout.channels and _wheels_of(layout)
+    }
     whole |= {_name(k) for k, group in enumerate(found.groups) if group.complete}
     out = []
     for kind, name in named:
-        for glob in globs_of(found.root, kind, sorted(every - set(kind.paths))):
+        for glob in globs_of(found.root, kind, sorted(found.paths - set(kind.paths))):
             floors = glob.count("/") > 0 and not folder_per_run(kind)
-            commented_out = name not in whole
-            surface, ask = ("folder", "") if floors else (floor_of(glob), _FLOOR.format(glob))
-            above = (
-                ("Without wheels or without a pose, so nothing to fit:",) if commented_out else ()
-            )
-            out.append(
-                LogsDraft(glob, name, surface, above, "" if commented_out else ask, commented_out)
-            )
-    if all(
-        one.commented_out for one in out
-    ):  # a config must have at least one section; its layout asks for what is missing
+            one = LogsDraft(glob, name, "folder" if floors else floor_of(glob))
+            if name not in whole:
+                one = replace(one, above=(_NOT_WHOLE,), commented_out=True)
+            elif not floors:
+                one = replace(one, question=_FLOOR.format(glob))
+            out.append(one)
+    if all(one.commented_out for one in out):
+        # A config must have at least one section; its layout asks for what is missing.
         return [replace(one, commented_out=False, above=()) for one in out]
     return sorted(out, key=lambda one: one.commented_out)
 
 
-def _checked_by_reader(draft: ConfigDraft, found: SortedFiles, wheels: int) -> ConfigDraft:
+def _checked_by_reader(draft: ConfigDraft, runs: Sequence[RunStudy], wheels: int) -> ConfigDraft:
     """Return the draft, with questions about problems in reading the first file of each layout.
 
     `wheels` is the number of wheels with columns in the logs.
     """
     drives = geometry(robot_of(draft.robot)).drives
+    first = {_name(k): run.kind.paths[0] for k, run in enumerate(runs)}
     layouts = []
-    for layout, group in zip(draft.layouts, found.groups, strict=True):
-        questions = list(layout.file.questions)
-        if wheels and drives != wheels:
+    for layout in draft.layouts:
+        questions = list(layout.questions)
+        if layout.name in first and wheels and drives != wheels:
             questions.append(f"[robot] has {drives} drives, but {wheels} have columns here: which?")
-        if problem := _read_first(draft, layout.name, group.kind.paths[0]).problem:
-            questions.append(f"the reader says: {problem}")
-        layouts.append(replace(layout, file=replace(layout.file, questions=tuple(questions))))
+        try:
+            if layout.name in first:
+                _read(draft, layout.name, first[layout.name])
+        except DataError as error:
+            questions.append(_problem(error))
+        layouts.append(replace(layout, questions=tuple(questions)))
     return replace(draft, layouts=tuple(layouts))
 
 
@@ -171,44 +167,37 @@ def _bags_checked(draft: ConfigDraft, first: Path) -> ConfigDraft:
 
     If the wheels pause in the bag, it is separated into runs at the pauses, in one session.
     """
-    (bag,) = draft.bags
-    tried = _read_first(draft, bag.name, first)
-    if tried.problem:
-        questions = (*bag.questions, f"the reader says: {tried.problem}")
-        return replace(draft, bags=(replace(bag, questions=questions),))
-    count = max((runs_between_pauses(log, PAUSE_S) for log in tried.logs), default=1)
+    (bag,) = draft.layouts
+    try:
+        logs = _read(draft, bag.name, first)
+    except DataError as error:
+        return replace(draft, layouts=(replace(bag, questions=(*bag.questions, _problem(error))),))
+    count = max((runs_between_pauses(log, PAUSE_S) for log in logs), default=1)
     if count < 2:
         return draft
     comment = f"cut where no wheel moves for longer: {count} runs in the first bag"
     cut = ConfigLine("runs", f"{{ pause_s = {PAUSE_S:g} }}", comment)
-    logs = tuple(replace(one, session="file") for one in draft.logs)
-    return replace(draft, bags=(replace(bag, settings=(*bag.settings, cut)),), logs=logs)
+    sections = tuple(replace(one, session="file") for one in draft.logs)
+    return replace(draft, layouts=(replace(bag, settings=(*bag.settings, cut)),), logs=sections)
 
 
-@dataclass(frozen=True)
-class _ReadResult:
-    """Result of reading a file: its runs, or else the reader's error."""
-
-    logs: tuple[Log, ...] = ()
-    problem: str = ""
+def _problem(error: DataError) -> str:
+    return f"the reader says: {str(error).splitlines()[0].replace('robot.toml ', '')}"
 
 
-def _read_first(draft: ConfigDraft, name: str, path: Path) -> _ReadResult:
-    """Return the result of reading a file with the draft's config.
+def _read(draft: ConfigDraft, name: str, path: Path) -> Sequence[Log]:
+    """Return the runs in a file, which is read with the draft's layout of this name.
 
-    Args:
-        draft: the draft.
-        name: name of the layout.
-        path: first file of the layout.
+    There are none if no section of the draft uses the layout.
+
+    Raises:
+        DataError: the file cannot be read so.
     """
-    try:
-        config = parsed(Path("robot.toml"), new_config(draft, "robot.toml").text)
-        section = next((one for one in config.content.logs if one.format == name), None)
-        if section is None:
-            return _ReadResult()
-        layout = layout_of(config, section)
-        logs = read_logs(path, layout, path.parent, FLOOR, "as_built").logs
-        refuse_misordered(logs)
-        return _ReadResult(tuple(logs))
-    except DataError as error:
-        return _ReadResult(problem=str(error).splitlines()[0].replace("robot.toml ", ""))
+    config = parsed(Path("robot.toml"), new_config(draft, "robot.toml").text)
+    for section in config.content.logs:
+        if section.format == name:
+            layout = layout_of(config, section)
+            logs = read_logs(path, layout, path.parent, FLOOR, "as_built").logs
+            refuse_misordered(logs)
+            return logs
+    return ()

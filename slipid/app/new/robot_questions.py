@@ -1,17 +1,12 @@
 """Questions about a robot, of which the type of drive is the first, and parsing of the answers."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
 
-from slipid.app.config import (
-    DifferentialDrive,
-    FourWheelDrive,
-    GeneralDrive,
-    OmniDrive,
-    Wheels,
-    geometry,
-)
+from pydantic import Field, TypeAdapter
+
+from slipid.app.config import Wheels, geometry
 from slipid.support.errors import DataError, did_you_mean
 
 Asker = Callable[[str, str, str], str]
@@ -20,26 +15,9 @@ Asker = Callable[[str, str, str], str]
 Its arguments are the question, the default, and a message about what was wrong with the previous
 answer (empty at first).
 """
-
-
-@dataclass(frozen=True, kw_only=True)
-class RobotOptions:
-    """Command-line options that describe a robot, as texts; None for options not given."""
-
-    drive: str | None = None
-    wheels: str | None = None
-    azimuths_deg: str | None = None
-    base_radius_m: str | None = None
-    wheelbase_m: str | None = None
-    track_m: str | None = None
-    shared: str | None = None
-    places_m: str | None = None
-    directions_deg: str | None = None
-    rollers_deg: str | None = None
-    wheel_radius_m: str | None = None
-    gear_ratio: str | None = None
-    mass_kg: str | None = None
-    ticks_per_revolution: str | None = None
+RobotOptions = Mapping[str, str]
+"""Texts of the command-line options that describe a robot, by the names of `RobotAnswers`."""
+_SECTION: TypeAdapter[Wheels] = TypeAdapter(Annotated[Wheels, Field(discriminator="drive")])
 
 
 @dataclass(frozen=True)
@@ -107,9 +85,13 @@ def yes(text: str, _: RobotAnswers) -> bool:
     return word in ("y", "yes", "true")
 
 
+def _parts(text: str) -> list[str]:
+    return text.replace(";", ",").split(",")
+
+
 def angles(text: str, answers: RobotAnswers) -> tuple[float, ...]:
     """Return an angle for every wheel [deg] from a text with numbers separated by commas."""
-    found = tuple(number(part) for part in text.replace(";", ",").split(","))
+    found = tuple(number(part) for part in _parts(text))
     if len(found) != answers.wheels:
         raise ValueError(f"{len(found)} angles; expected {answers.wheels}, one per wheel")
     return found
@@ -128,7 +110,7 @@ def rollers(text: str, answers: RobotAnswers) -> tuple[float | None, ...]:
 
     The angle is None for a wheel without rollers.
     """
-    words = [part.strip().lower() for part in text.replace(";", ",").split(",")]
+    words = [part.strip().lower() for part in _parts(text)]
     if len(words) != answers.wheels:
         raise ValueError(f"{len(words)} rollers; expected {answers.wheels}, one per wheel")
     return tuple(None if word == "none" else number(word) for word in words)
@@ -139,7 +121,7 @@ class RobotQuestion:
     """One question about a robot.
 
     Attributes:
-        name: name of the attribute of `RobotOptions` and `RobotAnswers` for the answer.
+        name: name of the option, and of the attribute of `RobotAnswers`, for the answer.
         text: text of the question.
         default: default answer, or a function that returns it from the earlier answers.
         read: function that parses an answer; its `ValueError` says what is expected.
@@ -256,10 +238,8 @@ def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> Robo
     questions = (*DRIVES[answers.drive], *COMMON)
     _refuse_other_drives(options, answers.drive, questions)
     for question in questions:
-        if question is _WHEELS and options.azimuths_deg is not None and options.wheels is None:
-            answers = replace(
-                answers, wheels=len(options.azimuths_deg.replace(";", ",").split(","))
-            )
+        if question is _WHEELS and "azimuths_deg" in options and "wheels" not in options:
+            answers = replace(answers, wheels=len(_parts(options["azimuths_deg"])))
             continue
         answers = _with_question(answers, question, options, asker)
         if question is _PLACES:
@@ -273,78 +253,61 @@ def _refuse_other_drives(
     options: RobotOptions, drive: str, questions: tuple[RobotQuestion, ...]
 ) -> None:
     """Raise `DataError` for an option that this type of drive would ignore."""
-    wanted = {"drive", *(question.name for question in questions)}
-    for one in fields(options):
-        if getattr(options, one.name) is not None and one.name not in wanted:
-            expected = ", ".join(question.option for question in questions)
-            raise DataError(
-                f"--{one.name.replace('_', '-')}: not of drive {drive}; expected some of {expected}"
-            )
+    for name in options.keys() - {"drive", *(question.name for question in questions)}:
+        expected = ", ".join(question.option for question in questions)
+        raise DataError(
+            f"--{name.replace('_', '-')}: not of drive {drive}; expected some of {expected}"
+        )
 
 
 def _with_question(
     answers: RobotAnswers, question: RobotQuestion, options: RobotOptions, asker: Asker | None
 ) -> RobotAnswers:
     """Return the answers, with the answer to one more question added."""
-    text = getattr(options, question.name)
-    if text is not None:
+
+    def read(text: str) -> RobotAnswers:
+        more: dict[str, Any] = {question.name: question.read(text, answers)}
+        return replace(answers, **more)
+
+    if (text := options.get(question.name)) is not None:
         try:
-            return _with_answer(answers, question, text)
+            return read(text)
         except ValueError as error:
             raise DataError(f"{question.option} '{text}': {error}") from None
     default = question.default if isinstance(question.default, str) else question.default(answers)
     if asker is None:
         answers = replace(answers, defaults=answers.defaults | {question.name})
-        return _with_answer(answers, question, default)
+        return read(default)
     wrong = ""
     while True:
         text = asker(question.text, default, wrong)
         try:
-            return _with_answer(answers, question, text)
+            return read(text)
         except ValueError as error:
             wrong = f"'{text}': {error}"
 
 
-def _with_answer(answers: RobotAnswers, question: RobotQuestion, text: str) -> RobotAnswers:
-    """Return the answers, with one added that is parsed from a text.
-
-    Raises:
-        ValueError: the text is not a valid answer.
-    """
-    more: dict[str, Any] = {question.name: question.read(text, answers)}
-    return replace(answers, **more)
-
-
 def robot_of(answers: RobotAnswers) -> Wheels:
     """Return the section `[robot]`; raise `DataError` if the answers describe no possible robot."""
-    sizes = {
-        "drive": answers.drive,
-        "wheel_radius_m": answers.wheel_radius_m,
-        "gear_ratio": answers.gear_ratio,
-        "mass_kg": answers.mass_kg,
-    }
+    own: dict[str, object]
+    if answers.drive == "omni":
+        own = {"wheel_azimuths_deg": answers.azimuths_deg, "base_radius_m": answers.base_radius_m}
+    elif answers.drive == "differential":
+        own = {"track_m": answers.track_m}
+    elif answers.drive == "general":
+        own = {
+            "wheel_places_m": answers.places_m,
+            "drive_directions_deg": answers.directions_deg,
+            "roller_angles_deg": ["none" if a is None else a for a in answers.rollers_deg],
+        }
+    else:
+        own = {"half_length_m": answers.wheelbase_m / 2, "half_width_m": answers.track_m / 2}
+        own |= {"drives": [[1, 3], [2, 4]]} if answers.shared else {}
+    for key in ("drive", "wheel_radius_m", "gear_ratio", "mass_kg"):
+        own[key] = getattr(answers, key)
     try:
-        robot = _section(answers, sizes)
+        robot = _SECTION.validate_python(own)
         geometry(robot)
     except ValueError as error:
         raise DataError(f"drive {answers.drive}: {error}") from None
     return robot
-
-
-def _section(answers: RobotAnswers, sizes: dict[str, object]) -> Wheels:
-    if answers.drive == "omni":
-        azimuths = list(answers.azimuths_deg)
-        own = {"wheel_azimuths_deg": azimuths, "base_radius_m": answers.base_radius_m}
-        return OmniDrive.model_validate({**sizes, **own})
-    if answers.drive == "differential":
-        return DifferentialDrive.model_validate({**sizes, "track_m": answers.track_m})
-    if answers.drive == "general":
-        rollers = ["none" if angle is None else angle for angle in answers.rollers_deg]
-        own = {
-            "wheel_places_m": [list(place) for place in answers.places_m],
-            "drive_directions_deg": list(answers.directions_deg),
-        }
-        return GeneralDrive.model_validate({**sizes, **own, "roller_angles_deg": rollers})
-    half = {"half_length_m": answers.wheelbase_m / 2, "half_width_m": answers.track_m / 2}
-    shared = {"drives": [[1, 3], [2, 4]]} if answers.shared else {}
-    return FourWheelDrive.model_validate({**sizes, **half, **shared})

@@ -37,6 +37,12 @@ class UnitGuess:
     doubt: str = ""
 
 
+def usual_step(time: Float[np.ndarray, " row"]) -> float:
+    """Return the median time between rows, in the unit of `time`; 1 if time does not increase."""
+    steps = np.diff(time)
+    return float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+
+
 def time_unit(values: Float[np.ndarray, " row"]) -> UnitGuess:
     """Return a guess of the unit of time: from stamps that count from 1970, else from the steps."""
     first = float(np.nanmin(np.abs(values)))

@@ -1,28 +1,27 @@
 """The reference of configs as Markdown text, made from the models that check configs."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 from slipid.app import config as c
 from slipid.app.new.config_lines import drawing
-from slipid.app.reference.keys import ConfigKey, ParameterRow, keys_of, parameter_rows, purpose
+from slipid.app.reference.keys import ConfigKey, keys_of, parameter_rows, purpose
 from slipid.data.reading.bag.layout import BagLayout, RunRule, TopicChannel
 from slipid.data.reading.layout import CHANNELS, PER_WHEEL, SEVERAL, Channel, Layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.units import KNOWN
 from slipid.support.errors import DataError, did_you_mean
 
-_DRIVES: tuple[tuple[type[c.Wheels], str, dict[str, object]], ...] = (
+_BOX = {"half_length_m": 0.2, "half_width_m": 0.15}
+_DRIVES: tuple[tuple[type[Any], str, dict[str, object] | None], ...] = (
     (c.OmniDrive, "omni", {"base_radius_m": 0.2, "wheel_azimuths_deg": [60, 180, 300]}),
-    (c.FourWheelDrive, "mecanum", {"half_length_m": 0.2, "half_width_m": 0.15}),
-    (
-        c.FourWheelDrive,
-        "skid",
-        {"half_length_m": 0.2, "half_width_m": 0.15, "drives": [[1, 3], [2, 4]]},
-    ),
+    (c.FourWheelDrive, "mecanum", {**_BOX}),
+    (c.FourWheelDrive, "skid", {**_BOX, "drives": [[1, 3], [2, 4]]}),
     (c.DifferentialDrive, "differential", {"track_m": 0.3}),
+    (c.GeneralDrive, "general", None),
+    (c.BenchMotors, "motor", None),
 )
-"""Model, name and sizes of an example robot for each type of drive that the reference draws."""
+"""Model and name of each type of drive, and sizes of an example robot if one is drawn."""
 _SECTIONS: tuple[tuple[str, type], ...] = (
     ("[[logs]]", c.LogsSection),
     ("[camera]", c.CameraSection),
@@ -35,19 +34,6 @@ _SECTIONS: tuple[tuple[str, type], ...] = (
 )
 
 
-@dataclass(frozen=True)
-class Chapter:
-    """Part of the reference that can be requested by its name.
-
-    Attributes:
-        name: name of the part.
-        text: function that returns the text, for the robot of a config if one is given.
-    """
-
-    name: str
-    text: Callable[["c.Config | None"], str]
-
-
 def reference(what: str | None = None, config: "c.Config | None" = None) -> str:
     """Return the reference of configs as Markdown.
 
@@ -58,14 +44,12 @@ def reference(what: str | None = None, config: "c.Config | None" = None) -> str:
     Raises:
         DataError: no part has this name.
     """
-    names = [chapter.name for chapter in CHAPTERS]
     if what is None:
-        parts = [_INTRODUCTION, *(chapter.text(config) for chapter in CHAPTERS)]
-        return "\n\n".join(parts) + "\n"
-    found = [chapter for chapter in CHAPTERS if chapter.name == what]
-    if not found:
-        raise DataError(f"'{what}'{did_you_mean(what, names)}; expected one of {', '.join(names)}")
-    return found[0].text(config) + "\n"
+        return "\n\n".join([_INTRODUCTION, *(text(config) for text in CHAPTERS.values())]) + "\n"
+    if what not in CHAPTERS:
+        expected = f"expected one of {', '.join(CHAPTERS)}"
+        raise DataError(f"'{what}'{did_you_mean(what, CHAPTERS)}; {expected}")
+    return CHAPTERS[what](config) + "\n"
 
 
 _INTRODUCTION = """\
@@ -79,7 +63,7 @@ each public data set."""
 def _config(_: object) -> str:
     parts = ["## Config", _table_of_keys(keys_of(c.ConfigContent))]
     for header, kind in _SECTIONS:
-        parts += [f"### `{header}`", purpose(kind), _table_of_keys(keys_of(kind))]
+        parts += [f"### `{header}`", *_explained(kind)]
     return "\n\n".join(parts)
 
 
@@ -94,16 +78,13 @@ order of `drives`. A wheel with a positive speed pushes the robot in the directi
 
 def _drives(_: object) -> str:
     parts = [_FRAMES, "### Keys of every drive", _table_of_keys(keys_of(c.WheeledDrive))]
-    common = {key.name for key in keys_of(c.WheeledDrive)}
+    common = ("drive", *(key.name for key in keys_of(c.WheeledDrive)))
     for kind, name, sizes in _DRIVES:
-        robot = kind.model_validate({"drive": name, "wheel_radius_m": 0.05, **sizes})
-        own = [key for key in keys_of(kind) if key.name not in common and key.name != "drive"]
-        picture = f"```text\n{drawing(c.geometry(robot))}\n```"
-        parts += [f'### `drive = "{name}"`', purpose(kind), _table_of_keys(own), picture]
-    own = [key for key in keys_of(c.GeneralDrive) if key.name not in common and key.name != "drive"]
-    parts += ['### `drive = "general"`', purpose(c.GeneralDrive), _table_of_keys(own)]
-    own = [key for key in keys_of(c.BenchMotors) if key.name != "drive"]
-    parts += ['### `drive = "motor"`', purpose(c.BenchMotors), _table_of_keys(own)]
+        own = _table_of_keys(keys_of(kind, hidden=common))
+        parts += [f'### `drive = "{name}"`', purpose(kind), own]
+        if sizes is not None:
+            robot = kind.model_validate({"drive": name, "wheel_radius_m": 0.05, **sizes})
+            parts.append(f"```text\n{drawing(c.geometry(robot))}\n```")
     return "\n\n".join(parts)
 
 
@@ -127,24 +108,21 @@ has a line for each channel, `CHANNEL = { topic = "/name" }`; the channels `pose
 and jumps are those of the table above."""
 
 
-def _bags() -> list[str]:
-    alike = tuple(key.name for key in keys_of(Layout))
-    return [
-        _BAGS,
-        _table_of_keys(keys_of(BagLayout, hidden=(*alike, "topics"))),
-        "#### A channel of `topics`",
-        purpose(TopicChannel),
-        _table_of_keys(keys_of(TopicChannel)),
-        "#### `runs`",
-        purpose(RunRule),
-        _table_of_keys(keys_of(RunRule)),
-    ]
-
-
 def _layouts(_: object) -> str:
-    keys = keys_of(Layout, hidden=("channels",))
-    parts = [_LAYOUT, _table_of_keys(keys), "### A channel of `columns`", purpose(Channel)]
-    return "\n\n".join([*parts, _table_of_keys(keys_of(Channel)), *_bags()])
+    alike = tuple(key.name for key in keys_of(Layout))
+    parts = [
+        *(_LAYOUT, _table_of_keys(keys_of(Layout, hidden=("channels",)))),
+        *("### A channel of `columns`", *_explained(Channel)),
+        *(_BAGS, _table_of_keys(keys_of(BagLayout, hidden=(*alike, "topics")))),
+        *("#### A channel of `topics`", *_explained(TopicChannel)),
+        *("#### `runs`", *_explained(RunRule)),
+    ]
+    return "\n\n".join(parts)
+
+
+def _explained(kind: type) -> tuple[str, str]:
+    """Return the purpose of a model, and the table of its keys."""
+    return purpose(kind), _table_of_keys(keys_of(kind))
 
 
 def _channels(_: object) -> str:
@@ -191,25 +169,15 @@ def _parameters(config: "c.Config | None") -> str:
 Parameters of {whose}. `FLOOR` and `SESSION` stand for names in
 the logs. In `[parameters]` a pattern such as `"surface.*.creep"` applies to every parameter that
 it matches."""
-    columns: list[str] = [
-        "parameter",
-        "numbers",
-        "symbol",
-        "unit",
-        "meaning",
-        "start",
-        "default prior",
+    columns = ("parameter", "numbers", "symbol", "unit", "meaning", "start", "default prior")
+    cells = [
+        (f"`{r.path}`", str(r.size), r.symbol, _unit_text(r.unit), r.means, r.start, r.prior)
+        for r in rows
     ]
-    columns += ["in this config"] if config else []
-    return f"{head}\n\n{_table(columns, [_cells(row, config is not None) for row in rows])}"
-
-
-def _cells(row: ParameterRow, of_config: bool) -> tuple[str, ...]:
-    cells = (
-        *(f"`{row.path}`", str(row.size), row.symbol, _unit_text(row.unit)),
-        *(row.means, row.start, row.prior),
-    )
-    return (*cells, row.here) if of_config else cells
+    if config is None:
+        return f"{head}\n\n{_table(columns, cells)}"
+    here = [(*row, r.here) for row, r in zip(cells, rows, strict=True)]
+    return f"{head}\n\n{_table((*columns, 'in this config'), here)}"
 
 
 def _unit_text(unit: str) -> str:
@@ -228,12 +196,13 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join([line(head), "|" + "---|" * len(head), *(line(row) for row in rows)])
 
 
-CHAPTERS = (
-    Chapter("config", _config),
-    Chapter("drives", _drives),
-    Chapter("layouts", _layouts),
-    Chapter("channels", _channels),
-    Chapter("units", _units),
-    Chapter("presets", _presets),
-    Chapter("parameters", _parameters),
-)
+CHAPTERS: dict[str, Callable[["c.Config | None"], str]] = {
+    "config": _config,
+    "drives": _drives,
+    "layouts": _layouts,
+    "channels": _channels,
+    "units": _units,
+    "presets": _presets,
+    "parameters": _parameters,
+}
+"""Function that returns the text of each chapter, for the robot of a config if one is given."""

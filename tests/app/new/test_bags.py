@@ -10,7 +10,6 @@ import pytest
 
 from slipid.app.new.config_text import new_config
 from slipid.app.new.propose import propose
-from slipid.app.new.robot_questions import RobotOptions
 from slipid.data.reading.bag.layout import declared_bag_layout
 from tests.helpers.made_bags import (
     ROBOTINO,
@@ -51,8 +50,7 @@ def messages(pose: str = POSE, effort: bool = False, more: tuple[str, ...] = ())
 
 
 def proposed(path: Path, **told: str):
-    proposal = propose(path, RobotOptions(**told))
-    return new_config(proposal.draft, "mine.toml")
+    return new_config(propose(path, told), "mine.toml")
 
 
 SKID = {

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from slipid.app.new.propose import propose
-from slipid.app.new.robot_questions import RobotOptions
 from slipid.support.errors import DataError
 from tests.helpers.made_tables import motion, plain, table, wheel_speeds
 from tests.helpers.proposals import ROBOT, layout_in, proposed, read
@@ -98,9 +97,9 @@ def test_files_at_other_times_are_not_of_the_run(tmp_path):
     si = plain()
     table(tmp_path / "wheels.csv", {n: si[n] for n in ("t", "left_vel", "right_vel")})
     table(tmp_path / "pose.csv", {**{n: si[n] for n in ("x", "y", "yaw")}, "t": si["t"] + 900})
-    proposal, config = proposed(tmp_path, **ROBOT)
+    draft, config = proposed(tmp_path, **ROBOT)
     assert "beside" not in layout_in(config)
-    assert any(line.startswith("left out") and "pose.csv" in line for line in proposal.sentences)
+    assert any(line.startswith("left out") and "pose.csv" in line for line in draft.sentences)
     assert any("no pose was found" in question for question in config.questions)
 
 
@@ -118,25 +117,25 @@ def test_parquet(tmp_path):
 
 def test_what_is_no_log_is_one_clear_error(tmp_path):
     with pytest.raises(DataError, match="no such file or folder"):
-        propose(tmp_path / "none.csv", RobotOptions())
+        propose(tmp_path / "none.csv", {})
     (tmp_path / "empty.csv").write_bytes(b"")
     with pytest.raises(DataError, match="the file is empty"):
-        propose(tmp_path / "empty.csv", RobotOptions())
+        propose(tmp_path / "empty.csv", {})
     (tmp_path / "words.csv").write_text("a,b\nc,d\n" * 20)
     with pytest.raises(DataError, match="no rows of numbers"):
-        propose(tmp_path / "words.csv", RobotOptions())
+        propose(tmp_path / "words.csv", {})
     (tmp_path / "binary.csv").write_bytes(b"\0\1\2\3" * 100)
     with pytest.raises(DataError, match="a binary file"):
-        propose(tmp_path / "binary.csv", RobotOptions())
+        propose(tmp_path / "binary.csv", {})
     with pytest.raises(DataError, match="no log in 3 files"):
-        propose(tmp_path, RobotOptions())
+        propose(tmp_path, {})
     (tmp_path / "sub").mkdir()
     with pytest.raises(DataError, match="no CSV or Parquet file below it"):
-        propose(tmp_path / "sub", RobotOptions())
+        propose(tmp_path / "sub", {})
     rows = "\n".join(f"{k},5;0,1" for k in range(30))
     (tmp_path / "sub" / "comma.csv").write_text(f"t;x\n{rows}\n")
     with pytest.raises(DataError, match="decimal points, not commas"):
-        propose(tmp_path / "sub" / "comma.csv", RobotOptions())
+        propose(tmp_path / "sub" / "comma.csv", {})
 
 
 def test_a_file_of_which_no_column_is_known_is_a_question_and_still_a_config(tmp_path):

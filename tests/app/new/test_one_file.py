@@ -17,7 +17,7 @@ from tests.helpers.proposals import ROBOT, layout_in, proposed, read
 def test_a_plain_file_leaves_nothing_open_and_reads(tmp_path):
     table(tmp_path / "grass" / "run1.csv", plain())
     table(tmp_path / "grass" / "run2.csv", plain(9.0))
-    proposal, config = proposed(tmp_path, **ROBOT)
+    draft, config = proposed(tmp_path, **ROBOT)
     (question,) = config.questions  # what no log without voltages tells
     assert question.startswith('"motor.resistance": without the voltages')
     assert config.text.replace('"# ?"', "").count(QUESTION_MARK) == 1
@@ -33,7 +33,7 @@ def test_a_plain_file_leaves_nothing_open_and_reads(tmp_path):
     angle, pose = motion(log.time)
     np.testing.assert_allclose(log.wheel_angle, angle - angle[0], atol=2e-3)
     np.testing.assert_allclose(log.pose, pose, atol=1e-6)
-    assert "2 like" in proposal.sentences[0]
+    assert "2 like" in draft.sentences[0]
 
 
 def test_other_units_follow_from_names_units_row_and_magnitude(tmp_path):

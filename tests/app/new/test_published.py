@@ -34,7 +34,7 @@ def test_robotino_2021(real_data):
 
 
 def test_omni3_has_no_names(real_data):
-    proposal, config = proposed(real_data / "omni3_optitrack")
+    draft, config = proposed(real_data / "omni3_optitrack")
     layout = layout_in(config)
     assert layout["ticks_are_increments"] is True
     columns = {name: channel.get("column") for name, channel in layout["columns"].items()}
@@ -43,7 +43,7 @@ def test_omni3_has_no_names(real_data):
         "wheel_ticks": 0,
     }
     assert layout["columns"]["wheel_ticks"]["columns"] == [4, 5, 6]
-    assert any("format = omni3_optitrack" in line for line in proposal.sentences)
+    assert any("format = omni3_optitrack" in line for line in draft.sentences)
     assert not any("metadata" in glob for glob in formats(config)["mine"])
 
 
