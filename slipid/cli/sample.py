@@ -60,7 +60,7 @@ def sample(
         robot = write_robot(out, posterior)
         report.stage("drawing")
         drawn = posterior_plots(posterior, out)
-    content = read_json(out / "identified.json", "what sample wrote")
+    content = read_json(out / "identified.json", "a result of `slipid sample`")
     shown = posterior.parameters.values(), about, content["messages"]
     written = (*WRITTEN, *robot, *(path.name for path in drawn))
     emit(json, content, lambda page: show_sample(page, *shown), out, written)
