@@ -1,4 +1,4 @@
-"""A control loop's step as StableHLO, for programs that run XLA without slipid.
+"""The step of a control loop as StableHLO, for programs that run XLA without slipid.
 
 `step.json` lists the input and output arrays in their order, with names, shapes and units.
 """
@@ -32,7 +32,7 @@ TOLERANCE = 1e-9
 """Largest difference between a number that the loaded program computes and the library's result,
 relative to the number's scale [1]."""
 PLATFORMS = ("cpu", "cuda", "tpu")
-"""Platforms that the programs run on."""
+"""Platforms on which the programs run."""
 FILES = ("step.stablehlo", "step_batch.stablehlo", "step.json", "golden.npz")
 
 
@@ -146,8 +146,8 @@ def load_program(folder: Path | str) -> Program:
         schema = about.pop("schema")
         if schema != SCHEMA:
             raise DataError(
-                f"{place / 'step.json'}: written as {schema}, this slipid reads {SCHEMA}; update "
-                "slipid, or export the robot again"
+                f"{place / 'step.json'}: its schema is {schema}, but this version of slipid reads "
+                f"{SCHEMA}; update slipid, or export the robot again"
             )
         signature = typed(Signature, about)
         arrays = np.load(io.BytesIO(content["golden.npz"]), allow_pickle=False)
@@ -156,7 +156,7 @@ def load_program(folder: Path | str) -> Program:
         steps = Golden(arrays["given"], arrays["said"], arrays["command"])
     except DataError:
         raise
-    except Exception as error:  # the parsers of three formats raise many kinds of errors
+    except Exception as error:  # The parsers of three formats raise many kinds of errors.
         raise DataError(f"{place}: damaged ({error}); export the robot again") from error
     program = Program(signature, tuple(start), *programs)
     _repeated(program, steps, place)
@@ -178,8 +178,8 @@ def _repeated(program: Program, steps: Golden, place: Path) -> None:
             gap = np.abs(numbers - np.concatenate([estimate, command]))
             if not (gap <= TOLERANCE * np.concatenate([scale, np.ones(len(command))])).all():
                 raise DataError(
-                    f"{place}: the program does not repeat what was computed when it was made "
-                    f"(off by {gap.max():.1e}); export the robot again"
+                    f"{place}: the program does not reproduce the results computed at export "
+                    f"(difference {gap.max():.1e}); export the robot again"
                 )
 
 

@@ -14,8 +14,7 @@ electric = partial(parameter, electric=True)
 REST = 2.5
 """Motor speed w0 below which the sign of the speed is unreliable [rad/s].
 
-It is about the resolution of the speed signal.
-"""
+It is about the resolution of the speed signal."""
 
 
 held = partial(electric, free=False)

@@ -68,7 +68,7 @@ class Robot(eqx.Module):
             base_radius: distance of the wheel centres from the middle [m].
             wheel_radius: radius of the wheels [m].
             gear_ratio: motor turns per wheel turn.
-            mass: mass of the robot, which scales torques [kg].
+            mass: mass of the robot, to which torques are proportional [kg].
         """
         azimuths = [float(a) for a in azimuth_deg]
         sizes = float(base_radius), float(wheel_radius), float(gear_ratio)
@@ -88,7 +88,7 @@ class Robot(eqx.Module):
     ) -> "Robot":
         """Return the same robot for these floors, load set-ups and sessions, at start values.
 
-        `image_centre` is where the camera's tilt and distortion are zero [m].
+        `image_centre` is the point at which the camera's tilt and distortion are zero [m].
         """
         made = build(self.geometry, surfaces, loads, sessions, image_centre)
         return _with_mass(replace(made, motor=self.motor), self.body.mass)
@@ -113,7 +113,7 @@ class Robot(eqx.Module):
 
 @dataclass(frozen=True)
 class Validity:
-    """Range of conditions a floor was driven in; outside it the fitted numbers extrapolate.
+    """Range of conditions of the runs on a floor; outside it the fitted numbers are extrapolated.
 
     Attributes:
         runs: number of runs.
@@ -123,8 +123,8 @@ class Validity:
         slip: smallest and largest slip.
         yaw_rate: smallest and largest yaw rate by the encoders [rad/s].
         headings_deg: directions of travel in the body frame that were driven [deg]. Headings,
-            speeds and turn rates are commanded values, or approximate values from the encoders
-            where no steady command was logged.
+            speeds and turn rates are commanded values, or approximate values from the encoders if
+            no steady command was logged.
         speeds: speeds of the body that were driven [m/s].
         turn_rates: yaw rates of the body that were driven [rad/s].
         distance: mean distance of a run [m].
@@ -204,7 +204,7 @@ def motor_forces(
     surface: Array,
     load: Array,
 ) -> Float[Array, "wheel 2"]:
-    """Return the forces that each motor works against at a twist, in units of mean(mu) m g.
+    """Return the forces against which each motor works at a twist, in units of mean(mu) m g.
 
     They are the traction, and the drag along the drive for `Motor.rolling_drag` 1
     (`contact.rolling_drag`).

@@ -1,4 +1,4 @@
-"""Picture of a design: commands of the proposed runs, and uncertainty over the number of runs."""
+"""Picture of a proposal of runs: their commands, and the uncertainty over the number of runs."""
 
 import math
 from collections import Counter
@@ -49,9 +49,9 @@ def _title(found: Design) -> str:
     names = [g["name"] for g in goals[:2]] + ["..."] * (len(goals) > 2)
     last = found.content["runs"][-1]["expected"]
     kept = math.sqrt(found.content["criterion"][-1])
-    head = f"Drive these {len(found.runs)} runs next to know more of {', '.join(names)}\n"
+    head = f"Next {len(found.runs)} runs, to reduce the uncertainty of {', '.join(names)}\n"
     if len(goals) > 1:
-        return head + f"uncertainty falls to {kept:.0%} of what it is now"
+        return head + f"uncertainty falls to {kept:.0%} of its present value"
     g = goals[0]
     scale, unit = (100, " %") if g["unit"] == "m/m" else (1, "" if g["unit"] == "1" else g["unit"])
     return head + f"std falls from {scale * g['now']:.3g} to {scale * last[g['name']]:.3g}{unit}"

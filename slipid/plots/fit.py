@@ -28,7 +28,7 @@ def raw_plots(data: Runs, out: Path) -> list[Path]:
 
 
 def plot_runs(data: Runs, runs: Sequence[int] | None = None, title: str = "as logged") -> Figure:
-    """Draw paths, wheel speeds and currents of runs on top of one another.
+    """Draw paths, wheel speeds and currents of all runs in the same axes.
 
     Args:
         data: all runs.
@@ -141,7 +141,7 @@ PICTURES: dict[str, Callable[[Fit, Runs, MeasuredWindows], Figure | None]] = {
 
 
 def identify_plots(fit: Fit, data: Runs, out: Path, warning: str | None = None) -> list[Path]:
-    """Write all `PICTURES` that the runs of the fit have data for; return the files.
+    """Write all `PICTURES` for which the runs of the fit have data; return the files.
 
     If the fit cannot be trusted, `warning` is added to the title of each picture.
     """
@@ -163,7 +163,7 @@ def picture(fit: Fit, data: Runs, name: str) -> Figure:
         raise ValueError(f"no picture '{name}'; there are {', '.join(PICTURES)}")
     made = PICTURES[name](fit, data, measured_windows(fit.robot, data, fit.channels.windows))
     if made is None:
-        raise ValueError(f"picture '{name}': the runs lack the data for it")
+        raise ValueError(f"picture '{name}': the runs do not have the data for it")
     return made
 
 

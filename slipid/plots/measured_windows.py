@@ -1,4 +1,4 @@
-"""Measured and predicted slip, currents and torques of segments of runs, as pictures show them."""
+"""Measured and predicted slip, currents and torques of segments of runs, for pictures."""
 
 from dataclasses import dataclass
 
@@ -18,9 +18,9 @@ from slipid.predict.slip_model import body_twist
 STRAIGHT = 0.98
 """Smallest ratio of displacement to path length, by encoders, of a segment that is straight."""
 SHORTEST_PATH = 0.05
-"""Distance that a wheel's rim turns in a segment up to which its slip is too noisy to use [m]."""
+"""The slip of a wheel is too noisy to use if its rim moves by less than this in a segment [m]."""
 TURNING = 0.5
-"""Yaw per path length, by encoders, from which a segment counts as a turn [rad/m]."""
+"""A segment counts as a turn from this yaw per path length, by encoders, on [rad/m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +48,8 @@ class MeasuredWindows:
         amps: measured current [A]; None if currents were not logged.
         amps_model: predicted current [A].
         torque: predicted traction torque at the wheel [N m].
-        drag_torque: predicted torque of the drag along the drive direction, which the motor bears
-            in addition to traction [N m].
+        drag_torque: predicted torque of the drag along the drive direction, against which the motor
+            works in addition to traction [N m].
         unsigned: True if currents were logged as magnitudes.
     """
 

@@ -15,12 +15,12 @@ from slipid.plots.measured_windows import MeasuredWindows
 from slipid.plots.motion import named
 
 SIDEWAYS_COLOUR = "#35B779"
-"""Colour of the curve of a wheel whose sideways speed equals its rim speed; dots use it too."""
+"""Colour of the curve of a wheel whose sideways speed equals its rim speed, and of such dots."""
 AT_REST = 0.05
-"""Ratio of a wheel's speed to that of the fastest wheel up to which it counts as at rest."""
+"""A wheel counts as at rest up to this ratio of its speed to that of the fastest wheel."""
 TOO_SLOW = 0.3
-"""Ratio of a wheel's speed to that of the fastest wheel up to which its slip is not drawn, since it
-would be too uncertain."""
+"""The slip of a wheel is too uncertain to be drawn up to this ratio of its speed to that of the
+fastest wheel."""
 
 
 def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:
@@ -29,7 +29,9 @@ def curve_figure(fit: Fit, measured: MeasuredWindows) -> Figure:
     Dots are the measured slips of all wheels.
     """
     floors = list(dict.fromkeys(floor for floor, _ in measured.groups))
-    title = "A wheel that pushes harder slips more, and more still when it rolls sideways"
+    title = (
+        "Slip increases with the torque of a wheel, and further if the wheel also rolls sideways"
+    )
     made, axes = drawing.panels(len(floors), 3.7, 3.9, title)
     drawn = None
     for ax, floor in zip(axes, floors, strict=True):
@@ -98,7 +100,7 @@ def _curve(ax: Axes, fit: Fit, floor: str) -> None:
     speed, share = curve.wheel_speed, curve.load_share
     slip = np.linspace(0.0, 1.0, 201)
     for sideways, colour, label in (
-        (1.0, SIDEWAYS_COLOUR, "predicted: as fast sideways as ahead"),
+        (1.0, SIDEWAYS_COLOUR, "predicted: sideways as fast as ahead"),
         (0.0, drawing.ORANGE, "predicted: rolls straight, 90 % band"),
     ):
         torque = wheel_curve(fit.robot, floor, slip, sideways, speed, share)
@@ -185,7 +187,7 @@ def _amps(
     ax: Axes, measured: MeasuredWindows, mine: np.ndarray, wheel: int, top: float
 ) -> PathCollection:
     assert measured.amps is not None
-    # wheels at rest are left out: their gear holds them, which the motor model does not describe
+    # Wheels at rest are left out: their gear holds them, which the motor model does not describe.
     speed, fastest = measured.wheel_speed[:, wheel], np.abs(measured.wheel_speed).max(axis=1)
     mine = mine & (np.abs(speed) > AT_REST * fastest)
     speed = speed[mine]

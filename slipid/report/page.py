@@ -35,7 +35,7 @@ class Page:
 
     def __init__(self, kept: bool = False) -> None:
         self._console = Console(highlight=False)
-        if kept:  # without these options, rich would print to a notebook, with colours
+        if kept:  # Without these options, rich would print to a notebook, with colours.
             self._console = Console(
                 highlight=False,
                 width=WIDTH,
@@ -43,7 +43,7 @@ class Page:
                 force_terminal=False,
                 force_jupyter=False,
             )
-        elif not self._console.is_terminal:  # a file or a pipe has no width
+        elif not self._console.is_terminal:  # A file or a pipe has no width.
             self._console = Console(highlight=False, width=WIDTH)
 
     @property

@@ -16,7 +16,7 @@ from slipid.support.errors import DataError
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file atomically: after a crash there is the old or the new file, never a part.
+    """Write a file atomically: after a crash, there is either the old or the new file.
 
     Raises:
         DataError: the file cannot be written.
@@ -70,21 +70,22 @@ def _plain(value: object) -> object:
         return value.tolist()
     if isinstance(value, Path):
         return value.as_posix()
-    raise TypeError(f"{type(value).__name__} does not go into JSON")
+    raise TypeError(f"{type(value).__name__} cannot be written as JSON")
 
 
 def read_json(path: Path, what: str) -> Any:
-    """Return the content of a JSON file that slipid wrote.
+    """Return the content of a JSON file.
 
     Raises:
-        DataError: the file is missing or not JSON; the message has `what` was expected.
+        DataError: the file is missing or not JSON; the message describes the expected content by
+            `what`.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; expected {what}") from error
     except ValueError as error:
-        raise DataError(f"{path}: no valid JSON ({error}); expected {what}") from error
+        raise DataError(f"{path}: not valid JSON ({error}); expected {what}") from error
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray], compress: bool = True) -> None:

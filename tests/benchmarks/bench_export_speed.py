@@ -225,7 +225,11 @@ def test_contact_balance_beside_its_twin(tmp_path):
     rims = float(three_floors().frame.radius) * speed
     counts = np.array([steps, count], np.int64)
     (tmp_path / "given").write_bytes(counts.tobytes() + rims.tobytes() + floors.tobytes())
-    sizes = [f"-DCOMBINATIONS={count}", f"-DCHORDS={contact.CHORD}", f"-DNEWTONS={contact.NEWTON}"]
+    sizes = [
+        f"-DCOMBINATIONS={count}",
+        f"-DCHORDS={contact.SETTLE_CHORD_STEPS}",
+        f"-DNEWTONS={contact.SETTLE_NEWTON_STEPS}",
+    ]
     twin = f'-DTWIN="{HERE / "twin.c"}"'
     for name, flags in FLAGS.items():
         words = ["gcc", "-std=c99", *flags, *sizes, twin, HERE / "export_settle.c", "settled.c"]

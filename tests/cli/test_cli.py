@@ -187,7 +187,7 @@ def test_a_log_without_motion_is_refused_before_anything_is_written(tmp_path):
     config = config_of(Case("still", lambda p: None, (), GENERIC), tmp_path)
     result = invoke("identify", config, "--data", data, "--out", tmp_path / "out", "--quiet")
     assert result.exit_code == 2
-    assert "no wheel moves 10 mm" in result.stderr
+    assert "no wheel rim moves by 10 mm" in result.stderr
     assert not (tmp_path / "out").exists()
 
 
@@ -588,7 +588,7 @@ def test_export_writes_a_folder_and_detects_a_changed_byte(small, tmp_path):
     words = ("export", out / "robot.json", "--to", "table", "--out", out, "--quiet")
     refused = invoke(*words)
     assert refused.exit_code == 2
-    assert "gains.csv: changed after it was written, and would be lost" in refused.output
+    assert "gains.csv: changed since it was written, and would be overwritten" in refused.output
     path.write_bytes(written)
     again = invoke(*words)
     assert again.exit_code == 0, again.output
@@ -596,7 +596,7 @@ def test_export_writes_a_folder_and_detects_a_changed_byte(small, tmp_path):
 
 
 def test_export_names_missing_options(tmp_path):
-    assert "robot.json: not there" in invoke("export", tmp_path, "--out", tmp_path / "o").output
+    assert "robot.json: missing" in invoke("export", tmp_path, "--out", tmp_path / "o").output
     told = invoke("export", tmp_path)
     assert told.exit_code == 2
     assert "--out is missing" in told.output

@@ -150,4 +150,4 @@ def test_the_demo_finds_the_motor_weighs_the_robot_and_beats_the_encoders(tmp_pa
     for ax, floor in zip(drawn, ("firm", "soft", "soft@moved"), strict=False):
         by = found["summary"][floor]
         mine, encoder = (100 * by[m]["endpoint_error_mean"] for m in ("identified", "encoder"))
-        assert f"end off by {mine:.1f} % (encoders {encoder:.1f} %)" in ax.get_title()
+        assert f"end-point error {mine:.1f} % (encoders {encoder:.1f} %)" in ax.get_title()

@@ -186,5 +186,5 @@ def test_a_folder_with_other_files_is_refused_before_anything_is_made(tmp_path, 
     (tmp_path / "mine.txt").write_text("kept")
     made = "slipid.deploy.export.control_loop_of"
     monkeypatch.setattr(made, lambda *_, **__: pytest.fail("made"))
-    with pytest.raises(DataError, match="files that no export wrote"):
+    with pytest.raises(DataError, match="files that are not from an export"):
         export(ROBOT, tmp_path, ExportOptions(), QUIET)

@@ -224,10 +224,10 @@ def equilibrium(rim, hold, roll, pull, shift, s, rest, base, near=None):
         return np.where(stuck[:, None], chord(xi), new) if stuck.any() else new
 
     if near is not None:
-        for _ in range(contact._MOST_NEAR):
+        for _ in range(contact._MOST_NEAR_STEPS):
             dx, _ = step(near)
             near = near - dx
-            if np.abs(dx).max() < contact._NEAR:
+            if np.abs(dx).max() < contact._CONVERGED_STEP:
                 return near
     j = hold
     xi = 0.8 * np.linalg.solve(j.T @ j + 1e-6 * np.eye(3), j.T @ (rim * pull).T).T

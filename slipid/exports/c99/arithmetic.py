@@ -1,4 +1,4 @@
-"""Rules that turn arithmetic primitives of JAX into C: element by element, reductions, products.
+"""Rules that convert arithmetic primitives of JAX to C: element-wise, reductions, products.
 
 A product with a constant 0 is omitted from a sum of products. The result is the same for finite
 numbers, but infinity and NaN do not propagate through such a product as they would in JAX.
@@ -34,8 +34,8 @@ from slipid.exports.fields import Kind, kind_of
 Shaped = jax.ShapeDtypeStruct
 Rule = Callable[[Builder, list[Value], Params, Shaped], Value]
 Simpler = Callable[[Builder, tuple[Cell, ...], int], Cell | None]
-"""Function that returns the cell that the result of an operation equals, given its operands and the
-number of lanes of the result; None if the operation must be computed as it is."""
+"""Function that returns an existing cell equal to the result of an operation, given its operands
+and the number of lanes of the result; None if the operation must be computed."""
 
 
 UNARY = {
@@ -77,7 +77,7 @@ BINARY = {
     "sub": "{0} - {1}",
 }
 INTEGER_TEMPLATES = {"max": "i_max({0}, {1})", "min": "i_min({0}, {1})", "rem": "{0} % {1}"}
-"""Templates of operations that C writes differently for whole numbers."""
+"""Templates of operations that have another form in C for whole numbers."""
 NEUTRAL = {"add": (0.0, 0.0), "sub": (None, 0.0), "mul": (1.0, 1.0), "div": (None, 1.0)}
 """Neutral numbers of an operation as its first and as its second operand; None if there is none."""
 

@@ -1,8 +1,8 @@
-"""Builder that decides in which block of code each statement of a function is placed.
+"""Builder that places each statement of a function in a block of code.
 
 Every number is computed once, in the earliest block that has its inputs. A block is straight-line
 code or one loop over lanes (the elements along one axis of an array), so that many operations on
-the same lanes form one loop. Values that do not change from turn to turn of a repetition are
+the same lanes form one loop. Values that are the same in all iterations of a repetition are
 computed before it.
 """
 
@@ -30,7 +30,7 @@ class Names:
         return self._last
 
     def table(self, values: np.ndarray, kind: Kind) -> Memory:
-        """Return memory that holds these constants, an existing table if it holds the same."""
+        """Return memory that contains these constants, an existing table if one is equal."""
         flat = np.ascontiguousarray(values.reshape(-1), dtype=DTYPES[kind])
         key = (kind, flat.tobytes())
         if key not in self.tables:
@@ -44,7 +44,7 @@ class Builder:
 
     Attributes:
         parent: builder of the code around it.
-        turns: block that repeats this code; None if none does.
+        turns: block that repeats this code; None if it is not repeated.
         blocks: blocks in their order.
         source: file and line of the Python code that the next statement is generated from.
         contiguous: arrays that are also stored in row-major order, with that memory, by the
@@ -122,7 +122,7 @@ class Builder:
         return self.parent._around(cells)
 
     def _changes(self, cell: Cell) -> bool:
-        """Return whether a cell may change from turn to turn of this repetition."""
+        """Return whether a cell may change between iterations of this repetition."""
         if isinstance(cell, At):
             home = cell.memory.home
             by_index = cell.index is not None and self._changes(cell.index)
@@ -153,5 +153,5 @@ class Builder:
 
     def _behind(self, home: CodeBlock | None, together: bool) -> int:
         if home is None or home.owner is not self:
-            return 0  # the memory is filled before this builder's code begins
+            return 0  # The memory is filled before the code of this builder begins.
         return home.place + (0 if together else 1)

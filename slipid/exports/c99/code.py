@@ -1,4 +1,4 @@
-"""Header and source of a control loop in C99, generated from the library's own JAX functions."""
+"""Header and source of a control loop in C99, generated from the JAX functions of the library."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ class Code:
         self._names = Names()
         begin, nothing, zero = loop.init(), Readings.nothing(robot.wheels), jnp.zeros(())
         estimate = loop.estimator.step(begin.estimator, nothing, zero)[1]
-        self.estimator = _struct("estimator", "What the estimator keeps.", begin.estimator)
-        self.controller = _struct("controller", "What the controller keeps.", begin.controller)
-        about = "What the sensors give; NaN where there is none."
+        self.estimator = _struct("estimator", "State of the estimator.", begin.estimator)
+        self.controller = _struct("controller", "State of the controller.", begin.controller)
+        about = "Readings of the sensors; NaN if there is no reading."
         self.reading = _struct("reading", about, nothing, Measurement)
-        self.estimate = _struct("estimate", "What is believed.", estimate)
+        self.estimate = _struct("estimate", "Output of the estimator.", estimate)
         self.structs = self.estimator, self.controller, self.reading, self.estimate
         self.functions = list(self._functions())
 
@@ -64,7 +64,7 @@ class Code:
         yield function(
             self._names,
             "slipid_begin",
-            "Start estimator and controller of a robot that stands at a pose: x, y [m], heading "
+            "Initialise estimator and controller of a robot at rest at a pose: x, y [m], heading "
             "[rad].",
             (
                 Argument.of("estimator", self.estimator, read=False, written=True),
@@ -76,14 +76,15 @@ class Code:
         yield function(
             self._names,
             "slipid_nothing",
-            "Make a reading one of no sensor at all; fill in what there is.",
+            "Set all fields of a reading to NaN (no reading); then fill in the measured ones.",
             (Argument.of("reading", self.reading, read=False, written=True),),
             lambda: Readings.nothing(wheels),
         )
         yield function(
             self._names,
             "slipid_observe",
-            "Take in what the sensors give dt after the last call [s]: the estimator's step.",
+            "Step of the estimator: process the readings of the sensors dt [s] after the last "
+            "call.",
             (
                 Argument.of("estimator", self.estimator, written=True),
                 Argument.of("reading", self.reading),
@@ -95,8 +96,8 @@ class Code:
         yield function(
             self._names,
             "slipid_command",
-            "Wheel speeds to command [rad/s] for a reference, x, y [m], heading [rad] and their "
-            "rates in the world [m/s, m/s, rad/s]: the controller's step.",
+            "Step of the controller: compute the wheel speeds to command [rad/s] for a "
+            "reference, x, y [m], heading [rad] and their rates in the world [m/s, m/s, rad/s].",
             (
                 Argument.of("controller", self.controller, written=True),
                 Argument.plain("reference", (6,)),
@@ -120,9 +121,9 @@ class Code:
         return function(
             self._names,
             "slipid_follow",
-            "Own time of the path [s], from 0, and the reference there, for a robot at a pose. "
-            f"The path begins at {begin} [m, m, rad] and lasts {path.duration:g} s; it waits for a "
-            "robot that lags.",
+            "Advance the time of the path [s], which begins at 0, for a robot at a pose, and "
+            f"return the reference at that time. The path begins at {begin} [m, m, rad] and lasts "
+            f"{path.duration:g} s; it waits for a robot that lags.",
             (
                 Argument.plain("time", (), written=True),
                 Argument.plain("pose", (3,)),
@@ -190,23 +191,26 @@ def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
     """Yield sentences about axes, wheels, sensors and floors, for readers of the header."""
     robot = loop.controller.robot
     yield (
-        "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: those in "
-        "which the start pose is given. A twist is in the body's axes."
+        "Axes of the body: x ahead, y left, angles counter-clockwise. Axes of the world: those "
+        "of the start pose. A twist is in the body's axes."
     )
     rows = zip(robot.places.tolist(), robot.forward.tolist(), strict=True)
     for k, ((x, y), row) in enumerate(rows):
         drives = math.degrees(math.atan2(row[1], row[0]))
         yield (
-            f"Wheel {k} stands at x = {x:.4f} m, y = {y:.4f} m; turning at a positive speed it "
-            f"pushes the body towards {drives:.1f} deg."
+            f"Wheel {k} is at x = {x:.4f} m, y = {y:.4f} m; with a positive speed it pushes the "
+            f"body in the direction {drives:.1f} deg."
         )
     settings = loop.estimator.settings
-    signs = "with their signs" if settings.current_is_signed else "without a sign (a sign is lost)"
-    yield f"Currents are taken {signs}. A wheel unheard for {float(settings.stale_s):g} s is stale."
-    yield "Floors, as columns count them: " + listed([*robot.labels, "none of them"]) + "."
+    signs = (
+        "with their signs" if settings.current_is_signed else "as magnitudes (signs are ignored)"
+    )
+    stale = float(settings.stale_s)
+    yield f"Currents are used {signs}. A wheel without readings for {stale:g} s is stale."
+    yield "Floors, in the order of the columns: " + listed([*robot.labels, "none of them"]) + "."
     rows = hypotheses_of(robot).under.tolist()
     each = "; ".join(f"{k}: {' '.join(map(str, row))}" for k, row in enumerate(rows))
-    yield f"Hypotheses of the floors, as rows count them, with the floor under each wheel: {each}."
+    yield f"Hypotheses, in the order of the rows, with the floor under each wheel: {each}."
 
 
 def _comment(*parts: str) -> list[str]:

@@ -24,7 +24,8 @@ class Argument:
         name: name of the argument.
         type: name of the struct that the argument points to; empty for plain numbers.
         fields: fields of the struct; a single one for plain numbers.
-        example: a tree of arrays with the shapes of the fields, as the traced function takes it.
+        example: a tree of arrays with the shapes of the fields, as an argument of the traced
+            function.
         read: True if the function reads it.
         written: True if the function fills it.
     """
@@ -83,7 +84,7 @@ class Function:
         arguments: arguments in order.
         lines: lines of its body.
         reads: names of all memory that it reads.
-        scratch: count of the numbers that it keeps in arrays on the stack.
+        scratch: count of the numbers in its arrays on the stack.
     """
 
     name: str
@@ -166,7 +167,7 @@ def traced(run: Callable[..., object], *like: object) -> Traced:
 
 
 def _holds(memory: Memory, value: Value) -> bool:
-    """Return whether memory already holds a value, so that nothing has to be stored."""
+    """Return whether memory already contains a value, so that nothing has to be stored."""
     if not isinstance(value, Array):
         return False
     like = in_memory(memory, value.shape)

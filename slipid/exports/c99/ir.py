@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 Cells = np.ndarray
 """Numpy array of objects, each of which is a `Cell`."""
-LANES = 7
-"""Length from which on an axis of an array becomes a loop in C."""
+LEAST_LANES = 7
+"""Smallest length of an axis of an array that becomes a loop in C."""
 
 
 class NoFormError(Exception):
-    """Reason why a primitive, as it is used here, cannot be turned into C."""
+    """Reason why a use of a primitive cannot be converted to C."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Memory:
         name: name in C.
         kind: kind of its numbers.
         size: count of its numbers.
-        home: block that fills it; None where it is filled before the function begins.
+        home: block that fills it; None if it is filled before the function begins.
         values: bytes of a table of constants, empty for other memory.
         scalar: True if it is a single number that C accesses without an index.
         lanes: True if it stores the lanes of a variable. Truth values are then stored as the
@@ -116,12 +116,12 @@ class Statement:
     """The C statement `target = template`, with cells in the places {0}, {1} and so on.
 
     Attributes:
-        target: variable that it computes; None where the template is a whole C statement.
+        target: variable that it computes; None if the template is a whole C statement.
         template: C text with places for cells.
         cells: cells for these places.
         writes: memory that the template fills.
-        times: count of the numbers that it fills in a loop of its own; 0 for no such loop.
-        always: True if it is kept even if nothing reads that memory.
+        times: count of the numbers that it fills in a separate loop; 0 for no such loop.
+        always: True to keep it even if that memory is never read.
         start: initial value of a reduction; empty for other statements.
         source: file and line of the Python code that it is generated from.
     """
@@ -140,10 +140,10 @@ class Statement:
 class CodeBlock:
     """Statements that run one after the other, for every lane if `lanes` is not 0.
 
-    A block with bodies is a condition or a repetition, and has no statements of its own.
+    A block with bodies is a condition or a repetition, and has no other statements.
 
     Attributes:
-        owner: builder that it belongs to.
+        owner: builder to which it belongs.
         lanes: number of iterations of the loop; 0 for straight-line code.
         calls: True if its statements call functions.
         when: condition under which the first of two bodies runs, else the second.
@@ -210,14 +210,14 @@ def varies(cell: Cell) -> bool:
 
 
 def longest(shape: Sequence[int]) -> int | None:
-    """Return the axis that becomes a loop by default, the longest; None where all are short."""
-    if max(shape, default=0) < LANES:
+    """Return the axis that becomes a loop by default, the longest; None if all are short."""
+    if max(shape, default=0) < LEAST_LANES:
         return None
     return max(range(len(shape)), key=lambda axis: (shape[axis], axis))
 
 
 def numbered(shape: Sequence[int]) -> np.ndarray:
-    """Return an array of this shape whose numbers are their own row-major indices."""
+    """Return an array of this shape whose numbers are their row-major indices."""
     return np.arange(prod(shape)).reshape(shape)
 
 
@@ -238,5 +238,5 @@ def read_at(memory: Memory, places: np.ndarray, index: Variable | None = None) -
 
 
 def in_memory(memory: Memory, shape: tuple[int, ...]) -> Array:
-    """Return the array of this shape that memory holds in row-major order."""
+    """Return the array of this shape that is stored in memory in row-major order."""
     return read_at(memory, numbered(shape))

@@ -1,4 +1,4 @@
-"""Lowering of traced functions to C statements; whatever is constant is computed at export."""
+"""Lowering of traced functions to C statements; constant expressions are computed at export."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ RULES: dict[str, Rule] = {
     "scatter-mul": moves.scattered("mul", 1.0),
     "select_n": arithmetic.select,
 }
-"""Rules that turn a primitive into C, by the primitive's name.
+"""Rules for the conversion of primitives to C, by the name of the primitive.
 
-Primitives that only move numbers need no rule of their own: they are applied to the indices of the
-numbers, which shows where the numbers of their result come from."""
+Primitives that only move numbers need no separate rule: they are applied to the indices of the
+numbers, which gives the sources of the numbers in their result."""
 INLINED = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"))
 """Primitives that call a function; its statements are inlined."""
 
@@ -64,9 +64,9 @@ _TYPES = frozenset(map(np.dtype, ("float64", "int64", "int32", "bool")))
 
 
 class UnsupportedError(DataError):
-    """Error for a function that cannot be turned into C.
+    """Error for a function that cannot be converted to C.
 
-    The message names the primitive and the line of Python code that it comes from.
+    The message gives the primitive and its line of Python code.
     """
 
 
@@ -115,7 +115,7 @@ def _ruled(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[Va
         return _cond(builder, params, values)
     if name == "scan":
         return _scan(builder, params, values)
-    out: Any = equation.outvars[0].aval  # jax's type hides its attributes
+    out: Any = equation.outvars[0].aval  # The type in JAX does not declare its attributes.
     shaped = Shaped(out.shape, out.dtype)
     if out.dtype not in _TYPES:
         raise NoFormError(f"numbers of type {out.dtype}")
@@ -131,7 +131,7 @@ def _ruled(builder: Builder, equation: JaxprEqn, values: list[Value]) -> list[Va
 
 
 def _cond(builder: Builder, params: Params, values: list[Value]) -> list[Value]:
-    """Return the results of a condition: those of one of two functions."""
+    """Return the results of a conditional call of one of two functions."""
     which, choices = values[0], branches(params)
     if len(choices) != 2:
         raise NoFormError("more than two branches")

@@ -9,7 +9,7 @@ import numpy as np
 
 from slipid.exports.c99.builder import Builder
 from slipid.exports.c99.ir import (
-    LANES,
+    LEAST_LANES,
     Array,
     At,
     Cell,
@@ -58,7 +58,7 @@ class Sources:
         axis = max(free, key=lambda a: (free[a], places.shape[a], a), default=None)
         if axis is not None and 2 * free[axis] * places.shape[axis] >= places.size > 0:
             return axis
-        large = len(np.unique(places)) > UNROLLED or max(places.shape, default=0) >= 2 * LANES
+        large = len(np.unique(places)) > UNROLLED or max(places.shape, default=0) >= 2 * LEAST_LANES
         return longest(places.shape) if large else None
 
     def _free(self, places: np.ndarray, axis: int) -> int:

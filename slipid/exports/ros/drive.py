@@ -1,4 +1,4 @@
-"""The drive controller of ros2_controllers that has a robot's kinematics, if there is one.
+"""The drive controller of ros2_controllers with the kinematics of a robot, if there is one.
 
 Such controllers convert a body twist (vx, vy, yaw rate W) to wheel speeds by
 
@@ -23,10 +23,10 @@ from slipid.exports.ros.yaml_text import Parameter
 from slipid.robot.deployed import DeployedRobot
 
 LARGEST_DIFFERENCE = 0.05
-"""Largest difference of kinematics up to which a controller still fits a robot.
+"""Largest difference of kinematics with which a controller is used for a robot.
 
-It is the error of a rim speed as a share of the body's speed [1], the speed being that of points on
-the base radius where the body turns on the spot."""
+It is the error of a rim speed as a share of the body's speed [1], the speed is that of points on
+the base radius if the body turns on the spot."""
 CORNERS = ("front_left", "front_right", "rear_right", "rear_left")
 
 
@@ -39,7 +39,7 @@ class DriveController:
         odometry: topic of its odometry, relative to the controller's name.
         covariances: parameters with the diagonals of the covariances of pose and twist.
         wheels: numbers of the robot's wheels in the controller's order.
-        turned: for each of these, whether the controller counts its speed with the opposite sign.
+        turned: for each of these, True if the controller uses the opposite sign of the speed.
         parameters: parameters of the controller.
         difference: largest difference of the controller's kinematics from the robot's, as in
             `LARGEST_DIFFERENCE` [1].
@@ -60,14 +60,14 @@ class DriveController:
 
 
 def drive_controller_of(robot: DeployedRobot) -> DriveController | None:
-    """Return the controller for a robot; None where no controller has its kinematics."""
+    """Return the controller for a robot; None if no controller has its kinematics."""
     found = (_mecanum(robot), _omni(robot))
     fitting = (c for c in found if c is not None and c.difference <= LARGEST_DIFFERENCE)
     return next(fitting, None)
 
 
 def joint(wheel: int) -> str:
-    """Return the name of a wheel's joint, a placeholder for the user's own."""
+    """Return a placeholder for the name of a wheel's joint."""
     return f"wheel_{wheel + 1}_joint"
 
 
@@ -76,7 +76,7 @@ def _with_signs(
 ) -> tuple[Float[np.ndarray, "wheel 3"], tuple[bool, ...]]:
     """Return rows of the robot's kinematics J in a controller's order, with its signs.
 
-    Signs are such that column `axis` has `sign`; the second result says which ones were changed.
+    Signs are such that column `axis` has `sign`; the second result marks those that were changed.
     """
     rows = np.asarray(robot.forward)[order]
     turned = rows[:, axis] * sign < 0
@@ -98,7 +98,7 @@ def _omni(robot: DeployedRobot) -> DriveController | None:
     if count < 3:
         return None
     azimuth = np.arctan2(places[:, 1], places[:, 0])
-    # a wheel whose azimuth is a rounding error below that of the first one counts as being at 0
+    # A wheel whose azimuth is below that of the first one by a rounding error is taken to be at 0.
     order = np.argsort(np.mod(azimuth - azimuth[0] + 1e-6, 2 * np.pi))
     rows, turned = _with_signs(robot, order, axis=2, sign=-1.0)
     even = 2 * np.pi * np.arange(count) / count
@@ -160,14 +160,17 @@ def _mecanum(robot: DeployedRobot) -> DriveController | None:
 
 
 _JOINTS = (
-    "Put in your own joint names, in this order; the number is that of the wheel in robot.json and "
-    "in the logs. README.md says which joints must be reversed."
+    "Replace these by the names of your joints, in this order; the number is that of the wheel "
+    "in robot.json and in the logs. README.md lists the joints that must be reversed."
 )
 _OFFSET = (
-    "Direction in which the first of these wheels stands, from ahead [rad]: the mean over the "
-    "wheels of what their identified drive directions say."
+    "Direction from the middle to the first of these wheels, from straight ahead [rad]: the mean "
+    "over the wheels of the values computed from their identified drive directions."
 )
-_BASE = "robot.base_radius, from the middle to the wheels [m]. It has no multiplier."
-_RADIUS = "robot.wheel_radius [m]. It has no multiplier: the identified value itself stands in."
+_BASE = (
+    "robot.base_radius, from the middle to the wheels [m], the identified value. It has no "
+    "multiplier."
+)
+_RADIUS = "robot.wheel_radius [m], the identified value. It has no multiplier."
 _MIDDLE = "The origin of the body as seen from the middle of the wheels [m, m, rad]."
 _REACH = "lx + ly [m]: the mean over the wheels of their identified levers about their middle."

@@ -37,25 +37,26 @@ from slipid.exports.text import filled, identifiers, interval, short, table
 from slipid.robot.deployed import DeployedRobot
 
 USES: Mapping[str, str] = {
-    "drive_controller.yaml": "geometry and covariances, on the worst floor, for the drive "
-    "controller: give it to the spawner or the controller manager, with your own joint names",
-    "robot_localization.yaml": "extended Kalman filter for the odometry of the drive controller, "
-    "on the worst floor: `ros2 run robot_localization ekf_node --ros-args --params-file` this file",
-    "robot_localization_slipid.yaml": "the same filter for odometry in which slip is estimated, "
-    "whoever publishes its twist, with the covariance that the file names",
+    "drive_controller.yaml": "geometry and covariances (on the worst floor) for the drive "
+    "controller: pass it to the spawner or the controller manager, after entering the names of "
+    "your joints",
+    "robot_localization.yaml": "extended Kalman filter for the odometry of that controller (on "
+    "the worst floor): `ros2 run robot_localization ekf_node --ros-args --params-file` this file",
+    "robot_localization_slipid.yaml": "the same filter for odometry with estimated slip; its "
+    "publisher must use the covariance given in the file",
     "slipid.yaml": "every number of the robot, gains and limits, as parameters of a node `slipid`",
-    "slipid_parameters.yaml": "their declaration for generate_parameter_library: types, "
-    "descriptions with verdicts, validators; the defaults are the numbers themselves",
+    "slipid_parameters.yaml": "declaration of these parameters for generate_parameter_library: "
+    "types, descriptions with verdicts, and validators; the defaults are the identified numbers",
 }
 """Use of each file, by name, without the files for single floors."""
 _FLOOR = (
     "covariances of the drive controller and process noise of `robot_localization.yaml` on this "
-    "floor: give it after those files, it overrides them"
+    "floor: load it after those files, whose values it overrides"
 )
 _ENCODERS = "the drive controller, which ignores slip"
 _ESTIMATED = (
-    "slipid's estimator or another one that knows the slip of the wheels, which states this twist "
-    "covariance diagonal"
+    "slipid's estimator, or another one that estimates slip and publishes this diagonal as the "
+    "covariance of its twist"
 )
 
 
@@ -102,11 +103,11 @@ def _covariances(
     effect, slip, process = (", ".join(map(short, x)) for x in (e.effect, e.slip, e.process))
     pose = (
         f"On '{e.floor}'. Variances of x, y [m^2], z, roll, pitch, yaw [rad^2] of odometry that "
-        f"ignores slip, d = {short(DISTANCE_M)} m after its pose was last corrected: "
-        f"(effect^2 + slip^2) d^2 + process^2 d, the larger of along and across for x and y, and "
-        f"with what the heading's error carries sideways. Effect {effect}, slip {slip} (along, "
-        f"across [m/m], yaw [rad/m]), process {process} (per sqrt(m)). They are constant here "
-        f"while true ones grow with the path; wheels measure no z, roll and pitch."
+        f"ignores slip, d = {short(DISTANCE_M)} m after the last correction of its pose: "
+        "(effect^2 + slip^2) d^2 + process^2 d (for x and y, the larger value of along and "
+        f"across), plus the sideways error due to the heading. Effect {effect}, slip {slip} "
+        f"(along, across [m/m], yaw [rad/m]), process {process} (per sqrt(m)). They are constant "
+        "here, while the true ones grow with the path. Wheels do not measure z, roll and pitch."
     )
     twist = (
         f"Variances of velocities [m^2/s^2, rad^2/s^2]: (effect^2 + slip^2) v^2 + process^2 v / T "
@@ -149,18 +150,19 @@ def _controller(drive: DriveController) -> list[str]:
     """Return the paragraphs about the controller manager and the controller's kinematics."""
     off = drive.difference
     return [
-        "The controller manager needs the type of the controller, under the name used here:",
+        "The controller manager needs the type of the controller, under the name that is used "
+        "here:",
         *("", "```yaml", "controller_manager:", "  ros__parameters:", f"    {drive.name}:"),
         *(f"      type: {drive.plugin}", "```", ""),
-        f"Its kinematics differ from the identified ones by {short(100 * off)} % of a rim speed at "
-        "most: it knows no drive directions of single wheels."
+        f"Its kinematics differ from the identified ones by at most {short(100 * off)} % of a rim "
+        "speed, since it has no parameters for the drive directions of single wheels."
         if off > 1e-9
         else "Its kinematics are the identified ones.",
     ]
 
 
 def _wheels(robot: DeployedRobot, drive: DriveController | None) -> list[str]:
-    """Return the table with order, places and directions of the wheels, and what to reverse."""
+    """Return the table with order, places and directions of wheels, and joints to reverse."""
     places, record = np.asarray(robot.places), robot.record
     offsets = np.broadcast_to(record.parameters["robot.drive_offset"].value, (robot.wheels,))
     order = range(robot.wheels) if drive is None else drive.wheels
@@ -211,7 +213,7 @@ def _names(robot: DeployedRobot) -> list[str]:
 
 
 def _numbers(robot: DeployedRobot) -> list[str]:
-    """Return the table with every number and its origin."""
+    """Return the table with every number and its source."""
     rows = []
     for row in number_rows(robot):
         number = (short(row.value), row.unit, interval(row.interval90))
@@ -224,12 +226,13 @@ def _numbers(robot: DeployedRobot) -> list[str]:
 _NO_DRIVE = (
     "No drive controller of ros2_controllers has the kinematics of this robot (to "
     f"{LARGEST_DIFFERENCE:.0%} of a rim speed): `omni_wheel_drive_controller` needs omni wheels "
-    "evenly on a circle, `mecanum_drive_controller` four wheels at corners with rollers at 45 "
-    "degrees. `slipid.yaml` has its matrices, `kinematics.forward` and `kinematics.inverse`."
+    "spaced evenly on a circle, `mecanum_drive_controller` four wheels at the corners of a "
+    "rectangle with rollers at 45 degrees. `slipid.yaml` contains its matrices, "
+    "`kinematics.forward` and `kinematics.inverse`."
 )
 _REVERSE = (
-    "**Reverse** the joints marked so, by their axis in the robot's description or in its hardware "
-    "driver, or the robot goes the other way: the controller counts their speeds with the other "
-    "sign than the logs did. `omni_wheel_drive_controller` takes a positive speed of every wheel "
-    "as a turn of the robot clockwise, `mecanum_drive_controller` as a way ahead."
+    "**Reverse** the marked joints, by their axes in the robot's description or in its hardware "
+    "driver: the controller uses the opposite sign of their speeds, and otherwise the robot "
+    "would move in the wrong direction. For `omni_wheel_drive_controller`, positive speeds of "
+    "all wheels turn the robot clockwise; for `mecanum_drive_controller`, they drive it ahead."
 )

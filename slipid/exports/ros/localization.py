@@ -1,12 +1,12 @@
 """Errors of odometry on each floor as variances for ROS messages, and filter parameters.
 
 Over a path length d [m] an error grows by a constant part (std e of the effect [m/m, rad/m]) and by
-a random part (std q of the process noise [m/sqrt(m), rad/sqrt(m)]), so that its variance is
-(e d)^2 + q^2 d. Odometry that ignores slip also has the slip of its wheels as an error: its e^2 is
-effect^2 + slip^2, where slip is the root mean square of the contact model's slip over directions of
-travel. A constant covariance does not depend on the direction of travel, so x and y both get the
-larger variance of along and across. A wrong heading moves the robot sideways; with e_w and q_w of
-the yaw this adds the variance (e_w d^2 / 2)^2 + q_w^2 d^3 / 3.
+a random part (std q of the process noise [m/sqrt(m), rad/sqrt(m)]), so that its variance is (e d)^2
++ q^2 d. Odometry that ignores slip also has the slip of its wheels as an error: its e^2 is effect^2
++ slip^2, where slip is the root mean square of the contact model's slip over directions of travel.
+A constant covariance cannot depend on the direction of travel, so x and y both get the larger
+variance of along and across. A wrong heading moves the robot sideways; with e_w and q_w of the yaw
+this adds the variance (e_w d^2 / 2)^2 + q_w^2 d^3 / 3.
 
 ROS drive controllers put one constant diagonal into every message, which is not a true covariance
 of odometry. It is computed here for the path length `DISTANCE_M`, and that of twists for the
@@ -167,8 +167,8 @@ def filter_parameters(
         source: description of the odometry's source, for a comment.
     """
     about = (
-        f"Odometry of {source}. Velocities only are fused: its pose is their sum, and would count "
-        "twice. Order: " + ", ".join(STATE) + "."
+        f"Odometry of {source}. Only its velocities are fused: its pose is their integral and "
+        "contains no further information. Order: " + ", ".join(STATE) + "."
     )
     return (
         Parameter("frequency", 1 / PERIOD_S, "Assumed rate of the odometry [Hz]."),
@@ -200,12 +200,12 @@ def process_noise(robot: DeployedRobot, errors: OdometryErrors) -> Parameter:
     noise |= {"vx": speed, "vy": speed, "vyaw": turn, "ax": ACCELERATION, "ay": ACCELERATION}
     matrix = np.diag([noise.get(name, PLANAR_NOISE) for name in STATE])
     about = (
-        f"On '{errors.floor}'. Pose: errors that stay the same over the path, and so are no noise "
-        f"of single velocities, as a random walk with the same error after {short(DISTANCE_M)} m, "
-        f"at the highest speed of the fitted runs, {short(top_speed(robot))} m/s. Velocity: the "
-        f"change that the limit of wheel acceleration, {short(acceleration)} rad/s^2, allows "
-        f"within {short(PERIOD_S)} s. Accelerations: the package's default. two_d_mode holds the "
-        "rest."
+        f"On '{errors.floor}'. Pose: a random walk that replaces the errors that stay constant "
+        f"over a path, with the same error after {short(DISTANCE_M)} m at the highest speed of "
+        f"the fitted runs, {short(top_speed(robot))} m/s. Velocity: the change that the limit of "
+        f"wheel acceleration, {short(acceleration)} rad/s^2, allows within {short(PERIOD_S)} s. "
+        "Accelerations: the default of the package. The other states are held at zero by "
+        "two_d_mode."
     )
     entries = tuple(matrix.reshape(-1).tolist())
     return Parameter("process_noise_covariance", entries, about, per_line=len(STATE))
@@ -215,6 +215,6 @@ _TF = (
     "Only one node may publish this transform: set enable_odom_tf of the drive controller to false."
 )
 _DYNAMIC = (
-    "False: the pose grows uncertain while the robot stands, too. True would scale it with the "
-    "square of the speed, which ignores slow motion."
+    "False: the uncertainty of the pose also grows at standstill. True would scale the noise "
+    "with the square of the speed, which neglects slow motion."
 )

@@ -41,7 +41,7 @@ POINT = '[[points]]\nsurface = "wood"\n'
         ("[region]\nat_m = [[0, 0], [1, 1], [0.5, 0.5]]\n", r"region: \d+ cells of 8 mm that"),
         ("[[mask]]\nat_m = [[-9, -9], [9, -9], [9, 9], [-9, 9]]\n", "hide all but 0 cells"),
         ("[regions]\n", "regions: no such key, did you mean region"),
-        ("[region\n", "no valid TOML"),
+        ("[region\n", "not valid TOML"),
     ],
 )
 def test_errors_in_a_palette_are_reported(made, tmp_path, config, match):
