@@ -293,7 +293,7 @@ def test_a_changed_digit_is_refused(path):
             lambda c: c["wheels"].update(drive_angle=[0.0]),
             "wheels.drive_angle: 1 entries; expected 3",
         ),
-        (lambda c: c["wheels"].update(roller_angle=[0.0] * 3), "such a wheel cannot drive"),
+        (lambda c: c["wheels"].update(roller_angle=[0.0] * 3), "the wheel cannot drive"),
         (lambda c: c["wheels"].update(drive_of=[0, 0, 2]), "counted from 0 without a gap"),
         (lambda c: c["wheels"].update(drive_of=[0, 0]), "expected one for each of the 3 wheels"),
         (lambda c: c["wheels"].update(drive_of=[0, 1, 0.5]), "drive_of"),

@@ -18,7 +18,7 @@ KINEMATIC = ("effective_track", "instantaneous_centres")
 def _every() -> list[SlipModel]:
     """Return all methods, unfitted.
 
-    Methods that do not handle floors themselves are wrapped so as to be fitted floor by floor.
+    Methods that do not distinguish floors are wrapped, so that they are fitted floor by floor.
     """
     of_one_floor: list[SlipModel] = [
         *(Corrected(name) for name in KINEMATIC),

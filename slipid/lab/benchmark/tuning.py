@@ -6,12 +6,12 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from slipid.lab.benchmark.protocols import INNER, inner
+from slipid.lab.benchmark.protocols import INNER_FOLDS, inner
 from slipid.lab.benchmark.scores import scored
 from slipid.predict.slip_model import TRIES, RobotSpec, Run, SlipModel
 from slipid.predict.slip_models import ByFloor
 
-WORST = 2.0
+LARGEST_ERROR = 2.0
 """Upper limit of the relative error of a run in the loss; larger errors count as this."""
 Method = TypeVar("Method")
 
@@ -46,12 +46,12 @@ def tuned(method: SlipModel, runs: Sequence[Run], spec: RobotSpec, kind: str) ->
     """Return the method with the best of its settings, unfitted.
 
     With each setting, the method is fitted without a part of the runs and scored on that part. The
-    part is chosen by the protocol's kind of split where the training runs allow it. The score is
-    the mean error, averaged with equal weights of floors: that of the end point relative to the
-    path length, or that of the energy, as `SlipModel.aim` says. A setting with which the method
-    cannot be fitted has the worst score. All training runs are used, since settings that are best
-    for fewer runs are too cautious. For a method that is fitted floor by floor, one fit to all runs
-    together is also tried, with the best settings, and used if it has the smaller loss.
+    part is chosen by the protocol's kind of split if the training runs allow it. The score is the
+    mean error of the end point relative to the path length, or of the energy, depending on
+    `SlipModel.aim`; all floors have the same weight. A setting with which the method cannot be
+    fitted has the worst score. All training runs are used, since the best settings for fewer runs
+    would be too cautious. For a method that is fitted floor by floor, one fit to all runs together
+    is also tried, with the best settings, and used if it has the smaller loss.
     """
     part = inner(runs, kind)
 
@@ -77,7 +77,7 @@ def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, spec: RobotS
     the method cannot be fitted, and 0 if no part can be held out.
     """
     errors: dict[str, list[float]] = {}
-    for k in range(INNER):
+    for k in range(INNER_FOLDS):
         training = [run for run, p in zip(runs, part, strict=True) if p != k]
         floors = {run.signals.floor for run in training}
         held_out = [
@@ -93,8 +93,8 @@ def _loss(method: SlipModel, runs: Sequence[Run], part: np.ndarray, spec: RobotS
         for run, one in zip(held_out, predicted, strict=True):
             score = scored(run, one, spec, "path")
             error = score.energy_error if method.aim == "energy" else score.endpoint_error
-            known = WORST if error is None or not np.isfinite(error) else error
-            errors.setdefault(run.floor, []).append(min(known, WORST))
+            known = LARGEST_ERROR if error is None or not np.isfinite(error) else error
+            errors.setdefault(run.floor, []).append(min(known, LARGEST_ERROR))
     return float(np.mean([np.mean(of_floor) for of_floor in errors.values()])) if errors else 0.0
 
 

@@ -25,17 +25,18 @@ from slipid.support.content import Content
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
-OWN_MAP = "slipid_map"
+MAP_ROW = "slipid_map"
 """Name of the row of slipid's estimator that is given the map of the floors."""
 
 
-OF_FITS = (
+FIT_SOURCES = (
     *("parameter", "search_space", "model", "data", "fitting", "predict", "infer", "app"),
     "lab/benchmark/slipid_rows",
 )
-"""Packages and modules that slipid's fits depend on; saved fits are void when one changes."""
-OF_ROWS = ("lab/systems", "lab/paper2021", "lab/benchmark", "robot", "deploy")
-"""Packages that the scores of all rows depend on in addition to `OF_FITS`."""
+"""Packages and modules on which slipid's fits depend; saved fits are invalid if one of them
+changes."""
+ROW_SOURCES = ("lab/systems", "lab/paper2021", "lab/benchmark", "robot", "deploy")
+"""Packages on which the scores of all rows depend in addition to `FIT_SOURCES`."""
 QUICK_RUNS = 60
 """Largest number of runs of each data set in a quick benchmark."""
 QUICK_KIND = "headings"
@@ -80,7 +81,7 @@ class FoldTask:
         return f"{self.source}/{self.kind}_{self.fold}"
 
     def run(self) -> str:
-        """Fit and score all rows that the checkpoint lacks, and return the task's name."""
+        """Fit and score all rows that are missing in the checkpoint, and return the task's name."""
         setup_jax(quiet=True)
         kept = checkpoint_of(self, fit=False)
         missing = [key for key in keys_of(self) if not _is_done(kept.load_json("_".join(key)))]
@@ -102,7 +103,7 @@ class FoldTask:
 
 
 def _is_done(content: Content | None) -> bool:
-    """Return True if a row's score was saved and is no failure; failed rows are tried again."""
+    """Return True if a row's score was saved and is not a failure; failed rows are tried again."""
     return content is not None and not content["failed"]
 
 
@@ -133,9 +134,9 @@ def split_of(task: FoldTask) -> Split:
 def checkpoint_of(task: FoldTask, fit: bool) -> Checkpoint:
     """Return the checkpoint of slipid's fit in a task if `fit`, else that of the task's scores."""
     data = data_of(task.options, task.source)
-    more = () if fit else (data.crossing_hash, source_hash(*OF_ROWS))
+    more = () if fit else (data.crossing_hash, source_hash(*ROW_SOURCES))
     split = split_of(task)
-    marks = data.job.config.hash, data.job.data_hash, source_hash(*OF_FITS)
+    marks = data.job.config.hash, data.job.data_hash, source_hash(*FIT_SOURCES)
     key = key_of(*marks, split.training, split.held_out, *more)
     # the folder name contains the key, so that results of other options are not overwritten
     return Checkpoint(task.options.out / "kept" / task.name / key[:12], key)
@@ -147,7 +148,7 @@ def keys_of(task: FoldTask) -> list[tuple[str, str]]:
     Protocols with unknown floors need more than one floor.
     """
     options, data = task.options, data_of(task.options, task.source)
-    own = [slipid_rows.NAME] + ([OWN_MAP] if task.kind == "all" else [])
+    own = [slipid_rows.NAME] + ([MAP_ROW] if task.kind == "all" else [])
     every = own + [method.name for method in rows(data.spec)]
     names = [name for name in every if not options.only or name in options.only]
     several = len({base_of(f.floor) for f in data.facts}) > 1 and not options.quick
@@ -157,12 +158,12 @@ def keys_of(task: FoldTask) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True, eq=False)
 class FoldData:
-    """Runs and slipid's fit that all rows of one fold share.
+    """Runs and slipid's fit for all rows of one fold.
 
     Attributes:
         data: the data set.
         fit: slipid's fit, or an empty score with the reason why there is none.
-        training: training runs, whose signals tell the floor.
+        training: training runs, whose signals contain the floor.
         batches: held-out runs, in batches with equal numbers of steps.
         held_out: logs of the held-out runs.
     """
@@ -192,7 +193,7 @@ def _fold_data(task: FoldTask) -> FoldData:
         problem = problem_of(task.options, task.source)
         fit = slipid_rows.fit_slipid(data.job, problem, split.training, kept)
         robot = fit.contact.robot
-    except Exception as error:  # without slipid's fit, the other rows can still be scored
+    except Exception as error:  # Without slipid's fit, the other rows can still be scored.
         fit = FoldScore.of_error(error)
         robot = Space(data.job.robot, data.job.choices).template
 
@@ -210,7 +211,7 @@ def _fold_data(task: FoldTask) -> FoldData:
 
 
 def _with_facts(batch: RunBatch, data: DataSet, numbers: np.ndarray) -> RunBatch:
-    """Return the batch with floors, headings and speeds of its runs as the splits use them.
+    """Return the batch with floors, headings and speeds of its runs as used by the splits.
 
     Floors include the load set-up; heading and speed follow from the commanded motion.
     """
@@ -227,7 +228,7 @@ def _score(data: FoldData, protocol: str, name: str) -> FoldScore:
     rules = PROTOCOLS[protocol]
     runs = [run.with_floor(rules.floor_known) for run in data.runs]
     try:
-        if name in (slipid_rows.NAME, OWN_MAP):
+        if name in (slipid_rows.NAME, MAP_ROW):
             return _slipid(data, rules, runs, name)
         method = next(m for m in rows(data.data.spec) if m.name == name)
         if lacks := method.needs - channels_of(runs, data.data.spec):
@@ -274,9 +275,9 @@ def _slipid(data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], name: 
     fit, known = data.fit, protocol.floor_known
     if isinstance(fit, FoldScore):
         return fit
-    if name == OWN_MAP and data.data.map is None:
+    if name == MAP_ROW and data.data.map is None:
         return FoldScore.lacking(["map"])
-    floor_map = data.data.map if name == OWN_MAP else None
+    floor_map = data.data.map if name == MAP_ROW else None
     floors = slipid_rows.FloorKnowledge(known, protocol.unseen_floors, floor_map)
     has_gyro = all(run.signals.gyro is not None for run in runs)
 

@@ -1,4 +1,4 @@
-"""The 2021 paper's system: the slip of each wheel from the torque or current of its own motor.
+"""The 2021 paper's system: the slip of each wheel from the torque or current of its motor.
 
     xi = back r (w_i (1 - s_i))
 
@@ -103,13 +103,13 @@ class PaperCode(_AsPublished):
 def recipe_samples(w: TrainingWindows, spec: RobotSpec) -> SlipSamples:
     """Return samples of single wheels and windows within the authors' limits of slip and current.
 
-    If there are more than `MOST_SAMPLES`, so many are drawn at random.
+    If there are more than `MOST_SAMPLES`, this number is drawn at random.
     """
     signals = w.signals
     rim = signals.speed * spec.wheel_radius
     real = w.twist @ spec.forward.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        # a wheel at rest has no finite slip ratio, and no comparison is true for it
+        # A wheel at rest has no finite slip ratio, and no comparison is true for it.
         slip = 1.0 - real / rim
     amps = signals.along(spec)
     kept = (slip > 0.0) & (slip <= 1.0) & (amps > FIGURES_3_AND_4.min_current)

@@ -1,4 +1,4 @@
-"""Reproduction of the 2021 paper: its numbers as JSON, its figures 2, 3, 4 and 7 from the data."""
+"""Reproduction of the 2021 paper: its numbers as JSON, and its figures 2, 3, 4 and 7."""
 
 from pathlib import Path
 
@@ -43,7 +43,7 @@ def run(data_dir: Path, out: Path) -> list[Path]:
 
 
 def runs_2022(folder: Path) -> tuple[Log, ...] | None:
-    """Return the 2022 runs, each on one surface; None if the folder has none."""
+    """Return the 2022 runs, each on one surface; None if the folder contains none."""
     pattern = "one_surface/*/*.csv"
     return read_runs(folder, pattern, "robotino2022").logs if any(folder.glob(pattern)) else None
 
@@ -124,7 +124,7 @@ def figure4(table: MotorTable) -> Figure:
 def figure7(tracks: tuple[SquareTrack, ...]) -> Figure:
     """Return figure 7: camera tracks on the commanded rectangle, headings and closure errors."""
     made = drawing.figure(
-        12.0, 5.7, "Figure 7: the same commanded rectangle, three ways to follow it"
+        12.0, 5.7, "Figure 7: the same commanded rectangle, followed with three controllers"
     )
     panels = list(made.subplots(1, len(tracks), squeeze=False)[0])
     for axes, track in zip(panels, tracks, strict=True):
@@ -144,7 +144,8 @@ def _draw_track(axes: Axes, track: SquareTrack) -> None:
     axes.plot(*xy.T, color=colour, lw=2)
     side = xy[: track.file.side_frames]
     axes.plot(*side.T, color=colour, lw=6, alpha=0.4, label="first side")
-    # arrows are 160 mm of path apart: at equal times, they would overlap where the robot stands
+    # Arrows are 160 mm of path apart; at equal time intervals they would overlap where the robot
+    # rests.
     travel = np.cumsum(np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T))
     every = np.searchsorted(travel, np.arange(80.0, travel[-1], 160.0))
     # logged headings are 90 deg ahead of right-handed ones on the floor

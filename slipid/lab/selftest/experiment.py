@@ -1,4 +1,4 @@
-"""The command `slipid selftest`: which parameters an experiment can recover."""
+"""The command `slipid selftest`: the parameters that an experiment can recover."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -28,16 +28,15 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.selftest/1"
-CHANCE = 1e-3
+SIGNIFICANCE = 1e-3
 """Significance level of the two tests of a parameter's errors over all replicates.
 
-The tests ask whether its 90 % intervals contain the truth often enough, and whether its errors are
-as small as its standard deviations say. A parameter that fails one of them was recovered wrongly,
-unless it counts as not recovered anyway.
-"""
+The tests check whether its 90 % intervals contain the truth often enough, and whether its errors
+agree with its standard deviations. A parameter that fails one of them was recovered wrongly, unless
+it counts as not recovered anyway."""
 LEAST_CONVERGED = 0.75
 """Smallest share of the replicates' fits that must converge for a successful self test."""
-ORDER = ("identified", "weak", "not_identified", "at_bound")
+VERDICT_ORDER = ("identified", "weak", "not_identified", "at_bound")
 """Verdicts of a fit; of equally frequent ones, the last in this order counts."""
 
 
@@ -109,7 +108,10 @@ def planned_task(config: Config, report: Reporter) -> ConfigFitTask:
     )
     if not has_current:
         logs = [replace(log, current=None) for log in logs]
-    report.line(f"no logs given: {len(logs)} runs of [selftest] on {', '.join(wanted.surfaces)}")
+    report.line(
+        f"no logs given; simulating the {len(logs)} runs of [selftest] on "
+        f"{', '.join(wanted.surfaces)}"
+    )
     return fit_task(config, collect(logs), [], report)
 
 
@@ -127,7 +129,9 @@ def wanted_paths(config: Config, problem: Problem) -> tuple[str, ...]:
     paths = [e.path for e in problem.space.free] + [e.path for e in ratios]
     given = config.content.selftest.wanted
     patterns = ["surface.*.creep"]
-    if problem.robot.geometry.determines_twist:  # other drives hardly show where the weight is
+    if (
+        problem.robot.geometry.determines_twist
+    ):  # The logs of other drives hardly show the distribution of the weight.
         patterns += ["surface.*.roller_drag", "robot.load_share@*"]
     patterns += ["surface.*.friction/motor.back_emf"] if w.has_current else []
     patterns += ["motor.resistance", "motor.back_emf"] if w.has_current and w.has_voltage else []
@@ -188,14 +192,17 @@ def number_summary(found: Sequence[NumberRecovery]) -> Content:
 
     `recovered` follows from the most frequent verdict of the fits: "yes" for identified, "roughly"
     for weak, and "no" for the others. "yes" and "roughly" become "wrong" if the errors are
-    significantly larger than the fits' intervals and standard deviations allow (`CHANCE`).
+    significantly larger than the fits' intervals and standard deviations allow (`SIGNIFICANCE`).
     """
     truth, value = np.array([f.truth for f in found]), np.array([f.value for f in found])
     inside, z = np.array([f.inside for f in found]), np.array([f.z for f in found])
     count = Counter(f.verdict for f in found)
-    verdict = max(reversed(ORDER), key=lambda v: count[v])
+    verdict = max(reversed(VERDICT_ORDER), key=lambda v: count[v])
     hits, total = int(inside.sum()), inside.size
-    honest = binom.cdf(hits, total, 0.9) > CHANCE and chi2.sf(float((z**2).sum()), z.size) > CHANCE
+    honest = (
+        binom.cdf(hits, total, 0.9) > SIGNIFICANCE
+        and chi2.sf(float((z**2).sum()), z.size) > SIGNIFICANCE
+    )
     recovered = {"identified": "yes", "weak": "roughly"}.get(verdict, "no")
     if recovered != "no" and not honest:
         recovered = "wrong"

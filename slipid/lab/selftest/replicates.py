@@ -1,10 +1,10 @@
 """Replicates of an experiment: simulations with known true parameters, and their fits.
 
-A replicate draws true parameters near the centre of their priors, fills the windows of the
-experiment with the measurements that a robot with these parameters would give, including noise, and
-fits them from the usual start values. Wheel motion, floors, loads, sessions and sampling are those
-of the given windows. The noise is that of the likelihood at typical variances. Replicates therefore
-show what the experiment can recover if the model is right; they cannot show an error of the model.
+A replicate draws true parameters near the centre of their priors, simulates the measurements of a
+robot with these parameters in the windows of the experiment, including noise, and fits them from
+the usual start values. Wheel motion, floors, loads, sessions and sampling are those of the given
+windows. The noise is that of the likelihood at typical variances. Replicates therefore show what
+the experiment can recover if the model is right; they cannot show an error of the model.
 
 Source: a small version of simulation-based calibration (Talts et al. 2018, arXiv:1804.06788).
 """
@@ -45,8 +45,8 @@ def simulate_windows(
     """Return the windows with simulated poses, currents and voltages, noise included.
 
     Every segment starts at its first pose in `w`. The random effects of the current components are
-    part of the current that flows, which determines the voltage. The noise of variance
-    `w.current_var` is that of the ammeter: it is added to measured currents only.
+    part of the true current, which determines the voltage. The noise of variance `w.current_var` is
+    that of the ammeter and is added to measured currents only.
 
     Args:
         truth: robot with the true parameters, and the floors, loads, sessions of the windows.
@@ -135,11 +135,11 @@ def _shared(
 
 FILE = "replicates"
 """Name of the checkpoint's file of finished replicates, from which a later call continues."""
-SCATTER, MOST = 0.5, 0.5
-"""True parameters are drawn with a std of `SCATTER` times the prior std, the latter at most `MOST`.
+TRUTH_STD_RATIO, LARGEST_PRIOR_STD = 0.5, 0.5
+"""True parameters are drawn with a std of `TRUTH_STD_RATIO` times the prior std, but of at most
+that ratio times `LARGEST_PRIOR_STD`.
 
-Both stds are in the search space.
-"""
+Both stds are in the search space."""
 
 
 @dataclass(frozen=True)
@@ -203,8 +203,8 @@ def plausible(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and std, in the search space, from which true parameters are drawn.
 
-    The mean is that of the prior; for the std see `SCATTER`. A parameter in `[selftest.truth]` has
-    exactly the value given there.
+    The mean is that of the prior; for the std see `TRUTH_STD_RATIO`. A parameter in
+    `[selftest.truth]` has exactly the value given there.
 
     Raises:
         DataError: `[selftest.truth]` names a parameter that does not exist or is fixed, or gives
@@ -212,7 +212,7 @@ def plausible(
     """
     space, given = problem.space, config.content.selftest.truth
     center = space.prior_mean.copy()
-    scatter = SCATTER * np.minimum(space.prior_std, MOST)
+    scatter = TRUTH_STD_RATIO * np.minimum(space.prior_std, LARGEST_PRIOR_STD)
     for pattern, value in given.items():
         where = f"{config.path}: selftest.truth.'{pattern}'"
         mine = [e for e in space.free if fnmatchcase(e.path, pattern)]
@@ -255,7 +255,7 @@ def replicates(
     fit = config.content.fit
     found = _FILE.validate_python(kept.load_json(FILE) or [])[:count]
     if found:
-        report.line(f"{len(found)} of {count} replicates are in {kept.folder / FILE}.json already")
+        report.line(f"{len(found)} of {count} replicates are already in {kept.folder / FILE}.json")
     report.stage("replicates")
 
     def tell(state: FitState) -> None:
@@ -337,7 +337,7 @@ def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, 
     """Return the mean end-point errors relative to the true chord, by floor and slip model.
 
     The runs are those of the experiment, simulated without noise, so that only errors of the fitted
-    parameters count.
+    parameters contribute.
     """
     start = jnp.zeros((len(w), 3))
 
@@ -352,7 +352,7 @@ def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, 
         "encoder": ends(as_increments(twist, w, truth)),
     }
     chord, floor = np.linalg.norm(true, axis=1), np.asarray(w.surface)
-    travels = chord > 0.1 * np.median(chord)  # turns on the spot have no chord
+    travels = chord > 0.1 * np.median(chord)  # Turns on the spot have no chord.
     out: dict[str, dict[str, float]] = {}
     for name in dict.fromkeys(w.surface):
         if (mine := travels & (floor == name)).any():

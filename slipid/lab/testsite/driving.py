@@ -45,8 +45,8 @@ class Waypoints:
     Attributes:
         places: x, y [m] in the frame of the pose.
         speed: speed between the positions [m/s].
-        by: pose that is fed back: `encoders` is dead reckoning from the start, `camera` the true
-            pose.
+        by: pose that is fed back: `encoders` for dead reckoning from the start, `camera` for the
+            true pose.
     """
 
     places: tuple[tuple[float, float], ...]
@@ -59,12 +59,12 @@ class SiteRun:
     """One run on the test site.
 
     Attributes:
-        surface: surface that its log names; None if the floor has several.
+        surface: surface named in the log; None if the floor has several.
         load: name of the load set-up.
         program: `TimedTwists` or `Waypoints`.
         start: start pose: x, y [m], heading [rad].
         floor: map of the floor; None if `surface` is everywhere.
-        place: name of the floor in file names; empty to use the surface's.
+        place: name of the floor in file names; empty to use the name of the surface.
     """
 
     surface: str | None
@@ -76,7 +76,7 @@ class SiteRun:
 
     @property
     def folder(self) -> str:
-        """Name of the folder of its log: that of the floor or, without one, of the surface."""
+        """Name of the folder of the log: that of the floor or, without one, that of the surface."""
         return self.place or str(self.surface)
 
     @property
@@ -222,7 +222,7 @@ def _towards(
         if distance > REACHED_M:
             break
         goal += 1
-    # the start is not among the way-points; closing the path makes it at least as long
+    # The start is not among the way-points; closing the path makes it at least as long.
     corners = np.array([program.places[-1], *program.places])
     longest = 10.0 + 3 * float(np.hypot(*np.diff(corners, axis=0).T).sum()) / program.speed
     if goal == len(program.places) or time > longest:

@@ -13,7 +13,7 @@ from slipid.support.errors import DataError
 
 TIMESTEP = 1e-3
 """Time step of the engine and of the speed loop [s]."""
-SETTLING = 0.4
+SETTLING_S = 0.4
 """Time for which the robot settles on the floor before anything is recorded [s]."""
 LOOKUP_STEPS = 5
 """Number of time steps from one lookup of the floor beneath the rollers to the next."""
@@ -43,7 +43,7 @@ class SimulatedRobot:
 
     Args:
         site: the robot's build, its sensors and the surfaces.
-        floor: map of surfaces that the site knows.
+        floor: map of surfaces of the site.
         load: name of the load set-up.
         start: start pose: x, y [m], heading [rad].
         seed: seed of the initial wheel angles and of the floor's unevenness.
@@ -61,7 +61,7 @@ class SimulatedRobot:
     ):
         self.robot, self.dt = site.robot, timestep
         mujoco = engine()
-        # by default, MuJoCo writes warnings to a file; `check` uses the engine's own counts
+        # By default, MuJoCo writes warnings to a file; `check` uses the counts of the engine.
         mujoco.set_mju_user_warning(lambda text: None)
         self._step = mujoco.mj_step
         self.model = mujoco.MjModel.from_xml_string(
@@ -76,7 +76,7 @@ class SimulatedRobot:
         )
         self._place(start, rng)
         self._count = 0
-        for _ in range(round(SETTLING / timestep)):
+        for _ in range(round(SETTLING_S / timestep)):
             self.step([0.0] * len(self.wheel_dof))
         self.angle_at_start = self.data.qpos[self.wheel_at].copy()
         self._count = 0
@@ -112,7 +112,7 @@ class SimulatedRobot:
     def check(self) -> None:
         """Raise `DataError` if the simulation became unstable.
 
-        The engine itself only counts a warning, resets the robot and continues.
+        The engine only counts a warning, resets the robot and continues.
         """
         mujoco = engine()
         kinds = [f"mjWARN_BAD{what}" for what in ("QPOS", "QVEL", "QACC")]
@@ -202,5 +202,5 @@ class SimulatedRobot:
         fx, fy = fx - size * vx, fy - size * vy
         heading = self.pose[2]
         c, s = np.cos(heading), np.sin(heading)
-        mx, my = z0 * fy, -z0 * fx  # the force acts at the floor, z0 below the wheel axes
+        mx, my = z0 * fy, -z0 * fx  # The force acts at the floor, z0 below the wheel axes.
         d.qfrc_applied[:6] = [fx, fy, 0.0, c * mx + s * my, c * my - s * mx, moment]

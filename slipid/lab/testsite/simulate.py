@@ -31,7 +31,7 @@ from slipid.support.progress import Reporter
 
 
 def log_of(trace: Trace, site: Site, run: SiteRun, name: str, seed: int) -> Log:
-    """Return the log of a run: its trace as the site's sensors record it.
+    """Return the log of a run, with the errors of the site's sensors.
 
     Args:
         trace: true motion of the run.
@@ -95,7 +95,7 @@ def _camera(
     """Return the logged marker pose in each row, and True for rows that have a new frame."""
     s = site.sensors
     delay = s.lag_s - 0.5 * s.frame_s
-    first = -(s.lag_s + 3 * s.frame_s)  # so that the first row has a frame
+    first = -(s.lag_s + 3 * s.frame_s)  # The first row then has a frame.
     taken = np.arange(first, trace.time[-1] + s.frame_s, s.frame_s) + rng.uniform(0, s.frame_s)
     taken = taken[(rng.uniform(size=len(taken)) >= s.dropout) | (taken + delay <= 0.0)]
     poses = interpolate(trace.time, trace.pose, taken)
@@ -120,7 +120,7 @@ TRUTH_STEP = 10
 
 @dataclass(frozen=True, eq=False)
 class SiteTask:
-    """Task of driving and writing one run, which may run in a process of its own."""
+    """Task of driving and writing one run, which may run in another process."""
 
     name: str
     run: SiteRun
@@ -137,18 +137,19 @@ def simulate(plan: SimulationPlan, out: Path, executor: Executor, report: Report
     interrupted simulation.
 
     Raises:
-        DataError: MuJoCo is missing, or the folder holds runs of another config.
+        DataError: MuJoCo is missing, or the folder contains runs of another config.
     """
     version = engine().__version__
     manifest = out / MANIFEST
     about = {"schema": SCHEMA, "config_hash": plan.hash, "mujoco": version}
     if manifest.is_file():
-        before = read_json(manifest, "what slipid simulate wrote")
+        before = read_json(manifest, "a result of `slipid simulate`")
         before = before if isinstance(before, dict) else {}
         for key, what in (("config_hash", "config"), ("mujoco", "version of MuJoCo")):
             if before.get(key) != about[key]:
                 raise DataError(
-                    f"{out}: holds runs of another {what}; expected an empty folder or the same"
+                    f"{out}: contains runs with another {what}; expected an empty folder or the "
+                    f"same {what}"
                 )
     write_json(manifest, about)
     _write_truth(plan, out)
@@ -212,7 +213,7 @@ def drive_and_write(task: SiteTask) -> float:
     """Drive one run, write its logs and its truth, and return the simulated duration [s]."""
     try:
         trace = drive(task.run, task.site, task.seed)
-    except ValueError as error:  # the engine also raises it for a robot that it cannot build
+    except ValueError as error:  # The engine also raises this for a robot that it cannot build.
         raise DataError(f"{task.name}: {error}") from error
     site = task.site
     gear, ticks = site.robot.gear_ratio, site.motor.ticks_per_revolution
@@ -226,7 +227,7 @@ def drive_and_write(task: SiteTask) -> float:
 
 
 def _seed(seed: int, k: int) -> int:
-    """Return the seed of run `k`, which does not change when runs are added after it."""
+    """Return the seed of run `k`, which does not depend on later runs."""
     return int(np.random.SeedSequence(seed, spawn_key=(k,)).generate_state(1)[0])
 
 
@@ -267,7 +268,7 @@ def _write_truth(plan: SimulationPlan, out: Path) -> None:
         if all_filmed(plan):
             texts[out / "robot_video.toml"] = identify_config(plan, by_video=True)
         for path, text in texts.items():
-            if not path.is_file():  # an existing config is kept, since it may have been edited
+            if not path.is_file():  # An existing config is kept, since it may have been edited.
                 write_bytes(path, text.encode())
 
 

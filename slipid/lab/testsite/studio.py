@@ -187,7 +187,8 @@ def film(
         written = cv2.VideoCapture(str(unfinished)).get(cv2.CAP_PROP_FRAME_COUNT)
         if written != len(frames):
             raise DataError(
-                f"{path}: {written:.0f} of {len(frames)} frames written; is there room?"
+                f"{path}: only {written:.0f} of {len(frames)} frames were written; is the disk "
+                "full?"
             )
         os.replace(unfinished, path)
     finally:
@@ -208,14 +209,14 @@ def _drawing_modules() -> tuple[ModuleType, ModuleType]:
         raise DataError(
             f"the test site's camera needs {error.name}; expected: pip install 'slipid[testsite]'"
         ) from error
-    except AttributeError as error:  # PyOpenGL where libEGL is absent
+    except AttributeError as error:  # raised by PyOpenGL if libEGL is absent
         raise _drawing_error(error) from error
     return mujoco, cv2
 
 
 def _drawing_error(error: Exception) -> DataError:
     return DataError(
-        f"nothing can be drawn here ({error}); expected OpenGL without a screen: MUJOCO_GL=egl "
+        f"pictures cannot be drawn ({error}); expected OpenGL without a screen: MUJOCO_GL=egl "
         "and, on Debian and Ubuntu, apt-get install libegl1 libgl1-mesa-dri"
     )
 

@@ -1,4 +1,4 @@
-"""Physics of surfaces, and the floor as a roller meets it, with random unevenness and ribs."""
+"""Physics of surfaces, and contact parameters over the floor, with random unevenness and ribs."""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -16,9 +16,9 @@ GRAVITY = 9.81
 """Gravitational acceleration [m/s^2]."""
 LEVELS = 7
 """Number of levels to which the random unevenness of a floor is rounded."""
-ARENA = 1.6
+ARENA_HALF = 1.6
 """Half the edge length of the square around the start that represents a single surface [m]."""
-GRID = 0.005
+GRID_CELL = 0.005
 """Cell size of the floor's lookup grid, which is larger on very large floors [m]."""
 
 Pose = tuple[float, float, float]
@@ -91,7 +91,7 @@ class Terrain:
         self.kinds = [(g, np.exp(g.unevenness * v)) for g in own for v in levels]
         x0, y0, x1, y1 = arena(floor, start)
         self._corner = np.array([x0, y0])
-        self._cell = max(GRID, ((x1 - x0) * (y1 - y0) / MOST_CELLS) ** 0.5)
+        self._cell = max(GRID_CELL, ((x1 - x0) * (y1 - y0) / MOST_CELLS) ** 0.5)
         x = np.arange(x0, x1, self._cell) + 0.5 * self._cell
         y = np.arange(y0, y1, self._cell) + 0.5 * self._cell
         surface = floor.at(np.stack(np.meshgrid(x, y), -1))
@@ -131,7 +131,7 @@ def arena(floor: FloorMap, start: Pose) -> tuple[float, float, float, float]:
     if len(floor.surfaces) > 1:
         return floor.extent
     x, y, _ = start
-    return x - ARENA, y - ARENA, x + ARENA, y + ARENA
+    return x - ARENA_HALF, y - ARENA_HALF, x + ARENA_HALF, y + ARENA_HALF
 
 
 def ribs(

@@ -1,4 +1,4 @@
-"""Controllers of a trial, each a row of its table: slipid's own and published control laws."""
+"""Controllers of a trial, the rows of its table: those of slipid and published control laws."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -56,7 +56,7 @@ ROWS: Mapping[str, ControllerRow] = {
     **CONTROLLERS,
     "goswami_padhy": ControllerRow(
         "encoder",
-        "law of Goswami and Padhy, gains by a swarm",
+        "law of Goswami and Padhy, gains by particle swarm",
         law=lambda _: GoswamiPadhy(jnp.asarray(_tuned_gains("swarm"))),
     ),
     "goswami_padhy_gradient": ControllerRow(
@@ -65,7 +65,7 @@ ROWS: Mapping[str, ControllerRow] = {
         law=lambda _: GoswamiPadhy(jnp.asarray(_tuned_gains("gradient"))),
     ),
     "indiveri": ControllerRow(
-        "encoder", "law of Indiveri, its limit keeps the direction", law=_indiveri
+        "encoder", "law of Indiveri, with a limit that keeps the direction", law=_indiveri
     ),
 }
 """Controllers by name: those of slipid and of the 2021 paper, then the published laws."""
@@ -80,8 +80,8 @@ def applicable(names: Sequence[str], robot: DeployedRobot) -> tuple[str, ...]:
     kept = tuple(name for name in names if ROWS[name].drives(robot))
     if not kept:
         raise DataError(
-            f"{', '.join(names)}: for robots with {PAPER_WHEELS} wheels, as that of the 2021 "
-            f"paper; this one has {robot.wheels}, expected some of "
+            f"{', '.join(names)}: only for robots with {PAPER_WHEELS} wheels, like that of the "
+            f"2021 paper; this robot has {robot.wheels}; expected some of "
             f"{', '.join(name for name, row in ROWS.items() if row.drives(robot))}"
         )
     return kept
@@ -91,7 +91,7 @@ def check_gains(out: Path, robot: DeployedRobot) -> None:
     """Raise `DataError` if the robot's file, in `out`, has no tuned gains for its load set-up."""
     tuned, path = robot.record.gains, out / "robot.json"
     if tuned is None:
-        raise DataError(f"{path}: it has no tuned gains; leave out --tuned-gains")
+        raise DataError(f"{path}: no tuned gains; leave out --tuned-gains")
     if tuned.load != robot.load_setup:
         raise DataError(
             f"{path}: gains were tuned for another load set-up ({tuned.load}), not for "
@@ -100,7 +100,7 @@ def check_gains(out: Path, robot: DeployedRobot) -> None:
 
 
 def unused_gains(robot: DeployedRobot, forced: bool) -> str:
-    """Return a sentence on tuned gains of the robot file that are not used, and why not.
+    """Return a sentence about tuned gains of the robot file that are not used, with the reason.
 
     It is empty if all are used, or there are none. `forced` is the option --tuned-gains.
     """
@@ -112,12 +112,12 @@ def unused_gains(robot: DeployedRobot, forced: bool) -> str:
     if not (tuned.is_better or forced):
         return (
             f"tuned gains are {tuned.verdict} (loss {tuned.loss.tuned:.1f} mm, by hand "
-            f"{tuned.loss.hand:.1f} mm): driving with those set by hand; --tuned-gains takes the "
-            "others"
+            f"{tuned.loss.hand:.1f} mm): driving with those set by hand; use --tuned-gains for "
+            "the tuned ones"
         )
     if tuned.values.ahead.value == 0.0:
         return ""
     return (
-        f"tuned gain ahead = {tuned.values.ahead.value:g} is not taken: there are no wheel speeds "
-        "by the contact model any more"
+        f"tuned gain ahead = {tuned.values.ahead.value:g} is ignored: controllers no longer use "
+        "wheel speeds of the contact model"
     )

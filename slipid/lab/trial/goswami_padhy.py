@@ -101,7 +101,7 @@ def minimise(
     swarm: Swarm,
     seed: int = 0,
 ) -> SwarmResult:
-    """Return the best point that a swarm finds in a box; it only depends on the seed.
+    """Return the best point found by a swarm in a box; for equal seeds the results are equal.
 
     Args:
         cost: function to minimise.

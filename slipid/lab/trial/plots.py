@@ -16,7 +16,7 @@ from slipid.plots.drawing import INK, SHADE, figure, plain, save
 from slipid.support.content import Content
 
 Paths = Mapping[str, np.ndarray]
-TINTS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
+SURFACE_COLOURS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
 """Colours of surfaces, in the order of the map's surfaces."""
 OTHERS, MARKED = "#56B4E9", "#D55E00"
 ERRORS = {
@@ -61,7 +61,7 @@ def _verdict(content: Content) -> str:
     """Return a text that names the controller with the smallest closure error, if it is clear."""
     best = content["closes_best"]
     if best is None:
-        return f"{', '.join(content['not_told_apart'])} are not distinguished"
+        return f"{', '.join(content['not_told_apart'])} do not differ significantly"
     ratio = content["summary"][best].get("to_encoder", {}).get("closure_error_median", {})
     return f"{best} closes best" + (f", {100 * ratio['value']:.0f} % of encoders'" if ratio else "")
 
@@ -100,7 +100,7 @@ def _paths_panel(
     start = runs[one]["start"]
     places = start[:2] + np.stack(np.meshgrid(x, y), -1) @ _rotation(start[2]).T
     kinds = max(len(floor.surfaces), 2)
-    tints = ListedColormap(TINTS[:kinds])
+    tints = ListedColormap(SURFACE_COLOURS[:kinds])
     axes.pcolormesh(x, y, floor.at(places), cmap=tints, vmin=0, vmax=kinds - 1)
     for p in own:
         axes.plot(*p.T, color=OTHERS, lw=0.5, alpha=0.6)
@@ -121,14 +121,12 @@ def _legend(drawing: Figure, floor: FloorMap) -> None:
     """Add the legend of floor tints and lines."""
     patches = [
         Patch(facecolor=tint, edgecolor=SHADE, label=name)
-        for name, tint in zip(floor.surfaces, TINTS, strict=False)
+        for name, tint in zip(floor.surfaces, SURFACE_COLOURS, strict=False)
     ]
     lines = [
         Line2D([], [], color=INK, ls="--", lw=1.0, label="wanted"),
         Line2D([], [], color=OTHERS, lw=1.0, label="every start"),
-        Line2D(
-            [], [], color=MARKED, lw=1.8, marker="o", ms=5, label="the start typical of encoders"
-        ),
+        Line2D([], [], color=MARKED, lw=1.8, marker="o", ms=5, label="typical start of `encoder`"),
     ]
     drawing.legend(handles=[*patches, *lines], loc="outside lower center", ncols=8, fontsize=8)
 

@@ -243,7 +243,7 @@ def test_replicates_that_are_done_are_not_repeated(tested):
     assert "the same command continues from the last checkpoint" in stopped.stderr
     assert list(left) == ["replicates.json"]
     before = json.loads(left["replicates.json"])["content"]
-    assert "1 of 2 replicates are in" in again.stderr
+    assert "1 of 2 replicates are already in" in again.stderr
     after = json.loads((out / "replicates.json").read_text())["content"]
     assert (len(before), len(after)) == (1, 2)
     assert after[0] == before[0]

@@ -607,7 +607,7 @@ def test_gains_are_the_tuned_ones_where_there_are_any(tmp_path, deployed):
         DataError, match=r"another load set-up \(far\), not for as_built; leave out"
     ):
         check_gains(tmp_path, other)
-    with pytest.raises(DataError, match="it has no tuned gains; leave out --tuned-gains"):
+    with pytest.raises(DataError, match="no tuned gains; leave out --tuned-gains"):
         check_gains(tmp_path, deployed)
 
 
@@ -627,7 +627,7 @@ def test_a_file_with_a_removed_gain_drives_with_the_others_and_that_is_reported(
     gains = tuned_for("as_built", ahead=0.7)
     robot = DeployedRobot.of(replace(deployed.record, gains=gains))
     assert values(control_loop_of(robot, ROWS["contact"]).controller.gains) == TUNED
-    assert "tuned gain ahead = 0.7 is not taken" in unused_gains(robot, forced=False)
+    assert "tuned gain ahead = 0.7 is ignored" in unused_gains(robot, forced=False)
 
 
 def run_of(name, k, closure, finished=True):

@@ -12,9 +12,9 @@ the cell and rho a soft absolute value. Currents are correlated for seconds and 
 run. A cell of n rows therefore has a weight proportional to n / (1 + n / 20), and the weight of a
 whole run saturates above `RUN_ROWS` rows.
 
-Ammeters. The Husky's ammeters measure the current that a motor takes from the battery. Where the
-floor pushes a wheel, as on the inner side of a turn, the motor brakes and the ammeter reads zero.
-Within a row the current scatters, so the mean reading is that of a clipped normal variable,
+Ammeters. The Husky's ammeters measure the current that a motor takes from the battery. If the floor
+pushes a wheel, as on the inner side of a turn, the motor brakes and the ammeter shows zero. Within
+a row the current scatters, so the mean reading is that of a clipped normal variable,
 
     E[max(I + n, 0)] = I Phi(I / s) + s phi(I / s),   n ~ N(0, s^2)
 
@@ -46,10 +46,10 @@ START = np.log([0.6, 0.15, 0.08])
 CURRENT_A, YAW_RATE = 1.0, 0.2
 """Scales by which residuals of currents [A] and of the yaw rate [rad/s] are divided."""
 CELL_ROWS, RUN_ROWS = 20.0, 300.0
-"""Numbers of rows above which more rows hardly add weight: in one cell, and in one run."""
-CELLS = 512
+"""Numbers of rows, in one cell and in one run, above which more rows hardly add weight."""
+MOST_CELLS = 512
 """Largest number of cells of a floor; fewer are padded to it, so that one shape is compiled."""
-SAME_SPEED = 1e-3
+SPEED_STEP = 1e-3
 """Width to which wheel speeds are rounded; rows with equal rounded speeds are one cell [rad/s]."""
 
 
@@ -79,7 +79,7 @@ class Cells:
         take = run.moving & np.isfinite(run.current).all(axis=1)
         speed, amps = run.speed[take], run.current[take]
         gyro = np.full(len(speed), np.nan) if run.gyro is None else run.gyro[take]
-        same = np.round(speed / SAME_SPEED)
+        same = np.round(speed / SPEED_STEP)
         first, cell, count = np.unique(
             same, axis=0, return_index=True, return_inverse=True, return_counts=True
         )[1:]
@@ -143,7 +143,7 @@ def stiffness_of(runs: Sequence[FloorSignals]) -> Float[np.ndarray, " drive"]:
 def fitted_floors(robot: Robot, runs: Sequence[FloorSignals]) -> Robot:
     """Return the robot with the parameters of each floor fitted to the runs on it."""
     for number, floor in enumerate(robot.surfaces.labels):
-        cells = Cells.joined([run for run in runs if run.floor == floor]).thinned(CELLS)
+        cells = Cells.joined([run for run in runs if run.floor == floor]).thinned(MOST_CELLS)
         arrays = (cells.speed, cells.current, cells.gyro, cells.weight)
         index = jnp.asarray(number)
         given = (robot, index, *map(jnp.asarray, arrays))
@@ -164,12 +164,12 @@ def currents_off(
     speed: Float[np.ndarray, "row drive"],
     current: Float[np.ndarray, "row drive"],
 ) -> Float[np.ndarray, "row drive"]:
-    """Return the modelled less the measured current of each row and drive on a floor [A].
+    """Return modelled less measured current of each row and drive on a floor [A].
 
-    Rows are evaluated in groups of `CELLS`, the last padded, so that one shape is compiled.
+    Rows are evaluated in groups of `MOST_CELLS`, the last padded, so that one shape is compiled.
     """
-    groups = -(-len(speed) // CELLS)
-    padded = np.zeros((groups * CELLS, speed.shape[1]))
+    groups = -(-len(speed) // MOST_CELLS)
+    padded = np.zeros((groups * MOST_CELLS, speed.shape[1]))
     padded[: len(speed)] = speed
     parts = [_shown(robot, jnp.asarray(number), w)[0] for w in np.split(padded, groups)]
     return np.concatenate(parts)[: len(speed)] - current
@@ -218,8 +218,8 @@ def _residuals(
 _jacobian = jax.jit(jax.jacfwd(_residuals))
 
 
-TURNING = 0.2
-"""Scale of the wheel speed in tanh(speed / TURNING), the smooth sign of motion that friction and
+SIGN_SPEED = 0.2
+"""Scale of the wheel speed in tanh(speed / SIGN_SPEED), the smooth sign of motion that friction and
 readings follow, as in `slipid.model.motor` [rad/s]."""
 STEADY_A = 0.1
 """Standard deviation of the current of a wheel at rest [A]."""
@@ -246,7 +246,7 @@ class MeteredMotor(Motor):
         self, torque: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
     ) -> Float[Array, " *w"]:
         """Return the mean reading of each drive's ammeter [A] at a wheel torque [N m]."""
-        sign = jnp.tanh(wheel_speed / TURNING)
+        sign = jnp.tanh(wheel_speed / SIGN_SPEED)
         along = sign * super().current(torque, wheel_speed) + jnp.abs(sign) * self.stiffness
         return clipped(along, STEADY_A + jnp.abs(sign) * self.scatter)
 

@@ -11,11 +11,11 @@ gyro. Besides the parameters of the floors it is given
 
 At the first row of a run, the filter starts with the measured wheel speeds, not from rest.
 
-Parameters of floors, motors and scatters come from the training runs. `SETTINGS`, `BENDS`, the
-model of the ammeters and the weights in `slipid.lab.benchmark.floors.fitting` are not picked by an
-inner cross-validation, as settings of other rows are: they were set by hand after about a hundred
-variants were compared by their cross-validated accuracy on `borealtc`. The accuracy of slipid on
-`borealtc` is therefore optimistic, to the extent that this choice was tuned to these runs.
+Parameters of floors, motors and scatters come from the training runs. `SETTINGS`, `BEND_RATIOS`,
+the model of the ammeters and the weights in `slipid.lab.benchmark.floors.fitting` are not picked by
+an inner cross-validation, as settings of other rows are: they were set by hand after about a
+hundred variants were compared by their cross-validated accuracy on `borealtc`. The accuracy of
+slipid on `borealtc` is therefore optimistic, as far as this choice was tuned to these runs.
 """
 
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ HIGHEST_A, HIGHEST_SPEED = 100.0, 20.0
 
 
 def deployed(robot: Robot) -> DeployedRobot:
-    """Return the robot in its deployed form, with its parameters as they are.
+    """Return the robot in its deployed form, with unchanged parameters.
 
     Fields of the record that the floor filter does not use, such as the uncertainty and the ranges
     of a fit, are filled with values that have no effect.
@@ -79,7 +79,7 @@ def deployed(robot: Robot) -> DeployedRobot:
     return DeployedRobot.of(record)
 
 
-BENDS = (0.17, 0.45)
+BEND_RATIOS = (0.17, 0.45)
 """Smallest ratio L |W| / (|v| + L |W|) that counts as a bend, and as turning on the spot.
 
 v is the velocity [m/s], W the yaw rate [rad/s] of the rolling wheels, and L the base radius [m].
@@ -183,14 +183,14 @@ def kinds(run: FloorSignals, spec: RobotSpec) -> Int[np.ndarray, " row"]:
     """Return the kind of motion in each row: 0 straight, 1 in a bend, 2 on the spot."""
     x, y, yaw = run.rolling(spec).T
     turn = spec.base_radius * np.abs(yaw)
-    return np.digitize(turn / np.maximum(np.hypot(x, y) + turn, 1e-9), BENDS)
+    return np.digitize(turn / np.maximum(np.hypot(x, y) + turn, 1e-9), BEND_RATIOS)
 
 
 def _scatter(
     robot: Robot, runs: Sequence[FloorSignals], spec: RobotSpec
 ) -> Float[np.ndarray, "kind floor"]:
     """Return the std of current residuals in each kind of motion on every floor [A]."""
-    count = len(BENDS) + 1
+    count = len(BEND_RATIOS) + 1
     std = np.ones((count, len(robot.surfaces.labels)))
     for k, floor in enumerate(robot.surfaces.labels):
         speed, current, kind = [], [], []

@@ -57,8 +57,9 @@ from slipid.predict.slip_model import RobotSpec
 
 GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""
-SLOW = 0.02
-"""Speed u up to which a row is not used, since its direction of travel is undefined [m/s]."""
+LEAST_SPEED = 0.02
+"""Rows with a speed u up to this are not used, since their direction of travel is undefined
+[m/s]."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ class CosineEnergyClassifier(FloorClassifier):
     ) -> Float[np.ndarray, "row 2"]:
         """Return direction of travel [rad] and energy coefficient e of every row.
 
-        The coefficient, or its logarithm, is NaN in rows at or below the speed `SLOW`.
+        The coefficient, or its logarithm, is NaN in rows at or below the speed `LEAST_SPEED`.
         """
         window = TrailingWindow.of(run.time, self.window_s)
         x, y, yaw = (window.mean(column) for column in run.rolling(spec).T)
@@ -143,7 +144,7 @@ class CosineEnergyClassifier(FloorClassifier):
         amps, shaft = np.abs(run.current), np.abs(spec.gear_ratio * run.speed)
         heat = spec.resistance * self.losses * amps
         power = ((heat + spec.back_emf * shaft) * amps).sum(axis=1)
-        moving = speed > SLOW
+        moving = speed > LEAST_SPEED
         energy = window.mean(power) / (spec.mass * GRAVITY * np.where(moving, speed, np.nan))
         energy = np.log(np.maximum(energy, 1e-9)) if self.logarithm else energy
         return np.stack([np.arctan2(sideways, x), energy], axis=1)

@@ -1,7 +1,7 @@
 """Interface of floor classifiers: the signals that they use, and the beliefs that they return.
 
-A classifier is fitted to runs whose floor is known. It then goes through other runs row by row and
-gives the probability of every floor after each row, from that row and earlier ones alone.
+A classifier is fitted to runs whose floor is known. It then processes other runs row by row and
+returns the probability of every floor after each row, from that row and earlier ones only.
 
 Features of a row are causal: they are computed over trailing windows of fixed length in seconds,
 which end with the row itself:
@@ -32,7 +32,7 @@ FloorChannel = Literal["current", "gyro", "vibration"]
 """Optional channel of the features; wheel speeds are always used."""
 DEFAULT_CHANNELS: frozenset[FloorChannel] = frozenset({"current", "gyro"})
 """Channels that slipid uses too, besides the wheel speeds."""
-STILL = 0.3
+REST_SPEED = 0.3
 """Wheel speed up to which a wheel counts as at rest [rad/s]."""
 WINDOWS_S = (0.5, 1.0, 2.0)
 """Lengths of the feature windows [s]."""
@@ -74,7 +74,7 @@ class FloorSignals:
     @property
     def moving(self) -> Bool[np.ndarray, " row"]:
         """True in rows in which a wheel turns; at rest there is no evidence about the floor."""
-        return np.asarray(np.abs(self.speed).max(axis=1) > STILL)
+        return np.asarray(np.abs(self.speed).max(axis=1) > REST_SPEED)
 
     def rows(self, first: int, last: int) -> "FloorSignals":
         """Return the run's rows from `first` up to but not including `last`."""
@@ -110,14 +110,14 @@ class FloorClassifier(abc.ABC):
 
     Attributes:
         name: name of its row in the tables.
-        labels: floors that it was fitted to, in the order of its beliefs; empty before a fit.
+        labels: floors to which it was fitted, in the order of its beliefs; empty before a fit.
     """
 
     name: str
     labels: tuple[str, ...] = ()
 
     def candidates(self) -> Sequence["FloorClassifier"]:
-        """Return variants with different settings, of which cross-validation picks one."""
+        """Return variants with different settings, from which cross-validation selects one."""
         return (self,)
 
     @abc.abstractmethod
@@ -128,7 +128,8 @@ class FloorClassifier(abc.ABC):
     def probability(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> list[Beliefs]:
         """Return the probability of each floor after every row of every run.
 
-        Each run starts anew. The belief after a row depends on that row and earlier ones only.
+        Each run is processed separately. The belief after a row depends on that row and earlier
+        ones only.
         """
 
     @property
@@ -166,8 +167,8 @@ def accumulated(
     log p_t = exp(-dt / memory) log p_{t-1} + (dt / apart) log l_t + const,   p_0 uniform
 
     Rows are not independent: all rows within `apart_s` [s] together count as one observation.
-    Evidence fades with the time constant `memory_s` [s]. A row in which the robot stands, or whose
-    likelihood is not finite, does not change the belief.
+    Evidence fades with the time constant `memory_s` [s]. A row in which the robot is at rest, or
+    whose likelihood is not finite, does not change the belief.
     """
     used = run.moving & np.isfinite(log_likelihood).all(axis=1)
     evidence = np.where(used[:, None], log_likelihood, 0.0) * (run.dt / apart_s)[:, None]
@@ -189,7 +190,7 @@ def features(
 ) -> Features:
     """Return the features of every row from the rows up to it; NaN where a channel has no value.
 
-    After every `restart_s` [s], windows start anew without earlier rows, as at the start of a run.
+    After every `restart_s` [s], windows restart without earlier rows, as at the start of a run.
     """
     start = run.segment_start(restart_s)
     columns = [np.minimum(run.time - run.time[start], max(windows_s))]
@@ -212,10 +213,10 @@ def features(
 def yaw_rate_shortfall(
     gyro: Float[np.ndarray, " row"], rolling: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, " row"]:
-    """Return by how much the body turns less than the rolling wheels suggest [rad/s].
+    """Return the shortfall of the body's yaw rate from that of the rolling wheels [rad/s].
 
-    It is the difference of the yaw rates from encoders and gyro, positive where the body turns
-    less, whatever the sense of rotation.
+    It is the difference of the yaw rates from encoders and gyro, positive if the body turns less,
+    for both senses of rotation.
     """
     return np.asarray(np.where(rolling < 0, gyro - rolling, rolling - gyro))
 

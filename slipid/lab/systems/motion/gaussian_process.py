@@ -5,9 +5,10 @@
     var(x) = k(x, x) + noise - k(x, X) (K + noise I)^-1 k(X, x)
 
 X are the training inputs, y their outputs and K = k(X, X). All outputs share one kernel, each in
-units of its own standard deviation. Hyperparameters maximise the marginal likelihood of `TUNED`
-windows, in at most `ROUNDS` steps from one start point; the posterior is conditioned on `KEPT`
-windows. Windows are drawn in proportion to their weight, with a fixed seed.
+units of its own standard deviation. Hyperparameters maximise the marginal likelihood of
+`MOST_TUNING_WINDOWS` windows, in at most `MOST_STEPS` steps from one start point; the posterior is
+conditioned on `MOST_WINDOWS` windows. Windows are drawn in proportion to their weight, with a fixed
+seed.
 
 Source: Rasmussen, Williams 2006, Gaussian Processes for RobotSpec Learning, MIT Press, equations
 2.25, 2.26, 4.17 and 5.8.
@@ -27,19 +28,19 @@ if TYPE_CHECKING:
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import Kernel
 
-KEPT = 1000
+MOST_WINDOWS = 1000
 """Largest number of windows in the posterior."""
-TUNED = 150
+MOST_TUNING_WINDOWS = 150
 """Largest number of windows to which hyperparameters are fitted."""
-ROUNDS = 20
+MOST_STEPS = 20
 """Largest number of optimiser steps in the fit of hyperparameters."""
 SEED = 0
 
-LENGTHS = (0.1, 100.0)
+LENGTH_BOUNDS = (0.1, 100.0)
 """Bounds of the length scales, in units of the inputs."""
-VARIANCES = (1e-2, 1e2)
+VARIANCE_BOUNDS = (1e-2, 1e2)
 """Bounds of the variance of the process, relative to the variance of the outputs."""
-NOISES = (1e-4, 2.0)
+NOISE_BOUNDS = (1e-4, 2.0)
 """Bounds of the variance of the noise, relative to the variance of the outputs."""
 
 
@@ -52,8 +53,8 @@ def untuned_kernel(lengths: float | Float[np.ndarray, " input"], free: bool) -> 
     """
     from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
-    matern = Matern(lengths, LENGTHS if free else "fixed", nu=1.5)
-    return ConstantKernel(1.0, VARIANCES) * matern + WhiteKernel(0.1, NOISES)
+    matern = Matern(lengths, LENGTH_BOUNDS if free else "fixed", nu=1.5)
+    return ConstantKernel(1.0, VARIANCE_BOUNDS) * matern + WhiteKernel(0.1, NOISE_BOUNDS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,13 +90,13 @@ class ProcessRows:
         from sklearn.exceptions import ConvergenceWarning
 
         with warnings.catch_warnings():
-            # a length scale at its upper bound only means that its input is irrelevant
+            # A length scale at its upper bound only means that its input is irrelevant.
             warnings.simplefilter("ignore", ConvergenceWarning)
-            return self._fitted(kernel, TUNED, _few_steps).kernel_
+            return self._fitted(kernel, MOST_TUNING_WINDOWS, _few_steps).kernel_
 
     def process(self, kernel: "Kernel") -> "GaussianProcessRegressor":
-        """Return the posterior of the process given a random sample of at most `KEPT` rows."""
-        return self._fitted(kernel, KEPT, None)
+        """Return the posterior of the process given at most `MOST_WINDOWS` random rows."""
+        return self._fitted(kernel, MOST_WINDOWS, None)
 
     def _fitted(
         self, kernel: "Kernel", most: int, optimizer: Callable | None
@@ -116,13 +117,13 @@ def fitted_numbers(process: "GaussianProcessRegressor") -> int:
 def _few_steps(
     loss: Callable, start: Float[np.ndarray, " log"], bounds: Float[np.ndarray, "log 2"]
 ) -> tuple[Float[np.ndarray, " log"], float]:
-    """Return the minimiser and the loss after at most `ROUNDS` steps of L-BFGS-B.
+    """Return the minimiser and the loss after at most `MOST_STEPS` steps of L-BFGS-B.
 
     It is an optimiser in scikit-learn's form; the variables are logarithms of hyperparameters.
     """
     from scipy.optimize import minimize
 
     found = minimize(
-        loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ROUNDS}
+        loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": MOST_STEPS}
     )
     return found.x, float(found.fun)

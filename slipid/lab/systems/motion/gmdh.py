@@ -52,17 +52,17 @@ from slipid.lab.systems.motion.features import (
 from slipid.lab.systems.motion.polynomial_network import Growth, PolynomialNetwork, grown
 from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, RunSignals, SlipModel
 
-KEPT = 20
+KEPT_NEURONS = 20
 """Number of neurons of a layer whose outputs are the inputs of the next layer."""
 LOWEST_OUTPUT = 0.05
 """Lower limit of the classifier's output for a floor in one window, which may be negative."""
-MEMORY = 0.9
+EVIDENCE_DECAY = 0.9
 """Factor by which evidence about the floor fades from window to window."""
 CANDIDATES = (
-    Growth(1e-3, KEPT, 5),
-    Growth(1e-1, KEPT, 5),
-    Growth(1e-2, KEPT, 1),
-    Growth(1.0, KEPT, 1),
+    Growth(1e-3, KEPT_NEURONS, 5),
+    Growth(1e-1, KEPT_NEURONS, 5),
+    Growth(1e-2, KEPT_NEURONS, 1),
+    Growth(1.0, KEPT_NEURONS, 1),
 )
 SEED = 0
 
@@ -160,7 +160,7 @@ class GmdhClass(SlipModel):
     def fit(self, runs: Sequence[Run], spec: RobotSpec) -> "GmdhClass":
         data = SlipExamples.of(runs, spec)
         in_a = first_half(data.run, data.floor)
-        # a floor on which no wheel turned has no training windows
+        # A floor on which no wheel turned has no training windows.
         names = list(dict.fromkeys(data.floor.tolist()))
         on = np.stack([data.floor == name for name in names], axis=1)
         floors = {
@@ -180,7 +180,7 @@ class GmdhClass(SlipModel):
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if not self.floors:
-            raise ValueError(f"{self.name}: predict before fit")
+            raise ValueError(f"{self.name} was not fitted; expected a call of fit before predict")
         windows, names = SignalWindows.of(runs, spec), list(self.floors)
         inputs = windows.inputs(spec, self.channels)
         belief = self._belief(windows, inputs, runs)
@@ -208,7 +208,7 @@ class GmdhClass(SlipModel):
             return np.ones((len(inputs), 1))
         share = self.classifier.predict(inputs).clip(min=LOWEST_OUTPUT)
         evidence = np.log(share / share.sum(axis=1, keepdims=True))
-        # signals of a robot at rest carry no evidence about its floor
+        # Signals of a robot at rest contain no evidence about its floor.
         evidence[~windows.moving] = 0.0
         possible = np.array([[run.load in loads for loads in self.loads] for run in runs])
         possible |= ~possible.any(axis=1, keepdims=True)
@@ -248,5 +248,5 @@ def remembered(
     # the k-th windows of all runs are updated together
     for k in range(1, place.max(initial=0) + 1):
         here = np.flatnonzero(place == k)
-        total[here] += MEMORY * total[here - 1]
+        total[here] += EVIDENCE_DECAY * total[here - 1]
     return total

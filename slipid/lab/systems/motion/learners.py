@@ -12,7 +12,7 @@ the training inputs, the output is that at the edge of the range.
 Tuned: the learning rate and the number of leaves of each of the sixty trees.
 
 Liberties of the trees:
-    - They are not a published slip system, but the obvious first method for tabular data.
+    - They are not a published slip system, but a standard method for tabular data.
     - Each component has its own trees; there is no shrinkage but the rate, and no early stopping.
     - Windows are drawn at random in proportion to their weight and then have equal weights.
 
@@ -51,10 +51,10 @@ from slipid.lab.systems.motion.features import Inputs, LearnedSlip, Ratios, Scal
 if TYPE_CHECKING:
     from sklearn.neural_network import MLPRegressor
 
-FEWEST = 20
+LEAST_WINDOWS = 20
 """Smallest number of windows in a leaf, and of training windows for early stopping."""
 SEED = 0
-PASSES = 60
+MOST_PASSES = 60
 """Largest number of passes of the network's training through all windows."""
 PATIENCE = 6
 """Passes without improvement after which the network's training stops."""
@@ -93,7 +93,7 @@ class BoostedTrees(LearnedSlip):
             learning_rate=self.rate,
             max_iter=self.trees,
             max_leaf_nodes=self.leaves,
-            min_samples_leaf=FEWEST,
+            min_samples_leaf=LEAST_WINDOWS,
             early_stopping=False,
             random_state=SEED,
         )
@@ -103,7 +103,7 @@ class BoostedTrees(LearnedSlip):
     @property
     def numbers(self) -> int:
         """Largest possible number of leaf values and thresholds; small trees have fewer."""
-        leaves = min(self.leaves, max(1, self.windows // FEWEST))
+        leaves = min(self.leaves, max(1, self.windows // LEAST_WINDOWS))
         return 0 if self.regressor is None else 3 * self.trees * (2 * leaves - 1)
 
 
@@ -149,13 +149,13 @@ class NeuralNetwork(LearnedSlip):
             hidden_layer_sizes=self.hidden,
             alpha=self.alpha,
             learning_rate_init=5e-3,
-            max_iter=PASSES,
-            early_stopping=len(examples.inputs) >= FEWEST,
+            max_iter=MOST_PASSES,
+            early_stopping=len(examples.inputs) >= LEAST_WINDOWS,
             n_iter_no_change=PATIENCE,
             random_state=SEED,
         )
         with warnings.catch_warnings():
-            # the number of passes is limited on purpose, so reaching the limit needs no warning
+            # The number of passes is limited on purpose, so reaching the limit needs no warning.
             warnings.simplefilter("ignore", ConvergenceWarning)
             x, y = inputs.scaled(examples.inputs), outputs.scaled(examples.ratio)
             network.fit(x, y, sample_weight=examples.weight)

@@ -67,12 +67,12 @@ Line = Float[np.ndarray, "2"]
 Tuning = Literal["continuous", "sporadic", "gyro"]
 FORGETTING = 0.995
 """Factor by which the weight of a window falls with each later window."""
-SIGMAS = 3.0
+THRESHOLD_STDS = 3.0
 """Slip is flagged if the mean current exceeds the hard floor's mean by this many std of the latter.
 """
-MOVING = 0.02
+LEAST_RIM_SPEED = 0.02
 """Mean rim speed above which the robot counts as moving [m/s]."""
-PRIOR = 1e6
+PRIOR_VARIANCE = 1e6
 """Prior variance of k0 [m^2/s^2] and k1 [m^2/s^2/A^2], so large that it has hardly any effect."""
 
 
@@ -166,7 +166,7 @@ class Ojeda(SlipModel):
     def _hard(self, runs: Sequence[Run], spec: RobotSpec) -> HardFloor:
         steps = Steps.of([run.signals for run in runs])
         current = steps.smoothed(steps.signals.along(spec), self.time_constant).mean(axis=1)
-        moving = np.abs(steps.signals.speed).mean(axis=1) * spec.wheel_radius > MOVING
+        moving = np.abs(steps.signals.speed).mean(axis=1) * spec.wheel_radius > LEAST_RIM_SPEED
         used = current[moving] if moving.any() else current
         return HardFloor(float(used.mean()), max(float(used.std()), 1e-6))
 
@@ -176,7 +176,7 @@ class Ojeda(SlipModel):
         steps = Steps.of(runs)
         rim = steps.signals.speed * spec.wheel_radius
         current = steps.smoothed(steps.signals.along(spec), self.time_constant)
-        return FlaggedSteps(steps, rim, current, hard.sigmas(current) > SIGMAS)
+        return FlaggedSteps(steps, rim, current, hard.sigmas(current) > THRESHOLD_STDS)
 
     def _line(self, runs: Sequence[Run], hard: HardFloor, spec: RobotSpec) -> Line:
         """Return k0 [m/s] and k1 [m/s/A] fitted to runs; zeros if no slip was flagged."""
@@ -189,7 +189,7 @@ class Ojeda(SlipModel):
         if self.tuning == "continuous":
             parts, gap = w.rows(spec.back @ steps.features(), spec)
             used = parts.any(axis=(1, 2))
-            return forgetful(parts[used], gap[used], FORGETTING, PRIOR)
+            return forgetful(parts[used], gap[used], FORGETTING, PRIOR_VARIANCE)
         return by_gyro(steps, w, hard.mean, spec)
 
 
@@ -256,7 +256,7 @@ def by_gyro(steps: FlaggedSteps, w: TrainingWindows, middle: float, spec: RobotS
     """
     signals = steps.steps.signals
     if signals.gyro is None:
-        raise ValueError(f"{signals.name}: no gyro; this method needs one")
+        raise ValueError(f"{signals.name}: no gyro; expected one, which this method needs")
     parts = w.means(spec.back[2] @ steps.features(middle)) * w.dt[:, None]
     gap = w.means(signals.rolling(spec)[:, 2] - signals.gyro) * w.dt
     offset, gain = scaled_least_squares(parts, gap)

@@ -25,10 +25,10 @@ from jaxtyping import Bool, Float, Int
 
 POWERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [2, 0], [0, 2]])
 """Exponents of the first and the second input in a neuron's terms."""
-GAIN = 1e-3
-"""Smallest relative fall of the mean square error on B by a new layer; less may be chance."""
-NOTHING = 1e-12
-"""Mean square error on B up to which it counts as rounding error, for outputs of variance one."""
+LEAST_GAIN = 1e-3
+"""Smallest relative decrease of the mean square error on B by a new layer; less may be chance."""
+ROUNDING_ERROR = 1e-12
+"""A mean square error on B up to this is taken as rounding error, for outputs of variance one."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +112,16 @@ def grown(
     layers: list[Layer] = []
     errors: list[float] = []
     halves = (in_a, ~in_a) if 0 < in_a.sum() < len(in_a) else (np.ones_like(in_a),) * 2
-    while len(layers) < growth.layers and x.shape[1] > 1 and (not errors or errors[-1] > NOTHING):
+    while (
+        len(layers) < growth.layers
+        and x.shape[1] > 1
+        and (not errors or errors[-1] > ROUNDING_ERROR)
+    ):
         half_a, half_b = (PairMoments.of(x[half], y[half], weight[half]) for half in halves)
         neurons = half_a.solved(growth.ridge)
         error = half_b.errors(neurons.weight)
         best = np.argsort(error, kind="stable")[: growth.kept]
-        if errors and error[best[0]] >= (1 - GAIN) * errors[-1]:
+        if errors and error[best[0]] >= (1 - LEAST_GAIN) * errors[-1]:
             break
         layers.append(neurons.only(best))
         errors.append(float(error[best[0]]))

@@ -85,7 +85,7 @@ from slipid.predict.slip_model import (
 if TYPE_CHECKING:
     from sklearn.gaussian_process import GaussianProcessRegressor
 
-SLOW = 0.02
+LEAST_SPEED = 0.02
 """Lower limit of |v| in the energy per metre, which is proportional to power below it [m/s]."""
 
 
@@ -124,7 +124,7 @@ class QuannEnergy(SlipModel):
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.process is None or self.law is None or self.fastest is None:
-            raise ValueError(f"{self.name}: predict before fit")
+            raise ValueError(f"{self.name} was not fitted; expected a call of fit before predict")
         windows = SignalWindows.of(runs, spec)
         residual = self.process.predict(places(windows, spec))
         motion = np.minimum(motions(windows.rolling), self.fastest)
@@ -142,8 +142,8 @@ class QuannEnergy(SlipModel):
 
 
 def rate(twist: Twists) -> Float[np.ndarray, " row"]:
-    """Return the larger of |v| and `SLOW` in each row [m/s]."""
-    return motions(twist)[:, 0].clip(min=SLOW)
+    """Return the larger of |v| and `LEAST_SPEED` in each row [m/s]."""
+    return motions(twist)[:, 0].clip(min=LEAST_SPEED)
 
 
 def motions(twist: Twists) -> Float[np.ndarray, "row 2"]:
@@ -165,9 +165,9 @@ def places(windows: SignalWindows, spec: RobotSpec) -> Float[np.ndarray, "window
 
 PARTS = 4
 """Number of parts of the runs; to find the inflation, a fit to the others predicts each part."""
-START = 2.0
+START_LENGTH = 2.0
 """Initial length scale of every input, in standard deviations of the input."""
-CAMERA = 1e-3
+CAMERA_STD = 1e-3
 """Assumed standard deviation of a camera's position, whichever camera was used [m]."""
 SEED = 0
 
@@ -199,7 +199,7 @@ class QuannSlip(SlipModel):
         inputs = slip_inputs(examples.windows, spec)[examples.windows.moving]
         scale = Scale.of(inputs)
         rows = ProcessRows(scale.scaled(inputs), examples.ratio, examples.weight)
-        lengths = np.full(inputs.shape[1], START) if self.anisotropic else START
+        lengths = np.full(inputs.shape[1], START_LENGTH) if self.anisotropic else START_LENGTH
         kernel = rows.tuned(untuned_kernel(lengths, free=True))
         squares = []
         for part in parts(np.unique(examples.run)):
@@ -213,14 +213,14 @@ class QuannSlip(SlipModel):
 
     def predict(self, runs: Sequence[RunSignals], spec: RobotSpec) -> list[PredictedRun]:
         if self.process is None or self.scale is None:
-            raise ValueError(f"{self.name}: predict before fit")
+            raise ValueError(f"{self.name} was not fitted; expected a call of fit before predict")
         windows = SignalWindows.of(runs, spec)
         inputs = self.scale.scaled(slip_inputs(windows, spec))
         ratio, ratio_std = self.process.predict(inputs, return_std=True)
         predicted = with_slip(runs, windows, ratio, spec)
         std = at_steps(ratio_std * windows.size[:, None] / spec.size, windows, runs)
         return [
-            replace(of_run, end_covariance=self.inflation * spread + CAMERA**2 * np.eye(2))
+            replace(of_run, end_covariance=self.inflation * spread + CAMERA_STD**2 * np.eye(2))
             for of_run, run, of_step in zip(predicted, runs, std, strict=True)
             for spread in [end_spread(of_run.path, of_step, run.dt)]
         ]

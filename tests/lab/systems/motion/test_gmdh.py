@@ -8,7 +8,7 @@ import pytest
 
 from slipid.lab.systems.motion.gmdh import (
     CANDIDATES,
-    MEMORY,
+    EVIDENCE_DECAY,
     GmdhClass,
     GmdhOne,
     NetworkSet,
@@ -16,7 +16,7 @@ from slipid.lab.systems.motion.gmdh import (
     remembered,
 )
 from slipid.lab.systems.motion.polynomial_network import (
-    GAIN,
+    LEAST_GAIN,
     Growth,
     Layer,
     PairMoments,
@@ -95,7 +95,7 @@ def test_growth_ends_where_the_held_out_half_does_not_improve():
     network = grown(x, y, weight, in_a, growth)
     errors = np.array(network.errors)
     assert 1 < len(network.layers) < 9
-    assert (errors[1:] < (1 - GAIN) * errors[:-1]).all()
+    assert (errors[1:] < (1 - LEAST_GAIN) * errors[:-1]).all()
     assert errors[-1] == pytest.approx(
         np.average((network.output(x) - y)[~in_a] ** 2, weights=weight[~in_a])
     )
@@ -108,7 +108,7 @@ def test_growth_ends_where_the_held_out_half_does_not_improve():
         kept = layer.only(best).output(kept)
     half_a, half_b = (PairMoments.of(kept[h], y[h], weight[h]) for h in (in_a, ~in_a))
     following = half_b.errors(half_a.solved(growth.ridge).weight).min()
-    assert following >= (1 - GAIN) * errors[-1]
+    assert following >= (1 - LEAST_GAIN) * errors[-1]
 
 
 def test_a_pruned_network_has_the_same_output():
@@ -149,7 +149,13 @@ def test_halves_are_of_whole_runs_of_every_floor():
 def test_older_evidence_fades_and_no_run_remembers_another():
     run = np.array([0, 0, 0, 1, 1])
     got = remembered(np.array([[1.0], [1.0], [1.0], [5.0], [0.0]]), run)
-    expected = [1.0, 1.0 + MEMORY, 1.0 + MEMORY + MEMORY**2, 5.0, 5.0 * MEMORY]
+    expected = [
+        1.0,
+        1.0 + EVIDENCE_DECAY,
+        1.0 + EVIDENCE_DECAY + EVIDENCE_DECAY**2,
+        5.0,
+        5.0 * EVIDENCE_DECAY,
+    ]
     assert got[:, 0] == pytest.approx(expected)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from slipid.lab.systems.motion.features import SignalWindows
 from slipid.lab.systems.motion.gaussian_process import (
-    KEPT,
+    MOST_WINDOWS,
     ProcessRows,
     fitted_numbers,
     untuned_kernel,
@@ -82,8 +82,8 @@ def test_hyperparameters_make_what_is_known_most_likely():
 def test_rows_are_drawn_in_proportion_to_their_weight():
     many = rows(n=4000)
     weighted = replace(many, weight=np.where(many.x[:, 0] > 0, 3.0, 1.0))
-    drawn = weighted.drawn(KEPT)
-    assert len(drawn.x) == KEPT == len(np.unique(drawn.x, axis=0))
+    drawn = weighted.drawn(MOST_WINDOWS)
+    assert len(drawn.x) == MOST_WINDOWS == len(np.unique(drawn.x, axis=0))
     assert (drawn.x[:, 0] > 0).mean() == pytest.approx(0.75, abs=0.08)
     assert len(many.drawn(5000).x) == 4000
 
