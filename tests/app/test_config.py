@@ -144,7 +144,7 @@ def test_absent_and_unreadable_files(tmp_path):
     with pytest.raises(DataError, match=r"No such file.*expected a config"):
         read_config(tmp_path / "none.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DataError, match="no UTF-8 text"):
+    with pytest.raises(DataError, match="not UTF-8 text"):
         read_config(tmp_path / "binary.toml")
 
 

@@ -256,4 +256,4 @@ def test_the_reading_names_the_rows_that_are_ahead():
         "no significant difference to row0, row1, row2, row3 and 2 more"
     )
     behind = {"slipid": ends(0.1), "rival": ends(0.2, behind=MeanInterval(0.1, 0.08, 0.12))}
-    assert sentence("x", "sectors", behind).endswith("by 20.0 %, +10.0 points [+8.0, +12.0]")
+    assert sentence("x", "sectors", behind).endswith(" 20.0 %, +10.0 points [+8.0, +12.0]")
