@@ -11,7 +11,7 @@ from slipid.app.config import read_config
 from slipid.app.logs import layout_of
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task
 from slipid.data.align.clock import Clock
-from slipid.data.check.findings import Finding, worst_first, wrong
+from slipid.data.check.findings import Finding, worst_first
 from slipid.data.check.sanity import findings
 from slipid.data.log import Log
 from slipid.data.runs import Runs
@@ -37,16 +37,6 @@ def sanity(task: FitTask) -> tuple[Finding, ...]:
     if isinstance(task, ConfigFitTask):
         found += [*_missing_sizes(task), *_different_gears(task)]
     return worst_first(found)
-
-
-def refuse_if_wrong(found: Sequence[Finding]) -> None:
-    """Raise `DataError` with every finding of severity "wrong"."""
-    if bad := wrong(found):
-        listed = "\n".join(f"  {k}. {finding}" for k, finding in enumerate(bad, start=1))
-        raise DataError(
-            f"not fitted: logs and config do not go together\n{listed}\n"
-            "expected them put right, or --anyway to fit all the same"
-        )
 
 
 def _braking(task: FitTask) -> Iterator[Finding]:

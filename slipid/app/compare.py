@@ -72,23 +72,12 @@ def compare(
     surfaces = transfer(problem.windows, robot) if problem.windows.has_current else {}
     content: Content = {
         "schema": SCHEMA,
-        "questions": {
-            name: {
-                "folds": len(some),
-                "converged": all(fold["converged"] for fold in some),
-                "floors": {
-                    floor: asdict(one)
-                    for floor, one in ranking([ScoredRun.of_json(r) for r in _rows(some)]).items()
-                },
-                "cost": _cost(some),
-            }
-            for name, some in results.items()
-        },
+        "questions": {name: _answer(folds) for name, folds in results.items()},
         "surfaces": surfaces,
         "data": {"hash": task.data_hash, "runs": len(task.dataset), "skipped": list(task.skipped)},
         "config": {"name": config.path.name, "sha256": config.hash},
         "versions": versions(),
-        "runs": {name: _rows(some) for name, some in results.items()},
+        "runs": {name: _rows(folds) for name, folds in results.items()},
     }
     report.stage("writing")
     write_json(out / "comparison.json", content)
@@ -97,6 +86,17 @@ def compare(
 
 def _rows(folds: Sequence[Content]) -> list[Content]:
     return [row for fold in folds for row in fold["rows"]]
+
+
+def _answer(folds: Sequence[Content]) -> Content:
+    """Return the ranking on each floor under one kind of held-out runs, and what it cost."""
+    floors = ranking([ScoredRun.of_json(row) for row in _rows(folds)])
+    return {
+        "folds": len(folds),
+        "converged": all(fold["converged"] for fold in folds),
+        "floors": {floor: asdict(one) for floor, one in floors.items()},
+        "cost": _cost(folds),
+    }
 
 
 def _cost(folds: Sequence[Content]) -> Content:

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from slipid.app.bench_priors import COPY_NAME
-from slipid.app.check import refuse_if_wrong, sanity
+from slipid.app.check import sanity
 from slipid.app.config import read_config
 from slipid.app.logs import write_run_file
 from slipid.app.problem import ConfigFitTask, FitTask, read_fit_task, with_mixed
 from slipid.app.trust import trust_report
+from slipid.data.check.findings import wrong
 from slipid.fitting.multi_floor import multi_floor_runs
 from slipid.fitting.multi_floor_fit import fit_multi_floor
 from slipid.fitting.optimise import Optimum, optimise
@@ -141,10 +142,14 @@ def _replaced_fit(out: Path, task: ConfigFitTask) -> str | None:
 def _check_sanity(task: ConfigFitTask, report: Reporter, anyway: bool) -> None:
     """Report the findings of the sanity check; raise `DataError` for wrong ones unless `anyway`."""
     report.stage("do logs and config go together?")
-    result = sanity(task)
-    if not anyway:
-        refuse_if_wrong(result)
-    for finding in result:
+    found = sanity(task)
+    if (bad := wrong(found)) and not anyway:
+        listed = "\n".join(f"  {k}. {finding}" for k, finding in enumerate(bad, start=1))
+        raise DataError(
+            f"not fitted: logs and config do not go together\n{listed}\n"
+            "expected them put right, or --anyway to fit all the same"
+        )
+    for finding in found:
         if finding.severity != "note":
             report.line(f"{finding.severity}: {finding}")
 
@@ -155,12 +160,7 @@ def _write_run(task: ConfigFitTask, trust: Trust, data: Path, out: Path, seconds
     if (bench := config.content.wheels.motor) is not None:
         write_json(out / COPY_NAME, read_json(config.path.parent / bench, "the numbers of a motor"))
     logs = {log.name: log.sha256 for log in task.logs}
-    inputs = {
-        "folder": str(data),
-        "hash": task.data_hash,
-        "logs": logs,
-        "skipped": task.skipped,
-    }
+    inputs = {"folder": str(data), "hash": task.data_hash, "logs": logs, "skipped": task.skipped}
     verdict = {"trust": trust.to_json(), "seed": task.settings.seed}
     write_run_file(out, config, inputs, seconds, verdict)
 
@@ -271,12 +271,11 @@ def _with_mixed_runs(
     result = fit_multi_floor(problem, optimum, mixed, tell, limits.rounds, limits.tolerance)
     new = summarise(result.problem, result.optimum, task.dataset, task.choices, task.settings.seed)
     floors = floor_errors(fit.contact, new.contact, task.dataset)
-    after = result.after and result.after._asdict()
     about: dict[str, Any] = {
         "runs": len(mixed.runs),
         "windows": int(mixed.counts.sum()),
         "before": result.before._asdict(),
-        "after": after,
+        "after": result.after and result.after._asdict(),
         "learnt": result.learnt._asdict(),
         "as_if": {name: e._asdict() for name, e in result.as_if.items()},
         "floors": {name: asdict(e) for name, e in floors.items()},

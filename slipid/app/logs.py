@@ -52,8 +52,7 @@ def read_dataset(
                     raise DataError(
                         f"{log.name}: found by two globs of {config.path}; expected it once"
                     )
-                named = section.session_name
-                sessions[log.name] = named or session_of(log, section.session)
+                sessions[log.name] = section.session_name or session_of(log, section.session)
                 logs.append(log)
             done += 1
             report.advance(done, count)

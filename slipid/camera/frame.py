@@ -1,6 +1,5 @@
 """Video frames with their pixels and times, and the interface of sources that supply them."""
 
-import csv
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
@@ -11,16 +10,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.opencv import Grey, opencv
+from slipid.camera.csv_rows import csv_rows
+from slipid.camera.opencv import Grey, cv2
 from slipid.support.errors import DataError, bad_data
 
-LOST = 0.02
+LOST_SHARE = 0.02
 """Share of the announced frames that a file may lack, since some formats only estimate their
 number [1]."""
-UNEVEN = 0.2
+UNEVEN_RATE = 0.2
 """Largest relative difference of an interval between frames from the median interval for which the
 frame rate still counts as even [1]."""
-DEPTH = 8
+READ_AHEAD = 8
 """Number of frames that are decoded in advance."""
 
 
@@ -68,7 +68,7 @@ def cut_off(source: FrameSource, count: int) -> str | None:
         return None
     if source.exact:
         return f"{source.name}: {count} frames, but {source.count} times; expected a time for each"
-    if count >= (1 - LOST) * source.count - 1:
+    if count >= (1 - LOST_SHARE) * source.count - 1:
         return None
     return (
         f"{source.name}: ends after frame {count} of {source.count}; the file was cut off or is "
@@ -86,7 +86,6 @@ def grey_of(picture: np.ndarray) -> Grey:
     """Return the grey levels of a picture, which may be in blue, green, red or already grey."""
     if picture.ndim == 2 or picture.shape[2] == 1:
         return np.asarray(picture).reshape(picture.shape[:2])
-    cv2 = opencv()
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
 
 
@@ -97,17 +96,11 @@ def read_times(path: Path) -> Float[np.ndarray, " frame"]:
         DataError: the file is unreadable or has other columns, frames are missing, or times do not
             increase.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; expected times of frames") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path}: no CSV text; expected the columns frame, time") from error
-    if not rows or [cell.strip() for cell in rows[0][:2]] != ["frame", "time"]:
+    rows = csv_rows(path, "times of frames, in the columns frame, time [s]")
+    if not rows or rows[0][1][:2] != ["frame", "time"]:
         raise bad_data(path, "other columns", "the columns frame, time [s]", row=1)
     times: list[float] = []
-    for line, row in enumerate(rows[1:], 2):
+    for line, row in rows[1:]:
         try:
             number, at = int(row[0]), float(row[1])
         except (ValueError, IndexError):
@@ -137,7 +130,7 @@ def uneven(times: Sequence[float] | Float[np.ndarray, " frame"]) -> str | None:
     if len(steps) < 2:
         return None
     usual, least, most = np.median(steps), steps.min(), steps.max()
-    if most <= (1 + UNEVEN) * usual and least >= (1 - UNEVEN) * usual:
+    if most <= (1 + UNEVEN_RATE) * usual and least >= (1 - UNEVEN_RATE) * usual:
         return None
     return (
         f"frames come every {1e3 * least:.0f} to {1e3 * most:.0f} ms, mostly {1e3 * usual:.0f}: a "
@@ -152,7 +145,7 @@ def read_ahead(frames: Iterator[Frame]) -> Generator[Frame]:
     is closed.
     """
     with ThreadPoolExecutor(1) as thread:
-        decoded = deque(thread.submit(next, frames, None) for _ in range(DEPTH))
+        decoded = deque(thread.submit(next, frames, None) for _ in range(READ_AHEAD))
         try:
             while (frame := decoded.popleft().result()) is not None:
                 decoded.append(thread.submit(next, frames, None))

@@ -11,12 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.camera.frame import Frame, FrameSource, even_times, grey_of, read_times, stamp
-from slipid.camera.opencv import opencv, read_picture, size_of
+from slipid.camera.opencv import cv2, is_picture, pictures_in, read_picture, size_of
 from slipid.support.errors import DataError
 
-BROKEN = 25
+MOST_BROKEN = 25
 """Number of consecutive frames that cannot be decoded after which a video counts as ended."""
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 MEDIAN_FRAMES = 25
 """Approximate number of frames of a video whose median is its still picture."""
 Times = Float[np.ndarray, " frame"]
@@ -31,7 +30,6 @@ class Capture:
     """
 
     def __init__(self, place: str):
-        cv2 = opencv()
         self._capture = cv2.VideoCapture(int(place) if place.isdigit() else place)
         if not self._capture.isOpened():
             raise DataError(
@@ -44,7 +42,7 @@ class Capture:
 
         Without `decode` the frame is skipped, and an empty array is returned.
         """
-        for _ in range(BROKEN):
+        for _ in range(MOST_BROKEN):
             if not self._capture.grab():
                 continue
             if not decode:
@@ -91,7 +89,7 @@ class Video(FrameSource):
                     f"{path}: no frame that OpenCV can decode; expected a video (a file that was "
                     "cut off, as by a full disk, may have lost its index)"
                 )
-            announced = capture.value(opencv().CAP_PROP_FRAME_COUNT)
+            announced = capture.value(cv2.CAP_PROP_FRAME_COUNT)
         count = int(announced) if 0 < announced < 1e9 else None
         if times is not None:
             count = len(times)
@@ -125,7 +123,7 @@ class Video(FrameSource):
         if self.fps is not None:
             return k / self.fps
         if self.times is None:
-            return capture.value(opencv().CAP_PROP_POS_MSEC) / 1000.0
+            return capture.value(cv2.CAP_PROP_POS_MSEC) / 1000.0
         if k >= len(self.times):
             raise DataError(
                 f"{self.name}: more than the {len(self.times)} frames that have a time; expected "
@@ -190,9 +188,7 @@ class PictureFolder(FrameSource):
         Raises:
             DataError: there is no picture, or the numbers of pictures and times differ.
         """
-        paths = sorted(p for p in folder.iterdir() if is_picture(p))
-        if not paths:
-            raise DataError(f"{folder}: no picture; expected {', '.join(PICTURES)}")
+        paths = pictures_in(folder)
         if times is None:
             if fps is None:
                 raise DataError(f"{folder}: pictures have no times; expected --fps or --times FILE")
@@ -267,11 +263,6 @@ def open_source(
     return Video.at(path, fps, given)
 
 
-def is_picture(path: Path) -> bool:
-    """Return whether a file is a picture, judged by its suffix."""
-    return path.suffix.lower() in PICTURES
-
-
 def still(path: Path) -> np.ndarray:
     """Return a picture, or the median of a video's frames, as rows, columns and blue, green, red.
 
@@ -284,7 +275,7 @@ def still(path: Path) -> np.ndarray:
     if is_picture(path) or not path.is_file() or not path.stat().st_size:
         return read_picture(path)
     with closing(Capture(str(path))) as capture:
-        count = int(capture.value(opencv().CAP_PROP_FRAME_COUNT))
+        count = int(capture.value(cv2.CAP_PROP_FRAME_COUNT))
         every, kept = max(1, count // MEDIAN_FRAMES), []
         for k in numbers():
             chosen = k % every == 0

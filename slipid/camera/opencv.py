@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -13,7 +12,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from slipid.support.errors import DataError, did_you_mean
 
-NEARLY = 0.8
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+"""Suffixes by which pictures are recognised; a picture of a board may have any."""
+NEARLY_MOST = 0.8
 """Share of the largest number of detected markers from which on a smaller dictionary is preferred
 [1]."""
 Mask = Bool[np.ndarray, "row column"]
@@ -25,7 +26,7 @@ Grey = UInt8[np.ndarray, "row column"]
 
 
 @cache
-def opencv() -> ModuleType:
+def _opencv() -> ModuleType:
     """Return the module cv2, with OpenCV's own messages about unreadable files switched off.
 
     Raises:
@@ -49,11 +50,21 @@ def opencv() -> ModuleType:
     return cv2
 
 
+class _LoadedOnUse:
+    """The module cv2, loaded when one of its attributes is first used; see `_opencv`."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(_opencv(), name)
+
+
+cv2: Any = _LoadedOnUse()
+
+
 def dictionary_names() -> list[str]:
     """Return the names of OpenCV's marker dictionaries, such as `4X4_50`."""
     prefix = "DICT_"
-    aruco = opencv().aruco
-    return sorted(name.removeprefix(prefix) for name in dir(aruco) if name.startswith(prefix))
+    names = dir(cv2.aruco)
+    return sorted(name.removeprefix(prefix) for name in names if name.startswith(prefix))
 
 
 def marker_dictionary(name: str) -> Any:
@@ -67,8 +78,7 @@ def marker_dictionary(name: str) -> Any:
     if short not in names:
         hint = did_you_mean(short, names)
         raise DataError(f"no marker dictionary '{name}'{hint}; expected one of {', '.join(names)}")
-    aruco = opencv().aruco
-    return aruco.getPredefinedDictionary(getattr(aruco, f"DICT_{short}"))
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{short}"))
 
 
 def marker_count(dictionary: str) -> int:
@@ -76,28 +86,32 @@ def marker_count(dictionary: str) -> int:
     return len(marker_dictionary(dictionary).bytesList)
 
 
-@dataclass(frozen=True)
-class VisibleMarkers:
-    """Numbers of the markers detected in pictures, and the name of their dictionary."""
-
-    dictionary: str
-    numbers: list[int]
-
-
-def visible_markers(pictures: Sequence[np.ndarray]) -> VisibleMarkers:
-    """Return the markers in pictures, whatever their dictionary.
+def visible_markers(pictures: Sequence[np.ndarray]) -> tuple[str, list[int]]:
+    """Return the dictionary of the markers in pictures, whatever it is, and the markers' numbers.
 
     Of the dictionaries with nearly the most detected markers, the smallest one is chosen.
     """
-    aruco, numbers = opencv().aruco, dict[str, set[int]]()
+    numbers: dict[str, set[int]] = {}
     for name in dictionary_names():
-        detector = aruco.ArucoDetector(marker_dictionary(name))
+        detector = cv2.aruco.ArucoDetector(marker_dictionary(name))
         ids = [detector.detectMarkers(np.ascontiguousarray(one))[1] for one in pictures if one.size]
         numbers[name] = {int(n) for one in ids if one is not None for n in np.ravel(one)}
     # a large dictionary contains smaller ones, and detects a few more markers by chance
     most = max(map(len, numbers.values()))
-    best = min((n for n in numbers if len(numbers[n]) >= NEARLY * most), key=marker_count)
-    return VisibleMarkers(best, sorted(numbers[best]))
+    best = min((n for n in numbers if len(numbers[n]) >= NEARLY_MOST * most), key=marker_count)
+    return best, sorted(numbers[best])
+
+
+def is_picture(path: Path) -> bool:
+    """Return whether a file is a picture, judged by its suffix."""
+    return path.suffix.lower() in SUFFIXES
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """Return the pictures in a folder by name; raise `DataError` if there is none."""
+    if paths := sorted(filter(is_picture, folder.iterdir())):
+        return paths
+    raise DataError(f"{folder}: no picture; expected {', '.join(SUFFIXES)}")
 
 
 def read_picture(path: Path) -> np.ndarray:
@@ -112,7 +126,6 @@ def read_picture(path: Path) -> np.ndarray:
         raise DataError(f"{path}: {error.strerror}; expected a picture") from error
     if not data:
         raise DataError(f"{path}: the file is empty; expected a picture (PNG, JPEG, ...)")
-    cv2 = opencv()
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error:  # OpenCV raises this for too large pictures
@@ -136,7 +149,6 @@ def ideal_points(
 
     The distortion is inverted by iteration to convergence.
     """
-    cv2 = opencv()
     until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
     iterated = getattr(cv2, "undistortPointsIter", None)
     if iterated is not None:  # OpenCV 4

@@ -14,9 +14,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, FiniteFloat
+from pydantic import Field, FiniteFloat, model_validator
 
-from slipid.camera.opencv import ideal_points, opencv
+from slipid.camera.opencv import cv2, ideal_points
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.files import read_json, write_json
@@ -126,7 +126,6 @@ class OverheadCamera:
 
     def pixels(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """Return the pixels at which places in the world [m] appear."""
-        cv2 = opencv()
         flat = np.ascontiguousarray(points, float).reshape(-1, 1, 3)
         shape = (*np.shape(points)[:-1], 2)
         if not len(flat):
@@ -177,32 +176,8 @@ class OverheadCamera:
         return read_camera(Path(path)).above_floor(path)
 
 
-@dataclass(frozen=True, eq=False)
-class CameraFile:
-    """Content of a camera file.
-
-    Attributes:
-        lens: the lens.
-        camera: the lens at its place above the floor; None if the file contains the lens alone.
-        report: report of the calibration.
-    """
-
-    lens: Lens
-    camera: OverheadCamera | None
-    report: Content
-
-    def above_floor(self, path: Path | str) -> OverheadCamera:
-        """Return the camera; raise `DataError` if the file `path` contains the lens alone."""
-        if self.camera is None:
-            raise DataError(
-                f"{path}: a lens without a floor; expected one with rotation_from_world and "
-                "place_m: `slipid calibrate --camera FILE --floor PICTURE` adds them"
-            )
-        return self.camera
-
-
-class _CameraSection(Section):
-    """Keys of a camera file."""
+class CameraFile(Section):
+    """Content of a camera file: a lens, and its place above the floor if that is known."""
 
     schema_: Literal["slipid.camera/1"] = Field(alias="schema")
     image_px: tuple[Pixels, Pixels]
@@ -214,6 +189,44 @@ class _CameraSection(Section):
     scale_std: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     report: Content = Field(default_factory=dict)
 
+    @model_validator(mode="after")
+    def _possible(self) -> "CameraFile":
+        """Raise `ValueError` for values that no camera can have."""
+        (fx, _, _), (_, fy, _), last = self.matrix
+        if not (fx > 0 and fy > 0 and last == [0, 0, 1]):
+            raise ValueError(f"matrix {self.matrix}; expected [[f, 0, x], [0, f, y], [0, 0, 1]]")
+        if (count := len(self.distortion)) not in (0, 4, 5, 8, 12, 14):
+            raise ValueError(f"{count} numbers of distortion; expected 4, 5, 8, 12 or 14")
+        if self.rotation_from_world is None or self.place_m is None:
+            return self
+        rotation, height = np.array(self.rotation_from_world), self.place_m[2]
+        right_handed = np.linalg.det(rotation) > 0
+        if not (right_handed and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)):
+            raise ValueError("rotation_from_world is not a rotation")
+        if not (height > 0 and rotation[2, 2] < 0):
+            raise ValueError(
+                f"the camera is {height:g} m high and "
+                f"{'looks up' if rotation[2, 2] >= 0 else 'looks down'}; expected it above the "
+                "floor (z up), looking down"
+            )
+        return self
+
+    @property
+    def lens(self) -> Lens:
+        """The lens."""
+        distortion = np.array(self.distortion or [0.0] * 4)
+        return Lens(self.image_px, np.array(self.matrix), distortion)
+
+    def above_floor(self, path: Path | str) -> OverheadCamera:
+        """Return the camera; raise `DataError` if the file `path` contains the lens alone."""
+        if self.rotation_from_world is None or self.place_m is None:
+            raise DataError(
+                f"{path}: a lens without a floor; expected one with rotation_from_world and "
+                "place_m: `slipid calibrate --camera FILE --floor PICTURE` adds them"
+            )
+        rotation, place = np.array(self.rotation_from_world), np.array(self.place_m)
+        return OverheadCamera(self.lens, rotation, place, self.scale_std, self.report)
+
 
 def read_camera(path: Path) -> CameraFile:
     """Return the checked content of a camera file.
@@ -222,28 +235,4 @@ def read_camera(path: Path) -> CameraFile:
         DataError: the file is absent, is not a camera file, or has values that no camera can have.
     """
     expected = "a camera file (slipid.camera/1) that `slipid calibrate` wrote"
-    given = checked(path, read_json(path, expected), _CameraSection)
-    matrix = np.array(given.matrix)
-    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and (matrix[2] == [0, 0, 1]).all()):
-        raise DataError(
-            f"{path}: matrix {given.matrix}; expected [[f, 0, x], [0, f, y], [0, 0, 1]]"
-        )
-    count = len(given.distortion)
-    if count not in (0, 4, 5, 8, 12, 14):
-        raise DataError(f"{path}: {count} numbers of distortion; expected 4, 5, 8, 12 or 14")
-    lens = Lens(given.image_px, matrix, np.array(given.distortion or [0.0] * 4))
-    if given.rotation_from_world is None or given.place_m is None:
-        return CameraFile(lens, None, given.report)
-    rotation, place = np.array(given.rotation_from_world), np.array(given.place_m)
-    if not (
-        np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
-    ):
-        raise DataError(f"{path}: rotation_from_world is not a rotation")
-    if not (place[2] > 0 and rotation[2, 2] < 0):
-        raise DataError(
-            f"{path}: the camera is {place[2]:g} m high and "
-            f"{'looks up' if rotation[2, 2] >= 0 else 'looks down'}; expected it above the floor "
-            "(z up), looking down"
-        )
-    camera = OverheadCamera(lens, rotation, place, given.scale_std, given.report)
-    return CameraFile(lens, camera, given.report)
+    return checked(path, read_json(path, expected), CameraFile)

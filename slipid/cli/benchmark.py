@@ -3,25 +3,17 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from slipid.cli.common import Jobs, Json, Out, Quiet, emit, executor_of, guarded
+from slipid.cli.common import Jobs, Json, Out, Quiet, emit, executor_of, flag, guarded, option
 from slipid.support.progress import Reporter
 
 
 @guarded
 def benchmark(
-    data: Annotated[
-        Path, typer.Option("--data", metavar="DIR", help="Folder of the public data sets.")
-    ],
+    data: Annotated[Path, option("DIR", "Folder of the public data sets.")],
     out: Out = Path("out/benchmark"),
-    quick: Annotated[
-        bool,
-        typer.Option("--quick", help="Use some of the runs and a single fold only."),
-    ] = False,
+    quick: Annotated[bool, flag("--quick", "Use some of the runs and a single fold only.")] = False,
     rows: Annotated[
-        str | None,
-        typer.Option(metavar="NAMES", help="Methods to run, separated by commas; all by default."),
+        str | None, option("NAMES", "Methods to run, separated by commas; all by default.")
     ] = None,
     jobs: Jobs = None,
     json: Json = None,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, Quiet, emit, guarded
+from slipid.cli.common import Json, Quiet, emit, flag, guarded, option
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -29,77 +29,50 @@ def calibrate(
             metavar="PICTURE...", help="Pictures of a ChArUco board: files, folders or globs."
         ),
     ] = None,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="Camera file to write.")
-    ] = Path("camera.json"),
+    out: Annotated[Path, option("FILE", "Camera file to write.")] = Path("camera.json"),
     board: Annotated[
-        str | None,
-        typer.Option(metavar="7x5", help="Number of squares of the ChArUco board along x and y."),
+        str | None, option("7x5", "Number of squares of the ChArUco board along x and y.")
     ] = None,
-    square: Annotated[
-        float | None, typer.Option(metavar="M", help="Edge length of a square, in m.")
-    ] = None,
-    marker: Annotated[
-        float | None, typer.Option(metavar="M", help="Edge length of a marker, in m.")
-    ] = None,
+    square: Annotated[float | None, option("M", "Edge length of a square, in m.")] = None,
+    marker: Annotated[float | None, option("M", "Edge length of a marker, in m.")] = None,
     dictionary: Annotated[
-        str, typer.Option(metavar="NAME", help="Name of the dictionary of the board's markers.")
+        str, option("NAME", "Name of the dictionary of the board's markers.")
     ] = "4X4_50",
     legacy: Annotated[
-        bool,
-        typer.Option("--legacy", help="The board was drawn by a version of OpenCV before 4.6."),
+        bool, flag("--legacy", "The board was drawn by a version of OpenCV before 4.6.")
     ] = False,
     k3: Annotated[
         bool,
-        typer.Option(
-            "--k3",
-            help="Also fit the distortion term k3, for wide-angle lenses with a large error.",
-        ),
+        flag("--k3", "Also fit the distortion term k3, for wide-angle lenses with a large error."),
     ] = False,
     camera: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Camera file with a calibrated lens, instead of pictures."
-        ),
+        Path | None, option("FILE", "Camera file with a calibrated lens, instead of pictures.")
     ] = None,
     floor: Annotated[
-        Path | None,
-        typer.Option(metavar="PICTURE", help="Picture in which the board lies on the floor."),
+        Path | None, option("PICTURE", "Picture in which the board lies on the floor.")
     ] = None,
     board_height: Annotated[
-        float,
-        typer.Option(metavar="M", help="Height of the board's printed face above the floor, in m."),
+        float, option("M", "Height of the board's printed face above the floor, in m.")
     ] = 0.0,
     points: Annotated[
         Path | None,
-        typer.Option(
-            metavar="CSV", help="CSV of measured points: u, v [pixel], x, y and optionally z [m]."
-        ),
+        option("CSV", "CSV of measured points: u, v [pixel], x, y and optionally z [m]."),
     ] = None,
     size_std: Annotated[
         float | None,
-        typer.Option(
-            metavar="PART",
-            help="Relative standard deviation of the measured lengths; 0.001 by default.",
-        ),
+        option("PART", "Relative standard deviation of the measured lengths; 0.001 by default."),
     ] = None,
     metres_per_pixel: Annotated[
         float | None,
-        typer.Option(
-            metavar="M", help="Length of a pixel on the floor, in m, if nothing was calibrated."
-        ),
+        option("M", "Length of a pixel on the floor, in m, if nothing was calibrated."),
     ] = None,
     lens_height: Annotated[
         float | None,
-        typer.Option(
-            metavar="M", help="Height of the lens above the floor, in m; with --metres-per-pixel."
-        ),
+        option("M", "Height of the lens above the floor, in m; with --metres-per-pixel."),
     ] = None,
     turn: Annotated[
         float | None,
-        typer.Option(
-            metavar="DEG", help="Rotation of the world's axes, in deg; with --metres-per-pixel."
-        ),
+        option("DEG", "Rotation of the world's axes, in deg; with --metres-per-pixel."),
     ] = None,
     json: Json = None,
     quiet: Quiet = False,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ParamSpec
 
 import typer
+from typer.models import OptionInfo
 
 from slipid.support.errors import DataError
 
@@ -16,36 +17,51 @@ if TYPE_CHECKING:
 
     from slipid.report.page import Page
 
+
+def option(
+    metavar: str,
+    words: str,
+    *names: str,
+    min: float | None = None,
+    max: float | None = None,
+) -> OptionInfo:
+    """Return an option with a value, for an annotation.
+
+    Args:
+        metavar: what the value is, in a word.
+        words: meaning of the option.
+        names: name of the option; by default it follows from that of the parameter.
+        min, max: limits of a number.
+    """
+    made: OptionInfo = typer.Option(*names, metavar=metavar, help=words, min=min, max=max)
+    return made
+
+
+def flag(name: str, words: str) -> OptionInfo:
+    """Return an option without a value, which has no opposite."""
+    made: OptionInfo = typer.Option(name, help=words)
+    return made
+
+
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="Config file (TOML).")]
 OutFolder = Annotated[
     Path, typer.Argument(metavar="OUT", help="Result folder of `slipid identify`.")
 ]
 DataFolder = Annotated[
-    Path,
-    typer.Option(
-        "--data", metavar="DIR", help="Folder of the logs, to which globs in the config refer."
-    ),
+    Path, option("DIR", "Folder of the logs, to which globs in the config refer.")
 ]
-Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write to.")]
+Out = Annotated[Path, option("DIR", "Folder to write to.")]
 MaybeOut = Annotated[
-    Path | None,
-    typer.Option("--out", metavar="DIR", help="Folder to write to; by default nothing is written."),
+    Path | None, option("DIR", "Folder to write to; by default nothing is written.")
 ]
-Load = Annotated[
-    str | None,
-    typer.Option("--load", metavar="NAME", help="Name of the load set-up; the first by default."),
-]
+Load = Annotated[str | None, option("NAME", "Name of the load set-up; the first by default.")]
 Jobs = Annotated[
-    int | None,
-    typer.Option("--jobs", min=1, help="Number of parallel processes; by default one per core."),
+    int | None, typer.Option(min=1, help="Number of parallel processes; by default one per core.")
 ]
 Json = Annotated[
-    str | None,
-    typer.Option(
-        "--json", metavar="FILE", help="Also write the result as JSON to this file; - for stdout."
-    ),
+    str | None, option("FILE", "Also write the result as JSON to this file; - for stdout.")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
+Quiet = Annotated[bool, flag("--quiet", "No progress.")]
 Words = ParamSpec("Words")
 
 

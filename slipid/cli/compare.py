@@ -2,9 +2,7 @@
 
 from typing import Annotated
 
-import typer
-
-from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, for_robots
+from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, for_robots, option
 from slipid.support.progress import Reporter
 
 
@@ -14,10 +12,7 @@ def compare(
     data: DataFolder,
     out: Out,
     folds: Annotated[
-        str,
-        typer.Option(
-            "--folds", metavar="NAMES", help="Kinds of held-out runs, separated by commas."
-        ),
+        str, option("NAMES", "Kinds of held-out runs, separated by commas.")
     ] = "sectors,speeds,random",
     json: Json = None,
     quiet: Quiet = False,

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Out, Quiet, executor_of, guarded
+from slipid.cli.common import Out, Quiet, executor_of, guarded, option
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -26,14 +26,10 @@ def demo(
     out: Out = Path("demo_out"),
     plant: Annotated[
         str,
-        typer.Option(
-            metavar="NAME",
-            help="`recorded` for logs that ship with slipid, `mujoco` to simulate new ones.",
-        ),
+        option("NAME", "`recorded` for logs that ship with slipid, `mujoco` to simulate new ones."),
     ] = "recorded",
     seed: Annotated[
-        int | None,
-        typer.Option("--seed", min=0, help="Seed of the simulation, with --plant mujoco."),
+        int | None, typer.Option(min=0, help="Seed of the simulation, with --plant mujoco.")
     ] = None,
     quiet: Quiet = False,
 ) -> int:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots
+from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots, option
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -17,51 +17,41 @@ def design(
     out: OutFolder,
     parameter: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Parameter whose uncertainty is to be reduced, with * and ? as wildcards; may be "
+        option(
+            "NAME",
+            "Parameter whose uncertainty is to be reduced, with * and ? as wildcards; may be "
             "repeated.",
         ),
     ] = None,
     predict: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="FLOOR[@LOAD][:SPEED[:HEADING]]",
-            help="Prediction whose uncertainty is to be reduced, such as gray:0.3:45 (m/s, deg); "
-            "may be repeated.",
+        option(
+            "FLOOR[@LOAD][:SPEED[:HEADING]]",
+            "Prediction whose uncertainty is to be reduced, such as gray:0.3:45 (m/s, deg); may "
+            "be repeated.",
         ),
     ] = None,
     runs: Annotated[int, typer.Option(min=1, max=1000, help="Number of runs to propose.")] = 12,
     headings: Annotated[
-        str | None,
-        typer.Option(metavar="LIST", help="Headings of candidate runs in deg, such as 0,45,90."),
+        str | None, option("LIST", "Headings of candidate runs in deg, such as 0,45,90.")
     ] = None,
     speeds: Annotated[
-        str | None,
-        typer.Option(metavar="LIST", help="Speeds of candidate runs in m/s, such as 0.1,0.2."),
+        str | None, option("LIST", "Speeds of candidate runs in m/s, such as 0.1,0.2.")
     ] = None,
     turns: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LIST", help="Turning rates of candidate runs in deg/s, such as -40,0,40."
-        ),
+        str | None, option("LIST", "Turning rates of candidate runs in deg/s, such as -40,0,40.")
     ] = None,
     distance: Annotated[
-        float | None,
-        typer.Option(metavar="M", help="Length of a run in m; by default that of the logged runs."),
+        float | None, option("M", "Length of a run in m; by default that of the logged runs.")
     ] = None,
     floor: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Floor on which runs are possible; may be repeated; all by default.",
-        ),
+        option("NAME", "Floor on which runs are possible; may be repeated; all by default."),
     ] = None,
     load: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            help="Load set-up with which runs are possible; may be repeated; all by default.",
+        option(
+            "NAME", "Load set-up with which runs are possible; may be repeated; all by default."
         ),
     ] = None,
     json: Json = None,

@@ -1,11 +1,12 @@
 """`slipid export`: write an identified robot to a folder in forms that robots can load."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, Load, Quiet, emit, for_robots
+from slipid.cli.common import Json, Load, Quiet, emit, flag, for_robots, option
 from slipid.support.progress import Reporter
 
 
@@ -20,42 +21,25 @@ def export(
         ),
     ],
     to: Annotated[
-        str,
-        typer.Option(
-            "--to", metavar="FORMS", help="Forms separated by commas: c, ros2, stablehlo, table."
-        ),
+        str, option("FORMS", "Forms separated by commas: c, ros2, stablehlo, table.")
     ] = "c,ros2,stablehlo,table",
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write to.")
-    ] = None,
+    out: Annotated[Path | None, option("DIR", "Folder to write to.")] = None,
     controller: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME", help="Controller: contact, slip_odometry, ... (as in `slipid trial`)."
-        ),
+        str, option("NAME", "Controller: contact, slip_odometry, ... (as in `slipid trial`).")
     ] = "contact",
     path: Annotated[
-        str, typer.Option(metavar="NAME", help="Path that the example program in C follows.")
+        str, option("NAME", "Path that the example program in C follows.")
     ] = "rectangle",
-    speed: Annotated[
-        float, typer.Option(metavar="M_S", help="Speed along the path, in m/s.")
-    ] = 0.2,
+    speed: Annotated[float, option("M_S", "Speed along the path, in m/s.")] = 0.2,
     load: Load = None,
     floors: Annotated[
-        str,
-        typer.Option(
-            metavar="NAMES", help="Floors that can occur, separated by commas; all by default."
-        ),
+        str, option("NAMES", "Floors that can occur, separated by commas; all by default.")
     ] = "",
     map: Annotated[
-        Path | None,
-        typer.Option("--map", metavar="FILE", help="Floor map, for the controller contact_map."),
+        Path | None, option("FILE", "Floor map, for the controller contact_map.")
     ] = None,
     check: Annotated[
-        bool,
-        typer.Option(
-            "--check", help="Only check that the files of an exported folder are unchanged."
-        ),
+        bool, flag("--check", "Only check that the files of an exported folder are unchanged.")
     ] = False,
     json: Json = None,
     quiet: Quiet = False,
@@ -91,14 +75,7 @@ def export(
         robot = read_robot(source, load, _names(floors))
         options = ExportOptions(_names(to), controller, path, speed, map)
         done = run(robot, out, options, report, ROWS)
-    content = {
-        "schema": "slipid.export/1",
-        "folder": str(done.folder),
-        "robot": done.robot,
-        "forms": list(done.forms),
-        "files": list(done.files),
-        "warnings": list(done.warnings),
-    }
+    content = {"schema": "slipid.export/1", **asdict(done), "folder": str(done.folder)}
     emit(json, content, lambda page: show_export(page, done))
     return 0
 

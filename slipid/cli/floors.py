@@ -3,9 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from slipid.cli.common import DataFolder, Json, Out, OutFolder, Quiet, emit, for_robots
+from slipid.cli.common import DataFolder, Json, Out, OutFolder, Quiet, emit, for_robots, option
 from slipid.support.content import Content
 from slipid.support.progress import Reporter
 
@@ -20,16 +18,12 @@ MOST_BEYOND = 0.05
 @for_robots
 def floors(
     fitted: OutFolder,
-    map: Annotated[
-        Path, typer.Option("--map", metavar="FILE", help="Floor map, as written by `slipid map`.")
-    ],
+    map: Annotated[Path, option("FILE", "Floor map, as written by `slipid map`.")],
     data: DataFolder,
     out: Out,
     logs: Annotated[
         str | None,
-        typer.Option(
-            metavar="GLOB", help="Glob of the logs; by default the logs with a map in the config."
-        ),
+        option("GLOB", "Glob of the logs; by default the logs with a map in the config."),
     ] = None,
     json: Json = None,
     quiet: Quiet = False,

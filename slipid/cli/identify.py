@@ -5,9 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, guarded
+from slipid.cli.common import ConfigFile, DataFolder, Json, Out, Quiet, emit, flag, guarded, option
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -24,13 +22,10 @@ def identify(
     out: Out,
     profile: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="PATH",
-            help="Also compute the profile likelihood of a parameter; may be repeated.",
-        ),
+        option("PATH", "Also compute the profile likelihood of a parameter; may be repeated."),
     ] = None,
     anyway: Annotated[
-        bool, typer.Option("--anyway", help="Fit even if logs and config contradict each other.")
+        bool, flag("--anyway", "Fit even if logs and config contradict each other.")
     ] = False,
     json: Json = None,
     quiet: Quiet = False,

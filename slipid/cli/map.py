@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, Out, Quiet, emit, guarded
+from slipid.cli.common import Json, Out, Quiet, emit, guarded, option
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -20,44 +20,28 @@ PROPOSAL = "palette.toml"
 def map_(
     image: Annotated[Path, typer.Argument(metavar="IMAGE", help="Picture or video of the floor.")],
     out: Out,
-    camera: Annotated[
-        Path, typer.Option(metavar="FILE", help="Camera file of `slipid calibrate`.")
-    ],
+    camera: Annotated[Path, option("FILE", "Camera file of `slipid calibrate`.")],
     config: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Config of the map: surfaces by colour or points, region, masks."
-        ),
+        option("FILE", "Config of the map: surfaces by colour or points, region, masks."),
     ] = None,
     surfaces: Annotated[
-        int | None, typer.Option(metavar="N", min=1, max=40, help="Number of surfaces to propose.")
+        int | None, option("N", "Number of surfaces to propose.", min=1, max=40)
     ] = None,
     cell: Annotated[
         float | None,
-        typer.Option(
-            metavar="M",
-            min=1e-4,
-            max=1,
-            help="Edge length of a map cell, in m; by default that of a pixel.",
+        option(
+            "M", "Edge length of a map cell, in m; by default that of a pixel.", min=0.0001, max=1
         ),
     ] = None,
     dictionary: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME", help="ArUco dictionary of the robot's marker, to mask the robot."
-        ),
+        str, option("NAME", "ArUco dictionary of the robot's marker, to mask the robot.")
     ] = "4X4_50",
     robot_radius: Annotated[
-        float,
-        typer.Option(
-            metavar="M", min=0, max=10, help="Radius of the masked disc around the robot, in m."
-        ),
+        float, option("M", "Radius of the masked disc around the robot, in m.", min=0, max=10)
     ] = 0.2,
     marker_height: Annotated[
-        float,
-        typer.Option(
-            metavar="M", min=0, max=10, help="Height of the marker above the floor, in m."
-        ),
+        float, option("M", "Height of the marker above the floor, in m.", min=0, max=10)
     ] = 0.25,
     json: Json = None,
     quiet: Quiet = False,

@@ -1,18 +1,16 @@
 """`slipid motor`: identify a motor on a bench from a single log file, without a config."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, MaybeOut, Quiet, emit, guarded
+from slipid.cli.common import Json, MaybeOut, Quiet, emit, flag, guarded, option
 from slipid.support.progress import Reporter
 
 Column = str | None
-
-
-def _column(words: str) -> object:
-    return typer.Option(metavar="NAME[:UNIT]", help=words)
+_column = partial(option, "NAME[:UNIT]")
 
 
 @guarded
@@ -34,11 +32,10 @@ def motor(
     ] = None,
     bus: Annotated[Column, _column("Column with the bus voltage, in V; with --duty.")] = None,
     unsigned: Annotated[
-        bool, typer.Option("--unsigned", help="The logged current is a magnitude without sign.")
+        bool, flag("--unsigned", "The logged current is a magnitude without sign.")
     ] = False,
     delimiter: Annotated[
-        str | None,
-        typer.Option(metavar="CHARACTER", help="Character between cells; guessed by default."),
+        str | None, option("CHARACTER", "Character between cells; guessed by default.")
     ] = None,
     out: MaybeOut = None,
     json: Json = None,

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import guarded
+from slipid.cli.common import flag, guarded, option
 
 if TYPE_CHECKING:
     from slipid.app.new.config_text import NewConfig
@@ -21,19 +21,20 @@ def _text(words: str, panel: str | None = None) -> object:
 
 @guarded
 def new(
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="Config file to write.")
-    ] = Path("robot.toml"),
+    out: Annotated[Path, option("FILE", "Config file to write.")] = Path("robot.toml"),
     log: Annotated[
         Path | None,
-        typer.Option(
+        option(
+            "LOG",
+            "Log (CSV, Parquet, bag) or folder of logs to read, instead of asking questions.",
             "--from",
-            metavar="LOG",
-            help="Log (CSV, Parquet, bag) or folder of logs to read, instead of asking questions.",
         ),
     ] = None,
     drive: Annotated[
-        Text, _text("Type of the wheels: omni, mecanum, skid, differential or general.")
+        Text,
+        _text(
+            "Type of the wheels: Type of the wheels: omni, mecanum, skid, differential or general."
+        ),
     ] = None,
     wheel_radius_m: Annotated[Text, _text("Wheel radius.")] = None,
     gear_ratio: Annotated[Text, _text("Motor turns per wheel turn.")] = None,
@@ -65,10 +66,9 @@ def new(
         Text, _text("General: angles of the rollers to these directions, such as 45,none.", _WHEELS)
     ] = None,
     yes: Annotated[
-        bool,
-        typer.Option("--yes", help="Do not ask: use defaults, which are marked in the config."),
+        bool, flag("--yes", "Do not ask: use defaults, which are marked in the config.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite.")] = False,
+    force: Annotated[bool, flag("--force", "Overwrite.")] = False,
 ) -> int:
     """Write a commented config for your robot, from your answers to questions or from its logs."""
     # Every argument that is a text describes the robot.

@@ -5,15 +5,12 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Out, guarded
+from slipid.cli.common import Out, guarded, option
 
 
 @guarded
 def paper(
-    data: Annotated[
-        Path,
-        typer.Option("--data", metavar="DIR", help="Folder that contains the folder robotino2021."),
-    ],
+    data: Annotated[Path, option("DIR", "Folder that contains the folder robotino2021.")],
     out: Out,
 ) -> int:
     """Regenerate the tables and figures of the 2021 paper from the paper's data."""

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import guarded
+from slipid.cli.common import guarded, option
 
 
 @guarded
@@ -18,10 +18,7 @@ def reference(
         ),
     ] = None,
     config: Annotated[
-        Path | None,
-        typer.Option(
-            "--config", metavar="CONFIG", help="Config of the robot whose parameters are listed."
-        ),
+        Path | None, option("CONFIG", "Config of the robot whose parameters are listed.")
     ] = None,
 ) -> int:
     """Print every key, channel, unit and parameter of configs, with meanings (Markdown)."""

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots
+from slipid.cli.common import Json, OutFolder, Quiet, emit, for_robots, option
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
@@ -14,32 +14,24 @@ from slipid.support.progress import Reporter
 def sample(
     out: OutFolder,
     data: Annotated[
-        Path | None,
-        typer.Option(
-            "--data", metavar="DIR", help="Folder of the logs, if it was moved since the fit."
-        ),
+        Path | None, option("DIR", "Folder of the logs, if it was moved since the fit.")
     ] = None,
     draws: Annotated[
         int,
         typer.Option(
-            "--draws",
-            min=10,
-            help="Number of draws to keep from each of the four ensembles of chains.",
+            min=10, help="Number of draws to keep from each of the four ensembles of chains."
         ),
     ] = 400,
-    most: Annotated[
-        int, typer.Option("--most", min=40, help="Largest number of blocks of steps.")
-    ] = 400,
+    most: Annotated[int, typer.Option(min=40, help="Largest number of blocks of steps.")] = 400,
     block: Annotated[
         int,
         typer.Option(
-            "--block",
             min=1,
             hidden=True,
             help="Number of steps per block; the chain is saved after each block.",
         ),
     ] = 20,
-    seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
     json: Json = None,
     quiet: Quiet = False,
 ) -> int:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import ConfigFile, Json, Out, Quiet, emit, for_robots
+from slipid.cli.common import ConfigFile, Json, Out, Quiet, emit, for_robots, option
 from slipid.support.progress import Reporter
 
 
@@ -13,12 +13,7 @@ from slipid.support.progress import Reporter
 def selftest(
     config: ConfigFile,
     data: Annotated[
-        Path | None,
-        typer.Option(
-            "--data",
-            metavar="DIR",
-            help="Folder of logs whose wheel motion is used in the simulation.",
-        ),
+        Path | None, option("DIR", "Folder of logs whose wheel motion is used in the simulation.")
     ] = None,
     out: Out = Path("selftest_out"),
     replicates: Annotated[int, typer.Option(min=1, help="Number of simulated experiments.")] = 8,

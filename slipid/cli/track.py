@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from slipid.cli.common import Json, Quiet, emit, guarded
+from slipid.cli.common import Json, Quiet, emit, guarded, option
 from slipid.support.progress import Reporter
 
 if TYPE_CHECKING:
@@ -22,77 +22,49 @@ def track(
             metavar="VIDEO|FOLDER|DEVICE", help="Video, pictures, or the number of a camera device."
         ),
     ],
-    camera: Annotated[
-        Path, typer.Option(metavar="FILE", help="Camera file of `slipid calibrate`.")
-    ],
-    out: Annotated[
-        Path,
-        typer.Option("--out", metavar="FILE", help="File of poses to write (.csv or .parquet)."),
-    ],
+    camera: Annotated[Path, option("FILE", "Camera file of `slipid calibrate`.")],
+    out: Annotated[Path, option("FILE", "File of poses to write (.csv or .parquet).")],
     marker_size: Annotated[
-        float | None,
-        typer.Option(metavar="M", help="Edge length of the marker's black square, in m."),
+        float | None, option("M", "Edge length of the marker's black square, in m.")
     ] = None,
     marker_height: Annotated[
-        float | None, typer.Option(metavar="M", help="Height of the marker above the floor, in m.")
+        float | None, option("M", "Height of the marker above the floor, in m.")
     ] = None,
     marker_yaw: Annotated[
         float,
-        typer.Option(
-            metavar="DEG",
-            help="Direction of the marker's top edge, in deg counter-clockwise from the robot's x "
-            "axis.",
+        option(
+            "DEG",
+            "Direction of the marker's top edge, in deg counter-clockwise from the robot's x axis.",
         ),
     ] = 0.0,
-    dictionary: Annotated[
-        str, typer.Option(metavar="NAME", help="Name of the dictionary of the marker.")
-    ] = "4X4_50",
+    dictionary: Annotated[str, option("NAME", "Name of the dictionary of the marker.")] = "4X4_50",
     id: Annotated[
         int | None,
         typer.Option(min=0, help="Number of the marker; by default the only one that is seen."),
     ] = None,
     targets: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Config of several markers, boards or robots, instead of the marker options.",
+        option(
+            "FILE", "Config of several markers, boards or robots, instead of the marker options."
         ),
     ] = None,
     fps: Annotated[
-        float | None,
-        typer.Option(
-            metavar="HZ", help="Frame rate, in Hz; by default the times in the video are used."
-        ),
+        float | None, option("HZ", "Frame rate, in Hz; by default the times in the video are used.")
     ] = None,
     times: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="CSV file of the frame times, with columns frame and time [s]."
-        ),
+        Path | None, option("FILE", "CSV file of the frame times, with columns frame and time [s].")
     ] = None,
     region: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X0,Y0,X1,Y1", help="Part of the picture in which to search, in pixels."
-        ),
+        str | None, option("X0,Y0,X1,Y1", "Part of the picture in which to search, in pixels.")
     ] = None,
     seconds: Annotated[
-        float | None,
-        typer.Option(
-            metavar="S", help="Duration of the recording in s; required for a camera device."
-        ),
+        float | None, option("S", "Duration of the recording in s; required for a camera device.")
     ] = None,
     preview: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Picture to write, with the poses of one frame drawn in it."
-        ),
+        Path | None, option("FILE", "Picture to write, with the poses of one frame drawn in it.")
     ] = None,
     preview_frame: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N", min=0, help="Number of this frame; by default the first with a pose."
-        ),
+        int | None, option("N", "Number of this frame; by default the first with a pose.", min=0)
     ] = None,
     json: Json = None,
     quiet: Quiet = False,

@@ -5,7 +5,18 @@ from typing import Annotated
 
 import typer
 
-from slipid.cli.common import Jobs, Json, Load, OutFolder, Quiet, emit, executor_of, for_robots
+from slipid.cli.common import (
+    Jobs,
+    Json,
+    Load,
+    OutFolder,
+    Quiet,
+    emit,
+    executor_of,
+    flag,
+    for_robots,
+    option,
+)
 from slipid.support.progress import Reporter
 
 
@@ -13,47 +24,27 @@ from slipid.support.progress import Reporter
 def trial(
     out: OutFolder,
     plant: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME", help="Simulated robot: testsite (MuJoCo), or twin (the fitted model)."
-        ),
+        str, option("NAME", "Simulated robot: testsite (MuJoCo), or twin (the fitted model).")
     ] = "testsite",
     map: Annotated[
-        Path | None,
-        typer.Option(
-            "--map", metavar="FILE", help="Floor map; by default patches of the fitted floors."
-        ),
+        Path | None, option("FILE", "Floor map; by default patches of the fitted floors.")
     ] = None,
     told_map: Annotated[
         Path | None,
-        typer.Option(
-            "--told-map",
-            metavar="FILE",
-            help="Map for the controllers that use one; by default the true map.",
-        ),
+        option("FILE", "Map for the controllers that use one; by default the true map."),
     ] = None,
     controllers: Annotated[
-        str | None,
-        typer.Option(metavar="NAMES", help="Controllers separated by commas; all by default."),
+        str | None, option("NAMES", "Controllers separated by commas; all by default.")
     ] = None,
     path: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="Path: rectangle, circle, eight, or turning (the robot also rotates).",
-        ),
+        str, option("NAME", "Path: rectangle, circle, eight, or turning (the robot also rotates).")
     ] = "rectangle",
-    speed: Annotated[
-        float, typer.Option(metavar="M_S", help="Speed along the path, in m/s.")
-    ] = 0.2,
+    speed: Annotated[float, option("M_S", "Speed along the path, in m/s.")] = 0.2,
     starts: Annotated[int, typer.Option(min=1, max=99, help="Number of start poses.")] = 20,
     load: Load = None,
     tuned_gains: Annotated[
         bool,
-        typer.Option(
-            "--tuned-gains",
-            help="Use tuned gains even if they are no better than those set by hand.",
-        ),
+        flag("--tuned-gains", "Use tuned gains even if they are no better than those set by hand."),
     ] = False,
     jobs: Jobs = None,
     json: Json = None,

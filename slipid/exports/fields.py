@@ -12,8 +12,12 @@ from dataclasses import dataclass, fields, is_dataclass
 from math import prod
 from typing import Literal
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+
+from slipid.robot.closed_loop import ControlLoop
+from slipid.robot.interface import Measurement, Readings
 
 Kind = Literal["real", "int", "bool"]
 DTYPES: dict[Kind, type] = {"real": np.float64, "int": np.int64, "bool": np.bool_}
@@ -49,14 +53,12 @@ class Struct:
     """A struct of C.
 
     Attributes:
-        name: name of the type.
-        about: comment of the struct, one sentence.
+        name: name of the type, without the prefix `slipid_`.
         fields: fields in the order of the tree's leaves.
         example: a tree whose arrays have the shapes of the fields.
     """
 
     name: str
-    about: str
     fields: tuple[Field, ...]
     example: object
 
@@ -73,6 +75,21 @@ def attribute_docs(kind: type) -> dict[str, str]:
     _, _, text = (inspect.getdoc(kind) or "").partition("Attributes:\n")
     found = re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", text, re.MULTILINE)
     return {name: " ".join(about.split()).rstrip(";.") for name, about in found}
+
+
+def structs_of(loop: ControlLoop[eqx.Module]) -> tuple[Struct, Struct, Struct, Struct]:
+    """Return the structs of a loop: estimator, controller, reading, and estimate.
+
+    They are the two states, the input and the output of its steps.
+    """
+    begin, nothing = loop.init(), Readings.nothing(loop.controller.robot.wheels)
+    estimate = loop.estimator.step(begin.estimator, nothing, jnp.zeros(()))[1]
+    return (
+        Struct("estimator", fields_of(begin.estimator), begin.estimator),
+        Struct("controller", fields_of(begin.controller), begin.controller),
+        Struct("reading", fields_of(nothing, Measurement), nothing),
+        Struct("estimate", fields_of(estimate), estimate),
+    )
 
 
 def fields_of(

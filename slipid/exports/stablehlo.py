@@ -19,11 +19,11 @@ import numpy as np
 from jax import export
 from jaxtyping import Array
 
-from slipid.exports.fields import Field, fields_of
+from slipid.exports.fields import Field, structs_of
 from slipid.exports.golden import Golden, golden, loop_step
 from slipid.exports.text import template
 from slipid.robot.closed_loop import ControlLoop
-from slipid.robot.interface import Measurement, Readings
+from slipid.robot.interface import Readings
 from slipid.robot.robot_file import typed
 from slipid.support.errors import DataError
 
@@ -103,29 +103,18 @@ def stablehlo_files(loop: ControlLoop[eqx.Module]) -> dict[str, bytes]:
 
 
 def _signature(loop: ControlLoop[eqx.Module]) -> Signature:
-    begin, wheels = loop.init(), loop.controller.robot.wheels
-    nothing = Readings.nothing(wheels)
-    estimate = loop.estimator.step(begin.estimator, nothing, 0.0)[1]
-    reference = "pose and rates in the world [m, m, rad and per s]"
-    return Signature(
-        state=(
-            *_named("estimator", fields_of(begin.estimator)),
-            *_named("controller", fields_of(begin.controller)),
-        ),
-        given=(
-            *_named("reading", fields_of(nothing, Measurement)),
-            Field("reference", "real", (6,), reference),
-            Field("dt", "real", (), "since the last step [s]"),
-        ),
-        said=(
-            *_named("estimate", fields_of(estimate)),
-            Field("command", "real", (wheels,), "wheel speeds [rad/s]"),
-        ),
+    estimator, controller, reading, estimate = (
+        tuple(replace(field, name=f"{struct.name}.{field.name}") for field in struct.fields)
+        for struct in structs_of(loop)
     )
-
-
-def _named(name: str, fields: Sequence[Field]) -> list[Field]:
-    return [replace(field, name=f"{name}.{field.name}") for field in fields]
+    about = "pose and rates in the world [m, m, rad and per s]"
+    reference, dt = Field("reference", "real", (6,), about), "since the last step [s]"
+    command = Field("command", "real", (loop.controller.robot.wheels,), "wheel speeds [rad/s]")
+    return Signature(
+        state=(*estimator, *controller),
+        given=(*reading, reference, Field("dt", "real", (), dt)),
+        said=(*estimate, command),
+    )
 
 
 def load_program(folder: Path | str) -> Program:

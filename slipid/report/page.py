@@ -34,17 +34,13 @@ class Page:
     """
 
     def __init__(self, kept: bool = False) -> None:
-        self._console = Console(highlight=False)
-        if kept:  # Without these options, rich would print to a notebook, with colours.
-            self._console = Console(
-                highlight=False,
-                width=WIDTH,
-                file=StringIO(),
-                force_terminal=False,
-                force_jupyter=False,
-            )
-        elif not self._console.is_terminal:  # A file or a pipe has no width.
-            self._console = Console(highlight=False, width=WIDTH)
+        # Without `force_jupyter`, rich would print a kept page to a notebook, with colours.
+        file, plain = (StringIO(), False) if kept else (None, None)
+        self._console = Console(
+            highlight=False, file=file, force_terminal=plain, force_jupyter=plain
+        )
+        if not self._console.is_terminal:  # A file or a pipe has no width.
+            self._console.width = WIDTH
 
     @property
     def text(self) -> str:

@@ -126,7 +126,7 @@ class Sizes:
 
 @cache
 def _bare(row: str) -> Code:
-    return Code(three_floors(), control_loop(row))
+    return Code(three_floors(), control_loop(row), rectangle())
 
 
 def sizes(row: str, chip: str, folder: Path) -> Sizes:

@@ -194,7 +194,6 @@ def settled(folder: Path) -> tuple[int, np.ndarray]:
     made = function(
         names,
         "settled",
-        "",
         arguments,
         lambda start, rim: contact.settle(start, rim, on, f.inverse),
     )

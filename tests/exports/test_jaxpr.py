@@ -116,4 +116,4 @@ def test_the_export_says_so_instead_of_ending_in_a_traceback(monkeypatch):
     monkeypatch.setattr(Params, "__init__", bare)
     arguments = [Argument.plain("x", (3,)), Argument.plain("y", (), False, True)]
     with pytest.raises(DataError, match=UNKNOWN.format("scan")):
-        function(Names(), "f", "", arguments, run)
+        function(Names(), "f", arguments, run)

@@ -236,7 +236,7 @@ def _library(folder: Path) -> ctypes.CDLL:
     names, functions = Names(), []
     for k, (run, *shapes) in enumerate(FUNCTIONS.values()):
         arguments, _ = _arguments(_real(run), shapes)
-        functions.append(function(names, f"f{k}", "", arguments, _real(run)))
+        functions.append(function(names, f"f{k}", arguments, _real(run)))
     return _compiled(names, functions, folder)
 
 
@@ -303,7 +303,7 @@ def test_c_has_the_numbers_of_jax_where_some_are_none(library, name):
 
 def text_of(run, *shapes):
     """Body of a function in C."""
-    made = function(Names(), "f", "", _arguments(run, shapes)[0], run)
+    made = function(Names(), "f", _arguments(run, shapes)[0], run)
     return "\n".join(made.lines)
 
 
@@ -336,7 +336,7 @@ def test_long_constants_are_copied_in_a_loop():
 def test_arguments_that_are_filled_in_place_are_read_first(tmp_path):
     names = Names()
     arguments = [Argument.plain(name, LANES, True, True) for name in ("x", "y")]
-    made = function(names, "f", "", arguments, lambda x, y: [y[::-1], x])
+    made = function(names, "f", arguments, lambda x, y: [y[::-1], x])
     x, y = np.arange(1.0 * N), np.arange(1.0 * N) ** 2
     pointers = [a.ctypes.data_as(ctypes.c_void_p) for a in (x, y)]
     _compiled(names, [made], tmp_path).f(*pointers)
@@ -349,14 +349,14 @@ def test_a_primitive_without_a_form_in_c_is_refused_by_name_and_line():
         return jnp.sort(x)
 
     with pytest.raises(UnsupportedError, match=r"'sort' has no form in C .*'?add, "):
-        function(Names(), "f", "", _arguments(bad, [LANES])[0], bad)
+        function(Names(), "f", _arguments(bad, [LANES])[0], bad)
     robot = small_twin.deployed()
 
     def own(x):
         return jnp.sort(robot.forward @ x) + robot.motor.current(jnp.cumsum(x), x)
 
     with pytest.raises(UnsupportedError, match="'sort'"):
-        function(Names(), "f", "", _arguments(own, [SMALL])[0], own)
+        function(Names(), "f", _arguments(own, [SMALL])[0], own)
 
 
 @pytest.mark.parametrize(
@@ -377,7 +377,7 @@ def test_a_primitive_without_a_form_in_c_is_refused_by_name_and_line():
 )
 def test_operations_with_other_results_in_c_are_refused(run, reason):
     with pytest.raises(UnsupportedError, match=reason):
-        function(Names(), "f", "", _arguments(run, [LANES])[0], run)
+        function(Names(), "f", _arguments(run, [LANES])[0], run)
 
 
 def test_a_product_with_a_constant_0_stops_what_is_no_number(library):

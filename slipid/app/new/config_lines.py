@@ -15,7 +15,6 @@ _COLUMN = 38
 """Column of the text at which comments begin, if the key and its value are short enough."""
 _WIDTH = 98
 """Largest width of lines of comments [character]."""
-Value = str | bool | int | float | list[int] | list[float] | list[str] | list[list[int]] | object
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ class ConfigBlock:
         return (*self.questions, *lines)
 
 
-def toml(value: Value) -> str:
+def toml(value: object) -> str:
     """Return a plain value as TOML text on one line; whole floats have no decimal point."""
     if isinstance(value, bool):
         return "true" if value else "false"

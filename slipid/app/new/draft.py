@@ -25,11 +25,6 @@ _EXAMPLES = (
     '[layouts.mine.beside."mocap.csv".columns]',
     'time = { column = "stamp", unit = "ns" }',
 )
-_LABELS = {
-    (4, False): ("fl", "fr", "rl", "rr"),
-    (4, True): ("left", "right"),
-    (2, False): ("left", "right"),
-}
 
 
 @dataclass(frozen=True)
@@ -156,24 +151,25 @@ def template_draft(answers: RobotAnswers) -> ConfigDraft:
 
 
 def _settings(answers: RobotAnswers) -> tuple[ConfigLine, ...]:
-    gear = layout_line("gear_ratio", answers.gear_ratio, comment="as above")
-    signed = layout_line(
-        "current_is_signed", True, comment="false where only magnitudes are logged"
+    ask = "taken by default: look it up, of the motor shaft with all edges"
+    ask = ask if "ticks_per_revolution" in answers.defaults else ""
+    ticks = (
+        layout_line("ticks_per_revolution", answers.ticks_per_revolution, ask),
+        layout_line("ticks_are_increments", False),
     )
-    if not answers.ticks_per_revolution:
-        return (gear, signed)
-    question = ""
-    if "ticks_per_revolution" in answers.defaults:
-        question = "taken by default: look it up, of the motor shaft with all edges"
-    ticks = layout_line("ticks_per_revolution", answers.ticks_per_revolution, question)
-    increments = layout_line("ticks_are_increments", False)
-    return (ticks, increments, gear, signed)
+    return (
+        *(ticks if answers.ticks_per_revolution else ()),
+        layout_line("gear_ratio", answers.gear_ratio, comment="as above"),
+        layout_line("current_is_signed", True, comment="false where only magnitudes are logged"),
+    )
 
 
 def _channels(answers: RobotAnswers) -> tuple[ConfigLine, ...]:
-    labels = _LABELS.get((answers.wheels, answers.shared))
-    if labels is None or answers.drive in ("omni", "general"):
-        labels = tuple(str(k + 1) for k in range(answers.wheels))
+    labels = ["fl", "fr", "rl", "rr"]
+    if answers.drive in ("omni", "general"):
+        labels = [str(k + 1) for k in range(answers.wheels)]
+    elif answers.shared or answers.drive == "differential":
+        labels = ["left", "right"]
 
     def each(name: str) -> tuple[str, ...]:
         return tuple(f"{name}_{label}" for label in labels)

@@ -8,7 +8,6 @@ files lie beside it.
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from re import sub
 
@@ -86,9 +85,7 @@ def channels_in(numbers: TableNumbers) -> Channels:
         notes.append(f"not used, a second column: {', '.join(also)}")
     kept, dropped = _consistent(list(first.values()))
     used = {at for one in kept for at in one.columns}
-    unused = [
-        name for at, name in enumerate(format.names) if name and at in meanings and at not in used
-    ]
+    unused = [format.names[at] for at in meanings if at not in used]
     return kept, unused, notes + dropped
 
 
@@ -113,11 +110,10 @@ def rank(label: str) -> tuple[int, int, str]:
 
     Known labels are in the order of the drives, numbers in their order after them.
     """
-    if label in _QUATERNION:
-        return (0, _QUATERNION.index(label), label)
-    if label in _ORDER:
-        return (1, _ORDER.index(label), label)
-    return (2, int(label) if label.isdecimal() else 0, label)
+    known = (*_QUATERNION, *_ORDER)
+    if label in known:
+        return (0, known.index(label), label)
+    return (1, int(label) if label.isdecimal() else 0, label)
 
 
 def _resolved(found: list[FileChannel]) -> list[FileChannel]:
@@ -277,8 +273,8 @@ def globs_of(root: Path, kind: FileKind, others: Sequence[Path]) -> list[str]:
 
 def _narrow_globs(paths: list[PurePosixPath], theirs: list[PurePosixPath]) -> list[str]:
     """Return a common glob for some files, or several narrower ones if it matches other files."""
-    glob = common_glob(paths)
-    if not any(_glob_matches(glob, path) for path in theirs):
+    glob, depth = common_glob(paths), len(paths[0].parts)
+    if not any(path.match(glob) and len(path.parts) == depth for path in theirs):
         return [glob]
     folders = {path.parent for path in paths}
     if len(folders) > 1:
@@ -296,13 +292,6 @@ def floor_of(glob: str) -> str:
     """Return the name of the floor of a glob's files: that of the top folder, or "floor"."""
     first, *others = glob.split("/")
     return first if len(others) > 1 and "*" not in first else "floor"
-
-
-def _glob_matches(glob: str, path: PurePosixPath) -> bool:
-    parts = glob.split("/")
-    return len(parts) == len(path.parts) and all(
-        fnmatchcase(name, part) for name, part in zip(path.parts, parts, strict=True)
-    )
 
 
 def _common_name(names: tuple[str, ...]) -> str:

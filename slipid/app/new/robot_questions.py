@@ -235,6 +235,8 @@ def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> Robo
     answers = _with_question(
         RobotAnswers(drive=drive), replace(DRIVE, default=drive), options, asker
     )
+    counts = {"mecanum": 4, "skid": 4, "differential": 2}
+    answers = replace(answers, wheels=counts.get(answers.drive, answers.wheels))
     questions = (*DRIVES[answers.drive], *COMMON)
     _refuse_other_drives(options, answers.drive, questions)
     for question in questions:
@@ -244,9 +246,7 @@ def ask(options: RobotOptions, asker: Asker | None, drive: str = "omni") -> Robo
         answers = _with_question(answers, question, options, asker)
         if question is _PLACES:
             answers = replace(answers, wheels=len(answers.places_m))
-    if answers.drive in ("mecanum", "skid"):
-        answers = replace(answers, wheels=4)
-    return replace(answers, wheels=2) if answers.drive == "differential" else answers
+    return answers
 
 
 def _refuse_other_drives(

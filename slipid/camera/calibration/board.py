@@ -4,29 +4,35 @@ import glob
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from slipid.camera.opencv import marker_count, marker_dictionary, opencv, size_of, visible_markers
+from slipid.camera.opencv import (
+    cv2,
+    marker_count,
+    marker_dictionary,
+    pictures_in,
+    size_of,
+    visible_markers,
+)
 from slipid.support.errors import DataError
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-"""Suffixes by which pictures in a folder are recognised; a file named directly may have any."""
 LARGEST_M = 1.0
 """Largest edge of a square [m]; a larger number was probably meant in millimetres."""
 LEAST_CORNERS = 6
 """Smallest number of corners in a view: a pose has six numbers, and each corner gives two."""
-SEARCHED = 3
+SEARCHED_PICTURES = 3
 """Number of pictures that are searched for other boards if the given board is not detected. It is
 small because every dictionary is tried on each picture."""
-ENOUGH = 4
+ENOUGH_DETECTIONS = 4
 """Smallest number of detected markers or corners that is taken as proof of a board: so many are
 hardly detected by chance."""
 LEAST_VIEWS = 6
 """Smallest number of usable views, and of those that differ from each other."""
-SAME = 0.08
+SAME_VIEW = 0.08
 """Difference of corner places, relative to the board's size in the picture, below which two views
 count as the same [1]."""
 
@@ -57,11 +63,7 @@ def named_pictures(words: Sequence[str]) -> list[Path]:
     for word in words:
         path = Path(word)
         if path.is_dir():
-            files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
-            if not files:
-                raise DataError(
-                    f"{word}: a folder without pictures; expected files {', '.join(SUFFIXES)}"
-                )
+            files = pictures_in(path)
         elif path.exists() or not glob.has_magic(word):
             files = [path]
         else:
@@ -125,7 +127,7 @@ class Board:
     def pattern(self) -> object:
         """The board as an object of OpenCV."""
         size, dictionary = (self.columns, self.rows), marker_dictionary(self.dictionary)
-        board = opencv().aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
+        board = cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
         if self.legacy:
             board.setLegacyPattern(True)
         return board
@@ -195,7 +197,7 @@ def board_of(size: str, square_m: float, marker_m: float, dictionary: str, legac
 
 def view_of(board: Board, picture: Picture) -> View:
     """Return the corners of the board in a picture; the view is empty if it is not detected."""
-    detector = opencv().aruco.CharucoDetector(board.pattern)
+    detector = cv2.aruco.CharucoDetector(board.pattern)
     pixels, numbers = detector.detectBoard(picture.image)[:2]
     if numbers is None:
         return View(picture.path.name, np.zeros((0, 2)), np.zeros((0, 2)))
@@ -203,17 +205,8 @@ def view_of(board: Board, picture: Picture) -> View:
     return View(picture.path.name, pixels, board.corners_m[np.ravel(numbers)])
 
 
-@dataclass(frozen=True, eq=False)
-class UsableViews:
-    """Usable views of a board in pictures of one size [pixel], and sentences about the others."""
-
-    image_px: tuple[int, int]
-    views: list[View]
-    left_out: list[str]
-
-
-def usable(board: Board, pictures: Sequence[Picture]) -> UsableViews:
-    """Return the usable views of a board in pictures.
+def usable(board: Board, pictures: Sequence[Picture]) -> tuple[list[View], list[str]]:
+    """Return the usable views of a board in pictures of one size, and sentences about the others.
 
     Raises:
         DataError: the pictures differ in size, or the board is detected in too few of them.
@@ -237,7 +230,7 @@ def usable(board: Board, pictures: Sequence[Picture]) -> UsableViews:
     ]
     good = [v for v in views if not v.flat]
     check_enough(good)
-    return UsableViews(pictures[0].image_px, good, left_out)
+    return good, left_out
 
 
 def check_enough(views: Sequence[View]) -> None:
@@ -253,7 +246,7 @@ def check_enough(views: Sequence[View]) -> None:
         )
     distinct: list[View] = []
     for view in views:
-        if all(_difference(view, other) > SAME for other in distinct):
+        if all(_difference(view, other) > SAME_VIEW for other in distinct):
             distinct.append(view)
     if len(distinct) < LEAST_VIEWS:
         raise DataError(
@@ -269,14 +262,11 @@ def _difference(view: View, other: View) -> float:
     It is relative to the distance of the corners from their middle, and infinite if two views have
     too few common corners.
     """
-    first, second = (
-        {tuple(np.round(b, 6)): p for b, p in zip(v.board_m, v.pixels, strict=True)}
-        for v in (view, other)
-    )
-    common = first.keys() & second.keys()
+    first, second = (np.round(v.board_m, 6) @ [1, 1j] for v in (view, other))
+    common, in_view, in_other = np.intersect1d(first, second, return_indices=True)
     if len(common) < LEAST_CORNERS:
         return np.inf
-    here, there = (np.array([corners[key] for key in common]) for corners in (first, second))
+    here, there = view.pixels[in_view], other.pixels[in_other]
     return float(np.linalg.norm(here - there) / np.linalg.norm(here - here.mean(0)))
 
 
@@ -286,30 +276,29 @@ def not_detected(board: Board, pictures: Sequence[Picture]) -> DataError:
         where = f"{pictures[0].path}: the board is not found in it"
     else:
         where = f"{pictures[0].path} and {len(pictures) - 1} more: the board is found in none"
-    return DataError(f"{where}; looked for {board}; {_instead(board, pictures[:SEARCHED])}")
+    return DataError(
+        f"{where}; looked for {board}; {_instead(board, pictures[:SEARCHED_PICTURES])}"
+    )
 
 
 def _instead(board: Board, pictures: Sequence[Picture]) -> str:
     """Return a sentence that says what pictures show instead of the board, and what to do."""
     if other := _other_board(board, board.dictionary, pictures):
         return other
-    markers = visible_markers([picture.image for picture in pictures])
-    name, numbers = markers.dictionary, markers.numbers
+    name, numbers = visible_markers([picture.image for picture in pictures])
     if other := _other_board(board, name, pictures):
         return other
-    if len(numbers) < ENOUGH:
+    if len(numbers) < ENOUGH_DETECTIONS:
         return (
             "and found no markers of any dictionary: expected a board that is sharp, evenly lit, "
             "not mirrored, and large enough that a marker has 20 pixels or more"
         )
+    remedy = f"say --dictionary {name} and the board's true size"
     if name == board.dictionary:
-        return (
-            f"but {len(numbers)} markers of {name} are there, numbers {numbers[0]} to "
-            f"{numbers[-1]}: expected another size in squares, or a board of other numbers"
-        )
+        remedy = "expected another size in squares, or a board of other numbers"
     return (
-        f"but {len(numbers)} markers of dictionary {name} are there, numbers {numbers[0]} to "
-        f"{numbers[-1]}: say --dictionary {name} and the board's true size"
+        f"but {len(numbers)} markers of {name} are there, numbers {numbers[0]} to "
+        f"{numbers[-1]}: {remedy}"
     )
 
 
@@ -321,14 +310,13 @@ def _other_board(board: Board, dictionary: str, pictures: Sequence[Picture]) -> 
     if marker_count(dictionary) < board.columns * board.rows // 2:
         return None
     swapped = replace(board, columns=board.rows, rows=board.columns)
-    for size in (board, swapped):
-        for legacy in (board.legacy, not board.legacy):
-            other = replace(size, legacy=legacy, dictionary=dictionary)
-            corners = max(len(view_of(other, picture).pixels) for picture in pictures)
-            if corners >= ENOUGH:
-                option = "--legacy" if legacy else "without --legacy"
-                return (
-                    f"but {corners} corners of this one are: {other}; say --board {other.size} "
-                    f"--dictionary {dictionary} {option}"
-                )
+    for size, legacy in product((board, swapped), (board.legacy, not board.legacy)):
+        other = replace(size, legacy=legacy, dictionary=dictionary)
+        corners = max(len(view_of(other, picture).pixels) for picture in pictures)
+        if corners >= ENOUGH_DETECTIONS:
+            option = "--legacy" if legacy else "without --legacy"
+            return (
+                f"but {corners} corners of this one are: {other}; say --board {other.size} "
+                f"--dictionary {dictionary} {option}"
+            )
     return None

@@ -20,7 +20,7 @@ from slipid.camera.calibration.lens import fit_robustly
 from slipid.camera.calibration.place import FloorFit, fit_place, fit_place_robustly, uncertainty
 from slipid.camera.calibration.points import FloorPoints, read_points
 from slipid.camera.calibration.quality import Quality, quality_of
-from slipid.camera.calibration.report import floor_report, lens_report, scale_std, straight_report
+from slipid.camera.calibration.report import floor_report, lens_report, straight_report
 from slipid.camera.opencv import read_picture, size_of
 from slipid.camera.overhead import Lens, OverheadCamera, read_camera
 from slipid.support.content import Content
@@ -59,10 +59,11 @@ def lens_from_pictures(words: Sequence[str], board: Board, k3: bool) -> Calibrat
     Raises:
         DataError: a file is not a picture, or the views do not determine a lens.
     """
-    views = usable(board, [Picture(path, read_picture(path)) for path in named_pictures(words)])
-    fit = fit_robustly(views.views, views.image_px, k3)
+    pictures = [Picture(path, read_picture(path)) for path in named_pictures(words)]
+    views, left_out = usable(board, pictures)
+    fit = fit_robustly(views, pictures[0].image_px, k3)
     quality = quality_of(fit, k3)
-    report = lens_report(quality, views.left_out) | {"board": str(board)}
+    report = lens_report(quality, left_out) | {"board": str(board)}
     return CalibratedLens(fit.lens, {"lens": report, "poor": quality.poor}, fit.covariance, quality)
 
 
@@ -160,8 +161,7 @@ def straight_camera(
 
 def _reported(lens: CalibratedLens, fit: FloorFit, source: str, size_std: float) -> FloorFit:
     """Return the fit with the report of lens and floor, and the std of lengths, in its camera."""
-    spread = uncertainty(fit, lens.covariance)
-    floor = floor_report(source, fit, spread, size_std)
+    floor = floor_report(source, fit, uncertainty(fit, lens.covariance), size_std)
     report = {**lens.report, "floor": floor, "poor": lens.report.get("poor", []) + floor["poor"]}
-    camera = replace(fit.camera, scale_std=scale_std(spread, size_std), report=report)
+    camera = replace(fit.camera, scale_std=floor["scale_std"], report=report)
     return replace(fit, camera=camera)

@@ -10,21 +10,21 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.camera.calibration.board import View, check_enough
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import cv2
 from slipid.camera.overhead import Lens
 from slipid.support.errors import DataError
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """Parameters of a lens, in the order of its covariance; k3 is present only if it is fitted."""
-ROUNDS = 30
-WORSE = 3.0
+MOST_ROUNDS = 30
+VIEW_RATIO = 3.0
 """Ratio of a view's median residual to that of all views above which the view is excluded [1]."""
-FAR = 6.0
+CORNER_RATIO = 6.0
 """Ratio of a corner's residual to the median one above which it is excluded [1]. Noise alone
 exceeds it for one corner in 10^7."""
-LEAST_PX = 0.3
+HARMLESS_PX = 0.3
 """Residual below which no view or corner is excluded, since it is harmless [pixel]."""
-MOST = 0.25
+MOST_VIEWS_EXCLUDED = 0.25
 """Largest share of the views that may be excluded; if more do not fit, it is not clear which ones
 are right [1]."""
 
@@ -44,7 +44,7 @@ class Pose:
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
         """Rotation matrix of the pose, from the object's axes to the camera's."""
-        return np.asarray(opencv().Rodrigues(self.turn)[0])
+        return np.asarray(cv2.Rodrigues(self.turn)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ def project(lens: Lens, pose: Pose, points: Float[np.ndarray, "point 3"]) -> Pro
     """Return the pixels at which points of an object [m] appear, with derivatives."""
     flat = np.ascontiguousarray(points).reshape(-1, 1, 3)
     given = (flat, pose.turn, pose.shift, lens.matrix, lens.distortion)
-    pixels, slope = (np.asarray(one) for one in opencv().projectPoints(*given)[:2])
+    pixels, slope = (np.asarray(one) for one in cv2.projectPoints(*given)[:2])
     return Projection(pixels.reshape(-1, 2), slope[:, :6], slope[:, 6:])
 
 
@@ -129,7 +129,6 @@ def fit_lens(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> Lens
     Raises:
         DataError: the views do not determine a lens.
     """
-    cv2 = opencv()
     points = [solid(view).astype(np.float32).reshape(-1, 1, 3) for view in views]
     pixels = [view.pixels.astype(np.float32).reshape(-1, 1, 2) for view in views]
     flags = 0 if k3 else cv2.CALIB_FIX_K3
@@ -185,7 +184,6 @@ def _with_covariance(lens: Lens, views: list[View], poses: list[Pose]) -> LensFi
 
 def pose_of(lens: Lens, view: View) -> Pose:
     """Return the pose of a board seen through a known lens."""
-    cv2 = opencv()
     points, pixels = solid(view).reshape(-1, 1, 3), view.pixels.reshape(-1, 1, 2)
     given = (points, pixels, lens.matrix, lens.distortion)
     starts = cv2.solvePnPGeneric(*given, flags=cv2.SOLVEPNP_IPPE)
@@ -202,19 +200,19 @@ def fit_robustly(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> 
         DataError: too many views do not fit the others, or too few views remain.
     """
     now, left_out, first = list(views), [], len(views)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         fit = fit_lens(now, image_px, k3)
         off = [np.hypot(*residual.T) for residual in fit.residuals]
         usual = [float(np.median(one)) for one in off]
-        level = max(float(np.median(usual)), LEAST_PX / WORSE)
+        level = max(float(np.median(usual)), HARMLESS_PX / VIEW_RATIO)
         worst = int(np.argmax(usual))
-        if usual[worst] > WORSE * level:
+        if usual[worst] > VIEW_RATIO * level:
             left_out.append(
                 f"view {now[worst].name} left out: its corners are off by {usual[worst]:.2f} "
                 f"pixels, those of the other views by {level:.2f}"
             )
             del now[worst]
-            if first - len(now) > MOST * first:
+            if first - len(now) > MOST_VIEWS_EXCLUDED * first:
                 raise DataError(
                     f"{first - len(now)} of {first} views do not fit the others ({now[0].name} "
                     "does); expected a flat board of known size, sharp pictures, and one camera "
@@ -223,7 +221,7 @@ def fit_robustly(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> 
             check_enough(now)
             continue
         # exclude only the worst corner of a view: the others may be off because of it
-        limit = max(FAR * level, LEAST_PX)
+        limit = max(CORNER_RATIO * level, HARMLESS_PX)
         bad = [(one > limit) & (one == one.max()) for one in off]
         if not any(b.any() for b in bad):
             break

@@ -1,35 +1,35 @@
 """The place of a camera with a known lens above a floor, fitted to points, and its uncertainty."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
 from slipid.camera.calibration.lens import Pose, lens_of, parameters_of, project, rms
 from slipid.camera.calibration.points import FloorPoints
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import cv2
 from slipid.camera.overhead import Lens, OverheadCamera
 from slipid.support.errors import DataError
 
 FLAT_M = 1e-9
-AGREES = 0.3
+AGREEMENT = 0.3
 """Ratio of the error without a point to the error with it, below which that point is bad [1]."""
 LEAST_BAD_PX = 1.5
 LEAST_TO_DROP = 6
 LEAST_TO_TEST = 5
 """Number of points below which the fit cannot show which of them is bad."""
-MOST = 0.25
+MOST_POINTS_EXCLUDED = 0.25
 """Largest share of the points that may be excluded [1]."""
 TWIN_RATIO = 2.0
 """Ratio of the errors of two poses below which the points hardly distinguish the two [1]."""
-LEAST_PX = 0.03
+LEAST_STD_PX = 0.03
 """Smallest std assumed for the error of a point [pixel], since few points may by chance fit better
 than corners can be detected."""
-STEP = 0.01
+STEP_IN_STDS = 0.01
 """Step of numerical derivatives, in stds of the variable [1]."""
-GRID = 5
-INSIDE = 0.8
+GRID_POINTS = 5
+INNER_SHARE = 0.8
 """Share of the picture's width and height in which lengths on the floor are compared [1]."""
 
 
@@ -41,8 +41,6 @@ class FloorFit:
         camera: the lens at its fitted place.
         pose: pose of the world in the camera's axes.
         points: points that the place was fitted to.
-        residuals: measured less computed places in the picture [pixel].
-        off_mm: measured less true places at the points' heights, x and y [mm].
         twin_px: root mean square error of the next best pose that also looks down [pixel]; None if
             there is none.
         left_out: sentences about points that do not fit.
@@ -52,11 +50,24 @@ class FloorFit:
     camera: OverheadCamera
     pose: Pose
     points: FloorPoints
-    residuals: Float[np.ndarray, "point 2"]
-    off_mm: Float[np.ndarray, "point 2"]
-    twin_px: float | None
+    twin_px: float | None = None
     left_out: tuple[str, ...] = ()
     disputed: bool = False
+
+    @cached_property
+    def residuals(self) -> Float[np.ndarray, "point 2"]:
+        """Measured less computed places of the points in the picture [pixel]."""
+        now = project(self.camera.lens, self.pose, self.points.places)
+        return self.points.pixels - now.pixels
+
+    @property
+    def off_mm(self) -> Float[np.ndarray, "point 2"]:
+        """Measured less true x and y of the points, at the points' heights [mm]."""
+        off = [
+            self.camera.on_plane(pixel, float(place[2])) - place[:2]
+            for pixel, place in zip(self.points.pixels, self.points.places, strict=True)
+        ]
+        return 1000 * np.array(off)
 
     @property
     def rms_px(self) -> float:
@@ -94,21 +105,20 @@ def fit_place_robustly(source: str, lens: Lens, points: FloorPoints) -> FloorFit
     """
     left_out: tuple[str, ...] = ()
     first = len(points.names)
+    fewest = max(LEAST_TO_DROP, first - int(MOST_POINTS_EXCLUDED * first) + 1)
     while len(points.names) >= LEAST_TO_TEST:
         bad = _bad_point(lens, points)
         if bad is None:
             return replace(fit_place(source, lens, points), left_out=left_out)
-        few = len(points.names) < LEAST_TO_DROP or first - len(points.names) >= int(MOST * first)
-        if few:
-            doubt = (
-                f"{bad.sentence}; it was NOT left out, for the points are too few: measure again"
-            )
+        index, sentence = bad
+        if len(points.names) < fewest:
+            doubt = f"{sentence}; it was NOT left out, for the points are too few: measure again"
             fit = _fitted(lens, points)
             if fit is None:
                 raise DataError(f"{source}: {doubt}")
             return replace(fit, left_out=(*left_out, doubt), disputed=True)
-        left_out = (*left_out, f"{bad.sentence}: left out")
-        points = points.without(bad.index)
+        left_out = (*left_out, f"{sentence}: left out")
+        points = points.without(index)
     fit = fit_place(source, lens, points)
     vague = fit.rms_px > LEAST_BAD_PX
     if vague:
@@ -120,16 +130,11 @@ def fit_place_robustly(source: str, lens: Lens, points: FloorPoints) -> FloorFit
     return replace(fit, left_out=left_out, disputed=vague)
 
 
-@dataclass(frozen=True)
-class _BadPoint:
-    """Index of a point that does not fit the others, and a sentence about it."""
+def _bad_point(lens: Lens, points: FloorPoints) -> tuple[int, str] | None:
+    """Return the point without which the others agree far better; None if there is none.
 
-    index: int
-    sentence: str
-
-
-def _bad_point(lens: Lens, points: FloorPoints) -> _BadPoint | None:
-    """Return the point without which the others agree far better; None if there is none."""
+    It is given by its index, with a sentence about it.
+    """
     fit = _fitted(lens, points)
     without = [_fitted(lens, points.without(k)) for k in range(len(points.names))]
     agreed = [(rest.rms_px, k, rest) for k, rest in enumerate(without) if rest is not None]
@@ -137,39 +142,32 @@ def _bad_point(lens: Lens, points: FloorPoints) -> _BadPoint | None:
         return None
     error, index, rest = min(agreed, key=lambda one: one[:2])
     # one bad point may be so far off that no place of a camera explains all points
-    limit = LEAST_BAD_PX if fit is None else AGREES * fit.rms_px
-    one = points.only([index])
-    off_px = float(np.hypot(*(one.pixels - rest.camera.pixels(one.places))[0]))
-    if not (error < limit and off_px > LEAST_BAD_PX):
+    limit = LEAST_BAD_PX if fit is None else AGREEMENT * fit.rms_px
+    one = replace(rest, points=points.only([index]))
+    if not (error < limit and one.rms_px > LEAST_BAD_PX):
         return None
-    off_mm = float(np.hypot(*_off_mm(rest.camera, one)[0]))
-    return _BadPoint(
-        index,
-        f"point {points.names[index]} is off by {off_px:.1f} pixels ({off_mm:.0f} mm), the others "
-        f"by {error:.1f}",
+    return index, (
+        f"point {points.names[index]} is off by {one.rms_px:.1f} pixels ({rms(one.off_mm):.0f} "
+        f"mm), the others by {error:.1f}"
     )
 
 
 def _fitted(lens: Lens, points: FloorPoints) -> FloorFit | None:
     """Return the best place above the floor; None if no such place explains the points."""
-    poses = sorted(_candidates(lens, points), key=lambda p: _error(lens, p, points))
-    above = [pose for pose in poses if _looks_down(camera_of(lens, pose))]
-    if not above:
-        return None
+    poses = _candidates(lens, points)
+    fits = [FloorFit(camera_of(lens, pose), pose, points) for pose in poses]
+    fits.sort(key=lambda fit: fit.rms_px)
+    above = [fit for fit in fits if fit.camera.place[2] > 0 and fit.camera.rotation[2, 2] < 0]
     # of two poses with similar errors the one above the floor is taken, if its error is acceptable
-    best, bearable = above[0], max(TWIN_RATIO * _error(lens, poses[0], points), LEAST_BAD_PX)
-    if _error(lens, best, points) > bearable:
+    if not above or above[0].rms_px > max(TWIN_RATIO * fits[0].rms_px, LEAST_BAD_PX):
         return None
-    camera = camera_of(lens, best)
-    twins = [_error(lens, pose, points) for pose in above[1:] if _differ(pose, best)]
-    residuals = points.pixels - project(lens, best, points.places).pixels
-    off_mm = _off_mm(camera, points)
-    return FloorFit(camera, best, points, residuals, off_mm, min(twins, default=None))
+    best, *others = above
+    twins = [fit.rms_px for fit in others if _differ(fit.pose, best.pose)]
+    return replace(best, twin_px=min(twins, default=None))
 
 
 def _candidates(lens: Lens, points: FloorPoints) -> list[Pose]:
     """Return poses that are local minima of the error; points in a plane have two of them."""
-    cv2 = opencv()
     middle = points.places.mean(0)
     # OpenCV recognises points in a plane only if their z is 0; centred numbers are most precise
     places = np.ascontiguousarray(points.places - middle).reshape(-1, 1, 3)
@@ -185,27 +183,10 @@ def _candidates(lens: Lens, points: FloorPoints) -> list[Pose]:
     return [pose for pose in poses if np.isfinite([*pose.turn, *pose.shift]).all()]
 
 
-def _error(lens: Lens, pose: Pose, points: FloorPoints) -> float:
-    return rms(points.pixels - project(lens, pose, points.places).pixels)
-
-
-def _looks_down(camera: OverheadCamera) -> bool:
-    return bool(camera.place[2] > 0 and camera.rotation[2, 2] < 0)
-
-
 def _differ(pose: Pose, other: Pose) -> bool:
     """Return whether the rotations of two poses differ by more than a degree."""
-    cosine = 0.5 * (np.trace(pose.rotation.T @ other.rotation) - 1)
-    return bool(np.degrees(np.arccos(np.clip(cosine, -1, 1))) > 1)
-
-
-def _off_mm(camera: OverheadCamera, points: FloorPoints) -> Float[np.ndarray, "point 2"]:
-    """Return measured less true x and y of points, at the points' heights [mm]."""
-    off = [
-        camera.on_plane(pixel, float(place[2])) - place[:2]
-        for pixel, place in zip(points.pixels, points.places, strict=True)
-    ]
-    return 1000 * np.array(off)
+    turn = cv2.Rodrigues(pose.rotation.T @ other.rotation)[0]
+    return bool(np.degrees(np.linalg.norm(turn)) > 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,18 +224,19 @@ def uncertainty(
     at = np.concatenate([fit.pose.turn, fit.pose.shift, parameters_of(lens)])
     joint = _joint(fit, of_lens)
 
-    def camera(values: np.ndarray) -> OverheadCamera:
-        return camera_of(lens_of(lens, values[6:]), Pose(values[:3], values[3:6]))
+    def derived(values: np.ndarray) -> np.ndarray:
+        camera = camera_of(lens_of(lens, values[6:]), Pose(values[:3], values[3:6]))
+        # the axis's direction, since the angle is not differentiable at straight down
+        return np.array([*camera.place, *camera.rotation[2, :2], _log_length(camera)])
 
-    place = _propagated(lambda v: camera(v).place, at, joint)
-    # covariance of the axis's direction, since the angle is not differentiable at straight down
-    axis = _propagated(lambda v: camera(v).rotation[2, :2], at, joint)
-    scale = _propagated(lambda v: np.array([_log_length(camera(v))]), at, joint)
+    steps = np.diag(np.maximum(STEP_IN_STDS * np.sqrt(np.diag(joint)), 1e-9))
+    slopes = [(derived(at + step) - derived(at - step)) / (2 * step.sum()) for step in steps]
+    spread = np.transpose(slopes) @ joint @ np.array(slopes)
     return PlaceUncertainty(
         joint[:6, :6],
-        np.sqrt(np.diag(place)),
-        float(np.degrees(np.sqrt(np.linalg.eigvalsh(axis)[-1]))),
-        float(np.sqrt(scale[0, 0])),
+        np.sqrt(np.diag(spread)[:3]),
+        float(np.degrees(np.sqrt(np.linalg.eigvalsh(spread[3:5, 3:5])[-1]))),
+        float(np.sqrt(spread[5, 5])),
     )
 
 
@@ -267,7 +249,7 @@ def _joint(
     """
     now = project(fit.camera.lens, fit.pose, fit.points.places)
     free = max(fit.residuals.size - 6, 1)
-    variance = max((fit.residuals**2).sum() / free, LEAST_PX**2)
+    variance = max((fit.residuals**2).sum() / free, LEAST_STD_PX**2)
     own = np.linalg.inv(now.by_pose.T @ now.by_pose)
     count = now.by_lens.shape[1]
     lens = np.zeros((count, count)) if of_lens is None else of_lens
@@ -276,28 +258,10 @@ def _joint(
     return np.block([[variance * own + cross @ follows.T, cross], [cross.T, lens]])
 
 
-def _propagated(
-    function: Callable[[np.ndarray], np.ndarray],
-    at: Float[np.ndarray, " all"],
-    joint: Float[np.ndarray, "all all"],
-) -> np.ndarray:
-    """Return the covariance of a function's result, to first order.
-
-    `at` are its uncertain arguments, and `joint` is their covariance.
-    """
-    slope = []
-    for k, std in enumerate(np.sqrt(np.diag(joint))):
-        step = np.zeros(len(at))
-        step[k] = max(STEP * std, 1e-9)
-        slope.append((function(at + step) - function(at - step)) / (2 * step[k]))
-    columns = np.stack(slope, axis=1)
-    return columns @ joint @ columns.T
-
-
 def _log_length(camera: OverheadCamera) -> float:
     """Return the mean logarithm of the floor lengths [m] between neighbours in a grid of pixels."""
     width, height = camera.lens.image_px
-    part = np.linspace(0.5 - 0.5 * INSIDE, 0.5 + 0.5 * INSIDE, GRID)
+    part = 0.5 + INNER_SHARE * np.linspace(-0.5, 0.5, GRID_POINTS)
     grid = np.stack(np.meshgrid(part * (width - 1), part * (height - 1)), axis=-1)
     floor = camera.on_plane(grid, 0.0)
     lengths = [np.linalg.norm(np.diff(floor, axis=axis), axis=-1).ravel() for axis in (0, 1)]

@@ -1,7 +1,5 @@
 """Measured points on the floor, read from a CSV file of their places in world and picture."""
 
-import csv
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,11 +7,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from slipid.camera.csv_rows import csv_rows
 from slipid.support.errors import DataError, bad_data, did_you_mean
 
 COLUMNS = ("u", "v", "x", "y")
+EXPECTED = "u, v (pixels), x, y (metres) and perhaps z"
+"""Columns of a file of points, for messages."""
 LEAST_POINTS = 4
-LINE = 0.02
+LINE_WIDTH = 0.02
 """Ratio of the points' spread across their main direction to that along it, below which they count
 as lying on one line [1]."""
 
@@ -50,21 +51,30 @@ def read_points(path: Path, image_px: tuple[int, int]) -> FloorPoints:
         DataError: the file is absent, lacks a column, has a cell that is not a number or a pixel
             outside the picture; or the points do not determine the camera's place.
     """
-    header, rows = _table(path)
-    names = (*COLUMNS, "z") if "z" in header else COLUMNS
+    rows = [row for row in csv_rows(path, f"a CSV file with columns {EXPECTED}") if any(row[1])]
+    if not rows:
+        raise DataError(f"{path}: the file is empty; expected columns {EXPECTED}")
+    header = [name.lower() for name in rows.pop(0)[1]]
     if missing := [name for name in COLUMNS if name not in header]:
         hint = did_you_mean(missing[0], header)
         raise DataError(
             f"{path}: no column {', '.join(missing)}{hint}; the first line has {', '.join(header)}"
-            "; expected u, v (pixels), x, y (metres) and perhaps z"
+            f"; expected {EXPECTED}"
         )
-    values = np.array(
-        [[_number(path, line, row, name, header) for name in names] for line, row in rows]
-    ).reshape(-1, len(names))
-    _inside(path, [line for line, _ in rows], values[:, :2], image_px)
-    height = values[:, 4:] if "z" in names else np.zeros((len(values), 1))
-    places = np.concatenate([values[:, 2:4], height], axis=1)
-    points = FloorPoints(tuple(f"row {line}" for line, _ in rows), values[:, :2], places)
+    names = (*COLUMNS, "z") if "z" in header else COLUMNS
+    numbers = [[_number(path, line, row, name, header) for name in names] for line, row in rows]
+    values = np.zeros((len(rows), 5))
+    values[:, : len(names)] = np.reshape(numbers, (-1, len(names)))
+    points = FloorPoints(tuple(f"row {k}" for k, _ in rows), values[:, :2], values[:, 2:])
+    for k in np.flatnonzero(((points.pixels < -1) | (points.pixels > image_px)).any(axis=1)):
+        u, v = points.pixels[k]
+        raise bad_data(
+            path,
+            f"u = {u:g}, v = {v:g}",
+            f"pixels inside the camera's picture of {image_px[0]} x {image_px[1]}; if the points "
+            "were read off another picture, take one at the same resolution",
+            row=rows[k][0],
+        )
     check_spread(path, points)
     return points
 
@@ -82,29 +92,11 @@ def check_spread(source: Path, points: FloorPoints) -> None:
         )
     for where, at in (("on the floor", points.places), ("in the picture", points.pixels)):
         spread = np.linalg.svd(at - at.mean(0), compute_uv=False)
-        if spread[1] <= LINE * spread[0]:
+        if spread[1] <= LINE_WIDTH * spread[0]:
             raise DataError(
                 f"{source}: all {len(points.names)} points lie on one line {where}; expected some "
                 "well beside it"
             )
-
-
-def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the names of the columns, and the rows, each with its line number in the file."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; expected a CSV file of points") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: no UTF-8 text; expected a CSV file of points") from error
-    if not text.strip():
-        raise DataError(f"{path}: the file is empty; expected columns u, v, x, y")
-    first = next((t for t in text.splitlines() if t.strip() and t[0] != "#"), "")
-    delimiter = max(",;\t", key=first.count)
-    lines = enumerate(csv.reader(io.StringIO(text), delimiter=delimiter), 1)
-    rows = [(n, [cell.strip() for cell in row]) for n, row in lines]
-    rows = [(n, row) for n, row in rows if any(row) and not row[0].startswith("#")]
-    return [name.lower() for name in rows[0][1]] if rows else [], rows[1:]
 
 
 def _number(path: Path, line: int, row: list[str], name: str, header: list[str]) -> float:
@@ -119,18 +111,3 @@ def _number(path: Path, line: int, row: list[str], name: str, header: list[str])
         shown = f"'{text}'" if text else "nothing"
         raise bad_data(path, shown, "a number", row=line, column=name)
     return value
-
-
-def _inside(
-    path: Path, lines: list[int], pixels: Float[np.ndarray, "point 2"], image_px: tuple[int, int]
-) -> None:
-    """Raise `DataError` unless all pixels lie inside the picture."""
-    for line, (u, v) in zip(lines, pixels, strict=True):
-        if not (-1 <= u <= image_px[0] and -1 <= v <= image_px[1]):
-            raise bad_data(
-                path,
-                f"u = {u:g}, v = {v:g}",
-                f"pixels inside the camera's picture of {image_px[0]} x {image_px[1]}; if the "
-                "points were read off another picture, take one at the same resolution",
-                row=line,
-            )

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,11 +19,11 @@ from slipid.camera.calibration.lens import (
 )
 from slipid.support.errors import DataError
 
-FOLDS = 5
+HELD_OUT_FOLDS = 5
 TILTED_DEG = 12.0
 """Tilt of the board above which a view separates focal length and distance [deg]."""
 LEAST_TILTED = 3
-ACROSS, DOWN = 8, 6
+CELLS = (8, 6)
 """Numbers of cells across and down into which the picture is divided, to measure coverage."""
 REFUSED_SHARE, POOR_SHARE = 0.35, 0.6
 """Share of the cells with corners below which a lens is refused, and below which it is reported as
@@ -59,13 +60,10 @@ class Coverage:
 def coverage(pixels: Float[np.ndarray, "corner 2"], image_px: tuple[int, int]) -> Coverage:
     """Return the coverage of a picture by corners."""
     size = np.array(image_px)
-    cells = np.clip((pixels + 0.5) / size * [ACROSS, DOWN], 0, [ACROSS - 1, DOWN - 1]).astype(int)
-    visited = np.zeros((DOWN, ACROSS), bool)
-    visited[cells[:, 1], cells[:, 0]] = True
+    visited = np.histogramdd(pixels, CELLS, [(-0.5, n - 0.5) for n in image_px])[0].T > 0
     from_middle = (pixels - (size - 1) / 2) / (size / 2)
     # the smaller of the shares in x and y counts: the middle of an edge is near no picture corner
-    directions = ([1, 1], [1, -1], [-1, 1], [-1, -1])
-    reach = min(float((from_middle * one).min(1).max()) for one in directions)
+    reach = min(float((from_middle * one).min(1).max()) for one in product((1, -1), repeat=2))
     return Coverage(visited, max(reach, 0.0))
 
 
@@ -132,10 +130,10 @@ def held_out_px(views: Sequence[View], image_px: tuple[int, int], k3: bool) -> f
     the error, which is scaled up to compensate.
     """
     squares, count = 0.0, 0
-    for fold in range(FOLDS):
-        rest = [v for k, v in enumerate(views) if k % FOLDS != fold]
+    for fold in range(HELD_OUT_FOLDS):
+        rest = [v for k, v in enumerate(views) if k % HELD_OUT_FOLDS != fold]
         lens = fit_lens(rest, image_px, k3).lens
-        for view in views[fold::FOLDS]:
+        for view in views[fold::HELD_OUT_FOLDS]:
             off = view.pixels - project(lens, pose_of(lens, view), solid(view)).pixels
             squares += rms(off) ** 2 * len(off) * off.size / (off.size - 6)
             count += len(off)

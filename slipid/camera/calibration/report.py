@@ -15,7 +15,7 @@ POOR_SCALE = 0.005
 POOR_FLOOR_PX = 1.5
 """Relative std of lengths on the floor [1], and error of points on the floor [pixel], above which a
 camera is reported as poor."""
-SHOWN = 12
+POINTS_SHOWN = 12
 """Number of points, those with the largest errors, that the text lists; the file lists all."""
 UNITS = {"fx": " px", "fy": " px", "cx": " px", "cy": " px"}
 
@@ -59,7 +59,7 @@ def floor_report(source: str, fit: FloorFit, spread: PlaceUncertainty, size_std:
     keys = ("name", "pixel", "place_m", "off_px", "off_mm")
     columns = (fit.points.pixels, fit.points.places, fit.residuals, fit.off_mm)
     rows = zip(fit.points.names, *(column.tolist() for column in columns), strict=True)
-    scale = scale_std(spread, size_std)
+    scale = float(np.hypot(spread.scale_std, size_std))
     return {
         "source": source,
         "rms_px": fit.rms_px,
@@ -89,11 +89,6 @@ def straight_report(camera: OverheadCamera) -> Content:
         "left_out": [],
         "poor": [],
     }
-
-
-def scale_std(spread: PlaceUncertainty, size_std: float) -> float:
-    """Return the relative std of lengths on the floor, from the pose and from `size_std` [1]."""
-    return float(np.hypot(spread.scale_std, size_std))
 
 
 def mm_per_pixel(camera: OverheadCamera) -> float:
@@ -177,14 +172,14 @@ def _floor(floor: Content) -> Iterator[str]:
     """Yield the lines of the report of a camera's place."""
     yield f"place above the floor: {floor['source']}"
     points = floor.get("points", [])
-    shown = sorted(points, key=lambda p: -math.hypot(*p["off_px"]))[:SHOWN]
+    shown = sorted(points, key=lambda p: -math.hypot(*p["off_px"]))[:POINTS_SHOWN]
     for point in points:
         if point in shown:
             u, v = point["off_px"]
             x, y = point["off_mm"]
             yield f"  {point['name']}: off by {u:+.2f}, {v:+.2f} px; {x:+.1f}, {y:+.1f} mm"
-    if len(points) > SHOWN:
-        yield f"  the other {len(points) - SHOWN} points are off by less"
+    if len(points) > POINTS_SHOWN:
+        yield f"  the other {len(points) - POINTS_SHOWN} points are off by less"
     yield from (f"  {sentence}" for sentence in floor["left_out"])
     if points:
         yield (

@@ -2,23 +2,23 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from slipid.camera.opencv import Mask, marker_dictionary, opencv
+from slipid.camera.opencv import Mask, cv2, marker_dictionary
 from slipid.camera.overhead import OverheadCamera
 from slipid.support.errors import DataError
 
 LEAST_CELLS, MOST_CELLS = 400, 4_000_000
 """Smallest and largest number of cells of a map."""
-FARTHEST = 3.0
+FARTHEST_IN_HEIGHTS = 3.0
 """Distance from the point below the lens up to which the floor is mapped, in heights of the lens
 above the floor [1]."""
 
 
-@dataclass(frozen=True)
-class Extent:
+class Extent(NamedTuple):
     """A rectangle of the floor along the axes [m]."""
 
     low_x: float
@@ -93,7 +93,6 @@ class Rectified:
 
 def filled(polygon: Float[np.ndarray, "corner 2"], rows: int, columns: int) -> Mask:
     """Return the points of a grid that lie in a polygon, whose corners are columns and rows."""
-    cv2 = opencv()
     mask = np.zeros((rows, columns), np.uint8)
     parts = 16  # OpenCV draws to a sixteenth of a step, set by the last argument below
     corners = np.rint(np.clip(polygon, -1e6, 1e6) * parts).astype(np.int32)
@@ -108,11 +107,12 @@ def view_of(camera: OverheadCamera) -> Extent:
         DataError: the camera sees no floor nearby.
     """
     floor = camera.on_plane(_pixel_grid(camera, -0.5), 0.0).reshape(-1, 2)
-    floor = floor[np.linalg.norm(floor - camera.place[:2], axis=1) <= FARTHEST * camera.height]
+    floor = floor[
+        np.linalg.norm(floor - camera.place[:2], axis=1) <= FARTHEST_IN_HEIGHTS * camera.height
+    ]
     if not len(floor):
         raise DataError("the camera sees no floor nearby; expected one that looks down")
-    (low_x, low_y), (high_x, high_y) = floor.min(axis=0), floor.max(axis=0)
-    return Extent(float(low_x), float(low_y), float(high_x), float(high_y))
+    return Extent(*map(float, (*floor.min(axis=0), *floor.max(axis=0))))
 
 
 def _pixel_grid(camera: OverheadCamera, edge: float) -> Float[np.ndarray, "65 65 2"]:
@@ -159,7 +159,6 @@ def grid_over(extent: Extent, cell: float, picture: Path) -> Grid:
 
 def rectified(picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, grid: Grid) -> Rectified:
     """Return the picture projected onto the floor; cells out of view are black."""
-    cv2 = opencv()
     centres = grid.centres()
     points = np.concatenate([centres, np.zeros((*centres.shape[:2], 1))], axis=-1)
     ahead = _before_lens(camera, points)
@@ -187,7 +186,10 @@ def _before_lens(camera: OverheadCamera, points: Float[np.ndarray, "row column 3
     ideal = camera.lens.ideal(_pixel_grid(camera, 0.0))
     widest = 1.02 * np.linalg.norm(ideal, axis=-1).max()
     rays = (points - camera.place) @ camera.rotation.T
-    near = np.linalg.norm(points[..., :2] - camera.place[:2], axis=-1) <= FARTHEST * camera.height
+    near = (
+        np.linalg.norm(points[..., :2] - camera.place[:2], axis=-1)
+        <= FARTHEST_IN_HEIGHTS * camera.height
+    )
     depth = rays[..., 2]
     return near & (depth > 0) & (np.linalg.norm(rays[..., :2], axis=-1) <= widest * depth)
 
@@ -224,7 +226,7 @@ def detected_robots(
     picture: UInt8[np.ndarray, "y x 3"], camera: OverheadCamera, shape: RobotShape
 ) -> tuple[DetectedRobot, ...]:
     """Return all robots whose markers are detected in a picture."""
-    detector = opencv().aruco.ArucoDetector(marker_dictionary(shape.dictionary))
+    detector = cv2.aruco.ArucoDetector(marker_dictionary(shape.dictionary))
     corners, numbers, _ = detector.detectMarkers(picture)
     robots = []
     for outline, number in zip(corners, [] if numbers is None else numbers.ravel(), strict=True):
@@ -244,7 +246,7 @@ def hidden_by(
     levels = np.linspace(0, shape.height, 5)
     points = np.concatenate([np.column_stack([ring, np.full(len(ring), z)]) for z in levels])
     # a cylinder is convex, so it hides the convex hull of its rings
-    outline = opencv().convexHull(camera.pixels(points).astype(np.float32))
+    outline = cv2.convexHull(camera.pixels(points).astype(np.float32))
     width, height = camera.lens.image_px
     hull: Float[np.ndarray, "corner 2"] = np.asarray(outline, float).reshape(-1, 2)
     return filled(hull, height, width)

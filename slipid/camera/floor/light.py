@@ -12,16 +12,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from slipid.camera.opencv import opencv
+from slipid.camera.opencv import cv2
 
-ORDER = 4
+DEGREE = 4
 """Highest sum of the degrees in x and y of the polynomials in a gain or a veil."""
 STIFF_GAIN, STIFF_VEIL = 3e-4, 1e-3
 """Weights of the penalties that pull the gain to 1 and the veil to 0, relative to the weighted mean
 square misfit of colours [1]."""
-ROUNDS = 6
+ALTERNATIONS = 6
 """Number of iterations in which illumination and colours are fitted alternately."""
-GRAY = 0.03
+DARK = 0.03
 """Linear RGB value up to which noise is about constant; above it noise grows with the value [1]."""
 
 
@@ -46,7 +46,6 @@ def features_of(colour: UInt8[np.ndarray, "row column 3"], smooth: float = 1.0) 
         colour: colours of the cells.
         smooth: std of the Gaussian that smooths their noise [cells].
     """
-    cv2 = opencv()
     fine = colour.astype(np.float32) / 255
     soft = cv2.GaussianBlur(fine, (0, 0), smooth)
     lab = cv2.cvtColor(soft, cv2.COLOR_BGR2LAB)
@@ -60,7 +59,6 @@ def texture(lightness: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "ro
     v is a median over a window, so that edges between surfaces, thin lines in the window, do not
     affect it.
     """
-    cv2 = opencv()
     change = np.abs(lightness - cv2.GaussianBlur(lightness, (0, 0), 2.5))
     coarse = np.clip(change * 16, 0, 255).astype(np.uint8)
     typical = cv2.medianBlur(coarse, 13).astype(np.float32) / 16
@@ -83,7 +81,6 @@ def to_srgb(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]
 
 def lab_of(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
     """Return the CIELAB values of linear RGB."""
-    cv2 = opencv()
     bgr = to_srgb(rgb)[..., ::-1].astype(np.float32).reshape(-1, 1, 3)
     if not len(bgr):
         return np.zeros(rgb.shape)
@@ -168,7 +165,7 @@ def fit_illumination(samples: ColourSamples, start: LitColours) -> LitColours:
     """
     fit = start
     basis = basis_at(samples.at)
-    for _ in range(ROUNDS):
+    for _ in range(ALTERNATIONS):
         weights = _weights(samples, fit)
         fit = replace(fit, illumination=_illumination(samples, basis, fit.colours, weights))
         fit = replace(fit, colours=_colours(samples, basis, fit, weights))
@@ -176,14 +173,14 @@ def fit_illumination(samples: ColourSamples, start: LitColours) -> LitColours:
 
 
 def basis_at(at: Float[np.ndarray, "place 2"]) -> Float[np.ndarray, "place function"]:
-    """Return products of Legendre polynomials of x and y up to `ORDER`, without the constant."""
+    """Return products of Legendre polynomials of x and y up to `DEGREE`, without the constant."""
     inside = np.clip(at, -1, 1)
-    x, y = (np.polynomial.legendre.legvander(inside[:, k], ORDER) for k in (0, 1))
+    x, y = (np.polynomial.legendre.legvander(inside[:, k], DEGREE) for k in (0, 1))
     return np.stack([x[:, i] * y[:, j] for i, j in _powers()[1:]], axis=1)
 
 
 def _powers() -> list[tuple[int, int]]:
-    return [(i, j) for i in range(ORDER + 1) for j in range(ORDER + 1 - i)]
+    return [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
 
 
 def _weights(samples: ColourSamples, fit: LitColours) -> Float[np.ndarray, "place 3"]:
@@ -193,7 +190,7 @@ def _weights(samples: ColourSamples, fit: LitColours) -> Float[np.ndarray, "plac
     """
     expected = fit.illumination.rgb_of(fit.colours, samples.at)
     own = expected[samples.surface, np.arange(len(samples.surface))]
-    scale = 1 / (GRAY + 0.5 * (own + samples.rgb))
+    scale = 1 / (DARK + 0.5 * (own + samples.rgb))
     error = np.abs((samples.rgb - own) * scale).max(axis=1)
     typical = max(1.5 * float(np.median(error)), 0.02)
     robust = 1 / (1 + (error / (2 * typical)) ** 2) ** 2

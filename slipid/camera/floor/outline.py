@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.camera.opencv import Labels, Mask, opencv
+from slipid.camera.opencv import Labels, Mask, cv2
 
-FITTED = 6
+FITTED_STEPS = 6
 """Smallest number of steps of a border part to which a line is fitted; a step is a cell's edge."""
 
 
@@ -37,7 +37,6 @@ def outlines_of(labels: Labels, tolerance: float) -> tuple[PatchOutline, ...]:
         tolerance: largest distance of a polygon's line from the cell edges that it replaces
             [cells].
     """
-    cv2 = opencv()
     fixed = _junctions(labels)
     outlines = []
     for label in np.unique(labels[labels >= 0]):
@@ -64,7 +63,6 @@ def _rings(cells: Mask) -> list[Int[np.ndarray, "_ 2"]]:
     computed on a grid twice as fine, on which a cell covers three by three points, so that they run
     along the edges of cells.
     """
-    cv2 = opencv()
     rows, columns = np.nonzero(cells)
     low = np.array([columns.min(), rows.min()])
     cut = cells[low[1] : rows.max() + 1, low[0] : columns.max() + 1]
@@ -122,7 +120,6 @@ def _line(path: Float[np.ndarray, "step 2"], tolerance: float) -> Float[np.ndarr
 
     The result does not depend on the direction of the border.
     """
-    cv2 = opencv()
     if (path[0] == path[-1]).all():  # a loop: its farthest corner splits it in two
         distance = ((path - path[0]) ** 2).sum(axis=1)
         turn = int(np.lexsort((path[:, 1], path[:, 0], distance))[-1])
@@ -155,10 +152,9 @@ def _fitted(
     out = middles[index].copy()
     for k in range(1, len(index) - 1):
         (p, along), (q, other) = lines[k - 1], lines[k]
-        cross = along[0] * other[1] - along[1] * other[0]
-        if abs(cross) > 0.1:  # otherwise the two lines are nearly parallel
-            off = q - p
-            meet = p + along * (off[0] * other[1] - off[1] * other[0]) / cross
+        both = np.stack([along, -other], axis=1)
+        if abs(np.linalg.det(both)) > 0.1:  # otherwise the two lines are nearly parallel
+            meet = p + along * np.linalg.solve(both, q - p)[0]
         else:
             feet = [on + d * float((out[k] - on) @ d) for on, d in lines[k - 1 : k + 1]]
             meet = (feet[0] + feet[1]) / 2
@@ -175,7 +171,7 @@ def _through(
 
     For few steps it is the line from the first to the last one.
     """
-    if len(steps) < FITTED:
+    if len(steps) < FITTED_STEPS:
         return steps[0], (steps[-1] - steps[0]) / np.linalg.norm(steps[-1] - steps[0])
     inner = steps[1:-1]  # the steps at the ends may belong to the neighbouring lines
     middle = inner.mean(axis=0)

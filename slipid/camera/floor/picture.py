@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from slipid.camera.floor.grid import RobotShape
-from slipid.camera.floor.light import Features, features_of
 from slipid.camera.floor.proposal import matched, proposed
 from slipid.camera.floor.region import (
     SCHEMA,
@@ -19,14 +18,15 @@ from slipid.camera.floor.region import (
     requested_region,
     seeds_of,
 )
-from slipid.camera.floor.result import PictureMap, Segmentation, map_from
+from slipid.camera.floor.result import PictureMap, map_from
 from slipid.camera.floor.surfaces import (
-    AROUND,
+    MARK_RADIUS,
     UNKNOWN,
     MarkedCells,
     Seeds,
     labelled,
     learnt,
+    surroundings,
     without_small_patches,
 )
 from slipid.camera.frame_source import still
@@ -35,7 +35,7 @@ from slipid.camera.overhead import OverheadCamera
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
-NARROW = 7
+NARROWEST = 7
 """Width of the narrowest patch that is kept [cells]."""
 
 
@@ -64,61 +64,54 @@ def map_of(path: Path, camera: OverheadCamera, options: MapOptions, report: Repo
             not fit the picture.
     """
     report.stage("laying the picture onto the floor")
-    picture = still(path)
     palette = Palette(schema=SCHEMA) if options.config is None else read_palette(options.config)
-    source = FloorPicture(path, options.config or path, picture, camera)
+    source = FloorPicture(path, still(path), camera, options.config or path, palette)
     if palette.names and options.surfaces is not None:
         raise DataError(
             f"{options.config}: it names {len(palette.names)} surfaces; expected no --surfaces "
             "with it"
         )
-    region = requested_region(source, palette, options.robot, options.cell)
-    features = features_of(region.floor.colour)
+    region = requested_region(source, options.robot, options.cell)
     report.stage("separating surfaces")
     if palette.names:
         points, names = None, palette.names
-        seeds = _with_matches(seeds_of(source, features, region, palette), features, region)
+        seeds = _with_matches(seeds_of(region), region)
     else:
-        points = proposed(features, region.visible, options.surfaces)
-        seeds = _seeds_around(points, features, region)
+        points = proposed(region.features, region.visible, options.surfaces)
+        seeds = _seeds_around(points, region)
         names = tuple(f"surface_{k + 1}" for k in range(len(seeds.colours)))
-    segmentation = _segmented(features, region, seeds)
+    surfaces = learnt(region.features, region.visible, seeds)
+    costs = surfaces.costs(region.features.appearance)
+    labels = without_small_patches(labelled(costs, region.visible), region.visible, NARROWEST)
+    labels = np.where(labels == len(costs), UNKNOWN, labels)
     if points is None:
-        check_all_present(source, names, segmentation.labels)
+        check_all_present(source, names, labels)
     report.stage("drawing outlines")
-    result = map_from(source, region, features, names, palette, segmentation)
+    result = map_from(region, names, surfaces, costs, labels)
     if points is None:
         return result
-    return replace(result, proposal=_config_of(path, palette, result, points))
+    return replace(result, proposal=_config_of(source, result, points))
 
 
-def _segmented(features: Features, region: FloorRegion, seeds: Seeds) -> Segmentation:
-    """Return the surface of each cell; cells that resemble none of them are unknown."""
-    surfaces = learnt(features, region.visible, seeds)
-    costs = surfaces.costs(features.appearance)
-    labels = labelled(costs, region.visible)
-    labels = without_small_patches(labels, region.visible, NARROW)
-    return Segmentation(np.where(labels == len(costs), UNKNOWN, labels), costs, surfaces)
-
-
-def _with_matches(seeds: Seeds, features: Features, region: FloorRegion) -> Seeds:
+def _with_matches(seeds: Seeds, region: FloorRegion) -> Seeds:
     """Return seeds with more marked cells for surfaces that have at most one marked point.
 
     These cells are on patches whose colour matches the surface.
     """
-    count = np.bincount(seeds.marked.surface, minlength=len(seeds.colours))
-    few = count <= (AROUND + 1) ** 2  # number of cells around one point
+    count = np.bincount(seeds.marked[:, 2], minlength=len(seeds.colours))
+    few = count <= (MARK_RADIUS + 1) ** 2  # number of cells around one point
     if not few.any():
         return seeds
-    match = matched(features, region.visible, seeds.colours)
-    more = match.only(few[match.surface]).surroundings(region.visible)
-    return replace(seeds, marked=seeds.marked.joined(more))
+    match = matched(region.features, region.visible, seeds.colours)
+    more = surroundings(match[few[match[:, 2]]], region.visible)
+    return replace(seeds, marked=np.concatenate([seeds.marked, more]))
 
 
-def _seeds_around(points: MarkedCells, features: Features, region: FloorRegion) -> Seeds:
+def _seeds_around(points: MarkedCells, region: FloorRegion) -> Seeds:
     """Return the cells around proposed points as marked cells, and their surfaces' colours."""
-    cells = points.surroundings(region.visible)
-    rgb, own = features.rgb[cells.row, cells.column], cells.surface
+    cells = surroundings(points, region.visible)
+    row, column, own = cells.T
+    rgb = region.features.rgb[row, column]
     colours = [np.median(rgb[own == k], axis=0) for k in range(own.max() + 1)]
     return Seeds(np.array(colours, float), cells)
 
@@ -133,11 +126,12 @@ def check_all_present(source: FloorPicture, names: tuple[str, ...], labels: Labe
         )
 
 
-def _config_of(path: Path, palette: Palette, result: PictureMap, points: MarkedCells) -> str:
+def _config_of(source: FloorPicture, result: PictureMap, points: MarkedCells) -> str:
     """Return the text of a config that marks the proposed surfaces by points in pixels."""
-    pixels = result.floor.pixels[points.row, points.column]
+    row, column, surface = points.T
+    pixels = result.floor.pixels[row, column]
     surfaces = []
     for k, (name, colour) in enumerate(result.vector.region.colours.items()):
-        own = points.surface == int(name.removeprefix("surface_")) - 1
+        own = surface == int(name.removeprefix("surface_")) - 1
         surfaces.append(points_text(name, colour, result.share(k), pixels[own]))
-    return palette_text(surfaces, path.name, palette)
+    return palette_text(surfaces, source.path.name, source.palette)

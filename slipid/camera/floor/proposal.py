@@ -23,29 +23,29 @@ from slipid.camera.floor.light import (
     fit_illumination,
     lab_of,
 )
-from slipid.camera.floor.surfaces import COARSE, MarkedCells, positions, thinned
-from slipid.camera.opencv import Labels, Mask, opencv
+from slipid.camera.floor.surfaces import COARSE_CELLS, MarkedCells, positions, thinned
+from slipid.camera.opencv import Labels, Mask, cv2
 from slipid.support.errors import DataError
 
-JOIN = (5.0, 7.0, 8.0, 8.0, 8.0)
+JOIN_LIMITS = (5.0, 7.0, 8.0, 8.0, 8.0)
 """Distance of colours up to which patches count as one surface, in each round [units of CIELAB]."""
-SEPARATE = 7.0
+SEPARATE_FROM = 7.0
 """Distance of colours from which on patches are proposed as two surfaces [units of CIELAB]. It is
 small, since users can easily give two proposed surfaces one name, but hardly split one."""
 LEAST_PART = 0.002
 """Share of the floor below which a patch is too small to propose a surface [1]."""
-LIGHTNESS = 0.8
+LIGHTNESS_WEIGHT = 0.8
 """Weight of a difference of lightness relative to one of a or b [1]; it is below 1 since shading
 changes lightness."""
-TEXTURE = 10.0
+TEXTURE_WEIGHT = 10.0
 """Distance of colours that a difference of 1 in texture equals [units of CIELAB]."""
-SAMPLES = 4000
+ABOUT_SAMPLES = 4000
 """Approximate number of cells to which the illumination is fitted."""
-POINTS = 4
+MOST_POINTS = 4
 """Largest number of points that mark a surface."""
-MATCH = (8.0, 10.0, 12.0, 14.0, 16.0, 16.0)
+MATCH_LIMITS = (8.0, 10.0, 12.0, 14.0, 16.0, 16.0)
 """Distance of colours up to which a patch matches a given one, in each round [units of CIELAB]."""
-CLEARER = 0.7
+CLEAR_RATIO = 0.7
 """Largest ratio of a patch's distance to the nearest colour and to the second nearest colour with
 which it still matches the nearest one [1]."""
 
@@ -56,14 +56,13 @@ class Patches:
 
     Attributes:
         appearance: L, a, b and texture of each patch.
-        row, column: cell of the full picture that is farthest from the patch's edge.
+        place: row and column of the full picture's cell that is farthest from the patch's edge.
         cells: number of cells of the full picture in each patch.
         samples: colours in all patches; their `surface` is the number of the patch.
     """
 
     appearance: Float[np.ndarray, "patch 4"]
-    row: Int[np.ndarray, " patch"]
-    column: Int[np.ndarray, " patch"]
+    place: Int[np.ndarray, "patch 2"]
     cells: Int[np.ndarray, " patch"]
     samples: ColourSamples
 
@@ -80,9 +79,9 @@ def proposed(features: Features, visible: Mask, count: int | None) -> MarkedCell
         DataError: there are fewer patches than surfaces.
     """
     patches = patches_of(features, visible)
-    if len(patches.row) < max(1, count or 1):
+    if len(patches.place) < max(1, count or 1):
         raise DataError(
-            f"{len(patches.row)} uniform patches, too few for {count or 1} surfaces; expected "
+            f"{len(patches.place)} uniform patches, too few for {count or 1} surfaces; expected "
             "a picture of a floor: mark surfaces in a config, or name fewer with --surfaces"
         )
     own = _clusters(patches, count)
@@ -91,15 +90,14 @@ def proposed(features: Features, visible: Mask, count: int | None) -> MarkedCell
     chosen = [
         one
         for k in range(len(size))
-        for one in np.flatnonzero(own == k)[np.argsort(-patches.cells[own == k])][:POINTS]
+        for one in np.flatnonzero(own == k)[np.argsort(-patches.cells[own == k])][:MOST_POINTS]
     ]
-    return MarkedCells(patches.row[chosen], patches.column[chosen], rank[own[chosen]])
+    return np.column_stack([patches.place[chosen], rank[own[chosen]]])
 
 
 def patches_of(features: Features, visible: Mask) -> Patches:
     """Return patches of connected cells within which the appearance changes slowly."""
-    cv2 = opencv()
-    step = max(1, round(np.sqrt(visible.size / (2 * COARSE))))
+    step = max(1, round(np.sqrt(visible.size / (2 * COARSE_CELLS))))
     few, some = thinned(features, step), visible[step // 2 :: step, step // 2 :: step]
     soft = cv2.GaussianBlur(few.appearance[..., :3], (0, 0), 1.2)
     across, down = (cv2.Sobel(soft, cv2.CV_32F, i, 1 - i, scale=0.125) for i in (1, 0))
@@ -112,12 +110,11 @@ def patches_of(features: Features, visible: Mask) -> Patches:
     area = stats[:, cv2.CC_STAT_AREA]
     kept = [k for k in range(1, count) if area[k] >= LEAST_PART * some.sum()]
     peak = [int(np.argmax(np.where(parts == k, inner, -1))) for k in kept]
-    rows, columns = np.unravel_index(np.array(peak, int), parts.shape)
+    places = np.stack(np.unravel_index(np.array(peak, int), parts.shape), axis=1)
     appearance = [np.median(few.appearance[parts == k], axis=0) for k in kept]
     return Patches(
         np.array(appearance, float).reshape(-1, 4),
-        np.minimum(rows * step + step // 2, visible.shape[0] - 1),
-        np.minimum(columns * step + step // 2, visible.shape[1] - 1),
+        np.minimum(places * step + step // 2, np.array(visible.shape) - 1),
         np.array([area[k] * step**2 for k in kept], int),
         _samples(few, parts, kept),
     )
@@ -129,7 +126,7 @@ def _samples(few: Features, parts: Labels, kept: Sequence[int]) -> ColourSamples
     own[list(kept)] = np.arange(len(kept))
     patch = own[parts].ravel()
     cells = np.flatnonzero(patch >= 0)
-    cells = cells[:: max(1, len(cells) // SAMPLES)]
+    cells = cells[:: max(1, len(cells) // ABOUT_SAMPLES)]
     weight = 1 / np.sqrt(np.bincount(patch[cells], minlength=1)[patch[cells]])
     at, rgb = positions(parts.shape)[cells], few.rgb.reshape(-1, 3)[cells].astype(float)
     return ColourSamples(at, rgb, patch[cells], weight)
@@ -149,30 +146,30 @@ def _clusters(patches: Patches, count: int | None) -> Int[np.ndarray, " patch"]:
     """
     from scipy.cluster.hierarchy import fcluster, linkage
 
-    samples, own = patches.samples, np.arange(len(patches.row))
+    samples, own = patches.samples, np.arange(len(patches.place))
     if len(own) == 1:
         return own
-    for near in JOIN:
+    for near in JOIN_LIMITS:
         grouped = replace(samples, surface=own[samples.surface])
         start = LitColours(Illumination.uniform(), _means(grouped))
         plain = _evenly(lab_of(_relit(fit_illumination(grouped, start).illumination, samples)))
         middle = [np.median(plain[samples.surface == k], axis=0) for k in range(len(own))]
-        rough = TEXTURE * patches.appearance[:, 3:]
+        rough = TEXTURE_WEIGHT * patches.appearance[:, 3:]
         tree = linkage(np.concatenate([np.array(middle), rough], axis=1), "average")
         own = fcluster(tree, near, "distance") - 1
     if count is None:
-        return np.asarray(fcluster(tree, SEPARATE, "distance") - 1)
+        return np.asarray(fcluster(tree, SEPARATE_FROM, "distance") - 1)
     return np.asarray(fcluster(tree, count, "maxclust") - 1)
 
 
 def _evenly(lab: Float[np.ndarray, "place 3"]) -> Float[np.ndarray, "place 3"]:
     """Return CIELAB with compressed chroma, so that distances of strong colours match perception.
 
-    Lightness is multiplied by `LIGHTNESS`.
+    Lightness is multiplied by `LIGHTNESS_WEIGHT`.
     """
     chroma = np.linalg.norm(lab[:, 1:], axis=1, keepdims=True)
     drawn = np.log1p(0.045 * chroma) / (0.045 * np.maximum(chroma, 1e-6))
-    return np.concatenate([LIGHTNESS * lab[:, :1], drawn * lab[:, 1:]], axis=1)
+    return np.concatenate([LIGHTNESS_WEIGHT * lab[:, :1], drawn * lab[:, 1:]], axis=1)
 
 
 def _relit(illumination: Illumination, samples: ColourSamples) -> Float[np.ndarray, "place 3"]:
@@ -188,20 +185,19 @@ def matched(
 ) -> MarkedCells:
     """Return the middles of patches that match one of the given colours [linear RGB]."""
     patches = patches_of(features, visible)
-    count = len(patches.row)
+    count = len(patches.place)
     own = np.full(count, -1)
     if not count:
-        return MarkedCells(patches.row, patches.column, own)
+        return np.zeros((0, 3), int)
     samples = patches.samples
     fit = LitColours(Illumination.uniform(), np.concatenate([colours, _means(samples)]))
-    for near in MATCH:
+    for near in MATCH_LIMITS:
         expected = _exposed(colours, fit.colours[: len(colours)], np.unique(own[own >= 0]))
         own = _nearest(patches, fit.illumination.rgb_of(expected, samples.at), near)
         # a patch without a match counts as a surface of its own: it shows how the light changes
         each = np.where(own >= 0, own, len(colours) + np.arange(count))
         fit = fit_illumination(replace(samples, surface=each[samples.surface]), fit)
-    kept = own >= 0
-    return MarkedCells(patches.row[kept], patches.column[kept], own[kept])
+    return np.column_stack([patches.place, own])[own >= 0]
 
 
 def _exposed(
@@ -229,13 +225,13 @@ def _nearest(
     A patch has no match if no colour is near or if two colours are about equally near.
     """
     samples = patches.samples
-    scale = np.array([LIGHTNESS, 1, 1])
+    scale = np.array([LIGHTNESS_WEIGHT, 1, 1])
     off = np.linalg.norm((lab_of(expected) - lab_of(samples.rgb)) * scale, axis=-1)
     distance = np.stack(
-        [np.median(off[:, samples.surface == k], 1) for k in range(len(patches.row))]
+        [np.median(off[:, samples.surface == k], 1) for k in range(len(patches.place))]
     )
     ordered = np.sort(distance, axis=1)
     clear = ordered[:, 0] < near
     if distance.shape[1] > 1:
-        clear &= ordered[:, 0] < CLEARER * ordered[:, 1]
+        clear &= ordered[:, 0] < CLEAR_RATIO * ordered[:, 1]
     return np.where(clear, np.argmin(distance, axis=1), -1)

@@ -6,6 +6,7 @@ masks.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -27,15 +28,15 @@ from slipid.camera.floor.grid import (
     rectified,
     view_of,
 )
-from slipid.camera.floor.light import Features, lab_of, linear_of_code
-from slipid.camera.floor.surfaces import MarkedCells, Seeds
+from slipid.camera.floor.light import Features, features_of, lab_of, linear_of_code
+from slipid.camera.floor.surfaces import Seeds, surroundings
 from slipid.camera.opencv import Mask, size_of
 from slipid.camera.overhead import OverheadCamera
 from slipid.data.floor_map import Colour, Point
 from slipid.support.errors import DataError
 from slipid.support.toml_file import Section, checked, mapping_of, text_of
 
-ABSENT = 30.0
+ABSENT_FROM = 30.0
 """Distance to the nearest cells' colours above which a colour counts as absent from the picture
 [units of CIELAB]."""
 SCHEMA: Literal["slipid.palette/1"] = "slipid.palette/1"
@@ -165,15 +166,24 @@ class FloorPicture:
 
     Attributes:
         path: file of the picture, for messages.
-        config: file of the palette, for messages.
         picture: blue, green, red of every pixel.
         camera: the calibrated camera.
+        config: file of the palette, for messages.
+        palette: surfaces, region and masks.
     """
 
     path: Path
-    config: Path
     picture: UInt8[np.ndarray, "y x 3"]
     camera: OverheadCamera
+    config: Path
+    palette: Palette
+
+    def cells(self, floor: Rectified, polygon: Polygon) -> Mask:
+        """Return the cells of the floor in a polygon."""
+        if polygon.at_m is not None:
+            return floor.grid.inside(np.array(polygon.at_m))
+        width, height = size_of(self.picture)
+        return floor.of_picture(filled(np.array(polygon.at_px), height, width))
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,39 +191,43 @@ class FloorRegion:
     """The part of the floor to be mapped.
 
     Attributes:
+        source: the picture and its camera.
         floor: the picture projected onto the floor.
         requested: cells of the region that lie in the camera's view.
         visible: requested cells that show the floor, not a mask or a robot.
         robots: robots detected in the picture.
     """
 
+    source: FloorPicture
     floor: Rectified
     requested: Mask
     visible: Mask
     robots: tuple[DetectedRobot, ...]
 
+    @cached_property
+    def features(self) -> Features:
+        """Features of every cell."""
+        return features_of(self.floor.colour)
 
-def requested_region(
-    source: FloorPicture, palette: Palette, robot: RobotShape, cell: float | None
-) -> FloorRegion:
+
+def requested_region(source: FloorPicture, robot: RobotShape, cell: float | None) -> FloorRegion:
     """Return the cells that a config requests, and which of them show the floor.
 
     Args:
-        source: the picture and its camera.
-        palette: the config, with its region and masks.
+        source: the picture, its camera, and the config with its region and masks.
         robot: shape of robots that may hide the floor.
         cell: edge length of a cell [m]; None for that of a pixel on the floor.
 
     Raises:
         DataError: the picture's resolution is not the camera's, or the region has no visible floor.
     """
-    picture, camera = source.picture, source.camera
+    picture, camera, palette = source.picture, source.camera, source.palette
     camera.lens.check_size(size_of(picture), source.path)
-    grid = grid_over(_extent(source, palette.region), cell or pixel_size(camera), source.path)
+    grid = grid_over(_extent(source), cell or pixel_size(camera), source.path)
     floor = rectified(picture, camera, grid)
     requested = floor.in_view.copy()
     if palette.region is not None:
-        requested &= _cells(source, floor, palette.region)
+        requested &= source.cells(floor, palette.region)
     if requested.sum() < LEAST_CELLS:
         raise DataError(
             f"{source.config if palette.region else source.path}: region: {requested.sum()} cells "
@@ -221,7 +235,7 @@ def requested_region(
         )
     visible = requested.copy()
     for polygon in palette.mask:
-        visible &= ~_cells(source, floor, polygon)
+        visible &= ~source.cells(floor, polygon)
     robots = detected_robots(picture, camera, robot)
     for one in robots:
         visible &= ~floor.of_picture(hidden_by(one, robot, camera))
@@ -230,12 +244,12 @@ def requested_region(
             f"{source.path}: masks and robots hide all but {visible.sum()} cells; expected "
             f"{LEAST_CELLS} or more of floor"
         )
-    return FloorRegion(floor, requested, visible, robots)
+    return FloorRegion(source, floor, requested, visible, robots)
 
 
-def _extent(source: FloorPicture, region: Polygon | None) -> Extent:
+def _extent(source: FloorPicture) -> Extent:
     """Return the rectangle around the visible part of a region, or around the whole view."""
-    view = view_of(source.camera)
+    view, region = view_of(source.camera), source.palette.region
     if region is None:
         return view
     if region.at_m is not None:
@@ -245,54 +259,39 @@ def _extent(source: FloorPicture, region: Polygon | None) -> Extent:
         part = np.linspace(0, 1, 33)[:, None, None]
         corners = source.camera.on_plane(pixels + part * (np.roll(pixels, -1, 0) - pixels), 0.0)
         corners = corners[np.isfinite(corners).all(axis=-1)]
-    low = np.maximum(corners.min(axis=0, initial=np.inf), [view.low_x, view.low_y])
-    high = np.minimum(corners.max(axis=0, initial=-np.inf), [view.high_x, view.high_y])
+    low = np.maximum(corners.min(axis=0, initial=np.inf), view[:2])
+    high = np.minimum(corners.max(axis=0, initial=-np.inf), view[2:])
     if not (low < high).all():
         raise DataError(
             f"{source.config}: region: no floor that the camera sees; expected a polygon within "
             f"x {view.low_x:.2f} to {view.high_x:.2f} m, y {view.low_y:.2f} to {view.high_y:.2f} m"
         )
-    return Extent(*(float(v) for v in (*low, *high)))
+    return Extent(*map(float, (*low, *high)))
 
 
-def _cells(source: FloorPicture, floor: Rectified, polygon: Polygon) -> Mask:
-    """Return the cells in a polygon."""
-    if polygon.at_m is not None:
-        return floor.grid.inside(np.array(polygon.at_m))
-    width, height = size_of(source.picture)
-    return floor.of_picture(filled(np.array(polygon.at_px), height, width))
-
-
-def seeds_of(
-    source: FloorPicture, features: Features, region: FloorRegion, palette: Palette
-) -> Seeds:
+def seeds_of(region: FloorRegion) -> Seeds:
     """Return colours and marked cells of the surfaces that a config specifies.
 
     Raises:
         DataError: a marked point does not show the floor, or a colour is absent from the picture.
     """
-    names = palette.names
-    marked = MarkedCells(*np.zeros((3, 0), int))
-    for k, one in enumerate(palette.points):
-        row, column = _marked(source, region, one, k).T
-        points = MarkedCells(row, column, np.full(len(row), names.index(one.surface)))
-        marked = marked.joined(points.surroundings(region.visible))
+    names, points = region.source.palette.names, [np.zeros((0, 3), int)]
+    for k, one in enumerate(region.source.palette.points):
+        points.append(np.insert(_marked(region, one, k), 2, names.index(one.surface), axis=1))
+    marked = surroundings(np.concatenate(points), region.visible)
     colours = np.zeros((len(names), 3))
     for k, name in enumerate(names):
-        own = marked.only(marked.surface == k)
-        if len(own.row):
-            colours[k] = np.median(features.rgb[own.row, own.column], axis=0)
+        row, column, _ = marked[marked[:, 2] == k].T
+        if len(row):
+            colours[k] = np.median(region.features.rgb[row, column], axis=0)
         else:
-            colours[k] = linear_of_code(palette.palette[name])
-            _check_present(source, name, palette, features.appearance[region.visible][:, :3])
+            colours[k] = _given_colour(region, name)
     return Seeds(colours, marked)
 
 
-def _marked(
-    source: FloorPicture, region: FloorRegion, marked: Places, k: int
-) -> Int[np.ndarray, "point 2"]:
+def _marked(region: FloorRegion, marked: Places, k: int) -> Int[np.ndarray, "point 2"]:
     """Return row and column of the marked points of entry `k` of a config."""
-    grid = region.floor.grid
+    source, grid = region.source, region.floor.grid
     given = np.array(marked.at_px or marked.at_m, float)
     width, height = size_of(source.picture)
     if marked.at_px is not None:
@@ -321,15 +320,19 @@ def _refuse(
         )
 
 
-def _check_present(
-    source: FloorPicture, name: str, palette: Palette, lab: Float[np.ndarray, "cell 3"]
-) -> None:
-    """Raise `DataError` if no cell has nearly the colour of the surface `name`."""
-    colour = palette.palette[name]
-    off = np.linalg.norm(lab - lab_of(linear_of_code(colour)[None])[0], axis=1)
-    if (nearest := float(np.percentile(off, 0.5))) > ABSENT:
+def _given_colour(region: FloorRegion, name: str) -> Float[np.ndarray, "3"]:
+    """Return the linear RGB of a surface from the config.
+
+    Raises:
+        DataError: no visible cell has nearly that colour.
+    """
+    code = region.source.palette.palette[name]
+    colour, lab = linear_of_code(code), region.features.appearance[region.visible][:, :3]
+    off = np.linalg.norm(lab - lab_of(colour[None])[0], axis=1)
+    if (nearest := float(np.percentile(off, 0.5))) > ABSENT_FROM:
         raise DataError(
-            f"{source.config}: palette.{name}: '{colour}' is nowhere in the picture (the nearest "
-            f"is {nearest:.0f} off in CIELAB); expected a colour as the picture shows it, or "
-            "points on the surface"
+            f"{region.source.config}: palette.{name}: '{code}' is nowhere in the picture (the "
+            f"nearest is {nearest:.0f} off in CIELAB); expected a colour as the picture shows it, "
+            "or points on the surface"
         )
+    return colour

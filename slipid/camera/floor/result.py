@@ -1,23 +1,23 @@
 """The map made from a picture: outlines in metres, colours, and warnings about its quality."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from slipid.camera.floor.grid import DetectedRobot, Rectified
-from slipid.camera.floor.light import Features, code_of_linear
+from slipid.camera.floor.light import code_of_linear
 from slipid.camera.floor.outline import PatchOutline, outlines_of, signed_area
-from slipid.camera.floor.region import FloorPicture, FloorRegion, Palette
+from slipid.camera.floor.region import FloorRegion
 from slipid.camera.floor.surfaces import UNKNOWN, Costs, Surfaces
-from slipid.camera.frame_source import is_picture
-from slipid.camera.opencv import Labels, Mask
+from slipid.camera.opencv import Labels, is_picture
 from slipid.data.geojson_map import MapRegion, Patch, VectorMap
 from slipid.support.content import Content
 from slipid.support.errors import DataError
 
-HARDLY, NOT = 5.0, 3.5
+HARDLY_DISTINCT, NOT_DISTINCT = 5.0, 3.5
 """Differences of appearance below which two surfaces are hardly distinguishable, and below which
 they are indistinguishable [spreads within a surface].
 
@@ -27,19 +27,10 @@ MOST_UNKNOWN = 1 / 3
 """Largest share of the requested floor that may be unknown in a good map [1]."""
 MOST_NAMED = 3
 """Number of patches of low confidence that are reported one by one, the largest first."""
-WEAK = 1.0
+WEAK_CONFIDENCE = 1.0
 """Confidence below which a patch is reported [spreads within a surface], see `_patch`."""
-TOLERANCE = 0.6
+OUTLINE_TOLERANCE = 0.6
 """Largest distance of an outline from the cell edges that it replaces [cells]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Segmentation:
-    """Surface of each cell, cost of every surface in each cell, and appearance of the surfaces."""
-
-    labels: Labels
-    costs: Costs
-    surfaces: Surfaces
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,45 +86,35 @@ class PictureMap:
 
 
 def map_from(
-    source: FloorPicture,
-    region: FloorRegion,
-    features: Features,
-    names: tuple[str, ...],
-    palette: Palette,
-    segmentation: Segmentation,
+    region: FloorRegion, names: tuple[str, ...], surfaces: Surfaces, costs: Costs, labels: Labels
 ) -> PictureMap:
     """Return the map of segmented cells, with outlines, colours and warnings.
 
     Args:
-        source: the picture and its camera.
-        region: the part of the floor that is mapped.
-        features: features of every cell.
+        region: the part of the floor that is mapped; the map keeps the colours of its config.
         names: names of the surfaces by number.
-        palette: the config, whose colours the map keeps.
-        segmentation: surface of each cell.
+        surfaces: appearance of the surfaces.
+        costs: cost of every surface in each cell.
+        labels: surface of each cell.
 
     Raises:
         DataError: no cell resembles any surface.
     """
-    present = [k for k in range(len(names)) if (segmentation.labels == k).any()]
+    source, features = region.source, region.features
+    present = [k for k in range(len(names)) if (labels == k).any()]
     if not present:
         raise DataError(f"{source.path}: no cell looks like a surface; expected a floor")
     number = np.full(len(names) + 1, UNKNOWN)
     number[present] = np.arange(len(present))
-    labels = number[segmentation.labels]  # label UNKNOWN, -1, picks the last entry
-    kept = tuple(names[k] for k in present)
-    colours = {
-        name: palette.palette.get(
-            name, code_of_linear(np.median(features.rgb[labels == k], axis=0))
-        )
-        for k, name in enumerate(kept)
-    }
-    costs = segmentation.costs[present]
-    patches = tuple(_patch(one, region, kept, costs) for one in outlines_of(labels, TOLERANCE))
-    vector = _vector(source, region, labels, patches, colours)
-    poor = _similar(segmentation.surfaces, names, present, 0.0, NOT)
-    warnings = _similar(segmentation.surfaces, names, present, NOT, HARDLY)
-    unknown = _unknown_share(labels, region.requested)
+    labels = number[labels]  # label UNKNOWN, -1, picks the last entry
+    seen = [np.median(features.rgb[labels == k], axis=0) for k in range(len(present))]
+    colours = {names[k]: code_of_linear(rgb) for k, rgb in zip(present, seen, strict=True)}
+    colours |= {name: source.palette.palette.get(name, seen) for name, seen in colours.items()}
+    outlines = outlines_of(labels, OUTLINE_TOLERANCE)
+    patches = tuple(_patch(one, region, list(colours), costs[present]) for one in outlines)
+    vector = _vector(region, labels, patches, colours)
+    poor, warnings = _similar(surfaces, names, present)
+    unknown = float((labels[region.requested] < 0).mean())
     if unknown > MOST_UNKNOWN:
         poor.append(
             f"{100 * unknown:.0f} % of the requested floor is unknown; expected at most "
@@ -152,34 +133,31 @@ def map_from(
 
 
 def _similar(
-    surfaces: Surfaces, names: tuple[str, ...], present: list[int], low: float, high: float
-) -> list[str]:
-    """Return sentences about pairs of surfaces whose appearances differ by `low` to `high` spreads.
+    surfaces: Surfaces, names: tuple[str, ...], present: list[int]
+) -> tuple[list[str], list[str]]:
+    """Return sentences about pairs of surfaces that cannot or can hardly be distinguished.
 
-    The difference is the median over the picture, relative to the spread within a surface.
+    The difference of appearances is the median over the picture, relative to the spread within a
+    surface.
     """
     appearances = surfaces.appearances((24, 24)).reshape(len(names), -1, 4)
-    sentences = []
+    cannot, hardly = [], []
     for one, other in combinations(present, 2):
         spread = np.maximum(surfaces.spread[one], surfaces.spread[other])
-        difference = float(
-            np.median(np.linalg.norm((appearances[one] - appearances[other]) / spread, axis=1))
+        away = np.linalg.norm((appearances[one] - appearances[other]) / spread, axis=1)
+        difference = float(np.median(away))
+        about = (
+            f"be distinguished: they differ by {difference:.1f} spreads of one surface; mark more "
+            "points on them, or give them one name"
         )
-        if low <= difference < high:
-            sentences.append(
-                f"{names[one]} and {names[other]} {'cannot' if high <= NOT else 'can hardly'} be "
-                f"distinguished: they differ by {difference:.1f} spreads of one surface; mark more "
-                "points on them, or give them one name"
-            )
-    return sentences
+        if difference < NOT_DISTINCT:
+            cannot.append(f"{names[one]} and {names[other]} cannot {about}")
+        elif difference < HARDLY_DISTINCT:
+            hardly.append(f"{names[one]} and {names[other]} can hardly {about}")
+    return cannot, hardly
 
 
-def _unknown_share(labels: Labels, requested: Mask) -> float:
-    """Return the share of the requested cells whose surface is unknown [1]."""
-    return float((labels[requested] < 0).mean())
-
-
-def _patch(one: PatchOutline, region: FloorRegion, names: tuple[str, ...], costs: Costs) -> Patch:
+def _patch(one: PatchOutline, region: FloorRegion, names: Sequence[str], costs: Costs) -> Patch:
     """Return a patch in metres, the outer ring anticlockwise and holes clockwise.
 
     A cell's appearance has a distance to each surface [spreads within the surface]. The patch's
@@ -199,26 +177,21 @@ def _patch(one: PatchOutline, region: FloorRegion, names: tuple[str, ...], costs
 
 
 def _vector(
-    source: FloorPicture,
-    region: FloorRegion,
-    labels: Labels,
-    patches: tuple[Patch, ...],
-    colours: dict[str, str],
+    region: FloorRegion, labels: Labels, patches: tuple[Patch, ...], colours: dict[str, str]
 ) -> VectorMap:
     """Return the map in the form of its file."""
-    extent = region.floor.grid.extent
     most = int(np.argmax(np.bincount(labels[labels >= 0])))
     unknown, notes = float((labels < 0).mean()), []
     if unknown > 0:
-        requested = _unknown_share(labels, region.requested)
+        requested = (labels[region.requested] < 0).mean()
         notes.append(
             f"{100 * unknown:.1f} % of the map's rectangle is unknown ({100 * requested:.1f} % of "
             "the requested floor): read as a floor map it has the nearest surface there"
         )
-    with source.path.open("rb") as file:  # not read at once: a video may exceed memory
+    with region.source.path.open("rb") as file:  # not read at once: a video may exceed memory
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     map_region = MapRegion(
-        extent_m=(extent.low_x, extent.low_y, extent.high_x, extent.high_y),
+        extent_m=region.floor.grid.extent,
         cell_m=region.floor.grid.cell,
         base=list(colours)[most],
         colours=colours,
@@ -231,7 +204,9 @@ def _vector(
 
 def _weak_patches(vector: VectorMap) -> list[str]:
     """Return sentences about patches that resemble another surface almost as well as their own."""
-    weak = [p for p in vector.patches if p.confidence is not None and p.confidence < WEAK]
+    weak = [
+        p for p in vector.patches if p.confidence is not None and p.confidence < WEAK_CONFIDENCE
+    ]
     sentences = []
     for patch in weak[:MOST_NAMED]:
         x, y = patch.rings[0].mean(axis=0)

@@ -19,70 +19,52 @@ from slipid.camera.floor.light import (
     fit_illumination,
     lab_of,
 )
-from slipid.camera.opencv import Labels, Mask, opencv
+from slipid.camera.opencv import Labels, Mask, cv2
 
-ROUNDS = 10
-STEADY = 3e-4
+MOST_ROUNDS = 10
+STEADY_SHARE = 3e-4
 """Share of cells that change their surface in a round below which learning ends [1]."""
-COARSE = 25_000
+COARSE_CELLS = 25_000
 """Approximate number of cells of the low resolution picture from which surfaces are learnt."""
-SAMPLES = 5_000
+MOST_SAMPLES = 5_000
 """Largest number of cells to which illumination and colours are fitted."""
 LEAST_SPREAD = np.array([2.0, 1.5, 1.5, 0.25])
 MOST_SPREAD = np.array([6.0, 4.0, 4.0, 0.7])
 """Smallest and largest spread of L, a, b [units of CIELAB] and texture [1] within a surface."""
-OUTLIER = 60.0
+OUTLIER_COST = 60.0
 """Cost of a cell above which it belongs to none of the surfaces [squared spreads]."""
-CLEAR = 16.0
+CLEAR_COST = 16.0
 """Cost of a cell below which it clearly belongs to its surface [squared spreads]."""
 Costs = Float32[np.ndarray, "surface row column"]
 """Cost of assigning each surface to each cell: the squared difference of their appearances, in
 squared spreads within the surface [1]."""
 UNKNOWN = -1
 """Label of cells without a surface."""
-COUPLING = 3.0
+NEIGHBOUR_COST = 3.0
 """Additional cost of a surface in a cell whose neighbours all have another surface [squared
 spreads]."""
-REACH = 1.5
+NEIGHBOUR_STD = 1.5
 """Std of the Gaussian that weights a cell's neighbours [cells]."""
 FIELD_ROUNDS = 5
 """Number of mean-field iterations over neighbouring cells."""
-SMALL = 150
+SMALL_PATCH = 150
 """Number of cells below which a patch is merged with its surroundings."""
-AROUND = 4
+MARK_RADIUS = 4
 """Distance around a marked point within which cells are taken to have its surface [cells]."""
 
 
-@dataclass(frozen=True, eq=False)
-class MarkedCells:
-    """Cells, given by row and column, and the number of the surface of each."""
+MarkedCells = Int[np.ndarray, "cell 3"]
+"""Row, column and number of the surface of some cells."""
 
-    row: Int[np.ndarray, " cell"]
-    column: Int[np.ndarray, " cell"]
-    surface: Int[np.ndarray, " cell"]
 
-    def only(self, kept: np.ndarray) -> "MarkedCells":
-        """Return only some of the cells, chosen by a mask or by indices."""
-        return MarkedCells(self.row[kept], self.column[kept], self.surface[kept])
-
-    def joined(self, other: "MarkedCells") -> "MarkedCells":
-        """Return these cells followed by the cells of `other`."""
-        return MarkedCells(
-            np.concatenate([self.row, other.row]),
-            np.concatenate([self.column, other.column]),
-            np.concatenate([self.surface, other.surface]),
-        )
-
-    def surroundings(self, visible: Mask) -> "MarkedCells":
-        """Return visible cells around each of these cells, marked with its surface."""
-        steps = np.arange(-AROUND, AROUND + 1, 2)
-        down, across = (step.ravel() for step in np.meshgrid(steps, steps))
-        row = (self.row[:, None] + down).ravel()
-        column = (self.column[:, None] + across).ravel()
-        cells = MarkedCells(row, column, np.repeat(self.surface, len(down)))
-        rows, columns = visible.shape
-        cells = cells.only((row >= 0) & (row < rows) & (column >= 0) & (column < columns))
-        return cells.only(visible[cells.row, cells.column])
+def surroundings(marked: MarkedCells, visible: Mask) -> MarkedCells:
+    """Return visible cells around each of the marked cells, marked with its surface."""
+    steps = np.arange(-MARK_RADIUS, MARK_RADIUS + 1, 2)
+    down, across = (step.ravel() for step in np.meshgrid(steps, steps))
+    around = np.stack([down, across, np.zeros(len(down), int)], axis=1)
+    cells = (marked[:, None] + around).reshape(-1, 3)
+    cells = cells[((cells[:, :2] >= 0) & (cells[:, :2] < visible.shape)).all(axis=1)]
+    return cells[visible[cells[:, 0], cells[:, 1]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +91,6 @@ class Surfaces:
 
     def appearances(self, shape: tuple[int, int]) -> Float32[np.ndarray, "surface row column 4"]:
         """Return the L, a, b and texture that each surface would have in every cell."""
-        cv2 = opencv()
         rows, columns = min(shape[0], 48), min(shape[1], 48)
         at = positions((rows, columns))
         coarse = lab_of(self.lit.illumination.rgb_of(self.lit.colours, at))
@@ -132,7 +113,7 @@ class Surfaces:
             wide = 2 * np.log(self.spread[k] / LEAST_SPREAD).sum()
             rough = np.minimum(off[..., 3] ** 2, 6.0)  # limited: edges and dirt are rough, too
             out[k] = (off[..., :3] ** 2).sum(axis=-1) + rough + wide
-        return np.minimum(out, 1.5 * OUTLIER)
+        return np.minimum(out, 1.5 * OUTLIER_COST)
 
 
 def positions(shape: tuple[int, int]) -> Float[np.ndarray, "place 2"]:
@@ -144,23 +125,23 @@ def positions(shape: tuple[int, int]) -> Float[np.ndarray, "place 2"]:
 
 def learnt(features: Features, visible: Mask, seeds: Seeds) -> Surfaces:
     """Return the appearance of the surfaces in a picture, learnt from seeds."""
-    step = max(1, round(np.sqrt(visible.size / COARSE)))
+    step = max(1, round(np.sqrt(visible.size / COARSE_CELLS)))
     few, some = thinned(features, step), visible[step // 2 :: step, step // 2 :: step]
     shape = few.appearance.shape[:2]
-    row, column = seeds.marked.row // step, seeds.marked.column // step
-    marked = np.minimum(row, shape[0] - 1) * shape[1] + np.minimum(column, shape[1] - 1)
+    places = np.minimum(seeds.marked[:, :2] // step, np.array(shape) - 1)
+    marked = places @ np.array([shape[1], 1])
     surfaces = _start(few, marked, seeds)
     flat = _flat(few.appearance) & some
     before = np.full(shape, -1)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         costs = surfaces.costs(few.appearance)
         labels = labelled(costs, some)
-        if np.mean(labels != before) < STEADY:
+        if np.mean(labels != before) < STEADY_SHARE:
             break
         before = labels
         costs = np.concatenate([costs, np.full((1, *shape), np.inf)])
         own = np.take_along_axis(costs, np.maximum(labels, 0)[None], axis=0)[0]
-        clear = (own < CLEAR) & flat & (labels < len(seeds.colours)) & (labels >= 0)
+        clear = (own < CLEAR_COST) & flat & (labels < len(seeds.colours)) & (labels >= 0)
         surfaces = _updated(surfaces, few, np.where(clear, labels, -1).ravel(), marked, seeds)
     return surfaces
 
@@ -169,7 +150,6 @@ def thinned(features: Features, step: int) -> Features:
     """Return the features of every `step`-th cell along both axes, smoothed over `step` cells."""
     if step == 1:
         return features
-    cv2 = opencv()
     cut = slice(step // 2, None, step)
     appearance, rgb = (
         cv2.GaussianBlur(one, (0, 0), 0.4 * step)[cut, cut]
@@ -180,7 +160,6 @@ def thinned(features: Features, step: int) -> Features:
 
 def _flat(appearance: Float[np.ndarray, "row column 4"]) -> Mask:
     """Return cells whose neighbours look about the same; others lie on edges and mix colours."""
-    cv2 = opencv()
     lab = np.ascontiguousarray(appearance[..., :3])
     kernel = np.ones((3, 3), np.uint8)
     change = (cv2.dilate(lab, kernel) - cv2.erode(lab, kernel)).max(axis=-1)
@@ -199,7 +178,7 @@ def _start(few: Features, marked: Int[np.ndarray, " seed"], seeds: Seeds) -> Sur
         few.rgb.reshape(-1, 3)[marked].astype(float),
         few.appearance[..., 3].ravel()[marked],
     )
-    at, own = positions(few.appearance.shape[:2])[marked], seeds.marked.surface
+    at, own = positions(few.appearance.shape[:2])[marked], seeds.marked[:, 2]
     for k in np.unique(own):
         texture[k], spread[k, 3] = np.median(rough[own == k]), MOST_SPREAD[3]
     fit = fit_illumination(ColourSamples(at, rgb, own, np.ones(len(at))), start)
@@ -215,10 +194,10 @@ def _updated(
 ) -> Surfaces:
     """Return the appearance of the surfaces, estimated from labelled cells and marked cells."""
     cells = np.flatnonzero(labels >= 0)
-    cells = cells[:: 1 + len(cells) // SAMPLES]
+    cells = cells[:: 1 + len(cells) // MOST_SAMPLES]
     if not len(cells):
         return surfaces
-    own = np.concatenate([labels[cells], seeds.marked.surface])
+    own = np.concatenate([labels[cells], seeds.marked[:, 2]])
     cells = np.concatenate([cells, marked])
     count = np.bincount(own, minlength=len(seeds.colours))
     # every surface contributes to the illumination, however small it is
@@ -244,7 +223,7 @@ def _updated(
 
 def labelled(costs: Costs, visible: Mask) -> Labels:
     """Return the surface of each cell; the number of surfaces marks cells that fit none of them."""
-    outlier = np.full((1, *visible.shape), OUTLIER, np.float32)
+    outlier = np.full((1, *visible.shape), OUTLIER_COST, np.float32)
     return smoothed(np.concatenate([costs, outlier]), visible)
 
 
@@ -255,15 +234,14 @@ def smoothed(costs: Costs, visible: Mask) -> Labels:
     shares of its neighbours reduce the costs of their surfaces. Cells that are not visible do not
     affect others and get the label `UNKNOWN`.
     """
-    cv2 = opencv()
     weight = visible.astype(np.float32)
-    around = np.maximum(cv2.GaussianBlur(weight, (0, 0), REACH), 1e-3)
+    around = np.maximum(cv2.GaussianBlur(weight, (0, 0), NEIGHBOUR_STD), 1e-3)
     total = costs
     for _ in range(FIELD_ROUNDS):
         share = np.exp(-0.5 * (total - total.min(axis=0)))
         share *= weight / share.sum(axis=0)
-        neighbours = np.stack([cv2.GaussianBlur(one, (0, 0), REACH) for one in share])
-        total = costs - 2 * COUPLING * neighbours / around
+        neighbours = np.stack([cv2.GaussianBlur(one, (0, 0), NEIGHBOUR_STD) for one in share])
+        total = costs - 2 * NEIGHBOUR_COST * neighbours / around
     return np.where(visible, np.argmin(total, axis=0), UNKNOWN)
 
 
@@ -278,7 +256,6 @@ def without_small_patches(labels: Labels, visible: Mask, width: int) -> Labels:
         visible: cells that may have a surface.
         width: width of the narrowest patch that is kept [cells].
     """
-    cv2 = opencv()
     size = 2 * (width // 2) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     kept = np.zeros(labels.shape, bool)
@@ -292,7 +269,7 @@ def without_small_patches(labels: Labels, visible: Mask, width: int) -> Labels:
     for surface in np.unique(labels[visible]):
         mine = (labels == surface).astype(np.uint8)
         _, parts, stats, _ = cv2.connectedComponentsWithStats(mine, connectivity=4)
-        big = stats[:, cv2.CC_STAT_AREA] >= SMALL
+        big = stats[:, cv2.CC_STAT_AREA] >= SMALL_PATCH
         big[0] = False  # component 0 is the background
         large |= big[parts]
     return np.where(visible, _nearest(labels, large & visible), UNKNOWN)

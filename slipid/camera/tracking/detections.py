@@ -4,22 +4,25 @@ import time as clock
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from slipid.camera.frame import Frame, FrameSource, read_ahead
+from slipid.camera.frame import FrameSource, read_ahead
 from slipid.camera.opencv import Grey, visible_markers
 from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region, cut
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
 
-KEPT_S = 10.0
+CHECKPOINT_S = 10.0
 """Time between two checkpoints [s]."""
-PART = "sightings"
+CHECKPOINT_NAME = "sightings"
 """Name under which a checkpoint stores the detections."""
+KINDS = {"frame": int, "time": float, "repeated": bool, "row": int, "id": int, "corners": float}
+"""Kind of the numbers of each attribute of `Detections`."""
 FIRST_FRAMES = 100
 """Number of frames without any wanted marker after which a message lists the visible markers."""
 
@@ -43,6 +46,12 @@ class Detections:
     id: Int[np.ndarray, " detection"]
     corners: Float[np.ndarray, "detection 4 2"]
 
+    @classmethod
+    def of(cls, lists: dict[str, list[Any]]) -> "Detections":
+        """Return the detections in lists, given by the names of the attributes."""
+        arrays = {name: np.array(lists[name], kind) for name, kind in KINDS.items()}
+        return cls(**arrays | {"corners": arrays["corners"].reshape(-1, 4, 2)})
+
     def counts(self, ids: Sequence[int]) -> Int[np.ndarray, "frame marker"]:
         """Return the number of detections of each marker in each frame."""
         rows = [self.row[self.id == number] for number in ids]
@@ -58,46 +67,6 @@ class Detections:
         return corners
 
 
-@dataclass(eq=False)
-class _DetectionLog:
-    """Detections so far, with the attributes of `Detections`."""
-
-    frame: list[int] = field(default_factory=list)
-    time: list[float] = field(default_factory=list)
-    repeated: list[bool] = field(default_factory=list)
-    row: list[int] = field(default_factory=list)
-    id: list[int] = field(default_factory=list)
-    corners: list[Float[np.ndarray, "4 2"]] = field(default_factory=list)
-
-    def add(self, frame: Frame, repeated: bool, tracker: MarkerTracker) -> None:
-        """Add a frame and the markers in it; a repeated frame is not searched for markers."""
-        for detection in [] if repeated else tracker.detect(frame.grey, frame.index):
-            self.row.append(len(self.frame))
-            self.id.append(detection.id)
-            self.corners.append(detection.corners)
-        self.frame.append(frame.index)
-        self.time.append(frame.time)
-        self.repeated.append(repeated)
-
-    def detections(self) -> Detections:
-        return Detections(
-            np.array(self.frame, int),
-            np.array(self.time, float),
-            np.array(self.repeated, bool),
-            np.array(self.row, int),
-            np.array(self.id, int),
-            np.array(self.corners, float).reshape(-1, 4, 2),
-        )
-
-    @classmethod
-    def resumed(cls, checkpoint: Checkpoint) -> "_DetectionLog":
-        """Return the log stored in a checkpoint, or an empty one."""
-        if (kept := checkpoint.load(PART)) is None:
-            return cls()
-        plain = {name: kept[name].tolist() for name in vars(cls()) if name != "corners"}
-        return cls(**plain, corners=list(kept["corners"]))
-
-
 def detect_all(
     source: FrameSource, tracker: MarkerTracker, checkpoint: Checkpoint, report: Reporter
 ) -> Detections:
@@ -106,38 +75,45 @@ def detect_all(
     Raises:
         DataError: no frame shows any wanted marker; the message lists the visible markers.
     """
-    log = _DetectionLog.resumed(checkpoint)
-    if log.frame:
-        report.line(f"going on from frame {len(log.frame)}")
+    kept = checkpoint.load(CHECKPOINT_NAME) or {}
+    log = {name: list(kept.get(name, ())) for name in KINDS}
+    known, saved = len(log["frame"]), clock.monotonic()
+    if known:
+        report.line(f"going on from frame {known}")
     report.stage("tracking")
     before: Grey | None = None
-    known, saved = len(log.frame), clock.monotonic()
     # the last frame of the checkpoint is read again, to check whether the next one repeats it
     with closing(read_ahead(source.frames(max(0, known - 1)))) as frames:
         try:
             for frame in frames:
                 if frame.index >= known:
                     repeated = before is not None and np.array_equal(before, frame.grey)
-                    log.add(frame, repeated, tracker)
-                    if len(log.frame) == FIRST_FRAMES and not log.row:
+                    found = [] if repeated else tracker.detect(frame.grey, frame.index)
+                    log["row"] += [len(log["frame"])] * len(found)
+                    log["id"] += [one.id for one in found]
+                    log["corners"] += [one.corners for one in found]
+                    log["frame"].append(frame.index)
+                    log["time"].append(frame.time)
+                    log["repeated"].append(repeated)
+                    if len(log["frame"]) == FIRST_FRAMES and not log["row"]:
                         report.line(_others(frame.grey, tracker) or "no marker in sight so far")
                 before = frame.grey
-                if clock.monotonic() > saved + KEPT_S:
-                    checkpoint.save(PART, vars(log.detections()))
+                if clock.monotonic() > saved + CHECKPOINT_S:
+                    checkpoint.save(CHECKPOINT_NAME, vars(Detections.of(log)))
                     saved = clock.monotonic()
-                report.advance(len(log.frame), max(source.count or 0, len(log.frame)))
+                report.advance(len(log["frame"]), max(source.count or 0, len(log["frame"])))
         except KeyboardInterrupt:
-            checkpoint.save(PART, vars(log.detections()))
+            checkpoint.save(CHECKPOINT_NAME, vars(Detections.of(log)))
             raise
-    if not log.row:
+    if not log["row"]:
         if before is not None and (sentence := _others(before, tracker)):
             raise DataError(f"{source.name}: {sentence}")
         wanted = ", ".join(map(str, sorted(tracker.ids)))
         raise DataError(
-            f"{source.name}: marker {wanted} in none of {len(log.frame)} frames; expected it in "
-            "view, sharp, flat, with a white margin around"
+            f"{source.name}: marker {wanted} in none of {len(log['frame'])} frames; expected it "
+            "in view, sharp, flat, with a white margin around"
         )
-    return log.detections()
+    return Detections.of(log)
 
 
 def _others(grey: Grey, tracker: MarkerTracker) -> str | None:
@@ -149,12 +125,12 @@ def _others(grey: Grey, tracker: MarkerTracker) -> str | None:
             f"marker {wanted} is in no frame so far, but {_numbers(others)}; expected --id "
             f"{others[0]}, or a file of targets"
         )
-    markers = visible_markers([cut(grey, tracker.region)])
-    if not markers.numbers:
+    dictionary, numbers = visible_markers([cut(grey, tracker.region)])
+    if not numbers:
         return None
     return (
-        f"marker {wanted} is in no frame so far, but {_numbers(markers.numbers)} of the dictionary "
-        f"{markers.dictionary}; expected --dictionary {markers.dictionary}"
+        f"marker {wanted} is in no frame so far, but {_numbers(numbers)} of the dictionary "
+        f"{dictionary}; expected --dictionary {dictionary}"
     )
 
 
@@ -184,10 +160,11 @@ def only_marker(source: FrameSource, detector: MarkerDetector, region: Region | 
             f"{source.name}: {_numbers(often)} in view; expected --id for the robot's, or a file "
             "of targets"
         )
-    if last is not None and (markers := visible_markers([cut(last, region)])).numbers:
+    dictionary, numbers = visible_markers([] if last is None else [cut(last, region)])
+    if numbers:
         raise DataError(
-            f"{source.name}: no marker of this dictionary, but {_numbers(markers.numbers)} of "
-            f"{markers.dictionary}; expected --dictionary {markers.dictionary}"
+            f"{source.name}: no marker of this dictionary, but {_numbers(numbers)} of "
+            f"{dictionary}; expected --dictionary {dictionary}"
         )
     raise DataError(
         f"{source.name}: no marker of any dictionary in the first frames; expected one in view, "

@@ -2,8 +2,8 @@
 
 OpenCV searches a whole frame in tens of milliseconds and the surroundings of a marker in one. If
 every wanted marker was detected in the last frame and is detected again near its expected place,
-the rest of the frame is skipped. Every `WHOLE`-th frame is searched completely, so that a second
-marker of the same number is detected.
+the rest of the frame is skipped. Every `WHOLE_INTERVAL`-th frame is searched completely, so that a
+second marker of the same number is detected.
 
 Corners are refined to less than a pixel as intersections of straight lines fitted to the four
 edges. Refining each corner by itself is inaccurate for a small marker: the window around the corner
@@ -18,32 +18,32 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from slipid.camera.opencv import Grey, marker_dictionary, opencv, size_of
+from slipid.camera.opencv import Grey, cv2, marker_dictionary, size_of
 
-WHOLE = 30
+WHOLE_INTERVAL = 30
 """Interval, in frames, at which the whole frame is searched."""
-AROUND = 0.7
+MARGIN = 0.7
 """Margin of the search region around a marker's expected place, relative to the marker's size in
 the picture [1]."""
-LEAST_AROUND = 12.0
+LEAST_MARGIN = 12.0
 """Smallest margin of the search region [pixel]: the detector ignores markers at its border."""
-ROUNDS = 3
+REFINEMENTS = 3
 """Number of times that edges are sampled and corners refined; the first time starts from corners
 with errors of about a pixel."""
 ALONG, ACROSS = 20, 11
 """Number of places along an edge, and number of brightness samples across it at each place."""
-ENDS = 0.12
+END_SHARE = 0.12
 """Share of an edge's length that is left out at each end, where the next edge is near [1]."""
-REACH = 0.6
+SAMPLED_REACH = 0.6
 """Distance up to which brightness is sampled on both sides of an edge, in squares of the marker
 [1]; beyond one square lies the inner pattern."""
-MOST_REACH = 6.0
+MOST_SAMPLED_REACH = 6.0
 """Largest distance up to which brightness is sampled [pixel]; more would only add noise."""
-LEVELS = 3
+LEVEL_SAMPLES = 3
 """Number of outermost samples on each side whose median is the dark or the bright level."""
 LEAST_CONTRAST = 12.0
 """Difference of the bright and the dark level below which there is no edge [grey levels]."""
-OFF = 0.15
+LEAST_OUTLIER = 0.15
 """Distance from the fitted line below which a point of an edge is never left out [pixel]."""
 
 
@@ -104,7 +104,7 @@ class MarkerDetector:
     def __init__(self, dictionary: str):
         book = marker_dictionary(dictionary)
         self._squares = int(book.markerSize) + 2
-        self._detector = opencv().aruco.ArucoDetector(book)
+        self._detector = cv2.aruco.ArucoDetector(book)
 
     def detect(self, grey: Grey, region: Region | None = None) -> list[Detection]:
         """Return all markers in a frame, or in a region of it."""
@@ -130,8 +130,7 @@ class MarkerTracker:
         region: region of the picture to which detections are limited.
         last: last detection of each wanted marker.
         speed: motion of each marker's middle between the last two frames [pixel].
-        whole: number of frames so far that were searched completely.
-        twice: True if a marker was detected twice in the last frame; the next frame is then
+        twice: whether a marker was detected twice in the last frame; the next frame is then
             searched completely, so that the tracker does not follow the wrong one.
     """
 
@@ -140,31 +139,27 @@ class MarkerTracker:
     region: Region | None = None
     last: dict[int, Detection] = field(default_factory=dict)
     speed: dict[int, Float[np.ndarray, "2"]] = field(default_factory=dict)
-    whole: int = 0
     twice: bool = False
 
     def detect(self, grey: Grey, number: int) -> list[Detection]:
         """Return all detections of the wanted markers in frame number `number`."""
-        if self.ids == self.last.keys() and not self.twice and number % WHOLE:
+        if self.ids == self.last.keys() and not self.twice and number % WHOLE_INTERVAL:
             near = [d for d in self.detector.detect(grey, self._around()) if d.id in self.ids]
             if self.ids == {d.id for d in near}:
                 return self._followed(near)
-        self.whole += 1
         return self._followed(
             [d for d in self.detector.detect(grey, self.region) if d.id in self.ids]
         )
 
     def _around(self) -> Region:
         """Return the region in which the markers of the last frame are expected now."""
-        low, high = np.full(2, np.inf), np.full(2, -np.inf)
-        for number, detection in self.last.items():
-            speed = self.speed.get(number, np.zeros(2))
-            corners = detection.corners + speed
-            margin = max(LEAST_AROUND, AROUND * float(np.ptp(corners, axis=0).max()))
-            low = np.minimum(low, corners.min(axis=0) - (margin + np.abs(speed)))
-            high = np.maximum(high, corners.max(axis=0) + (margin + np.abs(speed)))
-        left, top = np.floor(low).astype(int).tolist()
-        right, bottom = np.ceil(high).astype(int).tolist()
+        speed = np.array([self.speed.get(number, np.zeros(2)) for number in self.last])
+        corners = np.array([one.corners for one in self.last.values()]) + speed[:, None]
+        size = np.ptp(corners, axis=1).max(axis=1, keepdims=True)
+        reach = np.maximum(LEAST_MARGIN, MARGIN * size) + np.abs(speed)
+        low, high = corners.min(axis=1) - reach, corners.max(axis=1) + reach
+        left, top = np.floor(low.min(axis=0)).astype(int).tolist()
+        right, bottom = np.ceil(high.max(axis=0)).astype(int).tolist()
         around = Region(left, top, right + 1, bottom + 1)
         return around if self.region is None else around.within(self.region)
 
@@ -202,7 +197,8 @@ class _Edges:
         along = np.roll(corners, -1, axis=1) - corners
         length = np.maximum(np.linalg.norm(along, axis=-1), 1e-6)
         outward = np.stack([along[..., 1], -along[..., 0]], axis=-1) / length[..., None]
-        return cls(corners, along, outward, np.minimum(REACH * length / squares, MOST_REACH))
+        reach = np.minimum(SAMPLED_REACH * length / squares, MOST_SAMPLED_REACH)
+        return cls(corners, along, outward, reach)
 
 
 def refined(
@@ -218,7 +214,7 @@ def refined(
         squares: number of squares along an edge of a marker, including its border.
     """
     result = corners
-    for _ in range(ROUNDS):
+    for _ in range(REFINEMENTS):
         edges = _Edges.between(result, squares)
         better = _intersections(edges, _offsets(edges, _profiles(grey, edges)))
         moved = np.linalg.norm(better - corners, axis=-1).max(axis=-1)
@@ -230,7 +226,7 @@ def refined(
 
 def _profiles(grey: Grey, edges: _Edges) -> Float[np.ndarray, "marker 4 along across"]:
     """Return the brightness across each edge, from inside to outside, at places along the edge."""
-    along, across = np.linspace(ENDS, 1 - ENDS, ALONG), np.linspace(-1, 1, ACROSS)
+    along, across = np.linspace(END_SHARE, 1 - END_SHARE, ALONG), np.linspace(-1, 1, ACROSS)
     aside = edges.reach[..., None] * across
     places = (
         edges.start[:, :, None, None]
@@ -238,7 +234,6 @@ def _profiles(grey: Grey, edges: _Edges) -> Float[np.ndarray, "marker 4 along ac
         + (edges.outward[:, :, None] * aside[..., None])[:, :, None]
     )
     flat = places.reshape(-1, ALONG * ACROSS, 2).astype(np.float32)
-    cv2 = opencv()
     brightness = cv2.remap(
         *(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR), borderMode=cv2.BORDER_REPLICATE
     )
@@ -252,13 +247,13 @@ def _offsets(
 
     It is NaN if the two sides of the edge do not differ in brightness.
     """
-    dark = np.median(profiles[..., :LEVELS], axis=(-1, -2))
-    bright = np.median(profiles[..., -LEVELS:], axis=(-1, -2))
+    dark = np.median(profiles[..., :LEVEL_SAMPLES], axis=(-1, -2))
+    bright = np.median(profiles[..., -LEVEL_SAMPLES:], axis=(-1, -2))
     contrast = np.where(bright - dark > LEAST_CONTRAST, bright - dark, np.nan)
     part = (profiles - dark[..., None, None]) / contrast[..., None, None]
     area = np.trapezoid(np.clip(part, -0.2, 1.2), dx=2 / (ACROSS - 1), axis=-1)
     outside = (1.0 - area) * edges.reach[..., None]
-    along = np.broadcast_to(np.linspace(ENDS, 1 - ENDS, ALONG), outside.shape)
+    along = np.broadcast_to(np.linspace(END_SHARE, 1 - END_SHARE, ALONG), outside.shape)
     kept = np.ones(outside.shape)
     for _ in range(2):
         weight = kept / kept.sum(axis=-1, keepdims=True)
@@ -267,7 +262,7 @@ def _offsets(
         spread = (weight * (along - middle) ** 2).sum(axis=-1, keepdims=True)
         slope = (weight * (along - middle) * (outside - mean)).sum(axis=-1, keepdims=True) / spread
         residual = np.abs(outside - mean - slope * (along - middle))
-        limit = np.maximum(OFF, 4.5 * np.median(residual, axis=-1, keepdims=True))
+        limit = np.maximum(LEAST_OUTLIER, 4.5 * np.median(residual, axis=-1, keepdims=True))
         kept = np.where(np.isfinite(residual), (residual <= limit) * 1.0, 1.0)
     return np.asarray(mean + slope * (np.array([0.0, 1.0]) - middle))
 

@@ -14,7 +14,7 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from slipid.camera.opencv import Grey, opencv
+from slipid.camera.opencv import Grey, cv2
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.track import Flag, TrackedPoses
 from slipid.support.errors import DataError
@@ -113,9 +113,14 @@ def _parquet(track: TrackedPoses) -> bytes:
     return out.getvalue()
 
 
-GRID = 0.25
+GRID_M = 0.25
 """Distance between neighbouring lines of the grid drawn on the floor [m]."""
-FLOOR, EDGE, AHEAD, LEFT = (190, 190, 60), (0, 170, 255), (40, 40, 230), (60, 190, 60)
+GRID_BGR, EDGE_BGR, AHEAD_BGR, LEFT_BGR = (
+    (190, 190, 60),
+    (0, 170, 255),
+    (40, 40, 230),
+    (60, 190, 60),
+)
 """Colours, as blue, green, red, of the grid on the floor, the edges of markers, and the axes of a
 body that point ahead and to the left."""
 
@@ -135,7 +140,6 @@ def write_preview(
     Raises:
         DataError: the suffix is not that of a picture, or the file cannot be written.
     """
-    cv2 = opencv()
     drawn = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
     _grid(drawn, camera)
     for track in tracks:
@@ -155,7 +159,6 @@ def check_drawable(path: Path) -> None:
 
 
 def _encoded(path: Path, drawn: UInt8[np.ndarray, "row column 3"]) -> bytes:
-    cv2 = opencv()
     try:
         there, data = cv2.imencode(path.suffix or ".", drawn)
     except cv2.error:
@@ -173,7 +176,6 @@ def _line(
     width: int,
 ) -> None:
     """Draw a line through points in the world [m], unless it lies far outside the picture."""
-    cv2 = opencv()
     pixels = camera.pixels(points)
     if np.isfinite(pixels).all() and (np.abs(pixels) < 1e5).all():
         whole = np.round(pixels).astype(np.int32).reshape(-1, 1, 2)
@@ -182,55 +184,52 @@ def _line(
 
 def _grid(drawn: np.ndarray, camera: OverheadCamera) -> None:
     """Draw a grid on the visible floor, and write the distance between its lines."""
-    cv2 = opencv()
     width, height = camera.lens.image_px
     frame = np.stack(np.meshgrid(np.linspace(0, width, 9), np.linspace(0, height, 9)), -1)
     floor = camera.on_plane(frame.reshape(-1, 2), 0.0)
     floor = floor[np.isfinite(floor).all(axis=1)]
     low, high = floor.min(axis=0), floor.max(axis=0)
-    high = np.minimum(high, low + 100 * GRID)  # a tilted camera may see the horizon
-    lines = [np.arange(np.ceil(low[k] / GRID), high[k] / GRID) * GRID for k in range(2)]
+    high = np.minimum(high, low + 100 * GRID_M)  # a tilted camera may see the horizon
+    lines = [np.arange(np.ceil(low[k] / GRID_M), high[k] / GRID_M) * GRID_M for k in range(2)]
     for axis in range(2):
         along = np.linspace(low[1 - axis], high[1 - axis], 40)
         for at in lines[axis]:
             points = np.zeros((len(along), 3))
             points[:, axis], points[:, 1 - axis] = at, along
-            _line(drawn, camera, points, FLOOR, 2 if abs(at) < 1e-9 else 1)
+            _line(drawn, camera, points, GRID_BGR, 2 if abs(at) < 1e-9 else 1)
             if abs(at) > 1e-9:
                 _label(drawn, camera, at * np.eye(3)[axis], f"{'xy'[axis]} {at:g}")
-    text = f"lines on the floor every {GRID:g} m, thick through the origin"
-    cv2.putText(drawn, text, (20, height - 20), cv2.FONT_HERSHEY_SIMPLEX, 0.8, FLOOR, 2)
+    text = f"lines on the floor every {GRID_M:g} m, thick through the origin"
+    cv2.putText(drawn, text, (20, height - 20), cv2.FONT_HERSHEY_SIMPLEX, 0.8, GRID_BGR, 2)
 
 
 def _label(
     drawn: np.ndarray, camera: OverheadCamera, place: Float[np.ndarray, "3"], text: str
 ) -> None:
     """Write text beside a place on the floor [m], if the place lies in the picture."""
-    cv2 = opencv()
     x, y = camera.pixels(place[None])[0].tolist()
     width, height = camera.lens.image_px
     if 0 <= x < width and 0 <= y < height:
         where = (round(x) + 6, round(y) - 6)
-        cv2.putText(drawn, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.6, FLOOR, 1, cv2.LINE_AA)
+        cv2.putText(drawn, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.6, GRID_BGR, 1, cv2.LINE_AA)
 
 
 def _body(
     drawn: np.ndarray, camera: OverheadCamera, track: TrackedPoses, pose: Float[np.ndarray, "3"]
 ) -> None:
     """Draw the markers' edges expected at a pose, and the body's axes, x red and y green."""
-    cv2 = opencv()
     c, s = np.cos(pose[2]), np.sin(pose[2])
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     place = np.array([pose[0], pose[1], 0.0])
     for marker in track.target.markers:
         around = marker.corners[[0, 1, 2, 3, 0]] @ turn.T + place
-        _line(drawn, camera, around, EDGE, 2)
+        _line(drawn, camera, around, EDGE_BGR, 2)
     length = 1.5 * max(marker.size for marker in track.target.markers)
     origin = np.array([0.0, 0.0, track.target.height])
-    for axis, colour in enumerate((AHEAD, LEFT)):
+    for axis, colour in enumerate((AHEAD_BGR, LEFT_BGR)):
         tip = origin + length * np.eye(3)[axis]
         _line(drawn, camera, np.stack([origin, tip]) @ turn.T + place, colour, 3)
     at = camera.pixels((origin + place)[None])[0] + (30, -60)
     text = f"{track.target.name}: {pose[0]:.3f}, {pose[1]:.3f} m, {np.degrees(pose[2]):.1f} deg"
     where = tuple(np.round(at).astype(int).tolist())
-    cv2.putText(drawn, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.9, AHEAD, 2)
+    cv2.putText(drawn, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.9, AHEAD_BGR, 2)

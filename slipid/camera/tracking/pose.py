@@ -24,10 +24,10 @@ from jaxtyping import Bool, Float
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.target import Target
 
-ROUNDS = 3
+GAUSS_NEWTON_STEPS = 3
 """Number of Gauss-Newton steps; few suffice, since the start is exact except for the effect of the
 camera's tilt."""
-STEP = 0.5
+PIXEL_STEP = 0.5
 """Step of the numerical derivative of a ray's place by the pixel [pixel]."""
 
 
@@ -97,7 +97,7 @@ def poses_of(
     place = np.where(used[..., None], place, 0.0)
     into_pixels = np.linalg.inv(np.where(used[..., None, None], per_pixel, np.eye(2)))
     fitted = _similarity(place, body.middle + body.own, used)
-    for _ in range(ROUNDS):
+    for _ in range(GAUSS_NEWTON_STEPS):
         residual, slope = _residuals(fitted, place, into_pixels, body, used)
         normal = np.swapaxes(slope, 1, 2) @ slope
         step = np.linalg.solve(normal, np.swapaxes(slope, 1, 2) @ residual[..., None])
@@ -124,8 +124,8 @@ def _on_planes(
         some, z = pixels[:, at], float(height)
         place[:, at] = camera.on_plane(some, z)
         moved = [
-            (camera.on_plane(some + step, z) - camera.on_plane(some - step, z)) / (2 * STEP)
-            for step in STEP * np.eye(2)
+            (camera.on_plane(some + step, z) - camera.on_plane(some - step, z)) / (2 * PIXEL_STEP)
+            for step in PIXEL_STEP * np.eye(2)
         ]
         slope[:, at] = np.stack(moved, axis=-1)
     return place, slope

@@ -21,17 +21,17 @@ from slipid.camera.tracking.target import Target
 
 ACCELERATION = np.array([3.0, 3.0, 30.0])
 """Largest acceleration accepted, more than a wheeled robot has: x, y [m/s^2], heading [rad/s^2]."""
-SUDDEN = np.array([0.1, 0.1, 2.0])
+SUDDEN_CHANGE = np.array([0.1, 0.1, 2.0])
 """Largest sudden change of speed accepted, as in a collision: x, y [m/s], heading [rad/s]."""
 SPEED = np.array([5.0, 5.0, 15.0])
 """Largest speed accepted, more than a wheeled robot has: x, y [m/s], heading [rad/s]."""
-STDS = 6.0
+NOISE_STDS = 6.0
 """Deviation below which no pose is an outlier, in stds of the noise [1]."""
-BEHIND = 2
+POSES_BEHIND = 2
 """Number of poses over which the speed at an end of a segment is computed."""
-SEGMENTS = 60
+SEGMENTS_BEHIND = 60
 """Number of earlier segments among which the predecessor of a segment in the chain is searched."""
-FEWEST = 5
+FEWEST_POSES = 5
 """Number of poses below which outliers cannot be recognised."""
 
 
@@ -60,7 +60,7 @@ def jumps(
     """
     present = np.isfinite(pose).all(axis=1)
     bad = np.zeros(len(time), bool)
-    if present.sum() < FEWEST:
+    if present.sum() < FEWEST_POSES:
         return bad
     poses = _NoisyPoses(time[present], pose[present], std[present])
     first = _segments(poses)
@@ -82,10 +82,10 @@ def _segments(poses: _NoisyPoses) -> Int[np.ndarray, " segment"]:
     part = since / (since + until)
     gap = _wrapped(p[1:-1] - p[:-2]) - part * _wrapped(p[2:] - p[:-2])
     noise = np.sqrt(s[1:-1] ** 2 + ((1 - part) * s[:-2]) ** 2 + (part * s[2:]) ** 2)
-    reach = since * until * (0.5 * ACCELERATION + SUDDEN / (since + until))
-    sharp = np.abs(gap) > reach + STDS * noise
+    reach = since * until * (0.5 * ACCELERATION + SUDDEN_CHANGE / (since + until))
+    sharp = np.abs(gap) > reach + NOISE_STDS * noise
     odd = np.flatnonzero(sharp.any(axis=1)) + 1
-    fast = np.abs(_wrapped(np.diff(p, axis=0))) > SPEED * np.diff(t)[:, None] + STDS * s[1:]
+    fast = np.abs(_wrapped(np.diff(p, axis=0))) > SPEED * np.diff(t)[:, None] + NOISE_STDS * s[1:]
     steps = np.flatnonzero(fast.any(axis=1)) + 1
     return np.unique(np.concatenate([[0], odd, odd + 1, steps]))
 
@@ -100,11 +100,11 @@ def _longest_path(
     """
     total = last - first + 1
     before = np.full(len(first), -1)
-    base = np.where(last > first, np.maximum(first, last - BEHIND), -1)
+    base = np.where(last > first, np.maximum(first, last - POSES_BEHIND), -1)
     for segment in range(1, len(first)):
-        candidates = np.arange(max(0, segment - SEGMENTS), segment)
+        candidates = np.arange(max(0, segment - SEGMENTS_BEHIND), segment)
         start = np.full(len(candidates), first[segment])
-        onward = min(first[segment] + BEHIND, last[segment])
+        onward = min(first[segment] + POSES_BEHIND, last[segment])
         after = np.full(len(candidates), onward if onward > first[segment] else -1)
         sharpness = np.maximum(
             _sharpness(poses, last[candidates], base[candidates], start),
@@ -143,13 +143,13 @@ def _sharpness(
     t, p, s = poses.time, poses.pose, poses.std
     after = np.abs(t[to] - t[at])[:, None]
     change = _wrapped(p[to] - p[at])
-    fast = (np.abs(change) / (SPEED * after + STDS * (s[to] + s[at]))).max(axis=1)
+    fast = (np.abs(change) / (SPEED * after + NOISE_STDS * (s[to] + s[at]))).max(axis=1)
     moving = base >= 0
     span = np.where(moving, np.abs(t[at] - t[base]), 1.0)[:, None]
     times = after / span
     expected = times * _wrapped(p[at] - p[base])
     noise = np.sqrt(s[to] ** 2 + ((1 + times) * s[at]) ** 2 + (times * s[base]) ** 2)
-    allowed = after * (0.5 * (after + span) * ACCELERATION + SUDDEN) + STDS * noise
+    allowed = after * (0.5 * (after + span) * ACCELERATION + SUDDEN_CHANGE) + NOISE_STDS * noise
     sharp = (np.abs(_wrapped(change - expected)) / allowed).max(axis=1)
     return np.asarray(np.where(moving, np.maximum(fast, sharp), fast))
 
@@ -185,9 +185,9 @@ class Flag(IntEnum):
         return self.name.lower()
 
 
-LEAST_NOISE = 0.05
+LEAST_CORNER_STD = 0.05
 """Smallest std assumed for the error of a corner [pixel]; a smaller estimate is not credible."""
-SHARED = 0.05
+SHARED_STD = 0.05
 """Std of the error that all corners of a frame share, which residuals do not show [pixel]."""
 ODD_SQUARES = 25.0
 """Mean squared residual of a frame, relative to the median over frames, above which its corners do
@@ -299,9 +299,10 @@ def track_of(camera: OverheadCamera, target: Target, detections: Detections) -> 
     flag[detections.repeated] = Flag.REPEATED
     mean_square = fit.squares / np.maximum(fit.free, 1.0)
     flag[_odd(mean_square, fit.size, present) & (flag == Flag.OK)] = Flag.SHAPE
-    noise = _corner_std(mean_square[flag == Flag.OK])
+    squares = mean_square[flag == Flag.OK]
+    noise = max(LEAST_CORNER_STD, float(np.sqrt(squares.sum() / max(len(squares), 1))))
     corners_used = 0.5 * (fit.free + 4.0)
-    variance = noise**2 + corners_used * SHARED**2
+    variance = noise**2 + corners_used * SHARED_STD**2
     covariance = variance[:, None, None] * fit.unit_covariance
     pose = np.where((flag == Flag.OK)[:, None], fit.pose, np.nan)
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
@@ -332,12 +333,7 @@ def _odd(
     """Return a mask of the frames with too large residuals or an unusual size of the markers."""
     odd = np.zeros(len(size), bool)
     if present.any():
-        usual = max(float(np.median(mean_square[present])), LEAST_NOISE**2)
+        usual = max(float(np.median(mean_square[present])), LEAST_CORNER_STD**2)
         odd[present] = mean_square[present] > max(ODD_SQUARES * usual, ODD_LEAST**2)
         odd[present] |= np.abs(size[present] / np.median(size[present]) - 1) > ODD_SIZE
     return odd
-
-
-def _corner_std(mean_square: Float[np.ndarray, " frame"]) -> float:
-    """Return the std of a corner [pixel], from mean squared residuals of good frames [pixel^2]."""
-    return max(LEAST_NOISE, float(np.sqrt(mean_square.mean()))) if len(mean_square) else LEAST_NOISE

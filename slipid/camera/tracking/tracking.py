@@ -8,7 +8,7 @@ import numpy as np
 
 from slipid.camera.frame import FrameSource, cut_off, read_ahead, uneven
 from slipid.camera.frame_source import Device
-from slipid.camera.opencv import marker_count, opencv
+from slipid.camera.opencv import cv2, marker_count
 from slipid.camera.overhead import OverheadCamera
 from slipid.camera.tracking.detections import detect_all, only_marker
 from slipid.camera.tracking.detector import MarkerDetector, MarkerTracker, Region
@@ -118,7 +118,7 @@ def track(
         checkpoint,
         key_of(
             *(source.identity, dictionary, sorted(ids), region),
-            *(source_hash("camera"), opencv().__version__),
+            *(source_hash("camera"), cv2.__version__),
         ),
     )
     tracker = MarkerTracker(MarkerDetector(dictionary), ids, region)

@@ -7,6 +7,7 @@ numbers, but infinity and NaN do not propagate through such a product as they wo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import reduce
 from math import prod
 
 import jax
@@ -22,6 +23,7 @@ from slipid.exports.c99.ir import (
     NoFormError,
     Value,
     Variable,
+    axis_of,
     cells_of,
     kind_of_value,
     longest,
@@ -39,41 +41,30 @@ and the number of lanes of the result; None if the operation must be computed.""
 
 
 UNARY = {
-    "abs": "r_abs({0})",
-    "cos": "r_cos({0})",
-    "exp": "r_exp({0})",
-    "floor": "r_floor({0})",
+    **{
+        name: f"r_{name}({{0}})"
+        for name in ("abs", "cos", "exp", "floor", "log", "sign", "sin", "sqrt", "tanh")
+    },
+    **dict.fromkeys(("copy", "stop_gradient"), "{0}"),
     "is_finite": "is_finite({0})",
-    "log": "r_log({0})",
     "neg": "-{0}",
     "not": "!{0}",
     "rsqrt": "R(1.0) / r_sqrt({0})",
-    "sign": "r_sign({0})",
-    "sin": "r_sin({0})",
-    "sqrt": "r_sqrt({0})",
     "square": "{0} * {0}",
-    "tanh": "r_tanh({0})",
-    "copy": "{0}",
-    "stop_gradient": "{0}",
 }
 BINARY = {
-    "add": "{0} + {1}",
-    "add_any": "{0} + {1}",
+    **{name: f"r_{name}({{0}}, {{1}})" for name in ("atan2", "max", "min", "pow", "rem")},
+    **dict.fromkeys(("add", "add_any"), "{0} + {1}"),
     "and": "{0} & {1}",
-    "atan2": "r_atan2({0}, {1})",
     "div": "{0} / {1}",
     "eq": "{0} == {1}",
     "ge": "{0} >= {1}",
     "gt": "{0} > {1}",
     "le": "{0} <= {1}",
     "lt": "{0} < {1}",
-    "max": "r_max({0}, {1})",
-    "min": "r_min({0}, {1})",
     "mul": "{0} * {1}",
     "ne": "{0} != {1}",
     "or": "{0} | {1}",
-    "pow": "r_pow({0}, {1})",
-    "rem": "r_rem({0}, {1})",
     "sub": "{0} - {1}",
 }
 INTEGER_TEMPLATES = {"max": "i_max({0}, {1})", "min": "i_min({0}, {1})", "rem": "{0} % {1}"}
@@ -100,10 +91,7 @@ def applied(
     out = []
     for cells in zip(*(row.reshape(-1) for row in rows), strict=True):
         plain = simpler(builder, cells, lanes) if simpler else None
-        if plain is None:
-            count = lanes if any(varies(cell) for cell in cells) else 0
-            plain = builder.compute(kind, template, cells, count)
-        out.append(plain)
+        out.append(plain or builder.compute(kind, template, cells, lanes))
     return Array(shape, kind, axis, cells_of(rows[0].shape, out))
 
 
@@ -113,7 +101,7 @@ def _axis(values: Sequence[Value], shape: tuple[int, ...]) -> int | None:
     It is that of the first value with lanes along which the result is equally long.
     """
     for value in values:
-        axis = value.axis if isinstance(value, Array) else None
+        axis = axis_of(value)
         if axis is not None and len(value.shape) == len(shape) and value.shape[axis] == shape[axis]:
             return axis
     return longest(shape) if prod(shape) > UNROLLED else None
@@ -139,9 +127,7 @@ def binary(name: str) -> Rule:
     def simpler(builder: Builder, cells: tuple[Cell, ...], lanes: int) -> Cell | None:
         a, b = cells
         if name == "div" and isinstance(a, Variable) and a.made_by[0] == UNARY["tanh"]:
-            both = (*a.made_by[1], b)
-            count = lanes if any(varies(cell) for cell in both) else 0
-            return builder.compute("real", "r_tanh_over({0}, {1})", both, count)
+            return builder.compute("real", "r_tanh_over({0}, {1})", (*a.made_by[1], b), lanes)
         if isinstance(a, Constant) and first is not None and a.value == first:
             return b
         if isinstance(b, Constant) and second is not None and b.value == second:
@@ -210,15 +196,6 @@ REDUCED: dict[str, tuple[str, str, str | None]] = {
 """Template of each reduction, and its initial value for reals or truth values and for integers."""
 
 
-def chained(builder: Builder, template: str, kind: Kind, cells: Cells, lanes: int) -> Cell:
-    """Return the cell that results from combining cells one after the other."""
-    done: Cell = cells[0]
-    for cell in cells[1:]:
-        count = lanes if varies(done) or varies(cell) else 0
-        done = builder.compute(kind, template, (done, cell), count)
-    return done
-
-
 def reduced(name: str) -> Rule:
     """Return the rule of a reduction over some axes."""
     real_template, start, start_of_ints = REDUCED[name]
@@ -235,8 +212,11 @@ def reduced(name: str) -> Rule:
         over = [rest.index(d) for d in axes if d != value.axis]
         moved = np.moveaxis(value.cells, over, range(-len(over), 0)) if over else value.cells
         kept = moved.shape[: moved.ndim - len(over)]
-        rows = moved.reshape(prod(kept), -1)
-        cells = [chained(builder, template, kind, row, lanes) for row in rows]
+
+        def chained(done: Cell, cell: Cell) -> Cell:
+            return builder.compute(kind, template, (done, cell), lanes)
+
+        cells = [reduce(chained, row) for row in moved.reshape(prod(kept), -1)]
         if value.axis in axes:
             text = template.replace("{0}", "{acc}").replace("{1}", "{0}")
             cells = [builder.compute(kind, text, (cell,), lanes, first) for cell in cells]
@@ -307,7 +287,7 @@ def _lane_axes(
 
     They are those of an array that has lanes; None where an array does not depend on the lane.
     """
-    left, right = (v.axis if isinstance(v, Array) else None for v in values)
+    left, right = map(axis_of, values)
     if right in free[1]:
         return None, right
     if left in free[0]:
@@ -335,13 +315,12 @@ def _dot_one(
         cells.extend(factors)
     if not terms:
         return Constant(0.0, kind)
-    laned = lanes if any(varies(c) for c in cells) else 0
     if not summed:
         if terms == ["{0}"]:
             return cells[0]
-        return builder.compute(kind, " + ".join(terms), tuple(cells), laned)
-    if not laned:
+        return builder.compute(kind, " + ".join(terms), tuple(cells), lanes)
+    if not any(map(varies, cells)):
         terms.append(f"R({float(lanes)})")
         whole = f"({' + '.join(terms[:-1])}) * {terms[-1]}"
         return builder.compute(kind, whole, tuple(cells), 0)
-    return builder.compute(kind, " + ".join(["{acc}", *terms]), tuple(cells), laned, "R(0.0)")
+    return builder.compute(kind, " + ".join(["{acc}", *terms]), tuple(cells), lanes, "R(0.0)")

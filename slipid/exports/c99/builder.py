@@ -10,7 +10,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from slipid.exports.c99.ir import Array, At, Cell, CodeBlock, Memory, Statement, Variable
+from slipid.exports.c99.ir import (
+    Array,
+    At,
+    Cell,
+    CodeBlock,
+    Memory,
+    Statement,
+    Variable,
+    varies,
+)
 from slipid.exports.fields import DTYPES, Kind
 
 CALLS = ("r_atan2", "r_cos", "r_exp", "r_log", "r_pow", "r_rem", "r_sin", "r_floor")
@@ -73,9 +82,10 @@ class Builder:
             kind: kind of the number.
             template: C expression with places {0}, {1}, ... for the cells.
             cells: cells for these places.
-            lanes: number of lanes, 0 for a single number.
+            lanes: number of lanes; cells that are alike in all of them make a single number, too.
             start: initial value of a reduction over the lanes to one number; empty for none.
         """
+        lanes = lanes if start or any(map(varies, cells)) else 0
         around = self._around(cells)
         if around is not self:
             around.source = self.source

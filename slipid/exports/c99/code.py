@@ -6,30 +6,31 @@ import math
 from collections.abc import Iterator, Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from slipid.exports.c99.builder import Names
 from slipid.exports.c99.function import Argument, Function, function
 from slipid.exports.c99.text import TYPES, WIDTH, folded, table
 from slipid.exports.description import header
-from slipid.exports.fields import Struct, fields_of
+from slipid.exports.fields import Struct, structs_of
 from slipid.exports.text import filled, identifiers, listed, template, wrapped
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.filter.hypotheses import hypotheses_of
-from slipid.robot.interface import Measurement, Readings
+from slipid.robot.interface import Readings
 from slipid.robot.trajectory import Path
 
 TYPE = {**TYPES, "real": "slipid_real"}
 
 
 class Code:
-    """The C code of a control loop, and of a path if it follows one.
+    """The C code of a control loop, and of a path that it follows.
 
     Attributes:
         robot: robot with the record of its numbers.
         loop: estimator and controller.
-        path: path for a robot that starts at the origin; None without one.
+        path: path for a robot that starts at the origin.
         estimator: struct of the estimator's state.
         controller: struct of the controller's state.
         reading: struct of the inputs.
@@ -38,9 +39,7 @@ class Code:
         functions: all generated functions.
     """
 
-    def __init__(
-        self, robot: DeployedRobot, loop: ControlLoop[eqx.Module], path: Path | None = None
-    ):
+    def __init__(self, robot: DeployedRobot, loop: ControlLoop[eqx.Module], path: Path):
         """Trace and lower all functions.
 
         Raises:
@@ -48,90 +47,41 @@ class Code:
         """
         self.robot, self.loop, self.path = robot, loop, path
         self._names = Names()
-        begin, nothing, zero = loop.init(), Readings.nothing(robot.wheels), jnp.zeros(())
-        estimate = loop.estimator.step(begin.estimator, nothing, zero)[1]
-        self.estimator = _struct("estimator", "State of the estimator.", begin.estimator)
-        self.controller = _struct("controller", "State of the controller.", begin.controller)
-        about = "Readings of the sensors; NaN if there is no reading."
-        self.reading = _struct("reading", about, nothing, Measurement)
-        self.estimate = _struct("estimate", "Output of the estimator.", estimate)
-        self.structs = self.estimator, self.controller, self.reading, self.estimate
+        self.structs = structs_of(loop)
+        self.estimator, self.controller, self.reading, self.estimate = self.structs
         self.functions = list(self._functions())
 
     def _functions(self) -> Iterator[Function]:
-        loop, wheels = self.loop, self.robot.wheels
-        pose, dt = Argument.plain("pose", (3,)), Argument.plain("dt", ())
-        yield function(
-            self._names,
-            "slipid_begin",
-            "Initialise estimator and controller of a robot at rest at a pose: x, y [m], heading "
-            "[rad].",
-            (
-                Argument.of("estimator", self.estimator, read=False, written=True),
-                Argument.of("controller", self.controller, read=False, written=True),
-                pose,
-            ),
-            lambda pose: (loop.init(pose).estimator, loop.init(pose).controller),
+        loop, path, wheels = self.loop, self.path, self.robot.wheels
+        estimator, controller, reading, estimate = (
+            Argument(struct.name, struct) for struct in self.structs
         )
-        yield function(
-            self._names,
-            "slipid_nothing",
-            "Set all fields of a reading to NaN (no reading); then fill in the measured ones.",
-            (Argument.of("reading", self.reading, read=False, written=True),),
-            lambda: Readings.nothing(wheels),
+        pose, dt, time = (
+            Argument.plain(*one) for one in (("pose", (3,)), ("dt", ()), ("time", ()))
         )
-        yield function(
-            self._names,
-            "slipid_observe",
-            "Step of the estimator: process the readings of the sensors dt [s] after the last "
-            "call.",
-            (
-                Argument.of("estimator", self.estimator, written=True),
-                Argument.of("reading", self.reading),
-                dt,
-                Argument.of("estimate", self.estimate, read=False, written=True),
-            ),
-            loop.estimator.step,
-        )
-        yield function(
-            self._names,
-            "slipid_command",
-            "Step of the controller: compute the wheel speeds to command [rad/s] for a "
-            "reference, x, y [m], heading [rad] and their rates in the world [m/s, m/s, rad/s].",
-            (
-                Argument.of("controller", self.controller, written=True),
-                Argument.plain("reference", (6,)),
-                Argument.of("estimate", self.estimate),
-                dt,
-                Argument.plain("command", (wheels,), read=False, written=True),
-            ),
-            loop.controller.step,
-        )
-        if self.path is not None:
-            yield self._follow(self.path)
+        reference = Argument.plain("reference", (6,))
+        command = Argument.plain("command", (wheels,)).made
 
-    def _follow(self, path: Path) -> Function:
-        preview = self.loop.controller.gains.preview
-        begin = ", ".join(f"{float(x):g}" for x in path.rows[0, :3])
+        def begin(pose: jax.Array) -> tuple[object, object]:
+            return loop.init(pose).estimator, loop.init(pose).controller
 
-        def follow(time: jnp.ndarray, pose: jnp.ndarray, dt: jnp.ndarray) -> object:
+        def follow(time: jax.Array, pose: jax.Array, dt: jax.Array) -> object:
             here = jnp.where(jnp.isfinite(pose), pose, 1e3)
-            return path.follow(time, here, dt, preview)
+            return path.follow(time, here, dt, loop.controller.gains.preview)
 
-        return function(
-            self._names,
-            "slipid_follow",
-            "Advance the time of the path [s], which begins at 0, for a robot at a pose, and "
-            f"return the reference at that time. The path begins at {begin} [m, m, rad] and lasts "
-            f"{path.duration:g} s; it waits for a robot that lags.",
+        step = controller.changed, reference, estimate, dt, command
+        for name, run, arguments in (
+            ("slipid_begin", begin, (estimator.made, controller.made, pose)),
+            ("slipid_nothing", lambda: Readings.nothing(wheels), (reading.made,)),
             (
-                Argument.plain("time", (), written=True),
-                Argument.plain("pose", (3,)),
-                Argument.plain("dt", ()),
-                Argument.plain("reference", (6,), read=False, written=True),
+                "slipid_observe",
+                loop.estimator.step,
+                (estimator.changed, reading, dt, estimate.made),
             ),
-            follow,
-        )
+            ("slipid_command", loop.controller.step, step),
+            ("slipid_follow", follow, (time.changed, pose, dt, reference.made)),
+        ):
+            yield function(self._names, name, arguments, run)
 
     @property
     def kept(self) -> int:
@@ -151,21 +101,24 @@ class Code:
             f"SLIPID_WHEELS {robot.wheels}",
             f"SLIPID_FLOORS {len(robot.labels)}",
             *(f"SLIPID_FLOOR_{name.upper()} {k}" for k, name in enumerate(names)),
-            *([] if self.path is None else [f"SLIPID_PATH_SECONDS {self.path.duration!r}"]),
+            f"SLIPID_PATH_SECONDS {self.path.duration!r}",
         ]
-        public = ["slipid_init", "slipid_step", *(f.name for f in self.functions)]
+        begin = ", ".join(f"{float(x):g}" for x in self.path.rows[0, :3])
         values = {
             "HEAD": _comment(*header(robot)),
             "ROBOT": robot.record.numbers,
             "DEFINES": [f"#define {d}" for d in defines],
             "ABOUT": [line for part in about(self.loop) for line in _comment(part)],
-            "SINGLE": [f"#define {name} {name}_float" for name in public],
-            "STRUCTS": [line for s in self.structs for line in _definition(s)],
-            "FUNCTIONS": [
-                line
+            "FOLLOWABOUT": _comment(
+                "Own time of the path [s], from 0, and the reference there, for a robot at a pose. "
+                f"The path begins at {begin} [m, m, rad] and lasts {self.path.duration:g} s; it "
+                "waits for a robot that lags."
+            ),
+            **{s.name.upper(): _definition(s) for s in self.structs},
+            **{
+                f.name.removeprefix("slipid_").upper(): folded(f"{f.head};", "")
                 for f in self.functions
-                for line in (*_comment(f.about), *folded(f"{f.head};", ""), "")
-            ],
+            },
         }
         return filled("c99/slipid.h", values)
 
@@ -180,11 +133,6 @@ class Code:
             "FUNCTIONS": [line for f in self.functions for line in f.text],
         }
         return filled("c99/slipid.c", values)
-
-
-def _struct(name: str, about: str, tree: object, documented: type | None = None) -> Struct:
-    """Return the struct of a tree; `documented` is as in `fields_of`."""
-    return Struct(f"slipid_{name}", about, fields_of(tree, documented), tree)
 
 
 def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
@@ -216,16 +164,12 @@ def about(loop: ControlLoop[eqx.Module]) -> Iterator[str]:
 def _comment(*parts: str) -> list[str]:
     """Return the lines of a C comment."""
     lines = [line.replace("*/", "* /") for part in parts for line in wrapped(part)]
-    return (
-        [f"/* {lines[0]}", *(f"   {line}" for line in lines[1:-1]), f"   {lines[-1]} */"]
-        if len(lines) > 1
-        else [f"/* {lines[0]} */"]
-    )
+    return ("/* " + "\n   ".join(lines) + " */").split("\n")
 
 
 def _definition(struct: Struct) -> Sequence[str]:
     """Return the lines of C that define a struct."""
-    lines = [*_comment(struct.about), "typedef struct {"]
+    lines = ["typedef struct {"]
     for field in struct.fields:
         size = f"[{field.size}]" if field.shape else ""
         shape = "" if len(field.shape) < 2 else f", {' x '.join(map(str, field.shape))} by rows"
@@ -234,4 +178,4 @@ def _definition(struct: Struct) -> Sequence[str]:
             lines.append(f"{declared} /* {comment} */")
         else:
             lines += [*(f"  {line}" for line in _comment(comment)), declared]
-    return [*lines, f"}} {struct.name};", ""]
+    return [*lines, f"}} slipid_{struct.name};"]

@@ -13,17 +13,23 @@ from slipid.exports.c99.text import wrapped
 from slipid.exports.description import facts, made_with, warned
 from slipid.exports.fields import Struct
 from slipid.exports.golden import golden
-from slipid.exports.text import filled, template
+from slipid.exports.text import filled
 from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.trajectory import Path
 
+FILES = (
+    *("test/golden.h", "test/check.c", "examples/drive/drive.c", "examples/Slipid/Slipid.ino"),
+    *("CMakeLists.txt", "library.json", "library.properties", "README.md"),
+)
+"""Files that are filled from the template of the same name, besides the code itself."""
 
-def golden_header(code: Code) -> str:
-    """Return the text of golden.h: the steps as tables, and code that fills and reads structs."""
+
+def _golden(code: Code) -> dict[str, str | list[str]]:
+    """Return the values of golden.h: the steps as tables, and code that fills and reads structs."""
     steps = golden(code.loop)
     names = [f.name for f in code.estimate.fields for _ in range(f.size)]
-    values = {
+    return {
         "STEPS": str(len(steps.given)),
         "INPUTS": str(steps.given.shape[1]),
         "OUTPUTS": str(steps.said.shape[1]),
@@ -35,7 +41,6 @@ def golden_header(code: Code) -> str:
         "FILL": _filling(code.reading),
         "READ": _reading_out(code.estimate),
     }
-    return filled("c99/golden.h", values)
 
 
 def _table(rows: np.ndarray) -> list[str]:
@@ -110,27 +115,19 @@ def c_files(
     Raises:
         UnsupportedError: a step uses a primitive that has no form in C.
     """
-    code, release = Code(robot, loop, path), {"VERSION": made_with()}
+    code = Code(robot, loop, path)
     state, stack = (f"{numbers * 8 / 1024:.1f} KiB" for numbers in (code.kept, code.scratch))
     corners = [f"({x:.2f}, {y:.2f})" for x, y in np.asarray(path.corners).tolist()]
     x, y, heading = np.asarray(path.rows)[0, :3].tolist()
-    files = {
-        "src/slipid.h": code.header(),
-        "src/slipid.c": code.source(),
-        "test/golden.h": golden_header(code),
-        "test/check.c": template("c99/check.c"),
-        "examples/drive/drive.c": template("c99/drive.c"),
-        "examples/Slipid/Slipid.ino": filled("c99/Slipid.ino", {"STACK": stack}),
-        "CMakeLists.txt": template("c99/CMakeLists.txt"),
-        "library.json": filled("c99/library.json", release),
-        "library.properties": filled("c99/library.properties", release),
-    }
+    run: dict[str, str] = {}
     example = ""
     if recording is not None:
-        files["examples/drive/readings.txt"] = recording.readings
-        files["examples/drive/commands.txt"] = recording.commands
+        run["examples/drive/readings.txt"] = recording.readings
+        run["examples/drive/commands.txt"] = recording.commands
         example = filled("c99/recording.md", {"PLANT": recording.plant})
     values = {
+        **_golden(code),
+        "VERSION": made_with(),
         "WARNINGS": warned(robot),
         "HEAD": facts(robot),
         "RECORDING": example,
@@ -141,5 +138,5 @@ def c_files(
         "PATH": f"from ({x:.2f}, {y:.2f}), heading {heading:.2f} rad, over {', '.join(corners)} "
         f"[m] in {path.duration:g} s",
     }
-    files["README.md"] = filled("c99/README.md", values)
-    return files
+    others = {name: filled(f"c99/{name.rpartition('/')[2]}", values) for name in FILES}
+    return {"src/slipid.h": code.header(), "src/slipid.c": code.source(), **others, **run}

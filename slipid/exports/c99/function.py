@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 
 from slipid.exports.c99.builder import Builder, Names
-from slipid.exports.c99.ir import Array, Memory, Value, in_memory
+from slipid.exports.c99.ir import Memory, Value, holds, in_memory
 from slipid.exports.c99.jaxpr import Traced
 from slipid.exports.c99.lower import apart, lowered, store
 from slipid.exports.c99.text import FunctionBody, folded
@@ -22,53 +22,51 @@ class Argument:
 
     Attributes:
         name: name of the argument.
-        type: name of the struct that the argument points to; empty for plain numbers.
-        fields: fields of the struct; a single one for plain numbers.
-        example: a tree of arrays with the shapes of the fields, as an argument of the traced
-            function.
-        read: True if the function reads it.
-        written: True if the function fills it.
+        struct: struct that the argument points to; one without a name for plain numbers.
+        read: whether the function reads it.
+        written: whether the function fills it.
     """
 
     name: str
-    type: str
-    fields: tuple[Field, ...]
-    example: object
-    read: bool
-    written: bool
+    struct: Struct
+    read: bool = True
+    written: bool = False
 
     @classmethod
     def plain(
         cls, name: str, shape: tuple[int, ...], read: bool = True, written: bool = False
     ) -> Argument:
         """Return an argument that is a number, or an array of numbers."""
-        return cls(name, "", (Field(name, "real", shape, ""),), jnp.zeros(shape), read, written)
-
-    @classmethod
-    def of(cls, name: str, struct: Struct, read: bool = True, written: bool = False) -> Argument:
-        """Return an argument that is a pointer to a struct."""
-        return cls(name, struct.name, struct.fields, struct.example, read, written)
+        numbers = Struct("", (Field(name, "real", shape, ""),), jnp.zeros(shape))
+        return cls(name, numbers, read, written)
 
     @property
-    def memories(self) -> list[Memory]:
-        """Memory of each of its fields."""
-        plain = f"(*{self.name})" if self.written and not self.fields[0].shape else self.name
+    def made(self) -> Argument:
+        """The same argument where the function fills it."""
+        return replace(self, read=False, written=True)
+
+    @property
+    def changed(self) -> Argument:
+        """The same argument where the function reads and changes it."""
+        return replace(self, written=True)
+
+    @property
+    def values(self) -> list[tuple[Memory, tuple[int, ...]]]:
+        """Memory and shape of each of its fields."""
+        fields = self.struct.fields
+        plain = f"(*{self.name})" if self.written and not fields[0].shape else self.name
+        names = [f"{self.name}->{f.name}" if self.struct.name else plain for f in fields]
         return [
-            Memory(
-                f"{self.name}->{f.name}" if self.type else plain,
-                f.numbers,
-                f.size,
-                scalar=not f.shape,
-            )
-            for f in self.fields
+            (Memory(name, f.numbers, f.size, scalar=not f.shape), f.shape)
+            for name, f in zip(names, fields, strict=True)
         ]
 
     @property
     def declared(self) -> str:
         """Text of its declaration in the function's head."""
-        const, field = "" if self.written else "const ", self.fields[0]
-        if self.type:
-            return f"{const}{self.type} *{self.name}"
+        const, field = "" if self.written else "const ", self.struct.fields[0]
+        if self.struct.name:
+            return f"{const}slipid_{self.struct.name} *{self.name}"
         if field.shape:
             return f"{const}slipid_real {self.name}[{field.size}]"
         return f"slipid_real {'*' if self.written else ''}{self.name}"
@@ -80,7 +78,6 @@ class Function:
 
     Attributes:
         name: name of the function.
-        about: comment of its declaration.
         arguments: arguments in order.
         lines: lines of its body.
         reads: names of all memory that it reads.
@@ -88,7 +85,6 @@ class Function:
     """
 
     name: str
-    about: str
     arguments: tuple[Argument, ...]
     lines: tuple[str, ...]
     reads: frozenset[str]
@@ -106,18 +102,13 @@ class Function:
 
 
 def function(
-    names: Names,
-    name: str,
-    about: str,
-    arguments: Sequence[Argument],
-    run: Callable[..., object],
+    names: Names, name: str, arguments: Sequence[Argument], run: Callable[..., object]
 ) -> Function:
     """Return a function of JAX as a C function.
 
     Args:
         names: numbers for names and constant tables of the generated file.
         name: name of the function.
-        about: comment of its declaration.
         arguments: arguments in order.
         run: function whose inputs are the trees of all arguments that are read and whose results
             are those of all arguments that are written, in the arguments' order.
@@ -126,20 +117,15 @@ def function(
         UnsupportedError: the function uses a primitive without a rule.
     """
     builder = Builder(names)
-    values: list[Value] = [
-        in_memory(memory, field.shape)
-        for argument in arguments
-        if argument.read
-        for memory, field in zip(argument.memories, argument.fields, strict=True)
-    ]
-    examples = [argument.example for argument in arguments if argument.read]
-    results = lowered(builder, traced(run, *examples), values)
-    targets = [memory for a in arguments if a.written for memory in a.memories]
+    given = [argument for argument in arguments if argument.read]
+    values: list[Value] = [in_memory(*value) for argument in given for value in argument.values]
+    results = lowered(builder, traced(run, *(a.struct.example for a in given)), values)
+    targets = [memory for a in arguments if a.written for memory, _ in a.values]
     overwritten = frozenset(memory.name for memory in targets)
     changed = [
         (memory, apart(builder, value, overwritten))
         for memory, value in zip(targets, results, strict=True)
-        if not _holds(memory, value)
+        if not holds(memory, value)
     ]
     for memory, value in changed:
         store(builder, value, memory)
@@ -147,10 +133,10 @@ def function(
     unused = [
         f"  (void){a.name};"
         for a in arguments
-        if not a.written and not any(memory.name in body.reads for memory in a.memories)
+        if not a.written and not any(memory.name in body.reads for memory, _ in a.values)
     ]
     lines = (*unused, *body.lines)
-    return Function(name, about, tuple(arguments), lines, body.reads, body.scratch)
+    return Function(name, tuple(arguments), lines, body.reads, body.scratch)
 
 
 def traced(run: Callable[..., object], *like: object) -> Traced:
@@ -164,11 +150,3 @@ def traced(run: Callable[..., object], *like: object) -> Traced:
         return jax.tree.leaves(run(*jax.tree.unflatten(structure, leaves)))
 
     return Traced.of(jax.make_jaxpr(of)(*jax.tree.leaves(like)))
-
-
-def _holds(memory: Memory, value: Value) -> bool:
-    """Return whether memory already contains a value, so that nothing has to be stored."""
-    if not isinstance(value, Array):
-        return False
-    like = in_memory(memory, value.shape)
-    return value.axis == like.axis and bool((value.cells == like.cells).all())

@@ -194,6 +194,11 @@ def kind_of_value(value: Value) -> Kind:
     return value.kind if isinstance(value, Array) else kind_of(value.dtype)
 
 
+def axis_of(value: Value) -> int | None:
+    """Return the axis of a value's lanes; None without lanes."""
+    return value.axis if isinstance(value, Array) else None
+
+
 def cells_of(shape: Sequence[int], cells: Sequence[Cell]) -> Cells:
     """Return cells in row-major order as an array of this shape."""
     out = np.empty(len(cells), dtype=object)
@@ -240,3 +245,11 @@ def read_at(memory: Memory, places: np.ndarray, index: Variable | None = None) -
 def in_memory(memory: Memory, shape: tuple[int, ...]) -> Array:
     """Return the array of this shape that is stored in memory in row-major order."""
     return read_at(memory, numbered(shape))
+
+
+def holds(memory: Memory, value: Value) -> bool:
+    """Return whether memory already holds a value in row-major order."""
+    if not isinstance(value, Array):
+        return False
+    like = in_memory(memory, value.shape)
+    return value.axis == like.axis and bool((value.cells == like.cells).all())

@@ -29,7 +29,6 @@ from slipid.exports.c99.ir import (
     longest,
     numbered,
     rows_of,
-    varies,
 )
 from slipid.exports.c99.jaxpr import Params, ScanParameters, Traced, branches, called, source_line
 from slipid.exports.c99.moves import MOVES, SOURCES, moved
@@ -190,7 +189,7 @@ def apart(builder: Builder, value: Value, overwritten: frozenset[str]) -> Value:
     def own(cell: Cell) -> Cell:
         if not isinstance(cell, At) or cell.memory.name not in overwritten:
             return cell
-        return builder.compute(cell.kind, "{0}", (cell,), value.lanes if varies(cell) else 0)
+        return builder.compute(cell.kind, "{0}", (cell,), value.lanes)
 
     cells = [own(cell) for cell in value.cells.reshape(-1)]
     return Array(value.shape, value.kind, value.axis, cells_of(value.cells.shape, cells))

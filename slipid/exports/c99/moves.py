@@ -19,10 +19,10 @@ from slipid.exports.c99.ir import (
     NoFormError,
     Value,
     Variable,
+    axis_of,
     cells_of,
     numbered,
     read_at,
-    varies,
 )
 from slipid.exports.c99.jaxpr import Params
 from slipid.exports.c99.sources import along, contiguous, rearranged
@@ -118,8 +118,7 @@ def _offset(
         if most:
             terms.append(f"i_min(i_max({{{len(cells)}}}, 0), {most}) * {stride}")
             cells.append(start)
-    count = lanes if any(map(varies, cells)) else 0
-    return builder.compute("int", " + ".join(terms) or "0", tuple(cells), count)
+    return builder.compute("int", " + ".join(terms) or "0", tuple(cells), lanes)
 
 
 def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -> Value:
@@ -133,7 +132,7 @@ def gather(builder: Builder, values: list[Value], params: Params, out: Shaped) -
     memory = contiguous(builder, whole)
     batch = [d for d in range(len(out.shape)) if d not in numbers.offset_dims]
     kept = [d for d in range(len(whole.shape)) if d not in numbers.collapsed_slice_dims]
-    own = where.axis if isinstance(where, Array) else None
+    own = axis_of(where)
     axis = None if own is None else batch[own]
     lanes = 0 if own is None else where.shape[own]
     places = along(builder, where, where.shape, own)

@@ -19,7 +19,7 @@ from slipid.exports.c99.ir import (
     Value,
     Variable,
     cells_of,
-    in_memory,
+    holds,
     kind_of_value,
     longest,
     numbered,
@@ -182,10 +182,8 @@ def contiguous(builder: Builder, value: Value) -> Memory:
 
 def _contiguous(builder: Builder, value: Array) -> Memory:
     flat = tuple(value.cells.reshape(-1))
-    if isinstance(flat[0], At):
-        stored = in_memory(flat[0].memory, value.shape)
-        if stored.axis == value.axis and bool((stored.cells == value.cells).all()):
-            return flat[0].memory
+    if isinstance(flat[0], At) and holds(flat[0].memory, value):
+        return flat[0].memory
     places = numbered(value.shape)
     if value.axis is None:
         return Sources(builder, [value]).copied(places.reshape(-1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -171,13 +172,8 @@ def table(memory: Memory) -> list[str]:
 
 def wrapped(words: Iterable[str], indent: str) -> list[str]:
     """Return words joined by commas, in lines of at most `WIDTH` characters."""
-    lines, line = [], indent
-    for word in words:
-        if len(line) + len(word) + 2 > WIDTH and line.strip():
-            lines.append(line.rstrip())
-            line = indent
-        line += f"{word}, "
-    return [*lines, line.rstrip().rstrip(",")]
+    lines = _broken(", ".join(words) + ",", WIDTH - 1, indent, indent)
+    return [*lines[:-1], lines[-1].removesuffix(",")]
 
 
 class FunctionBody:
@@ -290,12 +286,16 @@ class FunctionBody:
 
 def folded(text: str, indent: str) -> list[str]:
     """Return the lines of a statement, wrapped at `WIDTH` characters."""
-    if len(indent) + len(text) <= WIDTH:
-        return [indent + text]
-    lines, line = [], indent
-    for word in text.split(" "):
-        if len(line) + len(word) > WIDTH:
-            lines.append(line.rstrip())
-            line = indent + "    "
-        line += word + " "
-    return [*lines, line.rstrip()]
+    return _broken(text, WIDTH, indent, f"{indent}    ")
+
+
+def _broken(text: str, width: int, first: str, later: str) -> list[str]:
+    """Return text as lines, broken at spaces alone; `first` and `later` are their indents."""
+    return textwrap.wrap(
+        text,
+        width,
+        initial_indent=first,
+        subsequent_indent=later,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

@@ -33,7 +33,7 @@ from slipid.exports.ros.localization import (
 )
 from slipid.exports.ros.node import NODE, node_parameters
 from slipid.exports.ros.yaml_text import Parameter, comment, declaration, nodes
-from slipid.exports.text import filled, identifiers, interval, short, table
+from slipid.exports.text import filled, identifiers, interval, short, table, template
 from slipid.robot.deployed import DeployedRobot
 
 USES: Mapping[str, str] = {
@@ -131,7 +131,7 @@ def _readme(
     values = {
         "HEAD": in_markdown(robot),
         "FILES": table(("file", "use"), [(f"`{name}`", use) for name, use in uses.items()]),
-        "CONTROLLER": _NO_DRIVE if drive is None else _controller(drive),
+        "CONTROLLER": _controller(drive),
         "WHEELS": _wheels(robot, drive),
         "ODOMETRY": _odometry(robot, errors),
         "SPEED": short(top_speed(robot)),
@@ -143,22 +143,23 @@ def _readme(
         "VERDICTS": [f"- *{v.replace('_', ' ')}*: {text}." for v, text in VERDICTS.items()],
         "PROVENANCES": [f"- *{p}*: {text}." for p, text in PROVENANCES.items()],
     }
-    return filled("ros2.md", values)
+    return filled("ros2/README.md", values)
 
 
-def _controller(drive: DriveController) -> list[str]:
+def _controller(drive: DriveController | None) -> str:
     """Return the paragraphs about the controller manager and the controller's kinematics."""
-    off = drive.difference
-    return [
-        "The controller manager needs the type of the controller, under the name that is used "
-        "here:",
-        *("", "```yaml", "controller_manager:", "  ros__parameters:", f"    {drive.name}:"),
-        *(f"      type: {drive.plugin}", "```", ""),
-        f"Its kinematics differ from the identified ones by at most {short(100 * off)} % of a rim "
-        "speed, since it has no parameters for the drive directions of single wheels."
-        if off > 1e-9
-        else "Its kinematics are the identified ones.",
-    ]
+    if drive is None:
+        return filled("ros2/no_drive.md", {"SHARE": f"{LARGEST_DIFFERENCE:.0%}"}).rstrip()
+    difference = (
+        f"differ from the identified ones by {short(100 * drive.difference)} % of a rim speed at "
+        "most: it knows no drive directions of single wheels."
+    )
+    values = {
+        "NAME": drive.name,
+        "PLUGIN": drive.plugin,
+        "DIFFERENCE": difference if drive.difference > 1e-9 else "are the identified ones.",
+    }
+    return filled("ros2/drive.md", values).rstrip()
 
 
 def _wheels(robot: DeployedRobot, drive: DriveController | None) -> list[str]:
@@ -177,7 +178,8 @@ def _wheels(robot: DeployedRobot, drive: DriveController | None) -> list[str]:
         sign = "" if drive is None else "**REVERSE**" if reverse else "as it is"
         rows.append((f"wheel {k + 1}", f"`{joint(k)}`", where, ahead, free, sign))
     head = ("robot.json", "joint", "x, y [m]", "drives to", "rollers", "sign for the controller")
-    return [*table(head, rows), *(("", _REVERSE) if any(turned) else ())]
+    warning = ["", template("ros2/reverse.md").rstrip()] if any(turned) else []
+    return [*table(head, rows), *warning]
 
 
 def _odometry(robot: DeployedRobot, errors: tuple[OdometryErrors, ...]) -> list[str]:
@@ -221,18 +223,3 @@ def _numbers(robot: DeployedRobot) -> list[str]:
         rows.append((f"`{row.name}`", row.entry, row.about, *known))
     head = ("robot.json", "", "", "value", "unit", "90 % interval", "verdict", "provenance")
     return table(head, rows)
-
-
-_NO_DRIVE = (
-    "No drive controller of ros2_controllers has the kinematics of this robot (to "
-    f"{LARGEST_DIFFERENCE:.0%} of a rim speed): `omni_wheel_drive_controller` needs omni wheels "
-    "spaced evenly on a circle, `mecanum_drive_controller` four wheels at the corners of a "
-    "rectangle with rollers at 45 degrees. `slipid.yaml` contains its matrices, "
-    "`kinematics.forward` and `kinematics.inverse`."
-)
-_REVERSE = (
-    "**Reverse** the marked joints, by their axes in the robot's description or in its hardware "
-    "driver: the controller uses the opposite sign of their speeds, and otherwise the robot "
-    "would move in the wrong direction. For `omni_wheel_drive_controller`, positive speeds of "
-    "all wheels turn the robot clockwise; for `mecanum_drive_controller`, they drive it ahead."
-)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from slipid.camera.floor.grid import RobotShape
 from slipid.camera.floor.picture import MapOptions, check_all_present, map_of
-from slipid.camera.floor.region import FloorPicture
+from slipid.camera.floor.region import SCHEMA, FloorPicture, Palette
 from slipid.camera.overhead import OverheadCamera
 from slipid.cli.main import app
 from slipid.data.floor_map import read_map
@@ -51,7 +51,7 @@ def test_errors_in_a_palette_are_reported(made, tmp_path, config, match):
 
 
 def test_a_surface_that_no_cell_has_is_refused(made):
-    source = FloorPicture(IMAGE, Path("p.toml"), made.picture, made.camera)
+    source = FloorPicture(IMAGE, made.picture, made.camera, Path("p.toml"), Palette(schema=SCHEMA))
     labels = np.array([[0, 2], [-1, 2]])
     with pytest.raises(DataError, match=r"p\.toml: nothing in the picture looks most like b; exp"):
         check_all_present(source, ("a", "b", "c"), labels)

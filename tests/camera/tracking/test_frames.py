@@ -10,7 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
-from slipid.camera.frame import DEPTH, cut_off, even_times, grey_of, read_ahead, read_times, uneven
+from slipid.camera.frame import (
+    READ_AHEAD,
+    cut_off,
+    even_times,
+    grey_of,
+    read_ahead,
+    read_times,
+    uneven,
+)
 from slipid.camera.frame_source import Capture, Device, open_source
 from slipid.support.errors import DataError
 from tests.helpers.made_sources import InMemory, write_video
@@ -275,7 +283,7 @@ def test_nobody_decodes_on_when_frames_are_no_longer_wanted():
     frames = read_ahead(endless())
     next(frames)
     frames.close()
-    assert len(taken) <= DEPTH + 3
+    assert len(taken) <= READ_AHEAD + 3
 
 
 def test_grey_of_pictures_with_one_or_three_colours():

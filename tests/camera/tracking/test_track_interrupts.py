@@ -104,7 +104,7 @@ def test_a_freeze_is_noticed_across_an_interrupt(made, tmp_path, monkeypatch):
 def test_poses_that_cannot_be_written_are_kept(made, tmp_path, monkeypatch):
     source = open_source(str(made.video("robot", ROBOT)))
     target = tracking.LoneMarker(0.131, 0.25, 0).target(source)
-    monkeypatch.setattr(detections, "KEPT_S", 0.0)
+    monkeypatch.setattr(detections, "CHECKPOINT_S", 0.0)
     done = tracking.track(source, STAGE.camera, (target,), tmp_path / "kept", KeptMessages())
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(DataError, match="cannot be written"):
@@ -131,7 +131,7 @@ def test_killed_in_the_middle_it_goes_on(made, tmp_path):
     """A process of its own, killed after its first checkpoint, then started again."""
     video = made.video("long", ROBOT, count=400)
     code = (
-        "from slipid.camera.tracking import detections; detections.KEPT_S = 0.05\n"
+        "from slipid.camera.tracking import detections; detections.CHECKPOINT_S = 0.05\n"
         "from slipid.cli.main import main; main()"
     )
     words = ["track", video, "--camera", made.camera, "--out", tmp_path / "p.csv", *LONE]

@@ -1,0 +1,30 @@
+"""Rows of CSV files that users write: measured points, and times of frames."""
+
+from pathlib import Path
+
+from slipid.data.reading.table import cells_of
+from slipid.support.errors import DataError
+
+
+def csv_rows(path: Path, expected: str) -> list[tuple[int, list[str]]]:
+    """Return the cells of each row of a CSV file with its line number, without comments.
+
+    Cells are separated by commas, semicolons or tabs, whichever the first row has most of.
+
+    Args:
+        path: the file.
+        expected: description of the file's content, for messages.
+
+    Raises:
+        DataError: the file cannot be read, or is not a text in UTF-8.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; expected {expected}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: no CSV text in UTF-8; expected {expected}") from error
+    lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]
+    first = next((line for _, line in lines if line.strip()), "")
+    delimiter = max(",;\t", key=first.count)
+    return [(k, cells_of(line, delimiter)) for k, line in lines]
