@@ -204,5 +204,5 @@ def test_learned_methods_are_reproducible_and_rest_where_wheels_rest(method):
     assert np.abs(one[0].path).max() == 0.0
     assert len(method.candidates()) == 4
     assert {type(each) for each in method.candidates()} == {type(method)}
-    with pytest.raises(ValueError, match="before fit"):
+    with pytest.raises(ValueError, match="was not fitted"):
         method.predict([at_rest], ROBOTINO)
