@@ -70,6 +70,17 @@ class Declaration:
         """True if the array has one search-space coordinate less than it has numbers."""
         return self.shares or self.deviation
 
+    def broken_rule(self, x: np.ndarray) -> str | None:
+        """Return the rule that numbers break, as text, or None if they keep all rules."""
+        if self.deviation:
+            kept, rule = abs(x.sum()) < 1e-6, "numbers that sum to 0"
+        elif self.shares:
+            kept, rule = (x > 0).all() & (abs(x.sum() - 1) < 1e-6), "positive shares that sum to 1"
+        else:
+            kept = ((x > self.lower) & (x < self.upper)).all()
+            rule = f"inside ({self.lower:g}, {self.upper:g}) {self.unit}"
+        return None if kept else rule
+
     def to_search(self, value: Any) -> np.ndarray:
         """Return the search-space vector of an SI value (scalar or array)."""
         x = np.atleast_1d(np.asarray(value, float))
@@ -142,6 +153,10 @@ def parameter(
         metadata={"parameter": declaration, "per": per},
         default_factory=lambda: as_numbers(declaration.start),
     )
+
+
+known = functools.partial(parameter, free=False)
+"""Declaration of a number that stays fixed unless the user frees it."""
 
 
 def as_numbers(x: Any) -> Array:

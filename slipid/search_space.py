@@ -223,17 +223,10 @@ def _checked_std(entry: Entry, std: Any) -> np.ndarray | None:
 
 def _checked_value(entry: Entry, value: Any) -> np.ndarray:
     """Return a value as an array; `ValueError` if invalid. A scalar applies to all elements."""
-    x, d = np.asarray(value, float), entry.declaration
+    x = np.asarray(value, float)
     if x.size not in (1, entry.size):
         raise ValueError(f"{entry.path}: {x.size} values; expected {entry.size}")
     x = np.broadcast_to(x.ravel(), (entry.size,))
-    if d.deviation:
-        inside, rule = abs(x.sum(keepdims=True)) < 1e-6, "numbers that sum to 0"
-    elif d.shares:
-        inside, rule = (x > 0) & (abs(x.sum() - 1) < 1e-6), "positive shares that sum to 1"
-    else:
-        inside = (x > d.lower) & (x < d.upper)
-        rule = f"inside ({d.lower:g}, {d.upper:g}) {d.unit}"
-    if not inside.all():
+    if rule := entry.declaration.broken_rule(x):
         raise ValueError(f"{entry.path} = {value}: expected {rule}")
     return x.reshape(()) if entry.size == 1 else x

@@ -4,11 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from slipid.api.fit import Numbers, Prior, fit_task_of
 from slipid.app.check import ExpectedEstimates, expected, overview
@@ -16,7 +13,8 @@ from slipid.data.runs import Runs, collect
 from slipid.infer.verdicts.estimates import Estimate
 from slipid.lab.selftest import logs as known
 from slipid.lab.selftest.logs import simulate_logs
-from slipid.model.robot import Robot, motor_current, twist, wheel_torque
+from slipid.model.robot import Robot, steady_states
+from slipid.parameter import as_numbers
 from slipid.report.estimates import show_check
 from slipid.report.page import text_of
 from slipid.support.content import Content
@@ -156,25 +154,18 @@ def steady_motion(
 
     Source: the force balance of `slipid.model.contact`.
     """
-    places = robot.surface_index(floor), robot.load_index(load or robot.body.loads[0])
-    rows = jnp.atleast_2d(jnp.asarray(command, dtype=float))
-    return SteadyMotion(*(np.asarray(x) for x in _steady(robot, rows, *map(jnp.asarray, places))))
-
-
-@eqx.filter_jit
-def _steady(
-    robot: Robot, command: Float[Array, "command 3"], floor: Array, load: Array
-) -> tuple[Array, ...]:
-    frame = robot.geometry.frame()
-
-    def one(row: Float[Array, "3"]) -> tuple[Array, ...]:
-        driven = robot.geometry.forward() @ row / frame.radius
-        speed = robot.geometry.at_wheels(driven)
-        direction, stands = jnp.sign(speed), jnp.abs(speed) < 1e-6
-        xi = twist(robot, frame, speed, floor, load)
-        torque = wheel_torque(robot, frame, xi, speed, floor, load)
-        rim = jnp.where(stands, jnp.nan, frame.radius * frame.drive_share * speed)
-        current = motor_current(robot, frame, xi, driven, floor, load) * jnp.sign(driven)
-        return xi, speed, 1 - frame.hold @ xi / rim, torque * direction, current
-
-    return jax.vmap(one)(command)
+    frame, shape = robot.geometry.frame(), robot.geometry
+    driven = np.atleast_2d(np.asarray(command, float)) @ np.asarray(shape.forward()).T
+    driven /= float(frame.radius)
+    place = robot.surface_index(floor), robot.load_index(load or robot.body.loads[0])
+    found = steady_states(robot, driven, *place)
+    speed = np.asarray(shape.at_wheels(as_numbers(driven)))
+    rim = float(frame.radius) * np.asarray(frame.drive_share) * speed
+    return SteadyMotion(
+        twist=found.twist,
+        wheel_speed=speed,
+        slip=1
+        - found.twist @ np.asarray(frame.hold).T / np.where(np.abs(speed) < 1e-6, np.nan, rim),
+        torque=found.torque * np.sign(speed),
+        current=found.current * np.sign(driven),
+    )

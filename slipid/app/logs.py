@@ -42,9 +42,9 @@ def read_dataset(
         layout = layout_of(config, section)
         surface = None if section.map is not None else section.surface
         for path in paths:
-            found_there = read_logs(path, layout, root, surface, section.load)
-            aside += found_there.aside
-            for log in found_there.logs:
+            inside = read_logs(path, layout, root, surface, section.load)
+            aside += inside.aside
+            for log in inside.logs:
                 if log.samples < section.min_rows:
                     short += 1
                     continue

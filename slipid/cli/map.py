@@ -31,7 +31,7 @@ def map_(
     cell: Annotated[
         float | None,
         option(
-            "M", "Edge length of a map cell, in m; by default that of a pixel.", min=0.0001, max=1
+            "M", "Edge length of a map cell, in m; by default that of a pixel.", min=1e-4, max=1
         ),
     ] = None,
     dictionary: Annotated[

@@ -93,7 +93,7 @@ def windows(
         longest: largest duration of a window [s]; longer runs have more segments.
 
     Raises:
-        DataError: a run has no wheel that moves `MOVED`, or has too few poses for its windows.
+        DataError: a run has no wheel that moves `MOVED_M`, or has too few poses for its windows.
     """
     each = [_edges(data, k, wheel_radius, lag, per_segment, longest) for k in range(len(data))]
     run = [k for k, segments in enumerate(each) for _ in segments]

@@ -180,8 +180,6 @@ def _number(e: Estimate) -> RecordedNumber:
 def given_numbers(robot: Robot) -> Mapping[str, RecordedNumber]:
     """Return the numbers of a robot by path, recorded as given and not fitted."""
     return {
-        e.path: RecordedNumber.without_std(
-            plain(np.asarray(e.get(robot))), e.declaration.unit, "fixed", "override"
-        )
+        e.path: RecordedNumber(plain(np.asarray(e.get(robot))), e.declaration.unit)
         for e in entries(robot)
     }

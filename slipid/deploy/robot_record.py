@@ -16,7 +16,6 @@ since the estimated effect changes with the numbers and compensates them.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
-from functools import reduce
 from types import MappingProxyType
 
 import equinox as eqx
@@ -26,16 +25,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from slipid.fitting.noise import SHARED
+from slipid.fitting.session_effects import on_floor
 from slipid.fitting.shared_effects import AXES, SpeedAndLoad, TravelConditions
 from slipid.model import contact
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import WheelFrame, at_drives, at_wheels
-from slipid.model.motor import Motor
-from slipid.model.robot import GRAVITY, Robot, Validity
-from slipid.parameter import entries
+from slipid.model.geometry import Geometry, WheelFrame
+from slipid.model.robot import Robot, Validity, steady_states
+from slipid.parameter import Numbers, entries
 from slipid.predict.predictive import ForceBalance
 from slipid.robot import record
 from slipid.robot.record import EffectRecord, axes_of, plain
+from slipid.support.blocks import in_blocks
 
 
 def robot_record(
@@ -81,7 +81,7 @@ def robot_record(
 def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numbers, ...]]]:
     """Yield path and draws of every number that varies over draws, except those of the camera."""
     for e in entries(robot):
-        leaf = np.asarray(reduce(getattr, e.leaf, draws))
+        leaf = np.asarray(e.whole(draws))
         rows = leaf if e.index is None else leaf[:, e.index]
         if not e.path.startswith("camera.") and (rows != rows[0]).any():
             yield e.path, tuple(plain(np.asarray(row)) for row in rows)
@@ -89,18 +89,12 @@ def _varied(robot: Robot, draws: Robot) -> Iterator[tuple[str, tuple[record.Numb
 
 def _floor(name: str, std: Mapping[str, float], seen: Validity | None) -> record.FloorRecord:
     """Return the record of a floor's errors, from the stds of variance components by name."""
-
-    def of(kind: str, default: record.Axes) -> np.ndarray:
-        return np.array(
-            [std.get(f"{kind}.{name}.{a}", d) for a, d in zip(AXES, default, strict=True)]
-        )
-
-    shared = [of(kind, (0.0, 0.0, 0.0)) ** 2 for kind in SHARED]
-    effect = np.sqrt(of("run", (0.01, 0.01, 0.03)) ** 2 + sum(shared))
+    shared = sum(on_floor(std, kind, name) ** 2 for kind in SHARED)
+    effect = np.sqrt(on_floor(std, "run", name, (0.01, 0.01, 0.03)) ** 2 + shared)
     kinds = [std.get(f"current.{name}.{kind}", 0.05) for kind in ("window", "run")]
     return record.FloorRecord(
         name=name,
-        process=axes_of(of("process", (0.005, 0.002, 0.01))),
+        process=axes_of(on_floor(std, "process", name, (0.005, 0.002, 0.01))),
         effect=axes_of(effect),
         current_std=float((kinds[0] ** 2 + kinds[1] ** 2) ** 0.5),
         seen=seen,
@@ -111,106 +105,70 @@ def _load(
     robot: Robot, name: str, top: float, draws: Robot, effects: EffectRecord | None
 ) -> record.LoadRecord:
     """Return the record of a load set-up."""
-    shape, k = robot.geometry, jnp.asarray(robot.load_index(name))
+    shape, k = robot.geometry, robot.load_index(name)
     frame, twists = shape.frame(), directions(36)
     if not shape.determines_twist:
-        twists = jnp.concatenate([twists, _turns(frame)])
-    wheels, rest = _WheelArrays.of(robot), robot.body.load_share[k]
-    floors, motor, mass = robot.surfaces, robot.motor, robot.body.mass
-    speed, amps, slip = _circle(wheels, floors, rest, motor, mass, jnp.asarray(top), twists)
-    curve = np.asarray(_wheel_curve(speed, amps, slip))
+        twists = np.concatenate([twists, _turns(frame)])
+    speed, amps, slip = _circle(robot, k, top, twists)
+    curve = _wheel_curve(speed, amps, slip)
     return record.LoadRecord(
         name=name,
         spread=tuple(axes_of(row) for row in _spread(robot, frame, draws, k)),
         told=effects,
-        highest_current=float(jnp.max(jnp.abs(amps))),
+        highest_current=float(np.abs(amps).max()),
         wheel_curve=tuple((float(a), float(b)) for a, b in curve),
     )
 
 
-def directions(count: int) -> Float[Array, "twist 3"]:
+def directions(count: int) -> Float[np.ndarray, "twist 3"]:
     """Return twists [m/s, m/s, rad/s] of 1 m/s in evenly spaced directions, without turning."""
     angle = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
-    return jax.device_put(np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=-1))
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=-1)
 
 
-def _turns(frame: WheelFrame) -> Float[Array, "twist 3"]:
+def _turns(frame: WheelFrame) -> Float[np.ndarray, "twist 3"]:
     """Return twists [m/s, m/s, rad/s] on the spot, left and right, at about 1 m/s rim speed."""
-    return jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / frame.base
+    return np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]) / np.asarray(frame.base)
 
 
-class _WheelArrays(eqx.Module):
-    """Geometry of the wheels as arrays, so that robots of equal structure share compiled code."""
-
-    frame: WheelFrame
-    forward: Float[Array, "*draw drive 3"]
-    drive_of: tuple[int, ...] = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, robot: Robot) -> "_WheelArrays":
-        shape = robot.geometry
-        return cls(shape.frame(), shape.forward(), shape.drive_of)
-
-    def rim(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """Return the rim speeds of the wheels from those of their drives [m/s]."""
-        return at_wheels(self.drive_of, of_drives)
-
-
-@eqx.filter_jit
 def _circle(
-    wheels: _WheelArrays,
-    surfaces: ContactSurface,
-    rest: Float[Array, " wheel"],
-    motor: Motor,
-    mass: Array,
-    top: Array,
-    twists: Float[Array, "twist 3"],
-) -> tuple[Array, Array, Array]:
+    robot: Robot, load: int, top: float, twists: Float[np.ndarray, "twist 3"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return wheel speeds [rad/s], currents [A] and slip ratios [1] for some twists.
 
     Twists are scaled to 0.4 and 0.8 of the highest wheel speed `top` [rad/s]. Each result has the
-    shape (floor, speed and twist, drive).
+    shape (floor and twist, drive).
     """
-    frame = wheels.frame
-    speed = twists @ wheels.forward.T / frame.radius
-    speed = jnp.stack([0.4 * top, 0.8 * top])[:, None, None] * speed / jnp.max(jnp.abs(speed))
-
-    def one(w: Array, floor: ContactSurface) -> tuple[Array, Array]:
-        turned = frame.radius * w
-        rim = wheels.rim(turned)
-        xi = contact.equilibrium(rim, frame, floor, rest)
-        force = floor.friction * mass * GRAVITY * frame.radius
-        where = xi, rim, frame, floor, rest
-        forces = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
-        torque = at_drives(wheels.drive_of, force * motor.opposing_force(forces))
-        amps = motor.current(torque, w)
-        lost = turned - wheels.forward @ xi
-        return amps, lost / jnp.where(jnp.abs(turned) < 1e-9, 1e-9, turned)
-
-    flat = speed.reshape(-1, speed.shape[-1])
-    amps, slip = jax.vmap(lambda s: jax.vmap(lambda w: one(w, s))(flat))(surfaces)
-    return jnp.broadcast_to(flat, amps.shape), amps, slip
+    frame = robot.geometry.frame()
+    forward, radius = np.asarray(frame.forward()), float(frame.radius)
+    speed = twists @ forward.T
+    speed *= top / np.abs(speed).max()
+    floors = len(robot.surfaces.labels)
+    speed = np.tile(np.concatenate([0.4 * speed, 0.8 * speed]), (floors, 1))
+    found = steady_states(robot, speed, np.repeat(np.arange(floors), len(speed) // floors), load)
+    turned = radius * speed
+    lost = turned - found.twist @ forward.T
+    return speed, found.current, lost / np.where(np.abs(turned) < 1e-9, 1e-9, turned)
 
 
-@eqx.filter_jit
-def _wheel_curve(speed: Array, amps: Array, slip: Array) -> Array:
+def _wheel_curve(
+    speed: Float[np.ndarray, "row drive"],
+    amps: Float[np.ndarray, "row drive"],
+    slip: Float[np.ndarray, "row drive"],
+) -> Float[np.ndarray, "drive 2"]:
     """Return a and b of the slip ratio a + b |I| of each drive, fitted over all floors [1, 1/A].
 
     It is the form that the 2021 paper's robot used, refitted here to the contact model. The slip
     speed, wheel speed times slip ratio, is fitted by least squares, so that wheels that hardly turn
     have little weight.
     """
-    flat = [x.reshape(-1, x.shape[-1]) for x in (speed, jnp.abs(amps), slip)]
-
-    def wheel(w: Array, i: Array, s: Array) -> Array:
-        a = jnp.stack([w, w * i], axis=-1)
-        return jnp.linalg.solve(a.T @ a, a.T @ (w * s))
-
-    return jax.vmap(wheel, 1)(*flat)
+    a = np.stack([speed, speed * np.abs(amps)], axis=-1)
+    normal = np.einsum("nda,ndb->dab", a, a)
+    return np.linalg.solve(normal, np.einsum("nda,nd->da", a, speed * slip)[..., None])[..., 0]
 
 
 def _spread(
-    robot: Robot, frame: WheelFrame, draws: Robot, load: Array
+    robot: Robot, frame: WheelFrame, draws: Robot, load: int
 ) -> Float[np.ndarray, "floor 3"]:
     """Return the posterior std of the motion per metre on each floor, along, across and in yaw.
 
@@ -218,9 +176,9 @@ def _spread(
     robots that cannot drive sideways it is the largest over driving ahead, back and turning on the
     spot.
     """
-    free, speed = robot.geometry.determines_twist, jnp.asarray(0.2)
-    twists = directions(12) if free else jnp.concatenate([directions(2), _turns(frame)])
-    std = spread_of(np.asarray(moved_per_metre(draws, load, speed, twists)))
+    free = robot.geometry.determines_twist
+    twists = directions(12) if free else np.concatenate([directions(2), _turns(frame)])
+    std = spread_of(moved_per_metre(draws, load, 0.2, twists))
     return np.sqrt(np.mean(std**2, axis=1)) if free else std.max(axis=1)
 
 
@@ -234,8 +192,8 @@ def spread_of(draws: Float[np.ndarray, "draw *rest"]) -> Float[np.ndarray, "*res
 
 
 def moved_per_metre(
-    draws: Robot, load: Array, speed: Array, twist: Float[Array, "twist 3"]
-) -> Float[Array, "draw floor twist 3"]:
+    draws: Robot, load: int | Array, speed: float | Array, twist: Numbers
+) -> Float[np.ndarray, "draw floor twist 3"]:
     """Return the motion along, across and in yaw, per metre that wheels would roll without slip.
 
     Args:
@@ -244,30 +202,28 @@ def moved_per_metre(
         speed: speed of the body without slip [m/s].
         twist: twists of 1 m/s [m/s, m/s, rad/s].
     """
-    rest = draws.body.load_share[:, load]
-    return _moved(jax.vmap(_WheelArrays.of)(draws), draws.surfaces, rest, speed, twist)
+    count, floors = len(draws.body.mass), len(draws.surfaces.labels)
+    at, floor, way = (x.ravel() for x in np.indices((count, floors, len(twist))))
+    frames = jax.tree.map(lambda x: np.asarray(x)[at], jax.vmap(Geometry.frame)(draws.geometry))
+    surfaces = jax.tree.map(lambda x: np.asarray(x)[at, floor], draws.surfaces)
+    rest, ahead = np.asarray(draws.body.load_share)[at, int(load)], np.asarray(twist)[way]
+    xi = in_blocks(_equilibria, frames, surfaces, rest, float(speed) * ahead) / float(speed)
+    along = (xi[:, :2] * ahead[:, :2]).sum(axis=1)
+    across = xi[:, 1] * ahead[:, 0] - xi[:, 0] * ahead[:, 1]
+    return np.stack([along, across, xi[:, 2]], axis=-1).reshape(count, floors, -1, 3)
 
 
 @eqx.filter_jit
-def _moved(
-    wheels: _WheelArrays,
-    surfaces: ContactSurface,
-    rest: Float[Array, "draw wheel"],
-    speed: Array,
-    twist: Float[Array, "twist 3"],
-) -> Array:
-    """Return the result of `moved_per_metre`; this part is compiled."""
+def _equilibria(
+    frames: WheelFrame, surface: ContactSurface, rest: Array, twist: Array
+) -> Float[Array, "row 3"]:
+    """Return the twists of robots whose wheels roll as for given twists without slip."""
 
-    def one(wheels: _WheelArrays, surfaces: ContactSurface, rest: Array) -> Array:
-        rim, frame = wheels.rim(speed * twist @ wheels.forward.T), wheels.frame
-        xi = jax.vmap(lambda s: jax.vmap(lambda r: contact.equilibrium(r, frame, s, rest))(rim))(
-            surfaces
-        )
-        along = jnp.einsum("fkc,kc->fk", xi[..., :2], twist[:, :2])
-        across = xi[..., 1] * twist[:, 0] - xi[..., 0] * twist[:, 1]
-        return jnp.stack([along, across, xi[..., 2]], axis=-1) / speed
+    def one(frame: WheelFrame, surface: ContactSurface, rest: Array, twist: Array) -> Array:
+        rim = frame.at_wheels(frame.forward() @ twist)
+        return contact.equilibrium(rim, frame, surface, rest)
 
-    return jax.vmap(one)(wheels, surfaces, rest)
+    return jax.vmap(one)(frames, surface, rest, twist)
 
 
 DIRECTIONS = 72
@@ -303,27 +259,24 @@ def _effect_table(
     speeds = tuple(SpeedAndLoad(float(s), load) for s in log_speed for _ in angle)
     rows = TravelConditions(np.tile(angle, count), speeds, contact.robot.geometry.mirror())
     robots = jax.vmap(contact.space.tree)(jnp.asarray(draws))
-    k = jnp.asarray(contact.robot.load_index(load))
-    moved = [moved_per_metre(robots, k, jnp.exp(s), directions(DIRECTIONS)) for s in log_speed]
-    predicted = np.concatenate([np.asarray(x) for x in moved], axis=2)  # directions for each speed
+    k = contact.robot.load_index(load)
+    moved = [moved_per_metre(robots, k, np.exp(s), directions(DIRECTIONS)) for s in log_speed]
+    predicted = np.concatenate(moved, axis=2)  # directions for each speed
     shape = (len(labels), count, DIRECTIONS, len(AXES))
     mean, left = np.zeros(shape), np.zeros(shape)
     for n, floor in enumerate(labels):
         effect = contact.shared[floor].forecast(rows)
         growth = contact.extrapolation.get(f"{floor}@{load}", 1.0)
         given = np.diagonal(effect.covariance, axis1=1, axis2=2)
-        given = given + _variances(contact, "session", floor)
+        given = given + on_floor(contact.variance, "session", floor)
         corrected = predicted[:, n] - np.einsum("nap,kp->kna", effect.slope, draws - center)
         at = effect.mean + effect.slope @ (center - contact.z)
         mean[n] = -at.reshape(shape[1:])
-        variance = _variances(contact, "run", floor) + growth * (given + spread_of(corrected) ** 2)
+        variance = on_floor(contact.variance, "run", floor) + growth * (
+            given + spread_of(corrected) ** 2
+        )
         left[n] = np.sqrt(variance).reshape(shape[1:])
     return EffectRecord(tuple(_rounded(np.exp(s)) for s in log_speed), _rows(mean), _rows(left))
-
-
-def _variances(contact: ForceBalance, kind: str, floor: str) -> Float[np.ndarray, "3"]:
-    """Return the variances of one kind of effect on a floor, by axis."""
-    return np.array([contact.variance.get(f"{kind}.{floor}.{axis}", 0.0) for axis in AXES])
 
 
 def _rows(grid: _Grid) -> tuple[tuple[tuple[record.Axes, ...], ...], ...]:

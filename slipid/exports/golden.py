@@ -15,7 +15,7 @@ from slipid.robot.closed_loop import PERIOD, ControlLoop
 from slipid.robot.controller import ControllerState
 from slipid.robot.interface import Measurement, Readings, StateEstimate
 
-STEPS = 48
+GOLDEN_STEPS = 48
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def _inputs(loop: ControlLoop[eqx.Module]) -> Iterator[tuple[Readings, jax.Array
     """
     robot = loop.controller.robot
     angle = np.zeros(robot.wheels)
-    for step in range(STEPS):
+    for step in range(GOLDEN_STEPS):
         t = step * PERIOD
         twist = np.array([0.15 * np.cos(2 * t), 0.12 * np.sin(3 * t), 0.4 * np.sin(t)])
         speed = np.asarray(robot.forward) @ twist / float(robot.frame.radius)

@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 
-WIDTH = 96
+COMMENT_WIDTH = 96
 """Largest length of a comment line, without the comment sign [characters]."""
 
 
@@ -29,7 +29,7 @@ def interval(ends: tuple[float, float] | None) -> str:
     return "" if ends is None else f"{short(ends[0])} to {short(ends[1])}"
 
 
-def wrapped(text: str, width: int = WIDTH) -> Iterator[str]:
+def wrapped(text: str, width: int = COMMENT_WIDTH) -> Iterator[str]:
     """Yield a paragraph as lines of a comment; words such as paths and addresses stay whole."""
     lines = textwrap.wrap(one_line(text), width, break_long_words=False, break_on_hyphens=False)
     yield from lines or [""]

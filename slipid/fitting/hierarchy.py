@@ -44,7 +44,7 @@ _GRID = np.geomspace(0.1, 4.0, 60)
 """Candidate stds of the load biases, divided by the typical std."""
 
 
-class _AxisEffects(NamedTuple):
+class AxisEffects(NamedTuple):
     """The effects of the runs on a floor along one axis.
 
     Attributes:
@@ -55,6 +55,7 @@ class _AxisEffects(NamedTuple):
         noise: part of the diagonal of `fixed` that comes from camera and process noise.
         numbers: indices of the estimated variances among all variances.
         bases: derivative of the covariance of `left` by each estimated variance.
+        typical: centre of the prior of each estimated log variance.
     """
 
     number: int
@@ -64,42 +65,26 @@ class _AxisEffects(NamedTuple):
     noise: Float[np.ndarray, " run"]
     numbers: list[int]
     bases: list[np.ndarray]
+    typical: Float[np.ndarray, " variance"]
 
 
-def effect_variances(
-    objective: Objective,
-    motion: tuple[Array, Array],
-    weight: Array,
-    covariance: Square,
-    log_v: Variances,
-) -> Variances:
-    """Return all log variances after scoring steps for those of run, shared and session effects.
-
-    Args:
-        motion: motion residuals of all segments and their derivative by the search vector.
-        weight: Student-t weight of every segment, 0 for a segment that is left out of the fit.
-        covariance: covariance of the search vector.
-    """
+def effect_variances(axes: Iterable[AxisEffects], log_v: Variances) -> Variances:
+    """Return all log variances after scoring steps for those of run, shared and session effects."""
     out = np.array(log_v)
-    for axis in _axes(objective, motion, weight, covariance, log_v):
-        typical = np.asarray(objective.typical)[axis.numbers]
-        out[axis.numbers] = _scoring_steps(axis, out[axis.numbers], typical)
+    for axis in axes:
+        out[axis.numbers] = _scoring_steps(axis, out[axis.numbers])
     return out
 
 
 def effect_information(
-    objective: Objective,
-    motion: tuple[Array, Array],
-    weight: Array,
-    covariance: Square,
-    log_v: Variances,
+    axes: Iterable[AxisEffects], log_v: Variances
 ) -> Float[np.ndarray, "variance variance"]:
     """Return the expected information of the log variances that `effect_variances` estimates.
 
-    Rows and columns of all other variances are zero. Arguments are those of `effect_variances`.
+    Rows and columns of all other variances are zero.
     """
     out = np.zeros((len(log_v), len(log_v)))
-    for axis in _axes(objective, motion, weight, covariance, log_v):
+    for axis in axes:
         v = np.exp(log_v)[axis.numbers]
         inverse = np.linalg.inv(_covariance(axis, v))
         grown = [k * (inverse @ b) for k, b in zip(v, axis.bases, strict=True)]
@@ -107,27 +92,12 @@ def effect_information(
     return out
 
 
-class TravelDirections(NamedTuple):
-    """Direction of travel, distance and load set-up of every segment.
-
-    Attributes:
-        direction: direction of travel relative to the body [rad], nan for turns on the spot.
-        distance: distance driven [m].
-        setup: name of the floor and the load set-up of the segment.
-    """
-
-    direction: Float[np.ndarray, " segment"]
-    distance: Float[np.ndarray, " segment"]
-    setup: Sequence[str]
-
-
 def extrapolation(
-    objective: Objective,
-    motion: tuple[Array, Array],
-    keep: Float[np.ndarray, " segment"],
-    covariance: Square,
+    axes: Iterable[AxisEffects],
     log_v: Variances,
-    travel: TravelDirections,
+    direction: Float[np.ndarray, " segment"],
+    distance: Float[np.ndarray, " segment"],
+    setup: Sequence[str],
 ) -> dict[str, float]:
     """Return the factors that correct too small variances in unfitted directions, by set-up.
 
@@ -140,15 +110,19 @@ def extrapolation(
     variances to distances between neighbouring runs, so that they are too small if the model is
     wrong on a larger scale; and it down-weights outliers, which occur in forecast runs as well.
 
+    Args:
+        axes: results of `axis_effects`.
+        log_v: all log variances.
+        direction: direction of travel relative to the body [rad], nan for turns on the spot.
+        distance: distance driven in every segment [m].
+        setup: name that stands for the floor and the load set-up of every segment.
+
     Sources: Sundararajan and Keerthi 2001, Neural Computation 13(5), eq. for leaving out; Bachoc
     2013, Computational Statistics and Data Analysis 66, on wrong models.
     """
-    axes = _axes(objective, motion, jnp.asarray(keep), covariance, log_v)
-    held_out = _held_out_effects(axes, log_v, travel.direction)
-    names = np.asarray(travel.setup)
+    held_out, names = _held_out_effects(axes, log_v, direction), np.asarray(setup)
     return {
-        name: _variance_growth(held_out, travel.distance, names == name)
-        for name in dict.fromkeys(names)
+        name: _variance_growth(held_out, distance, names == name) for name in dict.fromkeys(names)
     }
 
 
@@ -168,7 +142,7 @@ class _HeldOutEffects(NamedTuple):
 
 
 def _held_out_effects(
-    axes: Iterable[_AxisEffects], log_v: Variances, direction: Float[np.ndarray, " segment"]
+    axes: Iterable[AxisEffects], log_v: Variances, direction: Float[np.ndarray, " segment"]
 ) -> _HeldOutEffects:
     """Return every effect less its prediction from the other sectors, and the error's variance."""
     found = _HeldOutEffects(*(np.full((len(direction), len(AXES)), np.nan) for _ in range(3)))
@@ -234,14 +208,21 @@ def _sectors(direction: Float[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]
     return [moves[sector == k] for k in np.unique(sector)]
 
 
-def _axes(
+def axis_effects(
     objective: Objective,
     motion: tuple[Array, Array],
     weight: Array,
     covariance: Square,
     log_v: Variances,
-) -> Iterator[_AxisEffects]:
-    """Yield the remaining effects of every floor and axis."""
+) -> Iterator[AxisEffects]:
+    """Yield the remaining effects of every floor and axis.
+
+    Args:
+        motion: motion residuals of all segments and their derivative by the search vector.
+        weight: Student-t weight of every segment, 0 for a segment that is left out of the fit.
+        covariance: covariance of the search vector.
+        log_v: all log variances.
+    """
     space = objective.space
     of_floor = space.where(lambda e: e.surface is not None)
     wide = np.where(of_floor[:, None] | of_floor, 0.0, covariance)
@@ -261,7 +242,8 @@ def _axes(
             fixed = np.diag(alone) + by[:, k] @ wide @ by[:, k].T
             variances = _variance_bases(floor, k, kept, counted[mine])
             numbers, bases = [n for n, _ in variances], [c for _, c in variances]
-            yield _AxisEffects(k, mine, left[:, k], fixed, alone, numbers, bases)
+            typical = np.asarray(objective.typical)[numbers]
+            yield AxisEffects(k, mine, left[:, k], fixed, alone, numbers, bases, typical)
 
 
 def _variance_bases(
@@ -278,7 +260,7 @@ def _variance_bases(
     return [(number, matrix) for number, matrix in found if number >= 0]
 
 
-def _covariance(axis: _AxisEffects, v: np.ndarray) -> Float[np.ndarray, "run run"]:
+def _covariance(axis: AxisEffects, v: np.ndarray) -> Float[np.ndarray, "run run"]:
     """Return the covariance of the effects on an axis at given values of the variances."""
     return np.asarray(axis.fixed + sum(k * b for k, b in zip(v, axis.bases, strict=True)))
 
@@ -291,7 +273,7 @@ def _information(grown: list[np.ndarray]) -> np.ndarray:
     return np.array([[0.5 * np.sum(a * b.T) for b in grown] for a in grown])
 
 
-def _scoring_steps(axis: _AxisEffects, log_v: np.ndarray, typical: np.ndarray) -> np.ndarray:
+def _scoring_steps(axis: AxisEffects, log_v: np.ndarray) -> np.ndarray:
     """Return the log variances after Fisher scoring steps of the restricted likelihood.
 
     A step that decreases the likelihood is halved.
@@ -300,7 +282,7 @@ def _scoring_steps(axis: _AxisEffects, log_v: np.ndarray, typical: np.ndarray) -
     def loss(at: np.ndarray) -> float:
         root = np.linalg.cholesky(_covariance(axis, np.exp(at)))
         white = np.linalg.solve(root, axis.left)
-        deviation = (at - typical) / VARIANCE_SPREAD
+        deviation = (at - axis.typical) / VARIANCE_SPREAD
         return float(
             np.log(np.diag(root)).sum() + 0.5 * white @ white + 0.5 * deviation @ deviation
         )
@@ -313,7 +295,7 @@ def _scoring_steps(axis: _AxisEffects, log_v: np.ndarray, typical: np.ndarray) -
         grown = [k * (inverse @ b) for k, b in zip(v, axis.bases, strict=True)]
         quadratic = [k * white @ b @ white for k, b in zip(v, axis.bases, strict=True)]
         score = 0.5 * (np.array(quadratic) - [np.trace(g) for g in grown])
-        score -= (log_v - typical) / VARIANCE_SPREAD**2
+        score -= (log_v - axis.typical) / VARIANCE_SPREAD**2
         info = _information(grown) + np.eye(len(v)) / VARIANCE_SPREAD**2
         step = np.clip(np.linalg.solve(info, score), -1.5, 1.5)
         while (after := loss(log_v + step)) > before and np.abs(step).max() > _SETTLED:

@@ -13,15 +13,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from slipid.data.windows import Windows
-from slipid.model import robot as model
 from slipid.model import se2
-from slipid.model.robot import Robot
+from slipid.model.robot import GRAVITY, Robot
 
 Marker = Float[Array, "segment window 3"]
 """Increments of the marker [m, m, rad], or body twists [m/s, m/s, rad/s], of every window."""
 PerDrive = Float[Array, "segment window drive"]
 MotorForce = Float[Array, "segment window drive 2"]
-"""Forces of `model.robot.motor_forces` [mu m g], summed over the wheels of every drive."""
+"""Forces of `model.robot.Standing.motor_forces` [mu m g], summed over the wheels of every drive."""
 PerChannel = Float[Array, "segment m"]
 """One value per window and drive, in one row per segment: window by window, then drive by drive."""
 Std = Float[Array, ""] | float
@@ -125,25 +124,36 @@ def wheel_speed(robot: Robot, b: Batch) -> PerDrive:
 def predict(robot: Robot, b: Batch, near: Marker | None = None) -> Predicted:
     """Return the motion and motor forces of every window at its contact equilibrium.
 
-    `near` holds twists close to the equilibria, as in `model.robot.twist`.
+    `near` holds twists close to the equilibria, as in `model.contact.equilibrium`.
     """
-    shape, frame = robot.geometry, robot.geometry.frame()
+    frame = robot.geometry.frame()
 
-    def window(w: Array, near: Array | None, surface: Array, load: Array) -> tuple[Array, Array]:
-        w = shape.at_wheels(w)
-        xi = model.twist(robot, frame, w, surface, load, near)
-        return xi, shape.at_drives(model.motor_forces(robot, frame, xi, w, surface, load).T).T
+    def window(w: Array, near: Array | None, surface: Array, load: Array) -> Array:
+        return robot.standing(frame, surface, load).twist(frame.at_wheels(w), near)
 
-    twist, motor_force = each_window(window, b, wheel_speed(robot, b), near)
-    return Predicted(marker_increments(robot, twist, b.dt, b.session), twist, motor_force)
+    twist = each_window(window, b, wheel_speed(robot, b), near)
+    increment = marker_increments(robot, twist, b.dt, b.session)
+    return Predicted(increment, twist, motor_forces(robot, b, twist))
+
+
+@eqx.filter_jit
+def motor_forces(robot: Robot, b: Batch, twist: Marker) -> MotorForce:
+    """Return the forces each motor works against in every window at given body twists [mu m g]."""
+    frame = robot.geometry.frame()
+
+    def window(w: Array, xi: Array, surface: Array, load: Array) -> Array:
+        force = robot.standing(frame, surface, load).motor_forces(xi, frame.at_wheels(w))
+        return frame.at_drives(force.T).T
+
+    return each_window(window, b, wheel_speed(robot, b), twist)
 
 
 def each_window(of: Callable[..., Any], b: Batch, w: PerDrive, near: Marker | None = None) -> Any:
     """Return the results of function `of` for every window, with axes (segment, window, ...).
 
-    `of` takes the wheel speeds of a window [rad/s], a nearby twist or None, and the indices of its
-    surface and load. It is mapped over one flat axis of all windows: with two nested axes, JAX
-    would need 50 % more time for tracing.
+    `of` takes the wheel speeds of a window [rad/s], its element of `near` or None, and the indices
+    of its surface and load. It is mapped over one flat axis of all windows: with two nested axes,
+    JAX would need 50 % more time for tracing.
     """
     segments, windows = b.dt.shape
 
@@ -180,7 +190,7 @@ def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDri
         b.surface
     ]  # Forces are divided by mu m g averaged over the wheels.
     friction = friction[:, None] if b.surface.ndim == 1 else friction.mean(axis=-1)
-    weight = friction * robot.body.mass * model.GRAVITY
+    weight = friction * robot.body.mass * GRAVITY
     torque = (
         robot.geometry.wheel_radius * weight[..., None] * robot.motor.opposing_force(motor_force)
     )
@@ -191,16 +201,18 @@ def predicted_current(robot: Robot, b: Batch, motor_force: MotorForce) -> PerDri
 
 
 @eqx.filter_jit
+def corrected(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Float[Array, "segment edge 3"]:
+    """Return logged poses in corrected metres."""
+    return jax.vmap(jax.vmap(robot.camera.corrected))(pose)
+
+
+@eqx.filter_jit
 def measured_increments(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Marker:
     """Return measured marker increments in the frame of each window's start [m, m, rad]."""
-
-    def segment(edges: Float[Array, "edge 3"]) -> Float[Array, "window 3"]:
-        p = jax.vmap(robot.camera.corrected)(edges)
-        c, s = jnp.cos(p[:-1, 2]), jnp.sin(p[:-1, 2])
-        d = p[1:] - p[:-1]
-        return jnp.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], d[:, 2]], axis=-1)
-
-    return jax.vmap(segment)(pose)
+    p = corrected(robot, pose)
+    c, s = jnp.cos(p[:, :-1, 2]), jnp.sin(p[:, :-1, 2])
+    x, y, yaw = jnp.moveaxis(p[:, 1:] - p[:, :-1], -1, 0)
+    return jnp.stack([c * x + s * y, c * y - s * x, yaw], axis=-1)
 
 
 @eqx.filter_jit

@@ -143,7 +143,7 @@ def _joined(each: Sequence[Windows], run: Int[np.ndarray, " segment"]) -> Window
 
 def wheel_places(robot: Robot, w: Windows) -> Float[np.ndarray, "segment time wheel 2"]:
     """Return wheel centres at start, middle and end of the single window of every segment [m]."""
-    edges = np.asarray(jax.jit(jax.vmap(jax.vmap(robot.camera.corrected)))(w.pose))
+    edges = np.asarray(lk.corrected(robot, jnp.asarray(w.pose)))
     pose = np.stack([edges[:, 0], edges.mean(axis=1), edges[:, 1]], axis=1)
     yaw = np.array([float(robot.camera.yaw(robot.session_index(s))) for s in w.session])
     heading = pose[..., 2] - yaw[:, None]

@@ -141,7 +141,7 @@ def noise(windows: Windows, robot: Robot, multi_floor: MultiFloorRuns | None = N
         for floor in several_sessions if kind == "session" else floors:
             table += [Component(kind, what, floor, u, part * v) for what, u, v in _EFFECT]
     table.append(Component("pooled", "load_bias", None, "1", 0.05))
-    on = _floors(windows, robot)
+    on = np.array([[robot.surface_index(s)] for s in windows.surface])
     blocks = {"motion": _motion_components(windows, robot, 2 + 6 * on)}
     if multi_floor is not None:
         table += _multi_floor_components(multi_floor, robot, len(windows), len(table), blocks)
@@ -273,27 +273,21 @@ def _motion_components(
     distance, u = travel(windows, robot)
     n, k = distance.shape
     scale = float(robot.camera.scale)
-    place, heading = np.zeros((n, 3 * k, 2 * (k + 1))), np.zeros((n, 3 * k, k + 1))
-    for j in range(k):
-        th = windows.pose[:, j, 2]
-        c, s = scale * np.cos(th), scale * np.sin(th)
-        back = np.stack([c, s, -s, c], -1).reshape(n, 2, 2)
-        place[:, 3 * j : 3 * j + 2, 2 * j : 2 * j + 2] = -back
-        place[:, 3 * j : 3 * j + 2, 2 * j + 2 : 2 * j + 4] = back
-        move = np.einsum("nij,nj->ni", back, windows.pose[:, j + 1, :2] - windows.pose[:, j, :2])
-        heading[:, 3 * j, j], heading[:, 3 * j + 1, j] = move[:, 1], -move[:, 0]
-        heading[:, 3 * j + 2, j], heading[:, 3 * j + 2, j + 1] = -1.0, 1.0
+    place, heading = np.zeros((n, k, 3, k + 1, 2)), np.zeros((n, k, 3, k + 1))
+    begin, step = np.eye(k, k + 1), np.eye(k, k + 1, 1) - np.eye(k, k + 1)  # (window, edge)
+    c, s = scale * np.cos(windows.pose[:, :-1, 2]), scale * np.sin(windows.pose[:, :-1, 2])
+    back = np.stack([c, s, -s, c], -1).reshape(n, k, 2, 2)
+    place[:, :, :2] = np.einsum("nkij,ke->nkiej", back, step)
+    move = np.einsum("nkij,nkj->nki", back, np.diff(windows.pose[..., :2], axis=1))
+    heading[:, :, 0], heading[:, :, 1] = move[..., 1:] * begin, -move[..., :1] * begin
+    heading[:, :, 2] = step
+    place, heading = place.reshape(n, 3 * k, -1), heading.reshape(n, 3 * k, -1)
     grown = axes(u) * np.sqrt(distance)[None, :, None, :]
     effect = effects(windows, robot).transpose(2, 0, 1)[..., None]
     parts = [place, heading, *grown, *effect]
     base = np.stack([p @ p.transpose(0, 2, 1) for p in parts], axis=1)
     of_floor = first + np.arange(6)
     return _components("motion", base, np.insert(of_floor, 0, [[0], [1]], axis=1))
-
-
-def _floors(windows: Windows, robot: Robot) -> Int[np.ndarray, "segment 1"]:
-    """Return the index of each segment's floor."""
-    return np.array([[robot.surface_index(s)] for s in windows.surface])
 
 
 def axes(u: np.ndarray) -> np.ndarray:

@@ -2,25 +2,25 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from slipid.fitting import likelihood as lk
-from slipid.fitting.hierarchy import effect_variances, pooled
-from slipid.fitting.multi_floor import MULTI_FLOOR_MOTION
+from slipid.fitting.hierarchy import axis_effects, effect_variances, pooled
 from slipid.fitting.noise import SHARED
 from slipid.fitting.problem import (
     CREEPS,
     FitState,
+    GivenMotion,
     Problem,
     effects_given,
     linear,
+    linear_given,
     log_jacobian,
     without_effects,
 )
@@ -30,6 +30,7 @@ from slipid.fitting.variances import (
     Objective,
     Search,
     Square,
+    Vector,
     fitted_covariance,
     scoring_step,
 )
@@ -132,7 +133,7 @@ def one_round(
         motor_force=motor_force,
         slope=log_jacobian(objective, state.z, electric, keep)[1],
     )
-    z = np.asarray(levenberg(fixed, LimitedLevenberg(steps)))
+    z = levenberg(fixed, steps)
     electric = problem.electric(z, log_v)
     whole, jacobian, motor_force = linear(objective, jnp.asarray(z), electric)
     effect = effects_given(weighed.effects, root["motion"], whole["motion"])
@@ -161,7 +162,8 @@ def one_round(
     covariance = np.linalg.inv(information)
     if scoring:
         weight, motion = weighed.whitening.weight["motion"], (whole["motion"], jacobian["motion"])
-        found = effect_variances(objective, motion, weight, covariance, np.asarray(log_v))
+        axes = axis_effects(objective, motion, weight, covariance, np.asarray(log_v))
+        found = effect_variances(axes, np.asarray(log_v))
         found[objective.pooled] = pooled(information, z, objective, np.asarray(log_v))
         log_v = jnp.asarray(found)
     std = np.sqrt(np.diag(covariance))
@@ -264,65 +266,83 @@ class RoundInputs(eqx.Module):
     slope: Float[Array, " free"]
 
 
-class LimitedLevenberg(optx.LevenbergMarquardt):
-    """Levenberg-Marquardt solver that stops after `most` accepted steps.
+class Linearised(NamedTuple):
+    """Whitened residuals of all blocks and of the prior, and their derivative by the step."""
 
-    Refused steps are not counted: each makes the next step smaller, so that a round that stopped
-    after refused steps would look converged. The solver counts its evaluation of the start as an
-    accepted step.
+    residual: Float[np.ndarray, " row"]
+    jacobian: Float[np.ndarray, "row free"]
+
+    @property
+    def loss(self) -> float:
+        return 0.5 * float(self.residual @ self.residual)
+
+
+def levenberg(fixed: RoundInputs, steps: int) -> Search:
+    """Return the search vector after steps of the Levenberg-Marquardt method, fixed whitening.
+
+    A step is accepted if it lowers the loss by at least 1 % of what the linear model predicts, and
+    the damping then falls if the model is right to 1 %; it rises after a refused step. Refused
+    steps do not count: each makes the next one smaller, so that a round that stopped after refused
+    steps would look like convergence.
+
+    The loop is not compiled: it takes no time beside the Jacobians, while its compilation would
+    take as long as that of the model. Source: Gould et al. 2005, 4OR 3(3), for the constants.
+
+    Args:
+        steps: largest number of accepted steps.
     """
-
-    most: Array
-
-    def __init__(self, most: int):
-        super().__init__(rtol=1e-6, atol=1e-8, linear_solver=lx.Normal(lx.Cholesky()))
-        self.most = jnp.asarray(most)
-
-    def terminate(
-        self,
-        fn: Any,
-        y: Array,
-        args: RoundInputs,
-        options: Any,
-        state: Any,
-        tags: frozenset[object],
-    ) -> tuple[Array, optx.RESULTS]:
-        done, result = super().terminate(fn, y, args, options, state, tags)
-        taken = state.num_accepted_steps - 1 >= self.most
-        return done | taken | (state.num_steps >= self.most + _MOST_REFUSED), result
+    y = np.zeros(len(fixed.z))
+    at, length, accepted = linearised(fixed, y), 1.0, 0
+    for _ in range(steps + _MOST_REFUSED - 1):
+        a = at.jacobian.T @ at.jacobian + np.eye(len(y)) / length
+        step = -np.linalg.solve(a, at.jacobian.T @ at.residual)
+        predicted = Linearised(at.residual + at.jacobian @ step, at.jacobian).loss - at.loss
+        new = linearised(fixed, y + step)
+        if not new.loss - at.loss <= 0.01 * predicted:
+            length *= 0.25
+            continue
+        length *= 3.5 if new.loss - at.loss < 0.99 * predicted else 1.0
+        settled = _alike(y + step, y) and _alike(new.residual, at.residual)
+        y, at, accepted = y + step, new, accepted + 1
+        if settled or accepted >= steps:
+            break
+    return np.asarray(_at(fixed, y))
 
 
-@eqx.filter_jit
-def levenberg(fixed: RoundInputs, solver: LimitedLevenberg) -> Float[Array, " free"]:
-    """Return the search vector after the solver's steps with fixed whitening."""
-    start = jnp.zeros_like(fixed.z)
-    found = optx.least_squares(_stacked, solver, start, fixed, max_steps=None, throw=False)
-    return _at(fixed, found.value)
+def _alike(new: np.ndarray, old: np.ndarray) -> bool:
+    """Return True if no element has changed by more than the solver's tolerance."""
+    return bool((np.abs(new - old) < 1e-8 + 1e-6 * np.abs(new)).all())
 
 
-def _at(fixed: RoundInputs, y: Array) -> Array:
+def _at(fixed: RoundInputs, y: Vector) -> Vector:
     """Return the search vector after a step `y`, which is in units of the prior stds."""
     return fixed.z + fixed.mask * fixed.prior_std * y
 
 
-def _stacked(y: Array, fixed: RoundInputs) -> Array:
-    """Return the whitened residuals of all blocks and of the prior."""
-    objective, space = fixed.objective, fixed.objective.space
+def linearised(fixed: RoundInputs, y: Search) -> Linearised:
+    """Return whitened residuals and their derivative after a step `y` from the start."""
     z = _at(fixed, y)
-    robot, given = space.tree(z), space.tree(jnp.where(space.electric, z, fixed.z))
-    motion = lk.motion_residual(robot, objective.batch, lk.predict(robot, objective.batch))
-    # currents and voltages are predicted with the motion at the start of the round
-    electric = lk.electric_residuals(given, objective.batch, fixed.motor_force, fixed.electric)
-    blocks = {"motion": motion} | electric
-    if (of := objective.multi_floor) is not None:
-        # Here, too, currents change electric numbers only. Friction is one of them and changes the
-        # motion, so that currents need a separate prediction, with the other numbers at z.
-        blocks |= of.residuals(given, lk.predict(given, of.batch))
-        of_robot = of.residuals(robot, lk.predict(robot, of.batch))
-        blocks[MULTI_FLOOR_MOTION] = of_robot[MULTI_FLOOR_MOTION]
-    white = {k: jnp.einsum("nij,nj->ni", fixed.root[k], r) for k, r in blocks.items()}
-    rest = [w.ravel() for k, w in white.items() if k != "motion"]
-    parts = [marginal_residuals(fixed.effects, white["motion"]), *rest]
+    given = GivenMotion(np.array(True), fixed.z, fixed.motor_force)
+    residual, jacobian, _ = linear_given(fixed.objective, z, fixed.electric, given)
+    return Linearised(*map(np.asarray, _stacked(fixed, residual, jacobian, z)))
+
+
+@eqx.filter_jit
+def _stacked(
+    fixed: RoundInputs, residual: Blocks, jacobian: Blocks, z: Vector
+) -> tuple[Array, Array]:
+    """Return the whitened residuals of all blocks and of the prior, and their derivative."""
+
+    def rows(blocks: Blocks) -> Array:
+        white = {k: jnp.einsum("nij,nj->ni", fixed.root[k], r) for k, r in blocks.items()}
+        rest = [w.ravel() for k, w in white.items() if k != "motion"]
+        return jnp.concatenate([marginal_residuals(fixed.effects, white["motion"]), *rest])
+
+    scale = fixed.mask * fixed.prior_std
     # the log Jacobian adds slope . z to the log posterior: to first order it shifts the prior mean
-    mean = space.prior_mean + fixed.prior_std**2 * fixed.slope
-    return jnp.concatenate([*parts, (z - mean) / fixed.prior_std])
+    mean = fixed.objective.space.prior_mean + fixed.prior_std**2 * fixed.slope
+    slopes = jax.vmap(rows, -1, -1)(jacobian) * scale
+    return (
+        jnp.concatenate([rows(residual), (z - mean) / fixed.prior_std]),
+        jnp.concatenate([slopes, jnp.diag(fixed.mask)]),
+    )

@@ -10,13 +10,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from slipid.data.runs import Runs
 from slipid.data.windows import Windows
 from slipid.fitting import likelihood as lk
 from slipid.fitting import variances
-from slipid.fitting.multi_floor import MULTI_FLOOR_CURRENT, MultiFloorBatch, MultiFloorRuns
+from slipid.fitting.multi_floor import (
+    MULTI_FLOOR_CURRENT,
+    MULTI_FLOOR_MOTION,
+    MultiFloorBatch,
+    MultiFloorRuns,
+)
 from slipid.fitting.noise import POOLED, SHARED, electric_noise, noise
 from slipid.fitting.shared_effects import (
     Posteriors,
@@ -280,20 +285,60 @@ def effects_given(posteriors: Posteriors, root: Array, motion: Array) -> Array:
     return mean_effects(posteriors, jnp.einsum("nij,nj->ni", root, motion))
 
 
-@eqx.filter_jit
+class GivenMotion(eqx.Module):
+    """Motion from which currents and voltages are predicted while the search vector changes.
+
+    Attributes:
+        applies: True if electric residuals depend on electric numbers alone, given this motion;
+            False if they depend on all numbers at once.
+        z: search vector from which the other numbers are taken.
+        motor_force: motor forces at z [mu m g].
+    """
+
+    applies: Bool[np.ndarray, ""]
+    z: Vector
+    motor_force: lk.MotorForce | Float[np.ndarray, "segment window drive 2"]
+
+
 def linear(
     objective: Objective, z: Vector, electric: lk.ElectricNoise
 ) -> tuple[Blocks, Blocks, Array]:
     """Return residual blocks, their Jacobians, and the forces of every motor."""
+    no_force = np.zeros((*objective.batch.turn.shape, 2))
+    return linear_given(
+        objective, z, electric, GivenMotion(np.array(False), np.zeros(len(z)), no_force)
+    )
+
+
+@eqx.filter_jit
+def linear_given(
+    objective: Objective, z: Vector, electric: lk.ElectricNoise, given: GivenMotion
+) -> tuple[Blocks, Blocks, Array]:
+    """Return residual blocks, their Jacobians, and the forces of every motor.
+
+    Both kinds of electric residuals are compiled together: to compile them apart would take longer
+    than a whole fit to few runs.
+    """
+    space, batch = objective.space, objective.batch
 
     def blocks(x: Array) -> tuple[Blocks, tuple[Blocks, Array]]:
-        robot = objective.space.tree(x)
-        p = lk.predict(robot, objective.batch)
-        motion = {"motion": lk.motion_residual(robot, objective.batch, p)}
-        out = motion | lk.electric_residuals(robot, objective.batch, p.motor_force, electric)
+        robot = space.tree(x)
+        electrical = space.tree(jnp.where(given.applies & ~space.electric, given.z, x))
+        p = lk.predict(robot, batch)
+        force = jax.lax.cond(
+            given.applies,
+            lambda: jnp.asarray(given.motor_force),
+            lambda: lk.motor_forces(robot, batch, p.twist),
+        )
+        out = {"motion": lk.motion_residual(robot, batch, p)}
+        out |= lk.electric_residuals(electrical, batch, force, electric)
         if (of := objective.multi_floor) is not None:
-            out |= of.residuals(robot, lk.predict(robot, of.batch))
-        return out, (out, p.motor_force)
+            # friction is an electric number that changes the motion of runs over several floors, so
+            # that their currents need a prediction of their own
+            out |= of.residuals(electrical, lk.predict(electrical, of.batch))
+            of_robot = of.residuals(robot, lk.predict(robot, of.batch))
+            out[MULTI_FLOOR_MOTION] = of_robot[MULTI_FLOOR_MOTION]
+        return out, (out, force)
 
     jacobian, (out, motor_force) = jax.jacfwd(blocks, has_aux=True)(z)
     return out, jacobian, motor_force

@@ -70,7 +70,7 @@ def with_session_effects(
     scores = weighted * (_weights(model, np.zeros_like(model.run)) * keep)[:, None, None]
     of_session = by_axis(variance, "session", w)
     meat = np.zeros_like(model.covariance)
-    of_segment = floors_and_sessions(w)
+    of_segment = list(zip(w.surface, w.session, strict=True))
     for pair in dict.fromkeys(of_segment):
         mine = np.array([other == pair for other in of_segment]) & (keep > 0)
         if mine.any():
@@ -79,17 +79,23 @@ def with_session_effects(
     return variance, model.covariance + model.covariance @ meat @ model.covariance
 
 
-def floors_and_sessions(w: Windows) -> list[tuple[str, str]]:
-    """Return the floor and session of every segment; segments of equal pairs share effects."""
-    return list(zip(w.surface, w.session, strict=True))
-
-
 def by_axis(variance: Mapping[str, float], kind: str, w: Windows) -> Float[np.ndarray, "segment 3"]:
     """Return the variances of one kind of effect along, across and in yaw, for every segment.
 
     They are zero if `variance` has no entry `<kind>.<floor>.<axis>`.
     """
-    return np.array([[variance.get(f"{kind}.{f}.{axis}", 0.0) for axis in AXES] for f in w.surface])
+    return np.array([on_floor(variance, kind, floor) for floor in w.surface])
+
+
+def on_floor(
+    values: Mapping[str, float],
+    kind: str,
+    floor: str,
+    default: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Float[np.ndarray, "3"]:
+    """Return the values `<kind>.<floor>.<axis>` along, across and in yaw."""
+    names = [f"{kind}.{floor}.{axis}" for axis in AXES]
+    return np.array([values.get(name, usual) for name, usual in zip(names, default, strict=True)])
 
 
 def _variances(

@@ -193,17 +193,14 @@ def effects_by_floor(
             [number.get(f"{kind}.{floor}.{axis}", -1) for axis in AXES]
             for kind in ("run", "neighbours", "session")
         ]
-        found.append(
-            SharedEffects(
-                segments=jax.device_put(mine),
-                effect=jax.device_put(moved[mine]),
-                near=jax.device_put(here.basis(speeds_and_loads[floor])),
-                session=jax.device_put(
-                    session[:, : len(names) if len(names) > 1 else 0].astype(float)
-                ),
-                numbers=jax.device_put(np.array(numbers)),
-            )
-        )
+        arrays = {
+            "segments": mine,
+            "effect": moved[mine],
+            "near": here.basis(speeds_and_loads[floor]),
+            "session": session[:, : len(names) if len(names) > 1 else 0].astype(float),
+            "numbers": np.array(numbers),
+        }
+        found.append(SharedEffects(**jax.device_put(arrays)))
     return tuple(found), speeds_and_loads
 
 

@@ -12,9 +12,9 @@ from slipid.data.runs import Runs
 from slipid.fitting import likelihood as lk
 from slipid.fitting.noise import travel
 from slipid.model import contact_law as law
-from slipid.model import robot as model
 from slipid.model.contact_law import ContactSurface
-from slipid.model.robot import GRAVITY, Robot, Validity
+from slipid.model.robot import GRAVITY, Robot, Validity, steady_states
+from slipid.parameter import as_numbers
 from slipid.search_space import Space
 
 CURVE_POINTS = 41
@@ -50,24 +50,20 @@ class SlipCurve:
     load_share: float
 
 
-@jax.jit
-def wheel_states(robot: Robot, b: lk.Batch) -> tuple[Array, Array, Array]:
+def wheel_states(robot: Robot, b: lk.Batch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return wheel speeds [rad/s], torques [N m] and slips (segment, window, wheel).
 
     Slip is the sliding speed divided by the wheel activity, sqrt(rim speed^2 + roller speed^2), so
     that it is finite for a wheel at rest.
     """
-    frame = robot.geometry.frame()
-    speed = robot.geometry.at_wheels(lk.wheel_speed(robot, b))
-
-    def one(w: Array, surface: Array, load: Array) -> tuple[Array, Array]:
-        xi = model.twist(robot, frame, w, surface, load)
-        rim = frame.radius * w
-        active = jnp.sqrt(rim**2 + (frame.roll @ xi) ** 2 + 1e-12)
-        torque = model.wheel_torque(robot, frame, xi, w, surface, load)
-        return torque, (rim * frame.drive_share - frame.hold @ xi) / active
-
-    return speed, *jax.vmap(jax.vmap(one, (0, None, None)))(speed, b.surface, b.load)
+    frame, driven = robot.geometry.frame(), np.asarray(lk.wheel_speed(robot, b))
+    places = (np.repeat(np.asarray(x), driven.shape[1]) for x in (b.surface, b.load))
+    found = steady_states(robot, driven.reshape(-1, driven.shape[-1]), *places)
+    speed = np.asarray(robot.geometry.at_wheels(as_numbers(driven)))
+    rim, xi = float(frame.radius) * speed, found.twist.reshape(*driven.shape[:2], 3)
+    active = np.sqrt(rim**2 + (xi @ np.asarray(frame.roll).T) ** 2 + 1e-12)
+    sliding = rim * np.asarray(frame.drive_share) - xi @ np.asarray(frame.hold).T
+    return speed, found.torque.reshape(speed.shape), sliding / active
 
 
 def torque_of_slip(
@@ -101,7 +97,7 @@ def curves(
     wheels.
     """
     robot = space.tree(jnp.asarray(z))
-    speed, torque = (np.abs(np.asarray(x)) for x in wheel_states(robot, b)[:2])
+    speed, torque = (np.abs(x) for x in wheel_states(robot, b)[:2])
     labels, floor = robot.surfaces.labels, np.asarray(b.surface)
     share = 1.0 / speed.shape[-1]
     median = []
@@ -133,7 +129,7 @@ def slip_on(robot: Robot, floor: str, curve: SlipCurve) -> Float[np.ndarray, " t
 
 def validity(data: Runs, robot: Robot, b: lk.Batch) -> dict[str, Validity]:
     """Return the ranges of speed, torque, slip and motion that the runs on each floor cover."""
-    speed, torque, slip = (np.asarray(x) for x in wheel_states(robot, b))
+    speed, torque, slip = wheel_states(robot, b)
     back = np.asarray(robot.geometry.pseudo_inverse()) * float(robot.geometry.wheel_radius)
     # The ranges refer to the motion computed from the encoders without slip.
     twist = np.asarray(lk.wheel_speed(robot, b)) @ back.T

@@ -7,10 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from slipid.parameter import parameter
+from slipid.parameter import known
 
-known = partial(parameter, free=False)
-"""Declaration of a number that stays fixed unless the user frees it."""
 plane = partial(known, of="axis")
 """Declaration of a vector (x, y) in the plane that stays fixed unless the user frees it."""
 

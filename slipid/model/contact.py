@@ -169,32 +169,6 @@ def equilibrium(
     return _solve(problem) if near is None else _solve_near(problem)
 
 
-def traction(
-    xi: Float[Array, "3"],
-    rim: Float[Array, " wheel"],
-    frame: WheelFrame,
-    surface: ContactSurface,
-    rest: Float[Array, " wheel"],
-) -> Float[Array, " wheel"]:
-    """Return the traction of each wheel against which its motor works, along the drive [mu m g]."""
-    return Balance(rim, stand(frame, surface, rest)).motor_force(Planar(*xi))
-
-
-def rolling_drag(
-    xi: Float[Array, "3"],
-    rim: Float[Array, " wheel"],
-    frame: WheelFrame,
-    surface: ContactSurface,
-    rest: Float[Array, " wheel"],
-) -> Float[Array, " wheel"]:
-    """Return the rolling drag of each wheel along its drive, for `Motor.rolling_drag` 1 [mu m g].
-
-    At that value a wheel that rolls along its drive has as much drag as its rollers have. The motor
-    works against this drag; it exerts no force on the body.
-    """
-    return Balance(rim, stand(frame, surface, rest)).rolling_drag(Planar(*xi))
-
-
 def settle(
     start: Float[Array, "3 floors"], rim: Array, on: Stance, plain: Float[Array, "3 wheel"]
 ) -> tuple[Float[Array, "3 floors"], Float[Array, "wheel floors"]]:

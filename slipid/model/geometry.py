@@ -3,6 +3,7 @@
 Source: Indiveri 2009, IEEE T-RO 25(1).
 """
 
+import abc
 import math
 from collections.abc import Sequence
 from functools import partial
@@ -13,15 +14,53 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.parameter import as_numbers, parameter
+from slipid.parameter import as_numbers, known
 
 _MIRRORED = 0.01
 """Largest difference of a wheel from a mirror image, for `Geometry.mirror`.
 
-It limits distances, in base radii, and twice the angle between lines [rad]."""
+It limits distances, in base radii, and twice the angle between lines [rad].
+"""
 
 
-class Geometry(eqx.Module):
+class Drives(eqx.Module):
+    """Wheels and the drives that turn them.
+
+    Attributes:
+        drive_of: index of the drive that turns each wheel, from 0 (wheel,); empty if every wheel
+            has a separate drive.
+    """
+
+    drive_of: eqx.AbstractVar[tuple[int, ...]]
+
+    @property
+    @abc.abstractmethod
+    def wheels(self) -> int:
+        """Number of wheels."""
+
+    @property
+    def drives(self) -> int:
+        """Number of drives, which is also the number of logged angles, currents and voltages."""
+        return len(set(self.drive_of)) or self.wheels
+
+    def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
+        """Return the values of drives at their wheels, such as the speed of every wheel."""
+        return of_drives[..., jnp.asarray(self.drive_of)] if self.drive_of else of_drives
+
+    def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
+        """Return the sums of wheels' values by drive, such as the torque of every drive."""
+        if not self.drive_of:
+            return of_wheels
+        return of_wheels @ jnp.asarray(np.eye(self.drives)[list(self.drive_of)])
+
+    def on_average(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
+        """Return the means of wheels' values by drive."""
+        if not self.drive_of:
+            return of_wheels
+        return self.at_drives(of_wheels) / self.at_drives(jnp.ones(self.wheels))
+
+
+class Geometry(Drives):
     """Wheels on a rigid body, REP-103 axes (x ahead, y left, yaw counter-clockwise).
 
     A wheel has a position, a drive direction, and rollers that run freely at `roller_angle` from
@@ -38,22 +77,15 @@ class Geometry(eqx.Module):
         drive_angle: direction of travel of a positive wheel speed (wheel,) [rad].
         roller_angle: angle from the free rolling direction to the drive direction (wheel,) [rad].
         grips: True for an ordinary wheel, False for one with rollers (wheel,).
-        drive_of: index of the drive that turns each wheel, from 0 (wheel,); empty if every wheel
-            has a separate drive.
+        drive_of: see `Drives`.
         gear_ratio: n, motor speed over wheel speed.
     """
 
-    wheel_radius: Array = parameter(
-        "m", "r", "wheel radius", start=0.05, lower=0.0, spread=0.02, free=False
-    )
-    base_radius: Array = parameter(
-        "m", "L", "base radius", start=0.15, lower=0.0, spread=0.02, free=False
-    )
-    drive_offset: Array = parameter(
-        "rad", "delta", "drive direction offset", start=0.0, spread=0.01, free=False
-    )
-    radius_deviation: Array = parameter(
-        "1", "rho", "wheel radius over r, less 1", start=0.0, spread=0.005, free=False, of="drive"
+    wheel_radius: Array = known("m", "r", "wheel radius", start=0.05, lower=0.0, spread=0.02)
+    base_radius: Array = known("m", "L", "base radius", start=0.15, lower=0.0, spread=0.02)
+    drive_offset: Array = known("rad", "delta", "drive direction offset", start=0.0, spread=0.01)
+    radius_deviation: Array = known(
+        "1", "rho", "wheel radius over r, less 1", start=0.0, spread=0.005, of="drive"
     )
     place: tuple[tuple[float, float], ...] = eqx.field(static=True, default=())
     drive_angle: tuple[float, ...] = eqx.field(static=True, default=())
@@ -83,26 +115,12 @@ class Geometry(eqx.Module):
 
     @property
     def wheels(self) -> int:
-        """Number of wheels."""
         return len(self.drive_angle)
-
-    @property
-    def drives(self) -> int:
-        """Number of drives, which is also the number of logged angles, currents and voltages."""
-        return len(set(self.drive_of)) if self.drive_of else self.wheels
 
     @property
     def determines_twist(self) -> bool:
         """True if the wheel rotations determine x, y and yaw if nothing slips."""
         return int(np.linalg.matrix_rank(np.asarray(self.forward()), tol=1e-6)) == 3
-
-    def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """Return the values of drives at their wheels, such as the speed of every wheel."""
-        return at_wheels(self.drive_of, of_drives)
-
-    def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
-        """Return the sums of wheels' values by drive, such as the torque of every drive."""
-        return at_drives(self.drive_of, of_wheels)
 
     def frame(self) -> "WheelFrame":
         """Return the wheels as rows of matrices, for the current radii and drive offsets."""
@@ -147,11 +165,8 @@ class Geometry(eqx.Module):
         return None
 
     def forward(self) -> Float[Array, "drive 3"]:
-        """Return J, which gives the rim speed r w of each drive [m/s] from a twist without slip.
-
-        The row of a drive with several wheels is the mean over its wheels.
-        """
-        return _forward(self.frame(), self.drive_of)
+        """Return `WheelFrame.forward` for the current radii and drive offsets."""
+        return self.frame().forward()
 
     def pseudo_inverse(self) -> Float[Array, "3 drive"]:
         """Return J^+, which gives the least-squares body twist from the drives' rim speeds [m/s].
@@ -161,23 +176,7 @@ class Geometry(eqx.Module):
         return jax.device_put(np.linalg.pinv(np.asarray(self.forward()), rcond=1e-6))
 
 
-def at_wheels(
-    drive_of: tuple[int, ...], of_drives: Float[Array, "*batch drive"]
-) -> Float[Array, "*batch wheel"]:
-    """Return the values of drives at their wheels; `drive_of` as in `Geometry`."""
-    return of_drives[..., jnp.asarray(drive_of)] if drive_of else of_drives
-
-
-def at_drives(
-    drive_of: tuple[int, ...], of_wheels: Float[Array, "*batch wheel"]
-) -> Float[Array, "*batch drive"]:
-    """Return the sums of wheels' values by drive; `drive_of` as in `Geometry`."""
-    if not drive_of:
-        return of_wheels
-    return of_wheels @ jnp.asarray(np.eye(len(set(drive_of)))[list(drive_of)])
-
-
-class WheelFrame(eqx.Module):
+class WheelFrame(Drives):
     """Wheel directions and levers for the force balance.
 
     Attributes:
@@ -193,6 +192,7 @@ class WheelFrame(eqx.Module):
         shift: change of load shares per displacement of the contact patches (wheel, 2) [1/m].
         radius: wheel radius r [m].
         base: base radius [m], by which moments are divided to compare them with forces.
+        drive_of: see `Drives`.
         ordinary: True if some wheel has no rollers.
     """
 
@@ -204,7 +204,20 @@ class WheelFrame(eqx.Module):
     shift: Float[Array, "wheel 2"]
     radius: Float[Array, ""]
     base: Float[Array, ""]
-    ordinary: bool = eqx.field(static=True, default=False)
+    drive_of: tuple[int, ...] = eqx.field(static=True)
+    ordinary: bool = eqx.field(static=True)
+
+    @property
+    def wheels(self) -> int:
+        return len(self.grip)
+
+    @eqx.filter_jit
+    def forward(self) -> Float[Array, "drive 3"]:
+        """Return J, which gives the rim speed r w of each drive [m/s] from a twist without slip.
+
+        The row of a drive with several wheels is the mean over its wheels.
+        """
+        return self.on_average((self.hold / self.drive_share[:, None]).T).T
 
 
 @partial(jax.jit, static_argnames=("drive_of", "grips"))
@@ -221,7 +234,7 @@ def _wheel_frame(
 ) -> WheelFrame:
     p, drive = place * base, drive_angle + drive_offset
     deviation = jnp.broadcast_to(radius_deviation, (len(set(drive_of)) or len(grips),))
-    larger = 1.0 + at_wheels(drive_of, deviation)
+    larger = 1.0 + (deviation[np.array(drive_of)] if drive_of else deviation)
     free = drive - roller
     hold = free + 0.5 * math.pi
 
@@ -241,17 +254,9 @@ def _wheel_frame(
         shift=jnp.linalg.pinv(lever)[:, 1:],
         radius=radius,
         base=base,
+        drive_of=drive_of,
         ordinary=any(grips),
     )
-
-
-@partial(jax.jit, static_argnames="drive_of")
-def _forward(frame: WheelFrame, drive_of: tuple[int, ...]) -> Float[Array, "drive 3"]:
-    of_wheels = frame.hold / frame.drive_share[:, None]
-    if not drive_of:
-        return of_wheels
-    share = np.eye(len(set(drive_of)))[list(drive_of)]
-    return jnp.asarray((share / share.sum(axis=0)).T) @ of_wheels
 
 
 def omni(

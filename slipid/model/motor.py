@@ -3,11 +3,10 @@
 from functools import partial
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from slipid.parameter import parameter
+from slipid.parameter import as_numbers, parameter
 
 electric = partial(parameter, electric=True)
 
@@ -54,10 +53,7 @@ class Motor(eqx.Module):
     rotor_inertia: Array = held(
         "kg*m^2", "J_m", "inertia of the rotor", start=1e-5, lower=0.0, spread=1.0
     )
-    gear_ratio: Array = eqx.field(
-        converter=lambda x: x if isinstance(x, jax.core.Tracer) else jnp.asarray(x, dtype=float),
-        default=1.0,
-    )
+    gear_ratio: Array = eqx.field(converter=as_numbers, default=1.0)
 
     def voltage(
         self, current: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
@@ -77,8 +73,8 @@ class Motor(eqx.Module):
     def opposing_force(self, motor_force: Float[Array, "*w 2"]) -> Float[Array, " *w"]:
         """Return the force that a motor works against: traction plus drag along the drive.
 
-        `motor_force` holds the two, as `slipid.model.robot.motor_forces` returns them, and the
-        result has the same unit.
+        `motor_force` holds the two, as `slipid.model.robot.Standing.motor_forces` returns them, and
+        the result has the same unit.
         """
         return motor_force[..., 0] + self.rolling_drag * motor_force[..., 1]
 

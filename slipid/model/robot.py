@@ -2,18 +2,24 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from slipid.model import contact, geometry
 from slipid.model.camera import Camera
+from slipid.model.contact_balance import Balance, stand
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import Geometry, WheelFrame
 from slipid.model.motor import Motor
-from slipid.parameter import as_numbers, entries, parameter
+from slipid.model.se2 import Planar
+from slipid.parameter import as_numbers, entries, known, parameter
+from slipid.support.blocks import in_blocks
 
 Number = int | float
 GRAVITY = 9.81
@@ -23,9 +29,9 @@ GRAVITY = 9.81
 class Body(eqx.Module):
     """Mass, inertia and load shares; the leading axis of `load_share` is the load set-up."""
 
-    mass: Array = parameter("kg", "m", "mass", start=10.0, lower=0.0, spread=0.1, free=False)
-    yaw_inertia: Array = parameter(
-        "kg*m^2", "I_z", "inertia about the vertical", start=0.2, lower=0.0, spread=0.5, free=False
+    mass: Array = known("kg", "m", "mass", start=10.0, lower=0.0, spread=0.1)
+    yaw_inertia: Array = known(
+        "kg*m^2", "I_z", "inertia about the vertical", start=0.2, lower=0.0, spread=0.5
     )
     load_share: Array = parameter(
         "1",
@@ -77,7 +83,8 @@ class Robot(eqx.Module):
     @classmethod
     def of(cls, shape: Geometry, mass: Number = 10.0) -> "Robot":
         """Return a robot with any wheels (see `slipid.model.geometry`) and no floors yet."""
-        return _with_mass(build(shape, ()), as_numbers(mass))
+        robot = build(shape, ())
+        return replace(robot, body=replace(robot.body, mass=as_numbers(mass)))
 
     def on(
         self,
@@ -91,7 +98,15 @@ class Robot(eqx.Module):
         `image_centre` is the point at which the camera's tilt and distortion are zero [m].
         """
         made = build(self.geometry, surfaces, loads, sessions, image_centre)
-        return _with_mass(replace(made, motor=self.motor), self.body.mass)
+        return replace(made, motor=self.motor, body=replace(made.body, mass=self.body.mass))
+
+    def standing(self, frame: WheelFrame, surface: Array, load: Array) -> "Standing":
+        """Return the robot on a floor, or on one floor per wheel, with a load set-up.
+
+        `frame` are its wheels, `surface` and `load` indices of floors and of the load set-up.
+        """
+        rest = self.body.load_share[load]
+        return Standing(frame, self.surfaces.at(surface), rest, self.motor, self.body.mass)
 
     def surface_index(self, name: str) -> int:
         """Return the position of a floor in the stack; ValueError with the choices if unknown."""
@@ -109,6 +124,69 @@ class Robot(eqx.Module):
     def session_index(self, name: str) -> int:
         """Return the position of a session, -1 for one that was not fitted."""
         return self.camera.sessions.index(name) if name in self.camera.sessions else -1
+
+
+class Standing(eqx.Module):
+    """A robot standing on a floor, or on one floor under each wheel.
+
+    Attributes:
+        frame: directions and radii of the wheels.
+        floor: the floor, or the floor under each wheel.
+        rest: share of the load on each wheel at rest.
+        motor: motor, which all drives share.
+        mass: mass of the robot [kg].
+    """
+
+    frame: WheelFrame
+    floor: ContactSurface
+    rest: Float[Array, " wheel"]
+    motor: Motor
+    mass: Float[Array, ""]
+
+    def twist(
+        self, wheel_speed: Float[Array, " wheel"], near: Float[Array, "3"] | None = None
+    ) -> Float[Array, "3"]:
+        """Return the body twist at given wheel speeds [rad/s] (vx, vy [m/s], yaw rate [rad/s]).
+
+        `near` is as in `contact.equilibrium`.
+        """
+        rim = self.frame.radius * wheel_speed
+        return contact.equilibrium(rim, self.frame, self.floor, self.rest, near)
+
+    def motor_forces(
+        self, xi: Float[Array, "3"], wheel_speed: Float[Array, " wheel"]
+    ) -> Float[Array, "wheel 2"]:
+        """Return the forces along the drive of each wheel that motors work against [mean(mu) m g].
+
+        They are the traction, and the rolling drag for `Motor.rolling_drag` 1. At that value a
+        wheel that rolls along its drive has as much drag as its rollers have; this drag exerts no
+        force on the body.
+        """
+        on = stand(self.frame, self.floor, self.rest)
+        balance, at = Balance(self.frame.radius * wheel_speed, on), Planar(*xi)
+        return jnp.stack([balance.motor_force(at), balance.rolling_drag(at)], axis=-1)
+
+    @property
+    def lever(self) -> Float[Array, ""]:
+        """Torque at a wheel per unit of the forces: r mean(mu) m g [N m]."""
+        return self.frame.radius * (jnp.mean(self.floor.friction) * self.mass * GRAVITY)
+
+    def wheel_torque(
+        self, xi: Float[Array, "3"], wheel_speed: Float[Array, " wheel"]
+    ) -> Float[Array, " wheel"]:
+        """Return the torque of the traction of each wheel [N m]."""
+        return self.lever * self.motor_forces(xi, wheel_speed)[..., 0]
+
+    def current(
+        self, xi: Float[Array, "3"], speed: Float[Array, " drive"]
+    ) -> Float[Array, " drive"]:
+        """Return the signed current of each motor [A], for its wheels' forces and its friction.
+
+        `speed` is the wheel speed of each drive [rad/s].
+        """
+        forces = self.motor_forces(xi, self.frame.at_wheels(speed))
+        opposing = self.frame.at_drives(self.motor.opposing_force(forces))
+        return self.motor.current(self.lever * opposing, speed)
 
 
 @dataclass(frozen=True)
@@ -140,10 +218,6 @@ class Validity:
     speeds: tuple[float, ...]
     turn_rates: tuple[float, ...]
     distance: float
-
-
-def _with_mass(robot: Robot, mass: Array) -> Robot:
-    return replace(robot, body=replace(robot.body, mass=mass))
 
 
 def build(
@@ -179,69 +253,44 @@ def build(
     )
 
 
-def twist(
-    robot: Robot,
-    frame: WheelFrame,
-    wheel_speed: Float[Array, " wheel"],
-    surface: Array,
-    load: Array,
-    near: Float[Array, "3"] | None = None,
-) -> Float[Array, "3"]:
-    """Return the body twist at given wheel speeds [rad/s] (vx, vy [m/s], yaw rate [rad/s]).
+class SteadyStates(NamedTuple):
+    """Steady motions of a robot whose wheels keep given speeds, a row for each.
 
-    `surface` and `load` are indices of the floor and the load set-up. `surface` may have one index
-    per wheel, here and in the functions below; `near` is as in `contact.equilibrium`.
+    Attributes:
+        twist: body twists (vx, vy [m/s], yaw rate [rad/s]).
+        torque: torques of the traction of the wheels [N m].
+        current: signed currents of the motors [A].
     """
-    floor, rest = robot.surfaces.at(surface), robot.body.load_share[load]
-    return contact.equilibrium(frame.radius * wheel_speed, frame, floor, rest, near)
+
+    twist: Float[np.ndarray, "row 3"]
+    torque: Float[np.ndarray, "row wheel"]
+    current: Float[np.ndarray, "row drive"]
 
 
-def motor_forces(
+def steady_states(
     robot: Robot,
-    frame: WheelFrame,
-    xi: Float[Array, "3"],
-    wheel_speed: Float[Array, " wheel"],
-    surface: Array,
-    load: Array,
-) -> Float[Array, "wheel 2"]:
-    """Return the forces against which each motor works at a twist, in units of mean(mu) m g.
+    wheel_speed: Float[np.ndarray, "row drive"],
+    surface: int | Int[np.ndarray, " row"],
+    load: int | Int[np.ndarray, " row"],
+) -> SteadyStates:
+    """Return the steady motions at wheel speeds of the drives [rad/s].
 
-    They are the traction, and the drag along the drive for `Motor.rolling_drag` 1
-    (`contact.rolling_drag`).
+    `surface` and `load` are indices of the floors and the load set-ups. Nothing is compiled for
+    another number of rows.
     """
-    rim, floor = frame.radius * wheel_speed, robot.surfaces.at(surface)
-    where = xi, rim, frame, floor, robot.body.load_share[load]
-    return jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
+    places = (np.broadcast_to(np.asarray(x), len(wheel_speed)) for x in (surface, load))
+    return SteadyStates(*in_blocks(partial(_steady_states, robot), wheel_speed, *places))
 
 
-def wheel_torque(
-    robot: Robot,
-    frame: WheelFrame,
-    xi: Float[Array, "3"],
-    wheel_speed: Float[Array, " wheel"],
-    surface: Array,
-    load: Array,
-) -> Float[Array, " wheel"]:
-    """Return the torque of the traction of each wheel: r mu m g T [N m]."""
-    force = jnp.mean(robot.surfaces.friction[surface]) * robot.body.mass * GRAVITY
-    return frame.radius * force * motor_forces(robot, frame, xi, wheel_speed, surface, load)[..., 0]
+@eqx.filter_jit
+def _steady_states(
+    robot: Robot, wheel_speed: Array, surface: Array, load: Array
+) -> tuple[Array, Array, Array]:
+    frame = robot.geometry.frame()
 
+    def one(w: Array, surface: Array, load: Array) -> tuple[Array, Array, Array]:
+        standing, of_wheels = robot.standing(frame, surface, load), frame.at_wheels(w)
+        xi = standing.twist(of_wheels)
+        return xi, standing.wheel_torque(xi, of_wheels), standing.current(xi, w)
 
-def motor_current(
-    robot: Robot,
-    frame: WheelFrame,
-    xi: Float[Array, "3"],
-    speed: Float[Array, " drive"],
-    surface: Array,
-    load: Array,
-) -> Float[Array, " drive"]:
-    """Return the signed current of each motor [A], for the forces of its wheels and its friction.
-
-    `speed` is the wheel speed of each drive [rad/s].
-    """
-    shape = robot.geometry
-    force = jnp.mean(robot.surfaces.friction[surface]) * robot.body.mass * GRAVITY
-    opposing = robot.motor.opposing_force(
-        motor_forces(robot, frame, xi, shape.at_wheels(speed), surface, load)
-    )
-    return robot.motor.current(frame.radius * force * shape.at_drives(opposing), speed)
+    return jax.vmap(one)(wheel_speed, surface, load)

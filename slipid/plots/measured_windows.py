@@ -11,8 +11,8 @@ from slipid.data.runs import Runs
 from slipid.data.windows import windows
 from slipid.fitting import likelihood as lk
 from slipid.infer import slip_curves as curves
-from slipid.model import robot as model
-from slipid.model.robot import Robot
+from slipid.model.robot import GRAVITY, Robot, steady_states
+from slipid.parameter import as_numbers
 from slipid.predict.slip_model import body_twist
 
 STRAIGHT = 0.98
@@ -81,7 +81,7 @@ def measured_windows(robot: Robot, data: Runs, per_segment: int) -> MeasuredWind
     w = windows(data, radius, lag, per_segment=per_segment, longest=1.5)
     b, dt = lk.batch(w, robot), w.dt[..., None]
     shape = robot.geometry
-    torque = np.asarray(shape.at_drives(curves.wheel_states(robot, b)[1]))
+    torque = np.asarray(shape.at_drives(as_numbers(curves.wheel_states(robot, b)[1])))
     amps, drag_torque = (np.asarray(x) for x in _borne(robot, b))
     inverse, frame = np.asarray(shape.pseudo_inverse()) * radius, shape.frame()
     encoder = (w.turn @ inverse.T).sum(axis=1)
@@ -147,7 +147,7 @@ def by_heading(
     wanted = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1) * speed
     forward = np.asarray(robot.geometry.forward()) / float(robot.geometry.wheel_radius)
     place = robot.surface_index(surface), robot.load_index(load)
-    xi = np.asarray(_twists(robot, jnp.asarray(wanted @ forward.T), *map(jnp.asarray, place)))
+    xi = steady_states(robot, wanted @ forward.T, *place).twist
     along = (xi * wanted)[:, :2].sum(axis=1) / speed
     across = (wanted[:, 0] * xi[:, 1] - wanted[:, 1] * xi[:, 0]) / speed
     return np.stack(
@@ -159,14 +159,7 @@ def by_heading(
 def _borne(robot: Robot, b: lk.Batch) -> tuple[Array, Array]:
     """Return predicted currents [A], and torques of the drag along the drive direction [N m]."""
     motor_force = lk.predict(robot, b).motor_force
-    force = robot.surfaces.friction[b.surface] * robot.body.mass * model.GRAVITY
+    force = robot.surfaces.friction[b.surface] * robot.body.mass * GRAVITY
     drag = robot.motor.rolling_drag * motor_force[..., 1]
     torque = robot.geometry.wheel_radius * force[:, None, None] * drag
     return lk.predicted_current(robot, b, motor_force), torque
-
-
-@jax.jit
-def _twists(robot: Robot, wheel_speed: Array, surface: Array, load: Array) -> Array:
-    frame = robot.geometry.frame()
-    wheels = robot.geometry.at_wheels(wheel_speed)
-    return jax.vmap(lambda w: model.twist(robot, frame, w, surface, load))(wheels)

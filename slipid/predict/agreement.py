@@ -37,9 +37,9 @@ from slipid.fitting.variances import Search, Square
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
 from slipid.predict.kinematics import fourier
-from slipid.predict.predictive import PredictiveModel, setups
+from slipid.predict.predictive import PredictiveModel
 from slipid.predict.score import chords, mean_error
-from slipid.predict.slip_model import body_twist, turned
+from slipid.predict.slip_model import body_twist, setups, turned
 from slipid.search_space import Space
 
 WORSE_RATIO = 1.5

@@ -186,8 +186,7 @@ def slopes(model: FloorModels, w: Windows, of: Callable[[FloorModels], np.ndarra
     """
     ends = np.cumsum([0, *(v.size for v in model.state.values())]).tolist()
     now = of(model)
-    out = np.zeros((*now.shape, ends[-1]))
-    keys = np.array([model.key_of(s, load) for s, load in zip(w.surface, w.load, strict=True)])
+    out, keys = np.zeros((*now.shape, ends[-1])), model.keys(w)
     for k in range(max((v.size for v in model.state.values()), default=0)):
         moved = {key: np.array(value, float) for key, value in model.state.items()}
         for value in moved.values():

@@ -89,12 +89,6 @@ def contact_increments(robot: Robot, b: lk.Batch) -> Float[Array, "segment windo
 
 
 @jax.jit
-def corrected(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Float[Array, "segment edge 3"]:
-    """Return logged poses in corrected metres."""
-    return jax.vmap(jax.vmap(robot.camera.corrected))(pose)
-
-
-@jax.jit
 def chain(start: Float[Array, "segment 3"], step: Float[Array, "segment window 3"]) -> Array:
     """Return the poses from a start pose and body-frame increments (segment, window + 1, 3)."""
     return jax.vmap(se2.chain)(start, step)
@@ -104,7 +98,7 @@ def tracks_from_increments(
     robot: Robot, w: Windows, increment: Float[np.ndarray, "segment window 3"]
 ) -> Tracks:
     """Return the tracks of a model that predicts marker increments."""
-    pose = np.asarray(corrected(robot, jnp.asarray(w.pose)))
+    pose = np.asarray(lk.corrected(robot, jnp.asarray(w.pose)))
     path = np.asarray(chain(jnp.asarray(pose[:, 0]), jnp.asarray(increment)))
     return Tracks(w.run, path, pose)
 

@@ -28,7 +28,7 @@ from scipy.special import gammaln
 
 from slipid.data.windows import Windows
 from slipid.fitting import likelihood as lk
-from slipid.fitting.hierarchy import TravelDirections, extrapolation
+from slipid.fitting.hierarchy import axis_effects, extrapolation
 from slipid.fitting.noise import SHARED, effects, travel
 from slipid.fitting.problem import FitState, Problem
 from slipid.fitting.session_effects import by_axis
@@ -50,6 +50,7 @@ from slipid.fitting.variances import (
 )
 from slipid.model.robot import Robot
 from slipid.predict import open_loop as replay
+from slipid.predict.slip_model import setups
 from slipid.search_space import Space
 
 Residuals = Float[np.ndarray, "segment m"]
@@ -126,7 +127,7 @@ class PredictiveModel(abc.ABC):
         The density is per logged unit of position and heading.
         """
         return log_student(*self.scale(problem)) + np.asarray(
-            _camera_log_jacobian(self.robot, problem.batch.pose)
+            lk.camera_log_jacobian(self.robot, problem.batch.pose)
         )
 
 
@@ -144,9 +145,6 @@ def log_student(
     norm = gammaln((DEGREES + m) / 2) - gammaln(DEGREES / 2) - 0.5 * m * np.log(DEGREES * np.pi)
     tail = 0.5 * (DEGREES + m) * np.log1p((white**2).sum(-1) / DEGREES)
     return np.asarray(norm - log_det - tail)
-
-
-_camera_log_jacobian = jax.jit(lk.camera_log_jacobian)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,8 +245,9 @@ def force_balance_of(
     residual, jacobian = problem.linear(z, problem.electric(z, log_v))
     motion = residual["motion"], jacobian["motion"]
     direction = TravelConditions.of(w, problem.robot).direction
-    travelled = TravelDirections(direction, travel(w, problem.robot)[0].sum(axis=1), setups(w))
-    grown = extrapolation(problem.objective, motion, keep[: len(w)], covariance, log_v, travelled)
+    distance = travel(w, problem.robot)[0].sum(axis=1)
+    counted = jnp.asarray(keep[: len(w)])
+    axes = axis_effects(problem.objective, motion, counted, covariance, log_v)
     return ForceBalance(
         problem.space.tree(state.z),
         by_name(problem, log_v),
@@ -256,7 +255,7 @@ def force_balance_of(
         problem.space,
         z,
         shared=_fitted_effects(problem, state, keep, residual, jacobian),
-        extrapolation=grown,
+        extrapolation=extrapolation(axes, log_v, direction, distance, setups(w)),
     )
 
 
@@ -302,11 +301,6 @@ def parameter_covariance(jac: Slopes, cov: np.ndarray) -> np.ndarray:
         some = jac[mine][..., columns]
         out[mine] = (some @ cov[np.ix_(columns, columns)]) @ np.swapaxes(some, -1, -2)
     return out
-
-
-def setups(w: Windows) -> list[str]:
-    """Return the floor and load of every segment, `floor@load`."""
-    return [f"{floor}@{load}" for floor, load in zip(w.surface, w.load, strict=True)]
 
 
 def by_name(problem: Problem, log_v: Vector) -> dict[str, float]:

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, Self
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -21,14 +20,12 @@ from slipid.model.geometry import Geometry
 from slipid.model.robot import Robot
 
 Increments = Float[np.ndarray, "segment window 3"]
-_marker_increments = jax.jit(marker_increments)
-_measured_increments = jax.jit(measured_increments)
 
 
 def as_increments(twist: np.ndarray, w: Windows, robot: Robot) -> Increments:
     """Return marker increments [m, m, rad] of body twists (segment, window, 3)."""
     session = jnp.asarray([robot.session_index(s) for s in w.session])
-    return np.asarray(_marker_increments(robot, jnp.asarray(twist), jnp.asarray(w.dt), session))
+    return np.asarray(marker_increments(robot, jnp.asarray(twist), jnp.asarray(w.dt), session))
 
 
 def body_twist(w: Windows, robot: Robot) -> np.ndarray:
@@ -36,7 +33,7 @@ def body_twist(w: Windows, robot: Robot) -> np.ndarray:
 
     The yaw and the position of the marker on the body are removed.
     """
-    moved = np.asarray(_measured_increments(robot, jnp.asarray(w.pose)))
+    moved = np.asarray(measured_increments(robot, jnp.asarray(w.pose)))
     yaw = moved[..., 2]
     yaws = {s: float(robot.camera.yaw(robot.session_index(s))) for s in set(w.session)}
     psi = np.array([yaws[s] for s in w.session])[:, None]
@@ -46,6 +43,11 @@ def body_twist(w: Windows, robot: Robot) -> np.ndarray:
     # chord = arc sinc(yaw / 2), at half the yaw to the start heading
     arc = turned(-0.5 * yaw, chord) / np.sinc(yaw / (2 * np.pi))[..., None]
     return np.concatenate([arc, yaw[..., None]], -1) / w.dt[..., None]
+
+
+def setups(w: Windows) -> list[str]:
+    """Return the floor and load of every segment, `floor@load`."""
+    return [f"{floor}@{load}" for floor, load in zip(w.surface, w.load, strict=True)]
 
 
 def turned(angle: np.ndarray | float, v: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ from slipid.predict.slip_model import (
     SlipModel,
     as_increments,
     body_twist,
+    setups,
 )
 from slipid.predict.steps import Steps, TrainingWindows, TwistModel
 
@@ -70,8 +71,7 @@ class FloorModels:
 
     def twist(self, w: Windows, robot: Robot) -> np.ndarray:
         """Return the body twist of every window (segment, window, 3) [m/s, m/s, rad/s]."""
-        spec, out = RobotSpec.of(robot), np.empty((*w.dt.shape, 3))
-        keys = np.array([self.key_of(s, load) for s, load in zip(w.surface, w.load, strict=True)])
+        spec, out, keys = RobotSpec.of(robot), np.empty((*w.dt.shape, 3)), self.keys(w)
         for key in dict.fromkeys(keys.tolist()):
             mine = keys == key
             steps = steps_of(w.segments(np.flatnonzero(mine)))
@@ -82,6 +82,10 @@ class FloorModels:
     def increments(self, w: Windows, robot: Robot) -> Increments:
         """Return the marker increments of every window [m, m, rad]."""
         return as_increments(self.twist(w, robot), w, robot)
+
+    def keys(self, w: Windows) -> np.ndarray:
+        """Return the key of the model of every segment."""
+        return np.array([self.key_of(s, load) for s, load in zip(w.surface, w.load, strict=True)])
 
     def key_of(self, surface: str, load: str) -> str:
         """Return the key of the model of a floor and load set-up.
@@ -110,8 +114,7 @@ class FloorModels:
 
     def _parts(self, w: Windows) -> dict[str, Windows]:
         """Return the windows by the key of the model that is fitted to them."""
-        setups = [f"{s}@{load}" for s, load in zip(w.surface, w.load, strict=True)]
-        keys = np.array(setups if self.model.by_load else w.surface)
+        keys = np.array(setups(w) if self.model.by_load else w.surface)
         return {k: w.segments(np.flatnonzero(keys == k)) for k in dict.fromkeys(keys.tolist())}
 
 

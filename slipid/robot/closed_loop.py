@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from slipid.parameter import as_numbers
 from slipid.robot.controller import Controller, ControllerState
 from slipid.robot.interface import (
     AbstractEstimator,
@@ -65,8 +66,8 @@ class ControlLoop(eqx.Module, Generic[State]):
 
     def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> ControlLoopState[State]:
         """Return the state of a robot at rest at a pose [m, m, rad], at the start of its path."""
-        estimator = self.estimator.init(jnp.asarray(pose, dtype=float))
-        return ControlLoopState(estimator, self.controller.init(), jnp.zeros(()))
+        estimator, controller = self.estimator.init(pose), self.controller.init()
+        return ControlLoopState(estimator, controller, as_numbers(0.0))
 
     def step(
         self,

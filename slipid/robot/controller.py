@@ -18,7 +18,7 @@ traction spins. The controller returns to normal operation once the robot has mo
 Otherwise it stops for good and reports that it gave up.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import fields
 from typing import Literal
 
@@ -27,9 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from slipid.parameter import parameter
+from slipid.parameter import as_numbers, parameter
 from slipid.robot.deployed import RobotArrays, with_record
-from slipid.robot.interface import UNTIMED_S, Numbers, Scalar, StateEstimate, as_arrays
+from slipid.robot.interface import UNTIMED_S, Scalar, StateEstimate, as_arrays
 
 Correction = Literal["none", "torque", "paper_print", "paper_code"]
 Law = Callable[[Float[Array, "6"], Float[Array, "3"]], Float[Array, "3"]]
@@ -85,12 +85,7 @@ class Gains(eqx.Module):
             return cls()
         if not (tuned.is_better or forced):
             return cls()
-        return cls.at([getattr(tuned.values, f.name).value for f in fields(cls)])
-
-    @classmethod
-    def at(cls, values: Sequence[Float[Array, ""] | float] | Float[Numbers, " gain"]) -> "Gains":
-        """Return the gains in a vector, in the order of their declaration."""
-        return cls(*(jnp.asarray(value, dtype=float) for value in values))
+        return cls(*(as_numbers(getattr(tuned.values, f.name).value) for f in fields(cls)))
 
 
 class Limits(eqx.Module):
@@ -221,6 +216,7 @@ class Controller(eqx.Module):
         self.correction, self.law = correction, law
         self.gains = Gains.of(robot) if gains is None else gains
 
+    @eqx.filter_jit
     def init(self) -> ControllerState:
         """Return the state of a controller before its first command."""
         none, still, zero = jnp.zeros(self.robot.wheels), jnp.zeros(3), jnp.zeros(())

@@ -9,11 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from slipid.model.contact_law import ContactSurface
-from slipid.model.geometry import Geometry, WheelFrame, at_drives, at_wheels
+from slipid.model.geometry import Drives, Geometry, WheelFrame
 from slipid.model.motor import Motor
+from slipid.model.robot import Standing
 from slipid.parameter import as_numbers
 from slipid.robot.filter.effects import EffectLookup
 from slipid.robot.record import LoadRecord, Numbers, RobotRecord
@@ -22,7 +23,7 @@ from slipid.robot.unseen import with_unseen
 from slipid.support.errors import DataError
 
 
-class RobotArrays(eqx.Module):
+class RobotArrays(Drives):
     """Arrays of an identified robot with one load set-up, for estimators and controllers.
 
     Compiled code depends only on the static fields, which describe the structure of the robot, so
@@ -50,7 +51,7 @@ class RobotArrays(eqx.Module):
         highest: highest wheel speed of the fitted runs [rad/s], and the largest current that the
             model predicts up to 0.8 of that speed [A].
         wheel_curve: a and b of a + b |I|, the slip ratio of each drive over all floors (drive, 2).
-        drive_of: drive of each wheel, see `slipid.model.geometry.Geometry`.
+        drive_of: drive of each wheel, see `slipid.model.geometry.Drives`.
         around: order of the wheels around the body, see `slipid.model.geometry.Geometry`.
         unseen: for each floor, True if no run drove on it.
     """
@@ -82,13 +83,7 @@ class RobotArrays(eqx.Module):
 
     @property
     def wheels(self) -> int:
-        """Number of wheels."""
         return len(self.around)
-
-    @property
-    def drives(self) -> int:
-        """Number of drives, which is also the number of measured angles, currents and voltages."""
-        return len(set(self.drive_of)) or self.wheels
 
     @property
     def by_wheels(self) -> Float[Array, "3 wheel"]:
@@ -97,19 +92,9 @@ class RobotArrays(eqx.Module):
             return self.inverse
         return self.inverse @ self.on_average(jnp.eye(self.wheels)).T
 
-    def at_wheels(self, of_drives: Float[Array, "*batch drive"]) -> Float[Array, "*batch wheel"]:
-        """Return the value of each wheel's drive, such as its speed."""
-        return at_wheels(self.drive_of, of_drives)
-
-    def at_drives(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
-        """Return the sum over the wheels of every drive, such as their torque."""
-        return at_drives(self.drive_of, of_wheels)
-
-    def on_average(self, of_wheels: Float[Array, "*batch wheel"]) -> Float[Array, "*batch drive"]:
-        """Return the mean over the wheels of every drive."""
-        if not self.drive_of:
-            return of_wheels
-        return self.at_drives(of_wheels) / self.at_drives(jnp.ones(self.wheels))
+    def standing(self, under: Int[Array, " wheel"]) -> Standing:
+        """Return the robot with the floors number `under` under its wheels."""
+        return Standing(self.frame, self.floors.at(under), self.rest, self.motor, self.mass)
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from slipid.model.se2 import advance, compose
+from slipid.parameter import as_numbers
 from slipid.robot.deployed import RobotArrays
 from slipid.robot.filter.floor import Floor
 from slipid.robot.filter.floor_filter import FloorFilter, FloorState, TimeStep, length
@@ -79,12 +80,16 @@ class Estimator(AbstractEstimator[EstimatorState]):
         self, pose: Pose = (0.0, 0.0, 0.0), std: tuple[float, float] = (0.0, 0.0)
     ) -> EstimatorState:
         """Return the state of a robot at rest at a pose [m, m, rad] with stds [m], [rad]."""
+        return self._begun(as_numbers(pose), as_numbers(std))
+
+    @eqx.filter_jit
+    def _begun(self, pose: Float[Array, "3"], std: Float[Array, "2"]) -> EstimatorState:
         f, s = self.robot, self.settings
         return EstimatorState(
             wheels=WheelState.init(f, s),
             current=jnp.zeros(f.drives),
             floors=FloorFilter(f, s).init(),
-            place=PoseFilter(f, s).init(jnp.asarray(pose, dtype=float), std),
+            place=PoseFilter(f, s).init(pose, std),
             stuck=jnp.zeros(()),
         )
 
@@ -207,8 +212,12 @@ class Odometry(AbstractEstimator[OdometryState]):
 
     def init(self, pose: Pose = (0.0, 0.0, 0.0)) -> OdometryState:
         """Return the state of a robot at rest at a pose [m, m, rad]."""
+        return self._begun(as_numbers(pose))
+
+    @eqx.filter_jit
+    def _begun(self, pose: Float[Array, "3"]) -> OdometryState:
         return OdometryState(
-            pose=jnp.asarray(pose, dtype=float),
+            pose=pose,
             wheels=WheelState.init(self.robot, self.settings),
             current=jnp.zeros(self.robot.drives),
         )

@@ -103,6 +103,7 @@ class Readings(eqx.Module):
     fix_age: Float[Array, "*batch"]
 
     @classmethod
+    @eqx.filter_jit
     def nothing(cls, drives: int) -> "Readings":
         """Return the readings of a robot with this number of drives and no sensors."""
         shapes = [(drives,)] * 4 + [(), (3,), (2,), ()]

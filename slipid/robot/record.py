@@ -55,6 +55,8 @@ UNITS = {
 class RecordedNumber:
     """A fitted or fixed number of the robot, with the attributes that identified.json has.
 
+    By default it is a number that was given, not fitted.
+
     Attributes:
         value: value [unit].
         unit: unit of the value.
@@ -68,18 +70,11 @@ class RecordedNumber:
 
     value: Numbers
     unit: str
-    std: Numbers | None
-    interval90: Pair | tuple[Pair, ...] | None
-    verdict: Verdict
-    provenance: Provenance
-    source: Source
-
-    @classmethod
-    def without_std(
-        cls, value: Numbers, unit: str, verdict: Verdict, provenance: Provenance
-    ) -> "RecordedNumber":
-        """Return a number that was given, not fitted: std and interval are None."""
-        return cls(value, unit, None, None, verdict, provenance, "given")
+    std: Numbers | None = None
+    interval90: Pair | tuple[Pair, ...] | None = None
+    verdict: Verdict = "fixed"
+    provenance: Provenance = "override"
+    source: Source = "given"
 
 
 def plain(value: np.ndarray) -> Numbers:
@@ -103,11 +98,6 @@ class Wheels:
     grips: tuple[bool, ...]
     drive_of: tuple[int, ...]
     gear_ratio: float
-
-    @property
-    def drives(self) -> int:
-        """Number of drives, equal to `Geometry.drives` but computed without arrays."""
-        return len(set(self.drive_of)) or len(self.place)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from dataclasses import asdict, fields, is_dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Any, Literal, Union, get_args, get_origin
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,17 +26,16 @@ from slipid.robot.record import UNITS, EffectRecord, Numbers, RobotRecord
 from slipid.support.errors import DataError
 from slipid.support.files import checksum, write_bytes
 
-Kind = TypeVar("Kind")
 _MOST = sys.float_info.max
 _PLAIN = {bool: "true or false", str: "text", int: "a whole number", NoneType: "null"}
 
 
-def typed(kind: type[Kind], value: object, where: str = "") -> Kind:
+def typed(kind: Any, value: object, where: str = "") -> Any:
     """Return a JSON value as a dataclass; numbers must be finite and keys complete and known.
 
     Args:
-        kind: a dataclass of bool, int, float, str, None, `Literal`, tuples, mappings by str, unions
-            and dataclasses.
+        kind: a dataclass, or the type of one of its fields: bool, int, float, str, None, a
+            `Literal`, a tuple, a mapping by str, a union or a dataclass.
         value: value returned by `json.loads`.
         where: position of the value in the file, such as `floors[0].name`, for messages.
 
@@ -44,10 +43,6 @@ def typed(kind: type[Kind], value: object, where: str = "") -> Kind:
         ValueError: something is missing, unknown or of another type; the message gives its
             position.
     """
-    return _as(kind, value, where)
-
-
-def _as(kind: Any, value: object, where: str) -> Any:
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         return _one_of(inner, value, where)
@@ -60,7 +55,7 @@ def _as(kind: Any, value: object, where: str) -> Any:
     if origin is Mapping:
         if not isinstance(value, dict):
             raise _wrong(where, value, "an object")
-        return {k: _as(inner[1], v, f"{where}['{k}']") for k, v in value.items()}
+        return {k: typed(inner[1], v, f"{where}['{k}']") for k, v in value.items()}
     if is_dataclass(kind):
         return _object(kind, value, where)
     if kind is float:
@@ -78,8 +73,8 @@ def _one_of(kinds: tuple[Any, ...], value: object, where: str) -> Any:
     *others, last = (k for k in kinds if k is not NoneType)
     for k in others:
         with suppress(ValueError):
-            return _as(k, value, where)
-    return _as(last, value, where)
+            return typed(k, value, where)
+    return typed(last, value, where)
 
 
 def _items(inner: tuple[Any, ...], value: object, where: str) -> tuple[Any, ...]:
@@ -90,7 +85,7 @@ def _items(inner: tuple[Any, ...], value: object, where: str) -> tuple[Any, ...]
         raise ValueError(f"{where}: {len(value)} entries; expected {len(inner)}")
     kinds = [inner[0]] * len(value) if endless else inner
     return tuple(
-        _as(k, v, f"{where}[{n}]") for n, (k, v) in enumerate(zip(kinds, value, strict=True))
+        typed(k, v, f"{where}[{n}]") for n, (k, v) in enumerate(zip(kinds, value, strict=True))
     )
 
 
@@ -105,7 +100,7 @@ def _object(kind: Any, value: object, where: str) -> Any:
     for name in value:
         if name not in names:
             raise ValueError(f"{before}{name}: no such field; expected {', '.join(names)}")
-    return kind(**{name: _as(hints[name], value[name], f"{before}{name}") for name in names})
+    return kind(**{name: typed(hints[name], value[name], f"{before}{name}") for name in names})
 
 
 def _wrong(where: str, value: object, expected: str) -> ValueError:
@@ -140,7 +135,7 @@ def read_robot(path: Path) -> RobotRecord:
         raise DataError(f"{path}: its units differ from those of {SCHEMA}; {REWRITE_HINT}")
     numbers = content.pop("numbers", None)
     try:
-        record = typed(RobotRecord, content)
+        record: RobotRecord = typed(RobotRecord, content)
         check_record(record)
     except ValueError as error:
         raise DataError(f"{path}: {error}; {REWRITE_HINT}") from error
@@ -210,9 +205,7 @@ def check_record(record: RobotRecord) -> None:
         raise ValueError("wheels.place: no entries; expected one for every wheel")
     for name in ("drive_angle", "roller_angle", "grips"):
         _counted(f"wheels.{name}", getattr(record.wheels, name), wheels)
-    geometry_of(
-        record
-    )  # This raises an error for wheels that cannot drive and for drives without wheels.
+    drives = geometry_of(record).drives  # raises for wheels that cannot drive, or without a drive
     for kind, names in (("floors", record.labels), ("loads", [x.name for x in record.loads])):
         if not names or len(set(names)) < len(names):
             raise ValueError(
@@ -220,7 +213,7 @@ def check_record(record: RobotRecord) -> None:
             )
     for load in record.loads:
         _counted(f"loads, {load.name}: spread", load.spread, len(record.floors))
-        _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, record.wheels.drives)
+        _counted(f"loads, {load.name}: wheel_curve", load.wheel_curve, drives)
         if load.told is not None:
             _check_effects(f"loads, {load.name}: told", load.told, len(record.floors))
     _numbers(record)
@@ -296,15 +289,7 @@ def _sized(where: str, value: Numbers, size: int) -> None:
 
 
 def _inside(where: str, value: Numbers, declaration: Declaration, size: int) -> None:
-    """Raise `ValueError` for a value of another size, or one outside its declared bounds."""
+    """Raise `ValueError` for a value of another size, or one that breaks a declared rule."""
     _sized(where, value, size)
-    x = np.asarray(value)
-    if declaration.shares:
-        if not ((x > 0).all() and abs(x.sum() - 1) < 1e-6):
-            raise ValueError(f"{where} = {value}: expected positive shares that sum to 1")
-    elif declaration.deviation:
-        if not abs(x.sum()) < 1e-6:
-            raise ValueError(f"{where} = {value}: expected numbers that sum to 0")
-    elif not ((x > declaration.lower) & (x < declaration.upper)).all():
-        low, high = declaration.lower, declaration.upper
-        raise ValueError(f"{where} = {value}: expected a value between {low:g} and {high:g}")
+    if rule := declaration.broken_rule(np.asarray(value)):
+        raise ValueError(f"{where} = {value}: expected {rule}")

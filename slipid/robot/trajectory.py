@@ -92,11 +92,10 @@ class Path(eqx.Module):
 
     def after_rest(self, seconds: float) -> "Path":
         """Return the path preceded by a rest of this duration at its start."""
-        count = round(seconds / ROW_PERIOD)
-        still = jnp.broadcast_to(self.rows[0].at[3:].set(0.0), (count, 6))
-        return Path(
-            jnp.concatenate([still, self.rows]), self.marks + count * ROW_PERIOD, self.corners
-        )
+        count, rows = round(seconds / ROW_PERIOD), np.asarray(self.rows)
+        still = np.tile(rows[0] * [1, 1, 1, 0, 0, 0], (count, 1))
+        marks = jnp.asarray(np.asarray(self.marks) + count * ROW_PERIOD)
+        return Path(jnp.asarray(np.concatenate([still, rows])), marks, self.corners)
 
 
 def waypoints(

@@ -24,9 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from slipid.model import contact
-from slipid.model.robot import GRAVITY
 from slipid.model.se2 import advance, compose
+from slipid.parameter import as_numbers
 from slipid.robot.closed_loop import PERIOD
 from slipid.robot.deployed import RobotArrays
 from slipid.robot.filter.effects import RolledMotion, effect_correlation, travel_direction
@@ -208,9 +207,8 @@ class Twin(eqx.Module):
         """Return the pose one substep later, and the twist by contact equilibrium."""
         f = self.robot
         under = self.floor.under(pose, f.places)
-        rim = f.frame.radius * w
-        xi = contact.equilibrium(rim, f.frame, f.floors.at(under), f.rest)
-        rolled = RolledMotion.of(f.inverse @ rim, f.frame.base)
+        xi = f.standing(under).twist(w)
+        rolled = RolledMotion.of(f.inverse @ (f.frame.radius * w), f.frame.base)
         mean, part = f.effect_table.at(rolled)
         errors, far, share = mean + part * f.effect * effect, rolled.speed * h, f.rest[:, None]
         off = far * jnp.sum(share * errors[under], axis=0)
@@ -232,15 +230,11 @@ class Twin(eqx.Module):
         """Return signed currents [A], and their correlated errors after this period [A]."""
         f, wheels, xi, w = self.robot, self.robot.wheels, now.twist, now.speed
         under = self.floor.under(now.pose, f.places)
-        floor = f.floors.at(under)
-        where = xi, f.frame.radius * w, f.frame, floor, f.rest
-        motor_force = jnp.stack([contact.traction(*where), contact.rolling_drag(*where)], axis=-1)
-        force = jnp.mean(floor.friction) * f.mass * GRAVITY * f.frame.radius
         keep = float(np.exp(-PERIOD / self.actuators.drift_s))
         fresh = jnp.sqrt((1 - keep**2) / 2.0) * f.current_std[under] * noise[:wheels]
         drift = keep * now.drift + fresh
         moves = jnp.tanh(w / 0.2) ** 2  # A motor at standstill draws no current.
-        model = f.motor.current(force * f.motor.opposing_force(motor_force), w)
+        model = f.standing(under).current(xi, w)
         free = (f.inverse @ (f.frame.radius * w))[:2]
         more = f.current_trend @ jnp.stack([1.0, jnp.sqrt(free @ free + 1e-24)])
         return model + moves * (jnp.sign(model) * more + now.offset + drift), drift
@@ -267,12 +261,13 @@ class TwinPlant:
     """A twin as a `slipid.robot.closed_loop.Plant`; equal random keys give equal runs."""
 
     def __init__(self, twin: Twin, start: Pose, key: Array):
-        self.twin, self.start, self.key = twin, start, key
+        self.twin, self.start, self.key = twin, as_numbers(start), key
         self.reset()
 
     def reset(self) -> Readings:
-        self._state, self._count = self.twin.init(self.start, self.key), 0
-        return self.twin.first(self._state, self.twin.noise(self.key, 0))
+        self._count = 0
+        self._state, reading = _begun(self.twin, self.start, self.key)
+        return reading
 
     def step(self, wheel_speed: Float[np.ndarray, " wheel"]) -> Readings:
         self._count += 1
@@ -284,6 +279,12 @@ class TwinPlant:
     def pose(self) -> tuple[float, float, float]:
         x, y, heading = np.asarray(self._state.pose).tolist()
         return x, y, heading
+
+
+@eqx.filter_jit
+def _begun(twin: Twin, start: Array, key: Array) -> tuple[TwinState, Readings]:
+    state = twin.init(start, key)
+    return state, twin.first(state, twin.noise(key, 0))
 
 
 @eqx.filter_jit

@@ -18,7 +18,6 @@ from slipid.robot.record import (
     Axes,
     FloorRecord,
     LoadRecord,
-    Numbers,
     RecordedNumber,
     RobotRecord,
     axes_of,
@@ -60,10 +59,8 @@ def with_unseen(record: RobotRecord) -> RobotRecord:
     for name, (soft, grip) in zip(names, grid, strict=True):
         factor = {"creep": soft, "roller_drag": DRAG_EXPONENT * soft, "friction": grip}
         for quantity, number in middle.items():
-            value = float(np.exp(factor[quantity])) if quantity in factor else 1.0
-            parameters[f"surface.{name}.{quantity}"] = replace(
-                number, value=_scaled(number.value, value)
-            )
+            value = np.asarray(np.exp(factor.get(quantity, 0.0)) * np.asarray(number.value))
+            parameters[f"surface.{name}.{quantity}"] = replace(number, value=plain(value))
     process = np.mean([floor.process for floor in record.floors], axis=0)
     current_std = CURRENT_FACTOR * float(np.mean([floor.current_std for floor in record.floors]))
     one = FloorRecord("", axes_of(process), EFFECT, current_std, seen=None, unseen=True)
@@ -90,14 +87,11 @@ def _middle(record: RobotRecord) -> dict[str, RecordedNumber]:
         each = np.array([record.parameters[f"surface.{n}.{quantity}"].value for n in record.labels])
         signed = quantity in _SIGNED
         middle = each.mean(axis=0) if signed else np.exp(np.log(each).mean(axis=0))
-        middle_floor[quantity] = RecordedNumber.without_std(
-            plain(np.asarray(middle)), number.unit, "not_identified", "borrowed"
+        value = plain(np.asarray(middle))
+        middle_floor[quantity] = RecordedNumber(
+            value, number.unit, verdict="not_identified", provenance="borrowed"
         )
     return middle_floor
-
-
-def _scaled(value: Numbers, factor: float) -> Numbers:
-    return tuple(factor * x for x in value) if isinstance(value, tuple) else factor * value
 
 
 def _load(load: LoadRecord, count: int) -> LoadRecord:

@@ -37,10 +37,8 @@ def test_a_move_has_the_slip_of_its_own_twist():
 
 
 @pytest.fixture(scope="module")
-def fit():
-    made = sl.made_runs(["soft"], headings=12, speeds=[0.2], turns=0, voltage=False)
-    robot = sl.Robot.omni([60, 180, 300], base_radius=0.125, wheel_radius=0.04, gear_ratio=16)
-    return sl.fit(made.runs, robot, fixed={"camera.scale": 1.117}, quiet=True)
+def fit(world):
+    return world["fit"]
 
 
 @pytest.mark.slow
@@ -50,14 +48,14 @@ def test_a_check_counts_runs_and_forecasts_verdicts(fit):
     assert check["motor.resistance"].verdict == "not_identified"
     assert check["camera.scale"].verdict == "fixed"
     assert "current (unsigned)" in str(check)
-    assert check.content["groups"][0]["runs"] == 12
+    assert sum(group["runs"] for group in check.content["groups"]) == 12
     assert sl.plot_runs(fit.data, [0, 1], "two runs").axes
 
 
 @pytest.mark.slow
 def test_a_comparison_ranks_every_model_on_left_out_runs(fit):
     found = fit.compare("sectors", parts=2, quiet=True)
-    floor = found.floors["soft"]
+    floor = found.floors["gray"]
     assert floor.runs == 12
     assert floor.models[floor.best].verdict == "best"
     assert str(found) == floor.sentence
@@ -68,12 +66,12 @@ def test_a_comparison_ranks_every_model_on_left_out_runs(fit):
 
 @pytest.mark.slow
 def test_a_proposal_has_the_requested_runs(fit):
-    proposal = fit.design("surface.soft.creep", runs=2)
+    proposal = fit.design("surface.gray.creep", runs=2)
     assert len(proposal.runs) == 2
     assert str(proposal).startswith("run,floor,load,vx_m_s")
     assert proposal.plot().axes
     with pytest.raises(sl.DataError, match="matches no parameter"):
-        fit.design("surface.soft.nonsense")
+        fit.design("surface.gray.nonsense")
 
 
 @pytest.mark.slow
@@ -92,12 +90,12 @@ def test_a_closed_loop_run_prints_its_path_errors(fit):
 def test_a_drive_on_a_map_of_ones_own_is_on_that_map(fit, tmp_path):
     robot = fit.deploy()
     there, far = tmp_path / "lab.toml", "[-1, -1, 1, 1]"
-    there.write_text(f'schema = "slipid.map/1"\nbase = "soft"\nextent_m = {far}\ncell_m = 0.1\n')
+    there.write_text(f'schema = "slipid.map/1"\nbase = "gray"\nextent_m = {far}\ncell_m = 0.1\n')
     found = sl.drive(robot, "contact_map", map=there, path="circle", speed=0.1)
-    assert found.floor.surfaces == ("soft",)
+    assert found.floor.surfaces == ("gray",)
     assert found.run.path.duration > 20
     seen = found.run.estimate.surface_probability[-1]
-    assert seen[:, robot.labels.index("soft")].min() > 0.8
-    there.write_text(there.read_text().replace("soft", "ice"))
+    assert seen[:, robot.labels.index("gray")].min() > 0.8
+    there.write_text(there.read_text().replace("gray", "ice"))
     with pytest.raises(sl.DataError, match=r"lab\.toml: no surface 'ice'; identified"):
         sl.drive(robot, "contact_map", map=there)

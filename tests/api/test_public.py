@@ -2,63 +2,19 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
-from dataclasses import replace
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import slipid as sl
-from slipid.data.write import robotino2022_csv
-from slipid.infer.posterior import blocks, sample
-from slipid.infer.posterior.blocks import Plan
-from slipid.lab.selftest.logs import SimulatedSensors, heading_grid, simulate_logs, true_robot
-
-ROOT = Path(__file__).resolve().parents[2]
-FLOORS = (("gray", "as_built"),)
-DRIVES = heading_grid(setups=FLOORS, headings=6, speeds=(0.1, 0.3), turns=0)
-
-
-def example() -> str:
-    """The Python example of the README."""
-    return re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)[0]
-
-
-def write_runs(folder: Path) -> None:
-    """Made logs of the drives, laid out as those of 2022."""
-    for k, log in enumerate(simulate_logs(true_robot(DRIVES), DRIVES, 1, SimulatedSensors())):
-        path = folder / "one_surface" / str(log.surface) / f"exp{k:02d}.csv"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(
-            robotino2022_csv(replace(log, wheel_speed_command=log.wheel_speed), 16.0, 2000)
-        )
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory) -> dict:
-    """Names that the README's example leaves behind, run where its logs are; few steps sampled."""
-    folder = tmp_path_factory.mktemp("readme")
-    write_runs(folder / "logs")
-    around = sample.sampled
-    names: dict = {"angle": [0.0, 0.1, 0.2], "amps": [0.3, 0.1, 0.4]}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        few = Plan(ensembles=2, walkers=6, block=4, warm_up=(1, 2), most=3)
-        patch.setattr(blocks, "Plan", lambda seed, most: replace(few, seed=seed))
-        patch.setattr(
-            sample, "sampled", lambda fit, plan, draws, *rest: around(fit, plan, 16, *rest)
-        )
-        exec(compile(example(), "README.md", "exec"), names)
-    names["folder"] = folder
-    return names
+from tests.api.conftest import write_runs
 
 
 @pytest.mark.slow
-def test_the_example_of_the_readme_runs(world, capsys):
+def test_the_example_of_the_readme_runs(world):
     assert (world["folder"] / "robot.json").is_file()
     assert np.shape(world["estimate"].pose) == (3,)
     assert set(world["estimate"].surface) <= {"gray", "unknown"}

@@ -35,20 +35,20 @@ def test_other_starts_on_other_maps(fit_folder, robot, tmp_path):
         with Processes(os.cpu_count() or 1) as executor:
             runs += trial(fit_folder, wish, executor, Reporter(quiet=True)).runs
     table = summaries(runs)
-    base = table["encoder"].median
+    base = table["encoder"]
     print(
         f"\n{len(MAPS)} maps, {STARTS} starts each; encoders {base['closure_error_median']:.0f} mm"
     )
     for name, row in table.items():
         closes, across = (
-            row.to_encoder[key] for key in ("closure_error_median", "cross_track_rmse")
+            row["to_encoder"][key] for key in ("closure_error_median", "cross_track_rmse")
         )
-        low, high = closes.interval90
+        low, high = closes["interval90"]
         print(
-            f"{name:13s} closes at {closes.value:4.0%} ({low:.0%} to {high:.0%}) of encoders, worse"
-            f" than they in {row.worse_share:3.0%}, cross-track {across.value:4.0%},"
-            f" {row.finished_share:4.0%} finish"
+            f"{name:13s} closes at {closes['value']:4.0%} ({low:.0%} to {high:.0%}) of encoders,"
+            f" worse than they in {row['worse_share']:3.0%}, cross-track {across['value']:4.0%},"
+            f" {row['finished_share']:4.0%} finish"
         )
     print("not told apart:", ", ".join(best_controllers(runs)))
-    assert QUICK or min(row.finished_share for row in table.values()) > 0.9
+    assert QUICK or min(row["finished_share"] for row in table.values()) > 0.9
     assert np.isfinite(base["closure_error_median"])

@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 
 from slipid.fitting import problem as of_problem
 from slipid.fitting import variances
-from slipid.fitting.optimise import levenberg, optimise
+from slipid.fitting.optimise import _stacked, optimise
 from slipid.fitting.problem import FitState, Problem, effects_given, without_effects
 from slipid.fitting.variances import DEGREES
 from slipid.search_space import Choice
@@ -313,7 +313,7 @@ def test_a_problem_is_forgotten_after_use_and_those_like_it_compile_nothing(trut
     del first
     gc.collect()
     assert [ref() for ref in kept] == [None] * 3
-    jitted = (of_problem.linear, of_problem.log_jacobian, levenberg)
+    jitted = (of_problem.linear_given, of_problem.log_jacobian, _stacked)
     jitted += (variances.whitening, variances.scoring_step, variances.precision)
     before = [f._cached._cache_size() for f in jitted]
     assert min(before) > 0

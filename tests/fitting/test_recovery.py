@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from slipid.data.windows import windows
 from slipid.fitting.optimise import optimise
-from slipid.fitting.problem import FitState, linear
+from slipid.fitting.problem import FitState, linear_given
 from slipid.infer.summary import summarise
 from slipid.lab.selftest.logs import nominal_robot, true_robot
 from tests.helpers import recovery
@@ -132,7 +132,7 @@ def test_motion_does_not_need_the_voltage():
 
 @pytest.mark.slow
 def test_windows_of_one_shape_share_what_is_compiled():
-    problem, compiled = recovery.problem(), linear._cached._cache_size
+    problem, compiled = recovery.problem(), linear_given._cached._cache_size
     z = problem.space.start
     volt = problem.electric(z, 2 * np.log(problem.noise.typical))
     problem.linear(z, volt)

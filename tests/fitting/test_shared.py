@@ -26,7 +26,8 @@ from slipid.fitting.shared_effects import (
     marginal_residuals,
 )
 from slipid.fitting.variances import fitted_covariance
-from slipid.predict.predictive import force_balance_of, setups
+from slipid.predict.predictive import force_balance_of
+from slipid.predict.slip_model import setups
 from slipid.search_space import Choice
 from tests.helpers.dense import of_shared
 from tests.helpers.made_windows import made, robot
@@ -247,20 +248,21 @@ def axis_of(rng, runs=60):
     whole = fixed + sum(v * b for v, b in zip(true, bases, strict=True))
     left = np.linalg.cholesky(whole + 1e-9 * np.eye(runs)) @ rng.normal(size=runs)
     noise = np.full(runs, 0.2)
-    return hierarchy._AxisEffects(0, np.arange(runs), left, fixed, noise, [0, 1, 2], bases)
+    return hierarchy.AxisEffects(
+        0, np.arange(runs), left, fixed, noise, [0, 1, 2], bases, np.zeros(3)
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_scoring_ends_at_the_summit_of_the_likelihood(seed):
     axis = axis_of(np.random.default_rng(seed))
-    typical = np.zeros(3)
 
     def loss(log_v):
         whole = axis.fixed + sum(v * b for v, b in zip(np.exp(log_v), axis.bases, strict=True))
         own = multivariate_normal(np.zeros(len(whole)), whole).logpdf(axis.left)
         return -own + 0.5 * float(np.sum((log_v / 3.0) ** 2))
 
-    found = hierarchy._scoring_steps(axis, np.array([1.0, -1.0, 2.0]), typical)
+    found = hierarchy._scoring_steps(axis, np.array([1.0, -1.0, 2.0]))
     step = 1e-4 * np.eye(3)
     slope = [(loss(found + e) - loss(found - e)) / 2e-4 for e in step]
     np.testing.assert_allclose(slope, 0.0, atol=1e-2)
@@ -314,7 +316,7 @@ def test_every_axis_has_the_covariance_of_its_own_effects(problem):
     blocks, jacobian = motion(problem, log_v)
     moved = blocks["motion"], jacobian["motion"]
     covariance = np.diag(problem.space.prior_std**2)
-    axes = list(hierarchy._axes(problem.objective, moved, jnp.ones(RUNS), covariance, log_v))
+    axes = list(hierarchy.axis_effects(problem.objective, moved, jnp.ones(RUNS), covariance, log_v))
     assert len(axes) == 3 * len(problem.objective.shared)
     for k, axis in enumerate(axes):
         root = problem.objective.shared[k // 3].root(jnp.asarray(log_v))[axis.number]

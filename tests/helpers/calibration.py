@@ -22,7 +22,7 @@ from slipid.fitting.variances import DEGREES, VARIANCE_SPREAD
 from slipid.infer.posterior import sample as posterior
 from slipid.infer.posterior.blocks import Plan
 from slipid.infer.result import Channels, Fit
-from slipid.predict.open_loop import chain, corrected
+from slipid.predict.open_loop import chain
 from slipid.search_space import Choice
 from slipid.support.progress import Reporter
 from tests.helpers.made_windows import made, robot
@@ -202,7 +202,7 @@ def _predicted(truth, b):
     p = lk.predict(truth, b)
     return (
         p.increment,
-        corrected(truth, b.pose)[:, 0],
+        lk.corrected(truth, b.pose)[:, 0],
         lk.predicted_current(truth, b, p.motor_force),
     )
 

@@ -631,14 +631,19 @@ def test_mecanum_goes_sideways():
     assert xi[1] < 0.3
 
 
+def rolling_drag(xi, rim, frame, floor, rest):
+    """Drag of each wheel along its drive that only its motor works against."""
+    return Balance(rim, stand(frame, floor, rest)).rolling_drag(Planar(*xi))
+
+
 def test_a_wheel_drags_along_its_drive_as_far_as_it_rolls_that_way():
     frame, floor = ROBOTINO.frame(), FLOORS["gray"]
     xi = jnp.asarray([0.3, -0.1, 0.2])
     rim = frame.hold @ xi
-    found = contact.rolling_drag(xi, rim, frame, floor, jnp.asarray([0.2, 0.5, 0.3]))
+    found = rolling_drag(xi, rim, frame, floor, jnp.asarray([0.2, 0.5, 0.3]))
     share = np.asarray(rim) / np.hypot(np.asarray(rim), np.asarray(frame.roll @ xi))
     np.testing.assert_allclose(found, 0.31 / 3 * share * np.abs(share), rtol=1e-6)
-    back = contact.rolling_drag(-xi, -rim, frame, floor, EVEN)
+    back = rolling_drag(-xi, -rim, frame, floor, EVEN)
     np.testing.assert_allclose(back, -found, rtol=1e-6)
 
 
@@ -646,4 +651,4 @@ def test_only_wheels_with_rollers_drag_along_their_drive_as_rollers_do():
     xi = jnp.asarray([0.3, 0.0, 0.2])
     rim = SKID.forward() @ xi
     rest = jnp.full(4, 0.25)
-    assert not np.any(contact.rolling_drag(xi, rim, SKID.frame(), FLOORS["gray"], rest))
+    assert not np.any(rolling_drag(xi, rim, SKID.frame(), FLOORS["gray"], rest))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slipid.model.geometry import differential, general, omni, skid_steer
-from slipid.model.robot import build, motor_current, twist
+from slipid.model.robot import build
 from slipid.search_space import Choice, Space
 
 OWN = skid_steer(0.2, 0.15, 0.05, 10.0)
@@ -17,6 +17,12 @@ SHARED = skid_steer(0.2, 0.15, 0.05, 10.0, drive_of=(0, 1, 0, 1))
 def robot(shape):
     made = build(shape, ["floor"])
     return Space(made, [Choice("motor.coulomb_friction", fixed=0.05)]).template
+
+
+def standing(made):
+    """On its only floor, as built."""
+    at = jnp.asarray(0)
+    return made.standing(made.geometry.frame(), at, at)
 
 
 def test_a_drive_turns_all_its_wheels():
@@ -32,13 +38,13 @@ def test_a_drive_turns_all_its_wheels():
 
 @pytest.mark.slow
 def test_a_motor_bears_all_wheels_of_its_drive_and_its_own_friction_once():
-    drives, at = jnp.array([3.0, 6.0]), jnp.asarray(0)
+    drives = jnp.array([3.0, 6.0])
     shared, own = robot(SHARED), robot(OWN)
     wheels = SHARED.at_wheels(drives)
-    xi = twist(shared, SHARED.frame(), wheels, at, at)
-    np.testing.assert_allclose(xi, twist(own, OWN.frame(), wheels, at, at), atol=1e-12)
-    both = motor_current(shared, SHARED.frame(), xi, drives, at, at)
-    each = motor_current(own, OWN.frame(), xi, wheels, at, at)
+    xi = standing(shared).twist(wheels)
+    np.testing.assert_allclose(xi, standing(own).twist(wheels), atol=1e-12)
+    both = standing(shared).current(xi, drives)
+    each = standing(own).current(xi, wheels)
     friction = own.motor.friction(wheels) / own.motor.gain
     torque = np.asarray(each - friction)
     assert np.abs(torque).max() > 0.1
@@ -64,7 +70,7 @@ def test_a_larger_left_wheel_bends_what_should_be_straight():
     slick = {"creep": 1e-4, "scrub": 1e-9, "rolling_resistance": 1e-9, "lead": 0.0}
     choices = [Choice(f"surface.floor.{name}", fixed=value) for name, value in slick.items()]
     made = Space(build(larger, ["floor"]), choices).template
-    xi = np.asarray(twist(made, larger.frame(), jnp.full(2, 5.0), jnp.asarray(0), jnp.asarray(0)))
+    xi = np.asarray(standing(made).twist(jnp.full(2, 5.0)))
     np.testing.assert_allclose(xi[2] / xi[0], -0.02 / (0.4 * 1.01), rtol=1e-3)
     plain = np.asarray(larger.pseudo_inverse()) * 0.1 @ np.full(2, 5.0)
     np.testing.assert_allclose(plain, [0.505, 0.0, -0.025], atol=1e-9)
@@ -76,14 +82,14 @@ def test_a_larger_wheel_moves_the_body_as_one_that_turns_faster():
     deviation = jnp.array([0.03, 0.0, -0.03])
     larger = replace(shape, radius_deviation=deviation)
     one, other = build(shape, ["floor"]), build(larger, ["floor"])
-    wanted, at = jnp.array([0.1, 0.05, 0.2]), jnp.asarray(0)
+    wanted = jnp.array([0.1, 0.05, 0.2])
     speed = larger.forward() @ wanted / 0.04
     faster = speed * (1 + deviation)
     np.testing.assert_allclose(faster, shape.forward() @ wanted / 0.04, rtol=1e-12)
-    there = np.asarray(twist(other, larger.frame(), speed, at, at))
-    expected = np.asarray(twist(one, shape.frame(), faster, at, at))
+    there = np.asarray(standing(other).twist(speed))
+    expected = np.asarray(standing(one).twist(faster))
     np.testing.assert_allclose(there, expected, rtol=0.01)
-    neglected = np.asarray(twist(one, shape.frame(), speed, at, at))
+    neglected = np.asarray(standing(one).twist(speed))
     assert np.abs(neglected / expected - 1).max() > 0.03
 
 

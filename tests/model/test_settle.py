@@ -13,9 +13,10 @@ import pytest
 
 from slipid.model import contact
 from slipid.model.contact import settle
-from slipid.model.contact_balance import stand
+from slipid.model.contact_balance import Balance, stand
 from slipid.model.contact_law import ContactSurface
 from slipid.model.geometry import mecanum, omni
+from slipid.model.se2 import Planar
 
 KINDS = {
     "omni 3": omni([60.0, 180.0, 300.0], 0.125, 0.04, 16.0),
@@ -55,7 +56,7 @@ def one_by_one(kind, rim):
     def of(under):
         floor = floors.at(under)
         xi = contact.equilibrium(rim, frame, floor, rest)
-        return xi, contact.traction(xi, rim, frame, floor, rest)
+        return xi, Balance(rim, stand(frame, floor, rest)).motor_force(Planar(*xi))
 
     xi, pull = jax.vmap(of)(index)
     return xi.T, pull.T

@@ -144,7 +144,7 @@ def test_another_robot_other_gains_and_limits_are_controlled_without_compiling(r
         return np.asarray(commanded(controller, controller.init(), REFERENCE, estimate, 0.05)[1])
 
     before = step(Controller(one, Gains()))
-    gains = Gains.at((2.0, 1.0, 0.1, 0.2, 0.1))
+    gains = Gains(2.0, 1.0, 0.1, 0.2, 0.1)
     with compilations() as found:
         after = [
             step(Controller(two)),

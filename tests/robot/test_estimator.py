@@ -38,6 +38,7 @@ DT = 0.05
 KINDS = ("contact", "curve")
 CHESS = Floor.of("abc", np.add.outer(np.arange(9), np.arange(9)) % 3, (-1.0, -1.0), 0.25, "abc")
 solve = eqx.filter_jit(FloorFilter.solve)
+limited = eqx.filter_jit(limit_command)
 BAD = (np.nan, np.inf, -np.inf, 1e300, -1e300, 1e-310, 0.0, -1.0, 1e9, 3e7, 50.0)
 
 
@@ -63,9 +64,9 @@ def robot():
 def control_loop(kind):
     deployed = robot()
     if kind == "curve":
-        gains = Gains.at((2.0, 2.0, 0.2, 0.0, 0.15))
+        gains = Gains(2.0, 2.0, 0.2, 0.0, 0.15)
         return ControlLoop(Odometry(deployed, curve=True), Controller(deployed, gains))
-    gains = Gains.at((2.0, 2.0, 0.2, 0.3, 0.15))
+    gains = Gains(2.0, 2.0, 0.2, 0.3, 0.15)
     there = CHESS if kind == "mapped" else None
     return ControlLoop(Estimator(deployed, floor=there), Controller(deployed, gains))
 
@@ -241,7 +242,7 @@ def test_saturation_keeps_the_direction():
     for _ in range(50):
         wanted = rng.normal(size=3) * 30
         got = np.asarray(
-            limit_command(jnp.asarray(wanted), jnp.zeros(3), jnp.zeros(3), robot(), LIMITS, 0.5)
+            limited(jnp.asarray(wanted), jnp.zeros(3), jnp.zeros(3), robot(), LIMITS, 0.5)
         )
         np.testing.assert_allclose(np.cross(got, wanted), 0.0, atol=1e-9)
         assert got @ wanted > 0
@@ -251,9 +252,7 @@ def test_saturation_keeps_the_direction():
 def test_a_command_needs_no_more_than_the_supply_has_left(amps):
     f, limits = robot(), Limits(voltage=6.0, acceleration=1e4)
     wanted, motor = np.array([10.0, -9.0, 2.0]), f.motor
-    got = np.asarray(
-        limit_command(jnp.asarray(wanted), jnp.zeros(3), jnp.asarray(amps), f, limits, DT)
-    )
+    got = np.asarray(limited(jnp.asarray(wanted), jnp.zeros(3), jnp.asarray(amps), f, limits, DT))
     np.testing.assert_allclose(got / wanted, got[0] / wanted[0], rtol=1e-12)
     needs = np.abs(got) * float(motor.gear_ratio * motor.back_emf)
     left = 6.0 - float(motor.resistance) * np.abs(amps)
@@ -505,7 +504,7 @@ def test_the_observer_takes_a_constant_disturbance_out():
     """A body that does what it is asked to but for a constant: what is wanted comes about."""
     f, step = robot(), eqx.filter_jit(Controller.step)
     for gain, left in ((0.0, 1.0), (1.0, 0.0)):
-        con = Controller(f, Gains.at((0.0, 0.0, 0.0, gain, 0.0)))
+        con = Controller(f, Gains(0.0, 0.0, 0.0, gain, 0.0))
         reference = jnp.array([0.0, 0.0, 0.0, 0.1, 0.05, 0.0])
         off, state, twist = np.array([-0.04, 0.02, 0.1]), con.init(), np.zeros(3)
         for _ in range(120):
@@ -517,7 +516,7 @@ def test_the_observer_takes_a_constant_disturbance_out():
 
 def test_the_integral_asks_for_no_more_than_it_may_however_long_a_robot_is_off():
     f = robot()
-    con = Controller(f, Gains.at((0.0, 0.0, 1.0, 0.0, 0.0)))
+    con = Controller(f, Gains(0.0, 0.0, 1.0, 0.0, 0.0))
     step = jax.jit(lambda s, e: con.step(s, jnp.array([0.3, -0.1, 0.0, 0.0, 0.0, 0.0]), e, DT))
     state = con.init()
     for _ in range(40):
@@ -531,7 +530,7 @@ def test_the_integral_asks_for_no_more_than_it_may_however_long_a_robot_is_off()
 def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_and_says_so():
     """Going and turning cancel at two of its three wheels, as they do where only one spins."""
     f = robot()
-    con = Controller(f, Gains.at((1.5, 1.5, 0.0, 0.0, 0.0)), Limits(acceleration=1e4))
+    con = Controller(f, Gains(1.5, 1.5, 0.0, 0.0, 0.0), Limits(acceleration=1e4))
     reference = jnp.array([0.0, 0.05, np.arcsin(0.25), 0.0, 0.0, 0.0])
     said = estimate(f, immobilised=jnp.ones((), bool))
     step = jax.jit(lambda s, e: con.step(s, reference, e, DT))
@@ -560,7 +559,7 @@ def test_a_robot_that_is_stuck_turns_and_goes_by_turns_ever_harder_then_stops_an
 
 def test_a_robot_that_hardly_goes_where_it_is_asked_to_go_counts_as_stuck_and_one_that_goes_not():
     f = robot()
-    con = Controller(f, Gains.at((1.5, 1.5, 0.0, 0.0, 0.0)))
+    con = Controller(f, Gains(1.5, 1.5, 0.0, 0.0, 0.0))
     reference = jnp.array([0.0, 0.0, 0.0, 0.2, 0.0, 0.0])
     step = jax.jit(lambda s, e: con.step(s, reference, e, DT))
     for speed, stuck in ((0.1, False), (0.02, True)):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slipid.model.geometry import omni
-from slipid.model.robot import build, motor_current, twist
+from slipid.model.robot import build
 from slipid.robot.estimator import Estimator
 from slipid.robot.filter.floor_filter import FloorFilter
 from slipid.robot.filter.hypotheses import hypotheses_of
@@ -32,12 +32,10 @@ def test_drag_along_the_drive_is_in_the_currents_that_tell_floors():
     for _ in range(10):
         near, amps = eqx.filter_jit(floors.solve)(near, w)
     for k in range(2):
-        place = jnp.asarray(k), jnp.asarray(0)
-        xi = twist(robot, frame, w, *place)
+        standing = robot.standing(frame, jnp.asarray(k), jnp.asarray(0))
+        xi = standing.twist(w)
         alike = int(np.flatnonzero((hypotheses_of(known).under == k).all(axis=1))[0])
-        np.testing.assert_allclose(
-            amps[alike], motor_current(robot, frame, xi, w, *place), rtol=1e-6
-        )
+        np.testing.assert_allclose(amps[alike], standing.current(xi, w), rtol=1e-6)
 
 
 @pytest.mark.slow

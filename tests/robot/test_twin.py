@@ -21,7 +21,7 @@ SILENT = ActuatorModel(ammeter_a=0.0, voltmeter_v=0.0, gyro_noise=0.0, gyro_bias
 
 
 def control_loop(robot, gains=(1.5, 1.5, 0.1, 0.2, 0.1)):
-    return ControlLoop(Odometry(robot), Controller(robot, Gains.at(gains)))
+    return ControlLoop(Odometry(robot), Controller(robot, Gains(*gains)))
 
 
 def driven(twin, commands, key=KEY):

@@ -13,13 +13,12 @@ from slipid.app.reference.keys import in_short, meanings
 from slipid.data.reading.bag.layout import BagLayout
 from slipid.data.reading.bag.topics import Topic, topics_of
 from slipid.data.reading.column_names import meaning_of
-from slipid.data.reading.layout import CHANNELS, PER_WHEEL, Layout
+from slipid.data.reading.layout import CHANNELS, PER_WHEEL, TURNS, Layout
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 _METADATA = "metadata.yaml"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_WHEEL_CHANNELS = ("wheel_ticks", "wheel_angle", "wheel_speed", "motor_speed")
 _EFFORT = (
     "what is the effort: a current (A), a torque (motor_torque or wheel_torque, N*m), a voltage "
     "(V) or a duty (1)?"
@@ -93,9 +92,7 @@ def propose_bags(bags: Sequence[Path], path: Path, options: RobotOptions) -> Con
     topics = topics_of(bag)
     joints, doubt = _joints(topics)
     channels = list(_best_topics(topics, len(joints)))
-    wheels = next(
-        (one.wheels for name in _WHEEL_CHANNELS for one in channels if one.channel == name), 0
-    )
+    wheels = next((one.wheels for name in TURNS for one in channels if one.channel == name), 0)
     channels += _by_field_names(topics, channels, wheels)
     robot, hints = guess_robot(options, wheels, ())
     questions = [doubt] if doubt else []

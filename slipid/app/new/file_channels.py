@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.reading.column_names import ColumnMeaning, meaning_of
-from slipid.data.reading.layout import PER_WHEEL, Layout
+from slipid.data.reading.layout import GROUPS, PER_WHEEL, TURNS, Layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.reader import read_logs
 from slipid.data.reading.table_format import TableFormat, TableNumbers, format_of
@@ -25,8 +25,6 @@ from slipid.support.errors import DataError
 _ORDER = ("fl", "fr", "ml", "mr", "rl", "rr", "l", "r")
 """Labels of wheels in the order in which the types of drive count wheels."""
 _QUATERNION = ("x", "y", "z", "w")
-WHEEL_MOTION = ("wheel_ticks", "wheel_angle", "motor_angle", "wheel_speed", "motor_speed")
-"""Channels with the motion of the wheels, the most informative first."""
 _LEAST_TICKS = 50
 """Magnitude above which whole numbers of a position are taken for ticks."""
 
@@ -153,7 +151,7 @@ def _stays_up(values: Float[np.ndarray, "row column"]) -> bool:
 
 def _consistent(found: list[FileChannel]) -> tuple[list[FileChannel], list[str]]:
     """Return the channels with the same wheels as the motion, and a line about each other one."""
-    turns = [one for name in WHEEL_MOTION for one in found if one.channel == name]
+    turns = [one for name in TURNS for one in found if one.channel == name]
     per_wheel = turns or [one for one in found if one.channel in PER_WHEEL]
     count = len(per_wheel[0].columns) if per_wheel else 0
     labels = set(per_wheel[0].labels) if per_wheel else set()
@@ -201,7 +199,7 @@ def unnamed_channels(numbers: TableNumbers) -> Channels:
         put("time", time)
     if whole:
         put("wheel_ticks", *whole)
-    for channel, at in zip(("pose_x", "pose_y", "pose_heading"), others, strict=False):
+    for channel, at in zip(GROUPS["pose"], others, strict=False):
         if len(others) >= 3:
             put(channel, at)
     used = {at for one in found for at in one.columns}

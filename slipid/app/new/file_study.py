@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from slipid.app.new.file_channels import (
-    WHEEL_MOTION,
     FileChannel,
     FileKind,
     channels_in,
     unnamed_channels,
 )
 from slipid.app.new.units import UnitGuess, position_unit, time_unit, usual_step
+from slipid.data.reading.layout import TURNS
 from slipid.data.reading.table_format import TableFormat, TableNumbers, numbers_of
 from slipid.data.reading.units import factor
 from slipid.data.wheel_signals import refresh_period
@@ -57,7 +57,7 @@ class FileStudy:
     @property
     def wheels(self) -> int:
         """Return the number of wheels, or drives, with columns in the file."""
-        turns = self.find(*WHEEL_MOTION)
+        turns = self.find(*TURNS)
         return len(turns.columns) if turns else 0
 
     @property
@@ -70,9 +70,9 @@ class FileStudy:
         """Return the first of some channels that the file has, or None if it has none of them."""
         return first_of(channels, [self])
 
-    def column(self, channel: str) -> Float[np.ndarray, " row"]:
-        """Return the numbers of a channel that the file has in one column."""
-        return next(one for one in self.found if one.channel == channel).values[:, 0]
+    def channel(self, name: str) -> FileChannel:
+        """Return a channel that the file has."""
+        return next(one for one in self.found if one.channel == name)
 
     def without(self, names: frozenset[str]) -> "FileStudy":
         """Return the study without the channels in `names`, which come from another file."""
@@ -129,8 +129,8 @@ def pose_path(
     """
     if one is None or not one.has_pose:
         return UnitGuess("m"), None
-    x, y = one.column("pose_x"), one.column("pose_y")
-    logged = next(found.unit for found in one.found if found.channel == "pose_x")
+    logged = one.channel("pose_x").unit
+    x, y = (one.channel(name).values[:, 0] for name in ("pose_x", "pose_y"))
     if logged:
         unit = UnitGuess(logged)
     elif one.clock is None:

@@ -19,6 +19,7 @@ from slipid.app.new.file_channels import (
 )
 from slipid.app.new.file_study import FileStudy, RunStudy, file_with_pose, study_file
 from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, ask
+from slipid.data.reading.layout import GROUPS
 from slipid.data.reading.table_format import format_of
 from slipid.data.reading.units import factor
 from slipid.data.wheel_signals import body_steps
@@ -86,8 +87,8 @@ def drives_sideways(files: tuple[FileStudy, ...]) -> bool | None:
     turned = None if posed is None else posed.find("pose_heading")
     if posed is None or turned is None or not turned.unit:
         return None
-    heading = turned.values[:, 0] * factor(turned.unit, "rad")
-    pose = np.stack([posed.column("pose_x"), posed.column("pose_y"), heading], axis=1)
+    pose = np.stack([posed.channel(name).values[:, 0] for name in GROUPS["pose"]], axis=1)
+    pose[:, 2] *= factor(turned.unit, "rad")
     ahead, left, _ = np.abs(body_steps(pose[~np.isnan(pose).any(axis=1)])).sum(axis=0).tolist()
     return left > _SIDEWAYS * (ahead + left) if ahead + left > 0 else None
 

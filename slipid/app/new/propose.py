@@ -18,7 +18,7 @@ from slipid.app.new.robot_questions import RobotAnswers, RobotOptions, robot_of
 from slipid.data.check.columns import refuse_misordered
 from slipid.data.log import Log
 from slipid.data.reading.bag.runs import PAUSE_S, runs_between_pauses
-from slipid.data.reading.layout import Layout
+from slipid.data.reading.layout import TURNS, Layout
 from slipid.data.reading.motor_layout import motor_layout
 from slipid.data.reading.presets import PRESETS
 from slipid.data.reading.reader import read_logs
@@ -87,8 +87,7 @@ def _refuse_bench(path: Path, found: SortedFiles, wheels: int, files: Sequence[F
 
 
 def _wheels_of(layout: Layout) -> int:
-    turns = ("wheel_ticks", "motor_speed", "wheel_speed")
-    return max((len(layout.channels[c].columns) for c in turns if c in layout.channels), default=0)
+    return max((len(layout.channels[c].columns) for c in TURNS if c in layout.channels), default=0)
 
 
 def _with_preset_gear(robot: RobotAnswers, found: SortedFiles) -> RobotAnswers:

@@ -63,10 +63,6 @@ class Grid:
         """Return x and y [m] of cell corners; 0, 0 is the lowest corner of the first cell."""
         return np.array([self.low_x, self.low_y]) + corners * self.cell
 
-    def inside(self, polygon: Float[np.ndarray, "corner 2"]) -> Mask:
-        """Return the cells whose middle lies in a polygon with these corners [m]."""
-        return filled(self.steps(polygon), self.rows, self.columns)
-
 
 @dataclass(frozen=True, eq=False)
 class Rectified:

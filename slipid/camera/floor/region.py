@@ -181,7 +181,8 @@ class FloorPicture:
     def cells(self, floor: Rectified, polygon: Polygon) -> Mask:
         """Return the cells of the floor in a polygon."""
         if polygon.at_m is not None:
-            return floor.grid.inside(np.array(polygon.at_m))
+            corners = floor.grid.steps(np.array(polygon.at_m))
+            return filled(corners, floor.grid.rows, floor.grid.columns)
         width, height = size_of(self.picture)
         return floor.of_picture(filled(np.array(polygon.at_px), height, width))
 

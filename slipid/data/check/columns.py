@@ -9,10 +9,10 @@ the currents, voltages and power that are plausible for a robot.
 """
 
 from collections.abc import Iterator, Sequence
-from itertools import permutations
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.optimize import linear_sum_assignment
 
 from slipid.data.check.findings import Finding
 from slipid.data.check.interpretation import Interpretation, columns
@@ -21,16 +21,16 @@ from slipid.data.log import Log
 from slipid.data.wheel_signals import integral, interpolate, swapped_order
 from slipid.support.errors import DataError
 
-SUPERSEDING_KINDS = ("wheel_sign", "wheel_order", "command_sign", "command_order")
+MADE_REDUNDANT_BY = ("wheel_sign", "wheel_order", "command_sign", "command_order")
 """Kinds of findings from poses that make a `wheel_columns` finding redundant."""
-CONSEQUENTIAL_KINDS = ("wheel_scale", "wheel_speed_unit")
+CAUSED_BY_ORDER = ("wheel_scale", "wheel_speed_unit")
 """Kinds of findings that may only be consequences of a wrong order of columns. They are left out if
 there is a `wheel_columns` finding; once its remedy is applied, the next check reports them if they
 are real."""
 STEP_S = 0.5
 """Duration of the steps in which channels are compared with encoders [s]; delays and jitter are
 small compared with it."""
-CHANNELS = ("wheel_speed_command", "wheel_speed")
+SPEED_CHANNELS = ("wheel_speed_command", "wheel_speed")
 """Channels whose order of columns is compared with the encoders'."""
 LONGEST_LAG_S = 1.0
 """Largest searched lag of either sign between command and measured speed [s]."""
@@ -40,7 +40,7 @@ MOST_ROWS = 20_000
 """Largest number of rows in which command and measured speed are compared."""
 LEAST_CORRELATION = 0.3
 """Least correlation of command and measured speed, at the best lag, for a finding [1]."""
-LEAST_CHANGE_RATIO = 1.5
+CHANGE_RATIO = 1.5
 """Least ratio, for a finding, of the number of rows in which the declared command changes to that
 in which the declared measured speed changes [1]."""
 
@@ -79,7 +79,7 @@ def _orders(log: Log) -> Iterator[tuple[str, tuple[int, ...]]]:
     """Yield each channel of a run that fits the encoders only in another order, with that order."""
     edges = np.linspace(log.time[0], log.time[-1], max(2, int(log.duration / STEP_S) + 1))
     measured: Float[np.ndarray, "step wheel"] | None = None
-    for name in CHANNELS:
+    for name in SPEED_CHANNELS:
         rate = getattr(log, name)
         if rate is None:
             continue
@@ -92,13 +92,14 @@ def _orders(log: Log) -> Iterator[tuple[str, tuple[int, ...]]]:
 
 def exchanged(data: JoinedRuns) -> Iterator[Finding]:
     """Yield the finding that commanded and measured wheel speeds are exchanged, if they are."""
-    if data.commanded is None or data.reported is None:
+    if not {"wheel_speed_command", "wheel_speed"} <= set(data.channels):
         return
     row = float(np.median(data.row))
     when = np.arange(data.begin[0], data.end[-1], row)[:MOST_ROWS]
     inside = when + row <= data.end[data.runs_of(when).clip(0)]
     command, speed = (
-        _changes(channel, when, row, inside) for channel in (data.commanded, data.reported)
+        _changes(data.channels[name], when, row, inside)
+        for name in ("wheel_speed_command", "wheel_speed")
     )
     if not (command**2).sum() > 0 or not (speed**2).sum() > 0:
         return
@@ -110,7 +111,7 @@ def exchanged(data: JoinedRuns) -> Iterator[Finding]:
     if (
         correlation[best] > LEAST_CORRELATION
         and shifts[best] < 0
-        and busy[0] > LEAST_CHANGE_RATIO * busy[1]
+        and busy[0] > CHANGE_RATIO * busy[1]
     ):
         yield Finding(
             "command_exchanged",
@@ -152,14 +153,12 @@ def _correlation(command: np.ndarray, speed: np.ndarray, shift: int) -> float:
     return float((first * second).sum() / size) if size > 0 else 0.0
 
 
-REVERSED_SHARE = -0.25
+SHARE_IF_REVERSED = -0.25
 """Share of work (see `_share`) below which the sign of a current or voltage is wrong [1]."""
-REORDERED_SHARE = 0.4
+SHARE_IF_ORDERED = 0.4
 """Another order of the columns is a finding if every wheel's share of work exceeds this, and their
 sum exceeds that of the declared order with the best signs by as much [1]."""
-MOST_REORDERED = 6
-"""Largest number of wheels for which every order is tried."""
-POWER_SIGN_SHARE = 0.1
+SHARE_OF_POWER = 0.1
 """A current has the sign of the power, not of the torque, if its share of work is above this while
 wheels turn forwards and below its negative while they turn backwards [1]."""
 MOST_A_PER_KG = 2.5
@@ -173,7 +172,7 @@ LEAST_A = 0.005
 """Current of a driving motor below which its unit must be wrong [A]."""
 MOST_V, LEAST_V = 200.0, 0.2
 """Largest and smallest plausible voltages of the motors of such robots [V]."""
-POWER = (0.003, 60.0)
+PLAUSIBLE_POWER = (0.003, 60.0)
 """Plausible range of the electrical power over weight times speed, P / (m g v) [1], for robots on
 any slope and surface."""
 GRAVITY = 9.81
@@ -195,13 +194,13 @@ def electric(
     declared = _speeds(data)
     speed = declared @ columns(meant, data.wheels).T
     driving = np.abs(speed).max(axis=1, initial=0.0) > 0.2 * np.nanquantile(np.abs(speed), 0.95)
-    for channel, name in ((data.current, "current"), (data.voltage, "voltage")):
-        if channel is None or (name == "current" and not data.current_is_signed):
-            continue
-        yield from _sign_findings(channel.value[driving], speed[driving], declared[driving], name)
-    current = None if data.current is None else np.abs(data.current.value[driving])
-    volts = data.bus if data.voltage is None else data.voltage
-    voltage = None if volts is None else np.abs(volts.value[driving])
+    for name in ("current", "voltage") if data.current_is_signed else ("voltage",):
+        if name in data.channels:
+            values = data.channels[name].value[driving]
+            yield from _sign_findings(values, speed[driving], declared[driving], name)
+    magnitude = {name: np.abs(c.value[driving]) for name, c in data.channels.items()}
+    current = magnitude.get("current")
+    voltage = magnitude.get("voltage", magnitude.get("bus_voltage"))
     power = None
     if by_power and current is not None and voltage is not None and mass_kg is not None:
         watts = float(np.nanmean((current * voltage).sum(axis=1)))
@@ -212,7 +211,7 @@ def electric(
         *_size(voltage, "voltage", "V", LEAST_V, MOST_V, "voltage or bus_voltage"),
         *_size(current, "current", "A", LEAST_A, most, "current"),
     ]
-    if not sizes and power is not None and not POWER[0] <= power <= POWER[1]:
+    if not sizes and power is not None and not PLAUSIBLE_POWER[0] <= power <= PLAUSIBLE_POWER[1]:
         yield Finding(
             "current_unit",
             f"the motors take {power:.3g} times the power of lifting the robot at its speed",
@@ -249,23 +248,18 @@ def _sign_findings(
     """
     work = np.nan_to_num(values * speed)
     forwards, backwards = (_share(work[turns]) for turns in (speed > 0, speed < 0))
-    if name == "current" and forwards > POWER_SIGN_SHARE and backwards < -POWER_SIGN_SHARE:
+    if name == "current" and forwards > SHARE_OF_POWER and backwards < -SHARE_OF_POWER:
         both = "currents are positive in both directions of the wheels"
         if np.nanmin(values) < 0.0:
-            yield Finding(
-                "current_of_supply",
+            found = (
                 f"{both}, and sometimes negative: they are supply currents, which have the sign "
-                "of the power, not of the torque",
-                "remove the current from the layout, or log the current of each motor",
-                "note",
+                "of the power, not of the torque"
             )
+            remedy = "remove the current from the layout, or log the current of each motor"
         else:
-            yield Finding(
-                "current_of_supply",
-                f"{both}: they are magnitudes, which do not distinguish driving from braking",
-                "set current_is_signed = false in the layout",
-                "note",
-            )
+            found = f"{both}: they are magnitudes, which do not distinguish driving from braking"
+            remedy = "set current_is_signed = false in the layout"
+        yield Finding("current_of_supply", found, remedy, "note")
         return
     if order := _other_order(values, speed, declared):
         listed = ", ".join(str(k + 1) for k in order)
@@ -276,8 +270,8 @@ def _sign_findings(
             f"name the columns of the channel {name} in the order {listed}",
         )
         return
-    share = np.array([_share(column) for column in work.T])
-    turned = np.flatnonzero(share < REVERSED_SHARE)
+    share = _share(work)
+    turned = np.flatnonzero(share < SHARE_IF_REVERSED)
     if not len(turned):
         return
     every = len(turned) == len(share)
@@ -301,34 +295,23 @@ def _other_order(
     If the columns match the declared order of the encoders, there is no finding here: if that order
     is wrong, the finding is about the encoders.
     """
-    wheels = range(speed.shape[1])
-    if len(wheels) > MOST_REORDERED:
-        return None
-    share, as_declared = (_shares(values, one) for one in (speed, declared))
-    best = max(permutations(wheels), key=lambda order: float(share[list(order), wheels].sum()))
-    ordered = share[list(best), wheels]
-    signs = max(float(np.abs(np.diagonal(one)).sum()) for one in (share, as_declared))
-    return (
-        best
-        if ordered.min() > REORDERED_SHARE and ordered.sum() > signs + REORDERED_SHARE
-        else None
+    share, as_declared = (
+        _share(np.nan_to_num(values[:, None] * one[:, :, None])) for one in (speed, declared)
     )
+    wheels, best = linear_sum_assignment(share, maximize=True)
+    ordered = share[wheels, best]
+    signs = max(float(np.abs(np.diagonal(one)).sum()) for one in (share, as_declared))
+    found = ordered.min() > SHARE_IF_ORDERED and ordered.sum() > signs + SHARE_IF_ORDERED
+    return tuple(best.tolist()) if found else None
 
 
-def _shares(
-    values: Float[np.ndarray, "row wheel"], speed: Float[np.ndarray, "row wheel"]
-) -> Float[np.ndarray, "wheel wheel"]:
-    """Return the share of work of every column (rows) with every wheel's speed (columns)."""
-    return np.array([[_share(np.nan_to_num(v * w)) for w in speed.T] for v in values.T])
-
-
-def _share(work: np.ndarray) -> float:
-    """Return the share of work: the sum of all values over the sum of their magnitudes [1].
+def _share(work: Float[np.ndarray, "step *any"]) -> Float[np.ndarray, "*any"]:
+    """Return the share of work: the sum over steps over the sum of magnitudes [1].
 
     It is 1 if all values are positive, -1 if all are negative, and 0 if all are zero.
     """
-    total = float(np.abs(work).sum())
-    return float(work.sum()) / total if total > 0 else 0.0
+    total = np.abs(work).sum(axis=0)
+    return np.asarray(work.sum(axis=0) / np.where(total > 0, total, 1.0))
 
 
 def _size(

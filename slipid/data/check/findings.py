@@ -4,19 +4,19 @@ A finding describes what is wrong or could not be checked, and which key of the 
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from math import isclose, pi
 from typing import Literal
 
 from slipid.data.check.joined import PoseConvention
 from slipid.data.check.mistakes import Candidate, Mistake
-from slipid.data.check.ratios import ScaleCause, ScaleRatios
+from slipid.data.check.ratios import QUANTITIES, ScaleCause, ScaleRatio
 from slipid.support.content import Content
 
 Severity = Literal["wrong", "suspicious", "note"]
 """Severity of a finding: `wrong` must be corrected before a fit, `suspicious` may be correct but
 should be examined, `note` reports what could not be checked."""
-ORDER: tuple[Severity, ...] = ("wrong", "suspicious", "note")
+SEVERITIES: tuple[Severity, ...] = ("wrong", "suspicious", "note")
 MOST_NAMED_RUNS = 4
 """Largest number of runs that a sentence names; the others are only counted."""
 
@@ -56,13 +56,7 @@ class Finding:
 
     def to_json(self) -> Content:
         """Return the finding as an object of check.json."""
-        return {
-            "kind": self.kind,
-            "severity": self.severity,
-            "found": self.found,
-            "remedy": self.remedy,
-            "runs": list(self.runs),
-        }
+        return asdict(self) | {"runs": list(self.runs)}
 
 
 def listed(names: Sequence[str]) -> str:
@@ -73,7 +67,7 @@ def listed(names: Sequence[str]) -> str:
 
 def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return the findings in order of severity, those that forbid a fit first."""
-    return tuple(sorted(findings, key=lambda f: ORDER.index(f.severity)))
+    return tuple(sorted(findings, key=lambda f: SEVERITIES.index(f.severity)))
 
 
 def wrong(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -88,24 +82,6 @@ _CONVENTION_SENTENCES = {
     "pose_mirrored": "the poses are mirrored, as if seen from below or with y pointing down",
     "heading_quaternion": "the heading is the z of a quaternion, sin(yaw / 2), not an angle",
 }
-_CAUSES = {
-    "time": ("time_unit", "time"),
-    "pose_length": ("pose_length", "the scale of the poses"),
-    "heading": ("heading_unit", "the heading"),
-    "wheel_gear": ("wheel_scale", "the angle of the wheels"),
-    "wheel_turns": ("wheel_scale", "the angle of the wheels"),
-    "wheel_radius": ("wheel_scale", "wheel_radius_m"),
-    "base": ("base_radius", "the distance of the wheels from the centre"),
-    "gyro": ("gyro_unit", "the channel gyro"),
-    "report": ("wheel_speed_unit", "the channel wheel_speed (or motor_speed)"),
-    "command_wheels": (
-        "command_unit",
-        "the channel wheel_speed_command (or motor_speed_command)",
-    ),
-    "command_twist": ("command_unit", "the channel twist_command_x and twist_command_y"),
-    "command_yaw": ("command_unit", "the channel twist_command_yaw"),
-}
-"""Kind of finding, and name of the scaled quantity in its text, for the name of each cause."""
 
 
 def mistake_finding(mistake: Mistake) -> Finding:
@@ -202,9 +178,9 @@ def _convention_finding(kind: str, convention: PoseConvention) -> Finding:
 
 
 def cause_findings(
-    fitting: Sequence[ScaleCause], single: bool, why: str, gear_ratio: float
+    fitting: Sequence[ScaleCause], single: bool, scales: Mapping[str, ScaleRatio], gear_ratio: float
 ) -> tuple[Finding, ...]:
-    """Return findings about wrong factors.
+    """Return findings about wrong factors, from ratios outside their ranges.
 
     If causes fit alone, the likeliest one is the finding and others are alternatives in its text;
     if two causes fit only together, both are findings.
@@ -212,11 +188,18 @@ def cause_findings(
     Args:
         fitting: causes that fit, the likeliest first.
         single: True if each of these causes fits alone.
-        why: sentence about the ratios that are outside their ranges.
+        scales: ratios by name.
         gear_ratio: gear ratio of the declared robot.
     """
+    why = ratio_sentence(scales)
     if not fitting:
-        return ()
+        found = Finding(
+            "scales",
+            "the channels disagree about the motion, and no single wrong number explains it: "
+            f"{why}",
+            "check the units of all channels, gear_ratio, wheel_radius_m and base_radius_m",
+        )
+        return (found,) if why else ()
     if not single:
         return tuple(_factor_finding(one, gear_ratio).explained(why) for one in fitting)
     first, *others = (_factor_finding(one, gear_ratio) for one in fitting)
@@ -228,7 +211,7 @@ def cause_findings(
     return (first.explained(why, likely[:2]),)
 
 
-def ratio_sentence(scales: ScaleRatios) -> str:
+def ratio_sentence(known: Mapping[str, ScaleRatio]) -> str:
     """Return a sentence with the value of every ratio that is outside its range."""
     sentences = {
         "travel": "the body's path length is {:.3g} times that of the wheels",
@@ -239,13 +222,12 @@ def ratio_sentence(scales: ScaleRatios) -> str:
         "report": "the reported wheel speeds are {:.3g} times those of the encoders",
         "gyro": "the rotation measured by the gyro is {:.3g} times that of the poses",
     }
-    unnatural = {k: r.value for k, r in scales.known.items() if not r.natural}
-    return ", ".join(sentences[k].format(value) for k, value in unnatural.items())
+    return ", ".join(sentences[k].format(r.value) for k, r in known.items() if not r.natural)
 
 
 def _factor_finding(cause: ScaleCause, gear_ratio: float) -> Finding:
     """Return the finding about a quantity that is too large or too small by a factor."""
-    factor, (kind, channel) = cause.factor, _CAUSES[cause.name]
+    factor, (kind, channel, *_) = cause.factor, QUANTITIES[cause.name]
     ratio = f"{max(factor, 1 / factor):.3g}"
     size = f"{ratio} times too {'large' if factor > 1 else 'small'}"
     found = f"{channel} is {size}"

@@ -29,7 +29,7 @@ from slipid.data.check.joined import (
 )
 from slipid.model.geometry import Geometry
 
-LEAST_MOTION_SHARE = 1e-3
+LEAST_MOTION = 1e-3
 """Share of the predicted motion below which an axis is not compared [1]."""
 
 
@@ -75,11 +75,14 @@ class Commanded:
     def product(self, meant: Interpretation) -> float:
         """Return the sum of measured times commanded turns under an interpretation [rad^2]."""
         wheels = len(self.across)
-        turned, command = (
-            columns(meant, wheels),
-            Interpretation(meant.command_order, meant.command_sign),
-        )
-        return float(np.trace(turned @ self.across @ columns(command, wheels).T))
+        command = Interpretation(meant.command_order, meant.command_sign)
+        turned = columns(meant, wheels) @ self.across @ columns(command, wheels).T
+        return float(np.trace(turned))
+
+    def unexplained(self, meant: Interpretation) -> float:
+        """Return the share of the turns that commanded turns, times one factor, do not explain."""
+        squares = max(self.turns * self.commanded, 1e-300)
+        return 1.0 - max(self.product(meant), 0.0) ** 2 / squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,11 +159,6 @@ def _commanded(moved: ChannelIncrements) -> Commanded | None:
     return Commanded(turns.T @ commanded, float((turns**2).sum()), float((commanded**2).sum()))
 
 
-def misfit(evidence: Evidence, meant: Interpretation) -> float:
-    """Return the sum of the unexplained shares of an interpretation."""
-    return sum(misfits(evidence, meant).values())
-
-
 def misfits(evidence: Evidence, meant: Interpretation) -> dict[str, float]:
     """Return the unexplained share of each compared channel by its name."""
     convention = meant.convention
@@ -176,7 +174,7 @@ def misfits(evidence: Evidence, meant: Interpretation) -> dict[str, float]:
         signs = np.diag(np.array(meant.twist_sign, float))
         out["twist"] = _unexplained(evidence.twist, predict, signs, evidence.free)
     if evidence.command is not None:
-        out["command"] = _uncommanded(evidence.command, meant)
+        out["command"] = evidence.command.unexplained(meant)
     if evidence.gyro is not None:
         out["gyro"] = 0.5 * (1.0 - meant.gyro_sign * evidence.gyro.get(bare, -1.0))
     return out
@@ -224,7 +222,7 @@ def _unexplained(
     total = predicted.sum()
     if not total > 0 or not measured.sum() > 0:
         return 1.0
-    moves = predicted > LEAST_MOTION_SHARE * total
+    moves = predicted > LEAST_MOTION * total
     explained = np.where(moves, both.clip(0) ** 2 / np.where(moves, predicted, 1.0), 0.0)
     if (
         not free and moves[:2].any()
@@ -245,10 +243,3 @@ def _beyond_rigid(
     turns = wheels @ sums.turns @ wheels.T
     total = float(np.trace(turns))
     return 1.0 - float(np.trace(basis.T @ turns @ basis)) / total if total > 0 else 0.0
-
-
-def _uncommanded(commanded: Commanded, meant: Interpretation) -> float:
-    """Return the share of the rotation not explained by a multiple of the commanded rotation."""
-    return 1.0 - max(commanded.product(meant), 0.0) ** 2 / max(
-        commanded.turns * commanded.commanded, 1e-300
-    )

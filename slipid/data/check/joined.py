@@ -12,18 +12,22 @@ It works for any interpretation, since the fitted matrix K absorbs order, signs,
 and heading offset.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import body_increments, integral, interpolate
 
 STEP_S = 0.4
 """Duration of a step [s]: long enough that jitter and rounding matter little, and short compared
 with the time of a turn."""
+INTEGRATED = ("wheel_speed", "wheel_speed_command", "twist_command", "gyro")
+"""Channels of rates, which are compared by their integrals."""
 MOST_STEPS = 20_000
 """Largest number of steps; if there were more, for example with time in a wrong unit, steps are
 made longer."""
@@ -57,13 +61,8 @@ class JoinedRuns:
         row: median time between rows of each run (run,) [s].
         angle: angle of each wheel [rad].
         pose: x [m], y [m], heading [rad], only rows with a new pose.
-        reported: integral of the reported wheel speeds [rad], or None.
-        commanded: integral of the commanded wheel speeds [rad], or None.
-        twist: integral of the commanded twist in the body's axes [m, m, rad], or None.
-        gyro: integral of the yaw rate [rad], or None.
-        current: current of each motor [A], or None.
-        voltage: voltage of each motor [V], or None.
-        bus: voltage of the battery [V], or None.
+        channels: channels that some run has, by the name that `Log` has for them; of the rates
+            in `INTEGRATED` their integrals [rad, m], of currents [A] and voltages [V] the values.
         current_is_signed: False if some run has only magnitudes of currents.
     """
 
@@ -73,13 +72,7 @@ class JoinedRuns:
     row: Float[np.ndarray, " run"]
     angle: JoinedChannel
     pose: JoinedChannel
-    reported: JoinedChannel | None
-    commanded: JoinedChannel | None
-    twist: JoinedChannel | None
-    gyro: JoinedChannel | None
-    current: JoinedChannel | None
-    voltage: JoinedChannel | None
-    bus: JoinedChannel | None
+    channels: Mapping[str, JoinedChannel]
     current_is_signed: bool
 
     @property
@@ -139,21 +132,13 @@ def joined(data: Runs) -> JoinedRuns:
     fresh = data.fresh.copy()
     fresh[data.offset[:-1]] = fresh[data.offset[1:] - 1] = True
 
-    def channel(name: str, summed: bool = True) -> JoinedChannel | None:
-        """Return a channel, or its integral; nan in runs without it, None if no run has it."""
-        logged = [getattr(log, name) for log in data.logs]
-        columns = [values.size // len(values) for values in logged if values is not None]
-        if not columns:
-            return None
-        parts = []
-        for log, values in zip(data.logs, logged, strict=True):
-            if values is None:
-                parts.append(np.full((log.samples, columns[0]), np.nan))
-                continue
-            part = values.reshape(log.samples, -1)
-            parts.append(integral(log.time, part) if summed else part)
-        return JoinedChannel(time, np.concatenate(parts))
-
+    channels = {}
+    for name in (*INTEGRATED, "current", "voltage", "bus_voltage"):
+        logged = [values for log in data.logs if (values := getattr(log, name)) is not None]
+        if logged:
+            columns = logged[0].size // len(logged[0])
+            parts = [_rows(log, name, columns) for log in data.logs]
+            channels[name] = JoinedChannel(time, np.concatenate(parts))
     return JoinedRuns(
         names=tuple(log.name for log in data.logs),
         begin=starts,
@@ -161,15 +146,18 @@ def joined(data: Runs) -> JoinedRuns:
         row=np.array([float(np.median(np.diff(log.time))) for log in data.logs]),
         angle=JoinedChannel(time, data.wheel_angle),
         pose=JoinedChannel(time[fresh], data.pose[fresh]),
-        reported=channel("wheel_speed"),
-        commanded=channel("wheel_speed_command"),
-        twist=channel("twist_command"),
-        gyro=channel("gyro"),
-        current=channel("current", summed=False),
-        voltage=channel("voltage", summed=False),
-        bus=channel("bus_voltage", summed=False),
+        channels=channels,
         current_is_signed=data.current_is_signed,
     )
+
+
+def _rows(log: Log, name: str, columns: int) -> Float[np.ndarray, "row column"]:
+    """Return a channel of a run, or its integral; nan if the run does not have it."""
+    values = getattr(log, name)
+    if values is None:
+        return np.full((log.samples, columns), np.nan)
+    rows = values.reshape(log.samples, columns)
+    return integral(log.time, rows) if name in INTEGRATED else np.asarray(rows)
 
 
 def edges(data: JoinedRuns) -> StepEdges:
@@ -202,7 +190,7 @@ def increments(data: JoinedRuns, at: StepEdges, lag: float) -> ChannelIncrements
         change[outside] = np.nan
         return change
 
-    optional = (data.commanded, data.twist, data.gyro)
+    optional = map(data.channels.get, ("wheel_speed_command", "twist_command", "gyro"))
     return ChannelIncrements(
         moved(data.angle), *(None if channel is None else moved(channel) for channel in optional)
     )
@@ -265,21 +253,16 @@ def body_motion(at: StepEdges, convention: PoseConvention) -> Float[np.ndarray, 
 
 def _heading(logged: Float[np.ndarray, " step"], meaning: Heading) -> Float[np.ndarray, " step"]:
     """Return the true heading [rad] for logged values with a given meaning."""
-    if meaning == "turned_round":
-        return -logged
-    if meaning == "degrees":
-        return np.radians(logged)
-    if meaning == "radians":
-        return np.degrees(logged)
     if meaning == "half_sine":
         # A value above 1 in magnitude, but for rounding, cannot be a sine.
         return 2 * np.arcsin(np.where(np.abs(logged) <= 1.0 + 1e-3, logged.clip(-1, 1), np.nan))
-    return logged
+    factor = {"turned_round": -1.0, "degrees": np.pi / 180, "radians": 180 / np.pi}
+    return factor.get(meaning, 1.0) * logged
 
 
-ROUNDS = 8
+REWEIGHTINGS = 8
 """Number of iterations of the reweighted regression."""
-RIDGE = 1e-4
+RELATIVE_RIDGE = 1e-4
 """Ridge of the regression, relative to the mean squared turn [1]; it is needed because the wheels
 on one side of a robot may turn by equal angles."""
 
@@ -331,7 +314,7 @@ def products(
     turns: Float[np.ndarray, "step wheel"],
     body: Float[np.ndarray, "step 3"],
     base: float,
-    rounds: int = ROUNDS,
+    rounds: int = REWEIGHTINGS,
 ) -> Products | None:
     """Return the weighted sums of products over the known steps.
 
@@ -360,5 +343,5 @@ def _linear(turns: np.ndarray, body: np.ndarray, weight: np.ndarray) -> np.ndarr
     """Return the matrix (wheel, 3) from turns to body increments, by weighted ridge regression."""
     weighted = turns * weight[:, None]
     gram = weighted.T @ turns
-    ridge = RIDGE * np.trace(gram) / len(gram) + 1e-300
+    ridge = RELATIVE_RIDGE * np.trace(gram) / len(gram) + 1e-300
     return np.asarray(np.linalg.solve(gram + ridge * np.eye(len(gram)), weighted.T @ body))

@@ -9,15 +9,15 @@ from itertools import combinations, permutations, product
 
 import numpy as np
 
-from slipid.data.check.interpretation import Evidence, Interpretation, misfit, misfits
+from slipid.data.check.interpretation import Evidence, Interpretation, misfits
 from slipid.data.check.joined import PoseConvention
 
 MOST_MISTAKES = 3
 """Largest number of mistakes, which are found one after another."""
-LEAST_GAIN = 0.05
-"""A correction must reduce the misfit by at least `LEAST_GAIN` plus `LEAST_GAIN_RATIO` times the
-remaining misfit [1]."""
-LEAST_GAIN_RATIO = 0.3
+LEAST_REDUCTION = 0.05
+"""Constant part of the least reduction of the misfit for which a mistake is accepted,
+`LEAST_REDUCTION` plus `REDUCTION_SHARE` times the remaining misfit [1]."""
+REDUCTION_SHARE = 0.3
 """See `LEAST_GAIN` [1]; real logs without a mistake stay far below this reduction."""
 MOST_UNEXPLAINED = 0.4
 """Largest share of the poses' motion that an accepted pose convention leaves unexplained [1]."""
@@ -76,20 +76,19 @@ def mistakes(evidence: Evidence) -> tuple[Interpretation, tuple[Mistake, ...]]:
 
 def _next_mistake(evidence: Evidence, current: Interpretation) -> Mistake | None:
     """Return the simplest mistake that explains the logs decisively better, or None."""
-    before = misfit(evidence, current)
-    tried = [(misfit(evidence, c.meant), c) for c in candidates(evidence, current)]
+    before = sum(misfits(evidence, current).values())
     # Another convention of the poses is accepted only if the poses then follow the wheels.
     tried = [
-        (left, c)
-        for left, c in tried
-        if c.meant.convention == current.convention
-        or misfits(evidence, c.meant)["pose"] < MOST_UNEXPLAINED
+        (sum(left.values()), c)
+        for c in candidates(evidence, current)
+        for left in [misfits(evidence, c.meant)]
+        if c.meant.convention == current.convention or left["pose"] < MOST_UNEXPLAINED
     ]
-    after, best = min(tried, key=lambda pair: pair[0] + pair[1].cost)
-    if before - after < LEAST_GAIN + LEAST_GAIN_RATIO * after:
+    (after, best), *rest = sorted(tried, key=lambda pair: pair[0] + pair[1].cost)
+    if before - after < LEAST_REDUCTION + REDUCTION_SHARE * after:
         return None
     alternatives: dict[str, Candidate] = {}
-    for left, other in sorted(tried, key=lambda pair: pair[0] + pair[1].cost):
+    for left, other in rest:
         if other.kind != best.kind and left < after + ALTERNATIVE_MARGIN:
             alternatives.setdefault(other.kind, other)
     return Mistake(best, before, after, tuple(alternatives.values()))
@@ -124,27 +123,24 @@ def candidates(evidence: Evidence, current: Interpretation) -> Iterator[Candidat
 
 def _conventions(current: Interpretation) -> Iterator[Candidate]:
     """Yield candidates with other conventions of the poses."""
-    found: list[tuple[str, float, PoseConvention]] = []
+
+    def other(kind: str, cost: float, convention: PoseConvention) -> Candidate:
+        return Candidate(kind, replace(current, convention=convention), cost)
+
     for quarter in (0, 90, 180, -90):
         more = 0.0 if quarter == 0 else 0.02
-        found += [
-            ("heading_sign", more, PoseConvention("turned_round", False, quarter)),
-            ("pose_mirrored", more, PoseConvention("turned_round", True, quarter)),
-        ]
+        yield other("heading_sign", more, PoseConvention("turned_round", False, quarter))
+        yield other("pose_mirrored", more, PoseConvention("turned_round", True, quarter))
         kind = "pose_swapped" if abs(quarter) == 90 else "pose_axis"
         cost = 0.005 if quarter == 180 else 0.0
-        found.append((kind, cost, PoseConvention("as_logged", True, quarter)))
-    found += [
-        ("heading_unit", 0.0, PoseConvention("degrees")),
-        ("heading_unit", 0.0, PoseConvention("radians")),
-        ("heading_quaternion", 0.005, PoseConvention("half_sine")),
-    ]
+        yield other(kind, cost, PoseConvention("as_logged", True, quarter))
+    yield other("heading_unit", 0.0, PoseConvention("degrees"))
+    yield other("heading_unit", 0.0, PoseConvention("radians"))
+    yield other("heading_quaternion", 0.005, PoseConvention("half_sine"))
     for offset in range(-180 + GRID_DEG, 181, GRID_DEG):
         if offset:
             cost = 0.01 if offset % 90 == 0 else 0.02
-            found.append(("heading_offset", cost, PoseConvention(offset=offset)))
-    for kind, cost, convention in found:
-        yield Candidate(kind, replace(current, convention=convention), cost)
+            yield other("heading_offset", cost, PoseConvention(offset=offset))
 
 
 def _signs(wheels: int, rolling: np.ndarray) -> Iterator[tuple[tuple[int, ...], float]]:

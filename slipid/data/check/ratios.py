@@ -18,9 +18,10 @@ high_i for every i:
 error, such as 1000, 2 pi, 57.3 or the gear ratio, are preferred.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import exp, inf, log, pi
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -36,11 +37,11 @@ from slipid.data.check.joined import (
     usable,
 )
 
-LEAST_ROTATION = 0.01
+LEAST_TURNING = 0.01
 """Least share of rotation in the predicted motion for which rotations are compared [1]."""
 LEAST_TRANSLATION = 0.02
 """Least share of translation in the predicted motion for which translations are compared [1]."""
-SAME_DATA_TOLERANCE = 1e-6
+SAME_DATA = 1e-6
 """Relative difference between the wheels' angle and their integrated speed below which the angle
 was computed from the speed [1]."""
 
@@ -80,70 +81,57 @@ class ScaleRatio:
         return self.low <= self.value <= self.high
 
 
-@dataclass(frozen=True)
-class ScaleRatios:
-    """Ratios between the channels of a set of runs.
-
-    Attributes:
-        known: the ratios that can be computed, by name.
-        speed_is_angle: True if the wheel angles are integrals of the reported speeds, so that the
-            ratio `report` has no meaning.
-    """
-
-    known: Mapping[str, ScaleRatio]
-    speed_is_angle: bool
-
-
 def ratios(
     data: JoinedRuns,
     at: StepEdges,
     moved: ChannelIncrements,
     evidence: Evidence,
     meant: Interpretation,
-) -> ScaleRatios:
-    """Return the ratios under an interpretation whose order, signs and axes are right."""
+) -> tuple[dict[str, ScaleRatio], bool]:
+    """Return the ratios under an interpretation whose order, signs and axes are right.
+
+    Ratios that cannot be computed are left out. The second result is whether the wheels' angle is
+    the integral of the reported speeds, so that the ratio `report` means nothing.
+    """
     values: dict[str, float | None] = {}
     predict = to_body(evidence, meant)
     pose = evidence.pose.get(meant.convention.bare)
     if pose is not None:
-        values["travel"], values["turning"] = _along(pose, predict, meant.convention.offset)
+        values["travel"], values["turning"] = _along(
+            pose, predict, rotation(-meant.convention.offset)
+        )
         values["gyro"] = _gyro(at, moved, pose, meant)
     if evidence.twist is not None:
-        signs = np.array(meant.twist_sign)
-        twist = evidence.twist
-        signed = replace(
-            twist, across=twist.across * signs, body=twist.body * np.outer(signs, signs)
-        )
-        values["drive"], values["steer"] = _along(signed, predict, 0)
+        signs = np.diag(np.array(meant.twist_sign, float))
+        values["drive"], values["steer"] = _along(evidence.twist, predict, signs)
     if evidence.command is not None:
         values["command"] = evidence.command.product(meant) / evidence.command.turns
     values["report"], same = _reported(data)
-    if same:
-        values["report"] = None
     wide = dict(_WIDE)
     if values.get("drive") is None and values.get("command") is None:
         wide["travel"] = _UNVOUCHED
     if not evidence.free:
         wide.update(_SCRUBBING)
     known = {k: ScaleRatio(v, *wide[k]) for k, v in values.items() if v is not None and v > 0}
-    return ScaleRatios(known, same)
+    return known, same
 
 
 def _along(
-    sums: Products, predict: Float[np.ndarray, "3 wheel"], offset: int
+    sums: Products, predict: Float[np.ndarray, "3 wheel"], axes: Float[np.ndarray, "3 3"]
 ) -> tuple[float | None, float | None]:
     """Return least-squares ratios of measured to predicted motion, for translation and rotation.
 
-    A ratio is None if there is too little motion to compute it.
+    A ratio is None if there is too little motion to compute it. The matrix `axes` takes the axes of
+    the measured body increments to the true ones.
     """
-    predicted, both = sums.predicted(predict), sums.matched(predict, rotation(-offset))
+    predicted, both = sums.predicted(predict), sums.matched(predict, axes)
     total = predicted.sum()
     if not total > 0:
         return None, None
     ahead, about = predicted[:2].sum(), predicted[2]
     along = float(both[:2].sum() / ahead) if ahead > LEAST_TRANSLATION * total else None
     # Small predicted rotations are hidden by rotations due to slip.
-    turns = about > LEAST_ROTATION * total and both[2] ** 2 > 0.25 * about * sums.body[2, 2]
+    turns = about > LEAST_TURNING * total and both[2] ** 2 > 0.25 * about * sums.body[2, 2]
     return along, float(both[2] / about) if turns else None
 
 
@@ -171,56 +159,104 @@ def _gyro(
 def _reported(data: JoinedRuns) -> tuple[float | None, bool]:
     """Return the ratio of reported to encoder wheel speeds, and whether they are the same data.
 
-    The ratio is None if no speeds were reported or no wheel turns.
+    The ratio is None if no speeds were reported, no wheel turns, or they are the same data.
     """
-    if data.reported is None:
+    if "wheel_speed" not in data.channels:
         return None, False
     edges = [data.begin, 0.5 * (data.begin + data.end), data.end]
     reported, turned = (
         np.concatenate([channel.at(edge) - channel.at(edges[0]) for edge in edges[1:]])
-        for channel in (data.reported, data.angle)
+        for channel in (data.channels["wheel_speed"], data.angle)
     )
     known = usable(reported, turned)
     reported, turned = reported[known], turned[known]
     total = float((turned**2).sum())
     if not total > 0:
         return None, False
-    same = float(((reported - turned) ** 2).sum()) < SAME_DATA_TOLERANCE**2 * total
-    ratio = float(np.abs(reported * turned).sum()) / total
-    return ratio, same
+    same = float(((reported - turned) ** 2).sum()) < SAME_DATA**2 * total
+    return None if same else float(np.abs(reported * turned).sum()) / total, same
 
 
-FACTOR_MARGIN = 0.02
+MARGIN = 0.02
 """Margin by which a common factor may lie outside the range of a fitting cause, in its logarithm
 [1]."""
 USUAL_ROW_S = (0.001, 1.5)
 """Range of the time between rows in which the unit of time is not suspected [s]."""
 
-_COMMON = {
-    "time": (1000.0, 1e6, 1e9, 60.0),
-    "wheel_gear": (2.0, 4.0, 2 * pi, 180 / pi, 1000.0),
-    "wheel_turns": (2.0, 4.0, 10.0, 2 * pi, 180 / pi, 1000.0),
-    "wheel_radius": (2.0, 10.0, 100.0, 1000.0, 25.4),
-    "pose_length": (1000.0, 100.0, 10.0, 25.4),
-    "heading": (180 / pi,),
-    "base": (2.0, 10.0, 100.0, 1000.0),
-    "command_twist": (1000.0, 100.0, 10.0),
-    "command_yaw": (180 / pi, 1000.0, 2 * pi),
-    "command_wheels": (30 / pi, 180 / pi, 2 * pi, 1000.0, 10.0),
-    "report": (30 / pi, 180 / pi, 2 * pi, 1000.0, 10.0),
-    "gyro": (180 / pi, 1000.0),
+
+class ScaledQuantity(NamedTuple):
+    """A quantity that may be wrong by a factor.
+
+    Attributes:
+        kind: kind of the finding about it.
+        text: name of the quantity in the text of the finding.
+        powers: power of the factor in every ratio that it changes, by the ratio's name; a factor
+            above 1 means that the values of the quantity's channels are too large.
+        common: factors that are common errors, such as ratios of units; so are their inverses.
+    """
+
+    kind: str
+    text: str
+    powers: Mapping[str, float]
+    common: tuple[float, ...]
+
+
+_ANGLE = "the angle of the wheels"
+_OF_WHEELS = {"travel": -1.0, "turning": -1.0, "drive": -1.0, "steer": -1.0}
+_OF_TURNS = _OF_WHEELS | {"command": -1.0, "report": -1.0}
+_OF_TIME = {"drive": 1.0, "steer": 1.0, "command": 1.0, "gyro": 1.0, "report": 1.0}
+_OF_BASE = {"turning": 1.0, "steer": 1.0}
+_RATES = (30 / pi, 180 / pi, 2 * pi, 1e3, 10.0)
+QUANTITIES: Mapping[str, ScaledQuantity] = {
+    "time": ScaledQuantity("time_unit", "time", _OF_TIME, (1e3, 1e6, 1e9, 60.0)),
+    "pose_length": ScaledQuantity(
+        "pose_length", "the scale of the poses", {"travel": 1.0}, (1e3, 1e2, 10.0, 25.4)
+    ),
+    "heading": ScaledQuantity(
+        "heading_unit", "the heading", {"turning": 1.0, "gyro": -1.0}, (180 / pi,)
+    ),
+    "wheel_gear": ScaledQuantity(
+        "wheel_scale", _ANGLE, _OF_WHEELS | {"command": -1.0}, (2.0, 4.0, 2 * pi, 180 / pi, 1e3)
+    ),
+    "wheel_turns": ScaledQuantity(
+        "wheel_scale", _ANGLE, _OF_TURNS, (2.0, 4.0, 10.0, 2 * pi, 180 / pi, 1e3)
+    ),
+    "wheel_radius": ScaledQuantity(
+        "wheel_scale", "wheel_radius_m", _OF_WHEELS, (2.0, 10.0, 1e2, 1e3, 25.4)
+    ),
+    "base": ScaledQuantity(
+        "base_radius", "the distance of the wheels from the centre", _OF_BASE, (2.0, 10.0, 1e2, 1e3)
+    ),
+    "gyro": ScaledQuantity("gyro_unit", "the channel gyro", {"gyro": 1.0}, (180 / pi, 1e3)),
+    "report": ScaledQuantity(
+        "wheel_speed_unit", "the channel wheel_speed (or motor_speed)", {"report": 1.0}, _RATES
+    ),
+    "command_wheels": ScaledQuantity(
+        "command_unit",
+        "the channel wheel_speed_command (or motor_speed_command)",
+        {"command": 1.0},
+        _RATES,
+    ),
+    "command_twist": ScaledQuantity(
+        "command_unit",
+        "the channel twist_command_x and twist_command_y",
+        {"drive": 1.0},
+        (1e3, 1e2, 10.0),
+    ),
+    "command_yaw": ScaledQuantity(
+        "command_unit", "the channel twist_command_yaw", {"steer": 1.0}, (180 / pi, 1e3, 2 * pi)
+    ),
 }
+"""Quantities by name, the likeliest to be wrong first."""
 _BY_GEAR = ("wheel_gear", "wheel_turns", "command_wheels", "report")
-_OF_RATES = (30 / pi, 180 / pi, 2 * pi, 1000.0, 60.0)
-"""Common factors of the wheels' turns if these are integrated from speeds."""
+"""Quantities for which the gear ratio is a common factor as well."""
 
 
-@dataclass(frozen=True)
-class ScaleCause:
+class ScaleCause(NamedTuple):
     """A cause, that is, a quantity that is wrong by a factor, which explains the ratios.
 
     Attributes:
-        name: name of the cause.
+        name: name of the quantity in `QUANTITIES`.
         factor: factor by which the quantity, or the values of its channels, are too large [1].
         common: True if the factor is a common error, such as 1000.
     """
@@ -230,33 +266,8 @@ class ScaleCause:
     common: bool
 
 
-def causes(speed_is_angle: bool) -> Mapping[str, Mapping[str, float]]:
-    """Return the power of each cause's factor in every ratio that it changes.
-
-    The likeliest causes come first. A factor above 1 means that the channel's values are too large.
-    `speed_is_angle` is True if the wheel angles were integrated from their speeds.
-    """
-    rates = {"drive": 1.0, "steer": 1.0, "command": 1.0, "gyro": 1.0, "report": 1.0}
-    integrated = {"travel": -1.0, "turning": -1.0, "gyro": 1.0}
-    wheels = {"travel": -1.0, "turning": -1.0, "drive": -1.0, "steer": -1.0}
-    return {
-        "time": integrated if speed_is_angle else rates,
-        "pose_length": {"travel": 1.0},
-        "heading": {"turning": 1.0, "gyro": -1.0},
-        "wheel_gear": wheels | {"command": -1.0},
-        "wheel_turns": wheels | {"command": -1.0, "report": -1.0},
-        "wheel_radius": wheels,
-        "base": {"turning": 1.0, "steer": 1.0},
-        "gyro": {"gyro": 1.0},
-        "report": {"report": 1.0},
-        "command_wheels": {"command": 1.0},
-        "command_twist": {"drive": 1.0},
-        "command_yaw": {"steer": 1.0},
-    }
-
-
 def single_causes(
-    scales: ScaleRatios, row_s: float, gear_ratio: float
+    known: Mapping[str, ScaleRatio], speed_is_angle: bool, row_s: float, gear_ratio: float
 ) -> tuple[tuple[ScaleCause, ...], bool]:
     """Return the causes that fit, the likeliest first, and whether each of them fits alone.
 
@@ -264,51 +275,56 @@ def single_causes(
     every ratio is natural, or no pair of causes fits.
 
     Args:
-        scales: ratios.
+        known: ratios by name.
+        speed_is_angle: True if the wheels' angle was integrated from their speeds.
         row_s: median time between rows [s].
         gear_ratio: declared gear ratio.
     """
-    if all(r.natural for r in scales.known.values()):
+    if all(r.natural for r in known.values()):
         return (), True
-    possible = dict(causes(scales.speed_is_angle))
+    possible = _possible(speed_is_angle, gear_ratio)
     if USUAL_ROW_S[0] <= row_s <= USUAL_ROW_S[1]:
         del possible["time"]
-    common = _common(gear_ratio, scales.speed_is_angle)
-    single = _singles(scales.known, possible, common)
-    if single:
+    if single := _singles(known, possible):
         return tuple(sorted(single, key=lambda e: not e.common)), True
-    for first, power in possible.items():
-        for factor in common[first]:
+    for first, quantity in possible.items():
+        for factor in quantity.common:
             left = {
-                name: replace(r, value=r.value / factor ** power.get(name, 0.0))
-                for name, r in scales.known.items()
+                name: replace(r, value=r.value / factor ** quantity.powers.get(name, 0.0))
+                for name, r in known.items()
             }
             rest = {name: other for name, other in possible.items() if name != first}
-            second = [e for e in _singles(left, rest, common) if e.common]
-            if second:
+            if second := [e for e in _singles(left, rest) if e.common]:
                 return (ScaleCause(first, factor, True), second[0]), False
     return (), False
 
 
-def _singles(
-    known: Mapping[str, ScaleRatio],
-    possible: Mapping[str, Mapping[str, float]],
-    common: Mapping[str, Sequence[float]],
-) -> list[ScaleCause]:
-    """Return the causes that fit alone, each with its likeliest factor.
+def _possible(speed_is_angle: bool, gear_ratio: float) -> dict[str, ScaledQuantity]:
+    """Return the quantities by name, with all their common factors; arguments as above."""
+    found = dict(QUANTITIES)
+    if speed_is_angle:
+        integrated = {"travel": -1.0, "turning": -1.0, "gyro": 1.0}
+        found["time"] = found["time"]._replace(powers=integrated)
+        of_rates = (30 / pi, 180 / pi, 2 * pi, 1000.0, 60.0)
+        found["wheel_gear"] = found["wheel_gear"]._replace(common=of_rates)
+    for name, quantity in found.items():
+        gear = (gear_ratio,) if name in _BY_GEAR and gear_ratio > 1.5 else ()
+        both = tuple(f for one in (*gear, *quantity.common) for f in (one, 1 / one))
+        found[name] = quantity._replace(common=both)
+    return found
 
-    Args:
-        known: ratios by name.
-        possible: powers of each cause's factor in the ratios.
-        common: common factors of each cause.
-    """
+
+def _singles(
+    known: Mapping[str, ScaleRatio], possible: Mapping[str, ScaledQuantity]
+) -> list[ScaleCause]:
+    """Return the causes that fit alone, each with its likeliest factor."""
     found = []
-    for name, power in possible.items():
-        low, high = _range(known, power)
+    for name, quantity in possible.items():
+        low, high = _range(known, quantity.powers)
         if low > high:
             continue
-        inside = [f for f in common[name] if low - FACTOR_MARGIN <= log(f) <= high + FACTOR_MARGIN]
-        middle = min(max(_middle(known, power), low), high)
+        inside = [f for f in quantity.common if low - MARGIN <= log(f) <= high + MARGIN]
+        middle = min(max(_middle(known, quantity.powers), low), high)
         best = min(inside, key=lambda f: abs(log(f) - middle), default=None)
         found.append(ScaleCause(name, exp(middle) if best is None else best, best is not None))
     return found
@@ -343,13 +359,3 @@ def _middle(known: Mapping[str, ScaleRatio], powers: Mapping[str, float]) -> flo
             total += weight * log(ratio.value / ratio.usual) / power
             weights += weight
     return total / weights if weights else 0.0
-
-
-def _common(gear_ratio: float, speed_is_angle: bool) -> Mapping[str, Sequence[float]]:
-    """Return the common factors, and their inverses, of each cause by its name."""
-    named = dict(_COMMON)
-    if speed_is_angle:
-        named["wheel_gear"] = _OF_RATES
-    if gear_ratio > 1.5:
-        named |= {name: (gear_ratio, *named[name]) for name in _BY_GEAR}
-    return {name: [f for one in factors for f in (one, 1 / one)] for name, factors in named.items()}

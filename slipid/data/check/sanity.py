@@ -12,15 +12,15 @@ Kinds of findings: `wheel_sign`, `wheel_order`, `wheel_azimuths`, `wheel_scale`,
 `not_checked`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from slipid.data.align.lag import PoseLag, pose_lag
 from slipid.data.check.columns import (
-    CONSEQUENTIAL_KINDS,
-    SUPERSEDING_KINDS,
+    CAUSED_BY_ORDER,
+    MADE_REDUNDANT_BY,
     electric,
     exchanged,
     misordered,
@@ -29,13 +29,11 @@ from slipid.data.check.findings import (
     Finding,
     cause_findings,
     mistake_finding,
-    ratio_sentence,
     worst_first,
 )
 from slipid.data.check.interpretation import Evidence, Interpretation, gather, misfits, to_body
 from slipid.data.check.joined import (
     ChannelIncrements,
-    JoinedChannel,
     JoinedRuns,
     StepEdges,
     edges,
@@ -45,19 +43,19 @@ from slipid.data.check.joined import (
 )
 from slipid.data.check.mistakes import mistakes
 from slipid.data.check.ratios import (
-    LEAST_ROTATION,
     LEAST_TRANSLATION,
-    ScaleRatios,
+    LEAST_TURNING,
+    ScaleRatio,
     ratios,
     single_causes,
 )
-from slipid.data.check.single_runs import agreement, single_runs, standing
+from slipid.data.check.single_runs import agreement, single_runs
 from slipid.data.runs import Runs
 from slipid.model.geometry import Geometry
 
-LEAST_STEPS = 20
+FEWEST_STEPS = 20
 """Least number of steps in which poses and wheels can be compared."""
-UNRELATED_SHARE = 0.4
+UNEXPLAINED_IF_FOREIGN = 0.4
 """If the best interpretation leaves more than this share of the poses' motion unexplained, poses
 and wheels do not belong together [1]."""
 LATE_S = 1.0
@@ -70,7 +68,7 @@ time is smaller than declared."""
 FAST_M_S, FAST_ROW_S = 50.0, 1e-3
 """If the rim speed [m/s] is above and the time between rows [s] below these values, the unit of
 time is larger than declared."""
-SHORT_TRAVEL_RATIO = 0.62
+SHORT_TRAVEL = 0.62
 """Ratio of the body's path length to that of the wheels below which there is a finding if no
 command confirms the wheels [1]."""
 
@@ -104,11 +102,9 @@ def findings(data: Runs, geometry: Geometry, mass_kg: float | None = None) -> tu
     """
     channels = joined(data)
     found = tuple(_all(channels, edges(channels), geometry, mass_kg, pose_lag(data)))
-    if not {finding.kind for finding in found} & {*SUPERSEDING_KINDS}:
+    if not {finding.kind for finding in found} & {*MADE_REDUNDANT_BY}:
         columns = tuple(misordered(data.logs))
-        found = (
-            tuple(f for f in found if not columns or f.kind not in CONSEQUENTIAL_KINDS) + columns
-        )
+        found = tuple(f for f in found if not columns or f.kind not in CAUSED_BY_ORDER) + columns
     return worst_first(found)
 
 
@@ -123,17 +119,16 @@ def _all(
     found = _compared(data, at, geometry, lag)
     if found is None:
         yield _not_checked(
-            f"the runs are too short: {len(at.run)} steps of motion, expected at least "
-            f"{LEAST_STEPS}"
+            f"the runs are too short: {len(at.run)} steps, {FEWEST_STEPS} are needed"
         )
         return
     yield from found.findings
-    scales = ratios(data, at, found.moved, found.evidence, found.meant)
+    scales, speed_is_angle = ratios(data, at, found.moved, found.evidence, found.meant)
     if not found.poses:
-        known = {k: r for k, r in scales.known.items() if k not in ("travel", "turning", "gyro")}
-        scales = ScaleRatios(known, scales.speed_is_angle)
+        scales = {k: r for k, r in scales.items() if k not in ("travel", "turning", "gyro")}
     radius, gear_ratio = float(geometry.wheel_radius), float(geometry.gear_ratio)
-    factors = tuple(_factors(scales, float(np.median(data.row)), gear_ratio))
+    causes = single_causes(scales, speed_is_angle, float(np.median(data.row)), gear_ratio)
+    factors = cause_findings(*causes, scales, gear_ratio)
     factors = factors or tuple(_of_time(data, found.moved, at, radius))
     yield from factors
     yield from electric(data, found.meant, radius, mass_kg, not factors)
@@ -148,15 +143,15 @@ def _compared(
     """Return the comparison of poses with wheels, or None if there are too few steps."""
     lag = lag if lag is not None and lag.decisive else PoseLag(0.0, 1.0, 1.0)
     moved = increments(data, at, lag.seconds)
-    if usable(moved.wheels).sum() < LEAST_STEPS:
+    if usable(moved.wheels).sum() < FEWEST_STEPS:
         return None
     evidence = gather(geometry, at, moved)
     declared = agreement(data, at, moved, evidence, Interpretation())
-    if standing(data, declared).all():
+    if declared.still.all():
         return _Compared(tuple(single_runs(data, declared)), moved, evidence)
     meant, found = mistakes(evidence)
     left = misfits(evidence, meant)["pose"]
-    if left > UNRELATED_SHARE:
+    if left > UNEXPLAINED_IF_FOREIGN:
         return _Compared((_foreign(left),), moved, evidence)
     # sin(heading / 2) does not determine the heading beyond half a turn, so that single runs may
     # seem to disagree.
@@ -197,19 +192,6 @@ def _foreign(left: float) -> Finding:
     )
 
 
-def _factors(scales: ScaleRatios, row_s: float, gear_ratio: float) -> Iterator[Finding]:
-    """Yield findings about wrong units and sizes, from ratios outside their ranges."""
-    fitting, single = single_causes(scales, row_s, gear_ratio)
-    yield from cause_findings(fitting, single, ratio_sentence(scales), gear_ratio)
-    if not fitting and not all(r.natural for r in scales.known.values()):
-        yield Finding(
-            "scales",
-            "the channels disagree about the motion, and no single wrong number explains it: "
-            f"{ratio_sentence(scales)}",
-            "check the units of all channels, gear_ratio, wheel_radius_m and base_radius_m",
-        )
-
-
 def _of_time(
     data: JoinedRuns, moved: ChannelIncrements, at: StepEdges, radius: float
 ) -> Iterator[Finding]:
@@ -230,12 +212,12 @@ def _of_time(
         )
 
 
-def _suspicious(scales: ScaleRatios) -> Iterator[Finding]:
+def _suspicious(scales: Mapping[str, ScaleRatio]) -> Iterator[Finding]:
     """Yield the finding that the wheels travel much further than the body, without a command."""
-    travel = scales.known.get("travel")
-    if travel is None or "drive" in scales.known or "command" in scales.known:
+    travel = scales.get("travel")
+    if travel is None or "drive" in scales or "command" in scales:
         return
-    if travel.natural and travel.value < SHORT_TRAVEL_RATIO:
+    if travel.natural and travel.value < SHORT_TRAVEL:
         yield Finding(
             "travel",
             f"the path of the body is {travel.value:.2f} times as long as that of the wheels, and "
@@ -248,38 +230,30 @@ def _suspicious(scales: ScaleRatios) -> Iterator[Finding]:
 
 def _notes(data: JoinedRuns, evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
     """Yield notes about what could not be checked."""
-    yield from _unmoved(evidence, meant)
+    pose = next(iter(evidence.pose.values()), None)
+    if pose is not None:
+        share = pose.predicted(to_body(evidence, meant))
+        share = share / max(float(share.sum()), 1e-300)
+        if share[2] < LEAST_TURNING:
+            yield _not_checked(
+                "no run turns: base radius, unit of the heading and gyro are unchecked"
+            )
+        if share[0] < LEAST_TRANSLATION:
+            yield _not_checked("no run drives ahead: order and signs are only partly checked")
+        if evidence.free and share[1] < LEAST_TRANSLATION:
+            yield _not_checked("no run drives sideways: order and signs are only partly checked")
     if evidence.twist is None and evidence.command is None:
         yield _not_checked(
             "no command is logged, so logged wheel rotations that are too large cannot be told "
             "from slip"
         )
-    if data.current is not None and not data.current_is_signed:
+    if "current" in data.channels and not data.current_is_signed:
         yield _not_checked("currents are magnitudes: their signs cannot be checked")
-    if _constant(data.gyro):
+    gyro = data.channels.get("gyro")
+    if gyro is not None and not np.nanmax(np.abs(np.diff(gyro.value, axis=0))) > 0:
         yield _not_checked("the gyro channel is constant and cannot be checked")
 
 
 def _not_checked(what: str) -> Finding:
     """Return the note that something was not checked."""
     return Finding("not_checked", what, None, "note")
-
-
-def _unmoved(evidence: Evidence, meant: Interpretation) -> Iterator[Finding]:
-    """Yield notes about directions in which no run moves, so that they are unchecked."""
-    pose = next(iter(evidence.pose.values()), None)
-    if pose is None:
-        return
-    share = pose.predicted(to_body(evidence, meant))
-    share = share / max(float(share.sum()), 1e-300)
-    if share[2] < LEAST_ROTATION:
-        yield _not_checked("no run turns: base radius, unit of the heading and gyro are unchecked")
-    if share[0] < LEAST_TRANSLATION:
-        yield _not_checked("no run drives ahead: order and signs are only partly checked")
-    if evidence.free and share[1] < LEAST_TRANSLATION:
-        yield _not_checked("no run drives sideways: order and signs are only partly checked")
-
-
-def _constant(channel: JoinedChannel | None) -> bool:
-    """Return whether a channel was logged and never changes."""
-    return channel is not None and not np.nanmax(np.abs(np.diff(channel.value, axis=0))) > 0

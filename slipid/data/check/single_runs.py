@@ -17,21 +17,21 @@ from slipid.data.check.joined import (
     usable,
 )
 
-MOVED_M = 0.2
+LEAST_PATH_M = 0.2
 """A run is judged if the path length by the wheels exceeds this, since its poses must then move
 [m]."""
-STILL_M = 1e-6
+ROUNDING_M = 1e-6
 """Poses with a path shorter than this are constant, except for rounding [m]."""
 LEAST_ROWS = 20
 """Runs with fewer rows are not judged."""
-ODD_DISAGREEMENT, ODD_RATIO, LEAST_MEDIAN_COSINE = 0.3, 10.0, 0.9
+ODD_DISAGREEMENT, ODD_RATIO, USUAL_COSINE = 0.3, 10.0, 0.9
 """A run has poses of another run if its disagreement, 1 - cosine, exceeds both `ODD_DISAGREEMENT`
-and `ODD_RATIO` times that of the median run. No run is judged if the cosine of the median run is
-below `LEAST_MEDIAN_COSINE`."""
-CLIP_RATIO = 4.0
+and `ODD_RATIO` times that of the median run. No run is judged if the median run's cosine is below
+`USUAL_COSINE`."""
+LONGEST_RATIO = 4.0
 """Multiple of the median length of the body increments to which longer increments are
 shortened [1]."""
-ALL_RUNS_SHARE = 0.5
+SHARE_IF_ALL = 0.5
 """If at least this share of the runs has constant poses, the finding is about all runs [1]."""
 
 
@@ -46,11 +46,19 @@ class RunAgreement:
         poses_m: path length of the poses (run,) [m].
         cosine: normalised scalar product of the body increments from the poses and from the wheels
             (run,) [1].
+        judged: True if the run has enough rows, and its wheels travel far enough, to be judged
+            (run,).
     """
 
     wheels_m: Float[np.ndarray, " run"]
     poses_m: Float[np.ndarray, " run"]
     cosine: Float[np.ndarray, " run"]
+    judged: Bool[np.ndarray, " run"]
+
+    @property
+    def still(self) -> Bool[np.ndarray, " run"]:
+        """Return, for each run, whether its poses are constant although its wheels turn."""
+        return self.judged & (self.poses_m < ROUNDING_M)
 
 
 def agreement(
@@ -68,7 +76,7 @@ def agreement(
     known = usable(body, predicted)
     body, predicted, run = body[known], predicted[known], at.run[known]
     length = np.linalg.norm(body, axis=1)
-    most = CLIP_RATIO * float(np.median(length[length > 0])) if (length > 0).any() else 1.0
+    most = LONGEST_RATIO * float(np.median(length[length > 0])) if (length > 0).any() else 1.0
     body = body * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
     # Slip shortens the motion along each axis by a different factor.
     squares = (predicted**2).sum(axis=0)
@@ -80,25 +88,21 @@ def agreement(
 
     size = np.sqrt(total((body**2).sum(axis=1)) * total((scaled**2).sum(axis=1)))
     both = total((body * scaled).sum(axis=1))
+    wheels_m = total(np.linalg.norm(predicted, axis=1))
+    rows = (data.end - data.begin) / data.row
     return RunAgreement(
-        total(np.linalg.norm(predicted, axis=1)),
+        wheels_m,
         total(np.linalg.norm(body, axis=1)),
         np.where(size > 0, both / np.where(size > 0, size, 1.0), 0.0),
-    )
-
-
-def standing(data: JoinedRuns, compared: RunAgreement) -> Bool[np.ndarray, " run"]:
-    """Return, for each run, whether its poses are constant although its wheels turn."""
-    return (
-        (compared.poses_m < STILL_M) & (compared.wheels_m > MOVED_M) & (_rows(data) >= LEAST_ROWS)
+        (rows >= LEAST_ROWS) & (wheels_m > LEAST_PATH_M),
     )
 
 
 def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
     """Yield findings about runs with constant poses, and about runs with poses of another run."""
-    still = standing(data, compared)
+    still = compared.still
     if still.any():
-        every = bool(still.mean() >= ALL_RUNS_SHARE)
+        every = bool(still.mean() >= SHARE_IF_ALL)
         yield Finding(
             "pose_constant",
             f"the poses do not change in {still.sum()} of {len(still)} runs while the wheels "
@@ -109,15 +113,11 @@ def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
             runs=() if every else _names(data, still),
         )
     # Runs in which the robot slips in place disagree for a good reason, and are not judged.
-    moves = ~still & (_rows(data) >= LEAST_ROWS) & (compared.wheels_m > MOVED_M)
+    moves = compared.judged & ~still
     if moves.any():
-        moves &= (
-            compared.poses_m
-            > 0.25
-            * np.median(compared.poses_m[moves] / compared.wheels_m[moves])
-            * compared.wheels_m
-        )
-    if moves.sum() < 2 or (usual := float(np.median(compared.cosine[moves]))) < LEAST_MEDIAN_COSINE:
+        share = compared.poses_m / np.maximum(compared.wheels_m, 1e-300)
+        moves &= share > 0.25 * np.median(share[moves])
+    if moves.sum() < 2 or (usual := float(np.median(compared.cosine[moves]))) < USUAL_COSINE:
         return
     odd = moves & (1 - compared.cosine > max(ODD_DISAGREEMENT, ODD_RATIO * (1 - usual)))
     if odd.any():
@@ -130,10 +130,6 @@ def single_runs(data: JoinedRuns, compared: RunAgreement) -> Iterator[Finding]:
             "exclude them from the globs of [[logs]]",
             runs=_names(data, odd),
         )
-
-
-def _rows(data: JoinedRuns) -> Float[np.ndarray, " run"]:
-    return np.asarray((data.end - data.begin) / data.row)
 
 
 def _names(data: JoinedRuns, which: Bool[np.ndarray, " run"]) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ from slipid.exports.c99.ir import (
     varies,
 )
 from slipid.exports.c99.jaxpr import Params
-from slipid.exports.c99.sources import UNROLLED, along
+from slipid.exports.c99.sources import MOST_UNROLLED, along
 from slipid.exports.fields import Kind, kind_of
 
 Shaped = jax.ShapeDtypeStruct
@@ -104,7 +104,7 @@ def _axis(values: Sequence[Value], shape: tuple[int, ...]) -> int | None:
         axis = axis_of(value)
         if axis is not None and len(value.shape) == len(shape) and value.shape[axis] == shape[axis]:
             return axis
-    return longest(shape) if prod(shape) > UNROLLED else None
+    return longest(shape) if prod(shape) > MOST_UNROLLED else None
 
 
 def unary(name: str) -> Rule:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from slipid.exports.c99.builder import Names
 from slipid.exports.c99.function import Argument, Function, function
-from slipid.exports.c99.text import TYPES, WIDTH, folded, table
+from slipid.exports.c99.text import CODE_WIDTH, TYPES, folded, table
 from slipid.exports.description import header
 from slipid.exports.fields import Struct, structs_of
 from slipid.exports.text import filled, identifiers, listed, template, wrapped
@@ -21,7 +21,7 @@ from slipid.robot.filter.hypotheses import hypotheses_of
 from slipid.robot.interface import Readings
 from slipid.robot.trajectory import Path
 
-TYPE = {**TYPES, "real": "slipid_real"}
+C_TYPES = {**TYPES, "real": "slipid_real"}
 
 
 class Code:
@@ -173,8 +173,9 @@ def _definition(struct: Struct) -> Sequence[str]:
     for field in struct.fields:
         size = f"[{field.size}]" if field.shape else ""
         shape = "" if len(field.shape) < 2 else f", {' x '.join(map(str, field.shape))} by rows"
-        declared, comment = f"  {TYPE[field.numbers]} {field.name}{size};", f"{field.about}{shape}"
-        if len(declared) + len(comment) + 7 <= WIDTH:
+        declared = f"  {C_TYPES[field.numbers]} {field.name}{size};"
+        comment = f"{field.about}{shape}"
+        if len(declared) + len(comment) + 7 <= CODE_WIDTH:
             lines.append(f"{declared} /* {comment} */")
         else:
             lines += [*(f"  {line}" for line in _comment(comment)), declared]

@@ -18,7 +18,7 @@ from slipid.robot.closed_loop import ControlLoop
 from slipid.robot.deployed import DeployedRobot
 from slipid.robot.trajectory import Path
 
-FILES = (
+FILLED_FILES = (
     *("test/golden.h", "test/check.c", "examples/drive/drive.c", "examples/Slipid/Slipid.ino"),
     *("CMakeLists.txt", "library.json", "library.properties", "README.md"),
 )
@@ -138,5 +138,5 @@ def c_files(
         "PATH": f"from ({x:.2f}, {y:.2f}), heading {heading:.2f} rad, over {', '.join(corners)} "
         f"[m] in {path.duration:g} s",
     }
-    others = {name: filled(f"c99/{name.rpartition('/')[2]}", values) for name in FILES}
+    others = {name: filled(f"c99/{name.rpartition('/')[2]}", values) for name in FILLED_FILES}
     return {"src/slipid.h": code.header(), "src/slipid.c": code.source(), **others, **run}

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Cells = np.ndarray
 """Numpy array of objects, each of which is a `Cell`."""
-LEAST_LANES = 7
+LOOP_FROM = 7
 """Smallest length of an axis of an array that becomes a loop in C."""
 
 
@@ -216,7 +216,7 @@ def varies(cell: Cell) -> bool:
 
 def longest(shape: Sequence[int]) -> int | None:
     """Return the axis that becomes a loop by default, the longest; None if all are short."""
-    if max(shape, default=0) < LEAST_LANES:
+    if max(shape, default=0) < LOOP_FROM:
         return None
     return max(range(len(shape)), key=lambda axis: (shape[axis], axis))
 

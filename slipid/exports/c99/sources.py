@@ -9,7 +9,7 @@ import numpy as np
 
 from slipid.exports.c99.builder import Builder
 from slipid.exports.c99.ir import (
-    LEAST_LANES,
+    LOOP_FROM,
     Array,
     At,
     Cell,
@@ -18,6 +18,7 @@ from slipid.exports.c99.ir import (
     Memory,
     Value,
     Variable,
+    axis_of,
     cells_of,
     holds,
     kind_of_value,
@@ -28,7 +29,7 @@ from slipid.exports.c99.ir import (
 )
 from slipid.exports.fields import kind_of
 
-UNROLLED = 64
+MOST_UNROLLED = 64
 """Largest count of numbers in an array without lanes that stays unrolled in C."""
 
 
@@ -49,6 +50,15 @@ class Sources:
         k = int(np.searchsorted(self._starts, place, side="right")) - 1
         return self._sources[k], place - int(self._starts[k])
 
+    def _cell(self, place: int) -> tuple[Cell, int]:
+        """Return the cell that has the number at a place, and the lane of the number in it."""
+        source, inner = self._source(place)
+        if not isinstance(source, Array):
+            return Constant(source.reshape(-1)[inner].item(), kind_of(source.dtype)), 0
+        at = list(np.unravel_index(inner, source.shape))
+        lane = 0 if source.axis is None else int(at.pop(source.axis))
+        return source.cells[tuple(at)], lane
+
     def best_axis(self, places: np.ndarray) -> int | None:
         """Return the axis along which most rows are already lanes of a source.
 
@@ -58,7 +68,9 @@ class Sources:
         axis = max(free, key=lambda a: (free[a], places.shape[a], a), default=None)
         if axis is not None and 2 * free[axis] * places.shape[axis] >= places.size > 0:
             return axis
-        large = len(np.unique(places)) > UNROLLED or max(places.shape, default=0) >= 2 * LEAST_LANES
+        large = (
+            len(np.unique(places)) > MOST_UNROLLED or max(places.shape, default=0) >= 2 * LOOP_FROM
+        )
         return longest(places.shape) if large else None
 
     def _free(self, places: np.ndarray, axis: int) -> int:
@@ -70,19 +82,12 @@ class Sources:
 
     def _lanes(self, row: np.ndarray) -> Cell | None:
         """Return the cell of a source whose lanes are exactly this row, or None."""
-        source, first = self._source(int(row[0]))
-        if not isinstance(source, Array) or source.axis is None:
+        source, _ = self._source(int(row[0]))
+        if not isinstance(source, Array) or source.axis is None or source.lanes != len(row):
             return None
-        if source.shape[source.axis] != len(row):
-            return None
-        at = np.unravel_index(first, source.shape)
-        if at[source.axis] != 0:
-            return None
-        stride = prod(source.shape[source.axis + 1 :])
-        if not np.array_equal(row, row[0] + stride * np.arange(len(row))):
-            return None
-        cell: Cell = source.cells[tuple(a for k, a in enumerate(at) if k != source.axis)]
-        return cell
+        cell, lane = self._cell(int(row[0]))
+        whole = row[0] + prod(source.shape[source.axis + 1 :]) * np.arange(len(row))
+        return cell if lane == 0 and np.array_equal(row, whole) else None
 
     def one(self, place: int) -> Cell:
         """Return the cell of the number at a place."""
@@ -91,15 +96,9 @@ class Sources:
         return self._ones[place]
 
     def _one(self, place: int) -> Cell:
-        source, inner = self._source(place)
-        if not isinstance(source, Array):
-            return Constant(source.reshape(-1)[inner].item(), kind_of(source.dtype))
-        at = np.unravel_index(inner, source.shape)
-        cell: Cell = source.cells[tuple(a for k, a in enumerate(at) if k != source.axis)]
+        cell, lane = self._cell(place)
         if not varies(cell):
             return cell
-        assert source.axis is not None
-        lane = int(at[source.axis])
         if isinstance(cell, Variable):
             return At(cell.memory, lane)
         assert isinstance(cell, At)
@@ -119,8 +118,7 @@ class Sources:
             values = np.array([cell.value for cell in cells if isinstance(cell, Constant)])
             return At(self._builder.names.table(values, self.kind), 0, 1)
         places = _places(cells)
-        if places is None and self._laned_source(row):
-            source, _ = self._source(int(row[0]))
+        if places is None and (source := self._laned_source(row)) is not None:
             moved = contiguous(self._builder, source)
             cells = [At(moved, self._source(int(place))[1]) for place in row]
             places = _places(cells)
@@ -128,18 +126,18 @@ class Sources:
             return At(self.copied(row), 0, 1)
         first = cells[0]
         assert isinstance(first, At)
-        stride = int(places[1] - places[0])
-        if np.array_equal(places, places[0] + stride * np.arange(len(places))):
-            return At(first.memory, int(places[0]), stride, first.index)
+        strides = np.diff(places)
+        if (strides == strides[0]).all():
+            return At(first.memory, int(places[0]), int(strides[0]), first.index)
         if first.index is not None:
             return At(self.copied(row), 0, 1)
         return At(first.memory, 0, table=self._builder.names.table(places, "int"))
 
-    def _laned_source(self, row: np.ndarray) -> bool:
-        """Return whether all numbers of a row come from one array that has lanes."""
-        source, _ = self._source(int(row[0]))
-        same = all(self._source(int(place))[0] is source for place in row)
-        return same and isinstance(source, Array) and source.axis is not None
+    def _laned_source(self, row: np.ndarray) -> Value | None:
+        """Return the array with lanes that all numbers of a row come from; None without one."""
+        source, *others = (self._source(int(place))[0] for place in row)
+        same = all(other is source for other in others)
+        return source if same and axis_of(source) is not None else None
 
     def copied(self, places: np.ndarray) -> Memory:
         """Return memory that holds these numbers contiguously; a copy is made only if needed."""

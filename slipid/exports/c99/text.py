@@ -142,7 +142,7 @@ def _shared(arrays: list[_Life]) -> dict[str, StackArray]:
 
 TYPES: dict[Kind, str] = {"real": "real_t", "int": "int32_t", "bool": "bool"}
 """C type of each kind of number."""
-WIDTH = 100
+CODE_WIDTH = 100
 FLOAT_MAX = float(np.finfo(np.float32).max)
 
 
@@ -171,8 +171,8 @@ def table(memory: Memory) -> list[str]:
 
 
 def wrapped(words: Iterable[str], indent: str) -> list[str]:
-    """Return words joined by commas, in lines of at most `WIDTH` characters."""
-    lines = _broken(", ".join(words) + ",", WIDTH - 1, indent, indent)
+    """Return words joined by commas, in lines of at most `CODE_WIDTH` characters."""
+    lines = _broken(", ".join(words) + ",", CODE_WIDTH - 1, indent, indent)
     return [*lines[:-1], lines[-1].removesuffix(",")]
 
 
@@ -285,8 +285,8 @@ class FunctionBody:
 
 
 def folded(text: str, indent: str) -> list[str]:
-    """Return the lines of a statement, wrapped at `WIDTH` characters."""
-    return _broken(text, WIDTH, indent, f"{indent}    ")
+    """Return the lines of a statement, wrapped at `CODE_WIDTH` characters."""
+    return _broken(text, CODE_WIDTH, indent, f"{indent}    ")
 
 
 def _broken(text: str, width: int, first: str, later: str) -> list[str]:

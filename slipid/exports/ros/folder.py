@@ -81,14 +81,14 @@ def ros2_files(robot: DeployedRobot) -> dict[str, str]:
         ("robot_localization_slipid.yaml", known, "/slipid/odometry", f"{_ESTIMATED}: {stated}"),
     ):
         listed = localization.filter_parameters(robot, e, topic, source)
-        bodies[name] = nodes([(localization.NODE, listed)])
+        bodies[name] = nodes([(localization.FILTER_NODE, listed)])
     bodies["slipid.yaml"] = nodes([(NODE, parameters)])
     bodies["slipid_parameters.yaml"] = declaration(NODE, parameters)
     uses = {name: USES[name] for name in bodies}
     for label, e in zip(identifiers(robot.labels, "floor"), errors, strict=True):
         covariances = [(drive.name, _covariances(robot, drive, e))] if drive is not None else []
         noise = (localization.process_noise(robot, e),)
-        bodies[f"floors/{label}.yaml"] = nodes([*covariances, (localization.NODE, noise)])
+        bodies[f"floors/{label}.yaml"] = nodes([*covariances, (localization.FILTER_NODE, noise)])
         uses[f"floors/{label}.yaml"] = _FLOOR
     head = comment(header(robot))
     files = {name: "\n".join([*head, *body]) + "\n" for name, body in bodies.items()}

@@ -142,7 +142,7 @@ def _level(row: Float[np.ndarray, "3"]) -> Axes:
     return axes_of(np.array([row[:2].max(), row[:2].max(), row[2]]))
 
 
-NODE = "ekf_filter_node"
+FILTER_NODE = "ekf_filter_node"
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 STATE = (*_POSE, *(f"v{name}" for name in _POSE), "ax", "ay", "az")
 FUSED = ("vx", "vy", "vyaw")

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from slipid.exports.text import WIDTH, one_line, wrapped
+from slipid.exports.text import COMMENT_WIDTH, one_line, wrapped
 
 Scalar = bool | int | float | str
 Value = bool | float | str | tuple[bool, ...] | tuple[float, ...] | tuple[str, ...]
@@ -108,8 +108,9 @@ def _nested(parameters: Sequence[Parameter], depth: int, leaf: _Leaf) -> Iterato
 
 
 def _valued(parameter: Parameter, name: str, indent: str) -> Iterator[str]:
+    width = COMMENT_WIDTH - len(indent)
     if parameter.about:
-        yield from (f"{indent}# {line}" for line in wrapped(parameter.about, WIDTH - len(indent)))
+        yield from (f"{indent}# {line}" for line in wrapped(parameter.about, width))
     yield from _key(parameter, name, indent)
 
 
@@ -143,7 +144,7 @@ def _key(parameter: Parameter, name: str, indent: str) -> Iterator[str]:
     elif any(isinstance(x, str) for x in value):
         lines = [", ".join(words)]
     else:
-        lines = textwrap.wrap(", ".join(words), WIDTH - len(indent))
+        lines = textwrap.wrap(", ".join(words), COMMENT_WIDTH - len(indent))
     if len(lines) == 1:
         yield f"{indent}{name}: [{lines[0]}]"
         return

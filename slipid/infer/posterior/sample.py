@@ -21,7 +21,7 @@ from jaxtyping import Float
 from xarray import DataTree
 
 from slipid.fitting import likelihood as lk
-from slipid.fitting.hierarchy import effect_information, pooled_stds
+from slipid.fitting.hierarchy import axis_effects, effect_information, pooled_stds
 from slipid.fitting.problem import Problem, linear
 from slipid.fitting.variances import DEGREES, VARIANCE_SPREAD, information
 from slipid.infer.posterior import diagnosis, ensemble
@@ -122,7 +122,8 @@ def drawn_variances(
     precision = np.array(information(problem.noise.blocks, log_v, keep, through))
     of_blocks = np.asarray(problem.objective.scored)
     precision *= of_blocks[:, None] & of_blocks
-    precision += effect_information(problem.objective, motion, weight, fitted.covariance, log_v)
+    axes = axis_effects(problem.objective, motion, weight, fitted.covariance, log_v)
+    precision += effect_information(axes, log_v)
     precision[np.diag_indices_from(precision)] += np.where(of_blocks, 0.0, 1 / VARIANCE_SPREAD**2)
     root = np.linalg.cholesky(np.linalg.inv(precision))
     rng = np.random.default_rng([seed, 1])

@@ -3,8 +3,8 @@
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict
 from itertools import zip_longest
+from operator import methodcaller
 
 from slipid.lab.benchmark.floors.husky import HuskyFloorTask, husky_classifiers
 from slipid.lab.benchmark.floors.protocol import FloorTask
@@ -12,7 +12,7 @@ from slipid.lab.benchmark.floors.robotino import RobotinoFloorTask
 from slipid.lab.benchmark.protocols import PROTOCOLS, splits
 from slipid.lab.benchmark.rectangle import CONTROLLERS, RectangleTask
 from slipid.lab.benchmark.rows import ROWS
-from slipid.lab.benchmark.scores import FoldScore
+from slipid.lab.benchmark.scores import FoldScore, RunScore
 from slipid.lab.benchmark.sets import SOURCES, is_available
 from slipid.lab.benchmark.slipid_rows import NAME
 from slipid.lab.benchmark.summary import RowSummary, reading, summary
@@ -69,7 +69,7 @@ def benchmark(options: BenchmarkOptions, executor: Executor, report: Reporter) -
     if not options.quick and set(CONTROLLERS) & set(options.only or CONTROLLERS):
         tasks.insert(0, rectangle)
     report.stage(f"{len(tasks)} parts")
-    results(executor, run_task, {task.name: task for task in tasks}, report)
+    results(executor, methodcaller("run"), {task.name: task for task in tasks}, report)
     closed_loop = rectangle.drive(executor, report) if rectangle in tasks else None
     report.stage("comparing")
     tables = tables_of(folds)
@@ -111,11 +111,6 @@ def alternating(each: Sequence[Sequence[FoldTask]]) -> list[FoldTask]:
     return [task for row in zip_longest(*each) for task in row if task is not None]
 
 
-def run_task(task: BenchmarkTask) -> str:
-    """Run a task and return its name."""
-    return task.run()
-
-
 def _check(options: BenchmarkOptions) -> None:
     """Raise `DataError` if the data folder or a requested row does not exist."""
     if not options.data.is_dir():
@@ -133,7 +128,7 @@ def _check(options: BenchmarkOptions) -> None:
 
 def tables_of(tasks: Sequence[FoldTask]) -> Tables:
     """Return summaries of all scores that the tasks saved in their checkpoints."""
-    folds: dict[tuple[str, str], dict[str, list[FoldScore]]] = {}
+    folds: dict[tuple[str, str], dict[str, list[FoldScore[RunScore]]]] = {}
     for task in tasks:
         for (protocol, name), score in task.rows().items():
             folds.setdefault((task.source, protocol), {}).setdefault(name, []).append(score)
@@ -157,8 +152,5 @@ def _set(
         "over": data.source.over,
         "runs": len(data.logged) + (0 if data.crossing is None else len(data.crossing)),
         "hash": data.job.data_hash,
-        "protocols": {
-            protocol: {row: asdict(one) for row, one in found.items()}
-            for protocol, found in protocols.items()
-        },
+        "protocols": protocols,
     }

@@ -5,13 +5,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from slipid.plots import drawing
 from slipid.support.content import Content
 
-TICKS = [m * 10.0**k for k in range(-2, 4) for m in (1, 2, 5)]
-"""Tick positions of a logarithmic axis of errors [%]."""
-OWN = "slipid"
+OWN_PREFIX = "slipid"
 """Prefix of the names of rows that are highlighted."""
 
 
@@ -55,18 +54,17 @@ def _panel(ax: Axes, ends: Mapping[str, Sequence[float]]) -> None:
     order = sorted(ends, key=lambda row: -ends[row][0])
     for k, row in enumerate(order):
         middle, low, high = (100 * x for x in ends[row])
-        colour = drawing.ORANGE if row.startswith(OWN) else drawing.BLUE
+        colour = drawing.ORANGE if row.startswith(OWN_PREFIX) else drawing.BLUE
         ax.plot([low, high], [k, k], color=colour, lw=1.5)
         ax.plot(middle, k, "o", color=colour, ms=4)
     ax.set_yticks(np.arange(len(order)), order, fontsize=7)
     for label in ax.get_yticklabels():
-        if label.get_text().startswith(OWN):
+        if label.get_text().startswith(OWN_PREFIX):
             label.set_color(drawing.ORANGE)
             label.set_fontweight("bold")
     ax.set_xscale("log")
     ax.set_xlabel("end-point error, %")
-    low, high = ax.get_xlim()
-    ticks = [t for t in TICKS if low <= t <= high]
-    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.xaxis.set_major_formatter("{x:g}")
     ax.minorticks_off()
     ax.set_ylim(-0.7, len(order) - 0.3)

@@ -13,15 +13,15 @@ from slipid.predict import folds as compared
 from slipid.predict.folds import FoldKey, speeds
 from slipid.predict.slip_model import Run
 
-FOLDS = 2
+HEADING_FOLDS = 2
 """Number of folds by headings and by sectors; one fold holds every other sector."""
-MOST_SPEED_FOLDS = 2
+SPEED_FOLDS = 2
 """Largest number of folds by speeds; if there are more speeds, several share a fold."""
 INNER_FOLDS = 1
 """Number of folds of the training runs that are held out in turn to select settings."""
 LEAST_TRAINING, LEAST_HELD_OUT = 8, 3
 """Smallest numbers of training runs and of held-out runs of a split."""
-ALL_RUNS_FOLD = -1
+ONLY_FOLD = -1
 """Index of the only fold of the split "all", whose runs are all training runs."""
 Labels = Int[np.ndarray, " run"]
 
@@ -105,13 +105,13 @@ def headings(facts: Sequence[FoldKey]) -> Labels:
     bins = np.round(np.where(known, heading, 0.0) / 5.0) % 72
     bins = np.where(known, bins, 72 + np.arange(len(heading)))
     number = np.unique(bins, return_inverse=True)[1]
-    return np.random.default_rng(0).permutation(number.max() + 1)[number] % FOLDS
+    return np.random.default_rng(0).permutation(number.max() + 1)[number] % HEADING_FOLDS
 
 
 def sectors(facts: Sequence[FoldKey]) -> Labels:
     """Return folds by sector of the heading, every other sector in one; -1 without a heading."""
     sector = compared.sectors(facts)
-    return np.where(sector < 0, sector, sector % FOLDS)
+    return np.where(sector < 0, sector, sector % HEADING_FOLDS)
 
 
 def floors(facts: Sequence[FoldKey]) -> Labels:
@@ -122,7 +122,7 @@ def floors(facts: Sequence[FoldKey]) -> Labels:
 KINDS: dict[str, Callable[[Sequence[FoldKey]], Labels]] = {
     "headings": headings,
     "sectors": sectors,
-    "speeds": partial(speeds, most=MOST_SPEED_FOLDS),
+    "speeds": partial(speeds, most=SPEED_FOLDS),
     "floors": floors,
 }
 
@@ -135,7 +135,7 @@ def splits(facts: Sequence[FoldKey], kind: str) -> list[Split]:
     """
     everybody = np.arange(len(facts))
     if kind == "all":
-        return [Split(ALL_RUNS_FOLD, everybody, everybody[:0])]
+        return [Split(ONLY_FOLD, everybody, everybody[:0])]
     part = KINDS[kind](facts)
     where = np.array([f.floor for f in facts])
     found = []

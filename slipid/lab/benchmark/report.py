@@ -37,10 +37,10 @@ def show_benchmark(page: Page, found: Content) -> None:
             about = found["protocols"][protocol]
             title = f"\n{name}: {about}; end points over the {one['over']}"
             brief = [number for number in shown(rows) if number not in PAGE_ONLY]
-            head = ("row", *(COLUMNS[name][0] for name in brief), *COSTS[1:])
+            head, body = methods(rows, brief, COSTS[1:])
             made = table(head, title, right=head[1:])
-            for row, content in ranked(rows):
-                made.add_row(Text(row), *cells(content, brief), *costs(content)[1:])
+            for row, *cells in body:
+                made.add_row(Text(row), *cells)
             for column in made.columns:
                 column.no_wrap = True
             page.table(made)
@@ -61,10 +61,22 @@ def show_benchmark(page: Page, found: Content) -> None:
 COSTS = ("numbers", "fit, s", "step, us")
 
 
-def ranked(rows: Content) -> list[tuple[str, Content]]:
-    """Return the rows that have results, sorted by end-point error, the smallest first."""
+def methods(
+    rows: Content, numbers: Sequence[str], costs: Sequence[str]
+) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return head and body of the table of methods, sorted by end-point error, the smallest first.
+
+    Args:
+        rows: rows of a protocol; those without results are left out.
+        numbers: fields of `COLUMNS` that the table has.
+        costs: last ones of `COSTS`, which the table has as well.
+    """
     there = [(name, one) for name, one in rows.items() if one["endpoint_error"] is not None]
-    return sorted(there, key=lambda item: item[1]["endpoint_error"][0])
+    body = [
+        (name, *(in_words(n, one[n]) for n in numbers), *costs_of(one)[-len(costs) :])
+        for name, one in sorted(there, key=lambda item: item[1]["endpoint_error"][0])
+    ]
+    return ("row", *(COLUMNS[n][0] for n in numbers), *costs), body
 
 
 def shown(rows: Content) -> list[str]:
@@ -72,16 +84,8 @@ def shown(rows: Content) -> list[str]:
     return [name for name in COLUMNS if any(row[name] is not None for row in rows.values())]
 
 
-def cells(row: Content, numbers: Sequence[str]) -> list[str]:
-    """Return the formatted values of the named fields of a row."""
-    return [in_words(name, row[name]) for name in numbers]
-
-
 def in_words(name: str, value: Sequence[float] | None) -> str:
-    """Return a field's value as text, empty for None.
-
-    Fields in `WITH_INTERVALS` are followed by their intervals.
-    """
+    """Return a field's value as text, empty for None; see `WITH_INTERVALS` for its interval."""
     if value is None:
         return ""
     _, factor, places = COLUMNS[name]
@@ -90,7 +94,7 @@ def in_words(name: str, value: Sequence[float] | None) -> str:
     return f"{middle} [{low}, {high}]" if name in WITH_INTERVALS else middle
 
 
-def costs(row: Content) -> list[str]:
+def costs_of(row: Content) -> list[str]:
     """Return a row's number of parameters, time to fit [s] and time per step [us], as text."""
     fit, step = row["fit_s"], row["step_us"]
     seconds = "< 0.1" if fit < 0.1 else f"{fit:.1f}" if fit < 10 else f"{fit:.0f}"
@@ -260,10 +264,7 @@ def _set(found: Content, name: str, one: Content, drawn: bytes | None) -> list[s
     for protocol, rows in one["protocols"].items():
         title = f"{protocol.replace('_', ' ')}: {found['protocols'][protocol]}"
         parts.append(f"<h3>{escape(title)}</h3>")
-        numbers = shown(rows)
-        head = ("row", *(COLUMNS[name][0] for name in numbers), *COSTS)
-        body = [(row, *cells(content, numbers), *costs(content)) for row, content in ranked(rows)]
-        parts.append(html_table(head, body))
+        parts.append(html_table(*methods(rows, shown(rows), COSTS)))
         parts += [f"<p class='note'>{escape(line)}</p>" for line in absent(rows)]
         if lines := settings_lines(rows):
             parts.append("<details class='note'><summary>selected settings, fold by fold</summary>")

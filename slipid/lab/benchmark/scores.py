@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -138,17 +139,19 @@ def _energy_error(run: Run, predicted: PredictedRun, spec: RobotSpec) -> float |
     return abs(float((predicted.power * run.signals.dt).sum()) / max(spent, 1e-9) - 1)
 
 
+Scored = TypeVar("Scored")
+
+
 @dataclass(frozen=True)
-class FoldScore:
-    """Scores of a method in one fold of one protocol.
+class FoldScore(Generic[Scored]):
+    """Scores of a method in one fold of one protocol, or in several folds.
 
     Attributes:
-        runs: scores of the held-out runs.
+        runs: scores of the held-out runs, or answers of a classifier of floors.
         absent: reason why there are no scores: a channel that is missing in these logs, or an
             error; empty if there are scores.
         failed: True if that reason is an error.
         settings: settings selected by cross-validation, in words.
-        tried: number of settings that were compared.
         numbers: number of fitted parameters.
         tune_s: time to select the settings [s].
         fit_s: time of one fit [s].
@@ -156,11 +159,10 @@ class FoldScore:
         converged: True if the fit converged.
     """
 
-    runs: tuple[RunScore, ...] = ()
+    runs: tuple[Scored, ...] = ()
     absent: str = ""
     failed: bool = False
     settings: str = ""
-    tried: int = 1
     numbers: int = 0
     tune_s: float = 0.0
     fit_s: float = 0.0
@@ -168,9 +170,10 @@ class FoldScore:
     converged: bool = True
 
     @classmethod
-    def of_json(cls, content: Content) -> "FoldScore":
+    def of_json(cls, content: Content) -> "FoldScore[RunScore]":
         """Return the scores read back from JSON content."""
-        return cls(**{**content, "runs": tuple(RunScore(**run) for run in content["runs"])})
+        runs = tuple(RunScore(**run) for run in content["runs"])
+        return FoldScore(**{**content, "runs": runs})
 
     @classmethod
     def lacking(cls, channels: Iterable[str]) -> "FoldScore":
@@ -183,3 +186,24 @@ class FoldScore:
     def of_error(cls, error: Exception) -> "FoldScore":
         """Return the empty result of a method that raised this error."""
         return cls(absent=f"{type(error).__name__}: {error}".splitlines()[0][:300], failed=True)
+
+    @classmethod
+    def of_folds(cls, folds: Sequence["FoldScore[Scored]"]) -> "FoldScore[Scored]":
+        """Return all scores of a method, with the medians of its costs, but without its settings.
+
+        A method that is absent in some fold is absent altogether, since it would be averaged over
+        other runs than the rest.
+        """
+
+        def median(name: str) -> float:
+            return float(np.median([getattr(fold, name) for fold in folds]))
+
+        if absent := next((fold.absent for fold in folds if fold.absent), ""):
+            return cls(absent=absent, failed=any(fold.failed for fold in folds))
+        return cls(
+            runs=tuple(run for fold in folds for run in fold.runs),
+            numbers=int(median("numbers")),
+            tune_s=median("tune_s"),
+            fit_s=median("fit_s"),
+            step_us=median("step_us"),
+        )

@@ -37,7 +37,7 @@ TOLERANCE = 0.1
 """A fit has converged when no parameter changes by more than this multiple of its std.
 
 The errors of predictions vary far more than this between runs."""
-STEP_MULTIPLE = 16
+STEPS_MULTIPLE = 16
 """The steps of a replay are padded to a multiple of this number, so that few shapes are compiled.
 """
 RUNS_PER_CALL = 32
@@ -128,25 +128,19 @@ def forecast(fit: SlipidFit, batch: RunBatch, spec: RobotSpec) -> list[Predicted
     tracks, cov = fit.contact.ends(w)
     robot = fit.contact.robot
     paths = body_poses(robot, w, tracks.predicted)
-    power = _power(fit, w, spec) if fit.job.dataset.current is not None else None
-    return [
-        PredictedRun(
+    has_current = fit.job.dataset.current is not None
+    amps = np.abs(np.asarray(_currents(robot, lk.batch(w, robot)))) if has_current else None
+
+    def predicted(k: int, run: RunSignals) -> PredictedRun:
+        driven = replace(run, current=None if amps is None else amps[k], current_is_signed=False)
+        return PredictedRun(
             path=relative_to_start(paths[k]),
             end_covariance=turned_covariance(cov[k], -float(paths[k, 0, 2])),
             freedom=DEGREES,
-            power=None if power is None else power[k],
+            power=None if amps is None else driven.power(spec),
         )
-        for k in range(len(batch.runs))
-    ]
 
-
-def _power(fit: SlipidFit, w: Any, spec: RobotSpec) -> np.ndarray:
-    """Return the total electric power of the motors in each step, from predicted currents [W]."""
-    robot = fit.contact.robot
-    b = lk.batch(w, robot)
-    amps = np.abs(np.asarray(_currents(robot, b)))
-    shaft = np.abs(spec.gear_ratio * w.turn / w.dt[..., None])
-    return np.asarray(((spec.resistance * amps + spec.back_emf * shaft) * amps).sum(-1))
+    return [predicted(k, run.signals) for k, run in enumerate(batch.runs)]
 
 
 @jax.jit
@@ -264,7 +258,7 @@ def replay(
     """
     parts = [np.ceil(run.dt / LONGEST_STEP_S - 1e-9).astype(int).clip(1) for run in runs]
     longest = max(int(part.sum()) for part in parts)
-    longest = -(-longest // STEP_MULTIPLE) * STEP_MULTIPLE + 1
+    longest = -(-longest // STEPS_MULTIPLE) * STEPS_MULTIPLE + 1
     shape, labels = (RUNS_PER_CALL, longest), estimator.robot.labels
     known = [k for k, unseen in enumerate(estimator.robot.unseen) if not unseen]
     out: list[PredictedRun] = []

@@ -11,6 +11,7 @@ from slipid.data.log import Log
 from slipid.data.runs import Runs
 from slipid.data.wheel_signals import integral, interpolate
 from slipid.data.windows import Windows
+from slipid.fitting.likelihood import corrected
 from slipid.model.robot import Robot
 from slipid.predict import open_loop
 from slipid.predict.slip_model import Run, RunSignals, turned
@@ -62,7 +63,7 @@ def _step_count(poses: float, poses_per_step: int) -> int:
 
 def _batch(data: Runs, robot: Robot, w: Windows) -> RunBatch:
     numbers = tuple(dict.fromkeys(w.run.tolist()))
-    pose = body_poses(robot, w, np.asarray(open_loop.corrected(robot, jnp.asarray(w.pose))))
+    pose = body_poses(robot, w, np.asarray(corrected(robot, jnp.asarray(w.pose))))
     runs = []
     for n, k in enumerate(numbers):
         log = data.logs[k]

@@ -3,7 +3,7 @@
 `reading` compares slipid's end-point errors with those of the other rows in sentences.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from slipid.lab.benchmark.scores import FoldScore, RunScore
 from slipid.lab.benchmark.slipid_rows import NAME
+from slipid.support.content import Content
 
 MOST_NAMED_ROWS = 4
 """Largest number of tied rows that a sentence names."""
@@ -32,76 +33,45 @@ class MeanInterval(NamedTuple):
     high: float
 
 
-@dataclass(frozen=True)
-class RowSummary:
-    """Row of a method in one protocol of one data set.
+RowSummary = Content
+"""Row of a method in one protocol of one data set, in the form of benchmark.json.
 
-    Attributes that are not listed are means of the attribute of `RunScore` with the same name
-    (`coverage90` of `covered90`, `floor_accuracy` of `floor_right`), first over the runs of each
-    floor and then over floors; None if the method does not predict them.
+Values that are not listed are means of the attribute of `RunScore` with the same name
+(`coverage90` of `covered90`, `floor_accuracy` of `floor_right`), first over the runs of each floor
+and then over floors, with their intervals; None if the method does not predict them.
 
-    Attributes:
-        floors: mean end-point error of each floor, with its load set-up.
-        behind: end-point error less that of slipid on the same resampled runs; None for slipid
-            itself, and if slipid has no row.
-        slip_auc: area under the receiver operating characteristic of slip detection, by windows;
-            None if all windows slip, or if no window does.
-        runs: number of runs.
-        numbers: number of fitted parameters, median over folds.
-        tune_s: time to pick the settings, median over folds [s].
-        fit_s: time of one fit, median over folds [s].
-        step_us: time to predict one step of one run, median over folds [microseconds].
-        settings: settings picked in each fold.
-        unconverged: number of folds whose fit did not converge.
-        absent: reason why there are no runs, see `FoldScore`.
-        failed: True if the reason is an error.
-    """
-
-    endpoint_error: MeanInterval | None = None
-    floors: Mapping[str, MeanInterval] | None = None
-    behind: MeanInterval | None = None
-    length_error: MeanInterval | None = None
-    heading_error_deg: MeanInterval | None = None
-    twist_error: MeanInterval | None = None
-    coverage90: MeanInterval | None = None
-    slip_auc: MeanInterval | None = None
-    floor_accuracy: MeanInterval | None = None
-    energy_error: MeanInterval | None = None
-    runs: int = 0
-    numbers: int = 0
-    tune_s: float = 0.0
-    fit_s: float = 0.0
-    step_us: float = 0.0
-    settings: tuple[str, ...] = ()
-    unconverged: int = 0
-    absent: str = ""
-    failed: bool = False
+- floors: mean end-point error of each floor, with its load set-up.
+- behind: end-point error less that of slipid on the same resampled runs; None for slipid
+  itself, and if slipid has no row.
+- slip_auc: area under the receiver operating characteristic of slip detection, by windows;
+  None if all windows slip, or if no window does.
+- runs: number of runs.
+- numbers: number of fitted parameters, median over folds.
+- tune_s: time to pick the settings, median over folds [s].
+- fit_s: time of one fit, median over folds [s].
+- step_us: time to predict one step of one run, median over folds [microseconds].
+- settings: settings picked in each fold.
+- unconverged: number of folds whose fit did not converge.
+- absent: reason why there are no runs, see `FoldScore`.
+- failed: True if the reason is an error.
+"""
 
 
-def summary(folds: Mapping[str, Sequence[FoldScore]], reference: str) -> dict[str, RowSummary]:
-    """Return the summary of every row over its folds, compared with the row named `reference`.
-
-    A row that is absent in some fold is left out completely, since it would be averaged over other
-    runs than the rest.
-    """
-    present = {
-        name: each for name, each in folds.items() if each and not any(r.absent for r in each)
-    }
-    done = {name: [run for row in each for run in row.runs] for name, each in present.items()}
+def summary(
+    folds: Mapping[str, Sequence[FoldScore[RunScore]]], reference: str
+) -> dict[str, RowSummary]:
+    """Return the summary of every row over its folds, compared with the row named `reference`."""
+    scores = {name: FoldScore.of_folds(each) for name, each in folds.items()}
+    done = {name: score.runs for name, score in scores.items() if score.runs}
+    first = next(iter(done.values()), ())
+    weights, base = Bootstrap.of(first), done.get(reference)
     out: dict[str, RowSummary] = {}
-    first = next(iter(done.values()), [])
-    if first:
-        weights = Bootstrap.of(first)
-        base = done.get(reference)
-        for name, runs in done.items():
-            assert [run.name for run in runs] == [run.name for run in first]
-            rival = None if name == reference else base
-            out[name] = _summary(present[name], runs, rival, weights)
-    for name, each in folds.items():
-        if name not in out:
-            why = next((row.absent for row in each if row.absent), "no run")
-            out[name] = RowSummary(absent=why, failed=any(row.failed for row in each))
-    return {name: out[name] for name in folds}
+    for name, score in scores.items():
+        # all rows of a table are compared on the same runs
+        assert not score.runs or [r.name for r in score.runs] == [r.name for r in first]
+        rival = None if name == reference else base
+        out[name] = _summary(score, folds[name], rival, weights)
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,42 +138,46 @@ def mean_interval(draws: Float[np.ndarray, " draw"]) -> MeanInterval:
 
 
 def _summary(
-    rows: Sequence[FoldScore],
-    runs: Sequence[RunScore],
+    score: FoldScore[RunScore],
+    folds: Sequence[FoldScore[RunScore]],
     rival: Sequence[RunScore] | None,
     by: Bootstrap,
 ) -> RowSummary:
-    def mean(of: Callable[[RunScore], float | bool | None]) -> MeanInterval | None:
-        x = np.array([np.nan if (v := of(run)) is None else float(v) for run in runs])
+    """Return the row of a method; `rival` has the scores that it is compared with, if any."""
+    runs, ended = score.runs, folds if score.runs else ()
+
+    def mean(name: str) -> MeanInterval | None:
+        found = [getattr(run, name) for run in runs]
+        x = np.array([np.nan if value is None else float(value) for value in found])
         return mean_interval(by.mean(x)) if np.isfinite(x).any() else None
 
     error = np.array([run.endpoint_error for run in runs])
-    behind = None
-    if rival is not None:
+    behind, floors = None, None
+    if runs:
+        floors = {name: mean_interval(by.on(error, k)) for k, name in enumerate(by.names)}
+    if runs and rival:
         behind = mean_interval(by.mean(error - np.array([run.endpoint_error for run in rival])))
-
-    def median(name: str) -> float:
-        return float(np.median([getattr(row, name) for row in rows]))
-
-    return RowSummary(
-        endpoint_error=mean_interval(by.mean(error)),
-        floors={name: mean_interval(by.on(error, k)) for k, name in enumerate(by.names)},
-        behind=behind,
-        length_error=mean(lambda run: run.length_error),
-        heading_error_deg=mean(lambda run: run.heading_error_deg),
-        twist_error=mean(lambda run: run.twist_error),
-        coverage90=mean(lambda run: run.covered90),
-        slip_auc=_auc(runs, by),
-        floor_accuracy=mean(lambda run: run.floor_right),
-        energy_error=mean(lambda run: run.energy_error),
-        runs=len(runs),
-        numbers=int(median("numbers")),
-        tune_s=median("tune_s"),
-        fit_s=median("fit_s"),
-        step_us=median("step_us"),
-        settings=tuple(row.settings for row in rows),
-        unconverged=sum(not row.converged for row in rows),
-    )
+    return {
+        "endpoint_error": mean("endpoint_error"),
+        "floors": floors,
+        "behind": behind,
+        "length_error": mean("length_error"),
+        "heading_error_deg": mean("heading_error_deg"),
+        "twist_error": mean("twist_error"),
+        "coverage90": mean("covered90"),
+        "slip_auc": _auc(runs, by) if runs else None,
+        "floor_accuracy": mean("floor_right"),
+        "energy_error": mean("energy_error"),
+        "runs": len(runs),
+        "numbers": score.numbers,
+        "tune_s": score.tune_s,
+        "fit_s": score.fit_s,
+        "step_us": score.step_us,
+        "settings": [fold.settings for fold in ended],
+        "unconverged": sum(not fold.converged for fold in ended),
+        "absent": score.absent or ("" if runs else "no run"),
+        "failed": score.failed,
+    }
 
 
 def _auc(runs: Sequence[RunScore], by: Bootstrap) -> MeanInterval | None:
@@ -250,19 +224,19 @@ def sentence(name: str, protocol: str, found: Mapping[str, RowSummary]) -> str:
     """Return a sentence that compares slipid's end-point error with the other rows of a table."""
     head = f"{name}, {protocol.replace('_', ' ')}: "
     slipid = found.get(NAME)
-    if slipid is None or slipid.endpoint_error is None:
-        why = "not requested" if slipid is None else slipid.absent
+    if slipid is None or slipid["endpoint_error"] is None:
+        why = "not requested" if slipid is None else slipid["absent"]
         return f"{head}slipid has no row ({why})"
-    mine = _percent(slipid.endpoint_error)
+    mine = _percent(slipid["endpoint_error"])
     errors = {
-        row: s.endpoint_error
+        row: s["endpoint_error"]
         for row, s in found.items()
-        if s.endpoint_error is not None and not row.startswith(NAME)
+        if s["endpoint_error"] is not None and not row.startswith(NAME)
     }
     if not errors:
         return f"{head}error of slipid {mine}; no other row to compare with"
     order = sorted(errors, key=lambda row: errors[row].value)
-    behind = {row: b for row in order if (b := found[row].behind) is not None}
+    behind = {row: b for row in order if (b := found[row]["behind"]) is not None}
     ahead = [row for row, b in behind.items() if b.high < 0]
     if ahead:
         also = f" (and {len(ahead) - 1} more)" if len(ahead) > 1 else ""

@@ -13,15 +13,14 @@ from slipid.fitting.problem import Problem
 from slipid.lab.benchmark import slipid_rows
 from slipid.lab.benchmark.protocols import PROTOCOLS, BenchmarkProtocol, Split, base_of, splits
 from slipid.lab.benchmark.rows import rows
-from slipid.lab.benchmark.scores import FoldScore, scored
+from slipid.lab.benchmark.scores import FoldScore, RunScore, scored
 from slipid.lab.benchmark.sets import SOURCES, DataSet, LogSource, read_set
 from slipid.lab.benchmark.steps import RunBatch, in_order, run_batches
 from slipid.lab.benchmark.tuning import tuned
 from slipid.lab.systems.motion.features import common
-from slipid.predict.slip_model import Channel, PredictedRun, RobotSpec, Run, SlipModel
+from slipid.predict.slip_model import PredictedRun, Run, SlipModel
 from slipid.search_space import Space
 from slipid.support.checkpoint import Checkpoint, key_of, source_hash
-from slipid.support.content import Content
 from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
@@ -36,7 +35,7 @@ FIT_SOURCES = (
 """Packages and modules on which slipid's fits depend; saved fits are invalid if one of them
 changes."""
 ROW_SOURCES = ("lab/systems", "lab/paper2021", "lab/benchmark", "robot", "deploy")
-"""Packages on which the scores of all rows depend in addition to `FIT_SOURCES`."""
+"""Packages that the scores of all rows depend on in addition to `FIT_SOURCES`."""
 QUICK_RUNS = 60
 """Largest number of runs of each data set in a quick benchmark."""
 QUICK_KIND = "headings"
@@ -84,10 +83,12 @@ class FoldTask:
         """Fit and score all rows that are missing in the checkpoint, and return the task's name."""
         setup_jax(quiet=True)
         kept = checkpoint_of(self, fit=False)
-        missing = [key for key in keys_of(self) if not _is_done(kept.load_json("_".join(key)))]
+        found = {key: kept.load_json("_".join(key)) for key in keys_of(self)}
+        # failed rows are tried again
+        missing = [key for key, one in found.items() if one is None or one["failed"]]
         if missing:
             try:
-                data: FoldData | FoldScore = _fold_data(self)
+                data: FoldData | FoldScore[RunScore] = _fold_data(self)
             except Exception as error:  # a task that fails does not stop the others
                 data = FoldScore.of_error(error)
             for protocol, name in missing:
@@ -95,16 +96,11 @@ class FoldTask:
                 kept.save_json("_".join((protocol, name)), asdict(score))
         return self.name
 
-    def rows(self) -> dict[tuple[str, str], FoldScore]:
+    def rows(self) -> dict[tuple[str, str], FoldScore[RunScore]]:
         """Return the scores in the checkpoint, by protocol and row."""
         kept = checkpoint_of(self, fit=False)
         found = {key: kept.load_json("_".join(key)) for key in keys_of(self)}
         return {key: FoldScore.of_json(one) for key, one in found.items() if one is not None}
-
-
-def _is_done(content: Content | None) -> bool:
-    """Return True if a row's score was saved and is not a failure; failed rows are tried again."""
-    return content is not None and not content["failed"]
 
 
 def source_of(name: str) -> LogSource:
@@ -169,7 +165,7 @@ class FoldData:
     """
 
     data: DataSet
-    fit: slipid_rows.SlipidFit | FoldScore
+    fit: slipid_rows.SlipidFit | FoldScore[RunScore]
     training: tuple[Run, ...]
     batches: tuple[RunBatch, ...]
     held_out: Runs
@@ -187,7 +183,7 @@ def _fold_data(task: FoldTask) -> FoldData:
     the config if slipid cannot be fitted.
     """
     data, split = data_of(task.options, task.source), split_of(task)
-    fit: slipid_rows.SlipidFit | FoldScore
+    fit: slipid_rows.SlipidFit | FoldScore[RunScore]
     try:
         kept = checkpoint_of(task, fit=True)
         problem = problem_of(task.options, task.source)
@@ -223,7 +219,7 @@ def _with_facts(batch: RunBatch, data: DataSet, numbers: np.ndarray) -> RunBatch
     return replace(batch, runs=tuple(runs))
 
 
-def _score(data: FoldData, protocol: str, name: str) -> FoldScore:
+def _score(data: FoldData, protocol: str, name: str) -> FoldScore[RunScore]:
     """Return the score of a row in a protocol, or the reason why it is absent."""
     rules = PROTOCOLS[protocol]
     runs = [run.with_floor(rules.floor_known) for run in data.runs]
@@ -231,22 +227,17 @@ def _score(data: FoldData, protocol: str, name: str) -> FoldScore:
         if name in (slipid_rows.NAME, MAP_ROW):
             return _slipid(data, rules, runs, name)
         method = next(m for m in rows(data.data.spec) if m.name == name)
-        if lacks := method.needs - channels_of(runs, data.data.spec):
+        has = common(runs) | ({"twist"} if data.data.spec.determines_twist else set())
+        if lacks := method.needs - has:
             return FoldScore.lacking(lacks)
         return _published(data, rules, runs, method)
     except Exception as error:  # a row that fails does not stop the others
         return FoldScore.of_error(error)
 
 
-def channels_of(runs: Sequence[Run], spec: RobotSpec) -> frozenset[Channel]:
-    """Return the channels that all runs have, other than encoders."""
-    twist: frozenset[Channel] = frozenset({"twist"} if spec.determines_twist else ())
-    return common(runs) | twist
-
-
 def _published(
     data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], method: SlipModel
-) -> FoldScore:
+) -> FoldScore[RunScore]:
     """Return the score of a published method: tuned, fitted and applied to the held-out runs."""
     spec = data.data.spec
     training = [run.with_floor(protocol.floor_known) for run in data.training]
@@ -259,14 +250,15 @@ def _published(
     return replace(
         score,
         settings=found.settings,
-        tried=found.tried,
         numbers=fitted.numbers,
         tune_s=picked - began,
         fit_s=ended - picked,
     )
 
 
-def _slipid(data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], name: str) -> FoldScore:
+def _slipid(
+    data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], name: str
+) -> FoldScore[RunScore]:
     """Return the score of slipid in a protocol.
 
     Runs are predicted by its estimator if floors are unknown or the runs have a gyro, and
@@ -294,7 +286,7 @@ def _slipid(data: FoldData, protocol: BenchmarkProtocol, runs: list[Run], name: 
 
 def _timed(
     data: FoldData, runs: Sequence[Run], predict: Callable[[], list[PredictedRun]]
-) -> FoldScore:
+) -> FoldScore[RunScore]:
     """Return the scores of the predictions, with the time that one step of one run took."""
     began = time.perf_counter()
     predicted = predict()

@@ -8,8 +8,9 @@ import numpy as np
 
 from slipid.data.log import Log
 from slipid.lab.paper2021 import table as tables
-from slipid.lab.paper2021.samples import Transfer, leave_one_surface_out, read_columns
+from slipid.lab.paper2021.samples import leave_one_surface_out, read_columns
 from slipid.lab.paper2021.table import FittedForm, MotorTable, field_table, surface_tables
+from slipid.support.content import Content
 from slipid.support.errors import DataError, bad_data
 
 
@@ -136,7 +137,7 @@ class PaperResult:
     field: MotorTable
     motors: dict[int, MotorTable]
     tracks: tuple[SquareTrack, ...]
-    transfer: Transfer | None
+    transfer: Content | None
 
     def as_dict(self) -> dict[str, object]:
         """Return all numbers by name, ready for JSON."""
@@ -151,7 +152,7 @@ class PaperResult:
                 "threshold_A": tables.DEPLOYED_THRESHOLD,
                 "memory": tables.DEPLOYED_MEMORY,
             },
-            "transfer": self.transfer and {**asdict(self.transfer), "mean": self.transfer.mean()},
+            "transfer": self.transfer,
         }
 
 

@@ -15,6 +15,7 @@ from slipid.data.reading.presets import preset
 from slipid.data.reading.table import read_table
 from slipid.data.wheel_signals import body_steps, first_moved
 from slipid.predict.ranking import errors_by_floor
+from slipid.support.content import Content
 from slipid.support.errors import bad_data
 
 SURFACES = ("gray", "blue", "red")
@@ -173,28 +174,6 @@ def read_columns(path: Path, layout: str, needed: Sequence[str] = ()) -> dict[st
     return {str(name): column for name, column in zip(table.names, table.values.T, strict=True)}
 
 
-@dataclass(frozen=True)
-class Transfer:
-    """Errors of three predictions of slip on each surface [-].
-
-    Attributes:
-        samples: number of samples per surface.
-        pooled: root mean square error of a curve fitted to the other surfaces.
-        constant: root mean square error of the other surfaces' mean slip.
-        own: root mean square error of a curve fitted to the samples of the surface itself.
-    """
-
-    samples: dict[str, int]
-    pooled: dict[str, float]
-    constant: dict[str, float]
-    own: dict[str, float]
-
-    def mean(self) -> dict[str, float]:
-        """Return the error of each prediction, averaged over surfaces with equal weights."""
-        rows = {"pooled": self.pooled, "constant": self.constant, "own": self.own}
-        return {name: float(np.mean(list(row.values()))) for name, row in rows.items()}
-
-
 def wheel_windows(log: Log, recipe: Recipe) -> tuple[np.ndarray, np.ndarray]:
     """Return mean current and slip of every wheel in all windows of a log.
 
@@ -237,10 +216,16 @@ def curve_points(log: Log, recipe: Recipe) -> np.ndarray:
     return np.stack([current[keep], slip[keep]], axis=1)
 
 
-def leave_one_surface_out(logs: Iterable[Log]) -> Transfer:
+def leave_one_surface_out(logs: Iterable[Log]) -> Content:
     """Return the errors of curves fitted to other surfaces, or to a surface itself, on its slip.
 
     Poses are used as the camera logged them, without correction of its scale and lag.
+
+    Returns:
+        In the form of paper.json: the number of `samples` by surface; root mean square errors [-]
+        by surface of curves fitted to the other surfaces (`pooled`), of the other surfaces' mean
+        slip (`constant`), and of curves fitted to the samples of the surface itself (`own`); and
+        the `mean` of each of these errors over surfaces, with equal weights.
 
     Raises:
         ValueError: there are fewer than two surfaces, or one has too few samples for a curve.
@@ -260,5 +245,6 @@ def leave_one_surface_out(logs: Iterable[Log]) -> Transfer:
     current, slip = np.concatenate(list(points.values())).T
     floor = np.repeat(list(counts), list(counts.values()))
     found = errors_by_floor(slip, current, floor)
-    pooled, constant, own = (found[k]["each"] for k in ("pooled", "constant", "per_surface"))
-    return Transfer(samples=counts, pooled=pooled, constant=constant, own=own)
+    errors = {k: found["per_surface" if k == "own" else k] for k in ("pooled", "constant", "own")}
+    each, mean = ({k: e[part] for k, e in errors.items()} for part in ("each", "floors"))
+    return {"samples": counts, **each, "mean": mean}

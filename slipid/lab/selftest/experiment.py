@@ -28,7 +28,7 @@ from slipid.support.jax_setup import setup_jax
 from slipid.support.progress import Reporter
 
 SCHEMA = "slipid.selftest/1"
-SIGNIFICANCE = 1e-3
+LEVEL = 1e-3
 """Significance level of the two tests of a parameter's errors over all replicates.
 
 The tests check whether its 90 % intervals contain the truth often enough, and whether its errors
@@ -192,17 +192,14 @@ def number_summary(found: Sequence[NumberRecovery]) -> Content:
 
     `recovered` follows from the most frequent verdict of the fits: "yes" for identified, "roughly"
     for weak, and "no" for the others. "yes" and "roughly" become "wrong" if the errors are
-    significantly larger than the fits' intervals and standard deviations allow (`SIGNIFICANCE`).
+    significantly larger than the fits' intervals and standard deviations allow (`LEVEL`).
     """
     truth, value = np.array([f.truth for f in found]), np.array([f.value for f in found])
     inside, z = np.array([f.inside for f in found]), np.array([f.z for f in found])
     count = Counter(f.verdict for f in found)
     verdict = max(reversed(VERDICT_ORDER), key=lambda v: count[v])
     hits, total = int(inside.sum()), inside.size
-    honest = (
-        binom.cdf(hits, total, 0.9) > SIGNIFICANCE
-        and chi2.sf(float((z**2).sum()), z.size) > SIGNIFICANCE
-    )
+    honest = binom.cdf(hits, total, 0.9) > LEVEL and chi2.sf(float((z**2).sum()), z.size) > LEVEL
     recovered = {"identified": "yes", "weak": "roughly"}.get(verdict, "no")
     if recovered != "no" and not honest:
         recovered = "wrong"

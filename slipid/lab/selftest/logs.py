@@ -10,6 +10,7 @@ quantised voltages, repeated camera frames, uneven rows, and a delayed and rampe
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -22,10 +23,11 @@ from slipid.data.wheel_signals import interpolate
 from slipid.fitting.shared_effects import AXES
 from slipid.infer.design.planned_runs import PlannedRun
 from slipid.model.geometry import omni
-from slipid.model.robot import Robot, build, motor_current, twist
+from slipid.model.robot import Robot, build, steady_states
 from slipid.model.se2 import compose, path
 from slipid.parameter import entries
 from slipid.search_space import Choice, Space
+from slipid.support.blocks import in_blocks
 
 
 def true_numbers(robot: Robot) -> dict[str, float | list[float]]:
@@ -205,11 +207,17 @@ class _LogSimulator:
         base = float(robot.geometry.base_radius)
         seconds = [d.seconds(base) + s.delay + s.ramp for d in drives]
         time, angle = self.wheels(int(np.ceil(max(seconds) / s.row_period)) + 2)
-        floor = jnp.asarray([robot.surface_index(d.surface) for d in drives])
-        load = jnp.asarray([robot.load_index(d.load) for d in drives])
         dt = np.diff(time, axis=1)
         speed = np.diff(angle, axis=1) / dt[..., None]
-        xi, amps = (np.asarray(x) for x in _twists(robot, speed, floor, load))
+        floor, load = (
+            np.repeat(each, dt.shape[1])
+            for each in (
+                [robot.surface_index(d.surface) for d in drives],
+                [robot.load_index(d.load) for d in drives],
+            )
+        )
+        steady = steady_states(robot, speed.reshape(-1, speed.shape[-1]), floor, load)
+        xi, amps = steady.twist.reshape(*dt.shape, 3), steady.current.reshape(speed.shape)
         pose, fresh = self.camera(time, self.poses(dt, speed, xi))
         channels = self.electric(speed, amps)
         tick = 2 * np.pi / (s.ticks * robot.geometry.gear_ratio)
@@ -301,7 +309,8 @@ class _LogSimulator:
             marker[k] = interpolate(t, pose[k], at)
         session = [robot.session_index(d.session) for d in self.drives]
         yaw = np.array([float(robot.camera.yaw(k)) for k in session])
-        logged = np.asarray(_as_logged(robot, jnp.asarray(marker), jnp.asarray(yaw)))
+        every = marker.reshape(-1, 3), np.repeat(yaw, marker.shape[1])
+        logged = in_blocks(partial(_as_logged, robot), *every).reshape(marker.shape)
         std = [s.of(f"camera.{part}") for part in ("place", "place", "heading")]
         logged = logged + rng.normal(size=logged.shape) * np.array(std)
         rows = np.arange(time.shape[1])
@@ -330,29 +339,20 @@ class _LogSimulator:
         return current * s.current_step, voltage, np.round(1.013 * w / quantum) * quantum
 
 
-@jax.jit
-def _twists(robot: Robot, speed: Array, floor: Array, load: Array) -> tuple[Array, Array]:
-    """Return body twists [m/s, m/s, rad/s] and signed motor currents [A] by run and step."""
-    frame = robot.geometry.frame()
-
-    def one(w: Array, f: Array, s: Array) -> tuple[Array, Array]:
-        xi = twist(robot, frame, robot.geometry.at_wheels(w), f, s)
-        return xi, motor_current(robot, frame, xi, w, f, s)
-
-    return jax.vmap(jax.vmap(one, (0, None, None)))(speed, floor, load)
-
-
 _paths = jax.jit(jax.vmap(path))
 
 
 @jax.jit
 def _as_logged(robot: Robot, pose: Array, yaw: Array) -> Array:
-    """Return the poses that the camera logs, without noise, for true body poses."""
+    """Return the poses that the camera logs, without noise, for true poses of the body.
+
+    `yaw` is the heading of the marker in the body frame at each pose [rad].
+    """
 
     def one(body: Array, psi: Array) -> Array:
         return robot.camera.logged(compose(body, jnp.stack([*robot.camera.marker_place, psi])))
 
-    return jax.vmap(lambda run, psi: jax.vmap(lambda p: one(p, psi))(run))(pose, yaw)
+    return jax.vmap(one)(pose, yaw)
 
 
 def _row_means(x: Float[np.ndarray, "run step wheel"]) -> Float[np.ndarray, "run row wheel"]:

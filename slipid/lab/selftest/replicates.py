@@ -12,11 +12,12 @@ Source: a small version of simulation-based calibration (Talts et al. 2018, arXi
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from pydantic import TypeAdapter
 
 from slipid.app.config import Config
@@ -30,10 +31,13 @@ from slipid.infer.result import draws
 from slipid.infer.slip_curves import curves, slip_on
 from slipid.infer.verdicts.estimates import Estimate, derived, estimates
 from slipid.infer.verdicts.unidentified import flat_directions, members
+from slipid.model.camera import Camera
+from slipid.model.motor import Motor
 from slipid.model.robot import Robot
-from slipid.predict.open_loop import chain, contact_increments, corrected
+from slipid.predict.open_loop import chain, contact_increments
 from slipid.predict.slip_model import as_increments
 from slipid.search_space import Choice, Space
+from slipid.support.blocks import in_blocks
 from slipid.support.checkpoint import Checkpoint
 from slipid.support.errors import DataError
 from slipid.support.progress import Reporter
@@ -55,10 +59,14 @@ def simulate_windows(
         std: std of each variance component by its name (`fit.noise`); a name without a floor holds
             for every floor without an entry, and missing components are zero.
     """
-    b = lk.batch(w, truth)
-    increment, amps, start = (np.asarray(x) for x in _predicted(truth, b, w.pose))
+
+    def predicted(which: Int[np.ndarray, " segment"]) -> tuple[Array, Array, Array]:
+        return _predicted(truth, lk.batch(w.segments(which), truth), w.pose[which])
+
+    increment, amps, start = in_blocks(predicted, np.arange(len(w)), block=32)
     steps = increment + _process(truth, w, rng, std)
-    pose = np.array(_logged(truth, chain(start, steps)))
+    path = np.asarray(chain(start, steps))
+    pose = in_blocks(partial(_logged, truth.camera), path.reshape(-1, 3)).reshape(path.shape)
     pose[..., :2] += rng.normal(size=(*pose.shape[:2], 2)) * std.get("camera.place", 0.0)
     pose[..., 2] += rng.normal(size=pose.shape[:2]) * std.get("camera.heading", 0.0)
     each = _component_std(std, w, "current", "window")[:, None, None]
@@ -68,7 +76,7 @@ def simulate_windows(
     speed = w.turn / w.dt[..., None]
     signed = flowing - float(truth.motor.current_offset)
     signed = signed if w.current_is_signed else signed * np.tanh(speed / 0.2)
-    volts = np.asarray(_voltage(truth, signed, speed))
+    volts = np.asarray(_voltage(truth.motor, signed, speed))
     current = flowing + np.sqrt(w.current_var) * rng.normal(size=amps.shape)
     voltage = volts + rng.normal(size=amps.shape) * std.get("voltage.window", 0.0)
     return replace(
@@ -82,17 +90,12 @@ def simulate_windows(
 @jax.jit
 def _predicted(robot: Robot, b: lk.Batch, pose: Array) -> tuple[Array, Array, Array]:
     p = lk.predict(robot, b)
-    return p.increment, lk.predicted_current(robot, b, p.motor_force), corrected(robot, pose)[:, 0]
+    start = lk.corrected(robot, pose)[:, 0]
+    return p.increment, lk.predicted_current(robot, b, p.motor_force), start
 
 
-@jax.jit
-def _logged(robot: Robot, pose: Float[Array, "segment edge 3"]) -> Float[Array, "segment edge 3"]:
-    return jax.vmap(jax.vmap(robot.camera.logged))(pose)
-
-
-@jax.jit
-def _voltage(robot: Robot, amps: Array, wheel_speed: Array) -> Array:
-    return robot.motor.voltage(amps, wheel_speed)
+_logged = jax.jit(jax.vmap(Camera.logged, (None, 0)))
+_voltage = jax.jit(Motor.voltage)
 
 
 def _component_std(std: Mapping[str, float], w: Windows, kind: str, part: str) -> np.ndarray:
@@ -135,9 +138,9 @@ def _shared(
 
 FILE = "replicates"
 """Name of the checkpoint's file of finished replicates, from which a later call continues."""
-TRUTH_STD_RATIO, LARGEST_PRIOR_STD = 0.5, 0.5
-"""True parameters are drawn with a std of `TRUTH_STD_RATIO` times the prior std, but of at most
-that ratio times `LARGEST_PRIOR_STD`.
+TRUTH_STD_RATIO, MOST_PRIOR_STD = 0.5, 0.5
+"""True parameters are drawn with a std of `TRUTH_STD_RATIO` times the prior std, at most
+`MOST_PRIOR_STD`.
 
 Both stds are in the search space."""
 
@@ -185,14 +188,13 @@ class Replicate:
         curves: slip curves by floor.
         predictions: mean distance between predicted and true end of a run, divided by the true
             chord, by floor and slip model.
-        converged, reason: True if the fit converged, and why it stopped.
+        converged: True if the fit converged.
     """
 
     parameters: dict[str, NumberRecovery]
     curves: dict[str, CurveRecovery]
     predictions: dict[str, dict[str, float]]
     converged: bool
-    reason: str
 
 
 _FILE = TypeAdapter(list[Replicate])
@@ -212,7 +214,7 @@ def plausible(
     """
     space, given = problem.space, config.content.selftest.truth
     center = space.prior_mean.copy()
-    scatter = TRUTH_STD_RATIO * np.minimum(space.prior_std, LARGEST_PRIOR_STD)
+    scatter = TRUTH_STD_RATIO * np.minimum(space.prior_std, MOST_PRIOR_STD)
     for pattern, value in given.items():
         where = f"{config.path}: selftest.truth.'{pattern}'"
         mine = [e for e in space.free if fnmatchcase(e.path, pattern)]
@@ -302,13 +304,11 @@ def recovery(
         curves=_curves(problem, truth, z, covariance),
         predictions=_predictions(problem.windows, truth, found),
         converged=bool(end.converged),
-        reason=end.reason,
     )
 
 
 def _number(e: Estimate, truth: np.ndarray, score: np.ndarray) -> NumberRecovery:
-    pairs = e.interval90 if e.labels else [e.interval90]
-    values = e.value if e.labels else [e.value]
+    pairs, values = (x if e.labels else [x] for x in (e.interval90, e.value))
     return NumberRecovery(
         unit=e.unit,
         labels=list(e.labels),
@@ -353,11 +353,9 @@ def _predictions(w: Windows, truth: Robot, found: Robot) -> dict[str, dict[str, 
     }
     chord, floor = np.linalg.norm(true, axis=1), np.asarray(w.surface)
     travels = chord > 0.1 * np.median(chord)  # Turns on the spot have no chord.
-    out: dict[str, dict[str, float]] = {}
-    for name in dict.fromkeys(w.surface):
-        if (mine := travels & (floor == name)).any():
-            gaps = {
-                model: np.linalg.norm(end - true, axis=1) for model, end in predicted_ends.items()
-            }
-            out[name] = {m: float(np.mean((gap / chord)[mine])) for m, gap in gaps.items()}
-    return out
+    error = {m: np.linalg.norm(end - true, axis=1) / chord for m, end in predicted_ends.items()}
+    return {
+        name: {model: float(np.mean(of_model[mine])) for model, of_model in error.items()}
+        for name in dict.fromkeys(w.surface)
+        if (mine := travels & (floor == name)).any()
+    }

@@ -1,6 +1,6 @@
 """Runs of the simulated robot by timed twists or way-points, and records of its true motion."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -29,13 +29,13 @@ class TimedTwists:
 
     legs: tuple[tuple[BodyTwist, float], ...]
 
-    def command(self, time: float) -> BodyTwist | None:
-        """Return the twist at a time since the start [s]; None after the end of the last leg."""
+    def twists(self, plant: SimulatedRobot) -> Iterator[BodyTwist]:
+        """Yield the twist of each period until the end of the last leg."""
+        end = 0.0
         for twist, seconds in self.legs:
-            if time < seconds - 1e-9:
-                return twist
-            time -= seconds
-        return None
+            end += seconds
+            while plant.time < end - 1e-9:
+                yield twist
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,38 @@ class Waypoints:
     places: tuple[tuple[float, float], ...]
     speed: float = 0.2
     by: Literal["encoders", "camera"] = "encoders"
+
+    def twists(self, plant: SimulatedRobot) -> Iterator[BodyTwist]:
+        """Yield the twist of each period, in the body frame, until all positions are reached.
+
+        It ends earlier if too much time passes: 10 s and three times the duration without slip.
+        """
+        # The start is not among the way-points; closing the path makes it at least as long.
+        corners = np.array([self.places[-1], *self.places])
+        longest = 10.0 + 3 * float(np.hypot(*np.diff(corners, axis=0).T).sum()) / self.speed
+        pose, back = np.zeros(3), np.linalg.pinv(plant.robot.wheel_from_twist)
+        angle, goals = plant.wheel_angle, list(self.places)
+        while plant.time <= longest:
+            before, angle = angle, plant.wheel_angle
+            pose = _moved(pose, back @ (angle - before))
+            if self.by == "camera":
+                pose = np.array(plant.pose)
+            while goals and np.hypot(*(goals[0] - pose[:2])) <= REACHED_M:
+                del goals[0]
+            if not goals:
+                return
+            offset = goals[0] - pose[:2]
+            distance = float(np.hypot(*offset))
+            x, y = min(self.speed, max(0.05, 2.0 * distance)) * offset / distance
+            c, s = np.cos(pose[2]), np.sin(pose[2])
+            yield float(c * x + s * y), float(c * y - s * x), 0.0
+
+
+def _moved(pose: Float[np.ndarray, "3"], step: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Return the pose after a small displacement (x, y, turn) in the body frame [m, m, rad]."""
+    middle = pose[2] + 0.5 * step[2]
+    c, s = np.cos(middle), np.sin(middle)
+    return pose + np.array([c * step[0] - s * step[1], s * step[0] + c * step[1], step[2]])
 
 
 @dataclass(frozen=True)
@@ -182,92 +214,28 @@ def drive(run: SiteRun, site: Site, seed: int, timestep: float = TIMESTEP) -> Tr
         DataError: MuJoCo is missing, or the simulation became unstable.
     """
     plant = SimulatedRobot(site, run.map, run.load, run.start, seed, timestep)
-    recorder, rims = _Recorder(plant), RimSpeeds(site, plant)
-    back = np.linalg.pinv(site.robot.wheel_from_twist)
-    believed, sent, goal = np.zeros(3), np.zeros(3), 0
-    before = plant.wheel_angle
-    program = run.program
-    while True:
-        if isinstance(program, Waypoints):
-            turned = plant.wheel_angle
-            believed = _moved(believed, back @ (turned - before))
-            before = turned
-            pose = believed if program.by == "encoders" else np.array(plant.pose)
-            goal, twist = _towards(program, goal, pose, plant.time)
-        else:
-            twist = program.command(plant.time)
-        if twist is None:
-            break
+    rims, sent = RimSpeeds(site, plant), np.zeros(3)
+    rows: list[tuple[float | list[float] | np.ndarray, ...]] = []
+
+    def record() -> None:
+        """Keep the engine's state, in the order of the fields of `Trace`."""
+        p, d = plant, plant.data
+        body, angle = d.qpos[:7].copy(), d.qpos[p.wheel_at] - p.angle_at_start
+        wheels = angle, d.qvel[p.wheel_dof], rims.speed
+        electric = list(p.drive.current), list(p.drive.voltage), p.drive.bus
+        sinkage = np.maximum(p.robot.wheel_radius_m - d.xpos[p.wheel_body, 2], 0.0)
+        rows.append((p.time, body, d.qvel[5], *wheels, *electric, sinkage, sent))
+
+    for twist in run.program.twists(plant):
         sent = np.array(twist)
         rims.send(site.robot.wheel_from_twist @ sent)
         for _ in range(round(PERIOD / plant.dt)):
-            recorder.record(rims.follow(), sent)
+            rims.follow()
+            record()
             plant.step(rims.speed.tolist())
-    recorder.record(rims.speed, sent)
+    record()
     plant.check()
-    return recorder.trace()
-
-
-def _towards(
-    program: Waypoints, goal: int, pose: Float[np.ndarray, "3"], time: float
-) -> tuple[int, BodyTwist | None]:
-    """Return the index of the next way-point, and the twist towards it in the body frame.
-
-    The twist is None if all way-points are reached, or too much time has passed: 10 s and three
-    times the duration without slip.
-    """
-    while goal < len(program.places):
-        offset = np.array(program.places[goal]) - pose[:2]
-        distance = float(np.hypot(*offset))
-        if distance > REACHED_M:
-            break
-        goal += 1
-    # The start is not among the way-points; closing the path makes it at least as long.
-    corners = np.array([program.places[-1], *program.places])
-    longest = 10.0 + 3 * float(np.hypot(*np.diff(corners, axis=0).T).sum()) / program.speed
-    if goal == len(program.places) or time > longest:
-        return goal, None
-    speed = min(program.speed, max(0.05, 2.0 * distance))
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    x, y = speed * offset / distance
-    return goal, (float(c * x + s * y), float(c * y - s * x), 0.0)
-
-
-def _moved(pose: Float[np.ndarray, "3"], step: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Return the pose after a small displacement (x, y, turn) in the body frame [m, m, rad]."""
-    middle = pose[2] + 0.5 * step[2]
-    c, s = np.cos(middle), np.sin(middle)
-    return pose + np.array([c * step[0] - s * step[1], s * step[0] + c * step[1], step[2]])
-
-
-class _Recorder:
-    """Recorder of the engine's state at every time step, which returns it as a `Trace`."""
-
-    def __init__(self, plant: SimulatedRobot):
-        self.plant = plant
-        self._rows: list[tuple[float | list[float] | np.ndarray, ...]] = []
-
-    def record(self, wanted: Float[np.ndarray, " wheel"], sent: Float[np.ndarray, "3"]) -> None:
-        p, d = self.plant, self.plant.data
-        body, turn, height = d.qpos[:7].copy(), d.qvel[5], d.xpos[p.wheel_body, 2]
-        wheels = d.qpos[p.wheel_at], d.qvel[p.wheel_dof], height, wanted
-        electric = list(p.drive.current), list(p.drive.voltage), p.drive.bus
-        self._rows.append((p.time, body, turn, *wheels, *electric, sent))
-
-    def trace(self) -> Trace:
-        columns = (np.array(column) for column in zip(*self._rows, strict=True))
-        time, body, turn, angle, speed, height, wanted, amps, volts, bus, sent = columns
-        heading = np.unwrap(heading_of(body[:, 3:]))[:, None]
-        return Trace(
-            time=time,
-            pose=np.concatenate([body[:, :2], heading], axis=1),
-            yaw_rate=turn,
-            wheel_angle=angle - self.plant.angle_at_start,
-            wheel_speed=speed,
-            wheel_command=wanted,
-            current=amps,
-            voltage=volts,
-            bus=bus,
-            sinkage=np.maximum(self.plant.robot.wheel_radius_m - height, 0.0),
-            twist_command=sent,
-        )
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    body = columns[1]
+    columns[1] = np.column_stack([body[:, :2], np.unwrap(heading_of(body[:, 3:]))])
+    return Trace(*columns)

@@ -17,7 +17,7 @@ SETTLING_S = 0.4
 """Time for which the robot settles on the floor before anything is recorded [s]."""
 LOOKUP_STEPS = 5
 """Number of time steps from one lookup of the floor beneath the rollers to the next."""
-CREEP = 0.02
+RESISTANCE_SPEED = 0.02
 """Speed at which compaction and body drag reach 0.7 of their full force [m/s]."""
 
 
@@ -193,12 +193,12 @@ class SimulatedRobot:
         for (x, y, z), surface in zip(places.tolist(), beneath, strict=True):
             hard = surface.compaction * max(self.robot.wheel_radius_m - z, 0.0) ** 1.5
             ux, uy = vx - turn * (y - y0), vy + turn * (x - x0)
-            size = hard / (ux * ux + uy * uy + CREEP**2) ** 0.5
+            size = hard / (ux * ux + uy * uy + RESISTANCE_SPEED**2) ** 0.5
             fx -= size * ux
             fy -= size * uy
             moment -= size * ((x - x0) * uy - (y - y0) * ux)
         size = sum(g.body_drag_n for g in beneath) / len(places)
-        size /= (vx * vx + vy * vy + CREEP**2) ** 0.5
+        size /= (vx * vx + vy * vy + RESISTANCE_SPEED**2) ** 0.5
         fx, fy = fx - size * vx, fy - size * vy
         heading = self.pose[2]
         c, s = np.cos(heading), np.sin(heading)

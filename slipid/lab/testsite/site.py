@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, FiniteFloat
 from pydantic.dataclasses import dataclass
+from scipy.spatial.transform import Rotation
 
 from slipid.lab.testsite.robot_build import MotorBuild, RobotBuild, SpeedLoop
 from slipid.lab.testsite.surfaces import SURFACES, SurfacePhysics
@@ -169,11 +170,8 @@ class SiteCamera:
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
         """Rotation from the world to OpenCV's camera axes: x right, y down, z away."""
-        a, b = np.radians(self.tilt_deg)
-        down = np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
-        about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-        about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
-        return about_y @ about_x @ down
+        tilted = Rotation.from_euler("xy", self.tilt_deg, degrees=True)
+        return np.asarray(tilted.as_matrix() @ np.diag([-1.0, 1.0, -1.0]))
 
     @property
     def place(self) -> Float[np.ndarray, "3"]:

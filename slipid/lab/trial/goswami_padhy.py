@@ -45,7 +45,6 @@ optimization", ICNN, with the inertia of Shi and Eberhart 1998.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -76,32 +75,17 @@ class Swarm:
     others: float = 1.5
 
 
-@dataclass(frozen=True, eq=False)
-class SwarmResult:
-    """Result of a swarm.
-
-    Attributes:
-        place: best point found.
-        history: smallest cost found up to the start and up to each iteration.
-    """
-
-    place: Float[np.ndarray, " n"]
-    history: Float[np.ndarray, " iteration"]
-
-    @property
-    def cost(self) -> float:
-        """Cost at the best point."""
-        return float(self.history[-1])
-
-
 def minimise(
     cost: Cost,
     low: Float[np.ndarray, " n"],
     high: Float[np.ndarray, " n"],
     swarm: Swarm,
     seed: int = 0,
-) -> SwarmResult:
-    """Return the best point found by a swarm in a box; for equal seeds the results are equal.
+) -> tuple[Float[np.ndarray, " n"], list[float]]:
+    """Return the best point that a swarm finds in a box, and the smallest costs found.
+
+    The costs are those found up to the start and up to each iteration. Both results depend on the
+    seed only.
 
     Args:
         cost: function to minimise.
@@ -125,7 +109,7 @@ def minimise(
         better = now < value
         own, value = np.where(better[:, None], x, own), np.where(better, now, value)
         history.append(float(value.min()))
-    return SwarmResult(own[np.argmin(value)], np.array(history))
+    return own[np.argmin(value)], history
 
 
 def _finite(cost: Float[np.ndarray, " particle"]) -> Float[np.ndarray, " particle"]:
@@ -133,52 +117,43 @@ def _finite(cost: Float[np.ndarray, " particle"]) -> Float[np.ndarray, " particl
 
 
 Numbers = Array | np.ndarray
-"""Arrays of the law: of jax when it drives a robot, of numpy when many gains are tuned at once."""
-LOW, HIGH = np.zeros(3), np.full(3, 5.0)
+"""Arrays of the law: of jax when it drives a robot, of numpy when many gains are tuned at once.
+
+The first axis of vectors has x, y and yaw: poses, errors, rates, twists, or gains."""
+LOW_GAINS, HIGH_GAINS = np.zeros(3), np.full(3, 5.0)
 """Bounds of the gains [1/s]."""
 GAIN_STEP = 1e-4
 """Step of a gain in central differences [1/s]."""
 
 
-class PlaneVector(NamedTuple):
-    """Vector of x, y and yaw components: a pose, an error, rates, a twist, or gains."""
-
-    x: Numbers
-    y: Numbers
-    yaw: Numbers
-
-
-def in_body(v: PlaneVector, heading: Numbers) -> PlaneVector:
-    """Return a vector of world axes transformed to the axes of a body at a heading [rad]."""
+def in_body(v: Numbers, heading: Numbers) -> Numbers:
+    """Return vectors (x, y, yaw) of world axes in the axes of bodies at their headings [rad]."""
     of = heading.__array_namespace__()
     c, s = of.cos(heading), of.sin(heading)
-    return PlaneVector(c * v.x + s * v.y, c * v.y - s * v.x, v.yaw)
+    return of.stack([c * v[0] + s * v[1], c * v[1] - s * v[0], v[2]])
 
 
-def tracking_error(wanted: PlaneVector, pose: PlaneVector) -> PlaneVector:
+def tracking_error(wanted: Numbers, pose: Numbers) -> Numbers:
     """Return reference less actual pose: position in body axes [m, m] and heading [rad]."""
-    away = PlaneVector(wanted.x - pose.x, wanted.y - pose.y, wanted.yaw - pose.yaw)
-    return in_body(away, pose.yaw)
+    return in_body(wanted - pose, pose[2])
 
 
-def lyapunov(e: PlaneVector) -> Numbers:
+def lyapunov(e: Numbers) -> Numbers:
     """Return the Lyapunov function V of the errors; terms in m^2 and rad are added unweighted."""
-    return 0.5 * (e.x * e.x + e.y * e.y) + 1.0 - e.yaw.__array_namespace__().cos(e.yaw)
+    return 0.5 * (e[0] * e[0] + e[1] * e[1]) + 1.0 - e.__array_namespace__().cos(e[2])
 
 
-def twist(gains: PlaneVector, e: PlaneVector, rates: PlaneVector, heading: Numbers) -> PlaneVector:
+def twist(gains: Numbers, e: Numbers, rates: Numbers, heading: Numbers) -> Numbers:
     """Return the commanded twist [m/s, m/s, rad/s].
 
     Args:
         gains: k1, k2, k3 [1/s].
-        e: errors of the pose.
+        e: errors of the pose [m, m, rad].
         rates: rates of the path in the world [m/s, m/s, rad/s].
         heading: heading of the body [rad].
     """
-    ahead, turn = in_body(rates, heading), e.yaw.__array_namespace__().sin(e.yaw)
-    return PlaneVector(
-        ahead.x + gains.x * e.x, ahead.y + gains.y * e.y, ahead.yaw + gains.yaw * turn
-    )
+    of = e.__array_namespace__()
+    return in_body(rates, heading) + gains * of.stack([e[0], e[1], of.sin(e[2])])
 
 
 class GoswamiPadhy(eqx.Module):
@@ -193,10 +168,8 @@ class GoswamiPadhy(eqx.Module):
             reference: pose and rates of the path in the world [m, m, rad, m/s, m/s, rad/s].
             pose: estimated pose [m, m, rad].
         """
-        wanted, rates, here = (PlaneVector(*x) for x in (reference[:3], reference[3:], pose))
-        return jnp.stack(
-            twist(PlaneVector(*self.gains), tracking_error(wanted, here), rates, here.yaw)
-        )
+        error = tracking_error(reference[:3], pose)
+        return jnp.asarray(twist(self.gains, error, reference[3:], pose[2]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,16 +194,16 @@ class TuningTask:
 
     def integrals(self, gains: Places) -> Float[np.ndarray, " particle"]:
         """Return the mean over starts of the integral of V over time, for many gains at once."""
-        k, h = PlaneVector(*gains.T[..., None]), self.period / len(self.shares)
+        k, h = gains.T[..., None], self.period / len(self.shares)
         pose = np.repeat(self.begin.T[:, None], len(gains), axis=1)
         velocity, total = np.zeros(pose.shape), np.zeros(pose.shape[1:])
         ring = np.zeros((self.shares.shape[1], *pose.shape))
         for row in self.reference:
-            here = PlaneVector(*pose)
-            e = tracking_error(PlaneVector(*row[:3]), here)
+            wanted, rates = np.broadcast_to(row.reshape(2, 3, 1, 1), (2, *pose.shape))
+            e = tracking_error(wanted, pose)
             total += lyapunov(e)
             ring[1:] = ring[:-1]
-            ring[0] = twist(k, e, PlaneVector(*row[3:]), here.yaw)
+            ring[0] = twist(k, e, rates, pose[2])
             arrives = self.shares @ ring.reshape(len(ring), -1)
             for arrived in arrives.reshape(-1, *pose.shape):
                 velocity = velocity + self.follow * (arrived - velocity)
@@ -259,14 +232,14 @@ def _next_pose(
 
 def by_swarm(task: TuningTask, seed: int = 0) -> Float[np.ndarray, "3"]:
     """Return the gains that a particle swarm finds [1/s]."""
-    return minimise(task.integrals, LOW, HIGH, Swarm(), seed).place
+    return minimise(task.integrals, LOW_GAINS, HIGH_GAINS, Swarm(), seed)[0]
 
 
 def by_gradient(task: TuningTask) -> Float[np.ndarray, "3"]:
     """Return the gains that L-BFGS-B finds from the middle of the box [1/s]."""
-    from scipy.optimize import minimize
+    from scipy.optimize import Bounds, minimize
 
-    box = list(zip(LOW, HIGH, strict=True))
+    box, middle = Bounds(LOW_GAINS, HIGH_GAINS), 0.5 * (LOW_GAINS + HIGH_GAINS)
     exact = {"ftol": 1e-14, "gtol": 1e-10}
-    found = minimize(task.slope, 0.5 * (LOW + HIGH), jac=True, bounds=box, options=exact)
+    found = minimize(task.slope, middle, jac=True, bounds=box, options=exact)
     return np.asarray(found.x)

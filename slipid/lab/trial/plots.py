@@ -12,13 +12,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from slipid.data.floor_map import FloorMap
-from slipid.plots.drawing import INK, SHADE, figure, plain, save
+from slipid.plots.drawing import INK, ORANGE, SERIES, SHADE, figure, plain, save
 from slipid.support.content import Content
 
 Paths = Mapping[str, np.ndarray]
 SURFACE_COLOURS = ("#f7f7f4", "#dcdcd6", "#bdbdb4", "#a3a399", "#8c8c82", "#77776d")
 """Colours of surfaces, in the order of the map's surfaces."""
-OTHERS, MARKED = "#56B4E9", "#D55E00"
+FAINT = SERIES[4]
+"""Colour of the paths from all starts but one, which is orange."""
 ERRORS = {
     "closure_error_median": "closure error [mm]",
     "cross_track_rmse": "cross-track rms [mm]",
@@ -103,10 +104,10 @@ def _paths_panel(
     tints = ListedColormap(SURFACE_COLOURS[:kinds])
     axes.pcolormesh(x, y, floor.at(places), cmap=tints, vmin=0, vmax=kinds - 1)
     for p in own:
-        axes.plot(*p.T, color=OTHERS, lw=0.5, alpha=0.6)
+        axes.plot(*p.T, color=FAINT, lw=0.5, alpha=0.6)
     axes.plot(*wanted.T, "--", color=INK, lw=1.0)
-    axes.plot(*own[one].T, color=MARKED, lw=1.8)
-    axes.plot(*own[one][-1], "o", color=MARKED, ms=5)
+    axes.plot(*own[one].T, color=ORANGE, lw=1.8)
+    axes.plot(*own[one][-1], "o", color=ORANGE, ms=5)
     row = content["summary"][name]
     closes, off = row["closure_error_median"], row["heading_error_deg"]
     done = f"{100 * row['finished_share']:.0f} % finish"
@@ -123,10 +124,11 @@ def _legend(drawing: Figure, floor: FloorMap) -> None:
         Patch(facecolor=tint, edgecolor=SHADE, label=name)
         for name, tint in zip(floor.surfaces, SURFACE_COLOURS, strict=False)
     ]
+    typical = "typical start of `encoder`"
     lines = [
         Line2D([], [], color=INK, ls="--", lw=1.0, label="wanted"),
-        Line2D([], [], color=OTHERS, lw=1.0, label="every start"),
-        Line2D([], [], color=MARKED, lw=1.8, marker="o", ms=5, label="typical start of `encoder`"),
+        Line2D([], [], color=FAINT, lw=1.0, label="every start"),
+        Line2D([], [], color=ORANGE, lw=1.8, marker="o", ms=5, label=typical),
     ]
     drawing.legend(handles=[*patches, *lines], loc="outside lower center", ncols=8, fontsize=8)
 

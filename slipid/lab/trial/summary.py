@@ -4,12 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from slipid.robot.closed_loop import PathMetrics
+from slipid.support.content import Content
 
-Interval = tuple[float, float]
-"""Lower and upper end of a 90 % interval, by bootstrap over starts."""
+DRAWS = 2000
+"""Number of draws of the bootstrap over starts."""
+COMPARED = ("closure_error_median", "cross_track_rmse", "first_side_along_track_mm")
+"""Errors whose medians are compared with those of the controller `encoder`, see `columns`."""
 
 
 @dataclass(frozen=True)
@@ -36,98 +39,68 @@ class TrialRun:
         return {**about, **asdict(self.metrics), "believed_error_mm": self.believed_error_mm}
 
 
-@dataclass(frozen=True)
-class MedianRatio:
-    """Ratio of a controller's median error to that of the controller `encoder`, with interval."""
+def summaries(runs: Sequence[TrialRun]) -> dict[str, Content]:
+    """Return the summary of every controller over its starts, in the form of trial.json.
 
-    value: float
-    interval90: Interval
-
-
-@dataclass(frozen=True)
-class ControllerSummary:
-    """Summary of one controller over its starts.
-
-    Attributes:
-        median: medians of errors by name, see `columns`; without those that a plant does not
-            measure (the twin's energy).
-        interval90: intervals of the medians, by name.
-        runs: number of runs.
-        finished_share: share of the runs that reached the end of the path.
-        worse_share: share of the starts with a larger closure error than the controller `encoder`;
-            None without that controller.
-        to_encoder: ratios of medians to those of `encoder`; None without that controller.
+    A summary has the medians of the errors by name, see `columns`, without those that a plant does
+    not measure (the twin's energy); `interval90`, their 90 % intervals by bootstrap over starts;
+    `runs`, the number of runs; and `finished_share`, the share that reached the end of the path.
+    If the controller `encoder` is among them, it also has `worse_share`, the share of the starts
+    with a larger closure error than that controller's, and `to_encoder`, the ratios of medians to
+    its medians, each with its `value` and `interval90`.
     """
-
-    median: Mapping[str, float]
-    interval90: Mapping[str, Interval]
-    runs: int
-    finished_share: float
-    worse_share: float | None
-    to_encoder: Mapping[str, MedianRatio] | None
-
-    def to_json(self) -> dict[str, object]:
-        """Return the summary in the form of trial.json."""
-        rest = asdict(self)
-        if self.to_encoder is None:
-            del rest["to_encoder"], rest["worse_share"]
-        return {**rest.pop("median"), **rest}
-
-
-Columns = Mapping[str, Float[np.ndarray, " run"]]
-
-
-def summaries(runs: Sequence[TrialRun], draws: int = 2000) -> dict[str, ControllerSummary]:
-    """Return the summary of every controller, with 90 % bootstrap intervals over starts."""
-    names = list(dict.fromkeys(run.controller for run in runs))
-    of = {name: [run for run in runs if run.controller == name] for name in names}
-    table = {name: columns(of[name]) for name in names}
-    rng = np.random.default_rng(0)
-    count = min(len(c["closure_error_median"]) for c in table.values())
-    again = rng.integers(count, size=(draws, count))
-    base = table["encoder"]["closure_error_median"] if "encoder" in table else None
-    out: dict[str, ControllerSummary] = {}
+    of = _by_controller(runs)
+    table = {name: columns(mine) for name, mine in of.items()}
+    again, base = _resampled(of), table.get("encoder")
+    out: dict[str, Content] = {}
     for name, mine in table.items():
-        closes, worse = mine["closure_error_median"], None
-        if base is not None:
-            shared = min(len(closes), len(base))
-            worse = float(np.mean(closes[:shared] > base[:shared]))
         known = {k: v for k, v in mine.items() if np.all(np.isfinite(v))}
-        out[name] = ControllerSummary(
-            median={k: float(np.median(v)) for k, v in known.items()},
-            interval90={k: _interval(np.median(v[again], axis=1)) for k, v in known.items()},
-            runs=len(of[name]),
-            finished_share=float(np.mean([run.metrics.finished for run in of[name]])),
-            worse_share=worse,
-            to_encoder=_ratios(mine, table["encoder"], again) if "encoder" in table else None,
-        )
+        out[name] = {
+            **{k: float(np.median(v)) for k, v in known.items()},
+            "interval90": {k: _interval(np.median(v[again], axis=1)) for k, v in known.items()},
+            "runs": len(of[name]),
+            "finished_share": float(np.mean([run.metrics.finished for run in of[name]])),
+        }
+        if base is not None:
+            pairs = zip(mine["closure_error_median"], base["closure_error_median"], strict=False)
+            out[name]["worse_share"] = float(np.mean([own > other for own, other in pairs]))
+            out[name]["to_encoder"] = {k: _ratio(mine[k], base[k], again) for k in COMPARED}
     return out
 
 
-def best_controllers(runs: Sequence[TrialRun], draws: int = 2000) -> tuple[str, ...]:
+def best_controllers(runs: Sequence[TrialRun]) -> tuple[str, ...]:
     """Return the controllers that may have the smallest closure error, the lowest median first.
 
     The others are those whose errors are not clearly larger: the 90 % bootstrap interval of the
     difference of medians, over the same starts, does not lie above 0. Only controllers with the
     smallest number of unfinished runs are considered.
     """
-    names = list(dict.fromkeys(run.controller for run in runs))
-    of = {name: [run for run in runs if run.controller == name] for name in names}
-    unfinished = {name: sum(not run.metrics.finished for run in of[name]) for name in names}
-    complete = [name for name in names if unfinished[name] == min(unfinished.values())]
-    closes = {name: np.array([run.metrics.closure_mm for run in of[name]]) for name in complete}
-    best = min(complete, key=lambda name: float(np.median(closes[name])))
-    count = min(len(v) for v in closes.values())
-    again = np.random.default_rng(0).integers(count, size=(draws, count))
+    of = _by_controller(runs)
+    unfinished = {name: sum(not run.metrics.finished for run in mine) for name, mine in of.items()}
+    complete = {n: mine for n, mine in of.items() if unfinished[n] == min(unfinished.values())}
+    closes = {n: np.array([run.metrics.closure_mm for run in r]) for n, r in complete.items()}
+    best = min(closes, key=lambda name: float(np.median(closes[name])))
+    again = _resampled(complete)
 
     def surely_worse(name: str) -> bool:
         gap = np.median(closes[name][again], axis=1) - np.median(closes[best][again], axis=1)
         return _interval(gap)[0] > 0
 
-    return (best, *(name for name in complete if name != best and not surely_worse(name)))
+    return (best, *(name for name in closes if name != best and not surely_worse(name)))
 
 
-def columns(runs: Sequence[TrialRun]) -> Columns:
+def _by_controller(runs: Sequence[TrialRun]) -> dict[str, list[TrialRun]]:
+    names = dict.fromkeys(run.controller for run in runs)
+    return {name: [run for run in runs if run.controller == name] for name in names}
+
+
+def _resampled(of: Mapping[str, Sequence[TrialRun]]) -> Int[np.ndarray, "draw start"]:
+    """Return indices of starts, drawn with replacement from those that all controllers drove."""
+    count = min(map(len, of.values()))
+    return np.random.default_rng(0).integers(count, size=(DRAWS, count))
+
+
+def columns(runs: Sequence[TrialRun]) -> dict[str, Float[np.ndarray, " run"]]:
     """Return the errors of every run by name.
 
     `first_side_along_track_mm` and `heading_error_deg` are magnitudes; `first_side_travelled` is
@@ -149,15 +122,13 @@ def columns(runs: Sequence[TrialRun]) -> Columns:
     }
 
 
-def _ratios(mine: Columns, base: Columns, again: np.ndarray) -> dict[str, MedianRatio]:
-    out = {}
-    for key in ("closure_error_median", "cross_track_rmse", "first_side_along_track_mm"):
-        a, b = np.median(mine[key][again], axis=1), np.median(base[key][again], axis=1)
-        value = float(np.median(mine[key]) / max(float(np.median(base[key])), 1e-9))
-        out[key] = MedianRatio(value, _interval(a / np.maximum(b, 1e-9)))
-    return out
+def _ratio(mine: np.ndarray, base: np.ndarray, again: np.ndarray) -> Content:
+    """Return the ratio of two medians of errors, with its interval."""
+    a, b = (np.median(x[again], axis=1) for x in (mine, base))
+    value = float(np.median(mine) / max(float(np.median(base)), 1e-9))
+    return {"value": value, "interval90": _interval(a / np.maximum(b, 1e-9))}
 
 
-def _interval(values: np.ndarray) -> Interval:
-    low, high = np.quantile(values, [0.05, 0.95]).tolist()
-    return low, high
+def _interval(values: np.ndarray) -> list[float]:
+    """Return the lower and upper end of the 90 % interval of bootstrap draws."""
+    return [float(x) for x in np.quantile(values, [0.05, 0.95])]

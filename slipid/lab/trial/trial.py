@@ -149,7 +149,7 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
     results(executor, drive, todo, report)
     driven = {task.name: found for task in tasks if (found := _finished_run(task)) is not None}
     runs = [run for run, _ in driven.values()]
-    table, best = summaries(runs), list(best_controllers(runs))
+    best = list(best_controllers(runs))
     content = {
         "schema": SCHEMA,
         "plant": options.plant,
@@ -160,15 +160,14 @@ def trial(out: Path, options: TrialOptions, executor: Executor, report: Reporter
         "gains": _gains(tasks[0].robot, options.tuned_gains),
         "closes_best": None if len(best) > 1 else best[0],
         "not_told_apart": best,
-        "summary": {name: row.to_json() for name, row in table.items()},
+        "summary": summaries(runs),
         "controllers": {name: ROWS[name].about for name in rows},
         "runs": [run.to_json() for run in runs],
     }
     write_json(out / "trial.json", content)
     paths = {name: path for name, (_, path) in driven.items()}
-    return TrialResult(
-        content, tuple(runs), paths, np.asarray(tasks[0].path.rows)[:, :2], tasks[0].floor
-    )
+    wanted = np.asarray(tasks[0].path.rows)[:, :2]
+    return TrialResult(content, tuple(runs), paths, wanted, tasks[0].floor)
 
 
 def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
@@ -191,17 +190,10 @@ def _tasks(out: Path, options: TrialOptions) -> list[TrialTask]:
         require_known_surfaces(known_map, robot, str(options.told_map))
     if options.tuned_gains:
         check_gains(out, robot)
+    gains = _gains(robot, options.tuned_gains)
+    about = options.plant, options.path, options.speed, robot.load_setup, gains
     key = key_of(
-        *(
-            options.plant,
-            options.path,
-            options.speed,
-            robot.load_setup,
-            _gains(robot, options.tuned_gains),
-            settings,
-            actuators,
-            *jax.tree.leaves(robot),
-        ),
+        *(*about, settings, actuators, *jax.tree.leaves(robot)),
         *(part for m in (floor, known_map) for part in (m.surfaces, m.corner, m.cell, m.cells)),
         # Runs of another version of this code are not reused.
         source_hash("robot", "model", "lab/testsite", "data", "deploy", "lab/trial"),

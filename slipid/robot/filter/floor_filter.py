@@ -154,11 +154,13 @@ class FloorFilter(eqx.Module):
             mapped: probability of every hypothesis by a floor map at the robot's pose.
         """
         settled, predicted = self.solve(old.twist, w)
-        f = self.robot
+        f, hypotheses = self.robot, hypotheses_of(self.robot)
         rolling = f.inverse @ (f.frame.radius * w)
         rolled = RolledMotion.of(rolling, f.frame.base)
         mean, part = f.effect_table.at(rolled)
-        xi = settled + effects_by_hypothesis(f, rolled.speed * mean @ rolled.axes.T)
+        # the estimates hold for all wheels on one floor
+        effect = rolled.speed * mean @ rolled.axes.T
+        xi = settled + jnp.zeros((len(hypotheses), 3)).at[hypotheses.uniform].set(effect)
         known_log, unknown_log = self._evidence(xi, predicted, currents, w, turn)
         # Evidence has less weight while wheels accelerate, since the equilibrium neglects inertia.
         weight = jnp.where(tick.moves, tick.dt / self.settings.forget_s, 0.0)
@@ -170,7 +172,7 @@ class FloorFilter(eqx.Module):
         middle = known @ xi
         before = prior[:-1] / jnp.maximum(jnp.sum(prior[:-1]), 1e-12)
         apart, jump = self._moved(apart, known, xi, turn, tick)
-        under = self._marginal(known)
+        under = jnp.einsum("c,cwf->wf", known, hypotheses.on.astype(float))
         motion = BodyMotion(
             twist=middle,
             scatter=(xi - middle).T @ (known[:, None] * (xi - middle)),
@@ -350,18 +352,6 @@ class FloorFilter(eqx.Module):
         c, s = jnp.cos(mean[2]), jnp.sin(mean[2])
         relative = jnp.stack([c * x + s * y, c * y - s * x, yaw], axis=-1)
         return relative, mean - advance(known @ xi, tick.dt)
-
-    def _marginal(self, known: Array) -> Array:
-        """Return the probability of each floor under each wheel (wheel, floor)."""
-        return jnp.einsum("c,cwf->wf", known, hypotheses_of(self.robot).on.astype(float))
-
-
-def effects_by_hypothesis(
-    robot: RobotArrays, of_floor: Float[Array, "floor 3"]
-) -> Float[Array, "hypothesis 3"]:
-    """Return the estimated effects of hypotheses with all wheels on one floor, and 0 for others."""
-    hypotheses = hypotheses_of(robot)
-    return jnp.zeros((len(hypotheses), 3)).at[hypotheses.uniform].set(of_floor)
 
 
 def _followed(

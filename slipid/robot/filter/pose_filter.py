@@ -64,7 +64,9 @@ class PoseFilter(eqx.Module):
     robot: RobotArrays
     settings: Settings
 
-    def init(self, pose: Float[Array, "3"], std: tuple[float, float] = (0.0, 0.0)) -> PoseState:
+    def init(
+        self, pose: Float[Array, "3"], std: Float[Array, "2"] | tuple[float, float] = (0.0, 0.0)
+    ) -> PoseState:
         """Return the state at rest at a pose [m, m, rad] with stds [m], [rad]."""
         place, turn = std
         begin, bias = jnp.asarray([place, place, turn]), jnp.asarray([self.settings.gyro_bias_std])
@@ -148,7 +150,7 @@ class PoseFilter(eqx.Module):
     def _forgotten(self, old: PoseState, motion: BodyMotion, tick: TimeStep) -> PoseState:
         """Return the state with effects and belief errors decorrelated over the step.
 
-        Their variances return towards their stationary values.
+        Their variances return towards their stationary values, which are 1.
         """
         f = self.robot
         speed = length(motion.twist[:2]) + f.frame.base * jnp.abs(motion.twist[2])
@@ -160,13 +162,8 @@ class PoseFilter(eqx.Module):
         doubt = jnp.exp(-far / self.settings.doubt_m)
         parts = [jnp.repeat(keep, 3), jnp.ones(len(left)), jnp.full(3, doubt), jnp.ones(1)]
         kept = jnp.concatenate(parts)
-        std = jnp.concatenate(
-            [jnp.ones(3 * len(left)), jnp.zeros(len(left)), jnp.ones(3), jnp.zeros(1)]
-        )
-        new = (1 - kept**2) * std**2
         whole = jnp.concatenate([jnp.ones(3), kept])
-        covariance = whole[:, None] * old.covariance * whole
-        covariance = covariance + jnp.diag(jnp.concatenate([jnp.zeros(3), new]))
+        covariance = whole[:, None] * old.covariance * whole + jnp.diag(1 - whole**2)
         return replace(old, nuisance=kept * old.nuisance, covariance=covariance, toward=toward)
 
     def _turned(self, old: PoseState, free: Array, gyro: Array) -> Array:

@@ -7,7 +7,7 @@ from math import pi
 
 import pytest
 
-from slipid.data.check.ratios import ScaleRatio, ScaleRatios, single_causes
+from slipid.data.check.ratios import ScaleRatio, single_causes
 from slipid.data.check.sanity import findings
 from tests.helpers.mistakes import MISTAKES
 from tests.helpers.plain_robot import DRIVES, Drive, as_runs, drive
@@ -130,14 +130,11 @@ def test_a_turned_marker_hides_no_other_unit_of_the_pose():
 def test_a_heading_in_another_unit_makes_a_gyro_look_too_small():
     """One cause explains both ratios, and no finding blames the gyro."""
     deg = 180 / pi
-    ratios = ScaleRatios(
-        {
-            "travel": ScaleRatio(0.8, 0.3, 0.8, 1.35),
-            "turning": ScaleRatio(0.8 * deg, 0.35, 0.8, 1.35),
-            "gyro": ScaleRatio(1 / deg, 0.75, 1.0, 1.33),
-        },
-        speed_is_angle=False,
-    )
-    found, alone = single_causes(ratios, 0.05, 16.0)
+    ratios = {
+        "travel": ScaleRatio(0.8, 0.3, 0.8, 1.35),
+        "turning": ScaleRatio(0.8 * deg, 0.35, 0.8, 1.35),
+        "gyro": ScaleRatio(1 / deg, 0.75, 1.0, 1.33),
+    }
+    found, alone = single_causes(ratios, False, 0.05, 16.0)
     assert alone
     assert [(e.name, e.factor) for e in found] == [("heading", pytest.approx(deg))]

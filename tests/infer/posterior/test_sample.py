@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from slipid.fitting.hierarchy import effect_information
+from slipid.fitting.hierarchy import axis_effects, effect_information
 from slipid.fitting.noise import POOLED
 from slipid.fitting.problem import Problem
 from slipid.infer.posterior.blocks import ChainBlock
@@ -67,7 +67,8 @@ def test_variances_are_drawn_from_the_gaussian_of_their_information(problem):
     effect = effects_at(problem, residual, log_v)
     weight = problem.weighed(residual, log_v, np.ones(24), effect).whitening.weight["motion"]
     motion = residual["motion"], jacobian["motion"]
-    of_effects = effect_information(problem.objective, motion, weight, end.covariance, log_v)
+    axes = axis_effects(problem.objective, motion, weight, end.covariance, log_v)
+    of_effects = effect_information(axes, log_v)
     of_effects += np.eye(len(log_v)) / 9
     precision = np.where(single[:, None] & single, by_definition(problem, log_v), 0.0)
     precision += np.where(~single[:, None] & ~single, of_effects, 0.0)
@@ -90,9 +91,9 @@ def test_runs_with_a_common_error_are_no_outliers_to_variances(problem, monkeypa
 
     def spied(target, motion, weight, *rest):
         weights.append(np.asarray(weight))
-        return effect_information(target, motion, weight, *rest)
+        return axis_effects(target, motion, weight, *rest)
 
-    monkeypatch.setattr("slipid.infer.posterior.sample.effect_information", spied)
+    monkeypatch.setattr("slipid.infer.posterior.sample.axis_effects", spied)
     z, log_v = problem.space.start + 0.3, 2 * np.log(problem.noise.typical)
     every = np.ones(len(problem.windows))
     drawn_variances(problem, Fitted(z, log_v, problem.laplace(z, log_v, every)), (1, 2), 0)

@@ -1,6 +1,6 @@
 """Floor classification without a pose: reading, folds, answers, intervals, slipid's own row."""
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -30,14 +30,12 @@ from slipid.lab.benchmark.floors.husky import (
 )
 from slipid.lab.benchmark.floors.protocol import (
     EvaluationSettings,
-    ScoredClassifier,
     answers_of,
     classifier_table,
     folds_of,
-    joined,
     tuned_classifier,
 )
-from slipid.lab.benchmark.floors.result import Answer, ClassifierRow, after_seconds, confusion
+from slipid.lab.benchmark.floors.result import Answer, after_seconds, confusion
 from slipid.lab.benchmark.floors.robotino import (
     RobotinoFloorTask,
     beliefs_of,
@@ -45,6 +43,7 @@ from slipid.lab.benchmark.floors.robotino import (
     robotino_classifiers,
 )
 from slipid.lab.benchmark.floors.slipid_row import SlipidFloorClassifier, kinds
+from slipid.lab.benchmark.scores import FoldScore
 from slipid.lab.benchmark.work import BenchmarkOptions
 from slipid.lab.systems.floors.interface import FloorClassifier, floors_of
 from slipid.predict.slip_model import PredictedRun
@@ -213,8 +212,8 @@ def test_training_runs_have_no_answers(judged):
     table = classifier_table(
         [Memory()], runs, HUSKY, "made", EvaluationSettings((1.0,), 3, judged), "memory"
     )
-    assert table.rows[0].said["grass"] == {"grass": 0.0, "snow": 100.0}
-    assert len(table.rows[0].settings) == judged
+    assert table["rows"][0]["said"]["grass"] == {"grass": 0.0, "snow": 100.0}
+    assert len(table["rows"][0]["settings"]) == judged
 
 
 def answer(run, right, probability=0.5, floor="grass"):
@@ -225,17 +224,17 @@ def test_accuracies_and_differences_by_hand():
     mine = [answer("a", 1, 0.8), answer("a", 0, 0.2), answer("b", 1), answer("c", 1, floor="snow")]
     other = [answer("a", 0), answer("a", 0), answer("b", 1), answer("c", 1, floor="snow")]
     found = after_seconds(mine, other)[0]
-    assert found.stretches == 4
-    assert found.accuracy.value == 0.75
-    assert found.balanced.value == pytest.approx(0.5 * (2 / 3 + 1))
-    assert found.behind is not None
-    assert found.behind.value == 0.25
-    assert found.by_floor == {"grass": pytest.approx(2 / 3), "snow": 1.0}
-    assert found.log_score == pytest.approx(np.log([0.8, 0.2, 0.5, 0.5]).mean())
+    assert found["stretches"] == 4
+    assert found["accuracy"].value == 0.75
+    assert found["balanced"].value == pytest.approx(0.5 * (2 / 3 + 1))
+    assert found["behind"] is not None
+    assert found["behind"].value == 0.25
+    assert found["by_floor"] == {"grass": pytest.approx(2 / 3), "snow": 1.0}
+    assert found["log_score"] == pytest.approx(np.log([0.8, 0.2, 0.5, 0.5]).mean())
     # the run of snow is drawn in every draw; of grass a twice, b twice, or both
-    assert found.accuracy.low == pytest.approx(3 / 5)
-    assert found.accuracy.high == pytest.approx(1.0)
-    assert after_seconds(mine, None)[0].behind is None
+    assert found["accuracy"].low == pytest.approx(3 / 5)
+    assert found["accuracy"].high == pytest.approx(1.0)
+    assert after_seconds(mine, None)[0]["behind"] is None
 
 
 def test_stretches_of_one_run_are_no_independent_witnesses():
@@ -244,7 +243,7 @@ def test_stretches_of_one_run_are_no_independent_witnesses():
     together = [answer(f"r{k}", level[k]) for k in range(20) for _ in range(30)]
     apart = [answer(f"r{n}", a.named == "grass") for n, a in enumerate(together)]
     width = [
-        after_seconds(some, None)[0].accuracy.high - after_seconds(some, None)[0].accuracy.low
+        after_seconds(some, None)[0]["accuracy"].high - after_seconds(some, None)[0]["accuracy"].low
         for some in (together, apart)
     ]
     # std of 20 independent runs against that of 600
@@ -266,28 +265,27 @@ def test_a_table_compares_all_rows_with_the_reference():
     table = classifier_table(
         [good, bad], runs, HUSKY, "made", EvaluationSettings(seconds=(1.0, 4.0)), "good"
     )
-    first, second = table.rows
-    assert first.after[0].accuracy.value == 1.0
-    assert first.after[0].behind is None
-    assert second.after[0].accuracy.value == pytest.approx(0.5, abs=0.1)
-    assert second.after[0].behind is not None
-    assert second.after[0].behind.value == pytest.approx(second.after[0].accuracy.value - 1.0)
-    assert table.chance == 0.5
-    assert (table.runs, table.floors) == (10, ("grass", "snow"))
-    assert first.said == {"grass": {"grass": 100.0, "snow": 0.0}, "snow": {"grass": 0, "snow": 100}}
-    assert '"accuracy"' in json_text(asdict(table))
+    first, second = table["rows"]
+    assert first["after"][0]["accuracy"].value == 1.0
+    assert first["after"][0]["behind"] is None
+    assert second["after"][0]["accuracy"].value == pytest.approx(0.5, abs=0.1)
+    after = second["after"][0]
+    assert after["behind"].value == pytest.approx(after["accuracy"].value - 1.0)
+    assert table["chance"] == 0.5
+    assert (table["runs"], table["floors"]) == (10, ["grass", "snow"])
+    assert first["said"]["grass"] == {"grass": 100.0, "snow": 0.0}
+    assert first["said"]["snow"] == {"grass": 0.0, "snow": 100.0}
+    assert '"accuracy"' in json_text(table)
 
 
 def test_a_quick_table_is_of_one_fold_and_of_the_first_minute():
     runs = made_floor_runs({"grass": 2.0, "snow": 4.0}, runs=5, rows=600)
-    after = (
-        classifier_table([Meter()], runs, HUSKY, "made", EvaluationSettings.quick(), "meter")
-        .rows[0]
-        .after
-    )
-    assert [a.seconds for a in after] == [0.5, 1.0, 2.0]
+    settings = EvaluationSettings.quick()
+    table = classifier_table([Meter()], runs, HUSKY, "made", settings, "meter")
+    after = table["rows"][0]["after"]
+    assert [a["seconds"] for a in after] == [0.5, 1.0, 2.0]
     # of each floor one run, of which a minute is 30 stretches
-    assert [a.stretches for a in after] == [60, 60, 60]
+    assert [a["stretches"] for a in after] == [60, 60, 60]
 
 
 def test_rows_have_names_of_their_own_and_slipid_is_first():
@@ -454,11 +452,11 @@ def test_a_classifier_that_fails_has_an_empty_row_beside_the_others():
     table = classifier_table(
         methods, runs, HUSKY, "made", EvaluationSettings(seconds=(1.0,)), "broken"
     )
-    lost, there = table.rows
-    assert (lost.name, lost.absent) == ("broken", "ZeroDivisionError: no wheel")
-    assert lost.after == ()
-    assert there.after[0].accuracy.value > 0.5
-    assert there.after[0].behind is None
+    lost, there = table["rows"]
+    assert (lost["name"], lost["absent"]) == ("broken", "ZeroDivisionError: no wheel")
+    assert lost["after"] == []
+    assert there["after"][0]["accuracy"].value > 0.5
+    assert there["after"][0]["behind"] is None
     with pytest.raises(ValueError, match="no wheel"):
         classifier_table(
             methods[:1], runs, HUSKY, "made", EvaluationSettings(seconds=(1.0,)), "broken"
@@ -515,10 +513,11 @@ def test_what_the_estimator_calls_unknown_is_left_out_of_the_comparison():
 
 
 def test_a_classifier_that_fails_in_one_fold_has_an_empty_row():
-    lost = ScoredClassifier(ClassifierRow("trees", absent="ValueError: no leaf"), ())
-    there = ScoredClassifier(ClassifierRow("trees", numbers=4), (answer("a", 1),))
-    assert joined([there, lost]) == lost
-    assert joined([there, there]) == ScoredClassifier(there.row, there.answers * 2)
+    lost = FoldScore.of_error(ValueError("no leaf"))
+    there = FoldScore((answer("a", 1),), numbers=4)
+    assert FoldScore.of_folds([there, lost]).absent == "ValueError: no leaf"
+    assert FoldScore.of_folds([there, lost]).runs == ()
+    assert FoldScore.of_folds([there, there]) == replace(there, runs=there.runs * 2)
 
 
 def test_rows_on_the_robotino_use_no_vibration():

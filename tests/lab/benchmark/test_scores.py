@@ -11,7 +11,6 @@ from slipid.lab.benchmark.scores import FoldScore, scored
 from slipid.lab.benchmark.summary import (
     Bootstrap,
     MeanInterval,
-    RowSummary,
     area,
     sentence,
     summary,
@@ -153,17 +152,17 @@ def rows(errors, floor="gray"):
 def test_means_are_over_runs_and_then_over_floors():
     own = [rows([0.1, 0.1, 0.1, 0.1]), rows([0.3, 0.5], "green")]
     found = summary({"slipid": own}, "slipid")["slipid"]
-    assert found.endpoint_error is not None
-    assert found.endpoint_error.value == pytest.approx(0.25)
-    assert found.floors is not None
-    assert found.floors["green"].value == pytest.approx(0.4)
-    assert found.runs == 6
-    assert found.numbers == 3
+    assert found["endpoint_error"] is not None
+    assert found["endpoint_error"].value == pytest.approx(0.25)
+    assert found["floors"] is not None
+    assert found["floors"]["green"].value == pytest.approx(0.4)
+    assert found["runs"] == 6
+    assert found["numbers"] == 3
 
 
 def test_folds_whose_fit_did_not_come_to_rest_are_counted():
     folds = [rows([0.1, 0.2]), replace(rows([0.3]), converged=False)]
-    assert summary({"slipid": folds}, "slipid")["slipid"].unconverged == 1
+    assert summary({"slipid": folds}, "slipid")["slipid"]["unconverged"] == 1
 
 
 def test_a_difference_is_paired():
@@ -171,12 +170,12 @@ def test_a_difference_is_paired():
     errors = rng.uniform(0.1, 0.9, 40)
     own, other = [rows(errors)], [rows(errors + 0.01)]
     found = summary({"slipid": own, "other": other}, "slipid")
-    behind = found["other"].behind
+    behind = found["other"]["behind"]
     assert behind is not None
     assert behind == pytest.approx(
         MeanInterval(0.01, 0.01, 0.01)
     )  # runs that scatter do not hide it
-    assert found["slipid"].behind is None
+    assert found["slipid"]["behind"] is None
 
 
 @pytest.mark.slow
@@ -185,8 +184,8 @@ def test_intervals_cover_the_true_mean_at_their_level():
     hits = 0
     for _ in range(100):
         found = summary({"slipid": [rows(rng.normal(0.5, 0.1, 30))]}, "slipid")["slipid"]
-        assert found.endpoint_error is not None
-        hits += found.endpoint_error.low <= 0.5 <= found.endpoint_error.high
+        assert found["endpoint_error"] is not None
+        hits += found["endpoint_error"].low <= 0.5 <= found["endpoint_error"].high
     assert 80 <= hits <= 97
 
 
@@ -222,11 +221,11 @@ def test_a_row_that_is_absent_in_one_fold_is_absent():
         "ojeda_gyro": [FoldScore.lacking(["gyro"]), FoldScore.lacking(["gyro"])],
     }
     found = summary(folds, "slipid")
-    assert found["broken"].failed
-    assert found["broken"].absent == "ValueError: no rank"
-    assert found["broken"].endpoint_error is None
-    assert not found["ojeda_gyro"].failed
-    assert found["ojeda_gyro"].absent == "needs a gyro"
+    assert found["broken"]["failed"]
+    assert found["broken"]["absent"] == "ValueError: no rank"
+    assert found["broken"]["endpoint_error"] is None
+    assert not found["ojeda_gyro"]["failed"]
+    assert found["ojeda_gyro"]["absent"] == "needs a gyro"
 
 
 def test_rows_outlive_their_files():
@@ -236,7 +235,7 @@ def test_rows_outlive_their_files():
 
 def ends(value, low=None, high=None, behind=None):
     error = MeanInterval(value, value - 0.01, value + 0.01)
-    return RowSummary(endpoint_error=error, behind=behind, runs=9)
+    return {"endpoint_error": error, "behind": behind, "runs": 9}
 
 
 def test_the_reading_names_the_rows_that_are_ahead():

@@ -150,7 +150,6 @@ def row(verdict, converged=True):
         curves={"soft": CurveRecovery(gap=0.01, inside=0.9)},
         predictions={"soft": {"identified": 0.01, "encoder": 0.3}},
         converged=converged,
-        reason="",
     )
 
 
@@ -264,7 +263,7 @@ def test_a_replicate_depends_on_seed_and_number_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(selftest, "optimise", lambda *_, **__: end)
 
     def truth_alone(problem, choices, z, end):
-        return Replicate({"z": replace(number(), truth=z.tolist())}, {}, {}, True, "")
+        return Replicate({"z": replace(number(), truth=z.tolist())}, {}, {}, True)
 
     monkeypatch.setattr(selftest, "recovery", truth_alone)
 

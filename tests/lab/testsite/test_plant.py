@@ -1,6 +1,7 @@
 """Physics of the virtual test site that holds for any contact law."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -363,9 +364,13 @@ def test_the_plans_have_the_runs_of_the_published_logs():
 
 def test_a_timed_program_ends():
     program = TimedTwists((((0.1, 0.0, 0.0), 1.0), ((0.0, 0.0, 0.2), 0.5)))
-    assert program.command(0.5) == (0.1, 0.0, 0.0)
-    assert program.command(1.2) == (0.0, 0.0, 0.2)
-    assert program.command(1.5) is None
+    plant = SimpleNamespace(time=0.5)
+    twists = program.twists(plant)
+    assert next(twists) == (0.1, 0.0, 0.0)
+    plant.time = 1.2
+    assert next(twists) == (0.0, 0.0, 0.2)
+    plant.time = 1.5
+    assert list(twists) == []
 
 
 @pytest.mark.slow

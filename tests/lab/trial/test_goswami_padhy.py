@@ -7,10 +7,9 @@ import pytest
 from scipy.optimize import differential_evolution
 
 from slipid.lab.trial.goswami_padhy import (
-    HIGH,
-    LOW,
+    HIGH_GAINS,
+    LOW_GAINS,
     GoswamiPadhy,
-    PlaneVector,
     TuningTask,
     by_gradient,
     by_swarm,
@@ -29,7 +28,7 @@ def moved(pose, twist):
 
 
 def v_of(reference, pose):
-    return lyapunov(tracking_error(PlaneVector(*reference[:3]), PlaneVector(*pose)))
+    return lyapunov(tracking_error(reference[:3], pose))
 
 
 def test_v_falls_as_proven_at_any_pose_and_rates():
@@ -172,7 +171,7 @@ def test_the_gradient_is_that_of_the_integral():
 def test_swarm_and_gradient_find_what_another_search_finds():
     other = differential_evolution(
         lambda x: LATE.integrals(x.T),
-        list(zip(LOW, HIGH, strict=True)),
+        list(zip(LOW_GAINS, HIGH_GAINS, strict=True)),
         rng=0,
         vectorized=True,
         updating="deferred",
@@ -187,4 +186,4 @@ def test_swarm_and_gradient_find_what_another_search_finds():
 
 def test_gains_of_a_prompt_robot_are_the_largest_there_are():
     task = TuningTask(np.zeros((20, 6)), np.array([[0.1, 0.1, 0.1]]), **PROMPT)
-    np.testing.assert_allclose(by_gradient(task), HIGH, atol=1e-6)
+    np.testing.assert_allclose(by_gradient(task), HIGH_GAINS, atol=1e-6)

@@ -37,17 +37,17 @@ from scipy.optimize import least_squares
 
 from slipid.lab.systems.floors.interface import FloorSignals
 from slipid.model.motor import Motor
-from slipid.model.robot import Robot, motor_current, twist
+from slipid.model.robot import Robot
 
 FITTED = ("friction", "creep", "rolling_resistance")
 """Names of the parameters that are fitted for every floor; the fit is in their logarithms."""
-START = np.log([0.6, 0.15, 0.08])
+PRIOR_MEANS = np.log([0.6, 0.15, 0.08])
 """Prior means of the logarithms, where the fit also starts; the prior std of each is 1."""
 CURRENT_A, YAW_RATE = 1.0, 0.2
 """Scales by which residuals of currents [A] and of the yaw rate [rad/s] are divided."""
 CELL_ROWS, RUN_ROWS = 20.0, 300.0
 """Numbers of rows, in one cell and in one run, above which more rows hardly add weight."""
-MOST_CELLS = 512
+FLOOR_CELLS = 512
 """Largest number of cells of a floor; fewer are padded to it, so that one shape is compiled."""
 SPEED_STEP = 1e-3
 """Width to which wheel speeds are rounded; rows with equal rounded speeds are one cell [rad/s]."""
@@ -143,13 +143,13 @@ def stiffness_of(runs: Sequence[FloorSignals]) -> Float[np.ndarray, " drive"]:
 def fitted_floors(robot: Robot, runs: Sequence[FloorSignals]) -> Robot:
     """Return the robot with the parameters of each floor fitted to the runs on it."""
     for number, floor in enumerate(robot.surfaces.labels):
-        cells = Cells.joined([run for run in runs if run.floor == floor]).thinned(MOST_CELLS)
+        cells = Cells.joined([run for run in runs if run.floor == floor]).thinned(FLOOR_CELLS)
         arrays = (cells.speed, cells.current, cells.gyro, cells.weight)
         index = jnp.asarray(number)
         given = (robot, index, *map(jnp.asarray, arrays))
         solution = least_squares(
             lambda logs, given=given: np.asarray(_residuals(logs, *given)),
-            START,
+            PRIOR_MEANS,
             lambda logs, given=given: np.nan_to_num(np.asarray(_jacobian(logs, *given))),
             loss="soft_l1",
             max_nfev=30,
@@ -166,10 +166,11 @@ def currents_off(
 ) -> Float[np.ndarray, "row drive"]:
     """Return modelled less measured current of each row and drive on a floor [A].
 
-    Rows are evaluated in groups of `MOST_CELLS`, the last padded, so that one shape is compiled.
+    Rows are evaluated in groups of `FLOOR_CELLS`, the last one padded, so that one shape is
+    compiled.
     """
-    groups = -(-len(speed) // MOST_CELLS)
-    padded = np.zeros((groups * MOST_CELLS, speed.shape[1]))
+    groups = -(-len(speed) // FLOOR_CELLS)
+    padded = np.zeros((groups * FLOOR_CELLS, speed.shape[1]))
     padded[: len(speed)] = speed
     parts = [_shown(robot, jnp.asarray(number), w)[0] for w in np.split(padded, groups)]
     return np.concatenate(parts)[: len(speed)] - current
@@ -188,11 +189,12 @@ def shown(
     robot: Robot, number: Array, speed: Float[Array, "row drive"]
 ) -> tuple[Float[Array, "row drive"], Float[Array, " row"]]:
     """Return the modelled ammeter readings [A] and yaw rates [rad/s] at wheel speeds on a floor."""
-    frame, load = robot.geometry.frame(), jnp.zeros((), int)
+    frame = robot.geometry.frame()
+    standing = robot.standing(frame, number, jnp.zeros((), int))
 
     def one(w: Array) -> tuple[Array, Array]:
-        xi = twist(robot, frame, robot.geometry.at_wheels(w), number, load)
-        return motor_current(robot, frame, xi, w, number, load), xi[2]
+        xi = standing.twist(frame.at_wheels(w))
+        return standing.current(xi, w), xi[2]
 
     return jax.vmap(one)(speed)
 
@@ -210,7 +212,7 @@ def _residuals(
         [
             ((modelled - amps) / CURRENT_A * weight[:, :1]).ravel(),
             (turn - gyro) / YAW_RATE * weight[:, 1],
-            logs - START,
+            logs - PRIOR_MEANS,
         ]
     )
 
@@ -218,8 +220,8 @@ def _residuals(
 _jacobian = jax.jit(jax.jacfwd(_residuals))
 
 
-SIGN_SPEED = 0.2
-"""Scale of the wheel speed in tanh(speed / SIGN_SPEED), the smooth sign of motion that friction and
+SIGN_WIDTH = 0.2
+"""Scale of the wheel speed in tanh(speed / SIGN_WIDTH), the smooth sign of motion that friction and
 readings follow, as in `slipid.model.motor` [rad/s]."""
 STEADY_A = 0.1
 """Standard deviation of the current of a wheel at rest [A]."""
@@ -246,7 +248,7 @@ class MeteredMotor(Motor):
         self, torque: Float[Array, " *w"], wheel_speed: Float[Array, " *w"]
     ) -> Float[Array, " *w"]:
         """Return the mean reading of each drive's ammeter [A] at a wheel torque [N m]."""
-        sign = jnp.tanh(wheel_speed / SIGN_SPEED)
+        sign = jnp.tanh(wheel_speed / SIGN_WIDTH)
         along = sign * super().current(torque, wheel_speed) + jnp.abs(sign) * self.stiffness
         return clipped(along, STEADY_A + jnp.abs(sign) * self.scatter)
 

@@ -53,12 +53,12 @@ REQUIRED_COLUMNS = COLUMNS[:5]
 """Columns in which a missing value is an error: time, currents and rim speeds."""
 LARGEST_GAP_S = 0.5
 """Time between two rows above which a file is split into two runs there [s]."""
-LEAST_ROWS = 3
+FEWEST_ROWS = 3
 """Smallest number of rows of a run; shorter runs are left out."""
 
 
 def husky() -> Robot:
-    """Return the Husky with its manufacturer's data and measured motor friction, no floors."""
+    """Return the Husky with its manufacturer's data and measured friction, without floors."""
     robot = build(skid_steer(0.256, 0.275, RADIUS, 78.71, drive_of=(0, 1, 0, 1)), ())
     gain = float(robot.motor.gain)
     motor = replace(
@@ -72,7 +72,7 @@ def husky() -> Robot:
 def read_floor_runs(root: Path, wheel_radius: float) -> list[FloorSignals]:
     """Read the runs of a skid-steer robot below a folder, one folder per floor, as in `borealtc`.
 
-    A file is one run, or several runs separated by gaps of more than `LARGEST_GAP_S`.
+    A file is one run, or several where rows are more than `LARGEST_GAP_S` apart.
 
     Args:
         root: the folder.
@@ -90,8 +90,8 @@ def read_floor_runs(root: Path, wheel_radius: float) -> list[FloorSignals]:
 def _runs(path: Path, wheel_radius: float) -> list[FloorSignals]:
     """Return the runs of one file; DataError if a value is missing or times do not increase."""
     table = read_table(path, LAYOUT)
-    if len(table.values) < LEAST_ROWS:
-        raise bad_data(path, f"{len(table.values)} rows", f"at least {LEAST_ROWS}")
+    if len(table.values) < FEWEST_ROWS:
+        raise bad_data(path, f"{len(table.values)} rows", f"at least {FEWEST_ROWS}")
     for name in REQUIRED_COLUMNS:
         missing = np.flatnonzero(~np.isfinite(table[name]))
         if len(missing):
@@ -112,7 +112,7 @@ def _runs(path: Path, wheel_radius: float) -> list[FloorSignals]:
     )
     edges = [0, *(np.flatnonzero(np.diff(whole.time) > LARGEST_GAP_S) + 1), len(whole)]
     runs = [whole.rows(int(a), int(b)) for a, b in pairwise(edges)]
-    return [run for run in runs if len(run) >= LEAST_ROWS]
+    return [run for run in runs if len(run) >= FEWEST_ROWS]
 
 
 def husky_classifiers() -> list[FloorClassifier]:

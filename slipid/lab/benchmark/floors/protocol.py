@@ -10,8 +10,8 @@ it is at least that long and the robot moves in at least half of its rows up to 
 
 import abc
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
@@ -20,7 +20,6 @@ from jaxtyping import Int
 
 from slipid.lab.benchmark.floors.result import (
     Answer,
-    ClassifierRow,
     ClassifierTable,
     after_seconds,
     confusion,
@@ -38,7 +37,7 @@ SECONDS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Times from the start of a stretch after which answers are evaluated [s]."""
 QUICK_SECONDS = (0.5, 1.0, 2.0)
 """These times in a quick evaluation [s]."""
-FOLDS, INNER = 5, 2
+CLASSIFIER_FOLDS, CLASSIFIER_INNER_FOLDS = 5, 2
 """Numbers of folds: of the evaluation, and of the inner cross-validation that selects settings."""
 
 
@@ -56,9 +55,9 @@ class EvaluationSettings:
     """
 
     seconds: tuple[float, ...] = SECONDS
-    folds: int = FOLDS
-    held_out: int = FOLDS
-    inner: int = INNER
+    folds: int = CLASSIFIER_FOLDS
+    held_out: int = CLASSIFIER_FOLDS
+    inner: int = CLASSIFIER_INNER_FOLDS
     first_s: float = np.inf
 
     @classmethod
@@ -148,27 +147,14 @@ def _some(runs: Sequence[FloorSignals], take: np.ndarray) -> list[FloorSignals]:
     return [run for run, t in zip(runs, take, strict=True) if t]
 
 
-@dataclass(frozen=True)
-class ScoredClassifier:
-    """Result of a classifier in one or several folds.
-
-    Attributes:
-        row: row of the table, with costs and settings but without accuracies.
-        answers: answers to all stretches of the held-out runs.
-    """
-
-    row: ClassifierRow
-    answers: tuple[Answer, ...]
-
-
 def evaluated(
     method: FloorClassifier,
     training: Sequence[FloorSignals],
     held_out: Sequence[FloorSignals],
     spec: RobotSpec,
     settings: EvaluationSettings,
-) -> ScoredClassifier:
-    """Return a classifier's result in one fold: tuned, fitted and applied to the held-out runs."""
+) -> FoldScore[Answer]:
+    """Return a classifier's answers in one fold: tuned, fitted and applied to the held-out runs."""
     began = time.perf_counter()
     found = tuned_classifier(method, training, spec, settings)
     tuned = time.perf_counter()
@@ -176,45 +162,22 @@ def evaluated(
     ended = time.perf_counter()
     starts = [run.segments(settings.first_s)[0] for run in held_out]
     answers = answers_of(fitted, starts, spec, settings.seconds)
-    row = ClassifierRow(
-        method.name,
-        settings=(found.settings,),
+    return FoldScore(
+        tuple(answers),
+        settings=found.settings,
         numbers=fitted.numbers,
         fit_s=ended - tuned,
         tune_s=tuned - began,
-        row_us=1e6 * (time.perf_counter() - ended) / max(sum(map(len, starts)), 1),
+        step_us=1e6 * (time.perf_counter() - ended) / max(sum(map(len, starts)), 1),
     )
-    return ScoredClassifier(row, tuple(answers))
 
 
-def joined(folds: Sequence[ScoredClassifier]) -> ScoredClassifier:
-    """Return the results of all folds of a classifier as one result.
-
-    If the classifier failed in a fold, the result is that of the failed fold, without accuracies.
-    """
-    if failed := [fold for fold in folds if fold.row.absent]:
-        return failed[0]
-
-    def median(name: str) -> float:
-        return float(np.median([getattr(fold.row, name) for fold in folds]))
-
-    row = replace(
-        folds[0].row,
-        settings=tuple(word for fold in folds for word in fold.row.settings),
-        numbers=int(median("numbers")),
-        fit_s=median("fit_s"),
-        tune_s=median("tune_s"),
-        row_us=median("row_us"),
-    )
-    return ScoredClassifier(row, tuple(answer for fold in folds for answer in fold.answers))
-
-
-def attempted(name: str, work: Callable[[], ScoredClassifier]) -> ScoredClassifier:
-    """Return the result of `work()`; if it raises, an empty row with the reason."""
+def attempted(work: Callable[[], FoldScore[Answer]]) -> FoldScore[Answer]:
+    """Return the result of `work()`; if it raises, an empty one with the reason."""
     try:
         return work()
     except Exception as error:  # A row that fails does not stop the evaluation of the others.
-        return ScoredClassifier(ClassifierRow(name, absent=FoldScore.of_error(error).absent), ())
+        return FoldScore.of_error(error)
 
 
 def classifier_table(
@@ -231,20 +194,16 @@ def classifier_table(
     """
     fold = folds_of(runs, settings.folds)
 
-    def cross_validated(method: FloorClassifier) -> ScoredClassifier:
-        return joined(
-            [
-                evaluated(method, _some(runs, fold != k), _some(runs, fold == k), spec, settings)
-                for k in range(settings.held_out)
-            ]
-        )
+    def in_fold(k: int, method: FloorClassifier) -> FoldScore[Answer]:
+        training, held_out = _some(runs, fold != k), _some(runs, fold == k)
+        return attempted(partial(evaluated, method, training, held_out, spec, settings))
 
-    done = {m.name: attempted(m.name, partial(cross_validated, m)) for m in methods}
-    return table_of(done, runs, about, settings, reference)
+    folds = {m.name: [in_fold(k, m) for k in range(settings.held_out)] for m in methods}
+    return table_of(folds, runs, about, settings, reference)
 
 
 def table_of(
-    done: dict[str, ScoredClassifier],
+    folds: Mapping[str, Sequence[FoldScore[Answer]]],
     runs: Sequence[FloorSignals],
     about: str,
     settings: EvaluationSettings,
@@ -255,22 +214,33 @@ def table_of(
     Raises:
         ValueError: every classifier failed; the message lists the reasons.
     """
-    rival = (done[reference].answers or None) if reference in done else None
-    rows = []
-    for name, one in done.items():
-        if one.row.absent:
-            rows.append(one.row)
-            continue
-        after = after_seconds(one.answers, None if name == reference else rival)
-        table = confusion(one.answers, max(settings.seconds))
-        rows.append(replace(one.row, after=after, said=table))
-    first = next((one.answers for one in done.values() if one.answers), ())
+    done = {name: FoldScore.of_folds(each) for name, each in folds.items()}
+    first = next((one.runs for one in done.values() if one.runs), ())
     if not first:
-        raise ValueError("; ".join(f"{name}: {one.row.absent}" for name, one in done.items()))
+        raise ValueError("; ".join(f"{name}: {one.absent}" for name, one in done.items()))
+    rival = done[reference].runs if reference in done else ()
+    rows = [
+        {
+            "name": name,
+            "settings": [fold.settings for fold in folds[name]],
+            "numbers": one.numbers,
+            "after": after_seconds(one.runs, None if name == reference else rival or None),
+            "said": confusion(one.runs, max(settings.seconds)) or None,
+            "fit_s": one.fit_s,
+            "tune_s": one.tune_s,
+            "row_us": one.step_us,
+            "absent": one.absent,
+        }
+        for name, one in done.items()
+    ]
     floor = [a.floor for a in first if a.seconds == min(settings.seconds)]
-    chance = max(floor.count(name) for name in set(floor)) / len(floor)
-    names = tuple(sorted({run.floor for run in runs}))
-    return ClassifierTable(about, len({run.name for run in runs}), names, chance, tuple(rows))
+    return {
+        "about": about,
+        "runs": len({run.name for run in runs}),
+        "floors": sorted({run.floor for run in runs}),
+        "chance": max(floor.count(name) for name in set(floor)) / len(floor),
+        "rows": rows,
+    }
 
 
 @dataclass(frozen=True)
@@ -320,7 +290,7 @@ class FloorTask(abc.ABC):
         found = kept.load_json(self.name)
         if found is None or "failed" in found or any(row["absent"] for row in found["rows"]):
             try:
-                kept.save_json(self.name, asdict(self.make()))
+                kept.save_json(self.name, self.make())
             except Exception as error:  # A task that fails does not stop the others.
                 kept.save_json(self.name, {"failed": FoldScore.of_error(error).absent})
         return self.name

@@ -1,11 +1,12 @@
 """Results of floor classifiers: answers, accuracies by length of the signals, and tables."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from slipid.lab.benchmark.summary import Bootstrap, MeanInterval, mean_interval
+from slipid.lab.benchmark.summary import Bootstrap, mean_interval
+from slipid.support.content import Content
 
 
 @dataclass(frozen=True)
@@ -27,80 +28,42 @@ class Answer:
     probability: float
 
 
-@dataclass(frozen=True)
-class AfterSeconds:
-    """Accuracy of a classifier after the first seconds of every stretch.
+Accuracies = Content
+"""Accuracy of a classifier after the first seconds of every stretch, in the form of benchmark.json.
 
-    Attributes:
-        seconds: length of the signals used [s].
-        stretches: number of stretches.
-        accuracy: share of the stretches in which the most probable floor is the true one.
-        balanced: mean over floors of the accuracy on each floor.
-        behind: accuracy less that of slipid on the same resampled runs; None for slipid itself.
-        by_floor: accuracy on each floor.
-        log_score: mean natural logarithm of the probability of the true floor; 0 is best, and equal
-            probabilities of n floors give log(1 / n).
-    """
+- seconds: length of the signals used [s].
+- stretches: number of stretches.
+- accuracy: share of the stretches in which the most probable floor is the true one.
+- balanced: mean over floors of the accuracy on each floor.
+- behind: accuracy less that of slipid on the same resampled runs; None for slipid itself.
+- by_floor: accuracy on each floor.
+- log_score: mean natural logarithm of the probability of the true floor; 0 is best, and equal
+  probabilities of n floors give log(1 / n).
 
-    seconds: float
-    stretches: int
-    accuracy: MeanInterval
-    balanced: MeanInterval
-    behind: MeanInterval | None
-    by_floor: Mapping[str, float]
-    log_score: float
+Of `accuracy`, `balanced` and `behind` there is the value and its interval (`MeanInterval`).
+"""
+ClassifierTable = Content
+"""Table of all classifiers on one set of runs, in the form of benchmark.json.
 
-
-@dataclass(frozen=True)
-class ClassifierRow:
-    """Row of a classifier in the table.
-
-    Attributes:
-        name: name of the row.
-        settings: settings picked by cross-validation in each fold, in words.
-        numbers: number of fitted parameters, median over folds.
-        after: accuracy after each time.
-        said: confusion table after the longest time: `said[true][named]` is the share of the
-            stretches on the true floor in which a floor was named [%].
-        fit_s: time of one fit, median over folds [s].
-        tune_s: time to pick settings, median over folds [s].
-        row_us: time per row of signals, median over folds [microseconds].
-        absent: reason why the row is empty.
-    """
-
-    name: str
-    settings: tuple[str, ...] = ()
-    numbers: int = 0
-    after: tuple[AfterSeconds, ...] = ()
-    said: Mapping[str, Mapping[str, float]] | None = None
-    fit_s: float = 0.0
-    tune_s: float = 0.0
-    row_us: float = 0.0
-    absent: str = ""
+- about: description of the runs.
+- runs: number of runs.
+- floors: names of the floors.
+- chance: accuracy of always naming the most common floor.
+- rows: a row for each classifier:
+    - name: name of the row.
+    - settings: settings picked by cross-validation in each fold, in words.
+    - numbers: number of fitted parameters, median over folds.
+    - after: accuracy after each time (`Accuracies`).
+    - said: confusion table after the longest time: `said[true][named]` is the share of the
+      stretches on the true floor in which a floor was named [%].
+    - fit_s: time of one fit, median over folds [s].
+    - tune_s: time to pick settings, median over folds [s].
+    - row_us: time per row of signals, median over folds [microseconds].
+    - absent: reason why the row is empty.
+"""
 
 
-@dataclass(frozen=True)
-class ClassifierTable:
-    """Table of all classifiers on one set of runs.
-
-    Attributes:
-        about: description of the runs.
-        runs: number of runs.
-        floors: names of the floors.
-        chance: accuracy of a classifier that always names the floor with the most stretches.
-        rows: rows of the classifiers, slipid's first.
-    """
-
-    about: str
-    runs: int
-    floors: tuple[str, ...]
-    chance: float
-    rows: tuple[ClassifierRow, ...]
-
-
-def after_seconds(
-    answers: Sequence[Answer], rival: Sequence[Answer] | None
-) -> tuple[AfterSeconds, ...]:
+def after_seconds(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> list[Accuracies]:
     """Return the accuracy after each time, compared with a rival's if there is one.
 
     `rival` has the answers of another classifier to the same stretches, in the same order.
@@ -110,10 +73,10 @@ def after_seconds(
         take = [k for k, a in enumerate(answers) if a.seconds == seconds]
         mine = [answers[k] for k in take]
         out.append(_after(mine, None if rival is None else [rival[k] for k in take]))
-    return tuple(out)
+    return out
 
 
-def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> AfterSeconds:
+def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> Accuracies:
     """Return the accuracy from answers that were all read after the same time."""
     right = np.array([a.named == a.floor for a in answers], dtype=float)
     # whole runs are resampled, floor by floor
@@ -124,15 +87,15 @@ def _after(answers: Sequence[Answer], rival: Sequence[Answer] | None) -> AfterSe
         assert [(a.run, a.floor) for a in rival] == [(a.run, a.floor) for a in answers]
         theirs = np.array([a.named == a.floor for a in rival], dtype=float)
         behind = mean_interval(by.over_all(right - theirs))
-    return AfterSeconds(
-        seconds=answers[0].seconds,
-        stretches=len(answers),
-        accuracy=mean_interval(by.over_all(right)),
-        balanced=mean_interval(by.mean(right)),
-        behind=behind,
-        by_floor={name: float(by.on(right, k)[0]) for k, name in enumerate(by.names)},
-        log_score=float(np.mean(np.log(np.maximum([a.probability for a in answers], 1e-6)))),
-    )
+    return {
+        "seconds": answers[0].seconds,
+        "stretches": len(answers),
+        "accuracy": mean_interval(by.over_all(right)),
+        "balanced": mean_interval(by.mean(right)),
+        "behind": behind,
+        "by_floor": {name: float(by.on(right, k)[0]) for k, name in enumerate(by.names)},
+        "log_score": float(np.mean(np.log(np.maximum([a.probability for a in answers], 1e-6)))),
+    }
 
 
 def confusion(answers: Sequence[Answer], seconds: float) -> dict[str, dict[str, float]]:

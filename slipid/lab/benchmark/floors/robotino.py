@@ -17,15 +17,14 @@ from slipid.data.runs import Runs
 from slipid.lab.benchmark.floors.protocol import (
     EvaluationSettings,
     FloorTask,
-    ScoredClassifier,
     answers_after,
     attempted,
     evaluated,
-    joined,
     table_of,
 )
-from slipid.lab.benchmark.floors.result import Answer, ClassifierRow, ClassifierTable
+from slipid.lab.benchmark.floors.result import Answer, ClassifierTable
 from slipid.lab.benchmark.protocols import base_of, splits
+from slipid.lab.benchmark.scores import FoldScore
 from slipid.lab.benchmark.slipid_rows import (
     NAME,
     FloorKnowledge,
@@ -60,7 +59,7 @@ def robotino_table(options: BenchmarkOptions) -> ClassifierTable:
     data, only = data_of(options, SOURCE), options.only
     inner = 1 if options.quick else 2
     settings = EvaluationSettings(seconds=SECONDS, inner=inner, first_s=max(SECONDS))
-    folds: dict[str, list[ScoredClassifier]] = {}
+    folds: dict[str, list[FoldScore[Answer]]] = {}
     runs: list[FloorSignals] = []
     for split in splits(data.facts, KIND)[: 1 if options.quick else None]:
         kept = checkpoint_of(FoldTask(options, SOURCE, KIND, split.fold), fit=True)
@@ -80,9 +79,8 @@ def robotino_table(options: BenchmarkOptions) -> ClassifierTable:
             work[method.name] = partial(evaluated, method, training, held_out, data.spec, settings)
         for name, one in work.items():
             if not only or name in only:
-                folds.setdefault(name, []).append(attempted(name, one))
-    done = {name: joined(each) for name, each in folds.items()}
-    return table_of(done, runs, ABOUT, settings, NAME)
+                folds.setdefault(name, []).append(attempted(one))
+    return table_of(folds, runs, ABOUT, settings, NAME)
 
 
 def floor_signals(run: Run) -> FloorSignals:
@@ -108,7 +106,7 @@ def floor_signals(run: Run) -> FloorSignals:
 
 def _slipid(
     fit: SlipidFit, batches: list[RunBatch], data: Runs, runs: list[FloorSignals]
-) -> ScoredClassifier:
+) -> FoldScore[Answer]:
     """Return the result of slipid's estimator on held-out runs."""
     began = time.perf_counter()
     predicted = estimator_runs(fit, batches, data, FloorKnowledge())
@@ -117,9 +115,8 @@ def _slipid(
     for run, one in zip(runs, predicted, strict=True):
         labels, beliefs = beliefs_of(one)
         answers += answers_after(run, beliefs, labels, SECONDS)
-    row_us = 1e6 * took / sum(map(len, runs))
-    row = ClassifierRow(NAME, numbers=fit.numbers, fit_s=fit.seconds, row_us=row_us)
-    return ScoredClassifier(row, tuple(answers))
+    step_us = 1e6 * took / sum(map(len, runs))
+    return FoldScore(tuple(answers), numbers=fit.numbers, fit_s=fit.seconds, step_us=step_us)
 
 
 def beliefs_of(predicted: PredictedRun) -> tuple[tuple[str, ...], np.ndarray]:

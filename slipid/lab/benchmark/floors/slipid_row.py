@@ -36,6 +36,7 @@ from slipid.lab.benchmark.floors.fitting import (
     stiffness_of,
 )
 from slipid.lab.systems.floors.interface import Beliefs, FloorClassifier, FloorSignals, floors_of
+from slipid.lab.systems.padded import padded
 from slipid.model.robot import Robot
 from slipid.predict.slip_model import RobotSpec
 from slipid.robot.deployed import DeployedRobot
@@ -190,23 +191,18 @@ def _scatter(
     robot: Robot, runs: Sequence[FloorSignals], spec: RobotSpec
 ) -> Float[np.ndarray, "kind floor"]:
     """Return the std of current residuals in each kind of motion on every floor [A]."""
-    count = len(BEND_RATIOS) + 1
-    std = np.ones((count, len(robot.surfaces.labels)))
+    count, std = len(BEND_RATIOS) + 1, []
     for k, floor in enumerate(robot.surfaces.labels):
-        speed, current, kind = [], [], []
+        rows = []
         for run in (run for run in runs if run.floor == floor):
             take = np.flatnonzero(run.moving)
             take = take[:: max(1, len(take) // MOST_ROWS)]
-            speed.append(run.speed[take])
-            current.append(run.current[take])
-            kind.append(kinds(run, spec)[take])
-        off = currents_off(robot, k, np.concatenate(speed), np.concatenate(current))
-        squares, of_kind = (off**2).mean(axis=1), np.concatenate(kind)
-        for n in range(count):
-            mine = squares[of_kind == n]
-            shared = SHARED_ROWS * squares.mean()
-            std[n, k] = np.sqrt((mine.sum() + shared) / (len(mine) + SHARED_ROWS))
-    return std
+            rows.append((run.speed[take], run.current[take], kinds(run, spec)[take]))
+        speed, current, kind = map(np.concatenate, zip(*rows, strict=True))
+        squares = (currents_off(robot, k, speed, current) ** 2).mean(axis=1)
+        total, rows_of = np.bincount(kind, squares, count), np.bincount(kind, minlength=count)
+        std.append(np.sqrt((total + SHARED_ROWS * squares.mean()) / (rows_of + SHARED_ROWS)))
+    return np.stack(std, axis=1)
 
 
 def _filter_rows(
@@ -217,21 +213,17 @@ def _filter_rows(
     Runs are padded to `rows` rows and to `RUNS_PER_CALL` runs. The duration is 0 in rows of
     padding, and in rows at rest, which carry no evidence about the floor.
     """
-    drives = runs[0].speed.shape[1]
-    speed, current = np.zeros((2, RUNS_PER_CALL, rows, drives))
-    gyro, dt = np.full((RUNS_PER_CALL, rows), np.nan), np.zeros((RUNS_PER_CALL, rows))
-    kind = np.zeros((RUNS_PER_CALL, rows), dtype=int)
-    for k, run in enumerate(runs):
-        n = len(run)
-        speed[k, :n], current[k, :n] = run.speed, run.current
-        dt[k, :n] = np.where(run.moving, run.dt, 0.0)
-        gyro[k, :n] = np.nan if run.gyro is None else run.gyro
-        kind[k, :n] = kinds(run, spec)
-    nothing = jax.tree.map(
-        lambda x: jnp.full((RUNS_PER_CALL, rows, *x.shape), x), Readings.nothing(drives)
-    )
-    measured = {"wheel_speed": speed, "current": current, "gyro": gyro}
+    shape, drives = (RUNS_PER_CALL, rows), runs[0].speed.shape[1]
+    gyros = [np.full(len(run), np.nan) if run.gyro is None else run.gyro for run in runs]
+    measured = {
+        "wheel_speed": padded([run.speed for run in runs], shape),
+        "current": padded([run.current for run in runs], shape),
+        "gyro": padded(gyros, shape, np.nan),
+    }
+    nothing = jax.tree.map(lambda x: jnp.full((*shape, *x.shape), x), Readings.nothing(drives))
     readings = replace(nothing, **{name: jnp.asarray(x) for name, x in measured.items()})
+    dt = padded([np.where(run.moving, run.dt, 0.0) for run in runs], shape)
+    kind = padded([kinds(run, spec) for run in runs], shape)
     return readings, jnp.asarray(dt), jnp.asarray(kind)
 
 

@@ -43,6 +43,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import norm
 
 from slipid.lab.systems.floors.interface import (
     Beliefs,
@@ -53,10 +54,9 @@ from slipid.lab.systems.floors.interface import (
     floors_of,
     training_rows,
 )
+from slipid.model.robot import GRAVITY
 from slipid.predict.slip_model import RobotSpec
 
-GRAVITY = 9.81
-"""Acceleration of gravity [m/s^2]."""
 LEAST_SPEED = 0.02
 """Rows with a speed u up to this are not used, since their direction of travel is undefined
 [m/s]."""
@@ -99,6 +99,8 @@ class CosineEnergyClassifier(FloorClassifier):
         return [replace(self, losses=heat, logarithm=log) for heat in both for log in both]
 
     def fit(self, runs: Sequence[FloorSignals], spec: RobotSpec) -> "CosineEnergyClassifier":
+        from sklearn.linear_model import Ridge
+
         labels = floors_of(runs)
         rows, floor = training_rows(runs, lambda run: self._direction_and_energy(run, spec))
         known = np.isfinite(rows).all(axis=1)
@@ -106,10 +108,8 @@ class CosineEnergyClassifier(FloorClassifier):
         for name in labels:
             angle, energy = rows[known & (floor == name)].T
             a = terms(angle, self.harmonics)
-            ridge = self.ridge * np.eye(a.shape[1])
-            ridge[0, 0] = 0.0
-            normal = a.T @ a + ridge + 1e-9 * np.eye(len(ridge))
-            weights.append(np.linalg.solve(normal, a.T @ energy))
+            series = Ridge(self.ridge).fit(a[:, 1:], energy)
+            weights.append(np.append(series.intercept_, series.coef_))
             stds.append(max(float((energy - a @ weights[-1]).std()), 1e-6))
         return replace(self, labels=labels, weight=np.stack(weights), std=np.array(stds))
 
@@ -120,8 +120,7 @@ class CosineEnergyClassifier(FloorClassifier):
         for run in runs:
             angle, energy = self._direction_and_energy(run, spec).T
             expected = terms(angle, self.harmonics) @ self.weight.T
-            z = (energy[:, None] - expected) / self.std
-            log = -0.5 * z**2 - np.log(self.std)
+            log = norm.logpdf(energy[:, None], expected, self.std)
             out.append(accumulated(log, run, self.apart_s, self.memory_s))
         return out
 

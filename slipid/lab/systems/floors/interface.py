@@ -18,7 +18,7 @@ import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -32,7 +32,7 @@ FloorChannel = Literal["current", "gyro", "vibration"]
 """Optional channel of the features; wheel speeds are always used."""
 DEFAULT_CHANNELS: frozenset[FloorChannel] = frozenset({"current", "gyro"})
 """Channels that slipid uses too, besides the wheel speeds."""
-REST_SPEED = 0.3
+REST_WHEEL_SPEED = 0.3
 """Wheel speed up to which a wheel counts as at rest [rad/s]."""
 WINDOWS_S = (0.5, 1.0, 2.0)
 """Lengths of the feature windows [s]."""
@@ -74,19 +74,15 @@ class FloorSignals:
     @property
     def moving(self) -> Bool[np.ndarray, " row"]:
         """True in rows in which a wheel turns; at rest there is no evidence about the floor."""
-        return np.asarray(np.abs(self.speed).max(axis=1) > REST_SPEED)
+        return np.asarray(np.abs(self.speed).max(axis=1) > REST_WHEEL_SPEED)
 
     def rows(self, first: int, last: int) -> "FloorSignals":
         """Return the run's rows from `first` up to but not including `last`."""
         part = slice(first, last)
-        return replace(
-            self,
-            time=self.time[part],
-            speed=self.speed[part],
-            current=self.current[part],
-            gyro=None if self.gyro is None else self.gyro[part],
-            vibration=None if self.vibration is None else self.vibration[part],
-        )
+        arrays: dict[str, Any] = {
+            k: x[part] for k, x in vars(self).items() if isinstance(x, np.ndarray)
+        }
+        return replace(self, **arrays)
 
     def segment_start(self, seconds: float) -> Int[np.ndarray, " row"]:
         """Return the index of the first row of each row's segment; segments last `seconds` [s]."""

@@ -46,7 +46,7 @@ from slipid.predict.slip_model import (
     path_of,
 )
 
-REST = 0.02
+REST_SPEED = 0.02
 """Size of the rolling twist below which a robot counts as at rest [m/s]."""
 
 Inputs = Float[np.ndarray, "window input"]
@@ -88,11 +88,11 @@ class SignalWindows:
     @property
     def moving(self) -> Bool[np.ndarray, " window"]:
         """True for windows in which the wheels turn fast enough to define a slip ratio."""
-        return self.size >= REST
+        return self.size >= REST_SPEED
 
     def direction(self, spec: RobotSpec) -> Float[np.ndarray, "window 3"]:
         """Return the rolling twist divided by its size: forward, to the left, turning."""
-        return np.asarray(self.rolling * spec.size / self.size.clip(min=REST)[:, None])
+        return np.asarray(self.rolling * spec.size / self.size.clip(min=REST_SPEED)[:, None])
 
     def speed(self) -> Float[np.ndarray, "window drive"]:
         """Return the wheel speed of each drive [rad/s]."""
@@ -117,7 +117,7 @@ class SignalWindows:
             columns.append(self._channel("command"))
         if "gyro" in channels:
             gyro = self._channel("gyro")
-            slip = (gyro - self.rolling[:, 2]) * spec.base_radius / self.size.clip(min=REST)
+            slip = (gyro - self.rolling[:, 2]) * spec.base_radius / self.size.clip(min=REST_SPEED)
             columns.append(np.stack([gyro, slip], axis=1))
         return np.concatenate(columns, axis=1)
 

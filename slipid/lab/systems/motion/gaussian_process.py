@@ -6,11 +6,11 @@
 
 X are the training inputs, y their outputs and K = k(X, X). All outputs share one kernel, each in
 units of its own standard deviation. Hyperparameters maximise the marginal likelihood of
-`MOST_TUNING_WINDOWS` windows, in at most `MOST_STEPS` steps from one start point; the posterior is
-conditioned on `MOST_WINDOWS` windows. Windows are drawn in proportion to their weight, with a fixed
-seed.
+`MOST_TUNING_WINDOWS` windows, in at most `OPTIMISER_STEPS` steps from one start point; the
+posterior is conditioned on `MOST_WINDOWS` windows. Windows are drawn in proportion to their weight,
+with a fixed seed.
 
-Source: Rasmussen, Williams 2006, Gaussian Processes for RobotSpec Learning, MIT Press, equations
+Source: Rasmussen, Williams 2006, Gaussian Processes for Machine Learning, MIT Press, equations
 2.25, 2.26, 4.17 and 5.8.
 """
 
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from slipid.lab.systems.one_thread import one_thread
 
@@ -32,7 +32,7 @@ MOST_WINDOWS = 1000
 """Largest number of windows in the posterior."""
 MOST_TUNING_WINDOWS = 150
 """Largest number of windows to which hyperparameters are fitted."""
-MOST_STEPS = 20
+OPTIMISER_STEPS = 20
 """Largest number of optimiser steps in the fit of hyperparameters."""
 SEED = 0
 
@@ -71,16 +71,15 @@ class ProcessRows:
     y: Float[np.ndarray, "row output"]
     weight: Float[np.ndarray, " row"]
 
-    def only(self, take: Bool[np.ndarray, " row"]) -> "ProcessRows":
-        """Return the rows where `take` is True."""
+    def only(self, take: Bool[np.ndarray, " row"] | Int[np.ndarray, " some"]) -> "ProcessRows":
+        """Return the rows where `take` is True, or those of the indices in `take`."""
         return ProcessRows(self.x[take], self.y[take], self.weight[take])
 
     def drawn(self, most: int) -> "ProcessRows":
         """Return at most `most` rows, drawn at random in proportion to their weight."""
         share, rng = self.weight / self.weight.sum(), np.random.default_rng(SEED)
         count = min(most, int(np.count_nonzero(share)))
-        some = rng.choice(len(share), count, replace=False, p=share)
-        return ProcessRows(self.x[some], self.y[some], self.weight[some])
+        return self.only(rng.choice(len(share), count, replace=False, p=share))
 
     def tuned(self, kernel: "Kernel") -> "Kernel":
         """Return the kernel of largest marginal likelihood for a sample of the rows.
@@ -95,7 +94,7 @@ class ProcessRows:
             return self._fitted(kernel, MOST_TUNING_WINDOWS, _few_steps).kernel_
 
     def process(self, kernel: "Kernel") -> "GaussianProcessRegressor":
-        """Return the posterior of the process given at most `MOST_WINDOWS` random rows."""
+        """Return the posterior of the process given a sample of at most `MOST_WINDOWS` rows."""
         return self._fitted(kernel, MOST_WINDOWS, None)
 
     def _fitted(
@@ -117,13 +116,12 @@ def fitted_numbers(process: "GaussianProcessRegressor") -> int:
 def _few_steps(
     loss: Callable, start: Float[np.ndarray, " log"], bounds: Float[np.ndarray, "log 2"]
 ) -> tuple[Float[np.ndarray, " log"], float]:
-    """Return the minimiser and the loss after at most `MOST_STEPS` steps of L-BFGS-B.
+    """Return the minimiser and the loss after at most `OPTIMISER_STEPS` steps of L-BFGS-B.
 
     It is an optimiser in scikit-learn's form; the variables are logarithms of hyperparameters.
     """
     from scipy.optimize import minimize
 
-    found = minimize(
-        loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": MOST_STEPS}
-    )
+    most = {"maxiter": OPTIMISER_STEPS}
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=most)
     return found.x, float(found.fun)

@@ -56,7 +56,7 @@ KEPT_NEURONS = 20
 """Number of neurons of a layer whose outputs are the inputs of the next layer."""
 LOWEST_OUTPUT = 0.05
 """Lower limit of the classifier's output for a floor in one window, which may be negative."""
-EVIDENCE_DECAY = 0.9
+EVIDENCE_MEMORY = 0.9
 """Factor by which evidence about the floor fades from window to window."""
 CANDIDATES = (
     Growth(1e-3, KEPT_NEURONS, 5),
@@ -248,5 +248,5 @@ def remembered(
     # the k-th windows of all runs are updated together
     for k in range(1, place.max(initial=0) + 1):
         here = np.flatnonzero(place == k)
-        total[here] += EVIDENCE_DECAY * total[here - 1]
+        total[here] += EVIDENCE_MEMORY * total[here - 1]
     return total

@@ -51,7 +51,7 @@ from slipid.lab.systems.motion.features import Inputs, LearnedSlip, Ratios, Scal
 if TYPE_CHECKING:
     from sklearn.neural_network import MLPRegressor
 
-LEAST_WINDOWS = 20
+FEWEST_WINDOWS = 20
 """Smallest number of windows in a leaf, and of training windows for early stopping."""
 SEED = 0
 MOST_PASSES = 60
@@ -93,7 +93,7 @@ class BoostedTrees(LearnedSlip):
             learning_rate=self.rate,
             max_iter=self.trees,
             max_leaf_nodes=self.leaves,
-            min_samples_leaf=LEAST_WINDOWS,
+            min_samples_leaf=FEWEST_WINDOWS,
             early_stopping=False,
             random_state=SEED,
         )
@@ -103,7 +103,7 @@ class BoostedTrees(LearnedSlip):
     @property
     def numbers(self) -> int:
         """Largest possible number of leaf values and thresholds; small trees have fewer."""
-        leaves = min(self.leaves, max(1, self.windows // LEAST_WINDOWS))
+        leaves = min(self.leaves, max(1, self.windows // FEWEST_WINDOWS))
         return 0 if self.regressor is None else 3 * self.trees * (2 * leaves - 1)
 
 
@@ -150,7 +150,7 @@ class NeuralNetwork(LearnedSlip):
             alpha=self.alpha,
             learning_rate_init=5e-3,
             max_iter=MOST_PASSES,
-            early_stopping=len(examples.inputs) >= LEAST_WINDOWS,
+            early_stopping=len(examples.inputs) >= FEWEST_WINDOWS,
             n_iter_no_change=PATIENCE,
             random_state=SEED,
         )

@@ -67,7 +67,7 @@ Line = Float[np.ndarray, "2"]
 Tuning = Literal["continuous", "sporadic", "gyro"]
 FORGETTING = 0.995
 """Factor by which the weight of a window falls with each later window."""
-THRESHOLD_STDS = 3.0
+SLIP_SIGMAS = 3.0
 """Slip is flagged if the mean current exceeds the hard floor's mean by this many std of the latter.
 """
 LEAST_RIM_SPEED = 0.02
@@ -176,7 +176,7 @@ class Ojeda(SlipModel):
         steps = Steps.of(runs)
         rim = steps.signals.speed * spec.wheel_radius
         current = steps.smoothed(steps.signals.along(spec), self.time_constant)
-        return FlaggedSteps(steps, rim, current, hard.sigmas(current) > THRESHOLD_STDS)
+        return FlaggedSteps(steps, rim, current, hard.sigmas(current) > SLIP_SIGMAS)
 
     def _line(self, runs: Sequence[Run], hard: HardFloor, spec: RobotSpec) -> Line:
         """Return k0 [m/s] and k1 [m/s/A] fitted to runs; zeros if no slip was flagged."""

@@ -27,7 +27,7 @@ POWERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1], [2, 0], [0, 2]])
 """Exponents of the first and the second input in a neuron's terms."""
 LEAST_GAIN = 1e-3
 """Smallest relative decrease of the mean square error on B by a new layer; less may be chance."""
-ROUNDING_ERROR = 1e-12
+ROUNDING = 1e-12
 """A mean square error on B up to this is taken as rounding error, for outputs of variance one."""
 
 
@@ -112,11 +112,7 @@ def grown(
     layers: list[Layer] = []
     errors: list[float] = []
     halves = (in_a, ~in_a) if 0 < in_a.sum() < len(in_a) else (np.ones_like(in_a),) * 2
-    while (
-        len(layers) < growth.layers
-        and x.shape[1] > 1
-        and (not errors or errors[-1] > ROUNDING_ERROR)
-    ):
+    while len(layers) < growth.layers and x.shape[1] > 1 and (not errors or errors[-1] > ROUNDING):
         half_a, half_b = (PairMoments.of(x[half], y[half], weight[half]) for half in halves)
         neurons = half_a.solved(growth.ridge)
         error = half_b.errors(neurons.weight)

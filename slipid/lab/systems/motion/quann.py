@@ -163,7 +163,7 @@ def places(windows: SignalWindows, spec: RobotSpec) -> Float[np.ndarray, "window
     return np.concatenate([0.5 * (path[1:] + path[:-1]) for path in paths])
 
 
-PARTS = 4
+INFLATION_PARTS = 4
 """Number of parts of the runs; to find the inflation, a fit to the others predicts each part."""
 START_LENGTH = 2.0
 """Initial length scale of every input, in standard deviations of the input."""
@@ -237,9 +237,9 @@ def slip_inputs(windows: SignalWindows, spec: RobotSpec) -> Inputs:
 
 
 def parts(numbers: Int[np.ndarray, " run"]) -> list[Int[np.ndarray, " _"]]:
-    """Return the run indices split at random into `PARTS` parts, or fewer if there are few runs."""
+    """Return the run indices split at random into `INFLATION_PARTS` parts, or one part per run."""
     drawn = np.random.default_rng(SEED).permutation(numbers)
-    return list(np.array_split(drawn, min(PARTS, len(numbers))))
+    return list(np.array_split(drawn, min(INFLATION_PARTS, len(numbers))))
 
 
 def end_spread(

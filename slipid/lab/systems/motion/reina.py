@@ -47,7 +47,7 @@ rovers", IEEE/ASME Transactions on Mechatronics 11(2).
 import abc
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
 from jaxtyping import Float
@@ -83,6 +83,8 @@ class _Detector(SlipModel):
         slip: fitted share of the encoders' twist that is subtracted where slip is flagged.
     """
 
+    threshold: ClassVar[float]
+    """Score from which slip is flagged."""
     needs: frozenset[Channel] = field(default=_CURRENT, kw_only=True)
     smoothing: float = 0.3
     quantile: float = 0.95
@@ -99,7 +101,7 @@ class _Detector(SlipModel):
         predicted = []
         for run in runs:
             score = self.score(SmoothedSignals.of(run, spec, self.smoothing))
-            kept = 1.0 - self.slip * (score >= self._threshold)
+            kept = 1.0 - self.slip * (score >= self.threshold)
             path = path_of(run.rolling(spec) * kept[:, None], run.dt)
             predicted.append(PredictedRun(path, slipping=score))
         return predicted
@@ -111,23 +113,19 @@ class _Detector(SlipModel):
 
     def _mean_slip(self, examples: Sequence[LabelledRun]) -> float:
         """Return the mean slip of flagged steps, by least squares in the twists of windows."""
-        against = square = 0.0
+        shares = []
         for example in examples:
-            flags = (self.score(example.signals) >= self._threshold).astype(float)
+            flags = (self.score(example.signals) >= self.threshold).astype(float)
             count = np.diff(example.first, append=len(flags))
-            share = np.add.reduceat(flags, example.first) / count
-            against += float(share @ example.against)
-            square += float(share**2 @ example.square)
-        return against / square if square > 0.0 else 0.0
+            shares.append(np.add.reduceat(flags, example.first) / count)
+        share = np.concatenate(shares)
+        square = share**2 @ np.concatenate([example.square for example in examples])
+        against = share @ np.concatenate([example.against for example in examples])
+        return float(against / square) if square > 0.0 else 0.0
 
     def _trained(self, examples: Sequence[LabelledRun]) -> "_Detector":
         """Return the detector with its remaining parameters trained; thresholds are set already."""
         return self
-
-    @property
-    @abc.abstractmethod
-    def _threshold(self) -> float:
-        """Score from which slip is flagged."""
 
     @abc.abstractmethod
     def _moving_score(self, encoder: Numbers, current: Numbers, gyro: Numbers | None) -> Numbers:
@@ -139,6 +137,7 @@ class _Detector(SlipModel):
 class ReinaDeterministic(_Detector):
     """Detector that flags slip where GI >= 1 or CI >= 1; EI replaces GI without a gyro."""
 
+    threshold: ClassVar[float] = 1.0
     name: str = "reina_deterministic"
 
     def candidates(self) -> Sequence["ReinaDeterministic"]:
@@ -147,10 +146,6 @@ class ReinaDeterministic(_Detector):
     @property
     def numbers(self) -> int:
         return 4 + int(np.isfinite(self.limits.turning))
-
-    @property
-    def _threshold(self) -> float:
-        return 1.0
 
     def _moving_score(self, encoder: Numbers, current: Numbers, gyro: Numbers | None) -> Numbers:
         return np.maximum(encoder if gyro is None else gyro, current)
@@ -166,6 +161,7 @@ class ReinaFuzzy(_Detector):
         rules: fitted rules.
     """
 
+    threshold: ClassVar[float] = 0.5
     name: str = "reina_fuzzy"
     sets: int = 2
     rules: Sugeno | None = None
@@ -177,10 +173,6 @@ class ReinaFuzzy(_Detector):
     def numbers(self) -> int:
         rules = 0 if self.rules is None else len(self.rules.consequents)
         return 4 + int(np.isfinite(self.limits.turning)) + rules
-
-    @property
-    def _threshold(self) -> float:
-        return 0.5
 
     def _trained(self, examples: Sequence[LabelledRun]) -> "ReinaFuzzy":
         indicators = [self.limits.indicators(example.signals) for example in examples]

@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float
 
 from slipid.predict.slip_model import WINDOW_S, Numbers, RobotSpec, Run, RunSignals, groups
 
-_PRIOR = 1.0
+_PRIOR_SAMPLES = 1.0
 """Weight of the prior of each rule's consequent, in samples."""
 
 
@@ -68,8 +68,8 @@ class Sugeno:
     ) -> "Sugeno":
         """Return the same sets with consequents fitted to the target outputs."""
         strength = self.strengths(np.clip(x, 0.0, 1.0))
-        prior = _PRIOR * np.eye(len(self.consequents))
-        right = strength.T @ target + _PRIOR * self.consequents
+        prior = _PRIOR_SAMPLES * np.eye(len(self.consequents))
+        right = strength.T @ target + _PRIOR_SAMPLES * self.consequents
         return replace(self, consequents=np.linalg.solve(strength.T @ strength + prior, right))
 
 

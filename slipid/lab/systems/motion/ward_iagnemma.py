@@ -65,7 +65,7 @@ import numpy as np
 from jaxtyping import Int
 
 from slipid.lab.systems.motion.ward_iagnemma_dynamics import (
-    REST,
+    V_S,
     Drives,
     Dynamics,
     DynamicsStep,
@@ -73,6 +73,7 @@ from slipid.lab.systems.motion.ward_iagnemma_dynamics import (
     ForceLaw,
     PaddedRuns,
     Speeds,
+    measurements,
 )
 from slipid.lab.systems.motion.ward_iagnemma_filter import FilterNoise, SlipFilter
 from slipid.predict.slip_model import PredictedRun, RobotSpec, Run, RunSignals, SlipModel, path_of
@@ -89,7 +90,7 @@ _BOUNDS = {
 }
 _GRID = ((0.3, 1.0), (0.3, 6.0), (3.0, 1.0), (3.0, 6.0))
 """Start values of A and rho, as factors of the geometric middles of their bounds."""
-_PRIOR = 1e-3
+_PRIOR_WEIGHT = 1e-3
 """Weight of the prior: a parameter a factor e from its middle costs as much as this relative slip
 in every window."""
 _MEDIAN_OF_SQUARES = 0.4549
@@ -124,18 +125,11 @@ class PosedWindows:
         """Return the windows of at most `_FIT_RUNS` runs, drawn with a fixed seed."""
         drawn = np.random.default_rng(0).permutation(len(runs))[:_FIT_RUNS]
         joined = [runs[k].windowed() for k in np.sort(drawn)]
-        padded = PaddedRuns.of([run.signals for run in joined], spec)
-        run, step = np.nonzero(padded.dt > 0.0)
-        true = np.concatenate([run.twist * spec.size for run in joined])
-        return cls(
-            run=run,
-            rolling=padded.rolling[run, step],
-            true=true,
-            rim=padded.rim[run, step],
-            force=padded.force[run, step],
-            gyro=padded.gyro[run, step] - true[:, 2] / spec.base_radius,
-            dt=padded.dt[run, step],
-        )
+        run = np.repeat(np.arange(len(joined)), [len(one.signals) for one in joined])
+        columns = zip(*(measurements(one.signals, spec) for one in joined), strict=True)
+        dt, rim, rolling, gyro, force = map(np.concatenate, columns)
+        true = np.concatenate([one.twist * spec.size for one in joined])
+        return cls(run, rolling, true, rim, force, gyro - true[:, 2] / spec.base_radius, dt)
 
     def thinned(self, most: int) -> "PosedWindows":
         """Return at most `most` of the windows, evenly spaced."""
@@ -159,14 +153,14 @@ def fitted_law(windows: PosedWindows, spec: RobotSpec, with_drag: bool) -> Force
     low, high = np.log([_BOUNDS[name] for name in names]).T
     middle = 0.5 * (low + high)
     some = windows.thinned(_FIT_WINDOWS)
-    size = np.maximum(np.linalg.norm(some.rolling, axis=1), REST)[:, None]
+    size = np.maximum(np.linalg.norm(some.rolling, axis=1), V_S)[:, None]
 
     def law(logs: np.ndarray) -> ForceLaw:
         return ForceLaw(**dict(zip(names, np.exp(logs).tolist(), strict=True)))
 
     def residuals(logs: np.ndarray) -> np.ndarray:
         gap = (some.steady(Dynamics.of(spec, law(logs))).speeds - some.true) / size
-        return np.append(gap.ravel(), _PRIOR * np.sqrt(len(gap)) * (logs - middle))
+        return np.append(gap.ravel(), _PRIOR_WEIGHT * np.sqrt(len(gap)) * (logs - middle))
 
     starts = [middle + np.log([*times, 1.0, 1.0][: len(names)]) for times in _GRID]
     found = least_squares(
@@ -272,7 +266,7 @@ class WardIagnemma(SlipModel):
         padded = PaddedRuns.of(runs, spec)
         speeds, covariance = self.filter(spec).track(padded)
         size, fastest = (np.linalg.norm(q, axis=2) for q in (speeds, padded.rolling))
-        kept = np.where(fastest > REST, size / np.where(fastest > REST, fastest, 1.0), 1.0)
+        kept = np.where(fastest > V_S, size / np.where(fastest > V_S, fastest, 1.0), 1.0)
         slipping = np.clip(1.0 - kept, 0.0, 1.0)
         return [
             PredictedRun(

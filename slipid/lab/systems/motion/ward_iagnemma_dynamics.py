@@ -14,14 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from slipid.lab.systems.padded import padded
+from slipid.model.robot import GRAVITY
 from slipid.predict.slip_model import RobotSpec, RunSignals
 
 Drives = Float[np.ndarray, "run drive"]
 Speeds = Float[np.ndarray, "run 3"]
 """Speeds q of each run: the body twist times (1, 1, base radius) [m/s]."""
 Each = Float[np.ndarray, " run"]
-GRAVITY = 9.81
-REST = 0.02
+V_S = 0.02
 """Speed v_s below which resistance fades out [m/s]."""
 _OVER_MASS = np.array([1.0, 1.0, 2.0])
 """Diagonal of m M^-1: acceleration of q per force divided by mass; the inertia is m L^2 / 2."""
@@ -131,11 +132,9 @@ class Dynamics:
             stiff = np.where(zero, stiff, traction / np.where(zero, 1.0, slide))
         straight = 1.0 - self.turning
         coupled = np.outer(self.turning, self.turning) + np.outer(straight, straight)
-        size = np.sqrt(q**2 @ coupled + REST**2)
-        along, share = (
-            q / size,
-            GRAVITY * (rolling[:, None] * straight + law.turning * self.turning),
-        )
+        size = np.sqrt(q**2 @ coupled + V_S**2)
+        along = q / size
+        share = GRAVITY * (rolling[:, None] * straight + law.turning * self.turning)
         linear = share * (1.0 / size + law.drag * straight)
         squares = (self.rims[:, :, None] * self.rims[:, None, :]).reshape(-1, 9)
         slope = -(stiff @ squares).reshape(-1, 3, 3)
@@ -169,9 +168,8 @@ class Dynamics:
                 break
         at, wait = self.acceleration(solution, rolling, rim), dt[:, None]
         inverse = np.linalg.inv(np.eye(3) - wait[..., None] * at.slope)
-        return DynamicsStep(
-            solution, inverse, (inverse @ (wait * at.by_rolling)[..., None])[..., 0]
-        )
+        by_rolling = (inverse @ (wait * at.by_rolling)[..., None])[..., 0]
+        return DynamicsStep(solution, inverse, by_rolling)
 
     def _newton(
         self, q: Speeds, start: Speeds, rolling: Each, rim: Drives, dt: Each
@@ -228,22 +226,17 @@ class PaddedRuns:
     @classmethod
     def of(cls, runs: Sequence[RunSignals], spec: RobotSpec) -> "PaddedRuns":
         """Return runs of any lengths, padded to the longest."""
-        shape, drives = (len(runs), max(len(run) for run in runs)), len(spec.forward)
-        padded = cls(
-            dt=np.zeros(shape),
-            rim=np.zeros((*shape, drives)),
-            rolling=np.zeros((*shape, 3)),
-            gyro=np.full(shape, np.nan),
-            force=np.full((*shape, drives), np.nan),
-        )
-        for k, run in enumerate(runs):
-            steps = slice(len(run))
-            padded.dt[k, steps] = run.dt
-            padded.rim[k, steps] = run.speed * spec.wheel_radius
-            padded.rolling[k, steps] = run.rolling(spec) * spec.size
-            padded.gyro[k, steps] = np.nan if run.gyro is None else run.gyro
-            padded.force[k, steps] = motor_forces(run, spec)
-        return padded
+        shape, nan = (len(runs), max(map(len, runs))), np.nan
+        columns = zip(*(measurements(run, spec) for run in runs), strict=True)
+        fills = 0.0, 0.0, 0.0, nan, nan
+        return cls(*(padded(x, shape, fill) for x, fill in zip(columns, fills, strict=True)))
+
+
+def measurements(run: RunSignals, spec: RobotSpec) -> tuple[np.ndarray, ...]:
+    """Return the arrays of one run that `PaddedRuns` has of several, in the same order."""
+    gyro = np.full(len(run), np.nan) if run.gyro is None else run.gyro
+    rim, rolling = run.speed * spec.wheel_radius, run.rolling(spec) * spec.size
+    return run.dt, rim, rolling, gyro, motor_forces(run, spec)
 
 
 def motor_forces(run: RunSignals, spec: RobotSpec) -> Float[np.ndarray, "step drive"]:
@@ -254,6 +247,6 @@ def motor_forces(run: RunSignals, spec: RobotSpec) -> Float[np.ndarray, "step dr
     rim = np.abs(run.speed * spec.wheel_radius)
     if run.current is None:
         return np.full(rim.shape, np.nan)
-    drives = (rim >= _DRIVING * rim.max(axis=1, keepdims=True)) & (rim > REST)
+    drives = (rim >= _DRIVING * rim.max(axis=1, keepdims=True)) & (rim > V_S)
     scale = spec.gear_ratio * spec.back_emf / spec.wheel_radius
     return np.where(drives, scale * run.along(spec), np.nan)

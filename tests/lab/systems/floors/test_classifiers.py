@@ -11,7 +11,6 @@ from sklearn.discriminant_analysis import (
 from sklearn.ensemble import HistGradientBoostingClassifier
 
 from slipid.lab.systems.floors.cosine_energy import (
-    GRAVITY,
     CosineEnergyClassifier,
     terms,
 )
@@ -23,6 +22,7 @@ from slipid.lab.systems.floors.learned import (
     features,
     tree_classifiers,
 )
+from slipid.model.robot import GRAVITY
 from tests.helpers.made_floor_runs import HZ, ahead, made_floor_run, made_floor_runs
 from tests.helpers.made_runs import HUSKY, ROBOTINO
 

@@ -8,7 +8,7 @@ import pytest
 
 from slipid.lab.systems.motion.gmdh import (
     CANDIDATES,
-    EVIDENCE_DECAY,
+    EVIDENCE_MEMORY,
     GmdhClass,
     GmdhOne,
     NetworkSet,
@@ -151,10 +151,10 @@ def test_older_evidence_fades_and_no_run_remembers_another():
     got = remembered(np.array([[1.0], [1.0], [1.0], [5.0], [0.0]]), run)
     expected = [
         1.0,
-        1.0 + EVIDENCE_DECAY,
-        1.0 + EVIDENCE_DECAY + EVIDENCE_DECAY**2,
+        1.0 + EVIDENCE_MEMORY,
+        1.0 + EVIDENCE_MEMORY + EVIDENCE_MEMORY**2,
         5.0,
-        5.0 * EVIDENCE_DECAY,
+        5.0 * EVIDENCE_MEMORY,
     ]
     assert got[:, 0] == pytest.approx(expected)
 

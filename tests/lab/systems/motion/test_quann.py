@@ -13,7 +13,7 @@ from slipid.lab.systems.motion.gaussian_process import (
     untuned_kernel,
 )
 from slipid.lab.systems.motion.quann import (
-    PARTS,
+    INFLATION_PARTS,
     QuannEnergy,
     QuannSlip,
     end_spread,
@@ -175,7 +175,7 @@ def test_inflation_is_from_runs_that_the_process_does_not_know():
 def test_every_run_is_in_one_part():
     numbers = np.array([3, 5, 8, 9, 11, 12])
     dealt = parts(numbers)
-    assert len(dealt) == PARTS
+    assert len(dealt) == INFLATION_PARTS
     assert sorted(np.concatenate(dealt).tolist()) == numbers.tolist()
     assert [part.tolist() for part in parts(np.array([4]))] == [[4]]
 

@@ -7,7 +7,12 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import check_grad
 
-from slipid.lab.systems.motion.ward_iagnemma_dynamics import GRAVITY, REST, Dynamics, ForceLaw
+from slipid.lab.systems.motion.ward_iagnemma_dynamics import (
+    V_S,
+    Dynamics,
+    ForceLaw,
+)
+from slipid.model.robot import GRAVITY
 from tests.helpers.driven_runs import FLOOR, MACHINES, held
 from tests.helpers.made_runs import HUSKY, ROBOTINO
 
@@ -16,7 +21,7 @@ def test_at_constant_speed_traction_equals_resistance():
     """Ahead on two drives: C1 (1 - exp(-A u)) = rho v / sqrt(v^2 + v_s^2), solved for u."""
     law = ForceLaw(rise=12.0, viscous=0.0, rolling=0.25)
     v = held(np.array([0.5, 0.0, 0.0]), law, HUSKY, 1e6)[0]
-    u = -np.log(1.0 - law.rolling * v[0] / np.hypot(v[0], REST) / law.grip) / law.rise
+    u = -np.log(1.0 - law.rolling * v[0] / np.hypot(v[0], V_S) / law.grip) / law.rise
     assert v[0] == pytest.approx(0.5 - u, rel=1e-5)
     assert v[1:] == pytest.approx([0.0, 0.0], abs=1e-6)
 
@@ -25,7 +30,7 @@ def test_an_omni_robot_between_two_wheels_slides_by_what_both_must_pull():
     """Along x two of three wheels drive, at 30 deg: 2 (N T) cos 30 = rho m g, and N = m g / 3."""
     law = ForceLaw(rise=12.0, viscous=0.0, rolling=0.25, turning=0.3)
     v = held(np.array([0.5, 0.0, 0.0]), law, seconds=1e6)[0]
-    share = law.rolling * v[0] / np.hypot(v[0], REST) * np.sqrt(3.0) / law.grip
+    share = law.rolling * v[0] / np.hypot(v[0], V_S) * np.sqrt(3.0) / law.grip
     u = -np.log(1.0 - share) / law.rise
     assert np.cos(np.pi / 6) * (0.5 - v[0]) == pytest.approx(u, rel=1e-4)
 
@@ -53,8 +58,8 @@ def test_small_steps_follow_the_differential_equation(spec):
         x, y, turn = q
         p = np.array([x, y, 0.0]) if spec is ROBOTINO else np.array([x, 0.0, 0.0])
         t = q - p
-        force -= GRAVITY * law.rolling * p * (1 / np.sqrt(p @ p + REST**2) + law.drag)
-        force -= GRAVITY * law.turning * t / np.sqrt(t @ t + REST**2)
+        force -= GRAVITY * law.rolling * p * (1 / np.sqrt(p @ p + V_S**2) + law.drag)
+        force -= GRAVITY * law.turning * t / np.sqrt(t @ t + V_S**2)
         yaw = turn / spec.base_radius
         return force * [1, 1, 2] + np.array([yaw * y, -yaw * x, 0.0])
 

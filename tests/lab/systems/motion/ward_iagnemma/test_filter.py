@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from slipid.lab.systems.motion.ward_iagnemma_dynamics import (
-    GRAVITY,
     Dynamics,
     ForceLaw,
     PaddedRuns,
     motor_forces,
 )
 from slipid.lab.systems.motion.ward_iagnemma_filter import FilterNoise, FilterState, SlipFilter
+from slipid.model.robot import GRAVITY
 from slipid.predict.slip_model import path_of
 from tests.helpers.driven_runs import FLOOR
 from tests.helpers.made_runs import ROBOTINO, made_run, straight
